@@ -1,0 +1,32 @@
+"""Compiled code from torch modules: rollouts for scoring, functions for controllers.
+
+Knows nothing of plants or friction beyond the methods it calls.
+"""
+
+from nfriction.codegen.build import cache_folder
+from nfriction.codegen.errors import (
+    CodegenError,
+    CompilerError,
+    NoBackend,
+    SelfCheckFailed,
+    UnsupportedOperation,
+)
+from nfriction.codegen.function import CompiledFunction, compile_function, emit_c
+from nfriction.codegen.operations import supported_operations
+from nfriction.codegen.rollout import CompiledRollout, Trajectories, compile_rollout
+
+__all__ = [
+    "CodegenError",
+    "CompiledFunction",
+    "CompiledRollout",
+    "CompilerError",
+    "NoBackend",
+    "SelfCheckFailed",
+    "Trajectories",
+    "UnsupportedOperation",
+    "cache_folder",
+    "compile_function",
+    "compile_rollout",
+    "emit_c",
+    "supported_operations",
+]

@@ -1,0 +1,5 @@
+"""Artefacts for controllers, each proven equal to the model that was scored."""
+
+from nfriction.export.script import torchscript
+
+__all__ = ["torchscript"]

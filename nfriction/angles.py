@@ -1,0 +1,110 @@
+"""How a file writes joint positions, and the way to the library's joint coordinates and back.
+
+Joint coordinates: the first link's angle from upright (0 is up), every further link's angle
+relative to the link before it. A free arm's angle about the vertical comes first and has no
+convention.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, fields
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+Angles = Literal["relative", "absolute"]
+MeasuredFrom = Literal["upright", "hanging"]
+
+
+@dataclass(frozen=True)
+class AngleConvention:
+    """How joint positions are written; the default is the library's own.
+
+    Angles are not wrapped or unwrapped. Torques are joint torques in every convention.
+
+    Args:
+        angles: every link's angle to the link before it, or to the vertical.
+        measured_from: where the zero of the angles to the vertical is.
+    """
+
+    angles: Angles = "relative"
+    measured_from: MeasuredFrom = "upright"
+
+    def __post_init__(self) -> None:
+        for field, choices in zip(fields(self), (Angles, MeasuredFrom), strict=True):
+            value = getattr(self, field.name)
+            if value not in get_args(choices):
+                valid = " or ".join(map(repr, get_args(choices)))
+                raise ValueError(f"`{field.name}` must be {valid}, got {value!r}.")
+
+    @classmethod
+    def parse(cls, text: str) -> AngleConvention:
+        """Convention from words such as "absolute,hanging" or "relative-upright", in any order.
+
+        A word that is left out takes its default; an unknown or doubled one raises ValueError.
+        """
+        settings: dict[str, str] = {}
+        for word in re.split(r"[\s,;/_+-]+", text.strip().lower()):
+            key = "angles" if word in get_args(Angles) else "measured_from"
+            if word not in get_args(Angles) + get_args(MeasuredFrom) or key in settings:
+                raise ValueError(
+                    f"an angle convention is one of relative, absolute and one of upright, "
+                    f"hanging, such as 'absolute,hanging'; got {text!r}."
+                )
+            settings[key] = word
+        return cls(**settings)  # type: ignore[arg-type]
+
+    def __str__(self) -> str:
+        return f"{self.angles},{self.measured_from}"
+
+    def position_to_joint(self, q: ArrayLike, first_link: int = 0) -> Array:
+        """Joint coordinates [rad] of positions in this convention.
+
+        Args:
+            q: positions [rad], joints on the last axis.
+            first_link: column of the first link; columns before it (a free arm) stay as they are.
+        """
+        joint = self.rate_to_joint(q, first_link)
+        # Differences of absolute angles do not see where those are measured from.
+        joint[..., first_link : first_link + 1] += self._first_zero
+        return joint
+
+    def position_from_joint(self, q: ArrayLike, first_link: int = 0) -> Array:
+        """Positions in this convention [rad] of joint coordinates; undoes `position_to_joint`."""
+        q = _links(q, first_link)
+        q[..., first_link : first_link + 1] -= self._first_zero
+        return self.rate_from_joint(q, first_link)
+
+    def rate_to_joint(self, qd: ArrayLike, first_link: int = 0) -> Array:
+        """Joint rates of rates (velocities or accelerations) in this convention."""
+        qd = _links(qd, first_link)
+        if self.angles == "absolute":
+            qd[..., first_link + 1 :] = np.diff(qd[..., first_link:], axis=-1)
+        return qd
+
+    def rate_from_joint(self, qd: ArrayLike, first_link: int = 0) -> Array:
+        """Rates in this convention of joint rates; undoes `rate_to_joint`."""
+        qd = _links(qd, first_link)
+        if self.angles == "absolute":
+            qd[..., first_link:] = np.cumsum(qd[..., first_link:], axis=-1)
+        return qd
+
+    @property
+    def _first_zero(self) -> float:
+        """Where the first angle's zero lies, as an angle from upright [rad]."""
+        return math.pi if self.measured_from == "hanging" else 0.0
+
+
+def _links(q: ArrayLike, first_link: int) -> Array:
+    """A copy of `q`, checked to have a link at `first_link`."""
+    q = np.array(q, dtype=np.float64)
+    if q.ndim == 0 or not 0 <= first_link < q.shape[-1]:
+        raise ValueError(
+            f"`first_link` must be a column of `q`, got {first_link} for shape {q.shape}; "
+            f"it is 0, or 1 where column 0 is a free arm."
+        )
+    return q

@@ -1,0 +1,79 @@
+"""The functions that a rollout is made of, whatever the language.
+
+`driver_c` and `driver_python` put the same RK4 driver around them. Both give it the same entry
+point `nf_rollout` with the same arguments: candidates `first` to `last`, flat arrays and strides.
+"""
+
+from dataclasses import dataclass
+
+from nfriction.codegen.graph import Program
+from nfriction.codegen.partition import partition
+from nfriction.codegen.scalar import Level, Node
+
+LEVELS = {
+    "qd_held": Level.STEP,
+    "qdd_held": Level.STEP,
+    "tau": Level.STEP,
+    "q": Level.STAGE,
+    "qd": Level.STAGE,
+}
+"""How long the inputs of a rollout live; everything else is a parameter."""
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """The functions of a rollout as groups of nodes.
+
+    Attributes:
+        joints: number of joints.
+        parameters: number of scalar parameters.
+        once: values computed once a rollout.
+        step: values computed once a step.
+        stage: acceleration with friction.
+        start: acceleration without friction, which seeds the held acceleration.
+        inputs: text of the input nodes by number, elements of arrays.
+    """
+
+    joints: int
+    parameters: int
+    once: tuple[Node, ...]
+    step: tuple[Node, ...]
+    stage: tuple[Node, ...]
+    start: tuple[Node, ...]
+    inputs: dict[int, str]
+
+    @property
+    def hoisted(self) -> dict[int, str]:
+        """Text of the hoisted values, as the step and the stage read them."""
+        once = {node.number: f"once[{i}]" for i, node in enumerate(self.once)}
+        return once | {node.number: f"step[{i}]" for i, node in enumerate(self.step)}
+
+
+def pieces(program: Program) -> Pieces:
+    """Arrange a program with outputs (stage, start) by how often its values are needed."""
+    stage, start = program.outputs
+    joints = len(stage.nodes)
+    split = partition(program.graph, stage.nodes)
+    inputs: dict[int, str] = {}
+    offset = 0
+    for port in program.inputs:
+        held = port.name in LEVELS
+        for i, node in enumerate(port.nodes):
+            inputs[node.number] = f"{port.name}[{i}]" if held else f"p[{offset + i}]"
+        offset += 0 if held else len(port.nodes)
+    return Pieces(
+        joints,
+        offset,
+        split.hoisted[Level.PARAMETER],
+        split.hoisted[Level.STEP],
+        split.outputs,
+        start.nodes,
+        inputs,
+    )
+
+
+# Argument arrays of the functions, in order.
+ONCE = ["p"]
+STEP = ["p", "once", "tau", "qd_held", "qdd_held"]
+STAGE = ["p", "once", "step", "tau", "qd_held", "qdd_held", "q", "qd"]
+START = ["p", "tau", "q", "qd"]

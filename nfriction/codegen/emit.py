@@ -1,0 +1,272 @@
+"""Scalar nodes as text: C (double or float) or Python.
+
+Values used once are written where they are used, the others become constants of the function.
+The text depends on the graph alone, so the same model gives the same bytes.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from nfriction.codegen import lanes
+from nfriction.codegen.scalar import Node, is_predicate, reachable
+
+Real = Literal["double", "float"]
+
+_INLINE = 64  # characters; longer single-use values get a line of their own
+
+# How tightly an operator binds; an atom or a call binds tightest.
+_ATOM, _UNARY, _PRODUCT, _SUM, _COMPARE, _NOT, _AND, _OR = 9, 8, 7, 6, 5, 4, 3, 2
+_INFIX = {
+    "add": ("+", _SUM),
+    "sub": ("-", _SUM),
+    "mul": ("*", _PRODUCT),
+    "div": ("/", _PRODUCT),
+    "lt": ("<", _COMPARE),
+    "le": ("<=", _COMPARE),
+    "eq": ("==", _COMPARE),
+    "ne": ("!=", _COMPARE),
+}
+_C_NAMES = {"abs": "fabs"}
+_PYTHON_NAMES = {
+    "abs": "abs",
+    "max": "_max",
+    "min": "_min",
+    # math.floor and its like give integers, which know neither infinity nor NaN.
+    **{op: f"np.{op}" for op in ("floor", "ceil", "trunc", "fmod")},
+}
+
+PYTHON_PRELUDE = """\
+import math
+
+import numpy as np
+from numba import njit
+
+
+@njit(error_model="numpy")
+def _max(a, b):
+    return a if a > b or a != a else b
+
+
+@njit(error_model="numpy")
+def _min(a, b):
+    return a if a < b or a != a else b
+"""
+
+
+def c_prelude(real: Real = "double") -> str:
+    """Includes and the two functions that the emitted C relies on; both propagate NaN."""
+    return f"""#include <math.h>
+#include <stddef.h>
+
+static {real} nf_max({real} a, {real} b) {{ return a > b || a != a ? a : b; }}
+static {real} nf_min({real} a, {real} b) {{ return a < b || a != a ? a : b; }}
+"""
+
+
+@dataclass(frozen=True)
+class C:
+    """C with C89 syntax and the functions of the C99 `math.h`."""
+
+    real: Real = "double"
+
+    def literal(self, value: float | bool) -> str:
+        if isinstance(value, bool):
+            return "1" if value else "0"
+        single = self.real == "float"
+        if single:
+            with np.errstate(over="ignore"):
+                value = float(np.float32(value))
+        if np.isnan(value):
+            return "(HUGE_VAL - HUGE_VAL)"
+        if np.isinf(value):
+            return "HUGE_VAL" if value > 0 else "(-HUGE_VAL)"
+        text = f"{np.float32(value)!s}f" if single else repr(value)
+        return f"({text})" if text.startswith("-") else text
+
+    def call(self, op: str, args: Sequence[str]) -> str:
+        suffix = "f" if self.real == "float" else ""
+        name = f"nf_{op}" if op in ("max", "min") else _C_NAMES.get(op, op) + suffix
+        return f"{name}({', '.join(args)})"
+
+    def logical(self, op: str) -> str:
+        return {"and": "&&", "or": "||", "not": "!"}[op]
+
+    def where(self, condition: str, a: str, b: str) -> str:
+        return f"({condition} ? {a} : {b})"
+
+    def define(self, name: str, text: str, predicate: bool) -> str:
+        return f"const {'int' if predicate else self.real} {name} = {text};"
+
+
+@dataclass(frozen=True)
+class Python:
+    """Python for numba."""
+
+    def literal(self, value: float | bool) -> str:
+        if isinstance(value, bool):
+            return repr(value)
+        if np.isnan(value):
+            return "math.nan"
+        if np.isinf(value):
+            return "math.inf" if value > 0 else "(-math.inf)"
+        return f"({value!r})" if repr(value).startswith("-") else repr(value)
+
+    def call(self, op: str, args: Sequence[str]) -> str:
+        return f"{_PYTHON_NAMES.get(op, f'math.{op}')}({', '.join(args)})"
+
+    def logical(self, op: str) -> str:
+        return {"and": "and", "or": "or", "not": "not "}[op]
+
+    def where(self, condition: str, a: str, b: str) -> str:
+        return f"({a} if {condition} else {b})"
+
+    def define(self, name: str, text: str, predicate: bool) -> str:
+        return f"{name} = {text}"
+
+
+Dialect = C | Python
+
+
+def statements(
+    outputs: Sequence[Node], bound: Mapping[int, str], dialect: Dialect, collect: bool = False
+) -> tuple[list[str], list[str]]:
+    """Definitions of local values, and one expression per output.
+
+    Args:
+        outputs: nodes to express.
+        bound: text of nodes that are already at hand (inputs, hoisted values), by node number.
+        dialect: the language.
+        collect: compute independent sin, cos, exp and tanh four at a time (C, double).
+    """
+    nodes = reachable(outputs, [n for n in reachable(outputs) if n.number in bound])
+    uses: dict[int, int] = {}
+    for node in nodes:
+        if node.number not in bound:
+            for argument in node.args:
+                uses[argument.number] = uses.get(argument.number, 0) + 1
+    for node in outputs:
+        uses[node.number] = uses.get(node.number, 0) + 1
+    lines: list[str] = []
+    texts: dict[int, tuple[str, int]] = {}
+
+    def write(node: Node) -> None:
+        if node.number in bound:
+            texts[node.number] = bound[node.number], _ATOM
+        elif node.op == "constant":
+            texts[node.number] = dialect.literal(node.value), _ATOM
+        elif node.op == "input":
+            raise AssertionError(f"input {node.value} has no name here")
+        else:
+            text, binding = _expression(node, texts, dialect)
+            if uses[node.number] > 1 or len(text) > _INLINE:
+                name = f"t{len(lines)}"
+                lines.append(dialect.define(name, text, is_predicate(node)))
+                text, binding = name, _ATOM
+            texts[node.number] = text, binding
+
+    waiting: dict[str, list[Node]] = {}
+    phase = lanes.phases(nodes, bound) if collect else {}
+    order = sorted(nodes, key=lambda n: (phase[n.number], n.number)) if collect else nodes
+    for i, node in enumerate(order):
+        if collect and node.op in lanes.FAMILY and node.number not in bound:
+            waiting.setdefault(lanes.FAMILY[node.op], []).append(node)
+        else:
+            write(node)
+        if waiting and (i + 1 == len(order) or phase[order[i + 1].number] > phase[node.number]):
+            for family, calls in waiting.items():
+                _collected(family, calls, lines, texts)
+            waiting.clear()
+    return lines, [texts[node.number][0] for node in outputs]
+
+
+def _collected(
+    family: str,
+    calls: list[Node],
+    lines: list[str],
+    texts: dict[int, tuple[str, int]],
+) -> None:
+    arguments = list(dict.fromkeys(node.args[0].number for node in calls))
+    call = lanes.call(family, len(lines), [texts[number][0] for number in arguments])
+    for node in calls:
+        results = call.cosines if node.op == "cos" else call.results
+        texts[node.number] = results[arguments.index(node.args[0].number)], _ATOM
+    lines += call.lines
+
+
+def _expression(
+    node: Node, texts: Mapping[int, tuple[str, int]], dialect: Dialect
+) -> tuple[str, int]:
+    def operand(argument: Node, binding: int) -> str:
+        text, own = texts[argument.number]
+        return text if own >= binding else f"({text})"
+
+    args = node.args
+    if node.op in _INFIX:
+        sign, binding = _INFIX[node.op]
+        # Python chains comparisons, so those never stand side by side.
+        left = operand(args[0], binding + (binding == _COMPARE))
+        return f"{left} {sign} {operand(args[1], binding + 1)}", binding
+    if node.op == "neg":
+        return f"-{operand(args[0], _ATOM)}", _UNARY
+    if node.op == "not":
+        return f"{dialect.logical('not')}{operand(args[0], _ATOM)}", _NOT
+    if node.op in ("and", "or"):
+        sides = f" {dialect.logical(node.op)} ".join(operand(a, _ATOM) for a in args)
+        return sides, _AND if node.op == "and" else _OR
+    if node.op == "where":
+        return dialect.where(*(operand(a, _SUM) for a in args)), _ATOM
+    return dialect.call(node.op, [texts[a.number][0] for a in args]), _ATOM
+
+
+def c_function(
+    name: str,
+    arguments: Sequence[str],
+    outputs: Mapping[str, Sequence[Node]],
+    bound: Mapping[int, str],
+    real: Real = "double",
+    qualifier: str = "static ",
+    collect: bool = False,
+) -> str:
+    """A C function that writes each of `outputs` to the array of that name.
+
+    Args:
+        name: of the function.
+        arguments: names of its input arrays.
+        outputs: nodes by output array.
+        bound: text of the input nodes.
+        real: element type.
+        qualifier: what stands before `void`.
+        collect: see `statements`; needs C99 and `lanes.PRELUDE`.
+    """
+    nodes = [node for group in outputs.values() for node in group]
+    lines, texts = statements(nodes, bound, C(real), collect)
+    targets = [f"{array}[{i}]" for array, group in outputs.items() for i in range(len(group))]
+    lines += [f"{target} = {text};" for target, text in zip(targets, texts, strict=True)]
+    signature = [f"const {real} *{a}" for a in arguments] + [f"{real} *{a}" for a in outputs]
+    unused = [f"(void){a};" for a in (*arguments, *outputs)]
+    body = "\n    ".join(lines + unused)
+    return f"{qualifier}void {name}({', '.join(signature)})\n{{\n    {body}\n}}\n"
+
+
+def python_function(
+    name: str,
+    arguments: Sequence[str],
+    outputs: Sequence[Node],
+    bound: Mapping[int, str],
+    into: str | None = None,
+) -> str:
+    """A numba function that returns `outputs` as a tuple, or fills the array named `into`."""
+    lines, texts = statements(outputs, bound, Python())
+    if into is None:
+        lines.append(f"return ({', '.join(texts)},)")
+    else:
+        lines += [f"{into}[{i}] = {text}" for i, text in enumerate(texts)] or ["pass"]
+        arguments = [*arguments, into]
+    body = "\n    ".join(lines)
+    return (
+        f'@njit(error_model="numpy", fastmath={{"contract"}})\n'
+        f"def {name}({', '.join(arguments)}):\n    {body}\n"
+    )

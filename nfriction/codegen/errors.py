@@ -1,0 +1,32 @@
+"""What can go wrong between a torch module and its compiled form; named for what happened."""
+
+
+class CodegenError(RuntimeError):
+    """Base of everything the code generator raises on purpose."""
+
+
+class UnsupportedOperation(CodegenError):  # noqa: N818
+    """A traced module uses an operation that has no scalar form here.
+
+    The torch rollout runs every module; only the compiled one needs this list.
+    """
+
+    def __init__(self, operation: str, reason: str = "has no scalar form here") -> None:
+        super().__init__(
+            f"operation `{operation}` {reason}; rewrite it with the operations listed in "
+            "`nfriction.codegen.supported_operations()`, or use the torch rollout "
+            '(`backend="torch"`), which runs every module.'
+        )
+        self.operation = operation
+
+
+class NoBackend(CodegenError):  # noqa: N818
+    """Neither a C compiler nor numba is at hand."""
+
+
+class CompilerError(CodegenError):
+    """The C compiler refused the emitted source; the message carries its output."""
+
+
+class SelfCheckFailed(CodegenError):  # noqa: N818
+    """A compiled model disagrees with eager torch and must not be used."""

@@ -1,0 +1,306 @@
+"""Compile single functions, and write them as C for controllers."""
+
+import ctypes
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nfriction.codegen import arguments, build
+from nfriction.codegen.emit import (
+    PYTHON_PRELUDE,
+    C,
+    Real,
+    c_function,
+    c_prelude,
+    python_function,
+)
+from nfriction.codegen.errors import SelfCheckFailed
+from nfriction.codegen.graph import Program
+from nfriction.codegen.lift import Lifted, Method
+from nfriction.codegen.partition import Partition, partition
+from nfriction.codegen.scalar import Level, Node, evaluate
+
+Array = np.ndarray
+
+_CHECK_TOLERANCE = 1e-10
+
+
+def compile_function(
+    function: Callable[..., Any],
+    example_inputs: Sequence[Tensor],
+    *,
+    backend: build.Backend = "auto",
+) -> "CompiledFunction":
+    """Compile a function of tensors.
+
+    Args:
+        function: a module, a bound method of one (its parameters stay inputs, read at every
+            call), or any callable (tensors it closes over are baked in).
+        example_inputs: float64 tensors of the right shapes, without a batch dimension.
+        backend: "c", "numba", or "auto" for the first of them that is there.
+
+    Returns:
+        A callable on NumPy arrays whose first axis is a batch.
+
+    Raises:
+        NoBackend, UnsupportedOperation, CompilerError, SelfCheckFailed: see `compile_rollout`.
+    """
+    served = build.choose(backend)
+    compiled = CompiledFunction(function, example_inputs, served)
+    compiled.check(example_inputs)
+    return compiled
+
+
+class CompiledFunction:
+    """A compiled function; made by `compile_function`.
+
+    Attributes:
+        backend: "c" or "numba".
+        source: what was compiled.
+    """
+
+    def __init__(
+        self, function: Callable[..., Any], example_inputs: Sequence[Tensor], backend: str
+    ) -> None:
+        self.backend = backend
+        self._function = function
+        self._lifted = Lifted(Method(function))
+        inputs = {f"x{i}": x for i, x in enumerate(example_inputs)}
+        program = self._lifted.trace(inputs, dict.fromkeys(inputs, Level.STAGE))
+        self._inputs = [p.shape for p in program.inputs if p.name in inputs]
+        self._outputs = [p.shape for p in program.outputs]
+        split, groups = _split(program)
+        emit = _c_source if backend == "c" else _python_source
+        self.source = emit(program, split, groups, self._inputs)
+        if backend == "c":
+            self._kernel = _c_kernel(self.source, 1 + len(self._inputs) + len(self._outputs))
+        else:
+            self._kernel = build.build_numba(self.source).nf_function
+
+    def __call__(self, *inputs: Any) -> Any:
+        """Evaluate row by row.
+
+        Args:
+            *inputs: arrays of shape (batch, *shape of the example).
+
+        Returns:
+            One array (batch, *shape), or a tuple of them where the function returns several.
+
+        Raises:
+            ValueError: if shapes do not fit.
+        """
+        if len(inputs) != len(self._inputs):
+            raise ValueError(f"expected {len(self._inputs)} inputs, got {len(inputs)}.")
+        given = [arguments.to_array(x) for x in inputs]
+        for i, (x, shape) in enumerate(zip(given, self._inputs, strict=True)):
+            if x.shape[1:] != shape or not x.ndim:
+                raise ValueError(f"input {i} must be (batch, *{shape}), got {x.shape}.")
+        rows = arguments.candidates({f"input {i}": len(x) for i, x in enumerate(given)})
+        p, _ = arguments.parameter_rows(self._lifted.values(), {})
+        out = [np.empty((rows, *shape)) for shape in self._outputs]
+        flat = [arguments.repeated(x, rows) for x in given]
+        self._kernel(rows, p.reshape(-1), *flat, *(o.reshape(-1) for o in out))
+        return out[0] if len(out) == 1 else tuple(out)
+
+    def check(self, example_inputs: Sequence[Tensor]) -> None:
+        """Compare with eager torch at the example inputs and near them.
+
+        Raises:
+            SelfCheckFailed: if they differ by more than rounding explains.
+        """
+        generator = torch.Generator().manual_seed(0)
+        for spread in (0.0, 0.01, 0.1):
+            inputs = [
+                x.detach() + spread * torch.randn(x.shape, generator=generator, dtype=x.dtype)
+                for x in example_inputs
+            ]
+            with torch.no_grad():
+                eager = self._function(*(x.to(self._lifted.device) for x in inputs))
+            ours = self(*(x[None] for x in inputs))
+            for a, b in zip(
+                ours if isinstance(ours, tuple) else (ours,),
+                eager if isinstance(eager, (tuple, list)) else (eager,),
+                strict=True,
+            ):
+                expected = arguments.to_array(b)
+                tolerance = _CHECK_TOLERANCE
+                if not np.allclose(a[0], expected, tolerance, tolerance, equal_nan=True):
+                    raise SelfCheckFailed(
+                        f"the compiled function gives {a[0]} where torch gives {expected}; "
+                        "please report this, and use the torch module meanwhile."
+                    )
+
+
+def emit_c(
+    function: Callable[..., Any],
+    inputs: Mapping[str, Tensor],
+    outputs: Sequence[str],
+    *,
+    name: str = "model",
+    real: Real = "double",
+) -> str:
+    """Write a function as C with its parameters baked in as a static table.
+
+    What depends on parameters alone is computed here, in float64, and only the results go into
+    the table. The C has C89 syntax, calls nothing but `math.h` and allocates nothing.
+
+    Args:
+        function: a module, a bound method of one, or any callable.
+        inputs: example tensors (float64, no batch dimension) by argument name in the C function.
+        outputs: names of the C function's output arrays, one per tensor returned.
+        name: of the C function and prefix of its table.
+        real: "double" or "float".
+
+    Raises:
+        UnsupportedOperation: an operation without scalar form.
+        ValueError: names that are no C identifiers, or a wrong number of outputs.
+    """
+    names = [name, *inputs, *outputs]
+    if len(set(names)) < len(names) or not all(n.isidentifier() and n.isascii() for n in names):
+        raise ValueError(f"names must be different C identifiers, got {names}.")
+    lifted = Lifted(Method(function))
+    program = lifted.trace(dict(inputs), dict.fromkeys(inputs, Level.STAGE))
+    if len(outputs) != len(program.outputs):
+        raise ValueError(f"`outputs` must name {len(program.outputs)} tensors, got {outputs}.")
+    split, groups = _split(program)
+    table = _read_parameters(split)
+    values = evaluate(table, _port_values(program, lifted))
+    bound = {node.number: f"{name}_table[{i}]" for i, node in enumerate(table)}
+    bound |= {n.number: f"{p.name}[{i}]" for p in program.inputs for i, n in enumerate(p.nodes)
+              if p.name in inputs}  # fmt: skip
+    body = c_function(
+        name, list(inputs), dict(zip(outputs, groups, strict=True)), bound, real, qualifier=""
+    )
+    return "\n".join([c_prelude(real), _table(name, values, real), body])
+
+
+def _table(name: str, values: Sequence[Array], real: Real) -> str:
+    if not values:
+        return ""
+    literals = [C(real).literal(float(v)) for v in values]
+    lines = [", ".join(literals[i : i + 4]) for i in range(0, len(literals), 4)]
+    body = ",\n    ".join(lines)
+    return f"static const {real} {name}_table[{len(values)}] = {{\n    {body}\n}};\n"
+
+
+def _split(program: Program) -> tuple[Partition, list[tuple[Node, ...]]]:
+    nodes = [node for port in program.outputs for node in port.nodes]
+    split = partition(program.graph, nodes)
+    groups, start = [], 0
+    for port in program.outputs:
+        groups.append(split.outputs[start : start + len(port.nodes)])
+        start += len(port.nodes)
+    return split, groups
+
+
+def _read_parameters(split: Partition) -> list[Node]:
+    """Parameter-level nodes that the row function reads: hoisted ones and bare inputs."""
+    hoisted = set(split.hoisted[Level.PARAMETER])
+    read: dict[int, Node] = {}
+    stack = list(split.outputs)
+    seen: set[int] = set()
+    while stack:
+        node = stack.pop()
+        if node.number in seen:
+            continue
+        seen.add(node.number)
+        if node in hoisted or (node.op == "input" and node.level == Level.PARAMETER):
+            read[node.number] = node
+        else:
+            stack.extend(node.args)
+    return [read[number] for number in sorted(read)]
+
+
+def _port_values(program: Program, lifted: Lifted) -> dict[str, Array]:
+    flat = [value.reshape(-1) for value in lifted.values().values()]
+    return {f"p{i}": value for i, value in enumerate(flat)}
+
+
+def _bound(program: Program, split: Partition) -> tuple[dict[int, str], dict[int, str]]:
+    inputs: dict[int, str] = {}
+    offset = 0
+    for port in program.inputs:
+        own = port.name.startswith("x")
+        for i, node in enumerate(port.nodes):
+            inputs[node.number] = f"{port.name}[{i}]" if own else f"p[{offset + i}]"
+        offset += 0 if own else len(port.nodes)
+    once = {n.number: f"once[{i}]" for i, n in enumerate(split.hoisted[Level.PARAMETER])}
+    return inputs, inputs | once
+
+
+def _c_source(
+    program: Program,
+    split: Partition,
+    groups: list[tuple[Node, ...]],
+    shapes: list[tuple[int, ...]],
+) -> str:
+    inputs, known = _bound(program, split)
+    once = split.hoisted[Level.PARAMETER]
+    given, taken = _sizes("x", shapes), _sizes("y", [(len(g),) for g in groups])
+    named = dict(zip(taken, groups, strict=True))
+    arrays = [f"const double *{x}" for x in given] + [f"double *{y}" for y in taken]
+    rows = [f"{a} + r * {size}" for a, size in {**given, **taken}.items()]
+    return "\n".join(
+        [
+            c_prelude(),
+            c_function("nf_once", ["p"], {"once": once}, inputs),
+            c_function("nf_row", ["p", "once", *given], named, known),
+            "#if defined(_WIN32)\n__declspec(dllexport)\n#endif",
+            f"void nf_function(ptrdiff_t rows, const double *p, {', '.join(arrays)})",
+            "{",
+            f"    double once[{max(1, len(once))}];",
+            "    ptrdiff_t r;",
+            "    nf_once(p, once);",
+            "    for (r = 0; r < rows; ++r)",
+            f"        nf_row(p, once, {', '.join(rows)});",
+            "}\n",
+        ]
+    )
+
+
+def _python_source(
+    program: Program,
+    split: Partition,
+    groups: list[tuple[Node, ...]],
+    shapes: list[tuple[int, ...]],
+) -> str:
+    inputs, known = _bound(program, split)
+    once = split.hoisted[Level.PARAMETER]
+    given, taken = _sizes("x", shapes), _sizes("y", [(len(g),) for g in groups])
+    flat = [node for group in groups for node in group]
+    rows = [f"{x}[r * {size} : (r + 1) * {size}]" for x, size in given.items()]
+    names = [f"{y}[r * {size} + {i}]" for y, size in taken.items() for i in range(size)]
+    return "\n".join(
+        [
+            PYTHON_PRELUDE,
+            python_function("nf_once", ["p"], once, inputs, into="once"),
+            python_function("nf_row", ["p", "once", *given], flat, known, into="out"),
+            '@njit(error_model="numpy", nogil=True, cache=True)',
+            f"def nf_function(rows, p, {', '.join([*given, *taken])}):",
+            f"    once = np.empty({max(1, len(once))})",
+            f"    out = np.empty({len(flat)})",
+            "    nf_once(p, once)",
+            "    for r in range(rows):",
+            f"        nf_row(p, once, {', '.join([*rows, 'out'])})",
+            *(f"        {target} = out[{i}]" for i, target in enumerate(names)),
+            "",
+        ]
+    )
+
+
+def _sizes(prefix: str, shapes: Sequence[tuple[int, ...]]) -> dict[str, int]:
+    return {f"{prefix}{i}": int(np.prod(s, dtype=int)) for i, s in enumerate(shapes)}
+
+
+def _c_kernel(source: str, arrays: int) -> Callable[..., None]:
+    function = build.build_c(source).nf_function
+    function.argtypes = [ctypes.c_ssize_t, *[ctypes.c_void_p] * arrays]
+    function.restype = None
+
+    def call(rows: int, *given: Array) -> None:
+        function(rows, *(a.ctypes.data for a in given))
+
+    return call

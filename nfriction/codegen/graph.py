@@ -1,0 +1,251 @@
+"""Trace torch code into a graph of scalars.
+
+The function runs once on `ScalarTensor`s: tensors that hold an array of scalar nodes beside an
+example value. Every ATen operation that reaches the dispatcher (composite ones arrive already
+decomposed) acts on both, so views cost nothing, writing in place is seen through views, two equal
+tensors stay two inputs, and shapes and dtypes are torch's own. Where Python asks for a value (`if
+x > 0`, `.item()`) the trace stops with an error instead of baking one branch. Tracing takes
+milliseconds where `torch.export` takes seconds, so compiled code is looked up by the hash of its
+source rather than by guessing whether a module has changed.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils._mode_utils import no_dispatch
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves, tree_map
+
+from nfriction.codegen.errors import UnsupportedOperation
+from nfriction.codegen.operations import OPERATIONS, constants
+from nfriction.codegen.scalar import Graph, Level, Node
+
+LIMIT = 50_000
+"""Most elements a traced tensor, and most scalar operations a traced function, may have."""
+
+
+@dataclass(frozen=True)
+class Port:
+    """An input or output of a program: its name, shape and scalar nodes in row-major order."""
+
+    name: str
+    shape: tuple[int, ...]
+    nodes: tuple[Node, ...]
+
+
+@dataclass(frozen=True)
+class Program:
+    """What a traced function computes."""
+
+    graph: Graph
+    inputs: tuple[Port, ...]
+    outputs: tuple[Port, ...]
+
+
+class ScalarTensor(Tensor):
+    """A tensor whose elements are nodes of a scalar graph.
+
+    Attributes:
+        nodes: object array of `Node`s, shaped like the tensor.
+        example: an ordinary tensor with the same shape, strides and dtype.
+        graph: where the nodes live.
+    """
+
+    nodes: np.ndarray
+    example: Tensor
+    graph: Graph
+
+    @staticmethod
+    def __new__(cls, nodes: np.ndarray, example: Tensor, graph: Graph) -> "ScalarTensor":
+        if example.is_complex():
+            raise UnsupportedOperation("complex arithmetic")
+        if nodes.size > LIMIT or len(graph) > LIMIT:
+            raise UnsupportedOperation(
+                "unrolling", f"met more than {LIMIT} scalars; the model is too large to unroll"
+            )
+        self = torch.Tensor._make_wrapper_subclass(
+            cls, example.shape, strides=example.stride(), dtype=example.dtype
+        )
+        self.nodes, self.example, self.graph = nodes, example, graph
+        return self
+
+    def __repr__(self) -> str:  # type: ignore[override]
+        return f"ScalarTensor(shape={tuple(self.nodes.shape)})"
+
+    @classmethod
+    def __torch_dispatch__(  # type: ignore[override]
+        cls, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        raise UnsupportedOperation(_name(func), "was called on a traced tensor after its trace")
+
+
+class _Rules:
+    """What holds while tracing: nothing random, and freshly created tensors are traceable."""
+
+    graph: Graph
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        kwargs = kwargs or {}
+        if torch.Tag.nondeterministic_seeded in func.tags:
+            raise UnsupportedOperation(_name(func), "draws random numbers")
+        tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
+        traced = [tensor for tensor in tensors if isinstance(tensor, ScalarTensor)]
+        if traced:
+            return _interpret(self, func, args, kwargs, traced)
+        out = func(*args, **kwargs)
+        if isinstance(out, Tensor) and not tensors:
+            return ScalarTensor(constants(self.graph, out), out, self.graph)
+        return out
+
+
+class _Watch(_Rules, TorchDispatchMode):
+    # torch wraps a `__torch_dispatch__` found in the mode's own class so that it imports the whole
+    # of torch._dynamo (2 s) on first use; an inherited one it leaves alone.
+    def __init__(self, graph: Graph) -> None:
+        super().__init__()
+        self.graph = graph
+
+
+def _name(func: Any) -> str:
+    return str(func._schema.name).removeprefix("aten::")
+
+
+def _interpret(
+    watch: Any, func: Any, args: tuple[Any, ...], kwargs: dict[str, Any], leaves: list[ScalarTensor]
+) -> Any:
+    graph = watch.graph
+    name = _name(func)
+    in_place = func._schema.is_mutable
+    if name in ("_local_scalar_dense", "item", "is_nonzero"):
+        return _concrete(leaves[0], name)
+    operation = OPERATIONS.get(name.removesuffix("_") if in_place else name)
+    if operation is None or (in_place and not isinstance(args[0], ScalarTensor)):
+        with watch:  # inside its own handler a mode is off
+            return _decomposed(func, name, args, kwargs)
+
+    def nodes_of(leaf: Any) -> Any:
+        if isinstance(leaf, ScalarTensor):
+            return leaf.nodes
+        return constants(graph, leaf) if isinstance(leaf, Tensor) else leaf
+
+    def example_of(leaf: Any) -> Any:
+        return leaf.example if isinstance(leaf, ScalarTensor) else leaf
+
+    nodes = operation(graph, *tree_map(nodes_of, args), **tree_map(nodes_of, kwargs))
+    example = func(*tree_map(example_of, args), **tree_map(example_of, kwargs))
+    if torch.Tag.inplace_view in func.tags:
+        return _reshape_in_place(args[0], nodes, func, args, kwargs)
+    if in_place:
+        return _write(args[0], nodes, name)
+    if isinstance(example, (tuple, list)):
+        wrapped = [_wrap(n, e, graph, name, leaves) for n, e in zip(nodes, example, strict=True)]
+        return type(example)(wrapped)
+    return _wrap(nodes, example, graph, name, leaves)
+
+
+def _wrap(
+    nodes: np.ndarray, example: Tensor, graph: Graph, name: str, leaves: list[ScalarTensor]
+) -> ScalarTensor:
+    narrowed = example.is_floating_point() and example.dtype != torch.float64
+    if narrowed and any(leaf.dtype == torch.float64 for leaf in leaves):
+        raise UnsupportedOperation(name, f"turns float64 into {example.dtype}")
+    if nodes.shape != tuple(example.shape):
+        raise AssertionError(f"`{name}` traced to {nodes.shape}, not {tuple(example.shape)}")
+    return ScalarTensor(nodes, example, graph)
+
+
+def _write(target: ScalarTensor, nodes: np.ndarray, name: str) -> ScalarTensor:
+    if target.is_floating_point() and target.dtype != torch.float64:
+        raise UnsupportedOperation(name, f"writes in place into {target.dtype}, not float64")
+    if not target.nodes.flags.writeable:
+        raise UnsupportedOperation(name, "writes in place through a view that is not traced")
+    target.nodes[...] = nodes
+    return target
+
+
+def _reshape_in_place(
+    target: ScalarTensor, nodes: np.ndarray, func: Any, args: Any, kwargs: Any
+) -> ScalarTensor:
+    """`squeeze_` and its like (torch's own `linear` uses it) change shape and strides only."""
+    included = torch._C._meta_in_tls_dispatch_include()
+    torch._C._set_meta_in_tls_dispatch_include(True)
+    try:
+        with no_dispatch():
+            func(*args, **kwargs)
+    finally:
+        torch._C._set_meta_in_tls_dispatch_include(included)
+    target.nodes = nodes
+    return target
+
+
+def _concrete(tensor: ScalarTensor, name: str) -> Any:
+    node = tensor.nodes.flat[0]
+    if node.op != "constant":
+        raise UnsupportedOperation(
+            name, "asks for a value that is known only at run time (use `torch.where`)"
+        )
+    return tensor.example.item()
+
+
+def _decomposed(func: Any, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    if not func._schema.is_mutable:
+        composite = func.decompose(*args, **kwargs)
+        if composite is not NotImplemented:
+            return composite
+        from torch._decomp import decomposition_table
+
+        if func in decomposition_table:
+            return decomposition_table[func](*args, **kwargs)
+    raise UnsupportedOperation(name)
+
+
+def trace(
+    function: Callable[..., Any],
+    inputs: Mapping[str, Tensor],
+    levels: Mapping[str, Level] | None = None,
+    graph: Graph | None = None,
+) -> Program:
+    """Run `function(**inputs)` symbolically.
+
+    Args:
+        function: takes the inputs by keyword; returns a tensor or a tuple of tensors.
+        inputs: example tensors, float64; each becomes an input of its own.
+        levels: how long each input lives, `Level.STAGE` where not given.
+        graph: the graph to extend; a new one by default.
+
+    Raises:
+        UnsupportedOperation: an operation without scalar form, named.
+        ValueError: an example that is not float64.
+    """
+    graph = Graph() if graph is None else graph
+    ports, arguments = [], {}
+    for name, example in inputs.items():
+        if example.dtype != torch.float64:
+            raise ValueError(
+                f"`{name}` must be float64, got {example.dtype}; call `.double()` on the module."
+            )
+        # A copy each: inputs never share memory, whatever the caller passed.
+        example = example.detach().to("cpu").clone(memory_format=torch.contiguous_format)
+        level = (levels or {}).get(name, Level.STAGE)
+        nodes = [graph.input(name, i, level) for i in range(example.numel())]
+        ports.append(Port(name, tuple(example.shape), tuple(nodes)))
+        array = np.empty(len(nodes), dtype=object)
+        array[:] = nodes
+        arguments[name] = ScalarTensor(array.reshape(tuple(example.shape)), example, graph)
+    with torch.no_grad(), _Watch(graph):
+        outputs = function(**arguments)
+    outputs = outputs if isinstance(outputs, (tuple, list)) else (outputs,)
+    return Program(graph, tuple(ports), tuple(_output(graph, i, o) for i, o in enumerate(outputs)))
+
+
+def _output(graph: Graph, index: int, output: Any) -> Port:
+    if not isinstance(output, Tensor):
+        raise ValueError(f"a compiled function returns tensors, got {type(output).__name__}.")
+    nodes = output.nodes if isinstance(output, ScalarTensor) else constants(graph, output)
+    return Port(f"out{index}", tuple(output.shape), tuple(nodes.ravel()))

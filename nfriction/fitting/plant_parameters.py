@@ -1,0 +1,107 @@
+"""Which terms of a plant a fit may adjust, and by how much.
+
+Every adjustable term enters its buffer linearly, `buffer = nominal + sum_p basis_p x_p`, with
+x = 0 the plant as given: ratios are deviations from 1, offsets are in SI.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+# Inertia and gravity terms of a bench are known to about a tenth; the bound is the data cards'.
+RATIO_BOUND, RATIO_SD = 0.3, 0.1
+# An encoder's zero is known to about a degree.
+ANGLE_BOUND, ANGLE_SD = 0.1, 0.02
+# Air drag: the quadratic term of a slender bar is 0.5 rho c_d width, below 0.1 N s^2/m^3.
+DRAG_SD = 0.05
+
+
+@dataclass(frozen=True)
+class PlantParameter:
+    """One adjustable term.
+
+    Attributes:
+        name: what a report calls it.
+        buffer: the plant's buffer that it changes.
+        basis: change of the buffer per unit, shape of the buffer.
+        lower, upper: bounds.
+        prior_sd: standard deviation of the prior around 0.
+    """
+
+    name: str
+    buffer: str
+    basis: Tensor
+    lower: float
+    upper: float
+    prior_sd: float
+
+
+def plant_parameters(
+    plant: nn.Module, *, driven: bool, largest_torque: float = 0.0, drag: bool = False
+) -> list[PlantParameter]:
+    """The terms of a plant that a recording can tell.
+
+    Args:
+        plant: `PendulumChain` or `LinearAxis`.
+        driven: torque was measured. Free swing tells only ratios, so the first gravity term is
+            kept as the scale.
+        largest_torque: largest torque in the recordings [N m]; bounds a torque offset.
+        drag: fit air drag on the links, one linear and one quadratic coefficient for all links.
+
+    Returns:
+        Ratios of inertia, gravity, armature and mass terms, angle offsets, torque offsets of
+        driven joints, and drag.
+    """
+    buffers = dict(plant.named_buffers())
+    found: list[PlantParameter] = []
+
+    def ratio(label: str, buffer: str, *index: tuple[int, ...]) -> None:
+        nominal = buffers[buffer]
+        basis = torch.zeros_like(nominal)
+        for i in index:
+            basis[i] = nominal[i]
+        if basis.abs().sum() > 0:
+            found.append(PlantParameter(label, buffer, basis, -RATIO_BOUND, RATIO_BOUND, RATIO_SD))
+
+    def shift(label: str, buffer: str, basis: Tensor, low: float, high: float, sd: float) -> None:
+        found.append(PlantParameter(label, buffer, basis, low, high, sd))
+
+    if "inertia_coupling" in buffers:
+        links = buffers["gravity_moment"].shape[-1]
+        for i in range(links):
+            for j in range(i, links):
+                ratio(f"inertia {i + 1}{j + 1}", "inertia_coupling", (i, j), (j, i))
+        for i in range(0 if driven else 1, links):
+            ratio(f"gravity {i + 1}", "gravity_moment", (i,))
+        joints = buffers["angle_offset"].shape[-1]
+        for j in range(joints - links, joints):
+            unit = torch.eye(joints, dtype=torch.float64)[j]
+            shift(f"angle offset {j + 1} [rad]", "angle_offset", unit, -ANGLE_BOUND, ANGLE_BOUND,
+                  ANGLE_SD)  # fmt: skip
+    for name in ("armature", "mass"):
+        for j in range(buffers[name].shape[-1] if name in buffers else 0):
+            ratio(f"{name} {j + 1}", name, (j,))
+    if driven:
+        joints = buffers["torque_offset"].shape[-1]
+        for j, unit in enumerate(torch.eye(joints, dtype=torch.float64)):
+            bound = 0.3 * largest_torque
+            shift(f"torque offset {j + 1} [N m]", "torque_offset", unit, -bound, bound, bound / 3)
+    if drag:
+        for name in ("drag_linear", "drag_quadratic"):
+            ones = torch.ones_like(buffers[name])
+            shift(name.replace("_", " "), name, ones, 0.0, 1.0, DRAG_SD)
+    return found
+
+
+def adjusted_buffers(
+    plant: nn.Module, parameters: list[PlantParameter], vector: Tensor
+) -> Mapping[str, Tensor]:
+    """Buffers of the plant at a parameter vector, shape (parameter,)."""
+    nominal = dict(plant.named_buffers())
+    changed: dict[str, Tensor] = {}
+    for parameter, value in zip(parameters, vector, strict=True):
+        before = changed.get(parameter.buffer, nominal[parameter.buffer])
+        changed[parameter.buffer] = before + value * parameter.basis
+    return changed

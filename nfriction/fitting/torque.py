@@ -1,0 +1,127 @@
+"""Equation error: constant coefficients from the friction torque that a motion implies."""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.optimize import lsq_linear
+from torch import Tensor
+
+from nfriction.friction import Law
+from nfriction.friction.models import V_SMOOTH
+from nfriction.plant import LinearAxis, PendulumChain
+from nfriction.recording import Recording
+from nfriction.signals import Motion
+
+# Smoothers know less at the ends of a record; that much of each end is left out [s].
+EDGE = 0.02
+
+
+@dataclass(frozen=True)
+class TorqueFit:
+    """Constant coefficients found from torques.
+
+    Attributes:
+        coefficients: (joint, coefficient), in SI.
+        residual: root mean square of the torque left over, (joint,) [N m].
+        torque: root mean square of the friction torque, (joint,) [N m].
+    """
+
+    coefficients: Tensor
+    residual: Tensor
+    torque: Tensor
+
+
+def friction_torque(
+    plant: PendulumChain | LinearAxis, recording: Recording, motion: Motion
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Velocity, load and friction torque along a recording, each (sample, joint).
+
+    `tau_f = tau - M(q) qdd - bias(q, qd)`, the ends of the record left out.
+
+    Args:
+        plant: the mechanism.
+        recording: in joint coordinates.
+        motion: its smoothed motion.
+    """
+    inside = (recording.time >= recording.time[0] + EDGE) & (
+        recording.time <= recording.time[-1] - EDGE
+    )
+    q, qd, qdd = (torch.as_tensor(x[inside]) for x in (motion.q, motion.qd, motion.qdd))
+    tau = np.zeros_like(recording.q) if recording.tau is None else recording.tau
+    left = torch.as_tensor(tau[inside]) - plant.inverse_dynamics(q, qd, qdd)
+    return qd, plant.load(q, qd), left
+
+
+def fit_torque(
+    law: Law,
+    plant: PendulumChain | LinearAxis,
+    recordings: Sequence[Recording],
+    motions: Sequence[Motion],
+    v_smooth: float = V_SMOOTH,
+) -> TorqueFit:
+    """Least squares of the friction torque, joint by joint.
+
+    Linear least squares within bounds where the torque is linear in the coefficients; the others
+    are searched over the law's candidates.
+
+    Args:
+        law: the law to fit.
+        plant: the mechanism.
+        recordings: in joint coordinates.
+        motions: smoothed motion of each recording.
+        v_smooth: velocity over which the sign turns [rad/s].
+
+    Returns:
+        Coefficients with what they leave unexplained.
+    """
+    parts = [friction_torque(plant, r, m) for r, m in zip(recordings, motions, strict=True)]
+    qd, load, torque = (torch.cat(x) for x in zip(*parts, strict=True))
+    searched = [c.search for c in law.coefficients if not c.linear]
+    candidates = [_linear_fit(law, qd, load, torque, v_smooth, dict(zip(
+        (i for i, c in enumerate(law.coefficients) if not c.linear), values, strict=True)))
+        for values in itertools.product(*searched)]  # fmt: skip
+    residuals = torch.stack([c[1] for c in candidates])
+    best = residuals.argmin(0)
+    joints = range(qd.shape[1])
+    return TorqueFit(
+        torch.stack([candidates[int(best[j])][0][j] for j in joints]),
+        residuals.amin(0),
+        torque.square().mean(0).sqrt(),
+    )
+
+
+def _linear_fit(
+    law: Law,
+    qd: Tensor,
+    load: Tensor,
+    torque: Tensor,
+    v_smooth: float,
+    fixed: dict[int, float],
+) -> tuple[Tensor, Tensor]:
+    """Coefficients (joint, coefficient) and residual (joint,) with the nonlinear ones given."""
+    columns = []
+    linear = [i for i, c in enumerate(law.coefficients) if c.linear]
+    for i in linear:
+        unit = torch.zeros(*qd.shape, len(law.coefficients), dtype=qd.dtype)
+        unit[..., i] = 1.0
+        for k, value in fixed.items():
+            unit[..., k] = value
+        columns.append(law.torque(qd, load, unit, v_smooth))
+    design = torch.stack(columns, -1)
+    lower = [0.0 if law.coefficients[i].positive else -np.inf for i in linear]
+    coefficients = torch.zeros(qd.shape[1], len(law.coefficients), dtype=qd.dtype)
+    for k, value in fixed.items():
+        coefficients[:, k] = value
+    residual = torch.zeros(qd.shape[1], dtype=qd.dtype)
+    for joint in range(qd.shape[1]):
+        a, y = design[:, joint].numpy(), torque[:, joint].numpy()
+        # Columns of unit length: coefficients differ by orders of magnitude.
+        scale = np.linalg.norm(a, axis=0)
+        scale[scale == 0] = 1.0
+        solution = lsq_linear(a / scale, y, bounds=(lower, np.inf), tol=1e-12).x / scale
+        coefficients[joint, linear] = torch.as_tensor(solution)
+        residual[joint] = float(np.sqrt(np.mean((a @ solution - y) ** 2)))
+    return coefficients, residual

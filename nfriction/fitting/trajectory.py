@@ -1,0 +1,205 @@
+"""Output error: friction and plant terms from the positions of simulated windows.
+
+Each window starts from a free state of its own (multiple shooting without continuity), because
+the motion of a light mechanism forgets its start within seconds. Parameters and window states
+are found together by Levenberg-Marquardt with exact sensitivities.
+"""
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from nfriction.fitting.plant_parameters import PlantParameter, adjusted_buffers
+from nfriction.fitting.sensitivity import Motions, simulate, step_maps
+from nfriction.fitting.windows import Windows
+from nfriction.friction import FrictionModel
+from nfriction.plant import LinearAxis, PendulumChain
+from nfriction.solve.levenberg import LeastSquaresResult, LevenbergMarquardt, Quadratic, Step
+
+logger = logging.getLogger(__name__)
+
+# Steps whose sensitivities are accumulated together: large enough for fast matrix products.
+RUN = 50
+# Smoothed start states are off by far less; the prior only keeps a window from running away.
+START_Q_SD, START_QD_SD = 0.01, 0.3
+
+
+@dataclass
+class TrajectoryProblem:
+    """Sum of squares of the position error over windows, and its quadratic model.
+
+    The vector of unknowns is [friction parameters, plant parameters, q0 and qd0 of each window].
+
+    Args:
+        plant: the mechanism; in free swing its first gravity term is the scale.
+        friction: model whose schedule is varied in place.
+        windows: what was measured.
+        plant_terms: adjustable terms of the plant.
+        noise_sd: standard deviation of a position residual [rad], scale of the priors.
+        mixing: matrix (joint, joint) from joint coordinates to those in which the recording's
+            positions were measured; errors are counted there.
+        substeps: integration steps to a sample.
+    """
+
+    plant: PendulumChain | LinearAxis
+    friction: FrictionModel
+    windows: Windows
+    plant_terms: list[PlantParameter]
+    noise_sd: float
+    mixing: Tensor
+    substeps: int = 1
+
+    def __post_init__(self) -> None:
+        w = self.windows
+        self.friction_count = self.friction.schedule.parameter_vector().numel()
+        self.shared_count = self.friction_count + len(self.plant_terms)
+        self.step = w.step.repeat_interleave(self.substeps, 1) / self.substeps
+        self.tau = w.tau.repeat_interleave(self.substeps, 1)
+        self._simulated: tuple[Tensor, Motions] | None = None
+
+    def start(self, plant_vector: Tensor | None = None) -> Tensor:
+        """Unknowns at the model's present parameters and the smoothed window states."""
+        if plant_vector is None:
+            plant_vector = torch.zeros(len(self.plant_terms), dtype=torch.float64)
+        state = torch.cat([self.windows.q0, self.windows.qd0], -1).reshape(-1)
+        return torch.cat([self.friction.schedule.parameter_vector(), plant_vector, state])
+
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        lower, upper = self.friction.schedule.bounds()
+        free = torch.full((2 * self.windows.q0.numel(),), torch.inf, dtype=torch.float64)
+        terms = self.plant_terms
+        low = torch.tensor([t.lower for t in terms], dtype=torch.float64)
+        high = torch.tensor([t.upper for t in terms], dtype=torch.float64)
+        return torch.cat([lower, low, -free]), torch.cat([upper, high, free])
+
+    def split(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Friction parameters, plant parameters, window states (window, 2 joint)."""
+        friction, plant, state = x.split(
+            [self.friction_count, len(self.plant_terms), x.numel() - self.shared_count]
+        )
+        return friction, plant, state.reshape(len(self.windows), -1)
+
+    def plant_at(self, vector: Tensor) -> PendulumChain | LinearAxis:
+        """The plant with its adjustable terms at a parameter vector."""
+        changed = adjusted_buffers(self.plant, self.plant_terms, vector)
+        return self.plant.replace(**changed) if changed else self.plant
+
+    def residuals(self, x: Tensor) -> Tensor:
+        """Weighted position error over the noise, (window, step + 1, joint)."""
+        motions = self._simulate(x)
+        q = torch.cat([motions.q[:: self.substeps], motions.last_q[None]]).transpose(0, 1)
+        error = (q - self.windows.q) @ self.mixing.T
+        return error * (self.windows.weight[..., None] / self.noise_sd)
+
+    def cost(self, x: Tensor) -> Tensor:
+        """Half the sum of squares of residuals and prior."""
+        precision, mean = self._prior()
+        return 0.5 * (self.residuals(x).square().sum() + (precision * (x - mean) ** 2).sum())
+
+    def quadratic(self, x: Tensor) -> Quadratic:
+        """Gauss-Newton model of the cost at `x`."""
+        r = self.residuals(x)
+        precision, mean = self._prior()
+        gradient, hessian = precision * (x - mean), torch.diag(precision)
+        own, shared = self._normal_equations(x, r)
+        self._scatter(gradient, hessian, own, shared)
+        return Quadratic(self.cost(x), gradient, hessian)
+
+    def _simulate(self, x: Tensor) -> Motions:
+        """Motion at `x`; the last one is kept, as a step's cost and model ask for the same."""
+        if self._simulated is not None and torch.equal(self._simulated[0], x):
+            return self._simulated[1]
+        parameters, plant_vector, state = self.split(x)
+        self.friction.schedule.set_parameter_vector(parameters)
+        q0, qd0 = state.chunk(2, -1)
+        plant = self.plant_at(plant_vector)
+        motions = simulate(plant, self.friction, q0, qd0, self.windows.qdd0, self.tau, self.step)
+        self._simulated = (x.clone(), motions)
+        return motions
+
+    def _prior(self) -> tuple[Tensor, Tensor]:
+        """Prior precision and mean of every unknown."""
+        n = self.friction_count
+        w = self.windows
+        mean = torch.zeros(self.shared_count, dtype=torch.float64)
+        sd = torch.full_like(mean, torch.inf)
+        mean[:n], sd[:n] = self.friction.schedule.prior()
+        sd[n:] = torch.tensor([t.prior_sd for t in self.plant_terms], dtype=torch.float64)
+        start = torch.cat([w.q0, w.qd0], -1)
+        spread = torch.cat(
+            [torch.full_like(w.q0, START_Q_SD), torch.full_like(w.qd0, START_QD_SD)], -1
+        )
+        sd = torch.cat([sd, spread.reshape(-1)])
+        return sd.square().reciprocal(), torch.cat([mean, start.reshape(-1)])
+
+    def _normal_equations(self, x: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
+        """J^T r and J^T J of each window over [friction, plant, its own state]."""
+        _, plant_vector, _ = self.split(x)
+        motions = self._simulate(x)
+        steps, windows, joints = motions.q.shape
+        columns = self.shared_count + 2 * joints
+        carried = torch.zeros(windows, 3 * joints, columns, dtype=torch.float64)
+        carried[:, : 2 * joints, self.shared_count :] = torch.eye(2 * joints, dtype=torch.float64)
+        slope = torch.zeros(windows, columns, dtype=torch.float64)
+        curvature = torch.zeros(windows, columns, columns, dtype=torch.float64)
+
+        def accumulate(rows: list[Tensor], first: int) -> None:
+            stacked = torch.stack(rows, 1)
+            part = slice(first, first + len(rows))
+            weight = self.windows.weight[:, part, None, None] / self.noise_sd
+            jacobian = ((self.mixing @ stacked) * weight).reshape(windows, -1, columns)
+            slope.add_((r[:, part].reshape(windows, 1, -1) @ jacobian).squeeze(1))
+            curvature.add_(jacobian.transpose(1, 2) @ jacobian)
+
+        sample = 0
+        for maps in step_maps(
+            self.plant, self.friction, motions, self.tau, self.step, self.plant_terms,
+            plant_vector, RUN * self.substeps,
+        ):  # fmt: skip
+            rows = []
+            n = maps.parameters.shape[-1]
+            for k in range(maps.state.shape[0]):
+                if k % self.substeps == 0:
+                    rows.append(carried[:, :joints])
+                carried = maps.state[k] @ carried
+                carried[..., :n] += maps.parameters[k]
+                carried[..., n : self.shared_count] += maps.plant[k]
+            accumulate(rows, sample)
+            sample += len(rows)
+        accumulate([carried[:, :joints]], sample)
+        return slope, curvature
+
+    def _scatter(self, gradient: Tensor, hessian: Tensor, own: Tensor, shared: Tensor) -> None:
+        """Add each window's normal equations to the whole system's."""
+        c = self.shared_count
+        gradient[:c] += own[:, :c].sum(0)
+        gradient[c:] += own[:, c:].reshape(-1)
+        hessian[:c, :c] += shared[:, :c, :c].sum(0)
+        size = own.shape[1] - c
+        for w in range(own.shape[0]):
+            at = slice(c + w * size, c + (w + 1) * size)
+            hessian[at, at] += shared[w, c:, c:]
+            hessian[:c, at] += shared[w, :c, c:]
+            hessian[at, :c] += shared[w, c:, :c]
+
+
+def solve_trajectory(
+    problem: TrajectoryProblem,
+    x0: Tensor,
+    *,
+    max_steps: int = 30,
+    callback: Callable[[Tensor, Step], bool | None] | None = None,
+) -> LeastSquaresResult:
+    """Minimise a trajectory problem from `x0`, leaving the best parameters in its model."""
+    lower, upper = problem.bounds()
+    solver = LevenbergMarquardt(
+        max_steps=max_steps, gradient_tolerance=1e-6, cost_tolerance=1e-6, step_tolerance=1e-8
+    )
+    result = solver.minimise(
+        problem.quadratic, x0, cost=problem.cost, lower=lower, upper=upper, callback=callback
+    )
+    problem.friction.schedule.set_parameter_vector(problem.split(result.x)[0])
+    return result

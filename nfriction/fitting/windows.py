@@ -1,0 +1,79 @@
+"""Recordings cut into windows of equal length with an initial state each."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nfriction.recording import Recording
+from nfriction.signals import Motion
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Windows of recordings, in joint coordinates.
+
+    Attributes:
+        q: measured position [rad], (window, step + 1, joint).
+        tau: torque held over each step [N m], (window, step, joint).
+        step: [s], (window, step); zero where a window ends early.
+        weight: 1 where a sample counts, 0 where it pads, (window, step + 1).
+        q0, qd0, qdd0: smoothed state at the start, (window, joint).
+        names: recording that each window comes from.
+    """
+
+    q: Tensor
+    tau: Tensor
+    step: Tensor
+    weight: Tensor
+    q0: Tensor
+    qd0: Tensor
+    qdd0: Tensor
+    names: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return self.q.shape[0]
+
+
+def cut_windows(
+    recordings: Sequence[Recording], motions: Sequence[Motion], length: float
+) -> Windows:
+    """Cut recordings into windows of about `length` seconds that cover them.
+
+    Args:
+        recordings: in joint coordinates; a recording shorter than `length` is one window.
+        motions: the smoothed motion of each recording.
+        length: [s].
+
+    Raises:
+        ValueError: if a recording has so few samples that no window fits.
+    """
+    pieces = []
+    for recording, motion in zip(recordings, motions, strict=True):
+        span = recording.time[-1] - recording.time[0]
+        count = max(1, int(span / length + 0.5))
+        edges = np.linspace(0, len(recording.time) - 1, count + 1).astype(int)
+        pieces += [(recording, motion, a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    steps = max(b - a for _, _, a, b in pieces)
+    joints = recordings[0].q.shape[1]
+    q = np.zeros((len(pieces), steps + 1, joints))
+    tau = np.zeros((len(pieces), steps, joints))
+    step = np.zeros((len(pieces), steps))
+    weight = np.zeros((len(pieces), steps + 1))
+    for i, (recording, _, a, b) in enumerate(pieces):
+        n = b - a
+        q[i, : n + 1] = recording.q[a : b + 1]
+        q[i, n + 1 :] = recording.q[b]
+        step[i, :n] = np.diff(recording.time[a : b + 1])
+        weight[i, : n + 1] = 1.0
+        if recording.tau is not None:
+            tau[i, :n] = recording.tau[a:b]
+    starts = [
+        np.stack([getattr(m, name)[a] for _, m, a, _ in pieces]) for name in ("q", "qd", "qdd")
+    ]
+    return Windows(
+        *(torch.as_tensor(x, dtype=torch.float64) for x in (q, tau, step, weight, *starts)),
+        names=tuple(r.name for r, _, _, _ in pieces),
+    )

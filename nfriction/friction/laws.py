@@ -1,0 +1,173 @@
+"""Friction laws: pure elementwise functions of velocity, load and coefficients.
+
+A law maps joint velocity, normal load and a stack of coefficients (last axis) to the friction
+torque on the left-hand side of `M(q) qdd + bias(q, qd) + tau_f = tau`. Every law here scripts,
+exports and broadcasts; a user's own law is one such function wrapped in `Law`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+TorqueFunction = Callable[[Tensor, Tensor, Tensor, float], Tensor]
+
+
+@dataclass(frozen=True)
+class Coefficient:
+    """One coefficient of a law, as the papers name it.
+
+    Attributes:
+        name: symbol, e.g. `"B"`.
+        unit: SI unit for a revolute joint; for a sliding axis read N for N m and m for rad.
+        positive: positive by physics, hence kept positive by construction.
+        linear: the torque is linear in it, so least squares finds it directly.
+        search: candidate values tried by the torque fit where the torque is not linear in it.
+        fitted: estimated by default; otherwise kept at its initial value.
+    """
+
+    name: str
+    unit: str
+    positive: bool = True
+    linear: bool = True
+    search: tuple[float, ...] = ()
+    fitted: bool = True
+
+
+@dataclass(frozen=True)
+class Law:
+    """A friction law: its torque function and what its coefficients are.
+
+    Attributes:
+        name: name of the law.
+        coefficients: description of each entry of the coefficients' last axis, in order.
+        torque: `(qd, load, coefficients, v_smooth) -> tau_f`, elementwise and scriptable.
+    """
+
+    name: str
+    coefficients: tuple[Coefficient, ...]
+    torque: TorqueFunction
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(c.name for c in self.coefficients)
+
+
+def smooth_sign(qd: Tensor, v_smooth: float) -> Tensor:
+    """Sign of the velocity with a linear passage through zero: `tanh(qd / v_smooth)`."""
+    return torch.tanh(qd / v_smooth)
+
+
+def viscous(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
+    """Viscous friction `C_p qd` (NCFM).
+
+    Args:
+        qd: joint velocity [rad/s], shape (*batch, joint).
+        load: normal load over its value at rest [-]; not used by this law.
+        coefficients: C_p [N m s/rad], shape (*batch, joint, 1).
+        v_smooth: velocity over which the sign turns [rad/s]; not used by this law.
+
+    Returns:
+        Friction torque [N m], shape (*batch, joint).
+
+    References:
+        TLRIP paper, viscous model; second paper's NCFM (Table I).
+    """
+    return coefficients.select(-1, 0) * qd
+
+
+def linear(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
+    """Viscous plus load-dependent Coulomb friction `B qd + C load sgn(qd)` (LFM).
+
+    Args:
+        qd: joint velocity [rad/s], shape (*batch, joint).
+        load: `|N| / (m g)` [-], shape like `qd`.
+        coefficients: B [N m s/rad] and C [N m], shape (*batch, joint, 2).
+        v_smooth: velocity over which the sign turns [rad/s].
+
+    Returns:
+        Friction torque [N m], shape (*batch, joint).
+
+    References:
+        TLRIP paper, eqs. (26)-(29), with the load taken as |N|/(m g) so that C is a torque.
+    """
+    b, c = coefficients.unbind(-1)
+    return b * qd + c * load * smooth_sign(qd, v_smooth)
+
+
+def nonlinear(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
+    """Offset, Coulomb, viscous and arctangent friction (NLFM).
+
+    `f_o + f_c sgn(qd) + f_v qd + f_a arctan(f_b qd)`; passive where `f_o = 0`.
+
+    Args:
+        qd: joint velocity [rad/s], shape (*batch, joint).
+        load: normal load over its value at rest [-]; not used by this law.
+        coefficients: f_o [N m], f_c [N m], f_v [N m s/rad], f_a [N m], f_b [s/rad],
+            shape (*batch, joint, 5).
+        v_smooth: velocity over which the sign turns [rad/s].
+
+    Returns:
+        Friction torque [N m], shape (*batch, joint).
+
+    References:
+        Second paper's NLFM (Table III); TLRIP paper's NLFM.
+    """
+    f_o, f_c, f_v, f_a, f_b = coefficients.unbind(-1)
+    return f_o + f_c * smooth_sign(qd, v_smooth) + f_v * qd + f_a * torch.atan(f_b * qd)
+
+
+def stribeck(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
+    """Generalised Stribeck friction: `(F_c + F_d exp(-|qd/v_s|^delta)) sgn(qd) + F_v qd`.
+
+    `F_d = F_s - F_c` is what breakaway adds to Coulomb friction, so positive coefficients make
+    the law passive.
+
+    Args:
+        qd: joint velocity [rad/s], shape (*batch, joint).
+        load: normal load over its value at rest [-]; not used by this law.
+        coefficients: F_c [N m], F_d [N m], F_v [N m s/rad], v_s [rad/s], delta [-],
+            shape (*batch, joint, 5).
+        v_smooth: velocity over which the sign turns [rad/s].
+
+    Returns:
+        Friction torque [N m], shape (*batch, joint).
+
+    References:
+        Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30 (1994), eq. (8).
+    """
+    f_c, f_d, f_v, v_s, delta = coefficients.unbind(-1)
+    # The square keeps the derivative finite at qd = 0 for every delta; 1e-12 is far below v_smooth.
+    ratio = (qd / v_s).square() + 1e-12
+    drop = torch.exp(-torch.exp(0.5 * delta * torch.log(ratio)))
+    return (f_c + f_d * drop) * smooth_sign(qd, v_smooth) + f_v * qd
+
+
+VISCOUS = Law("viscous", (Coefficient("C_p", "N m s/rad"),), viscous)
+
+LINEAR = Law("linear", (Coefficient("B", "N m s/rad"), Coefficient("C", "N m")), linear)
+
+NONLINEAR = Law(
+    "nonlinear",
+    (
+        Coefficient("f_o", "N m", positive=False),
+        Coefficient("f_c", "N m"),
+        Coefficient("f_v", "N m s/rad"),
+        Coefficient("f_a", "N m"),
+        Coefficient("f_b", "s/rad", linear=False, search=(0.1, 0.3, 1.0, 3.0, 10.0)),
+    ),
+    nonlinear,
+)
+
+STRIBECK = Law(
+    "stribeck",
+    (
+        Coefficient("F_c", "N m"),
+        Coefficient("F_d", "N m"),
+        Coefficient("F_v", "N m s/rad"),
+        Coefficient("v_s", "rad/s", linear=False, search=(0.03, 0.1, 0.3, 1.0, 3.0)),
+        Coefficient("delta", "-", linear=False, search=(2.0,), fitted=False),
+    ),
+    stribeck,
+)

@@ -1,0 +1,199 @@
+"""Fuzzy sets: membership functions, the sets a range of values stands for, and their coverage.
+
+The functions work elementwise on tensors of any shape that broadcast, keep dtype and device, and
+script. Those that begin with `log_` stay finite where the membership itself underflows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor
+
+HALF_WIDTH_OF_GAUSSIAN = math.sqrt(2.0 * math.log(2.0))
+"""Half-width of a Gaussian set of sigma 1 where its membership is one half."""
+
+
+def log_gaussian(x: Tensor, centre: Tensor, sigma: Tensor) -> Tensor:
+    """Logarithm of a Gaussian membership, `-((x - centre)/sigma)^2 / 2`."""
+    z = (x - centre) / sigma
+    return -0.5 * z * z
+
+
+def gaussian(x: Tensor, centre: Tensor, sigma: Tensor) -> Tensor:
+    """Gaussian membership, `exp(-((x - centre)/sigma)^2 / 2)`."""
+    return torch.exp(log_gaussian(x, centre, sigma))
+
+
+def log_bell(x: Tensor, centre: Tensor, width: Tensor, slope: Tensor) -> Tensor:
+    """Logarithm of a generalised bell, `1 / (1 + |(x - centre)/width|^(2 slope))`.
+
+    It is differentiable at the centre too: the logarithm of z^2 is taken a hair above zero (1e-37,
+    which float32 can still hold).
+    """
+    z = (x - centre) / width
+    return F.logsigmoid(-slope * torch.log(z * z + 1e-37))
+
+
+def bell(x: Tensor, centre: Tensor, width: Tensor, slope: Tensor) -> Tensor:
+    """Generalised bell membership, one half at `centre ± width`; `slope` sets the steepness there.
+
+    References:
+        Jang (1993), ANFIS: Adaptive-Network-Based Fuzzy Inference System, eq. (11).
+    """
+    return torch.exp(log_bell(x, centre, width, slope))
+
+
+def left_shoulder(x: Tensor, centre: Tensor, sigma: Tensor) -> Tensor:
+    """Membership 1 up to `centre`, then the falling half of a Gaussian."""
+    return gaussian(torch.maximum(x, centre), centre, sigma)
+
+
+def right_shoulder(x: Tensor, centre: Tensor, sigma: Tensor) -> Tensor:
+    """The rising half of a Gaussian up to `centre`, then membership 1."""
+    return gaussian(torch.minimum(x, centre), centre, sigma)
+
+
+def two_sided_gaussian(
+    x: Tensor, left: Tensor, left_sigma: Tensor, right: Tensor, right_sigma: Tensor
+) -> Tensor:
+    """Rising Gaussian up to `left`, falling Gaussian from `right`: their product.
+
+    An infinite sigma removes that side, which makes shoulders of it.
+    """
+    return right_shoulder(x, left, left_sigma) * left_shoulder(x, right, right_sigma)
+
+
+def trapezoid(x: Tensor, a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
+    """Membership that rises from a to b, is 1 up to c and falls to 0 at d; a = b is a cliff."""
+    # The comparisons are false for NaN, which so stays NaN.
+    rising = torch.where(x >= b, torch.ones_like(x), (x - a) / (b - a).clamp(min=1e-37))
+    falling = torch.where(x <= c, torch.ones_like(x), (d - x) / (d - c).clamp(min=1e-37))
+    return torch.minimum(rising, falling).clamp(0.0, 1.0)
+
+
+def triangle(x: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    """Membership that rises from 0 at a to 1 at b and falls to 0 at c."""
+    return trapezoid(x, a, b, b, c)
+
+
+def coverage(memberships: Tensor) -> Tensor:
+    """Least of the largest membership: how well the sets cover a universe.
+
+    Args:
+        memberships: shape (*batch, points, terms), over the points of the universe.
+    Returns:
+        Shape (*batch); 0.5 or more means that something holds everywhere.
+    """
+    return memberships.amax(-1).amin(-1)
+
+
+SHAPES: dict[str, tuple[str, ...]] = {
+    "gaussian": ("centre", "sigma"),
+    "left_shoulder": ("centre", "sigma"),
+    "right_shoulder": ("centre", "sigma"),
+    "two_sided_gaussian": ("left", "left_sigma", "right", "right_sigma"),
+    "bell": ("centre", "width", "slope"),
+    "triangle": ("a", "b", "c"),
+    "trapezoid": ("a", "b", "c", "d"),
+}
+"""Names of the shapes a `FuzzySet` may have, and of their parameters in order."""
+
+_FUNCTIONS: dict[str, Callable[..., Tensor]] = {
+    "gaussian": gaussian,
+    "left_shoulder": left_shoulder,
+    "right_shoulder": right_shoulder,
+    "two_sided_gaussian": two_sided_gaussian,
+    "bell": bell,
+    "triangle": triangle,
+    "trapezoid": trapezoid,
+}
+
+
+@dataclass(frozen=True)
+class FuzzySet:
+    """A named set: one of `SHAPES` with its parameters, in the unit of its variable."""
+
+    name: str
+    shape: str
+    parameters: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        where = f"fuzzy set {self.name!r}"
+        if self.shape not in SHAPES:
+            raise ValueError(f"{where}: unknown shape {self.shape!r}; use one of {list(SHAPES)}.")
+        names = SHAPES[self.shape]
+        if len(self.parameters) != len(names):
+            raise ValueError(
+                f"{where}: {self.shape} takes {len(names)} numbers {names}, "
+                f"got {len(self.parameters)}."
+            )
+        if not all(math.isfinite(value) for value in self.parameters):
+            raise ValueError(f"{where}: numbers must be finite, got {self.parameters}.")
+        for name, value in zip(names, self.parameters, strict=True):
+            if ("sigma" in name or name in ("width", "slope")) and value <= 0:
+                raise ValueError(f"{where}: `{name}` must be positive, got {value}.")
+        if self.shape in ("triangle", "trapezoid") and list(self.parameters) != sorted(
+            self.parameters
+        ):
+            raise ValueError(f"{where}: corners must ascend, got {self.parameters}.")
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """Membership of `x`, same shape."""
+        return _FUNCTIONS[self.shape](x, *(x.new_tensor(value) for value in self.parameters))
+
+    @property
+    def core(self) -> float:
+        """Middle of where the set holds fully: the order of the terms is the order of these."""
+        if self.shape in ("triangle", "trapezoid"):
+            return 0.5 * (self.parameters[1] + self.parameters[-2])
+        if self.shape == "two_sided_gaussian":
+            return 0.5 * (self.parameters[0] + self.parameters[2])
+        return self.parameters[0]
+
+
+def sets_from_ranges(
+    names: Sequence[str], ranges: Sequence[tuple[float, float]]
+) -> tuple[FuzzySet, ...]:
+    """Gaussian sets from the range [low, high] that each of them is said to span.
+
+    A table of ranges does not tell the shape. Chosen here: an interior set is centred in its range
+    with sigma = range/4, so that it has fallen to 0.135 at the ends; the first and last sets are
+    shoulders at the outer end of their range with sigma = range/2, so that they fall to the same
+    0.135 at the inner end.
+
+    Args:
+        names: one for each set, in ascending order of the values.
+        ranges: (low, high) of each set; lows and highs both ascend.
+    Raises:
+        ValueError: if the ranges are empty, not finite, or do not ascend.
+    """
+    if len(names) != len(ranges):
+        raise ValueError(f"got {len(names)} names but {len(ranges)} ranges; one range a set.")
+    if len(ranges) < 2:
+        raise ValueError("at least two sets are needed to span a universe with shoulders.")
+    for name, (low, high) in zip(names, ranges, strict=True):
+        if not (math.isfinite(low) and math.isfinite(high) and low < high):
+            raise ValueError(f"range of {name!r} must be finite with low < high, got {low, high}.")
+    for (name, before), (after_name, after) in zip(
+        zip(names, ranges, strict=True), list(zip(names, ranges, strict=True))[1:], strict=False
+    ):
+        if not (before[0] < after[0] and before[1] < after[1]):
+            raise ValueError(
+                f"ranges must ascend: {after_name!r} {list(after)} comes after "
+                f"{name!r} {list(before)}; write the sets from the smallest values to the largest."
+            )
+    last = len(ranges) - 1
+    sets = []
+    for index, (name, (low, high)) in enumerate(zip(names, ranges, strict=True)):
+        if index == 0:
+            sets.append(FuzzySet(name, "left_shoulder", (low, (high - low) / 2)))
+        elif index == last:
+            sets.append(FuzzySet(name, "right_shoulder", (high, (high - low) / 2)))
+        else:
+            sets.append(FuzzySet(name, "gaussian", ((low + high) / 2, (high - low) / 4)))
+    return tuple(sets)

@@ -1,0 +1,118 @@
+"""Learnable fuzzy partitions of the inputs: free sets, or sets that keep their linguistic order."""
+
+import torch
+from torch import Tensor, nn
+
+MIN_SPACING, MAX_SPACING = 0.25, 1.0
+"""Spacing of neighbouring centres over the sum of their half-widths. At 1 the sets cross at 0.5,
+at 0.25 (Gaussians) at 0.96, beyond which two words would mean the same."""
+
+
+class FreePartition(nn.Module):
+    """Sets with free centres and positive widths.
+
+    Parameters `centres` and `log_widths` have shape (groups, sets), the sets of all inputs one
+    after the other.
+    """
+
+    def __init__(self, groups: int, terms: list[int], dtype: torch.dtype) -> None:
+        super().__init__()
+        self.terms = terms
+        sets = sum(terms)
+        self.centres = nn.Parameter(torch.zeros(groups, sets, dtype=dtype))
+        self.log_widths = nn.Parameter(torch.zeros(groups, sets, dtype=dtype))
+
+    def forward(self) -> tuple[Tensor, Tensor]:
+        """Centres and widths, each of shape (groups, sets)."""
+        return self.centres, torch.exp(self.log_widths)
+
+    @torch.no_grad()
+    def assign(self, centres: Tensor, widths: Tensor, lower: Tensor, upper: Tensor) -> None:
+        """Take these sets over, shape (groups, sets); the ranges are not needed."""
+        self.centres.copy_(centres)
+        self.log_widths.copy_(widths.log())
+
+
+class OrderedPartition(nn.Module):
+    """Sets that are ordered, inside their range and overlap at 0.5 or more, by construction.
+
+    Free are the relative half-width h of each set (where its membership is one half) and, between
+    neighbours, the spacing s in (0.25, 1): centres lie s (h_t + h_{t+1}) apart, so some point
+    between them belongs to both at 0.5 at least. The first and last centres lie less than h inside
+    the range, so its ends belong to a set at 0.5 too. All lengths are scaled together to fill the
+    range. Every partition with these properties can be reached, and everything is smooth.
+
+    Parameters: `log_widths`, shape (groups, sets); `spacings`, shape (groups, sets + inputs): for
+    each input the margin, the spacings between its sets, the other margin, as logits.
+    """
+
+    lower: Tensor
+    upper: Tensor
+
+    def __init__(
+        self, groups: int, terms: list[int], half_width: float, dtype: torch.dtype
+    ) -> None:
+        super().__init__()
+        self.terms = terms
+        self.half_width = half_width  # of a set of width 1
+        self.least, self.span = MIN_SPACING, MAX_SPACING - MIN_SPACING
+        sets, inputs = sum(terms), len(terms)
+        self.log_widths = nn.Parameter(torch.zeros(groups, sets, dtype=dtype))
+        self.spacings = nn.Parameter(torch.zeros(groups, sets + inputs, dtype=dtype))
+        self.register_buffer("lower", torch.zeros(groups, inputs, dtype=dtype))
+        self.register_buffer("upper", torch.ones(groups, inputs, dtype=dtype))
+
+    def forward(self) -> tuple[Tensor, Tensor]:
+        """Centres and widths, each of shape (groups, sets)."""
+        centres: list[Tensor] = []
+        widths: list[Tensor] = []
+        start = 0
+        for i, terms in enumerate(self.terms):
+            # Relative to the mean, so that only the shape of the partition counts.
+            logs = self.log_widths[:, start : start + terms]
+            half = torch.exp(logs - logs.mean(1, keepdim=True))
+            logits = self.spacings[:, start + i : start + i + terms + 1]
+            margins = torch.sigmoid(logits)
+            spacing = self.least + self.span * margins[:, 1:-1]
+            gaps = torch.cat(
+                [
+                    margins[:, :1] * half[:, :1],
+                    spacing * (half[:, :-1] + half[:, 1:]),
+                    margins[:, -1:] * half[:, -1:],
+                ],
+                1,
+            )
+            ends = torch.cumsum(gaps, 1)
+            lower, upper = self.lower[:, i : i + 1], self.upper[:, i : i + 1]
+            scale = (upper - lower) / ends[:, -1:]
+            centres.append(lower + scale * ends[:, :-1])
+            widths.append(scale * half / self.half_width)
+            start += terms
+        return torch.cat(centres, 1), torch.cat(widths, 1)
+
+    @torch.no_grad()
+    def assign(self, centres: Tensor, widths: Tensor, lower: Tensor, upper: Tensor) -> None:
+        """Take the nearest ordered partition over: bounds that are met or broken are kept by 2 %.
+
+        Args:
+            centres, widths: shape (groups, sets).
+            lower, upper: range of each input, shape (groups, inputs).
+        """
+        self.lower.copy_(lower)
+        self.upper.copy_(upper)
+        start = 0
+        for i, terms in enumerate(self.terms):
+            c = centres[:, start : start + terms]
+            half = widths[:, start : start + terms] * self.half_width
+            spacing = c.diff(dim=1) / (half[:, :-1] + half[:, 1:])
+            share = torch.cat(
+                [
+                    (c[:, :1] - self.lower[:, i : i + 1]) / half[:, :1],
+                    (spacing - self.least) / self.span,
+                    (self.upper[:, i : i + 1] - c[:, -1:]) / half[:, -1:],
+                ],
+                1,
+            ).clamp(0.02, 0.98)
+            self.log_widths[:, start : start + terms] = half.log()
+            self.spacings[:, start + i : start + i + terms + 1] = torch.logit(share)
+            start += terms

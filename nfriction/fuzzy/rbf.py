@@ -1,0 +1,203 @@
+"""Radial basis functions: the paper's 2-10-2 network, and the head on an ANFIS layer."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from nfriction.fuzzy.layout import to_columns, to_rows
+from nfriction.fuzzy.least_squares import ridge
+from nfriction.fuzzy.radial_centres import kmeans_centres, nearest_spread, selected_centres
+
+
+class RBFNetwork(nn.Module):
+    """Gaussian units with a width per axis and a linear output layer, groups stacked.
+
+    `y = output_weight · exp(-Σ_i ((x_i - c_i)/s_i)^2 / 2) + output_bias`. A fresh network has its
+    centres drawn from [-1, 1] and small random output weights; `init_kmeans` or `init_ols` place
+    the centres by the data, `solve_output` gives the best output layer for them.
+
+    Parameters: `centres` and `log_widths` (groups, units, inputs), `output_weight` (groups,
+    outputs, units), `output_bias` (groups, outputs).
+
+    Args:
+        groups: independent networks of the same shape, e.g. one a joint.
+        inputs, units, outputs: the paper's network is 2-10-2.
+        seed: of the fresh centres and weights.
+
+    References:
+        Moody and Darken (1989), Fast learning in networks of locally-tuned processing units.
+        TLRIP paper, section on the neuro-fuzzy models (2-10-2).
+    """
+
+    def __init__(
+        self,
+        groups: int,
+        inputs: int = 2,
+        units: int = 10,
+        outputs: int = 2,
+        *,
+        seed: int = 0,
+        dtype: torch.dtype = torch.float64,
+    ) -> None:
+        super().__init__()
+        if min(groups, inputs, units, outputs) < 1:
+            raise ValueError(
+                "`groups`, `inputs`, `units` and `outputs` must be at least 1, got "
+                f"{groups}, {inputs}, {units}, {outputs}."
+            )
+        self.groups, self.inputs, self.units, self.outputs = groups, inputs, units, outputs
+        random = torch.Generator().manual_seed(seed)
+        weight = torch.randn(groups, outputs, units, generator=random, dtype=dtype)
+        self.centres = nn.Parameter(torch.empty(groups, units, inputs, dtype=dtype))
+        self.log_widths = nn.Parameter(torch.empty(groups, units, inputs, dtype=dtype))
+        self.output_weight = nn.Parameter(0.1 * weight)
+        self.output_bias = nn.Parameter(torch.zeros(groups, outputs, dtype=dtype))
+        self.init_range(-1.0, 1.0, seed)
+
+    def extra_repr(self) -> str:
+        return (
+            f"groups={self.groups}, inputs={self.inputs}, units={self.units}, "
+            f"outputs={self.outputs}"
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Outputs, shape (*batch, groups, outputs), of inputs (*batch, groups, inputs)."""
+        y = torch.baddbmm(self.output_bias.unsqueeze(-1), self.output_weight, self._activations(x))
+        return to_rows(y, x)
+
+    def activations(self, x: Tensor) -> Tensor:
+        """Outputs of the Gaussian units, shape (*batch, groups, units)."""
+        return to_rows(self._activations(x), x)
+
+    def regressors(self, x: Tensor) -> Tensor:
+        """Features in which the output is linear: the units and 1, (*batch, groups, units + 1)."""
+        return torch.cat([self.activations(x), torch.ones_like(x[..., :1])], -1)
+
+    def _activations(self, x: Tensor) -> Tensor:
+        """Units' outputs, shape (groups, units, samples).
+
+        The exponent is expanded into a product of matrices, 12 times faster on 40,000 samples than
+        differences of every sample and centre. Taken about the mean centre it costs digits only by
+        (range/width)^2, never by where the inputs lie.
+        """
+        columns = to_columns(x)
+        middle = self.centres.mean(1)
+        offset = self.centres - middle.unsqueeze(1)
+        v = columns - middle.unsqueeze(-1)
+        precision = torch.exp(-2.0 * self.log_widths)
+        linear = precision * offset
+        constant = -0.5 * (linear * offset).sum(2)
+        quadratic = torch.cat([-0.5 * precision, linear], 2)
+        exponent = torch.baddbmm(constant.unsqueeze(-1), quadratic, torch.cat([v * v, v], 1))
+        return torch.exp(exponent)
+
+    @torch.no_grad()
+    def init_range(self, lower: float | Tensor, upper: float | Tensor, seed: int = 0) -> None:
+        """Centres drawn from a range, widths half of it.
+
+        Args:
+            lower, upper: range of each input, broadcastable to (groups, inputs).
+            seed: of the draw.
+        """
+        like = self.centres[:, 0].detach()
+        low = (
+            torch.as_tensor(lower, dtype=like.dtype, device=like.device)
+            .expand_as(like)
+            .unsqueeze(1)
+        )
+        span = (
+            torch.as_tensor(upper, dtype=like.dtype, device=like.device)
+            .expand_as(like)
+            .unsqueeze(1)
+            - low
+        )
+        if not bool(((span > 0) & torch.isfinite(span)).all()):
+            raise ValueError("every input needs a finite range with `lower` < `upper`.")
+        random = torch.Generator().manual_seed(seed)
+        drawn = torch.rand(self.centres.shape, generator=random, dtype=torch.float64).to(like)
+        self.centres.copy_(low + span * drawn)
+        self.log_widths.copy_((0.5 * span).log().expand_as(self.centres))
+
+    @torch.no_grad()
+    def init_kmeans(self, x: Tensor, seed: int = 0, overlap: float = 2.0) -> None:
+        """Centres by k-means; widths from the distance to the nearest other centres.
+
+        Args:
+            x: samples, shape (*batch, groups, inputs).
+            seed: of the k-means++ start.
+            overlap: width over the mean distance to the two nearest centres.
+        """
+        samples = self._samples(x)
+        for group in range(self.groups):
+            centres = kmeans_centres(samples[:, group], self.units, seed)
+            self.centres[group] = centres
+            self.log_widths[group] = nearest_spread(centres, samples[:, group], overlap).log()
+
+    @torch.no_grad()
+    def init_ols(self, x: Tensor, y: Tensor, width: float = 1.5) -> None:
+        """Centres by orthogonal least squares: greedily those samples that explain most of `y`.
+
+        Args:
+            x: inputs, shape (*batch, groups, inputs).
+            y: wanted outputs, shape (*batch, groups, outputs).
+            width: of every unit, over the standard deviation of each input.
+        """
+        samples = self._samples(x)
+        targets = y.reshape(-1, self.groups, self.outputs)
+        for group in range(self.groups):
+            scale = width * samples[:, group].std(0)
+            centres = selected_centres(samples[:, group], targets[:, group], self.units, scale)
+            self.centres[group] = centres
+            self.log_widths[group] = scale.log().expand_as(centres)
+
+    @torch.no_grad()
+    def solve_output(
+        self,
+        x: Tensor,
+        y: Tensor,
+        prior_precision: float | Tensor = 1e-6,
+        prior: Tensor | None = None,
+    ) -> None:
+        """Set weights and bias to the least-squares optimum for the present units, in place.
+
+        Args:
+            x: inputs, shape (*batch, groups, inputs).
+            y: wanted outputs, shape (*batch, groups, outputs).
+            prior_precision: over the noise precision; a number or broadcastable to (groups,
+                units + 1).
+            prior: (groups, outputs, units + 1), weight then bias, to shrink toward; default zero.
+        """
+        features = self.regressors(x).reshape(-1, self.groups, self.units + 1)
+        targets = y.reshape(-1, self.groups, self.outputs)
+        start = features.new_zeros(1, 1, 1) if prior is None else prior.mT
+        layer = ridge(features, targets, prior_precision, start).mT
+        self.output_weight.copy_(layer[..., :-1])
+        self.output_bias.copy_(layer[..., -1])
+
+    def _samples(self, x: Tensor) -> Tensor:
+        samples = x.detach().reshape(-1, self.groups, self.inputs)
+        spread = samples.amax(0) - samples.amin(0)
+        if len(samples) < self.units or not bool(((spread > 0) & torch.isfinite(spread)).all()):
+            raise ValueError(
+                f"placing {self.units} units needs at least as many finite samples and inputs that "
+                f"vary, got {len(samples)} samples with spreads {spread.tolist()}."
+            )
+        return samples
+
+
+class RBFHead(RBFNetwork):
+    """An RBF network that begins as zero: adding it to a model changes nothing at the start."""
+
+    def __init__(
+        self,
+        groups: int,
+        inputs: int,
+        units: int = 10,
+        outputs: int = 2,
+        *,
+        seed: int = 0,
+        dtype: torch.dtype = torch.float64,
+    ) -> None:
+        super().__init__(groups, inputs, units, outputs, seed=seed, dtype=dtype)
+        nn.init.zeros_(self.output_weight)

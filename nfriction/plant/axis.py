@@ -1,0 +1,92 @@
+"""One driven mass on a straight guide: positioning axes, carriages, cylinders."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from nfriction.plant.base import Plant, vector
+
+
+class LinearAxis(Plant):
+    """Equation of motion mass * qdd = tau + torque_offset, q in metres and tau in newtons.
+
+    Args:
+        mass: moved mass, the drive's inertia included [kg].
+        torque_offset: constant force added to tau [N].
+        name, joint_names, position_quantum: see `Plant`.
+
+    Attributes:
+        mass: (1,) [kg].
+        torque_offset: (1,) [N].
+    """
+
+    kind = "axis"
+    required = ("mass",)
+    optional = ("torque_offset", "name", "joint_names", "position_quantum")
+
+    mass: Tensor
+
+    def __init__(
+        self,
+        mass: float,
+        *,
+        torque_offset: float = 0.0,
+        name: str = "",
+        joint_names: Sequence[str] | None = None,
+        position_quantum: float | None = None,
+    ) -> None:
+        super().__init__(
+            1, joint_names=joint_names, name=name, unit="m", position_quantum=position_quantum
+        )
+        self.links = 1
+        self.register_buffer("mass", vector("mass", [mass], 1, positive=True))
+        self.register_buffer("torque_offset", vector("torque_offset", [torque_offset], 1))
+        self._given = {"mass": float(mass), "torque_offset": float(torque_offset)}
+
+    def mass_matrix(self, q: Tensor) -> Tensor:
+        """The mass [kg], (*batch, 1, 1)."""
+        self._check(q=q)
+        return torch.broadcast_tensors(self.mass, q)[0].unsqueeze(-1)
+
+    def bias(self, q: Tensor, qd: Tensor) -> Tensor:
+        """Zero force [N], (*batch, 1)."""
+        self._check(q=q, qd=qd)
+        return torch.zeros_like(q + qd)
+
+    def gravity(self, q: Tensor) -> Tensor:
+        """Zero force [N], (*batch, 1)."""
+        self._check(q=q)
+        return torch.zeros_like(q)
+
+    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
+        """Acceleration [m/s^2], (*batch, 1), under a force with friction subtracted [N]."""
+        self._check(q=q, qd=qd, tau=tau)
+        qdd = (tau + self.torque_offset) / self.mass
+        return qdd.expand(torch.broadcast_shapes(qdd.shape, q.shape, qd.shape))
+
+    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+        """Force tau (friction subtracted) that gives the acceleration `qdd` [N], (*batch, 1)."""
+        self._check(q=q, qd=qd, qdd=qdd)
+        return self.mass * qdd - self.torque_offset
+
+    def energy(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
+        """Kinetic and (zero) potential energy [J], each (*batch)."""
+        self._check(q=q, qd=qd)
+        kinetic = (self.mass * qd * qd / 2).squeeze(-1)
+        return kinetic, torch.zeros_like(kinetic)
+
+    def load(self, q: Tensor, qd: Tensor) -> Tensor:
+        """Normal load over the load at rest [-]: 1, the guide carries the weight at all times."""
+        self._check(q=q, qd=qd)
+        return torch.ones_like(q)
+
+    @torch.no_grad()
+    def mobility(self) -> Tensor:
+        """1 / mass [1/kg], (*batch, 1); RK4 is stable below 2.785 / (dt * mobility) [N s/m]."""
+        return 1 / self.mass
+
+    def extra_repr(self) -> str:
+        """Name, mass and offset."""
+        offset = self.torque_offset.tolist()
+        return f"{self.name or 'unnamed'}, mass={self.mass.tolist()} kg, offset={offset} N"

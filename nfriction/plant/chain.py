@@ -1,0 +1,335 @@
+"""A chain of pendulum links in one plane, on a fixed pivot or on a rotating arm."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import asdict
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from nfriction.plant.arm import Arm, ArmTerms, arm_terms, with_arm_bias, with_arm_mass
+from nfriction.plant.base import Plant, check_keys, number, vector
+from nfriction.plant.coordinates import (
+    absolute,
+    joint_forces,
+    joint_matrix,
+    link_forces,
+    relative,
+)
+from nfriction.plant.drag import drag_forces
+from nfriction.plant.inertia import inertia_tensors
+from nfriction.plant.linear import Matrix, dot, entries, multiply, solve, stack, stack_matrix
+from nfriction.plant.planar import (
+    Pose,
+    add_centrifugal,
+    add_rotors,
+    coupling_constants,
+    gravity_forces,
+    planar_mass,
+    pose_of,
+    static_moment,
+)
+from nfriction.plant.poses import refuse_indefinite, turning_poses
+
+
+class _Geometry(NamedTuple):
+    pose: Pose
+    arm: ArmTerms | None
+    coupling: Matrix
+
+
+class PendulumChain(Plant):
+    """Frictionless equations of motion M(q) qdd + bias(q, qd) = tau + torque_offset.
+
+    Joint coordinates: with a free arm, column 0 is its angle about the vertical; the first link
+    is measured from upright, each further one relative to the link before. Friction is not part
+    of a plant (a rollout subtracts it from tau); air drag is, once `replace` sets it.
+
+    Args:
+        mass: of each link [kg].
+        length: joint to joint, for the last link joint to tip (only drag needs that one) [m].
+        com: joint to mass centre [m]; None for the middle of each link.
+        inertia: about the mass centre [kg m^2]: None (point masses), Izz per link (slender rods)
+            or (links, 6) columns Ixx, Iyy, Izz, Ixy, Ixz, Iyz, link frame x along the link,
+            z the joint axis. Without a free arm only Izz matters.
+        gravity: [m/s^2].
+        arm: the rotating arm; None where it is fixed.
+        armature: rotor inertia seen at each joint [kg m^2]; None for none.
+        convention: of the recordings' columns, see `Plant`.
+        joint_names, name, position_quantum: see `Plant`.
+
+    Attributes:
+        inertia_coupling: a_ij, (links, links) [kg m^2]; only the upper triangle is read.
+        gravity_moment: g b_i, (links,) [N m].
+        armature: (joints,) [kg m^2].
+        angle_offset: added to q before the geometry is evaluated, (joints,) [rad].
+        torque_offset: added to tau, (joints,) [N m].
+        drag_linear, drag_quadratic: k1 [N s/m^2], k2 [N s^2/m^3] per link.
+        length: (links,) [m].
+        load_lever: l_i / g, (links,) [s^2].
+        arm_inertia: J0, the arm with the links' masses at its end, () [kg m^2]; with an arm only.
+        arm_lever: L1 / g, () [s^2], so that L1 b_i follows `gravity_moment`; with an arm only.
+        inertia_tensor: (links, 6) [kg m^2]; with an arm only.
+
+    Raises:
+        ValueError: for values that are not positive, of another shape, or whose mass matrix is
+            not positive definite.
+
+    References:
+        TLRIP paper, eqs. (2)-(22), corrected.
+    """
+
+    kind = "chain"
+    required = ("mass", "length")
+    optional = ("com", "inertia", "gravity", "arm", "armature", "convention", "joint_names",
+                "name", "position_quantum")  # fmt: skip
+
+    inertia_coupling: Tensor
+    gravity_moment: Tensor
+    armature: Tensor
+    angle_offset: Tensor
+    drag_linear: Tensor
+    drag_quadratic: Tensor
+    length: Tensor
+    load_lever: Tensor
+    arm_inertia: Tensor
+    arm_lever: Tensor
+    inertia_tensor: Tensor
+
+    def __init__(
+        self,
+        mass: Sequence[float] | Tensor,
+        length: Sequence[float] | Tensor,
+        com: Sequence[float] | Tensor | None = None,
+        inertia: Sequence[float] | Sequence[Sequence[float]] | Tensor | None = None,
+        *,
+        gravity: float = 9.81,
+        arm: Arm | None = None,
+        armature: Sequence[float] | Tensor | None = None,
+        convention: Sequence[str] = ("relative", "upright"),
+        joint_names: Sequence[str] | None = None,
+        name: str = "",
+        position_quantum: float | None = None,
+    ) -> None:
+        m = vector("mass", mass, None, positive=True)
+        gravity = number("gravity", gravity, positive=True)
+        links = len(m)
+        first = 1 if arm else 0
+        super().__init__(
+            first + links,
+            joint_names=joint_names,
+            name=name,
+            unit="rad",
+            convention=convention,
+            position_quantum=position_quantum,
+        )
+        self.links, self.first_link = links, first
+        size = vector("length", length, links, positive=True)
+        centre = size / 2 if com is None else vector("com", com, links)
+        tensors = inertia_tensors(inertia, links)
+        rotor = vector("armature", [0.0] * self.joints if armature is None else armature,
+                       self.joints)  # fmt: skip
+        if (rotor < 0).any():
+            raise ValueError(f"`armature` must not be negative, got {rotor.tolist()}.")
+        moment = static_moment(m, size, centre)
+        zero = torch.zeros(links, dtype=torch.float64)
+        self.register_buffer("inertia_coupling", coupling_constants(m, size, centre, tensors[:, 2]))
+        self.register_buffer("gravity_moment", gravity * moment)
+        self.register_buffer("armature", rotor)
+        self.register_buffer("angle_offset", torch.zeros_like(rotor))
+        self.register_buffer("torque_offset", torch.zeros_like(rotor))
+        self.register_buffer("drag_linear", zero)
+        self.register_buffer("drag_quadratic", zero.clone())
+        self.register_buffer("length", size)
+        self.register_buffer("load_lever", centre / gravity)
+        if arm:
+            self.register_buffer("arm_inertia", m.sum() * arm.length**2 + arm.inertia)
+            self.register_buffer("arm_lever", m.new_tensor(arm.length / gravity))
+            self.register_buffer("inertia_tensor", tensors)
+        # What is zero costs nothing: Python flags, settled here and by `replace`, never in a step.
+        self.has_armature = bool(rotor.any())
+        self.has_drag = False
+        self._slender = bool(torch.equal(tensors[:, 1], tensors[:, 2])) and not bool(
+            tensors[:, [0, 3, 4, 5]].any()
+        )
+        self._given: dict[str, Any] = {
+            "convention": list(self.convention),
+            "mass": m.tolist(),
+            "length": size.tolist(),
+            "com": centre.tolist(),
+            "inertia": None
+            if inertia is None
+            else torch.as_tensor(inertia, dtype=m.dtype).tolist(),
+            "gravity": gravity,
+            "arm": asdict(arm) if arm else None,
+            "armature": rotor.tolist() if self.has_armature else None,
+        }
+        aligned = self.mass_matrix(rotor.new_zeros(self.joints))
+        refuse_indefinite(self.inertia_coupling, aligned[first:, first:])
+
+    def mass_matrix(self, q: Tensor) -> Tensor:
+        """Mass matrix M(q) [kg m^2].
+
+        Args:
+            q: joint angles [rad], (*batch, joint).
+        Returns:
+            Symmetric positive definite, (*batch, joint, joint).
+        """
+        self._check(q=q)
+        mass = stack_matrix(joint_matrix(self._mass(self._geometry(q)), self.first_link))
+        # A single link's does not depend on q, yet has its batch.
+        return mass.expand(torch.broadcast_shapes(mass.shape, (*q.shape, self.joints)))
+
+    def bias(self, q: Tensor, qd: Tensor) -> Tensor:
+        """Centrifugal, Coriolis, gravity and drag torques [N m], (*batch, joint)."""
+        self._check(q=q, qd=qd)
+        force = self._bias(self._geometry(q), qd)
+        return stack(joint_forces(force, self.first_link))
+
+    def gravity(self, q: Tensor) -> Tensor:
+        """The gravity part of the bias [N m], (*batch, joint): the potential's gradient."""
+        self._check(q=q)
+        force = gravity_forces(self._geometry(q).pose, self.gravity_moment.unbind(-1))
+        own = [torch.zeros_like(force[0])] * self.first_link
+        return stack(joint_forces([*own, *force], self.first_link))
+
+    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
+        """Joint accelerations under joint torques.
+
+        Args:
+            q, qd: joint angles [rad] and rates [rad/s], (*batch, joint).
+            tau: joint torques with friction already subtracted [N m], (*batch, joint).
+        Returns:
+            qdd [rad/s^2], (*batch, joint).
+        """
+        self._check(q=q, qd=qd, tau=tau)
+        geometry = self._geometry(q)
+        force = link_forces((tau + self.torque_offset).unbind(-1), self.first_link)
+        bias = self._bias(geometry, qd)
+        rhs = [f - h for f, h in zip(force, bias, strict=True)]
+        # Every acceleration hangs on every input, so all share one shape: no broadcast needed.
+        return torch.stack(relative(solve(self._mass(geometry), rhs), self.first_link), -1)
+
+    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+        """Joint torques tau (friction subtracted) that give the accelerations `qdd` [N m].
+
+        Args:
+            q, qd, qdd: joint angles [rad], rates [rad/s], accelerations [rad/s^2],
+                (*batch, joint).
+        Returns:
+            tau [N m], (*batch, joint).
+        """
+        self._check(q=q, qd=qd, qdd=qdd)
+        geometry = self._geometry(q)
+        inertial = multiply(self._mass(geometry), absolute(qdd.unbind(-1), self.first_link))
+        force = [f + h for f, h in zip(inertial, self._bias(geometry, qd), strict=True)]
+        return stack(joint_forces(force, self.first_link)) - self.torque_offset
+
+    def energy(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
+        """Kinetic and potential energy [J], each (*batch); zero height is the first joint's."""
+        self._check(q=q, qd=qd)
+        geometry = self._geometry(q)
+        rate = absolute(qd.unbind(-1), self.first_link)
+        kinetic = dot(rate, multiply(self._mass(geometry), rate)) / 2
+        height = [angle.cos() for angle in geometry.pose.angle]
+        return kinetic, dot(self.gravity_moment.unbind(-1), height)
+
+    def load(self, q: Tensor, qd: Tensor) -> Tensor:
+        """Normal load of each joint over its link's weight, |N_i| / (m_i g) [-].
+
+        N_i = m_i l_i qd_i^2 - m_i g cos phi_i with the joint's own rate qd_i and the link's
+        absolute angle phi_i from upright; 1 for the arm, whose axis is vertical.
+
+        Args:
+            q, qd: joint angles [rad] and rates [rad/s], (*batch, joint).
+        Returns:
+            Loads >= 0, (*batch, joint).
+        References:
+            TLRIP paper, eqs. (26)-(29), with - m g cos phi for + m g cos theta: the printed sign
+            belongs to angles from hanging, and taken literally feeds energy in.
+        """
+        self._check(q=q, qd=qd)
+        joint = (q + self.angle_offset).unbind(-1)[self.first_link :]
+        rates = qd.unbind(-1)[self.first_link :]
+        levers = self.load_lever.unbind(-1)
+        loads = [
+            (lever * rate * rate - angle.cos()).abs()
+            for lever, rate, angle in zip(levers, rates, absolute(joint, 0), strict=True)
+        ]
+        return stack([torch.ones_like(loads[0])] * self.first_link + loads)
+
+    @torch.no_grad()
+    def mobility(self) -> Tensor:
+        """Largest diagonal entry of M^-1 over poses, (*batch, joint) [rad/s^2 per N m].
+
+        Explicit RK4 stays stable while a friction curve is flatter than 2.785 / (dt * mobility).
+        Searched on a grid of at most 5 degrees for one or two turning angles, coarser for more.
+        """
+        inverse = torch.linalg.inv(self.mass_matrix(turning_poses(self.joints).to(self.armature)))
+        return inverse.diagonal(dim1=-2, dim2=-1).amax(-2)
+
+    def extra_repr(self) -> str:
+        """Name, links, arm and what is switched on."""
+        parts = [self.name or "unnamed", f"links={self.links}"]
+        parts.append(f"arm={'free' if self.first_link else 'fixed'}")
+        parts.append(f"mass={self._given['mass']}, length={self._given['length']}")
+        parts.append(f"convention={self.convention}, armature={self.has_armature}")
+        return ", ".join([*parts, f"drag={self.has_drag}"])
+
+    def _note_replaced(self, names: Collection[str]) -> None:
+        if {"drag_linear", "drag_quadratic"} & set(names):
+            if self.first_link:
+                raise ValueError(
+                    "air drag is modelled for a fixed arm only; the sweep of a rotating arm has "
+                    "no part in it. Use a chain without `arm`."
+                )
+            self.has_drag = True
+        self.has_armature = self.has_armature or "armature" in names
+        self._slender = self._slender and "inertia_tensor" not in names
+
+    def _geometry(self, q: Tensor) -> _Geometry:
+        pose = pose_of((q + self.angle_offset).unbind(-1)[self.first_link :])
+        coupling = entries(self.inertia_coupling)
+        if not self.first_link:
+            return _Geometry(pose, None, coupling)
+        lever = (self.gravity_moment * self.arm_lever.unsqueeze(-1)).unbind(-1)
+        tensor = None
+        if not self._slender:
+            tensor = [list(row.unbind(-1)) for row in self.inertia_tensor.unbind(-2)]
+        arm = arm_terms(pose, coupling, self.arm_inertia, lever, tensor)
+        return _Geometry(pose, arm, coupling)
+
+    def _mass(self, geometry: _Geometry) -> Matrix:
+        """Mass matrix over (arm angle, absolute link angles), rotors included."""
+        mass = planar_mass(geometry.pose, geometry.coupling)
+        if geometry.arm is not None:
+            mass = with_arm_mass(mass, geometry.arm)
+        if self.has_armature:
+            add_rotors(mass, self.armature.unbind(-1), self.first_link)
+        return mass
+
+    def _bias(self, geometry: _Geometry, qd: Tensor) -> list[Tensor]:
+        """Bias over (arm angle, absolute link angles)."""
+        joint = qd.unbind(-1)
+        rate = absolute(joint[self.first_link :], 0)
+        squared = [x * x for x in rate]
+        bias = gravity_forces(geometry.pose, self.gravity_moment.unbind(-1))
+        add_centrifugal(bias, geometry.pose, geometry.coupling, squared)
+        if self.has_drag:
+            coefficients = (self.length, self.drag_linear, self.drag_quadratic)
+            drag = drag_forces(geometry.pose, rate, *(x.unbind(-1) for x in coefficients))
+            bias = [h + d for h, d in zip(bias, drag, strict=True)]
+        if geometry.arm is not None:
+            bias = with_arm_bias(bias, geometry.arm, joint[0], rate, squared)
+        return bias
+
+    @classmethod
+    def _parse(cls, given: dict[str, Any]) -> dict[str, Any]:
+        if given.get("arm") is None:
+            return given
+        check_keys("arm", given["arm"], ("inertia", "length"))
+        return given | {"arm": Arm(**{k: number(k, v) for k, v in given["arm"].items()})}
+
+
+def _numbers(values: object) -> Any:
+    return torch.as_tensor(values, dtype=torch.float64).tolist()

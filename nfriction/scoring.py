@@ -1,0 +1,199 @@
+"""Scores: position errors of free runs and of windows, in the recording's own coordinates."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from nfriction.friction import FrictionModel
+from nfriction.plant import LinearAxis, PendulumChain
+from nfriction.recording import Recording
+from nfriction.signals import Motion, kalman_smoother
+from nfriction.simulation import required_substeps, rollout
+
+Array = NDArray[np.float64]
+
+HORIZONS = (1.0, 2.0, 5.0)
+
+
+@dataclass(frozen=True)
+class Rmse:
+    """Root mean square of the position error [rad; m for a sliding axis].
+
+    Attributes:
+        joints: of each joint.
+        all: over samples and joints.
+    """
+
+    joints: tuple[float, ...]
+    all: float
+
+    @classmethod
+    def of(cls, error: Array) -> "Rmse":
+        """From errors of shape (..., joint); NaN or infinity make it infinite."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            square = np.mean(error.reshape(-1, error.shape[-1]) ** 2, axis=0)
+        square = np.where(np.isfinite(square), square, np.inf)
+        return cls(tuple(float(x) for x in np.sqrt(square)), float(np.sqrt(square.mean())))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON; a diverged simulation has no number."""
+        values = [x if np.isfinite(x) else None for x in (*self.joints, self.all)]
+        return {"joints": values[:-1], "all": values[-1]}
+
+
+@dataclass(frozen=True)
+class Score:
+    """How well a model predicts one recording.
+
+    Attributes:
+        recording: name of the recording.
+        free_run: error of one simulation over the whole recording from its initial state.
+        windows: error of simulations restarted from the recording, by horizon [s].
+        floor: error of the free run when every initial position is off by one encoder count:
+            below it, differences between models mean nothing. None where the count is unknown.
+        time, simulated: the free run, in the recording's coordinates, for figures.
+        diverged_at: time at which the free run diverged [s], infinity where it did not.
+    """
+
+    recording: str
+    free_run: Rmse
+    windows: dict[str, Rmse]
+    floor: Rmse | None
+    time: Array = field(repr=False)
+    simulated: Array = field(repr=False)
+    diverged_at: float
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "free_run": self.free_run.to_dict(),
+            "windows": {horizon: rmse.to_dict() for horizon, rmse in self.windows.items()},
+            "floor": None if self.floor is None else self.floor.to_dict(),
+            "diverged_at": self.diverged_at if np.isfinite(self.diverged_at) else None,
+        }
+
+
+def score(
+    plant: PendulumChain | LinearAxis,
+    friction: FrictionModel | None,
+    recording: Recording,
+    *,
+    motion: Motion | None = None,
+    initial_state: tuple[Array, Array] | None = None,
+    horizons: Sequence[float] = HORIZONS,
+) -> Score:
+    """Simulate a recording and measure the position error.
+
+    Args:
+        plant: the mechanism.
+        friction: friction model, or None for no friction.
+        recording: what was measured, in any convention.
+        motion: its smoothed motion in joint coordinates; computed where not given.
+        initial_state: q0 and qd0 of the free run in the recording's convention, (joint,) each;
+            default from the smoothed motion.
+        horizons: lengths of windows [s]; those longer than the recording are left out.
+
+    Returns:
+        Errors in the recording's coordinates and unit.
+    """
+    first_link = plant.first_link
+    joint = recording.joint_coordinates(first_link)
+    motion = motion or kalman_smoother(joint.time, joint.q)
+    q0, qd0 = motion.q[0], motion.qd[0]
+    if initial_state is not None:
+        q0 = recording.convention.position_to_joint(np.asarray(initial_state[0]), first_link)
+        qd0 = recording.convention.rate_to_joint(np.asarray(initial_state[1]), first_link)
+    tau = None if joint.tau is None else torch.as_tensor(joint.tau[:-1].copy())
+    step = torch.as_tensor(np.diff(joint.time))
+    substeps = 1 if friction is None else required_substeps(plant, friction, float(step.max()))
+    quantum = getattr(plant, "position_quantum", None)
+    starts = [q0] if quantum is None else [q0, *(q0 + quantum * e for e in np.eye(len(q0)))]
+    with torch.no_grad():
+        run = rollout(
+            plant, friction, torch.as_tensor(np.stack(starts)), torch.as_tensor(qd0.copy()),
+            tau, sample_time=step, substeps=substeps,
+        )  # fmt: skip
+    simulated = recording.convention.position_from_joint(run.q.numpy(), first_link)
+    floor = None
+    if quantum is not None:
+        # Independent errors of every joint add in the mean square.
+        floor = Rmse.of(np.sqrt(np.sum((simulated[1:] - simulated[0]) ** 2, axis=0)))
+    return Score(
+        recording=recording.name,
+        free_run=Rmse.of(simulated[0] - recording.q),
+        windows=_windows(plant, friction, recording, joint, motion, horizons, substeps),
+        floor=floor,
+        time=recording.time,
+        simulated=simulated[0],
+        diverged_at=float(run.diverged_at[0]),
+    )
+
+
+def _windows(
+    plant: PendulumChain | LinearAxis,
+    friction: FrictionModel | None,
+    recording: Recording,
+    joint: Recording,
+    motion: Motion,
+    horizons: Sequence[float],
+    substeps: int,
+) -> dict[str, Rmse]:
+    """Error of windows that follow each other, restarted from the smoothed motion."""
+    time = recording.time - recording.time[0]
+    steps = np.diff(time)
+    found = {}
+    for horizon in horizons:
+        # A recording a few samples short of a whole number of windows still gives that number.
+        count = int(time[-1] / horizon + 0.02)
+        width = min(horizon, time[-1] / max(count, 1))
+        edges = [int(np.searchsorted(time, k * width - 1e-9)) for k in range(count + 1)]
+        length = min(np.diff(edges), default=0)
+        starts = edges[:count]
+        if length < 1:
+            continue
+        index = np.array(starts)[:, None] + np.arange(length)
+        tau = None if joint.tau is None else torch.as_tensor(joint.tau[index])
+        with torch.no_grad():
+            run = rollout(
+                plant,
+                friction,
+                torch.as_tensor(motion.q[starts]),
+                torch.as_tensor(motion.qd[starts]),
+                tau,
+                sample_time=torch.as_tensor(steps[index]),
+                substeps=substeps,
+            )
+        simulated = recording.convention.position_from_joint(run.q.numpy(), plant.first_link)
+        measured = recording.q[np.array(starts)[:, None] + np.arange(length + 1)]
+        found[f"{horizon:g}"] = Rmse.of(simulated - measured)
+    return found
+
+
+def rmse_table(scores: Mapping[str, Sequence[Score]], horizon: str | None = None) -> Array:
+    """Root mean square over recordings of each model's error: rows models, columns joints, all.
+
+    Args:
+        scores: scores by model; all models over the same recordings.
+        horizon: window length as in `Score.windows`; None for the free run.
+
+    References:
+        TLRIP paper, Table 10.
+    """
+    rows = []
+    for of_model in scores.values():
+        errors = [s.free_run if horizon is None else s.windows[horizon] for s in of_model]
+        square = np.mean([[*e.joints, e.all] for e in errors] ** np.float64(2), axis=0)
+        rows.append(np.sqrt(square))
+    return np.array(rows)
+
+
+def improvement_table(rmse: Array, reference: int = 0) -> Array:
+    """Reduction of the error against a reference row [%]: `100 (1 - rmse / rmse_reference)`.
+
+    References:
+        TLRIP paper, Table 11.
+    """
+    return 100.0 * (1.0 - rmse / rmse[reference])

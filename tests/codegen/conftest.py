@@ -1,0 +1,10 @@
+"""Compiled code goes to a cache of the test run's own, shared so that it is built only once."""
+
+import pytest
+
+
+@pytest.fixture(autouse=True)
+def _cache(tmp_path_factory, monkeypatch):
+    folder = tmp_path_factory.getbasetemp() / "compiled"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    monkeypatch.setenv("NFRICTION_CACHE", str(folder))

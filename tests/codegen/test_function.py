@@ -1,0 +1,139 @@
+"""Single functions: compiled equals eager, and the C for controllers stands alone."""
+
+import ctypes
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import nn
+
+from nfriction.codegen import compile_function, emit_c
+from tests.codegen.mechanisms import F64, NeuroFuzzy
+
+CC = shutil.which("cc") or shutil.which("gcc")
+
+
+class Network(nn.Module):
+    def __init__(self):
+        super().__init__()
+        torch.manual_seed(0)
+        self.layers = nn.Sequential(nn.Linear(2, 6), nn.Tanh(), nn.Linear(6, 3)).double()
+
+    def forward(self, x, y):
+        return self.layers(x), torch.maximum(x, y).sum()
+
+
+def everything(x, y):
+    """One of each scalar operation that the emitters spell."""
+    p = x.abs() + 0.1
+    return torch.stack([
+        x + y, x - y, x * y, x / p, -x, p, p**1.7, torch.fmod(x, p), torch.remainder(x, p),
+        torch.atan2(x, y), torch.maximum(x, y), torch.minimum(x, y), p.sqrt(), x.exp(), x.expm1(),
+        p.log(), p.log1p(), x.sin(), x.cos(), x.tan(), x.tanh().asin(), x.tanh().acos(), x.atan(),
+        x.sinh(), x.cosh(), x.tanh(), (3 * x).floor(), (3 * x).ceil(), (3 * x).trunc(),
+        torch.where((x < y) & (x <= 1) | ~(x == y), x, y), (x != y).to(F64), -(-x - y) * -(x - 9.0),
+        torch.where(torch.logical_xor(x > 0, y > 0), x * 1e-320, torch.inf), x - (y - (x - y)),
+        x / (y / p), (x < 0).to(F64) - ((x > y) == (y > 0)).to(F64),
+    ])  # fmt: skip
+
+
+@pytest.mark.parametrize("backend", ["c", "numba"])
+def test_every_operation_agrees_in_every_language(backend):
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(size=(2, 50, 3))
+    compiled = compile_function(everything, torch.randn(2, 3, dtype=F64).unbind(), backend=backend)
+    expected = torch.stack([everything(a, b) for a, b in zip(*map(torch.tensor, (x, y)))])  # noqa: B905
+    np.testing.assert_allclose(compiled(x, y), expected.numpy(), rtol=1e-13, atol=1e-15)
+
+
+@pytest.mark.parametrize("backend", ["c", "numba"])
+def test_nan_and_infinity_pass_as_in_torch(backend):
+    def f(x, y):
+        return torch.stack([torch.maximum(x, y), torch.minimum(x, y), x.clamp(-1.0, 1.0), 1 / x])
+
+    special = np.array([np.nan, np.inf, -np.inf, 0.0, 1.0])
+    x, y = (a.reshape(-1, 1) for a in np.meshgrid(special, special))
+    compiled = compile_function(f, torch.ones(2, 1, dtype=F64).unbind(), backend=backend)
+    expected = torch.stack([f(a, b) for a, b in zip(*map(torch.tensor, (x, y)))])  # noqa: B905
+    np.testing.assert_array_equal(compiled(x, y), expected.numpy())
+
+
+def test_parameters_of_a_module_stay_inputs():
+    network = Network()
+    compiled = compile_function(network, torch.ones(2, 2, dtype=F64).unbind())
+    with torch.no_grad():
+        network.layers[0].weight *= 2.0
+    x = torch.randn(7, 2, dtype=F64)
+    out, total = compiled(x, -x)
+    np.testing.assert_allclose(out, network(x, -x)[0].detach(), rtol=1e-13)
+    assert total.shape == (7,)
+    with pytest.raises(ValueError, match="batch"):
+        compiled(np.ones((7, 3)), np.ones((7, 3)))
+
+
+def test_a_bound_method_lifts_its_module():
+    friction = NeuroFuzzy(2)
+    compiled = compile_function(friction.coefficients, torch.ones(2, 2, dtype=F64).unbind())
+    with torch.no_grad():
+        friction.rule *= 0.5
+    qd, qdd = torch.randn(2, 9, 2, dtype=F64)
+    expected = friction.coefficients(qd, qdd).detach()
+    np.testing.assert_allclose(compiled(qd, qdd), expected, rtol=1e-12)
+
+
+OPERATORS = [
+    lambda a, b: a + b, lambda a, b: a - b, lambda a, b: a * b, lambda a, b: a / (b.abs() + 1),
+    torch.maximum, torch.atan2, lambda a, b: torch.where(a < b, a.sin(), b.tanh()),
+    lambda a, b: (a - b).clamp(-1, 1), lambda a, b: -a, lambda a, b: torch.exp(-a.abs()) * b,
+]  # fmt: skip
+
+
+@given(st.lists(st.tuples(*[st.integers(0, 50)] * 3), min_size=1, max_size=20))
+@settings(max_examples=15)
+def test_random_graphs_agree(lines):
+    def f(x, y):
+        values = [x, y]
+        for op, i, j in lines:
+            a, b = values[i % len(values)], values[j % len(values)]
+            values.append(OPERATORS[op % len(OPERATORS)](a, b))
+        return values[-1]
+
+    x = torch.linspace(-2, 2, 6, dtype=F64).reshape(3, 2)
+    compiled = compile_function(f, (x[0], x[1]), backend="c")
+    got, expected = compiled(x, x.flip(0)), f(x, x.flip(0)).numpy()
+    np.testing.assert_allclose(got, expected, rtol=1e-10, atol=1e-10)  # chains of 20 products
+
+
+@pytest.mark.skipif(CC is None, reason="needs a C compiler")
+@pytest.mark.parametrize(("real", "tolerance"), [("double", 1e-12), ("float", 1e-4)])
+def test_emitted_c_stands_alone_and_equals_the_model(tmp_path, real, tolerance):
+    friction = NeuroFuzzy(2)
+    inputs = {"qd": torch.ones(2, dtype=F64), "qdd": torch.ones(2, dtype=F64)}
+    source = emit_c(friction.coefficients, inputs, ["c"], name="coefficients", real=real)
+    assert source == emit_c(friction.coefficients, inputs, ["c"], name="coefficients", real=real)
+    (tmp_path / "c.c").write_text(source)
+    # Declarations, comments and loops of C89; only the functions of math.h are C99's.
+    flags = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-Wdeclaration-after-statement"]
+    flags += ["-Wno-unused-function", "-shared", "-fPIC"]
+    command = [CC, *flags, "-o", str(tmp_path / "c.so"), str(tmp_path / "c.c"), "-lm"]
+    subprocess.run(command, check=True, capture_output=True)
+    function = ctypes.CDLL(str(tmp_path / "c.so")).coefficients
+    dtype = np.float64 if real == "double" else np.float32
+    qd, qdd = np.array([0.7, -1.5], dtype), np.array([3.0, -9.0], dtype)
+    out = np.empty(4, dtype)
+    function(*(ctypes.c_void_p(a.ctypes.data) for a in (qd, qdd, out)))
+    expected = friction.coefficients(torch.tensor(qd).double(), torch.tensor(qdd).double())
+    np.testing.assert_allclose(out, expected.detach().reshape(-1), rtol=tolerance)
+
+
+def test_names_must_be_identifiers():
+    x = {"x": torch.ones(1, dtype=F64)}
+    for names in ({"inputs": {"x y": x["x"]}, "outputs": ["y"]}, {"inputs": x, "outputs": ["x"]}):
+        with pytest.raises(ValueError, match="identifiers"):
+            emit_c(torch.sin, **names)
+    with pytest.raises(ValueError, match="must name 1"):
+        emit_c(torch.sin, x, ["a", "b"])

@@ -1,0 +1,57 @@
+"""The positioning axis speaks the same language as the chain."""
+
+import json
+
+import pytest
+import torch
+
+from nfriction.plant import LinearAxis
+
+
+def test_newton() -> None:
+    axis = LinearAxis(4.0, torque_offset=2.0)
+    q, qd, tau = torch.randn(3, 5, 1, dtype=torch.float64)
+    qdd = axis(q, qd, tau)
+    torch.testing.assert_close(qdd, (tau + 2) / 4)
+    torch.testing.assert_close(axis.inverse_dynamics(q, qd, qdd), tau)
+    rhs = tau + axis.torque_offset - axis.bias(q, qd)
+    torch.testing.assert_close((axis.mass_matrix(q) @ qdd[..., None])[..., 0], rhs)
+    kinetic, potential = axis.energy(q, qd)
+    torch.testing.assert_close(kinetic, 2 * qd[:, 0] ** 2)
+    assert not potential.any()
+    assert not axis.gravity(q).any()
+    assert torch.equal(axis.load(q, qd), torch.ones(5, 1).double())
+    assert axis.mobility().item() == 0.25
+    assert (axis.unit, axis.joints, axis.has_drag) == ("m", 1, False)
+
+
+def test_replace_broadcasts_and_carries_gradients() -> None:
+    mass = torch.tensor([[1.0], [2.0]], dtype=torch.float64, requires_grad=True)
+    axis = LinearAxis(4.0).replace(mass=mass[:, None])
+    x = torch.ones(2, 3, 1).double()
+    qdd = axis(x, x, x)
+    torch.testing.assert_close(qdd[..., 0], torch.tensor([[1.0] * 3, [0.5] * 3]).double())
+    (gradient,) = torch.autograd.grad(qdd.sum(), mass)
+    torch.testing.assert_close(gradient[:, 0], torch.tensor([-3.0, -0.75]).double())
+    assert axis.mass_matrix(x).shape == (2, 3, 1, 1)
+
+
+def test_export_and_round_trip() -> None:
+    axis = LinearAxis(95.0, torque_offset=3.0, name="axis").replace(mass=torch.tensor([90.0]))
+    again = LinearAxis.from_dict(json.loads(json.dumps(axis.to_dict())))
+    assert again.mass.item() == 90
+    assert "axis" in repr(again)
+    q, qd, tau = torch.randn(3, 1, dtype=torch.float64)
+    program = torch.export.export(again, (q, qd, tau))
+    assert torch.equal(program.module()(q, qd, tau), again(q, qd, tau))
+
+
+@pytest.mark.parametrize("mass", [0.0, -1.0, float("nan"), "heavy"])
+def test_bad_mass_is_refused(mass: float) -> None:
+    with pytest.raises(ValueError, match="`mass` must be"):
+        LinearAxis(mass)
+
+
+def test_wrong_shape_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"`q` must be \(\*batch, 1\)"):
+        LinearAxis(1.0).gravity(torch.zeros(3))

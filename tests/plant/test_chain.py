@@ -1,0 +1,287 @@
+"""Laws of the chain's equations of motion, in any pose and for any masses."""
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from nfriction.plant import Arm, PendulumChain, rigs
+
+FULL_TENSOR = [
+    [0.002, 0.0388, 0.04, 0.0004, 0.00032, -0.00024],
+    [0.0025, 0.0485, 0.05, 0.0005, 0.0004, -0.0003],
+    [0.0025, 0.0485, 0.05, 0.0005, 0.0004, -0.0003],
+]
+ARMS: list[Any] = ["fixed", "free"]
+
+
+def states(joints: int, batch: tuple[int, ...] = (20,), seed: int = 0) -> tuple[Tensor, ...]:
+    generator = torch.Generator().manual_seed(seed)
+    q, qd, tau = torch.randn(3, *batch, joints, dtype=torch.float64, generator=generator)
+    return 3 * q, 5 * qd, tau
+
+
+def every_kind(arm: Any) -> PendulumChain:
+    """Offsets, rotors, full tensors and, with a fixed arm, drag: every term switched on."""
+    rig = rigs.tlrip(arm, FULL_TENSOR)
+    joints, links = torch.linspace(0.1, 0.2, rig.joints).double(), torch.ones(3).double()
+    drag = {} if rig.first_link else {"drag_linear": 0.02 * links, "drag_quadratic": 0.03 * links}
+    return rig.replace(armature=joints / 10, angle_offset=joints, torque_offset=-joints, **drag)
+
+
+@st.composite
+def chains(draw: Callable[[Any], Any]) -> PendulumChain:
+    links = draw(st.integers(1, 4))
+
+    def values(low: float, high: float) -> list[float]:
+        return draw(st.lists(st.floats(low, high), min_size=links, max_size=links))
+
+    mass, length = values(0.05, 10), values(0.05, 2)
+    com = [share * size for share, size in zip(values(0.1, 1.2), length, strict=True)]
+    # Slender rods: what a body of that length may have about its mass centre.
+    inertia = [f * m * s**2 for f, m, s in zip(values(0, 0.2), mass, length, strict=True)]
+    arm = draw(st.sampled_from([None, Arm(0.1, 0.3), Arm(2.0, 1.0)]))
+    armature = draw(st.sampled_from([None, [0.01] * (links + (arm is not None))]))
+    return PendulumChain(mass, length, com, inertia, arm=arm, armature=armature)
+
+
+@given(rig=chains(), seed=st.integers(0, 1000))
+def test_mass_matrix_is_symmetric_positive_definite(rig: PendulumChain, seed: int) -> None:
+    q, _, _ = states(rig.joints, (50,), seed)
+    mass = rig.mass_matrix(q)
+    assert torch.equal(mass, mass.mT)
+    assert (torch.linalg.eigvalsh(mass) > 0).all()
+
+
+@given(rig=chains(), seed=st.integers(0, 1000))
+def test_inverse_dynamics_undoes_forward_dynamics(rig: PendulumChain, seed: int) -> None:
+    q, qd, tau = states(rig.joints, seed=seed)
+    qdd = rig(q, qd, tau)
+    # The error of a solve grows with the condition number, and stays small against each term.
+    scale = (rig.mass_matrix(q).abs() @ qdd.abs()[..., None])[..., 0] + rig.bias(q, qd).abs()
+    condition = torch.linalg.cond(rig.mass_matrix(q)).amax()
+    error = (rig.inverse_dynamics(q, qd, qdd) - tau).abs()
+    assert (error <= 1e-14 * condition * (1 + scale.amax(-1, keepdim=True))).all()
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_forward_dynamics_is_mass_matrix_and_bias(arm: Any) -> None:
+    rig = every_kind(arm)
+    q, qd, tau = states(rig.joints)
+    rhs = tau + rig.torque_offset - rig.bias(q, qd)
+    expected = torch.linalg.solve(rig.mass_matrix(q), rhs)
+    torch.testing.assert_close(rig(q, qd, tau), expected, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_gravity_is_the_gradient_of_the_potential_and_the_bias_at_rest(arm: Any) -> None:
+    rig = every_kind(arm)
+    q = states(rig.joints)[0].requires_grad_()
+    (gradient,) = torch.autograd.grad(rig.energy(q, torch.zeros_like(q))[1].sum(), q)
+    torch.testing.assert_close(rig.gravity(q), gradient)
+    torch.testing.assert_close(rig.bias(q, torch.zeros_like(q)), gradient)
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_bias_follows_from_the_energies(arm: Any) -> None:
+    """Lagrange: bias = d/dt(dT/dqd) at qdd = 0 - d(T - V)/dq, by differentiating the energies."""
+    rig = rigs.tlrip(arm, FULL_TENSOR)
+    rig = rig.replace(armature=torch.full((rig.joints,), 0.01).double())
+
+    def momentum(q: Tensor, qd: Tensor) -> Tensor:
+        return (rig.mass_matrix(q) @ qd[:, None])[:, 0]
+
+    def lagrangian(q: Tensor, qd: Tensor) -> Tensor:
+        kinetic, potential = rig.energy(q, qd)
+        return kinetic - potential
+
+    q, qd, _ = states(rig.joints, ())
+    _, momentum_rate = torch.func.jvp(lambda x: momentum(x, qd), (q,), (qd,))
+    expected = momentum_rate - torch.func.grad(lagrangian)(q, qd)
+    torch.testing.assert_close(rig.bias(q, qd), expected, rtol=1e-11, atol=1e-11)
+    torch.testing.assert_close(torch.func.grad(lagrangian, argnums=1)(q, qd), momentum(q, qd))
+
+
+def test_load_is_one_at_rest_in_line_and_none_at_rest_level() -> None:
+    rig = rigs.tlrip("free")
+    still = torch.zeros(4).double()
+    torch.testing.assert_close(rig.load(still, still), torch.ones(4).double())
+    level = torch.tensor([0.3, torch.pi / 2, 0, 0]).double()
+    expected = torch.tensor([1.0, 0, 0, 0]).double()
+    torch.testing.assert_close(rig.load(level, still), expected, atol=1e-7, rtol=0)
+    # Hanging and swinging adds m l qd^2: N / (m g) = 1 + l qd^2 / g.
+    hanging, qd = torch.tensor([0, torch.pi, 0, 0]).double(), torch.tensor([9.0, 2, 0, 0]).double()
+    swing = 1 + 0.2675 / 2 * 4 / 9.81
+    assert rig.load(hanging, qd)[1].item() == pytest.approx(swing)
+
+
+def test_mobility_gives_the_papers_stability_bounds() -> None:
+    bound = 2.785 / (1e-3 * rigs.tlrip().mobility())
+    torch.testing.assert_close(bound, torch.tensor([247.0, 77, 77]).double(), rtol=0.01, atol=0)
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_mobility_bounds_random_poses(arm: Any) -> None:
+    rig = every_kind(arm)
+    q, _, _ = states(rig.joints, (2000,))
+    found = torch.linalg.inv(rig.mass_matrix(q)).diagonal(dim1=-2, dim2=-1).amax(0)
+    # The grid's steps of 15 degrees for three angles miss the top by no more than a percent.
+    assert (found <= 1.01 * rig.mobility()).all()
+    assert (found >= 0.8 * rig.mobility()).all()
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_gradients_of_both_modes(arm: Any) -> None:
+    rig = every_kind(arm)
+    names = ["inertia_coupling", "gravity_moment", "armature", "angle_offset", "torque_offset"]
+    names += ["arm_inertia", "arm_lever", "inertia_tensor"] if rig.first_link else []
+    names += [] if rig.first_link else ["drag_linear", "drag_quadratic", "length"]
+    values = [getattr(rig, name).clone() for name in names]
+
+    def acceleration(q: Tensor, qd: Tensor, tau: Tensor, *buffers: Tensor) -> Tensor:
+        return rig.replace(**dict(zip(names, buffers, strict=True)))(q, qd, tau)
+
+    inputs = [x.requires_grad_() for x in (*states(rig.joints, (2,)), *values)]
+    assert torch.autograd.gradcheck(acceleration, inputs, check_forward_ad=True)
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_replaced_buffers_broadcast_over_the_batch(arm: Any) -> None:
+    rig = every_kind(arm)
+    scales = torch.tensor([0.9, 1.0, 1.2]).double()
+    swapped = {
+        name: torch.stack([scale * buffer for scale in scales])[:, None]
+        for name, buffer in rig.named_buffers()
+        if not (rig.first_link and name.startswith("drag"))
+    }
+    batched = rig.replace(**swapped)
+    q, qd, tau = states(rig.joints, (3, 5))
+    for p in range(3):
+        one = rig.replace(**{name: value[p, 0] for name, value in swapped.items()})
+        at = q[p], qd[p], tau[p]
+        torch.testing.assert_close(batched(q, qd, tau)[p], one(*at))
+        torch.testing.assert_close(batched.mass_matrix(q)[p], one.mass_matrix(q[p]))
+        torch.testing.assert_close(batched.gravity(q)[p], one.gravity(q[p]))
+        torch.testing.assert_close(batched.bias(q, qd)[p], one.bias(q[p], qd[p]))
+        torch.testing.assert_close(batched.load(q, qd)[p], one.load(q[p], qd[p]))
+        torch.testing.assert_close(batched.energy(q, qd)[0][p], one.energy(q[p], qd[p])[0])
+        torch.testing.assert_close(batched.mobility()[p], one.mobility())
+
+
+def test_a_single_link_keeps_the_batch() -> None:
+    rig = PendulumChain([1.0], [1.0])
+    q, qd, tau = states(1, (2, 4))
+    assert rig.mass_matrix(q).shape == (2, 4, 1, 1)
+    assert rig(q, qd, tau).shape == rig.load(q, qd).shape == rig.gravity(q).shape == (2, 4, 1)
+    assert rig.energy(q, qd)[0].shape == (2, 4)
+
+
+def test_replace_leaves_the_original_alone_and_refuses_strangers() -> None:
+    rig = rigs.tlrip()
+    before = {name: value.clone() for name, value in rig.named_buffers()}
+    changed = rig.replace(torque_offset=torch.ones(3).double(), drag_linear=torch.ones(3).double())
+    assert changed.has_drag
+    assert not rig.has_drag
+    assert changed.inertia_coupling is rig.inertia_coupling
+    for name, value in rig.named_buffers():
+        assert torch.equal(value, before[name])
+    with pytest.raises(ValueError, match=r"no buffer `mass`.*gravity_moment"):
+        rig.replace(mass=torch.ones(3))
+    with pytest.raises(ValueError, match=r"\(\*batch, 3, 3\)"):
+        rig.replace(inertia_coupling=torch.ones(3))
+    with pytest.raises(TypeError, match="tensor"):
+        rig.replace(armature=[1.0, 1, 1])  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="fixed arm only"):
+        rigs.tlrip("free").replace(drag_linear=torch.ones(3))
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_export_traces_to_core_operations(arm: Any) -> None:
+    rig = every_kind(arm)
+    program = torch.export.export(rig, states(rig.joints, (7,), seed=1)).run_decompositions()
+    other = states(rig.joints, (7,), seed=2)
+    torch.testing.assert_close(program.module()(*other), rig(*other), rtol=1e-12, atol=1e-12)
+    calls = [node.target for node in program.graph.nodes if node.op == "call_function"]
+    core = [c for c in calls if torch.Tag.core in getattr(c, "tags", ())]
+    plain = {c for c in calls if c not in core and "getitem" not in str(c)}
+    assert not plain
+
+
+def test_dtype_follows() -> None:
+    rig = rigs.tlrip("free").float()
+    q, qd, tau = (x.float() for x in states(4))
+    assert rig(q, qd, tau).dtype == torch.float32
+    exact = rigs.tlrip("free")(q.double(), qd.double(), tau.double())
+    torch.testing.assert_close(rig(q, qd, tau).double(), exact, rtol=1e-3, atol=1e-2)
+
+
+def test_round_trip_through_plain_numbers() -> None:
+    for rig in (rigs.tlrip("free", FULL_TENSOR), every_kind("fixed"), rigs.multiarm_triple()):
+        again = PendulumChain.from_dict(json.loads(json.dumps(rig.to_dict())))
+        for (name, value), (_, other) in zip(
+            rig.named_buffers(), again.named_buffers(), strict=True
+        ):
+            assert torch.equal(value, other), name
+        assert repr(again) == repr(rig)
+        assert ("buffers" in rig.to_dict()) == rig.has_drag
+        assert again.joint_names == rig.joint_names
+        assert again.convention == rig.convention
+
+
+def test_chain_formula_of_the_multiarm_bench() -> None:
+    """A_ii = I_i + m_i a_i^2 + later masses L_i^2, and so on, as the source writes them."""
+    rig = rigs.multiarm_triple()
+    m, a = np.array([0.258172, 0.279428, 0.118624]), np.array([0.16, 0.202939, 0.183709])
+    length, inertia = np.array([0.1728, 0.2287, 0.0]), [1.00043e-4, 3.14160e-4, 1.68739e-4]
+    for i in range(3):
+        later = m[i + 1 :].sum()
+        assert rig.inertia_coupling[i, i].item() == pytest.approx(
+            inertia[i] + m[i] * a[i] ** 2 + later * length[i] ** 2, rel=1e-14
+        )
+        moment = 9.80834 * (m[i] * a[i] + later * length[i])
+        assert rig.gravity_moment[i].item() == pytest.approx(moment, rel=1e-14)
+        for j in range(i + 1, 3):
+            beyond = m[j] * a[j] + m[j + 1 :].sum() * length[j]
+            assert rig.inertia_coupling[i, j].item() == pytest.approx(length[i] * beyond, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"mass": [1.0, -1.0]}, "`mass` must be positive"),
+        ({"mass": []}, "`mass` must be one or more numbers"),
+        ({"mass": "heavy"}, "`mass` must be one or more numbers"),
+        ({"length": [1.0]}, "`length` must be a list of 2"),
+        ({"com": [float("nan"), 1.0]}, "`com` must be finite"),
+        ({"com": [0.5, 0.0]}, "positive definite"),
+        ({"inertia": [1.0, 1.0, 1.0]}, "`inertia` must be None"),
+        ({"inertia": [0.0, -0.5]}, "positive definite"),
+        ({"gravity": 0.0}, "`gravity` must be positive"),
+        ({"armature": [0.0, -1.0]}, "`armature` must not be negative"),
+        ({"convention": ("absolute", "down")}, "`convention` must be"),
+        ({"joint_names": ["a", "a"]}, "different names"),
+        ({"position_quantum": -1.0}, "`position_quantum` must be positive"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:the inertia of link")
+def test_bad_parameters_are_refused(kwargs: dict[str, Any], message: str) -> None:
+    good: dict[str, Any] = {"mass": [1.0, 1.0], "length": [1.0, 1.0]}
+    with pytest.raises(ValueError, match=message):
+        PendulumChain(**(good | kwargs))
+
+
+def test_impossible_inertia_warns_and_wrong_shapes_are_refused() -> None:
+    with pytest.warns(UserWarning, match=r"link \[2\].*no rigid body"):
+        rig = PendulumChain([1.0, 1.0], [1.0, 1.0], inertia=[0.1, -0.01])
+    with pytest.raises(ValueError, match=r"`qd` must be \(\*batch, 2\)"):
+        rig.bias(torch.zeros(2), torch.zeros(3))
+    with pytest.raises(ValueError, match="`q` must be"):
+        rig.mass_matrix(torch.tensor(1.0))
+    with pytest.raises(ValueError, match="arm's inertia"):
+        Arm(inertia=0.0, length=1.0)

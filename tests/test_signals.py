@@ -1,0 +1,443 @@
+"""Signals against known motions: error of every method, causality, frequency response, limits."""
+
+import math
+import time as clock
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.signal import savgol_coeffs
+
+from nfriction.recording import Recording, read_initial_states
+from nfriction.signals import (
+    Motion,
+    SecondOrderLowPass,
+    causal_motion,
+    frequency_counting,
+    initial_state,
+    kalman_smoother,
+    quantise,
+    savitzky_golay,
+)
+
+COUNTS = 8192
+QUANTUM = 2 * math.pi / COUNTS
+
+
+def sines(time: np.ndarray) -> Motion:
+    """Three joints, each a sum of three sines of 0.5 to 6 Hz."""
+    amplitude = np.array([[0.6, 0.3, 0.1], [0.4, 0.5, 0.05], [0.9, 0.2, 0.03]])
+    rate = 2 * np.pi * np.array([[0.7, 1.9, 4.3], [1.1, 2.3, 6.1], [0.5, 1.3, 3.7]])
+    z = amplitude * np.exp(1j * (time[:, None, None] * rate + np.array([0.3, 1.0, 2.0])))
+    q, qd, qdd = (((1j * rate) ** k * z).sum(axis=-1).imag for k in range(3))
+    return Motion(time, q, qd, qdd)
+
+
+def decay(time: np.ndarray) -> Motion:
+    """Three damped oscillations, as of a pendulum that comes to rest."""
+    pole = np.array([-0.25 + 8.2j, -0.3 + 5.7j, -0.4 + 12.6j])
+    z = np.array([0.8, 1.0, 0.5]) * np.exp(time[:, None] * pole)
+    return Motion(time, *((pole**k * z).real for k in range(3)))  # type: ignore[misc]
+
+
+MOTIONS = {"sines": sines, "decay": decay}
+METHODS = {
+    "causal": lambda t, q: causal_motion(t, q, COUNTS),
+    "savitzky_golay": savitzky_golay,
+    "kalman": kalman_smoother,
+}
+UNIFORM = np.arange(5000) * 1e-3
+IRREGULAR = UNIFORM + np.random.default_rng(5).uniform(-2e-4, 2e-4, UNIFORM.shape)
+
+
+def rmse(found: np.ndarray, truth: np.ndarray) -> float:
+    """Over all joints, the ends of 0.2 s apart."""
+    return float(np.sqrt(np.mean((found - truth)[200:-200] ** 2)))
+
+
+def errors(method: str, truth: Motion) -> tuple[float, float]:
+    found = METHODS[method](truth.time, quantise(truth.q, COUNTS))
+    return rmse(found.qd, truth.qd), rmse(found.qdd, truth.qdd)
+
+
+# --- every method on a known motion ----------------------------------------------------------
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_smoothers_beat_the_causal_way_by_far(motion: str) -> None:
+    truth = MOTIONS[motion](UNIFORM)
+    causal = errors("causal", truth)
+    for method in ("savitzky_golay", "kalman"):
+        smooth = errors(method, truth)
+        # The causal way is late by about 20 ms; the smoothers are not.
+        assert smooth[0] < causal[0] / 20
+        assert smooth[1] < causal[1] / 5
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_causal_error_is_the_filters_delay(motion: str) -> None:
+    truth = MOTIONS[motion](UNIFORM)
+    delay = math.sqrt(2) / (2 * math.pi * 20.0)  # of a Butterworth filter of 20 Hz at low frequency
+    jerk = np.gradient(truth.qdd, 1e-3, axis=0)
+    qd, qdd = errors("causal", truth)
+    # To first order in frequency over cut-off (up to 6/20); acceleration passes two filters.
+    assert qd == pytest.approx(delay * rmse(truth.qdd, 0 * jerk), rel=0.2)
+    assert qdd == pytest.approx(2 * delay * rmse(jerk, 0 * jerk), rel=0.2)
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_savitzky_golay_error_is_its_bias_and_the_encoders_noise(motion: str) -> None:
+    truth = MOTIONS[motion](UNIFORM)
+    unquantised = savitzky_golay(truth.time, truth.q)
+    found = errors("savitzky_golay", truth)
+    for k, key in enumerate(("qd", "qdd"), start=1):
+        bias = rmse(getattr(unquantised, key), getattr(truth, key))
+        weights = savgol_coeffs(61, 4, deriv=k, delta=1e-3)
+        noise = QUANTUM / math.sqrt(12) * float(np.linalg.norm(weights))
+        # Quantisation is not quite white.
+        assert found[k - 1] == pytest.approx(math.hypot(bias, noise), rel=0.2)
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_kalman_smoother_finds_a_good_bandwidth(motion: str) -> None:
+    """It knows nothing of the motion and yet rivals the best of many Savitzky-Golay windows."""
+    truth = MOTIONS[motion](UNIFORM)
+    q = quantise(truth.q, COUNTS)
+    tried = [savitzky_golay(truth.time, q, window) for window in np.arange(0.02, 0.2, 0.01)]
+    qd, qdd = errors("kalman", truth)
+    assert qd < 1.6 * min(rmse(one.qd, truth.qd) for one in tried)
+    assert qdd < 2.5 * min(rmse(one.qdd, truth.qdd) for one in tried)
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+@pytest.mark.parametrize("method", METHODS)
+def test_irregular_stamps_cost_next_to_nothing(motion: str, method: str) -> None:
+    even = errors(method, MOTIONS[motion](UNIFORM))
+    jittered = errors(method, MOTIONS[motion](IRREGULAR))
+    # Quantisation falls differently, so the two errors are alike, not equal. The causal filter
+    # runs at the nominal step, and the difference of velocities over a short step is noisier.
+    limit = 1.6 if method == "causal" else 1.25
+    assert jittered[0] < limit * even[0]
+    assert jittered[1] < limit * even[1]
+
+
+@pytest.mark.parametrize(
+    "method",
+    [savitzky_golay, partial(kalman_smoother, noise=2e-4, jerk_density=1e8)],
+    ids=["savitzky_golay", "kalman"],
+)
+def test_irregular_path_equals_the_uniform_one(method: Callable[..., Motion]) -> None:
+    """A jitter just above the tolerance switches the path and hardly moves a sample."""
+    truth = sines(UNIFORM[:2000])
+    nudged = truth.time.copy()
+    nudged[1000] += 5e-6
+    q = quantise(truth.q, COUNTS)
+    fast, exact = method(truth.time, q), method(nudged, q)
+    # 5 µs at up to 10 rad/s are 5e-5 rad, a fraction of the noise, in one sample of thousands.
+    assert np.abs(fast.qd - exact.qd).max() < 2e-3
+    assert np.abs(fast.qdd - exact.qdd).max() < 0.5
+    # Far from that sample nothing is left of it.
+    assert np.abs(fast.qdd - exact.qdd)[:500].max() < 1e-6
+
+
+@pytest.mark.parametrize("time", [UNIFORM[:400], IRREGULAR[:400]], ids=["uniform", "irregular"])
+def test_smoothers_leave_a_cubic_as_it_is(time: np.ndarray) -> None:
+    """The constant-jerk model and a polynomial of order 4 both contain every cubic, ends too."""
+    s = time[:, None]
+    q = 0.3 - 2 * s + 5 * s**2 - 4 * s**3
+    for found in (
+        savitzky_golay(time, q),
+        kalman_smoother(time, q, noise=1e-4, jerk_density=1e2),
+    ):
+        np.testing.assert_allclose(found.q, q, atol=1e-9)
+        np.testing.assert_allclose(found.qd, -2 + 10 * s - 12 * s**2, atol=1e-7)
+        np.testing.assert_allclose(found.qdd, 10 - 24 * s, atol=1e-5)
+
+
+# --- encoder ---------------------------------------------------------------------------------
+
+
+@given(q=st.floats(-1e3, 1e3), counts=st.integers(4, 10**6), offset=st.floats(-1, 1))
+def test_quantise_is_nearest_and_idempotent(q: float, counts: int, offset: float) -> None:
+    once = quantise(q, counts, offset=offset)
+    # Half a count, and the rounding of 1e3.
+    assert abs(once - q) <= math.pi / counts + 1e-12
+    assert abs(quantise(once, counts, offset=offset) - once) < 1e-12
+
+
+@pytest.mark.parametrize("speed", [-3.1, -0.2, 0.05, 0.9, 40.0])
+def test_frequency_counting_of_a_steady_turn(speed: float) -> None:
+    time = np.arange(4000) * 1e-3
+    q = quantise(speed * time[:, None] + 0.01, COUNTS)
+    found = frequency_counting(time, q, COUNTS)[1000:, 0]
+    # An edge is known to one sample: between edges that lie a time T apart the speed is off by at
+    # most a share 1 ms / T; faster than a count a sample, by a count in 1 ms.
+    share = 1e-3 * abs(speed) / QUANTUM
+    assert np.abs(found - speed).max() <= abs(speed) * share / max(1 - share, 0.5) + (
+        QUANTUM / 1e-3 if share > 0.5 else 1e-12
+    )
+    assert abs(found.mean() - speed) < 0.02 * abs(speed)
+
+
+def test_latched_edge_times_make_frequency_counting_exact() -> None:
+    speed, time = 2.3, np.arange(1000) * 1e-3
+    q = speed * time[:, None]
+    edge = (np.floor(q / QUANTUM - 0.5) + 0.5) * QUANTUM / speed
+    found = frequency_counting(time, q, COUNTS, edge_time=np.maximum(edge, 0))
+    np.testing.assert_allclose(found[10:], speed, rtol=1e-9)
+    with pytest.raises(ValueError, match="`edge_time` must be shaped like"):
+        frequency_counting(time, q, COUNTS, edge_time=edge[:-1])
+
+
+def test_frequency_counting_falls_to_zero_at_rest_and_ignores_dither() -> None:
+    time = np.arange(3000) * 1e-3
+    moving = np.minimum(time, 1.0)[:, None]
+    found = frequency_counting(time, quantise(moving, COUNTS), COUNTS)[:, 0]
+    rest = time > 1.1
+    assert np.all(np.diff(found[rest]) < 0)
+    # No edge for t seconds: at most one count in that time; the last edge lies at most at 1 s.
+    assert np.all(found[rest] <= QUANTUM / (time[rest] - 1.0) * (1 + 1e-12))
+    dither = QUANTUM * (np.arange(3000) % 2)[:, None]
+    assert np.all(frequency_counting(time, dither, COUNTS)[2:] == 0)
+
+
+# --- the causal way --------------------------------------------------------------------------
+
+
+def test_causal_motion_does_not_see_the_future() -> None:
+    truth = sines(UNIFORM[:3000])
+    q = quantise(truth.q, COUNTS)
+    other = q.copy()
+    other[2000:] = 7.0 - 3 * other[2000:]
+    first, second = causal_motion(truth.time, q, COUNTS), causal_motion(truth.time, other, COUNTS)
+    for key in ("q", "qd", "qdd"):
+        assert np.array_equal(getattr(first, key)[:2000], getattr(second, key)[:2000])
+        assert not np.array_equal(getattr(first, key)[2000:], getattr(second, key)[2000:])
+
+
+def response(low_pass: SecondOrderLowPass, frequency_hz: float) -> float:
+    """Gain measured on a long sine."""
+    time = np.arange(int(20 / low_pass.sample_time)) * low_pass.sample_time
+    late = time > 10
+    carrier = np.exp(-2j * np.pi * frequency_hz * time)
+    output = low_pass(np.sin(2 * np.pi * frequency_hz * time))
+    return 2 * abs(np.mean((output * carrier)[late]))
+
+
+@pytest.mark.parametrize("sample_time", [1e-3, 4e-3])
+@pytest.mark.parametrize("cutoff", [2.0, 20.0, 100.0])
+def test_cut_off_is_at_minus_three_decibels(cutoff: float, sample_time: float) -> None:
+    # Ten seconds hold whole periods: the transient is gone and nothing leaks.
+    gain = response(SecondOrderLowPass(cutoff, sample_time), cutoff)
+    assert gain == pytest.approx(math.sqrt(0.5), rel=1e-3)
+    damped = response(SecondOrderLowPass(cutoff, sample_time, damping=1.0), cutoff)
+    assert damped == pytest.approx(0.5, rel=1e-3)
+
+
+def test_low_pass_falls_with_the_second_power() -> None:
+    low_pass = SecondOrderLowPass(1.0, 1e-3)
+    assert response(low_pass, 20.0) / response(low_pass, 40.0) == pytest.approx(4, rel=0.03)
+    assert response(low_pass, 0.05) == pytest.approx(1, rel=1e-4)
+
+
+def test_sample_by_sample_equals_the_array() -> None:
+    values = np.random.default_rng(3).normal(size=(500, 3))
+    low_pass = SecondOrderLowPass(15.0, 1e-3)
+    state = low_pass.init(values[0])
+    outputs = []
+    for value in values:
+        state, output = low_pass.step(state, value)
+        outputs.append(output)
+    np.testing.assert_allclose(outputs, low_pass(values), atol=1e-13)
+
+
+def test_low_pass_at_rest_stays() -> None:
+    low_pass = SecondOrderLowPass(15.0, 1e-3)
+    # Rounding, kept by poles close to 1.
+    np.testing.assert_allclose(low_pass(np.full((1000, 2), 3.7)), 3.7, rtol=1e-11)
+    with pytest.raises(ValueError, match=r"half the sampling frequency \(500 Hz\), got 600"):
+        SecondOrderLowPass(600.0, 1e-3)
+    with pytest.raises(ValueError, match="must be positive"):
+        SecondOrderLowPass(10.0, 1e-3, damping=0.0)
+
+
+# --- Kalman smoother -------------------------------------------------------------------------
+
+
+def test_standard_deviations_are_right_where_the_model_is() -> None:
+    """On motion drawn from the model itself, with its parameters given."""
+    rng = np.random.default_rng(11)
+    step, n, joints, noise, density = 1e-3, 4000, 12, 3e-4, 1e8
+    power = np.arange(4)
+    fine = np.linalg.cholesky(
+        density
+        * np.array(
+            [
+                [step ** (7 - i - j) / math.factorial(3 - i) / math.factorial(3 - j) / (7 - i - j)
+                 for j in power]
+                for i in power
+            ]
+        )
+    )  # fmt: skip
+    carry = np.array(
+        [[step ** (j - i) / math.factorial(j - i) if j >= i else 0.0 for j in power] for i in power]
+    )
+    state = np.zeros((n, 4, joints))
+    for k in range(1, n):
+        state[k] = carry @ state[k - 1] + fine @ rng.normal(size=(4, joints))
+    measured = state[:, 0] + noise * rng.normal(size=(n, joints))
+    found = kalman_smoother(np.arange(n) * step, measured, noise, density)
+    assert found.std is not None
+    for k, key in enumerate(("q", "qd", "qdd")):
+        score = (getattr(found, key) - state[:, k]) / getattr(found.std, key)
+        # Errors stay alike over about 20 samples: some 2,400 independent ones, 1.5 % of spread.
+        assert np.sqrt(np.mean(score**2)) == pytest.approx(1.0, abs=0.06)
+    # The same parameters come out of the record when they are not given.
+    searched = kalman_smoother(np.arange(n) * step, measured)
+    assert searched.std is not None
+    ratio = searched.std.qdd[n // 2] / found.std.qdd[n // 2]
+    assert np.all((ratio > 0.7) & (ratio < 1.4))
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_standard_deviations_cover_the_error_of_quantised_motion(motion: str) -> None:
+    truth = MOTIONS[motion](UNIFORM)
+    found = kalman_smoother(truth.time, quantise(truth.q, COUNTS))
+    assert found.std is not None
+    for key in ("q", "qd", "qdd"):
+        score = np.abs(getattr(found, key) - getattr(truth, key)) / getattr(found.std, key)
+        # Real motion is smoother than the model: on the safe side, by less than a factor of 2.5.
+        assert 0.4 < np.sqrt(np.mean(score**2)) < 1.1
+        assert 0.93 < np.mean(score < 2) <= 1.0
+
+
+def test_noise_is_found_or_taken() -> None:
+    rng = np.random.default_rng(0)
+    truth = sines(UNIFORM[:3000])
+    sigma = np.array([1e-4, 1e-3, 5e-3])
+    measured = truth.q + sigma * rng.normal(size=truth.q.shape)
+    found = kalman_smoother(truth.time, measured)
+    residual = found.q - truth.q
+    assert np.all(np.sqrt(np.mean(residual**2, axis=0)) < 0.5 * sigma)
+    assert found.std is not None
+    mean_std = found.std.qd.mean(axis=0)
+    assert mean_std[0] < mean_std[1] < mean_std[2]
+    # More noise, less certain; a more restless jerk, less certain too.
+    pairs = [(1e-3, 1e6), (2e-3, 1e6), (1e-3, 1e7)]
+    stds = [kalman_smoother(truth.time, truth.q, *pair).std.qd.mean() for pair in pairs]  # type: ignore[union-attr]
+    assert stds[0] < min(stds[1:])
+    # Either of the two may be given alone; the other then comes from the record.
+    for option in ({"noise": sigma}, {"jerk_density": 1e7}):
+        alone = kalman_smoother(truth.time, measured, **option)  # type: ignore[arg-type]
+        assert np.all(np.sqrt(np.mean((alone.q - truth.q) ** 2, axis=0)) < 0.5 * sigma)
+    with pytest.raises(ValueError, match="`noise` must be one positive number or 3"):
+        kalman_smoother(truth.time, truth.q, noise=[1.0, 2.0])
+
+
+def test_joint_at_rest_has_no_motion() -> None:
+    q = np.full((300, 2), 0.7)
+    q[:, 1] = quantise(np.sin(np.arange(300) / 50), COUNTS)
+    found = kalman_smoother(np.arange(300) * 1e-3, q)
+    np.testing.assert_allclose(found.q[:, 0], 0.7, atol=1e-12)
+    np.testing.assert_allclose(found.qdd[:, 0], 0.0, atol=1e-6)
+    assert np.all(np.isfinite(found.qdd))
+
+
+@pytest.mark.slow
+def test_smoother_is_fast() -> None:
+    time = np.arange(40_000) * 1e-3
+    q = quantise(sines(time).q, COUNTS)
+    begin = clock.perf_counter()
+    kalman_smoother(time, q)
+    # 1.1 s on one core of a busy machine.
+    assert clock.perf_counter() - begin < 5
+
+
+# --- initial states --------------------------------------------------------------------------
+
+
+def test_initial_state_of_a_known_motion() -> None:
+    truth = sines(UNIFORM)
+    q = quantise(truth.q, COUNTS)
+    middle = [initial_state(truth.time, q, start=s) for s in truth.time[500:4500:50]]
+    edge = [initial_state(truth.time[k:], q[k:]) for k in range(500, 4500, 50)]
+    sigma = QUANTUM / math.sqrt(12)
+    for found, slope in ((middle, 75**0.5), (edge, 1200**0.5)):
+        q0, qd0 = map(np.stack, zip(*found, strict=True))
+        # Slope of a least-squares cubic from N samples over T: sigma/(T √N) times √75 in the
+        # middle and √1200 at the end.
+        expected = sigma * slope / (0.03 * math.sqrt(31))
+        assert rmse_all(qd0 - truth.qd[500:4500:50]) < 1.3 * expected
+        assert rmse_all(q0 - truth.q[500:4500:50]) < sigma
+
+
+def rmse_all(difference: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(difference**2)))
+
+
+def test_initial_state_is_exact_on_a_cubic_anywhere() -> None:
+    time = IRREGULAR[:200] - IRREGULAR[0]
+    q = np.stack([1 + 2 * time - 3 * time**2 + 4 * time**3, -time], axis=1)
+    for start in (0.0, 0.004, 0.1, time[-1]):
+        q0, qd0 = initial_state(time, q, start=start)
+        np.testing.assert_allclose(
+            q0, [1 + 2 * start - 3 * start**2 + 4 * start**3, -start], atol=1e-12
+        )
+        np.testing.assert_allclose(qd0, [2 - 6 * start + 12 * start**2, -1], rtol=1e-8)
+    # Too short a duration takes four samples.
+    np.testing.assert_allclose(initial_state(time, q, duration=1e-5)[1], [2, -1], rtol=1e-6)
+    with pytest.raises(ValueError, match="`start` must lie in"):
+        initial_state(time, q, start=9.0)
+
+
+def test_initial_states_of_the_real_pendulums(data_dir: Path) -> None:
+    folder = data_dir / "multiarm_pendulum"
+    sigma = 2 * math.pi / 40_000 / math.sqrt(12)
+    one_sided = sigma * math.sqrt(1200) / (0.03 * math.sqrt(31))
+    for key, (q_card, qd_card) in read_initial_states(folder / "recordings.csv").items():
+        recording = Recording.read(folder / f"{key}.csv.gz", convention="absolute,hanging")
+        q0, qd0 = initial_state(recording.time, recording.q)
+        # The card's states saw the samples before the cut, to about 1e-3 rad/s; ours cannot.
+        assert np.abs(q0 - q_card).max() < 3 * sigma
+        assert np.abs(qd0 - qd_card).max() < 1e-3 + 4 * one_sided
+
+
+def test_smoothers_agree_on_a_real_triple_pendulum(data_dir: Path) -> None:
+    recording = Recording.read(data_dir / "multiarm_pendulum" / "triple_b0.csv.gz")
+    smooth = kalman_smoother(recording.time, recording.q)
+    local = savitzky_golay(recording.time, recording.q)
+    # Both beside the residual noise of 2-5e-5 rad that the card tells.
+    assert 1e-5 < rmse(smooth.q, recording.q) < 6e-5
+    assert rmse(smooth.qd, local.qd) < 0.01
+    assert smooth.std is not None
+    assert rmse(smooth.qdd, local.qdd) < 0.5
+
+
+# --- the border ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_bad_arrays_are_refused(method: str) -> None:
+    time = np.arange(100) * 1e-3
+    with pytest.raises(ValueError, match=r"`q` \(time, joint\).*q\[:, None\]"):
+        METHODS[method](time, np.zeros(100))
+    with pytest.raises(ValueError, match="at least 8 samples"):
+        METHODS[method](time[:7], np.zeros((7, 1)))
+    with pytest.raises(ValueError, match="`time` increasing"):
+        METHODS[method](time[::-1], np.zeros((100, 1)))
+
+
+def test_bad_settings_are_refused() -> None:
+    time, q = np.arange(100) * 1e-3, np.zeros((100, 1))
+    with pytest.raises(ValueError, match="8192 counts after quadrature"):
+        quantise(q, 0)
+    with pytest.raises(ValueError, match="`order` must be at least 2"):
+        savitzky_golay(time, q, order=1)
+    with pytest.raises(ValueError, match=r"`window_s` of 0\.2 s is 201 samples"):
+        savitzky_golay(time, q, window_s=0.2)
+    with pytest.raises(ValueError, match="more than order = 4"):
+        savitzky_golay(time, q, window_s=0.002)
