@@ -153,4 +153,4 @@ def _nearest(fits: Mapping[str, Fit], model: FrictionModel) -> Fit | None:
     for found in fits.values():
         if found.model.law is model.law and isinstance(found.model.schedule, Constant):
             return found
-    return next(reversed(fits.values()), None) if fits else None
+    return list(fits.values())[-1] if fits else None

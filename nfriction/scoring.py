@@ -185,7 +185,7 @@ def rmse_table(scores: Mapping[str, Sequence[Score]], horizon: str | None = None
     rows = []
     for of_model in scores.values():
         errors = [s.free_run if horizon is None else s.windows[horizon] for s in of_model]
-        square = np.mean([[*e.joints, e.all] for e in errors] ** np.float64(2), axis=0)
+        square = np.mean(np.square([[*e.joints, e.all] for e in errors]), axis=0)
         rows.append(np.sqrt(square))
     return np.array(rows)
 

@@ -11,8 +11,10 @@ from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from tqdm import tqdm
+
+from nfriction.compiled import Backend, integrate_compiled, wants_compiled
 
 logger = logging.getLogger(__name__)
 
@@ -52,6 +54,8 @@ class Rollout:
         time: [s], shape (steps + 1,) or (*batch, steps + 1).
         q: joint position [rad], shape (*batch, steps + 1, joint).
         qd: joint velocity [rad/s], same shape.
+        qdd: joint acceleration known at each sample, that of the step before (at the start: without
+            friction) [rad/s^2], same shape; with `qd` it drives the coefficients.
         diverged_at: time [s] at which a candidate stopped being finite, infinity where it never
             did, shape (*batch,).
     """
@@ -59,6 +63,7 @@ class Rollout:
     time: Tensor
     q: Tensor
     qd: Tensor
+    qdd: Tensor
     diverged_at: Tensor
 
     @property
@@ -148,6 +153,8 @@ def rollout(
     drive: Literal["simulated", "measured"] = "simulated",
     measured: tuple[Tensor, Tensor] | None = None,
     gradients: bool | None = None,
+    backend: Backend = "auto",
+    threads: int = 1,
     progress: bool = False,
 ) -> Rollout:
     """Simulate a plant with friction from an initial state.
@@ -166,7 +173,10 @@ def rollout(
         measured: velocity and acceleration for `drive="measured"`, each (*batch, steps, joint).
         gradients: record gradients; None does so where any input asks for it and there are at
             most 10,000 steps (a longer graph takes gigabytes).
-        progress: show a progress bar.
+        backend: `"torch"` steps in eager torch; `"c"` and `"numba"` compile the same definition
+            (no gradients); `"auto"` compiles where it can.
+        threads: a compiled batch is shared out among this many.
+        progress: show a progress bar (eager torch only; compiled rollouts take milliseconds).
 
     Returns:
         Rollout with `q` and `qd` of shape (*batch, steps + 1, joint). A diverging candidate is
@@ -175,38 +185,99 @@ def rollout(
     Raises:
         ValueError: if shapes do not fit, inputs are not finite, or the friction is so steep at
             rest that the integration would be unstable.
+        CodegenError: if a backend asked for by name cannot serve.
     """
     q, qd, torque, step, steps = _prepare(plant, friction, q0, qd0, tau, sample_time, steps)
     if (drive == "measured") != (measured is not None):
         raise ValueError('`measured=(qd, qdd)` goes with `drive="measured"`, and only with it.')
     _refuse_unstable(plant, friction, float(step.max()) / substeps)
     if gradients is None:
-        gradients = torch.is_grad_enabled() and steps <= GRADIENT_STEPS
-    context = contextlib.nullcontext() if gradients else torch.no_grad()
-    inner = step / substeps
-    positions, velocities = [q], [qd]
-    with context:
-        qdd = plant.forward_dynamics(q, qd, torque[..., 0, :])
-        for k in tqdm(range(steps), disable=not progress, unit="step", leave=False):
-            driven = None if measured is None else (measured[0][..., k, :], measured[1][..., k, :])
-            for _ in range(substeps):
-                held = None
-                if friction is not None:
-                    held = friction.coefficients(*(driven or (qd, qdd)))
-                q, qd, qdd = rk4_step(
-                    plant, friction, q, qd, torque[..., k, :], held, inner[..., k, None]
-                )
-            positions.append(q)
-            velocities.append(qd)
-        shape = torch.broadcast_shapes(*(p.shape for p in (positions[0], positions[-1])))
-        q_all = torch.stack([p.expand(shape) for p in positions], -2)
-        qd_all = torch.stack([v.expand(shape) for v in velocities], -2)
+        gradients = (
+            torch.is_grad_enabled()
+            and steps <= GRADIENT_STEPS
+            and _asks_gradients(plant, friction, q, qd, torque)
+        )
+    return integrate(
+        plant, friction, q, qd, torque, step, substeps=substeps, measured=measured,
+        gradients=gradients, backend=backend, threads=threads, progress=progress,
+    )  # fmt: skip
+
+
+def integrate(
+    plant: Plant,
+    friction: Friction | None,
+    q0: Tensor,
+    qd0: Tensor,
+    tau: Tensor,
+    step: Tensor,
+    *,
+    substeps: int = 1,
+    measured: tuple[Tensor, Tensor] | None = None,
+    gradients: bool = False,
+    backend: Backend = "auto",
+    threads: int = 1,
+    progress: bool = False,
+) -> Rollout:
+    """`rollout` without its checks, for searches whose trials may well be unstable.
+
+    Shapes: q0, qd0 (*batch, joint); tau (*batch, steps, joint) and step (*batch, steps), or
+    without the batch; the rest as in `rollout`.
+    """
+    states = None
+    if wants_compiled(backend, q0, gradients):
+        states = integrate_compiled(
+            plant, friction, q0, qd0, tau, step, substeps, measured, backend, threads
+        )
+    if states is None:
+        with contextlib.nullcontext() if gradients else torch.no_grad():
+            states = _integrate(plant, friction, q0, qd0, tau, step, substeps, measured, progress)
     time = torch.cat([torch.zeros_like(step[..., :1]), step.cumsum(-1)], -1)
-    diverged_at = _divergence(time, q_all, qd_all)
+    q, qd, qdd = states
+    diverged_at = _divergence(time, q, qd)
     if torch.isfinite(diverged_at).any():
         lost = (time >= diverged_at[..., None])[..., None]
-        q_all, qd_all = (x.masked_fill(lost, torch.nan) for x in (q_all, qd_all))
-    return Rollout(time, q_all, qd_all, diverged_at)
+        q, qd, qdd = (x.masked_fill(lost, torch.nan) for x in states)
+    return Rollout(time, q, qd, qdd, diverged_at)
+
+
+def _integrate(
+    plant: Plant,
+    friction: Friction | None,
+    q: Tensor,
+    qd: Tensor,
+    tau: Tensor,
+    step: Tensor,
+    substeps: int,
+    measured: tuple[Tensor, Tensor] | None,
+    progress: bool,
+) -> tuple[Tensor, ...]:
+    """States at every sample in eager torch: q, qd, qdd, each (*batch, steps + 1, joint)."""
+    inner = step / substeps
+    qdd = plant.forward_dynamics(q, qd, tau[..., 0, :])
+    states = [(q, qd, qdd)]
+    for k in tqdm(range(step.shape[-1]), disable=not progress, unit="step", leave=False):
+        driven = None if measured is None else (measured[0][..., k, :], measured[1][..., k, :])
+        for _ in range(substeps):
+            held = None if friction is None else friction.coefficients(*(driven or (qd, qdd)))
+            q, qd, qdd = rk4_step(
+                plant, friction, q, qd, tau[..., k, :], held, inner[..., k, None]
+            )
+        states.append((q, qd, qdd))
+    shape = states[-1][0].shape
+    return tuple(torch.stack([x.expand(shape) for x in one], -2) for one in zip(*states, strict=True))
+
+
+def _asks_gradients(
+    plant: Plant, friction: Friction | None, *inputs: Tensor
+) -> bool:
+    """Whether anything that shapes the motion requires a gradient."""
+    owned = [
+        t
+        for module in (plant, friction)
+        if isinstance(module, nn.Module)
+        for t in (*module.parameters(), *module.buffers())
+    ]
+    return any(t.requires_grad for t in (*inputs, *owned))
 
 
 def _prepare(

@@ -11,17 +11,27 @@ def c_source(parts: Pieces) -> str:
     """The C translation unit of a rollout."""
     known = parts.inputs | parts.hoisted
     below = {n.number: known[n.number] for n in parts.once} | parts.inputs
+    seldom = "NF_SELDOM static "
     functions = [
-        c_function("nf_once", ONCE, {"once": parts.once}, parts.inputs),
+        c_function("nf_once", ONCE, {"once": parts.once}, parts.inputs, qualifier=seldom),
         c_function("nf_step", STEP, {"step": parts.step}, below, collect=True),
         c_function("nf_stage", STAGE, {"qdd": parts.stage}, known, collect=True),
-        c_function("nf_start", START, {"qdd": parts.start}, parts.inputs),
+        c_function("nf_start", START, {"qdd": parts.start}, parts.inputs, qualifier=seldom),
     ]
     driver = _C_DRIVER.substitute(
         N=parts.joints, NO=max(1, len(parts.once)), NS=max(1, len(parts.step))
     )
-    return "\n".join([c_prelude(), lanes.PRELUDE, *functions, driver])
+    return "\n".join([c_prelude(), lanes.PRELUDE, _SELDOM, *functions, driver])
 
+
+# These functions are long and run once a rollout: optimising them would double the compile time.
+_SELDOM = """\
+#if defined(__GNUC__) && !defined(__clang__)
+#define NF_SELDOM __attribute__((optimize("O0")))
+#else
+#define NF_SELDOM
+#endif
+"""
 
 _C_DRIVER = Template("""\
 #if defined(_WIN32)
@@ -45,7 +55,7 @@ static ptrdiff_t nf_candidate(ptrdiff_t steps, ptrdiff_t every, double limit, co
     const double *q0, const double *qd0, const double *h, ptrdiff_t h_step,
     const double *torque, ptrdiff_t torque_step,
     const double *qd_drive, const double *qdd_drive, ptrdiff_t drive_step,
-    double *q_out, double *qd_out)
+    double *q_out, double *qd_out, double *qdd_out)
 {
     double once[$NO], step[$NS];
     double q[N], qd[N], held[N], prev[N], x[N], tau[N];
@@ -56,10 +66,12 @@ static ptrdiff_t nf_candidate(ptrdiff_t steps, ptrdiff_t every, double limit, co
         q_out[i] = q[i] = q0[i];
         qd_out[i] = qd[i] = qd0[i];
     }
+    nf_once(p, once);
+    nf_start(p, torque, q, qd, prev);
+    for (i = 0; i < N; ++i) qdd_out[i] = prev[i];
     q_out += N;
     qd_out += N;
-    nf_once(p, once);
-    if (steps > 0) nf_start(p, torque, q, qd, prev);
+    qdd_out += N;
     for (k = 0; k < steps; ++k) {
         const double dt = h[k * h_step], half = 0.5 * dt, sixth = dt / 6.0;
         for (i = 0; i < N; ++i) {
@@ -94,17 +106,20 @@ static ptrdiff_t nf_candidate(ptrdiff_t steps, ptrdiff_t every, double limit, co
             prev[i] = a1[i];
         }
         if (!nf_within(q, qd, limit)) {
-            for (; next <= steps; next += every, q_out += N, qd_out += N)
-                for (i = 0; i < N; ++i) q_out[i] = qd_out[i] = HUGE_VAL - HUGE_VAL;
+            for (; next <= steps; next += every, q_out += N, qd_out += N, qdd_out += N)
+                for (i = 0; i < N; ++i)
+                    q_out[i] = qd_out[i] = qdd_out[i] = HUGE_VAL - HUGE_VAL;
             return k + 1;
         }
         if (k + 1 == next) {
             for (i = 0; i < N; ++i) {
                 q_out[i] = q[i];
                 qd_out[i] = qd[i];
+                qdd_out[i] = prev[i];
             }
             q_out += N;
             qd_out += N;
+            qdd_out += N;
             next += every;
         }
     }
@@ -116,7 +131,7 @@ NF_EXPORT void nf_rollout(ptrdiff_t first, ptrdiff_t last, ptrdiff_t steps, ptrd
     const double *h, ptrdiff_t h_row, ptrdiff_t h_step,
     const double *torque, ptrdiff_t torque_row, ptrdiff_t torque_step,
     const double *qd_drive, const double *qdd_drive, ptrdiff_t drive_row, ptrdiff_t drive_step,
-    double *q_out, double *qd_out, ptrdiff_t *diverged)
+    double *q_out, double *qd_out, double *qdd_out, ptrdiff_t *diverged)
 {
     const ptrdiff_t records = (steps / every + 1) * N;
     ptrdiff_t c;
@@ -124,6 +139,6 @@ NF_EXPORT void nf_rollout(ptrdiff_t first, ptrdiff_t last, ptrdiff_t steps, ptrd
         diverged[c] = nf_candidate(steps, every, limit, p + c * p_row, q0 + c * N, qd0 + c * N,
             h + c * h_row, h_step, torque + c * torque_row, torque_step,
             qd_drive + c * drive_row, qdd_drive + c * drive_row, drive_step,
-            q_out + c * records, qd_out + c * records);
+            q_out + c * records, qd_out + c * records, qdd_out + c * records);
 }
 """)

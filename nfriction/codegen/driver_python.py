@@ -61,7 +61,8 @@ def _python_names(parts: Pieces) -> dict[str, object]:
         "qd_args": ", ".join(_names("qd", count)),
         "tau_args": ", ".join(_names("tau", count)),
         "initial": lines("q_# = q0[#]; qd_# = qd0[#]; q_out[#] = q_#; qd_out[#] = qd_#", 4),
-        "first_tau": lines("tau_# = torque[#]", 8),
+        "first_tau": lines("tau_# = torque[#]", 4),
+        "first_qdd": lines("qdd_out[#] = qdd_held_#", 4),
         "start_out": each("qdd_held_#"),
         "seed": lines("qdd_held_# = 0.0", 4),
         "take": lines("tau_# = torque[k * torque_step + #]; qd_held_# = qd_#", 8),
@@ -86,7 +87,9 @@ def _python_names(parts: Pieces) -> dict[str, object]:
             8,
         ),
         "within": " and ".join(f"abs(qd_{i}) <= limit and q_{i} - q_{i} == 0.0" for i in n),
-        "record": lines("q_out[at + #] = q_#; qd_out[at + #] = qd_#", 12),
+        "record": lines(
+            "q_out[at + #] = q_#; qd_out[at + #] = qd_#; qdd_out[at + #] = qdd_held_#", 12
+        ),
     }
 
 
@@ -94,16 +97,16 @@ _PYTHON_DRIVER = Template("""\
 @njit(error_model="numpy", fastmath={"contract"})
 def nf_candidate(
     steps, every, limit, p, q0, qd0, h, h_step, torque, torque_step,
-    qd_drive, qdd_drive, drive_step, q_out, qd_out,
+    qd_drive, qdd_drive, drive_step, q_out, qd_out, qdd_out,
 ):
     once = np.empty($NO)
     step = np.empty($NS)
     $initial
     $seed
     nf_once(p, once)
-    if steps > 0:
-        $first_tau
-        $start_out = nf_start(p, $tau_args, $q_args, $qd_args)
+    $first_tau
+    $start_out = nf_start(p, $tau_args, $q_args, $qd_args)
+    $first_qdd
     at = $N
     next = every
     for k in range(steps):
@@ -125,6 +128,7 @@ def nf_candidate(
         if not ($within):
             q_out[at:] = math.nan
             qd_out[at:] = math.nan
+            qdd_out[at:] = math.nan
             return k + 1
         if k + 1 == next:
             $record
@@ -137,7 +141,7 @@ def nf_candidate(
 def nf_rollout(
     first, last, steps, every, limit, p, p_row, q0, qd0, h, h_row, h_step,
     torque, torque_row, torque_step, qd_drive, qdd_drive, drive_row, drive_step,
-    q_out, qd_out, diverged,
+    q_out, qd_out, qdd_out, diverged,
 ):
     records = (steps // every + 1) * $N
     for c in range(first, last):
@@ -146,5 +150,6 @@ def nf_rollout(
             h[c * h_row :], h_step, torque[c * torque_row :], torque_step,
             qd_drive[c * drive_row :], qdd_drive[c * drive_row :], drive_step,
             q_out[c * records : (c + 1) * records], qd_out[c * records : (c + 1) * records],
+            qdd_out[c * records : (c + 1) * records],
         )
 """)

@@ -46,12 +46,15 @@ class Trajectories(NamedTuple):
     Attributes:
         q, qd: positions and velocities [rad, rad/s], shape (candidate, record, joint); NaN from
             where a candidate diverged.
+        qdd: acceleration known at each record [rad/s^2]: of the first stage of the step before it,
+            at the start that without friction; same shape.
         diverged_step: step after which the state was not finite or too fast, -1 where it never
             was, shape (candidate,).
     """
 
     q: Any
     qd: Any
+    qdd: Any
     diverged_step: Any
 
 
@@ -121,7 +124,7 @@ def _c_kernel(source: str) -> Callable[..., None]:
     function.restype = None
     function.argtypes = [
         *(size, size, size, size, real, array, size, array, array, array, size, size),
-        *(array, size, size, array, array, size, size, array, array, array),
+        *(array, size, size, array, array, size, size, array, array, array, array),
     ]
 
     def call(*args: Any) -> None:
@@ -208,7 +211,7 @@ class CompiledRollout:
         p, counts = arguments.parameter_rows(self._lifted.values(), parameters or {})
         counts |= {"q0": len(q), "qd0": len(qd), "time_step": h.rows, "tau": torque.rows}
         count = arguments.candidates({**counts, "drive": measured[0].rows})
-        out = [np.empty((count, steps // every + 1, n)) for _ in range(2)]
+        out = [np.empty((count, steps // every + 1, n)) for _ in range(3)]
         diverged = np.empty(count, dtype=np.intp)
         shared = (
             *(steps, every, float(speed_limit)),
@@ -216,13 +219,13 @@ class CompiledRollout:
             *(arguments.repeated(q, count), arguments.repeated(qd, count)),
             *(h.values, h.row, h.step, torque.values, torque.row, torque.step),
             *(measured[0].values, measured[1].values, measured[0].row, measured[0].step),
-            *(out[0].reshape(-1), out[1].reshape(-1), diverged),
+            *(*(a.reshape(-1) for a in out), diverged),
         )
         self._run(count, threads, shared)
         if isinstance(q0, Tensor):
             tensors = [torch.from_numpy(a) for a in (*out, diverged)]
-            return Trajectories(tensors[0], tensors[1], tensors[2])
-        return Trajectories(out[0], out[1], diverged)
+            return Trajectories(*tensors)
+        return Trajectories(*out, diverged)
 
     def check(self, states: int = 3) -> None:
         """Compare two steps from random states with the same steps in eager torch.

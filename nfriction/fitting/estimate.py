@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -129,7 +129,8 @@ def fit(
     terms = _terms(plant, joint, fit_plant, drag)
     vector = None if start is None else start._plant_vector
     noise = FIRST_NOISE if start is None else effective_noise(start._residuals)
-    result: LeastSquaresResult | None = None
+    if not windows:
+        raise ValueError("`windows` must name at least one window length [s].")
     for length in windows:
         problem = TrajectoryProblem(
             plant, model, cut_windows(joint, moved, length), terms, noise,
@@ -139,15 +140,20 @@ def fit(
         x0 = problem.start(vector)
         stage = f"{length:g} s windows"
         result = solve_trajectory(
-            problem, x0, max_steps=max_steps,
-            callback=None if callback is None else lambda _, step, s=stage: callback(s, step),
-        )  # fmt: skip
+            problem, x0, max_steps=max_steps, callback=_told(callback, stage)
+        )
         vector = problem.split(result.x)[1].clone()
         residuals = problem.residuals(result.x) * problem.noise_sd
         noise = effective_noise(residuals)
         if result.status == "stopped":
             break
     return _fit_of(problem, result, residuals, moved)
+
+
+def _told(
+    callback: Callable[[str, Step], bool | None] | None, stage: str
+) -> Callable[[Tensor, Step], bool | None] | None:
+    return None if callback is None else lambda _, step: callback(stage, step)
 
 
 def effective_noise(residuals: Tensor) -> float:

@@ -16,41 +16,10 @@ from torch import Tensor
 from nfriction.fitting.plant_parameters import PlantParameter, adjusted_buffers
 from nfriction.friction import FrictionModel
 from nfriction.plant import LinearAxis, PendulumChain
-from nfriction.simulation import rk4_step
+from nfriction.simulation import Rollout, rk4_step
 
 # Samples linearised together: their dual numbers should stay in the processor's cache.
 CHUNK = 1024
-
-
-@dataclass(frozen=True)
-class Motions:
-    """States at the start of every step of a batch of windows, each (step, window, joint)."""
-
-    q: Tensor
-    qd: Tensor
-    qdd: Tensor
-    last_q: Tensor
-
-
-def simulate(
-    plant: PendulumChain | LinearAxis,
-    friction: FrictionModel,
-    q0: Tensor,
-    qd0: Tensor,
-    qdd0: Tensor,
-    tau: Tensor,
-    step: Tensor,
-) -> Motions:
-    """Motion of windows from given states; shapes (window, joint), tau (window, step, joint)."""
-    q, qd, qdd = q0, qd0, qdd0
-    states: tuple[list[Tensor], list[Tensor], list[Tensor]] = ([], [], [])
-    with torch.no_grad():
-        for k in range(step.shape[1]):
-            for store, value in zip(states, (q, qd, qdd), strict=True):
-                store.append(value)
-            held = friction.coefficients(qd, qdd)
-            q, qd, qdd = rk4_step(plant, friction, q, qd, tau[:, k], held, step[:, k, None])
-    return Motions(*(torch.stack(s) for s in states), last_q=q)
 
 
 @dataclass(frozen=True)
@@ -69,37 +38,42 @@ class StepMaps:
 def step_maps(
     plant: PendulumChain | LinearAxis,
     friction: FrictionModel,
-    motions: Motions,
+    motion: Rollout,
     tau: Tensor,
     step: Tensor,
     parameters: list[PlantParameter],
     vector: Tensor,
     run: int,
 ) -> Iterator[StepMaps]:
-    """Linearise all steps, `run` of them at a time, in order."""
-    steps, windows, joints = motions.q.shape
+    """Linearise all steps, `run` of them at a time, in order.
+
+    Args:
+        plant: the mechanism as given.
+        friction: the friction model.
+        motion: of the windows, (window, step + 1, joint).
+        tau: torque held over each step, (window, step, joint).
+        step: [s], (window, step).
+        parameters, vector: adjustable terms of the plant and where they stand.
+        run: steps to a piece.
+    """
+    windows, steps = step.shape
+    joints = motion.q.shape[-1]
+
+    def samples(x: Tensor, part: slice, width: int) -> Tensor:
+        return x[:, part].transpose(0, 1).reshape(-1, width)
+
     for start in range(0, steps, run):
         part = slice(start, min(start + run, steps))
-        q, qd, qdd = (x[part].reshape(-1, joints) for x in (motions.q, motions.qd, motions.qdd))
+        q, qd, qdd = (samples(x, part, joints) for x in (motion.q, motion.qd, motion.qdd))
         held = friction.coefficients(qd, qdd).detach()
         held = held.expand(*qd.shape, held.shape[-1])
-        by = [
-            _directional(plant, friction, *piece, parameters, vector)
-            for piece in zip(
-                *(
-                    x.split(CHUNK)
-                    for x in (
-                        q,
-                        qd,
-                        held,
-                        tau[:, part].transpose(0, 1).reshape(-1, joints),
-                        step[:, part].transpose(0, 1).reshape(-1, 1),
-                    )
-                ),
-                strict=True,
-            )
-        ]
-        derivative = torch.cat(by, 0)
+        every = (q, qd, held, samples(tau, part, joints), samples(step, part, 1))
+        derivative = torch.cat(
+            [
+                _directional(plant, friction, a, b, c, d, e, parameters, vector)
+                for a, b, c, d, e in zip(*(x.split(CHUNK) for x in every), strict=True)
+            ]
+        )
         maps = _compose(friction, derivative, qd, qdd, len(parameters))
         shape = (part.stop - part.start, windows, 3 * joints, -1)
         yield StepMaps(*(m.reshape(shape) for m in maps))
@@ -120,7 +94,7 @@ def _directional(
 
     Directions: q, qd, held coefficients (joint-major), plant parameters.
     """
-    samples, joints = q.shape
+    joints = q.shape[-1]
     k = held.shape[-1]
     count = 2 * joints + joints * k + len(parameters)
     unit = torch.eye(count, dtype=q.dtype)

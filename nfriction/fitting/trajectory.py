@@ -13,10 +13,11 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.plant_parameters import PlantParameter, adjusted_buffers
-from nfriction.fitting.sensitivity import Motions, simulate, step_maps
+from nfriction.fitting.sensitivity import step_maps
 from nfriction.fitting.windows import Windows
 from nfriction.friction import FrictionModel
 from nfriction.plant import LinearAxis, PendulumChain
+from nfriction.simulation import Rollout, integrate
 from nfriction.solve.levenberg import LeastSquaresResult, LevenbergMarquardt, Quadratic, Step
 
 logger = logging.getLogger(__name__)
@@ -58,7 +59,7 @@ class TrajectoryProblem:
         self.shared_count = self.friction_count + len(self.plant_terms)
         self.step = w.step.repeat_interleave(self.substeps, 1) / self.substeps
         self.tau = w.tau.repeat_interleave(self.substeps, 1)
-        self._simulated: tuple[Tensor, Motions] | None = None
+        self._simulated: tuple[Tensor, Rollout] | None = None
 
     def start(self, plant_vector: Tensor | None = None) -> Tensor:
         """Unknowns at the model's present parameters and the smoothed window states."""
@@ -89,8 +90,7 @@ class TrajectoryProblem:
 
     def residuals(self, x: Tensor) -> Tensor:
         """Weighted position error over the noise, (window, step + 1, joint)."""
-        motions = self._simulate(x)
-        q = torch.cat([motions.q[:: self.substeps], motions.last_q[None]]).transpose(0, 1)
+        q = self._simulate(x).q[:, :: self.substeps]
         error = (q - self.windows.q) @ self.mixing.T
         return error * (self.windows.weight[..., None] / self.noise_sd)
 
@@ -108,7 +108,7 @@ class TrajectoryProblem:
         self._scatter(gradient, hessian, own, shared)
         return Quadratic(self.cost(x), gradient, hessian)
 
-    def _simulate(self, x: Tensor) -> Motions:
+    def _simulate(self, x: Tensor) -> Rollout:
         """Motion at `x`; the last one is kept, as a step's cost and model ask for the same."""
         if self._simulated is not None and torch.equal(self._simulated[0], x):
             return self._simulated[1]
@@ -116,9 +116,9 @@ class TrajectoryProblem:
         self.friction.schedule.set_parameter_vector(parameters)
         q0, qd0 = state.chunk(2, -1)
         plant = self.plant_at(plant_vector)
-        motions = simulate(plant, self.friction, q0, qd0, self.windows.qdd0, self.tau, self.step)
-        self._simulated = (x.clone(), motions)
-        return motions
+        motion = integrate(plant, self.friction, q0, qd0, self.tau, self.step)
+        self._simulated = (x.clone(), motion)
+        return motion
 
     def _prior(self) -> tuple[Tensor, Tensor]:
         """Prior precision and mean of every unknown."""
@@ -138,8 +138,8 @@ class TrajectoryProblem:
     def _normal_equations(self, x: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
         """J^T r and J^T J of each window over [friction, plant, its own state]."""
         _, plant_vector, _ = self.split(x)
-        motions = self._simulate(x)
-        steps, windows, joints = motions.q.shape
+        motion = self._simulate(x)
+        windows, joints = self.windows.q0.shape
         columns = self.shared_count + 2 * joints
         carried = torch.zeros(windows, 3 * joints, columns, dtype=torch.float64)
         carried[:, : 2 * joints, self.shared_count :] = torch.eye(2 * joints, dtype=torch.float64)
@@ -156,7 +156,7 @@ class TrajectoryProblem:
 
         sample = 0
         for maps in step_maps(
-            self.plant, self.friction, motions, self.tau, self.step, self.plant_terms,
+            self.plant, self.friction, motion, self.tau, self.step, self.plant_terms,
             plant_vector, RUN * self.substeps,
         ):  # fmt: skip
             rows = []

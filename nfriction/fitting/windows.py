@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -20,7 +21,7 @@ class Windows:
         tau: torque held over each step [N m], (window, step, joint).
         step: [s], (window, step); zero where a window ends early.
         weight: 1 where a sample counts, 0 where it pads, (window, step + 1).
-        q0, qd0, qdd0: smoothed state at the start, (window, joint).
+        q0, qd0: smoothed state at the start, (window, joint).
         names: recording that each window comes from.
     """
 
@@ -30,7 +31,6 @@ class Windows:
     weight: Tensor
     q0: Tensor
     qd0: Tensor
-    qdd0: Tensor
     names: tuple[str, ...]
 
     def __len__(self) -> int:
@@ -55,7 +55,7 @@ def cut_windows(
         span = recording.time[-1] - recording.time[0]
         count = max(1, int(span / length + 0.5))
         edges = np.linspace(0, len(recording.time) - 1, count + 1).astype(int)
-        pieces += [(recording, motion, a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        pieces += [(recording, motion, a, b) for a, b in pairwise(edges)]
     steps = max(b - a for _, _, a, b in pieces)
     joints = recordings[0].q.shape[1]
     q = np.zeros((len(pieces), steps + 1, joints))
@@ -70,10 +70,10 @@ def cut_windows(
         weight[i, : n + 1] = 1.0
         if recording.tau is not None:
             tau[i, :n] = recording.tau[a:b]
-    starts = [
-        np.stack([getattr(m, name)[a] for _, m, a, _ in pieces]) for name in ("q", "qd", "qdd")
+    start = [
+        np.stack([getattr(m, name)[a] for _, m, a, _ in pieces]) for name in ("q", "qd")
     ]
-    return Windows(
-        *(torch.as_tensor(x, dtype=torch.float64) for x in (q, tau, step, weight, *starts)),
-        names=tuple(r.name for r, _, _, _ in pieces),
+    q_, tau_, step_, weight_, q0, qd0 = (
+        torch.as_tensor(x, dtype=torch.float64) for x in (q, tau, step, weight, *start)
     )
+    return Windows(q_, tau_, step_, weight_, q0, qd0, tuple(r.name for r, _, _, _ in pieces))

@@ -25,6 +25,9 @@ class Coefficient:
         linear: the torque is linear in it, so least squares finds it directly.
         search: candidate values tried by the torque fit where the torque is not linear in it.
         fitted: estimated by default; otherwise kept at its initial value.
+
+    Raises:
+        ValueError: if the torque is not linear in it and there is nothing to search.
     """
 
     name: str
@@ -33,6 +36,12 @@ class Coefficient:
     linear: bool = True
     search: tuple[float, ...] = ()
     fitted: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.linear and not self.search:
+            raise ValueError(
+                f"coefficient {self.name!r} is not linear, so `search` needs values to try for it."
+            )
 
 
 @dataclass(frozen=True)
@@ -43,14 +52,29 @@ class Law:
         name: name of the law.
         coefficients: description of each entry of the coefficients' last axis, in order.
         torque: `(qd, load, coefficients, v_smooth) -> tau_f`, elementwise and scriptable.
+
+    Raises:
+        ValueError: if there is no coefficient, or two bear the same name.
+
+    Examples:
+        >>> def drag(qd, load, coefficients, v_smooth):
+        ...     return coefficients[..., 0] * qd * qd.abs()
+        >>> DRAG = Law("drag", (Coefficient("D", "N m s^2/rad^2"),), drag)
     """
 
     name: str
     coefficients: tuple[Coefficient, ...]
     torque: TorqueFunction
 
+    def __post_init__(self) -> None:
+        if not self.names or len(set(self.names)) < len(self.names):
+            raise ValueError(
+                f"law {self.name!r} needs coefficients with names of their own, got {self.names}."
+            )
+
     @property
     def names(self) -> tuple[str, ...]:
+        """Names of the coefficients, in order."""
         return tuple(c.name for c in self.coefficients)
 
 
@@ -138,9 +162,11 @@ def stribeck(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) ->
         Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30 (1994), eq. (8).
     """
     f_c, f_d, f_v, v_s, delta = coefficients.unbind(-1)
-    # The square keeps the derivative finite at qd = 0 for every delta; 1e-12 is far below v_smooth.
-    ratio = (qd / v_s).square() + 1e-12
-    drop = torch.exp(-torch.exp(0.5 * delta * torch.log(ratio)))
+    # A millionth of v_s is added in quadrature, so that the power's slope is finite at qd = 0 for
+    # every delta. The power stops at e^7, where the exponential underflows: 0 times its infinite
+    # slope would be NaN.
+    log_ratio = 0.5 * torch.log((qd / v_s).square() + 1e-12)
+    drop = torch.exp(-torch.exp((delta * log_ratio).clamp(max=7.0)))
     return (f_c + f_d * drop) * smooth_sign(qd, v_smooth) + f_v * qd
 
 

@@ -1,5 +1,6 @@
 """Friction models: a law times a schedule, `tau_f = model(qd, qdd, load)`."""
 
+import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -27,6 +28,9 @@ class FrictionModel(nn.Module):
     Shape:
         qd, qdd, load: (*batch, joint); output (*batch, joint).
 
+    Raises:
+        ValueError: if `v_smooth` is not positive, or law and schedule name other coefficients.
+
     Examples:
         >>> model = LFM(joints=3, initial=[1e-3, 2e-3])
         >>> qd = torch.ones(3, dtype=torch.float64)
@@ -36,8 +40,13 @@ class FrictionModel(nn.Module):
 
     def __init__(self, law: Law, schedule: Schedule, v_smooth: float = V_SMOOTH) -> None:
         super().__init__()
-        if not v_smooth > 0:
-            raise ValueError(f"`v_smooth` must be positive [rad/s], got {v_smooth}.")
+        if not 0 < v_smooth < math.inf:
+            raise ValueError(f"`v_smooth` must be positive and finite [rad/s], got {v_smooth}.")
+        if tuple(schedule.coefficient_names) != law.names:
+            raise ValueError(
+                f"the schedule gives {', '.join(schedule.coefficient_names)}, but the law "
+                f"{law.name!r} takes {', '.join(law.names)}; make it for this law."
+            )
         self.law = law
         self.schedule = schedule
         self.v_smooth = float(v_smooth)
@@ -55,7 +64,10 @@ class FrictionModel(nn.Module):
         return self.law_torque(qd, load, self.schedule(qd, qdd), self.v_smooth)
 
     def coefficients(self, qd: Tensor, qdd: Tensor) -> Tensor:
-        """Coefficients of the law at a motion, shape (*batch, joint, coefficient)."""
+        """Coefficients of the law at a motion, shape (*batch, joint, coefficient).
+
+        The batch is left out where they do not depend on the motion.
+        """
         return self.schedule(qd, qdd)
 
     def torque(self, qd: Tensor, load: Tensor, coefficients: Tensor) -> Tensor:
@@ -67,8 +79,8 @@ class FrictionModel(nn.Module):
 
         What decides whether an explicit integrator stays stable near standstill.
         """
-        parameter = next(self.parameters())
-        rest = torch.zeros(self.joints, dtype=parameter.dtype, device=parameter.device)
+        like = next(self.parameters(), torch.zeros((), dtype=torch.float64))
+        rest = torch.zeros(self.joints, dtype=like.dtype, device=like.device)
         load = torch.ones_like(rest)
         with torch.no_grad():
             held = self.coefficients(rest, torch.zeros_like(rest))
@@ -78,7 +90,7 @@ class FrictionModel(nn.Module):
 
     def options(self) -> dict[str, Any]:
         """Constructor arguments beyond `joints` and `v_smooth`, as plain JSON."""
-        return {}
+        return self.schedule.options()
 
     def extra_repr(self) -> str:
         return f"law={self.law.name}, joints={self.joints}, v_smooth={self.v_smooth:g}"
@@ -164,16 +176,6 @@ class NeuroFuzzyModel(FrictionModel):
             prior_sd=prior_sd,
         )
         super().__init__(self.definition, schedule, v_smooth)
-
-    def options(self) -> dict[str, Any]:
-        s = self.schedule
-        return {
-            "terms": list(s.terms),
-            "head_units": s.head_units,
-            "acceleration": "along_motion" if s.along_motion else "signed",
-            "interpretable": s.interpretable,
-            "prior_sd": s.prior_sd,
-        }
 
 
 class NFNCFM(NeuroFuzzyModel):

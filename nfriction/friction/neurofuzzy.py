@@ -1,23 +1,30 @@
 """Coefficients as a neuro-fuzzy function of velocity and acceleration."""
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Final, Literal
 
 import torch
 from torch import Tensor, nn
-from torch.func import functional_call, grad, vmap
+from torch.func import functional_call, grad, jvp, vmap
 
 from nfriction.friction.laws import Law
 from nfriction.friction.schedules import Constant, Schedule, Sensitivity
 from nfriction.fuzzy import AnfisRBF
 
-# Roundness of the positive map, in units of the coefficient's scale: 0.05 leaves it linear for
-# all but the last twentieth above zero.
-ROUNDNESS = 0.05
-# Velocity over which "along the motion" turns [rad/s]; only feeds held coefficients.
-DIRECTION_SMOOTH = 3e-2
 # Samples whose parameter derivatives are formed at once.
 CHUNK = 4096
+# Below a hundredth of its scale a coefficient is as good as zero, and must be able to rise.
+LEAST_RATIO = 0.01
+
+
+def soft_positive(u: Tensor, roundness: float) -> Tensor:
+    """A positive number for every u, and u itself away from zero: `(u + sqrt(u^2 + 4 r^2)) / 2`."""
+    return 0.5 * (u + torch.sqrt(u * u + 4.0 * roundness * roundness))
+
+
+def soft_positive_inverse(y: Tensor, roundness: float) -> Tensor:
+    """The u for which `soft_positive(u, roundness)` is y > 0."""
+    return y - roundness * roundness / y
 
 
 class NeuroFuzzy(Schedule):
@@ -43,6 +50,16 @@ class NeuroFuzzy(Schedule):
         TLRIP paper, neuro-fuzzy friction estimation (5 x 5 sets, 25 rules, 10 radial basis units).
     """
 
+    # Final, so that TorchScript takes them for constants.
+    roundness: Final[float] = 0.05  # of the positive map, in units of a coefficient's scale
+    turn: Final[float] = 3e-3  # where qdd sgn(qd) turns, in units of the velocity's range
+
+    reference: Tensor
+    scale: Tensor
+    velocity_range: Tensor
+    acceleration_lower: Tensor
+    acceleration_upper: Tensor
+
     def __init__(
         self,
         law: Law,
@@ -60,14 +77,15 @@ class NeuroFuzzy(Schedule):
             raise ValueError(
                 f'`acceleration` must be "along_motion" or "signed", got {acceleration!r}.'
             )
+        if not prior_sd > 0:
+            raise ValueError(f"`prior_sd` must be positive, got {prior_sd}.")
         k = len(law.names)
         self.terms, self.head_units = tuple(terms), head_units
-        self.interpretable = interpretable
+        self.interpretable = bool(interpretable)
         self.along_motion = acceleration == "along_motion"
-        self.prior_sd = prior_sd
+        self.prior_sd = float(prior_sd)
         self.network = AnfisRBF(joints, 2, terms, k, units=head_units, interpretable=interpretable)
-        self.network.init_grid(torch.zeros(2), torch.ones(2))
-        self.register_buffer("positive", torch.tensor(self.positive_mask), persistent=False)
+        self.network.init_grid(0.0, 1.0)
         for name, shape in (
             ("reference", (joints, k)),
             ("scale", (joints, k)),
@@ -77,70 +95,86 @@ class NeuroFuzzy(Schedule):
         ):
             self.register_buffer(name, torch.ones(shape, dtype=torch.float64))
         self.set_reference(Constant(law, joints, initial).values)
-        self.set_range(torch.full((joints,), 20.0), torch.tensor([-200.0, 200.0]))
+        self.set_range(20.0, [-200.0, 200.0])
 
     def inputs(self, qd: Tensor, qdd: Tensor) -> Tensor:
         """Scaled inputs of the network in [0, 1], shape (*batch, joint, 2)."""
+        velocity = qd / self.velocity_range
         if self.along_motion:
-            qdd = qdd * torch.tanh(qd / 3e-2)
+            qdd = qdd * torch.tanh(velocity / self.turn)
         span = self.acceleration_upper - self.acceleration_lower
-        scaled = torch.stack(
-            [qd.abs() / self.velocity_range, (qdd - self.acceleration_lower) / span], -1
-        )
+        scaled = torch.stack([velocity.abs(), (qdd - self.acceleration_lower) / span], -1)
         return scaled.clamp(0.0, 1.0)
 
     def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
-        raw = self.reference + self.network(self.inputs(qd, qdd))
-        # (u + sqrt(u^2 + 4 r^2)) / 2: positive, and u itself away from zero.
-        lifted = 0.5 * (raw + torch.sqrt(raw * raw + 0.01))
-        return self.scale * torch.where(self.positive, lifted, raw)
+        return self._coefficients(self.reference + self.network(self.inputs(qd, qdd)))
+
+    def _coefficients(self, u: Tensor) -> Tensor:
+        return self.scale * torch.where(self.positive, soft_positive(u, self.roundness), u)
+
+    def reference_coefficients(self) -> Tensor:
+        """Coefficients of the constant law from which the network deviates, in SI."""
+        return self._coefficients(self.reference)
 
     @torch.no_grad()
     def set_reference(self, values: Tensor, scale: Tensor | None = None) -> None:
         """Set the constant law from which the network deviates.
 
+        A positive coefficient below a hundredth of its scale becomes a hundredth of it.
+
         Args:
             values: coefficients in SI, (joint, coefficient).
-            scale: how far a coefficient may deviate, (joint, coefficient); default its value.
+            scale: how far a coefficient may deviate, (joint, coefficient); at least its value,
+                which is also the default (1 where that is zero).
         """
-        size = values.abs() if scale is None else torch.maximum(values.abs(), scale)
-        self.scale.copy_(torch.where(size > 0, size, 1.0))
+        values = values.to(self.reference)
+        size = values.abs()
+        if scale is not None:
+            size = torch.maximum(size, scale.to(size))
+        self.scale.copy_(torch.where(size > 0, size, torch.ones_like(size)))
         ratio = values / self.scale
-        # Below a hundredth of its scale a coefficient is as good as zero, and must be able to rise.
-        above = ratio.clamp_min(0.01)
-        raw = torch.where(self.positive, above - ROUNDNESS**2 / above, ratio)
-        self.reference.copy_(raw)
+        lifted = soft_positive_inverse(ratio.clamp_min(LEAST_RATIO), self.roundness)
+        self.reference.copy_(torch.where(self.positive, lifted, ratio))
 
     @torch.no_grad()
-    def set_range(self, velocity: Tensor, acceleration: Tensor) -> None:
+    def set_range(
+        self,
+        velocity: Tensor | Sequence[float] | float,
+        acceleration: Tensor | Sequence[float],
+    ) -> None:
         """Set the trained range, outside which inputs are clamped.
 
         Args:
-            velocity: largest |velocity| of each joint [rad/s], (joint,).
-            acceleration: smallest and largest acceleration [rad/s^2], (joint, 2) or (2,).
+            velocity: largest |velocity| of each joint [rad/s], (joint,) or one for all.
+            acceleration: smallest and largest acceleration [rad/s^2], (joint, 2) or (2,); along
+                the motion where the schedule takes it so.
 
         Raises:
             ValueError: if a range is empty or not finite.
         """
-        velocity = torch.as_tensor(velocity, dtype=torch.float64)
-        acceleration = torch.as_tensor(acceleration, dtype=torch.float64)
-        lower, upper = acceleration.unbind(-1)
-        finite = torch.isfinite(velocity).all() and torch.isfinite(acceleration).all()
-        if not (finite and (velocity > 0).all() and (upper > lower).all()):
+        like = self.velocity_range
+        fastest = torch.as_tensor(velocity, dtype=like.dtype, device=like.device)
+        both = torch.as_tensor(acceleration, dtype=like.dtype, device=like.device)
+        lower, upper = both.unbind(-1)
+        finite = torch.isfinite(fastest).all() and torch.isfinite(both).all()
+        if not (finite and (fastest > 0).all() and (upper > lower).all()):
             raise ValueError(
                 "a range must be finite and not empty: velocity > 0 and lower < upper "
-                f"acceleration, got {velocity.tolist()} and {acceleration.tolist()}."
+                f"acceleration, got {fastest.tolist()} and {both.tolist()}."
             )
-        self.velocity_range.copy_(velocity)
+        self.velocity_range.copy_(fastest)
         self.acceleration_lower.copy_(lower)
         self.acceleration_upper.copy_(upper)
 
     def trained(self) -> dict[str, nn.Parameter]:
-        """The parameters that a trajectory fit varies: what enters the coefficients linearly."""
+        """The parameters that a trajectory fit varies, each (joint, coefficient, ...).
+
+        They are what enters the coefficients linearly. The head's bias stays at zero: the rules'
+        constants say the same, and twice the same parameter would halve the prior's pull.
+        """
         return {
-            name: p
-            for name, p in self.named_parameters()
-            if name.endswith(("consequents", "output_weight"))
+            "network.anfis.consequents": self.network.anfis.consequents,
+            "network.head.output_weight": self.network.head.output_weight,
         }
 
     def parameter_vector(self) -> Tensor:
@@ -153,37 +187,52 @@ class NeuroFuzzy(Schedule):
             p.copy_(part.reshape(p.shape))
 
     def bounds(self) -> tuple[Tensor, Tensor]:
-        free = torch.full_like(self.parameter_vector(), torch.inf)
-        return -free, free
+        vector = self.parameter_vector()
+        mask = torch.tensor(self.fitted_mask, device=vector.device)[:, None]
+        fitted = torch.cat(
+            [
+                mask.expand(self.joints, -1, p[0, 0].numel()).reshape(-1)
+                for p in self.trained().values()
+            ]
+        )
+        free = torch.full_like(vector, torch.inf)
+        return torch.where(fitted, -free, vector), torch.where(fitted, free, vector)
 
     def prior(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the parameter vector."""
         vector = self.parameter_vector()
         return torch.zeros_like(vector), torch.full_like(vector, self.prior_sd)
 
+    @torch.no_grad()
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
         trained = {name: p.detach() for name, p in self.trained().items()}
-        rest = {
-            n: t.detach() for n, t in self.state_dict(keep_vars=True).items() if n not in trained
-        }
 
         def one(values: dict[str, Tensor], qd: Tensor, qdd: Tensor, k: int) -> Tensor:
             # Joints share no parameter, so the sum over joints has every joint's gradient in it.
-            return functional_call(self, {**rest, **values}, (qd, qdd))[:, k].sum()
+            return functional_call(self, values, (qd, qdd))[:, k].sum()
 
-        count = len(self.coefficient_names)
         rows = []
-        for k in range(count):
-            per_sample = vmap(grad(lambda v, a, b, k=k: one(v, a, b, k)), (None, 0, 0),
-                              chunk_size=CHUNK)(trained, qd, qdd)  # fmt: skip
-            rows.append(torch.cat([g.reshape(qd.shape[0], -1) for g in per_sample.values()], -1))
+        for k in range(len(self.coefficient_names)):
+            gradients = vmap(grad(one), (None, 0, 0, None), chunk_size=CHUNK)
+            parts = gradients(trained, qd, qdd, k).values()
+            rows.append(torch.cat([g.reshape(qd.shape[0], -1) for g in parts], -1))
+        joints = torch.arange(self.joints, device=qd.device)
         joint = torch.cat(
-            [
-                torch.arange(self.joints).repeat_interleave(p.numel() // self.joints)
-                for p in trained.values()
-            ]
+            [joints.repeat_interleave(p.numel() // self.joints) for p in trained.values()]
         )
         ones, zeros = torch.ones_like(qd), torch.zeros_like(qd)
-        by_qd = torch.func.jvp(self.forward, (qd, qdd), (ones, zeros))[1].detach()
-        by_qdd = torch.func.jvp(self.forward, (qd, qdd), (zeros, ones))[1].detach()
+        by_qd = jvp(self.forward, (qd, qdd), (ones, zeros))[1]
+        by_qdd = jvp(self.forward, (qd, qdd), (zeros, ones))[1]
         return Sensitivity(torch.stack(rows, 1), joint, by_qd, by_qdd)
+
+    def options(self) -> dict[str, Any]:
+        return {
+            "terms": list(self.terms),
+            "head_units": self.head_units,
+            "acceleration": "along_motion" if self.along_motion else "signed",
+            "interpretable": self.interpretable,
+            "prior_sd": self.prior_sd,
+        }
+
+    def extra_repr(self) -> str:
+        return ", ".join(f"{name}={value!r}" for name, value in self.options().items())

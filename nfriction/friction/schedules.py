@@ -7,7 +7,7 @@ shape (*batch, joint) -> (*batch, joint, coefficient). Fits see it through `para
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -43,9 +43,17 @@ class Schedule(nn.Module, ABC):
     Args:
         law: the law whose coefficients are scheduled.
         joints: number of joints.
+
+    Attributes:
+        coefficient_names: names of the last axis.
+        fitted_mask: which coefficients are estimated by default.
+        positive: which coefficients are positive by physics, a buffer (coefficient,).
     """
 
     joints: int
+    coefficient_names: list[str]
+    fitted_mask: list[bool]
+    positive: Tensor
 
     def __init__(self, law: Law, joints: int) -> None:
         super().__init__()
@@ -53,12 +61,16 @@ class Schedule(nn.Module, ABC):
             raise ValueError(f"`joints` must be at least 1, got {joints}.")
         self.joints = joints
         self.coefficient_names = list(law.names)
-        self.positive_mask = [c.positive for c in law.coefficients]
         self.fitted_mask = [c.fitted for c in law.coefficients]
+        positive = torch.tensor([c.positive for c in law.coefficients])
+        self.register_buffer("positive", positive, persistent=False)
 
     @abstractmethod
     def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
-        """Coefficients (*batch, joint, coefficient) at velocity and acceleration (*batch, joint)."""
+        """Coefficients at velocity and acceleration of shape (*batch, joint).
+
+        Shape (*batch, joint, coefficient), or without the batch where the motion does not matter.
+        """
 
     @abstractmethod
     def parameter_vector(self) -> Tensor:
@@ -70,7 +82,7 @@ class Schedule(nn.Module, ABC):
 
     @abstractmethod
     def bounds(self) -> tuple[Tensor, Tensor]:
-        """Lower and upper bounds of the parameter vector."""
+        """Lower and upper bounds of the parameter vector; equal where nothing is to be fitted."""
 
     def prior(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the parameter vector; infinite where nothing is known."""
@@ -80,6 +92,10 @@ class Schedule(nn.Module, ABC):
     @abstractmethod
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
         """Derivatives of the coefficients at motions of shape (sample, joint)."""
+
+    def options(self) -> dict[str, Any]:
+        """Constructor arguments beyond law, joints and initial values, as plain JSON."""
+        return {}
 
 
 class Constant(Schedule):
@@ -98,7 +114,6 @@ class Constant(Schedule):
     def __init__(self, law: Law, joints: int, initial: Tensor | Sequence | None = None) -> None:
         super().__init__(law, joints)
         self.raw = nn.Parameter(torch.zeros(joints, len(law.names), dtype=torch.float64))
-        self.register_buffer("positive", torch.tensor(self.positive_mask), persistent=False)
         default = [
             c.search[len(c.search) // 2] if c.search else (1e-3 if c.positive else 0.0)
             for c in law.coefficients
@@ -118,47 +133,57 @@ class Constant(Schedule):
         """Set the coefficients in SI, shape (joint, coefficient) or (coefficient,).
 
         Raises:
-            ValueError: if the shape does not fit, or a coefficient that is positive by physics
-                is negative or not finite.
+            ValueError: if the shape does not fit, a coefficient is not finite, or one that is
+                positive by physics is negative.
         """
-        given = torch.as_tensor(values, dtype=torch.float64)
-        try:
-            given = given.broadcast_to(self.raw.shape)
-        except RuntimeError:
-            raise ValueError(
-                f"coefficients must be (joint, coefficient) = {tuple(self.raw.shape)} "
-                f"({', '.join(self.coefficient_names)}), got shape {tuple(given.shape)}."
-            ) from None
+        given = self._numbers(values)
         bad = ~torch.isfinite(given) | (self.positive & (given < 0))
         if bad.any():
             joint, k = (int(i) for i in bad.nonzero()[0])
             raise ValueError(
                 f"`{self.coefficient_names[k]}` of joint {joint + 1} must be finite"
-                f"{' and not negative' if self.positive_mask[k] else ''}, got {given[joint, k]:g}."
+                f"{' and not negative' if self.positive[k] else ''}, got {given[joint, k]:g}."
             )
-        log = torch.log(given.clamp_min(SMALLEST))
-        self.raw.copy_(torch.where(self.positive, log, given))
+        raw = torch.where(self.positive, torch.log(given.clamp_min(SMALLEST)), given)
+        # exp(log(x)) may miss x in its last digits; what stays the same keeps its bits.
+        self.raw.copy_(torch.where(given == self.values, self.raw, raw))
+
+    def _numbers(self, values: Tensor | Sequence) -> Tensor:
+        """Given coefficients as a tensor (joint, coefficient)."""
+        try:
+            given = torch.as_tensor(values, dtype=self.raw.dtype, device=self.raw.device)
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"coefficients must be an array of numbers, got {values!r}."
+            ) from error
+        if given.shape not in (self.raw.shape, self.raw.shape[1:]):
+            raise ValueError(
+                f"coefficients must be (joint, coefficient) = {tuple(self.raw.shape)} or one row "
+                f"for all joints ({', '.join(self.coefficient_names)}), got shape "
+                f"{tuple(given.shape)}."
+            )
+        return given.expand(self.raw.shape)
 
     def parameter_vector(self) -> Tensor:
-        return self.values.reshape(-1).clone()
+        return self.values.reshape(-1)
 
     def set_parameter_vector(self, vector: Tensor) -> None:
         self.set_coefficients(vector.reshape(self.raw.shape))
 
     def bounds(self) -> tuple[Tensor, Tensor]:
-        lower = torch.where(self.positive, SMALLEST, -torch.inf).expand(self.raw.shape)
-        upper = torch.full_like(self.raw, torch.inf)
-        fixed = ~torch.tensor(self.fitted_mask).expand(self.raw.shape)
-        lower = torch.where(fixed, self.values, lower.to(self.raw))
-        upper = torch.where(fixed, self.values, upper.detach())
-        return lower.reshape(-1), upper.reshape(-1)
+        values = self.values
+        fitted = torch.tensor(self.fitted_mask, device=values.device)
+        free = torch.full_like(values, torch.inf)
+        lower = torch.where(self.positive, torch.full_like(values, SMALLEST), -free)
+        lower = torch.where(fitted, lower, values)
+        return lower.reshape(-1), torch.where(fitted, free, values).reshape(-1)
 
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
         joints, k = self.raw.shape
         samples = qd.shape[0]
-        identity = torch.eye(k, dtype=self.raw.dtype).repeat(1, joints)
-        zero = torch.zeros((), dtype=self.raw.dtype).expand(samples, joints, k)
-        joint = torch.arange(joints).repeat_interleave(k)
+        identity = torch.eye(k, dtype=self.raw.dtype, device=self.raw.device).repeat(1, joints)
+        zero = self.raw.new_zeros(()).expand(samples, joints, k)
+        joint = torch.arange(joints, device=self.raw.device).repeat_interleave(k)
         return Sensitivity(identity.expand(samples, -1, -1), joint, zero, zero)
 
     def extra_repr(self) -> str:

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from nfriction.fuzzy import anfis_jacobian
+from nfriction.fuzzy.factored_jacobian import dense_jacobian
 from nfriction.fuzzy.layout import to_columns, to_rows
 from nfriction.fuzzy.least_squares import ridge
 from nfriction.fuzzy.membership import HALF_WIDTH_OF_GAUSSIAN, log_bell, log_gaussian
@@ -99,7 +101,7 @@ class Anfis(nn.Module):
         """
         columns = to_columns(x)
         weights = self.consequents.transpose(2, 3).flatten(1, 2)
-        blended = torch.bmm(weights, self._strengths(columns))
+        blended = torch.bmm(weights, self.strength_columns(columns))
         if self.order == 1:
             # The rules' planes are blended first, then evaluated once.
             planes = blended.unflatten(1, (self.outputs, self.inputs + 1))
@@ -112,7 +114,7 @@ class Anfis(nn.Module):
 
         They sum to 1 even where every rule underflows.
         """
-        return to_rows(self._strengths(to_columns(x)), x)
+        return to_rows(self.strength_columns(to_columns(x)), x)
 
     def regressors(self, x: Tensor) -> Tensor:
         """Features in which the layer is linear, shape (*batch, groups, rules * columns).
@@ -163,7 +165,7 @@ class Anfis(nn.Module):
             start += count
         return logs
 
-    def _strengths(self, columns: Tensor) -> Tensor:
+    def strength_columns(self, columns: Tensor) -> Tensor:
         """Normalised firing strengths, shape (groups, rules, samples).
 
         On a full grid the softmax of the summed log memberships is the product of one softmax for
@@ -175,6 +177,30 @@ class Anfis(nn.Module):
             shares = torch.softmax(log, 1)
             strengths = (strengths.unsqueeze(2) * shares.unsqueeze(1)).flatten(1, 2)
         return strengths
+
+    def jacobian(self, x: Tensor) -> Tensor:
+        """Derivative of every output by every trained parameter, as solvers ask for it.
+
+        Args:
+            x: inputs, shape (samples, groups, inputs).
+        Returns:
+            Shape (samples, groups * outputs, parameters), parameters in the order of
+            `named_parameters`.
+        """
+        return dense_jacobian(self.jacobian_columns(x), self.jacobian_maps())
+
+    def jacobian_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
+        """What the derivatives of all outputs combine, (groups, columns, samples).
+
+        Args:
+            x: inputs, shape (samples, groups, inputs).
+            out: where to write the result, its shape; fresh memory costs more than the arithmetic.
+        """
+        return anfis_jacobian.jacobian_columns(self, x, out)
+
+    def jacobian_maps(self) -> dict[str, Tensor]:
+        """How `jacobian_columns` combine, (groups, outputs, columns, entries of a group)."""
+        return anfis_jacobian.jacobian_maps(self)
 
     def init_grid(self, lower: Range, upper: Range) -> None:
         """Evenly spaced sets from `lower` to `upper`, neighbours crossing at 0.5.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from nfriction.fuzzy.factored_jacobian import dense_jacobian, trained
 from nfriction.fuzzy.layout import to_columns, to_rows
 from nfriction.fuzzy.least_squares import ridge
 from nfriction.fuzzy.radial_centres import kmeans_centres, nearest_spread, selected_centres
@@ -73,6 +74,75 @@ class RBFNetwork(nn.Module):
     def regressors(self, x: Tensor) -> Tensor:
         """Features in which the output is linear: the units and 1, (*batch, groups, units + 1)."""
         return torch.cat([self.activations(x), torch.ones_like(x[..., :1])], -1)
+
+    def jacobian(self, x: Tensor) -> Tensor:
+        """Derivative of every output by every trained parameter, as solvers ask for it.
+
+        Args:
+            x: inputs, shape (samples, groups, inputs).
+        Returns:
+            Shape (samples, groups * outputs, parameters), parameters in the order of
+            `named_parameters`.
+        """
+        return dense_jacobian(self.jacobian_columns(x), self.jacobian_maps())
+
+    @torch.no_grad()
+    def jacobian_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
+        """What the derivatives of all outputs combine: phi z, phi z^2 and phi of each unit, and 1.
+
+        Here z = (x - c)/s. `jacobian_maps` says how they combine.
+
+        Args:
+            x: inputs, shape (samples, groups, inputs).
+            out: where to write the result, its shape; fresh memory costs more than the arithmetic.
+        Returns:
+            Shape (groups, (2 inputs + 1) units + 1, samples).
+        """
+        moving, columns = self.units * self.inputs, to_columns(x)
+        shape = (len(columns), 2 * moving + self.units + 1, columns.shape[-1])
+        F = columns.new_empty(shape) if out is None else out
+        by_centre, by_width = (
+            F[:, i * moving : (i + 1) * moving].unflatten(1, (self.units, self.inputs))
+            for i in (0, 1)
+        )
+        z, phi = by_width, F[:, 2 * moving : -1]
+        torch.sub(columns.unsqueeze(1), self.centres.unsqueeze(-1), out=z)
+        z.mul_(torch.exp(-self.log_widths).unsqueeze(-1))
+        torch.mul(z[:, :, 0], z[:, :, 0], out=phi)
+        for i in range(1, self.inputs):
+            phi.addcmul_(z[:, :, i], z[:, :, i])
+        phi.mul_(-0.5).exp_()
+        torch.mul(z, phi.unsqueeze(2), out=by_centre)
+        by_width.mul_(by_centre)
+        F[:, -1] = 1.0
+        return F
+
+    @torch.no_grad()
+    def jacobian_maps(self) -> dict[str, Tensor]:
+        """How `jacobian_columns` combine to the derivatives by each trained parameter.
+
+        d y_k = sum_u w_ku (phi z / s dc + phi z^2 dlog s) + phi_u dw_ku + db_k.
+
+        Returns:
+            For each trained parameter (groups, outputs, columns, entries of a group).
+        """
+        groups, units, inputs = self.centres.shape
+        moving, columns = units * inputs, (2 * inputs + 1) * units + 1
+        weight = self.output_weight.detach().repeat_interleave(inputs, 2)
+        slope = weight * torch.exp(-self.log_widths).flatten(1).unsqueeze(1)
+        own, one = (torch.eye(n).to(weight) for n in (self.outputs, units))
+        blocks = {
+            "centres": (0, torch.diag_embed(slope)),
+            "log_widths": (moving, torch.diag_embed(weight)),
+            "output_weight": (2 * moving, torch.einsum("ab,uv->aubv", own, one).flatten(2)),
+            "output_bias": (columns - 1, own.unsqueeze(1)),
+        }
+        maps = {}
+        for name in trained(self):
+            start, block = blocks[name]
+            maps[name] = weight.new_zeros(groups, self.outputs, columns, block.shape[-1])
+            maps[name][:, :, start : start + block.shape[-2]] = block
+        return maps
 
     def _activations(self, x: Tensor) -> Tensor:
         """Units' outputs, shape (groups, units, samples).

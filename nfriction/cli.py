@@ -1,0 +1,270 @@
+"""Command line: fit, compare and export friction models."""
+
+import argparse
+import logging
+import shlex
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from tqdm import tqdm
+
+from nfriction.angles import AngleConvention
+from nfriction.codegen import CodegenError
+from nfriction.comparison import Comparison, compare
+from nfriction.export import ExportError, torchscript
+from nfriction.fitting import fit
+from nfriction.friction import MODELS, model_by_name
+from nfriction.modelfile import ModelFileError, info_of, load, save
+from nfriction.plant import LinearAxis, PendulumChain, rigs
+from nfriction.recording import Recording, read_initial_states
+from nfriction.results import model_info, write_results
+
+DEFAULT_MODELS = "NCFM,LFM,NLFM,NFLFM"
+
+
+class UsageError(Exception):
+    """What the user asked for cannot be done; the message says why and what to do."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; errors are one line on standard error, and exit status 2."""
+    arguments = _parser().parse_args(argv)
+    logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
+    # Several threads make small tensors up to 100 times slower.
+    torch.set_num_threads(1)
+    arguments.command_line = shlex.join(["nfriction", *(sys.argv[1:] if argv is None else argv)])
+    try:
+        return arguments.run(arguments)
+    except KeyboardInterrupt:
+        print("nfriction: interrupted; nothing half-written was left behind", file=sys.stderr)
+        return 130
+    except (UsageError, ModelFileError, ExportError, CodegenError, ValueError, OSError,
+            ImportError) as error:  # fmt: skip
+        if arguments.debug:
+            raise
+        print(f"nfriction: error: {error}", file=sys.stderr)
+        return 2
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="nfriction",
+        description="Learn joint friction from encoder recordings, prove it by simulation.",
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    estimation = argparse.ArgumentParser(add_help=False)
+    _add_estimation(estimation)
+
+    one = commands.add_parser("fit", parents=[common, estimation], help="fit one model")
+    one.add_argument("recordings", nargs="+", type=Path, metavar="RECORDING")
+    one.add_argument("--model", default="NFLFM", help=f"one of {', '.join(MODELS)}")
+    one.add_argument("--out", type=Path, default=Path("model.json"), help="model file to write")
+    one.set_defaults(run=_fit)
+
+    many = commands.add_parser(
+        "compare", parents=[common, estimation], help="fit models and score them"
+    )
+    many.add_argument("train", nargs="+", type=Path, metavar="TRAIN")
+    many.add_argument("--held-out", nargs="+", type=Path, default=[], metavar="TEST")
+    many.add_argument("--models", default=DEFAULT_MODELS, help=f"of {', '.join(MODELS)}")
+    _add_output(many)
+    many.set_defaults(run=_compare)
+
+    demo = commands.add_parser(
+        "demo", parents=[common], help="simulate a rig with hidden friction, then compare models"
+    )
+    demo.add_argument("--models", default=DEFAULT_MODELS)
+    demo.add_argument("--seed", type=int, default=0)
+    _add_output(demo)
+    demo.set_defaults(run=_demo, out=Path("runs/demo"))
+
+    exporter = commands.add_parser("export", parents=[common], help="write a controller artefact")
+    exporter.add_argument("model", type=Path, help="model file")
+    exporter.add_argument("--to", default="torchscript", help="torchscript")
+    exporter.add_argument("--out", type=Path, default=Path(), help="folder to write to")
+    exporter.set_defaults(run=_export)
+    return parser
+
+
+def _add_estimation(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--rig", required=True,
+                        help=f"a rig file, or one of {', '.join(rigs.names())}")  # fmt: skip
+    parser.add_argument("--angles", help="how the files write angles, e.g. absolute,hanging; "
+                        "default the rig's convention")  # fmt: skip
+    parser.add_argument("--degrees", action="store_true", help="the files are in degrees")
+    parser.add_argument("--windows", default="0.5,2", help="window lengths of the fit [s]")
+    parser.add_argument("--plant", choices=("fit", "given"), default="fit",
+                        help="adjust inertia and gravity terms within bounds, or not")  # fmt: skip
+    parser.add_argument("--drag", action="store_true", help="fit air drag on the links too")
+    parser.add_argument("--max-steps", type=int, default=30, help="steps to each window length")
+
+
+def _add_output(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", type=Path, default=Path("runs/compare"), help="folder to write")
+    parser.add_argument("--initial-states", type=Path,
+                        help="recordings.csv with columns id, q0_1, qd0_1, ...")  # fmt: skip
+    parser.add_argument("--no-figures", action="store_true")
+
+
+def _fit(arguments: argparse.Namespace) -> int:
+    plant = _rig(arguments.rig)
+    recordings = _read(arguments.recordings, plant, arguments)
+    model = model_by_name(arguments.model)(plant.joints)
+    with _Progress() as progress:
+        progress.stage(f"fit {arguments.model}")
+        found = fit(model, plant, recordings, callback=lambda s, _: progress.step(s),
+                    **_settings(arguments))  # fmt: skip
+    save(model, arguments.out, model_info(found, recordings))
+    print(f"{arguments.model}: {found.status}")
+    print(f"position error over training windows: {1e3 * found.residual:.3g} m{plant.unit}")
+    print(f"wrote {arguments.out}")
+    return 0
+
+
+def _compare(arguments: argparse.Namespace) -> int:
+    plant = _rig(arguments.rig)
+    train = _read(arguments.train, plant, arguments)
+    held_out = _read(arguments.held_out, plant, arguments)
+    return _run_comparison(plant, train, held_out, arguments, _settings(arguments))
+
+
+def _demo(arguments: argparse.Namespace) -> int:
+    from nfriction.demonstration import simulated_recordings
+
+    plant, train, held_out = simulated_recordings(seed=arguments.seed)
+    print(f"simulated {len(train)} recordings to train and {len(held_out)} to hold out")
+    return _run_comparison(plant, train, held_out, arguments, {"fit_plant": False})
+
+
+def _run_comparison(
+    plant: PendulumChain | LinearAxis,
+    train: list[Recording],
+    held_out: list[Recording],
+    arguments: argparse.Namespace,
+    settings: dict[str, Any],
+) -> int:
+    names = [name.strip() for name in arguments.models.split(",") if name.strip()]
+    for name in names:
+        model_by_name(name)
+    states = None
+    if arguments.initial_states is not None:
+        states = read_initial_states(arguments.initial_states)
+    _check_writable(arguments.out)
+    with _Progress(len(names)) as progress:
+        comparison = compare(
+            plant, names, train, held_out, initial_states=states,
+            on_stage=progress.stage, on_step=progress.step, **settings,
+        )  # fmt: skip
+        progress.stage("write results and figures")
+        write_results(
+            comparison, train, held_out, arguments.out,
+            command=arguments.command_line, figures=not arguments.no_figures,
+        )  # fmt: skip
+    _print_tables(comparison)
+    print(f"\nresults, models and figures are in {arguments.out}")
+    return 0
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    writers: dict[str, tuple[str, Callable[..., Path]]] = {"torchscript": (".pt", torchscript)}
+    model, info = load(arguments.model), info_of(arguments.model)
+    for target in arguments.to.split(","):
+        if target not in writers:
+            raise UsageError(f"cannot export to {target!r}; there are {', '.join(writers)}.")
+        suffix, writer = writers[target]
+        path = writer(model, arguments.out / f"{arguments.model.stem}{suffix}", info)
+        print(f"wrote {path}")
+    return 0
+
+
+def _print_tables(comparison: Comparison) -> None:
+    """Free run and windows in thousandths of the unit, and what was saved in percent."""
+    for held_out, kind in ((True, "held out"), (False, "trained on")):
+        if not (comparison.held_out if held_out else comparison.train):
+            continue
+        scores = comparison.held_out if held_out else comparison.train
+        files = ", ".join(s.recording for s in next(iter(scores.values())))
+        table = 1e3 * comparison.table(held_out=held_out)
+        columns = {f"{h} s": 1e3 * comparison.table(h, held_out=held_out)["all"]
+                   for h in comparison.horizons()}  # fmt: skip
+        saved = comparison.improvement(held_out=held_out)["all"].rename("saved %")
+        whole = pd.concat([table, pd.DataFrame(columns), saved], axis=1)
+        print(f"\nPosition RMSE, {kind} ({files}), m{comparison.unit}: free run by joint, "
+              "restarted windows, free-run error saved against no friction")  # fmt: skip
+        print(whole.to_string(float_format=lambda x: f"{x:.4g}" if np.isfinite(x) else "diverged"))
+    for name, found in comparison.fits.items():
+        note = f"; at a bound: {', '.join(found.at_bounds)}" if found.at_bounds else ""
+        print(f"{name}: {found.status}{note}")
+
+
+def _rig(name: str) -> PendulumChain | LinearAxis:
+    if name in rigs.names():
+        return rigs.by_name(name)
+    if Path(name).suffix.lower() in (".json", ".toml"):
+        return rigs.read(name)
+    raise UsageError(f"no rig is called {name!r}; give a .json file or one of "
+                     f"{', '.join(rigs.names())}.")  # fmt: skip
+
+
+def _read(
+    paths: Sequence[Path], plant: PendulumChain | LinearAxis, arguments: argparse.Namespace
+) -> list[Recording]:
+    text = arguments.angles or ",".join(plant.convention)
+    convention = AngleConvention.parse(text)
+    return [
+        Recording.read(path, degrees=arguments.degrees, convention=convention, unit=plant.unit)
+        for path in paths
+    ]
+
+
+def _settings(arguments: argparse.Namespace) -> dict[str, Any]:
+    try:
+        windows = tuple(float(w) for w in arguments.windows.split(","))
+    except ValueError:
+        raise UsageError(f"--windows takes seconds like 0.5,2, got {arguments.windows!r}.") from None
+    return {
+        "windows": windows,
+        "fit_plant": arguments.plant == "fit",
+        "drag": arguments.drag,
+        "max_steps": arguments.max_steps,
+    }
+
+
+def _check_writable(folder: Path) -> None:
+    """Refuse an unwritable folder before the work rather than after it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=folder):
+        pass
+
+
+class _Progress:
+    """One bar for a whole run: what is being done, and steps taken."""
+
+    def __init__(self, models: int = 1) -> None:
+        self._bar = tqdm(unit=" steps", disable=not sys.stderr.isatty(), leave=False)
+
+    def __enter__(self) -> "_Progress":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def stage(self, what: str) -> None:
+        self._what = what
+        self._bar.set_description(what)
+
+    def step(self, stage: str) -> None:
+        self._bar.set_description(f"{self._what}, {stage}")
+        self._bar.update()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,158 @@
+"""Compiled rollouts, found by the structure of plant and friction and kept for later calls.
+
+What was compiled once serves every plant and friction model of the same structure: parameters and
+buffers are inputs of the compiled code, so a fit may change them between calls.
+"""
+
+import logging
+from collections import OrderedDict
+from collections.abc import Hashable
+from types import FunctionType
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from nfriction import codegen
+
+logger = logging.getLogger(__name__)
+
+Backend = Literal["auto", "torch", "c", "numba"]
+# Compiled structures kept in memory; each is some hundred kilobytes.
+KEPT = 32
+
+_cache: OrderedDict[Hashable, "codegen.CompiledRollout | None"] = OrderedDict()
+
+
+class NoFriction(nn.Module):
+    """Stands where a compiled rollout needs a friction model and there is none."""
+
+    def __init__(self, joints: int) -> None:
+        super().__init__()
+        self.joints = joints
+
+    def coefficients(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        return torch.zeros_like(qd)[..., None]
+
+    def torque(self, qd: Tensor, load: Tensor, coefficients: Tensor) -> Tensor:
+        return torch.zeros_like(qd)
+
+
+def wants_compiled(backend: Backend, q: Tensor, gradients: bool) -> bool:
+    """Whether a rollout should be tried in compiled code.
+
+    Raises:
+        ValueError: if a compiled backend is asked for together with gradients or off the CPU.
+    """
+    if backend not in ("auto", "torch", "c", "numba"):
+        raise ValueError(f'`backend` is "auto", "torch", "c" or "numba", got {backend!r}.')
+    able = not gradients and q.dtype == torch.float64 and q.device.type == "cpu"
+    if backend in ("c", "numba") and not able:
+        raise ValueError(
+            f'backend="{backend}" needs float64 on the CPU and records no gradients; use '
+            'backend="torch", or `gradients=False`.'
+        )
+    return backend != "torch" and able
+
+
+def integrate_compiled(
+    plant: Any,
+    friction: Any,
+    q: Tensor,
+    qd: Tensor,
+    tau: Tensor,
+    step: Tensor,
+    substeps: int,
+    measured: tuple[Tensor, Tensor] | None,
+    backend: Backend,
+    threads: int,
+) -> tuple[Tensor, ...] | None:
+    """States at every sample: q, qd, qdd, each (*batch, steps + 1, joint).
+
+    Returns:
+        None where `backend="auto"` finds no way to compile, so that eager torch serves.
+
+    Raises:
+        CodegenError: if a backend asked for by name cannot serve.
+    """
+    compiled = _compiled(plant, friction or NoFriction(plant.joints), backend)
+    if compiled is None:
+        return None
+    batch, joints = q.shape[:-1], q.shape[-1]
+
+    def rows(x: Tensor, trailing: int) -> Tensor:
+        """Candidates on one leading axis; what all share keeps none."""
+        x = x.detach()
+        if x.ndim > trailing:
+            x = x.expand(*batch, *x.shape[x.ndim - trailing :]).reshape(-1, *x.shape[-trailing:])
+        return x
+
+    def finer(x: Tensor, axis: int) -> Tensor:
+        return x if substeps == 1 else x.repeat_interleave(substeps, axis)
+
+    steps = step.shape[-1] * substeps
+    drive = None
+    if measured is not None:
+        drive = tuple(finer(rows(m, 2), -2) for m in measured)
+    found = compiled(
+        q.detach().reshape(-1, joints).contiguous(),
+        qd.detach().reshape(-1, joints).contiguous(),
+        steps=steps,
+        time_step=finer(rows(step, 1) / substeps, -1),
+        tau=finer(rows(tau, 2), -2),
+        parameters=_values(plant, friction, compiled.parameter_names),
+        drive=drive,
+        threads=threads,
+        record_every=substeps,
+    )
+    return tuple(x.reshape(*batch, -1, joints) for x in (found.q, found.qd, found.qdd))
+
+
+def _compiled(plant: Any, friction: Any, backend: Backend) -> "codegen.CompiledRollout | None":
+    """The compiled rollout of this structure, from the cache where it is there."""
+    if not (isinstance(plant, nn.Module) and isinstance(friction, nn.Module)):
+        return None
+    key = (backend, _structure(plant), _structure(friction))
+    if key in _cache:
+        _cache.move_to_end(key)
+        return _cache[key]
+    compiled = None
+    try:
+        compiled = codegen.compile_rollout(plant, friction, backend=backend)
+    except codegen.SelfCheckFailed:
+        raise
+    except codegen.CodegenError as error:
+        if backend != "auto":
+            raise
+        logger.warning("rollouts run in eager torch, as they cannot be compiled: %s", error)
+    _cache[key] = compiled
+    while len(_cache) > KEPT:
+        _cache.popitem(last=False)
+    return compiled
+
+
+def _structure(module: nn.Module) -> Hashable:
+    """All that compiled code bakes in: classes, plain attributes, shapes, tables of indices."""
+    parts: list[Hashable] = []
+    for name, part in module.named_modules():
+        plain = tuple(
+            (key, str(value) if isinstance(value, list | dict) else value)
+            for key, value in sorted(vars(part).items())
+            if isinstance(value, bool | int | float | str | tuple | FunctionType)
+            or (isinstance(value, list | dict) and not key.startswith("_"))
+        )
+        parts.append((name, type(part), plain))
+    for name, tensor in (*module.named_parameters(), *module.named_buffers()):
+        baked = None if tensor.is_floating_point() else tensor.cpu().numpy().tobytes()
+        parts.append((name, tuple(tensor.shape), baked))
+    return tuple(parts)
+
+
+def _values(plant: nn.Module, friction: Any, names: Any) -> dict[str, Tensor]:
+    """The parameters and buffers of these very modules."""
+    found = {}
+    for prefix, module in (("plant", plant), ("friction", friction)):
+        if isinstance(module, nn.Module):
+            for name, value in (*module.named_parameters(), *module.named_buffers()):
+                found[f"{prefix}.{name}"] = value.detach()
+    return {name: value for name, value in found.items() if name in names}

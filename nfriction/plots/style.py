@@ -1,0 +1,190 @@
+"""How every figure looks: sizes, colours, units; no global matplotlib state is touched."""
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from numpy.typing import NDArray
+
+from nfriction.comparison import NO_FRICTION
+
+COLUMN, PAGE = 3.5, 7.0
+"""Widths of a figure in a two-column paper [in]: one column, both."""
+
+INK, GRID, FAINT = "#222222", "#dddddd", "#8c8c8c"
+LABEL, SMALL, TINY = 8.0, 7.0, 6.0  # sizes of text [pt]
+# Okabe and Ito's palette without its yellow (too pale for lines) and black (text).
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#5D3A9B")
+MEASURED: dict[str, Any] = {"color": "#bcbcbc", "linewidth": 3.0}
+_DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)), (0, (6, 1.5, 1.2, 1.5)))
+_MARKERS = ("o", "s", "^", "D", "v", "P", "p")
+_HATCHES = ("", "////", "....", "\\\\\\\\")
+MAP = "viridis"
+LOG_FROM = 30.0
+"""Ratio of the largest value to the smallest beyond which an axis is logarithmic."""
+
+
+def panels(
+    rows: int, columns: int, width: float, height: float, **options: Any
+) -> tuple[Figure, NDArray[np.object_]]:
+    """A figure on white with a grid of plain axes, (rows, columns); `options` as for `subplots`."""
+    figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
+    axes = figure.subplots(rows, columns, squeeze=False, **options)
+    for ax in axes.flat:
+        dress(ax)
+    return figure, axes
+
+
+def dress(ax: Axes) -> None:
+    """Colours and sizes, set one by one so that a user's own style cannot make text unreadable."""
+    ax.set_facecolor("white")
+    ax.set_axisbelow(True)
+    ax.grid(True, color=GRID, linewidth=0.5, linestyle="-")
+    ax.tick_params(which="both", colors=INK, labelsize=SMALL, width=0.6, length=2.5)
+    ax.tick_params(which="minor", length=1.5)
+    for side, spine in ax.spines.items():
+        spine.set(visible=side in ("left", "bottom"), color=INK, linewidth=0.6)
+    for text in (ax.xaxis.label, ax.yaxis.label, ax.title):
+        text.set(fontsize=LABEL, color=INK)
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.get_offset_text().set(fontsize=SMALL, color=INK)
+
+
+def bare(ax: Axes) -> None:
+    """A frame all round and no grid, for maps."""
+    ax.grid(False)
+    for spine in ax.spines.values():
+        spine.set_visible(True)
+
+
+def legend(figure: Figure, handles: Iterable[Artist], labels: Sequence[str]) -> None:
+    """A legend above all panels, in as many columns as fit; the figure grows by its height."""
+    longest = max(len(label) for label in labels)
+    columns = min(len(labels), max(1, int(figure.get_figwidth() / (0.5 + 0.05 * longest))))
+    rows = -(-len(labels) // columns)
+    figure.set_figheight(figure.get_figheight() + 0.05 + 0.15 * rows)
+    figure.legend(
+        list(handles),
+        list(labels),
+        loc="outside upper center",
+        ncols=columns,
+        frameon=False,
+        fontsize=SMALL,
+        labelcolor=INK,
+        handlelength=2.4,
+        columnspacing=1.2,
+    )
+
+
+def title(ax: Axes, text: str) -> None:
+    """A panel's title, in the size of its labels."""
+    ax.set_title(text, fontsize=LABEL, color=INK)
+
+
+def log_axis(ax: Axes, bottom: float, top: float) -> None:
+    """A logarithmic y axis with plain numbers, at least two of them."""
+    ax.set_yscale("log")
+    ax.set_ylim(bottom, top)
+    ratio = top / bottom
+    subs = (1,) if ratio > 200 else (1, 2, 5) if ratio > 8 else range(1, 10)
+    ax.yaxis.set_major_locator(LogLocator(subs=[float(s) for s in subs]))
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
+    ax.yaxis.set_minor_formatter(NullFormatter())
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a model is drawn, the same in every figure of a comparison.
+
+    Attributes:
+        line: options of a line.
+        marker: further options of a line with points.
+        bar: options of a bar.
+    """
+
+    line: dict[str, Any]
+    marker: dict[str, Any]
+    bar: dict[str, Any]
+
+
+def looks(names: Iterable[str]) -> dict[str, Look]:
+    """A look for each model; no friction is grey whichever others there are."""
+    models = [name for name in names if name != NO_FRICTION]
+    found = {NO_FRICTION: _look(FAINT, (0, (2.5, 2.5)), "x", "xxxx")}
+    for k, name in enumerate(models):
+        found[name] = _look(*(cycle[k % len(cycle)] for cycle in _CYCLES))
+    return found
+
+
+_CYCLES: tuple[tuple[Any, ...], ...] = (COLOURS, _DASHES, _MARKERS, _HATCHES)
+
+
+def _look(colour: str, dashes: Any, marker: str, hatch: str) -> Look:
+    return Look(
+        line={"color": colour, "linestyle": dashes, "linewidth": 1.1},
+        marker={"marker": marker, "markersize": 4.0},
+        bar={"facecolor": colour, "hatch": hatch, "edgecolor": "white", "linewidth": 0.4},
+    )
+
+
+def scaled(unit: str, values: Any) -> tuple[float, str]:
+    """Factor and unit with prefix in which values are read easily: small radians as mrad.
+
+    Args:
+        unit: SI unit, `"rad"`, `"N m s/rad"`, `"-"` ...
+        values: what will be shown, any shape; what is not finite does not count.
+    """
+    sizes = np.abs(np.asarray(values, dtype=np.float64))
+    largest = float(np.max(sizes, where=np.isfinite(sizes), initial=0.0))
+    if unit in ("", "1", "-") or largest == 0.0 or largest >= 0.2:
+        return 1.0, unit
+    return (1e3, f"m{unit}") if largest >= 2e-4 else (1e6, f"µ{unit}")
+
+
+def sliding(unit: str, position: str) -> str:
+    """A revolute joint's unit as it reads for positions in `"rad"` or `"m"`."""
+    return unit if position == "rad" else unit.replace("N m", "N").replace("rad", position)
+
+
+def velocity_unit(position: str) -> str:
+    """Unit of a velocity, for positions in `"rad"` or `"m"`."""
+    return f"{position}/s"
+
+
+def symbol(name: str) -> str:
+    """A coefficient's name as print writes it: `f_o` with its index below, `B` in italics."""
+    match = re.fullmatch(r"([A-Za-z])(?:_([A-Za-z0-9]+))?", name)
+    if match is None:
+        return name
+    index = f"_\\mathrm{{{match[2]}}}" if match[2] else ""
+    return f"${match[1]}{index}$"
+
+
+def joint_labels(names: Sequence[str] | None, joints: int) -> list[str]:
+    """The names given, or joint1, joint2, ...
+
+    Raises:
+        ValueError: if there is not one for each joint.
+    """
+    if names is not None and len(names) != joints:
+        raise ValueError(f"`joint_names` must be {joints} names, got {list(names)}.")
+    return list(names) if names is not None else [f"joint{k + 1}" for k in range(joints)]
+
+
+def spread(values: Any) -> float:
+    """Largest finite value over the smallest positive one; 1 where there are none."""
+    known = np.asarray(values, dtype=np.float64)
+    known = known[np.isfinite(known) & (known > 0)]
+    return float(known.max() / known.min()) if known.size else 1.0
+
+
+def padded(low: float, high: float, share: float = 0.05) -> tuple[float, float]:
+    """Limits a little wider than the values, and never empty."""
+    margin = share * (high - low) or 0.05 * abs(high) or 1.0
+    return low - margin, high + margin
