@@ -34,7 +34,7 @@ def limit(plant: Pendulum, friction: Coulomb, folder: str) -> Callable[..., tupl
     compiler = build.find_compiler()
     if compiler is None:
         raise SystemExit("no C compiler found")
-    flags = [*build.FLAGS, "-march=native", "-shared", "-fPIC"]
+    flags = ["-O3", *build.FLAGS, "-march=native", "-shared", "-fPIC"]
     subprocess.run([*compiler, *flags, "-o", str(library), str(source), "-lm"], check=True)
     function = ctypes.CDLL(str(library)).limit_rollout
 

@@ -18,8 +18,7 @@ from nfriction.plant import LinearAxis, PendulumChain, rigs
 from nfriction.recording import Recording
 from nfriction.scoring import Score, score
 from nfriction.simulation import Rollout, rollout
-
-__version__ = "0.1.0"
+from nfriction.version import __version__
 
 __all__ = [
     "LFM",
@@ -38,6 +37,7 @@ __all__ = [
     "Rollout",
     "Score",
     "Stribeck",
+    "__version__",
     "compare",
     "export",
     "fit",

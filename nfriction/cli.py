@@ -229,7 +229,9 @@ def _settings(arguments: argparse.Namespace) -> dict[str, Any]:
     try:
         windows = tuple(float(w) for w in arguments.windows.split(","))
     except ValueError:
-        raise UsageError(f"--windows takes seconds like 0.5,2, got {arguments.windows!r}.") from None
+        raise UsageError(
+            f"--windows takes seconds like 0.5,2, got {arguments.windows!r}."
+        ) from None
     return {
         "windows": windows,
         "fit_plant": arguments.plant == "fit",

@@ -259,17 +259,15 @@ def _integrate(
         driven = None if measured is None else (measured[0][..., k, :], measured[1][..., k, :])
         for _ in range(substeps):
             held = None if friction is None else friction.coefficients(*(driven or (qd, qdd)))
-            q, qd, qdd = rk4_step(
-                plant, friction, q, qd, tau[..., k, :], held, inner[..., k, None]
-            )
+            q, qd, qdd = rk4_step(plant, friction, q, qd, tau[..., k, :], held, inner[..., k, None])
         states.append((q, qd, qdd))
     shape = states[-1][0].shape
-    return tuple(torch.stack([x.expand(shape) for x in one], -2) for one in zip(*states, strict=True))
+    return tuple(
+        torch.stack([x.expand(shape) for x in one], -2) for one in zip(*states, strict=True)
+    )
 
 
-def _asks_gradients(
-    plant: Plant, friction: Friction | None, *inputs: Tensor
-) -> bool:
+def _asks_gradients(plant: Plant, friction: Friction | None, *inputs: Tensor) -> bool:
     """Whether anything that shapes the motion requires a gradient."""
     owned = [
         t

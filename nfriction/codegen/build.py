@@ -28,7 +28,7 @@ Backend = Literal["auto", "c", "numba"]
 
 # No errno and no traps let the compiler use its own square root and pair sin with cos; fused
 # multiply-add only removes roundings. NaN keeps its meaning, unlike under -ffast-math.
-FLAGS = ("-O3", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast")
+FLAGS = ("-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast")
 _NATIVE = "-march=native"
 _SHARED = ("-shared", "-fPIC")
 
@@ -91,8 +91,12 @@ def choose(backend: Backend) -> Literal["c", "numba"]:
     )
 
 
-def build_c(source: str) -> ctypes.CDLL:
+def build_c(source: str, level: str = "-O3") -> ctypes.CDLL:
     """Compile C source to a shared library, or take it from the cache.
+
+    Args:
+        source: the translation unit.
+        level: how hard the compiler should optimise.
 
     Raises:
         CompilerError: with the compiler's message.
@@ -103,9 +107,9 @@ def build_c(source: str) -> ctypes.CDLL:
         choose("c")
     assert compiler is not None
     folder = cache_folder()
-    recipe = (source, *compiler, _version(tuple(compiler)), *FLAGS, _processor())
+    recipe = (source, *compiler, _version(tuple(compiler)), level, *FLAGS, _processor())
     key = hashlib.sha256("\0".join(recipe).encode()).hexdigest()[:32]
-    library = _intact(folder, key) or _compile(compiler, source, folder, key)
+    library = _intact(folder, key) or _compile([*compiler, level], source, folder, key)
     return ctypes.CDLL(str(library))
 
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from nfriction.codegen import arguments, build
+from nfriction.codegen.derivative import with_jacobian
 from nfriction.codegen.emit import (
     PYTHON_PRELUDE,
     C,
@@ -32,6 +33,7 @@ def compile_function(
     function: Callable[..., Any],
     example_inputs: Sequence[Tensor],
     *,
+    jacobian: Sequence[int] = (),
     backend: build.Backend = "auto",
 ) -> "CompiledFunction":
     """Compile a function of tensors.
@@ -40,6 +42,8 @@ def compile_function(
         function: a module, a bound method of one (its parameters stay inputs, read at every
             call), or any callable (tensors it closes over are baked in).
         example_inputs: float64 tensors of the right shapes, without a batch dimension.
+        jacobian: positions of the inputs by which to differentiate; the exact Jacobian, (elements
+            of all outputs, elements of these inputs), is then returned last.
         backend: "c", "numba", or "auto" for the first of them that is there.
 
     Returns:
@@ -49,7 +53,7 @@ def compile_function(
         NoBackend, UnsupportedOperation, CompilerError, SelfCheckFailed: see `compile_rollout`.
     """
     served = build.choose(backend)
-    compiled = CompiledFunction(function, example_inputs, served)
+    compiled = CompiledFunction(function, example_inputs, served, jacobian)
     compiled.check(example_inputs)
     return compiled
 
@@ -63,20 +67,29 @@ class CompiledFunction:
     """
 
     def __init__(
-        self, function: Callable[..., Any], example_inputs: Sequence[Tensor], backend: str
+        self,
+        function: Callable[..., Any],
+        example_inputs: Sequence[Tensor],
+        backend: str,
+        jacobian: Sequence[int] = (),
     ) -> None:
         self.backend = backend
         self._function = function
+        self._jacobian = tuple(jacobian)
         self._lifted = Lifted(Method(function))
         inputs = {f"x{i}": x for i, x in enumerate(example_inputs)}
         program = self._lifted.trace(inputs, dict.fromkeys(inputs, Level.STAGE))
+        if jacobian:
+            program = with_jacobian(program, [f"x{i}" for i in jacobian])
         self._inputs = [p.shape for p in program.inputs if p.name in inputs]
         self._outputs = [p.shape for p in program.outputs]
         split, groups = _split(program)
         emit = _c_source if backend == "c" else _python_source
         self.source = emit(program, split, groups, self._inputs)
         if backend == "c":
-            self._kernel = _c_kernel(self.source, 1 + len(self._inputs) + len(self._outputs))
+            # A Jacobian is long straight code, whose optimisation takes minutes and gains little.
+            level = "-O1" if jacobian else "-O3"
+            self._kernel = _c_kernel(self.source, level, 1 + len(self._inputs) + len(self._outputs))
         else:
             self._kernel = build.build_numba(self.source).nf_function
 
@@ -112,17 +125,17 @@ class CompiledFunction:
             SelfCheckFailed: if they differ by more than rounding explains.
         """
         generator = torch.Generator().manual_seed(0)
-        for spread in (0.0, 0.01, 0.1):
+        for spread in (0.1,) if self._jacobian else (0.0, 0.01, 0.1):
             inputs = [
                 x.detach() + spread * torch.randn(x.shape, generator=generator, dtype=x.dtype)
                 for x in example_inputs
             ]
             with torch.no_grad():
-                eager = self._function(*(x.to(self._lifted.device) for x in inputs))
+                eager = self._eager([x.to(self._lifted.device) for x in inputs])
             ours = self(*(x[None] for x in inputs))
             for a, b in zip(
                 ours if isinstance(ours, tuple) else (ours,),
-                eager if isinstance(eager, (tuple, list)) else (eager,),
+                eager,
                 strict=True,
             ):
                 expected = arguments.to_array(b)
@@ -132,6 +145,23 @@ class CompiledFunction:
                         f"the compiled function gives {a[0]} where torch gives {expected}; "
                         "please report this, and use the torch module meanwhile."
                     )
+
+    def _eager(self, inputs: list[Tensor]) -> tuple[Tensor, ...]:
+        """All outputs, the Jacobian among them, in eager torch."""
+
+        def outputs(*given: Tensor) -> Tensor:
+            return torch.cat([y.reshape(-1) for y in _tuple(self._function(*given))])
+
+        eager = _tuple(self._function(*inputs))
+        if not self._jacobian:
+            return eager
+        blocks = torch.func.jacfwd(outputs, argnums=self._jacobian)(*inputs)
+        flat = [block.reshape(block.shape[0], -1) for block in blocks]
+        return (*eager, torch.cat(flat, -1))
+
+
+def _tuple(found: Any) -> tuple[Tensor, ...]:
+    return tuple(found) if isinstance(found, (tuple, list)) else (found,)
 
 
 def emit_c(
@@ -295,8 +325,8 @@ def _sizes(prefix: str, shapes: Sequence[tuple[int, ...]]) -> dict[str, int]:
     return {f"{prefix}{i}": int(np.prod(s, dtype=int)) for i, s in enumerate(shapes)}
 
 
-def _c_kernel(source: str, arrays: int) -> Callable[..., None]:
-    function = build.build_c(source).nf_function
+def _c_kernel(source: str, level: str, arrays: int) -> Callable[..., None]:
+    function = build.build_c(source, level).nf_function
     function.argtypes = [ctypes.c_ssize_t, *[ctypes.c_void_p] * arrays]
     function.restype = None
 

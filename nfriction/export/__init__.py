@@ -1,5 +1,5 @@
 """Artefacts for controllers, each proven equal to the model that was scored."""
 
-from nfriction.export.script import torchscript
+from nfriction.export.script import ExportError, torchscript
 
-__all__ = ["torchscript"]
+__all__ = ["ExportError", "torchscript"]

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.plant_parameters import PlantParameter, plant_parameters
+from nfriction.fitting.sensitivity import StepJacobian
 from nfriction.fitting.torque import TorqueFit, fit_torque
 from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
 from nfriction.fitting.windows import cut_windows
@@ -128,23 +129,29 @@ def fit(
             return _torque_only(model, plant, moved, torque)
     terms = _terms(plant, joint, fit_plant, drag)
     vector = None if start is None else start._plant_vector
-    noise = FIRST_NOISE if start is None else effective_noise(start._residuals)
+    # A neuro-fuzzy model starts where its constant law ended: what that left over, at the same
+    # window length, is the noise that its prior is weighed against.
+    refines = isinstance(model.schedule, NeuroFuzzy)
+    noise = effective_noise(start._residuals) if refines and start else FIRST_NOISE
     if not windows:
         raise ValueError("`windows` must name at least one window length [s].")
-    for length in windows:
+    jacobian = StepJacobian(plant, model, terms)
+    for length in windows[-1:] if refines else windows:
         problem = TrajectoryProblem(
-            plant, model, cut_windows(joint, moved, length), terms, noise,
+            jacobian,
+            cut_windows(joint, moved, length),
+            noise,
             _mixing(plant, given[0]),
             substeps=_substeps(plant, model, joint),
-        )  # fmt: skip
-        x0 = problem.start(vector)
-        stage = f"{length:g} s windows"
-        result = solve_trajectory(
-            problem, x0, max_steps=max_steps, callback=_told(callback, stage)
         )
+        x0 = problem.start(vector)
+        told = _told(callback, f"{length:g} s windows")
+        result = solve_trajectory(
+            problem, x0, max_steps=max_steps, callback=told,
+            cost_tolerance=1e-4 if refines else 1e-6,
+        )  # fmt: skip
         vector = problem.split(result.x)[1].clone()
         residuals = problem.residuals(result.x) * problem.noise_sd
-        noise = effective_noise(residuals)
         if result.status == "stopped":
             break
     return _fit_of(problem, result, residuals, moved)

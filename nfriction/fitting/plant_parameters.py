@@ -98,10 +98,11 @@ def plant_parameters(
 def adjusted_buffers(
     plant: nn.Module, parameters: list[PlantParameter], vector: Tensor
 ) -> Mapping[str, Tensor]:
-    """Buffers of the plant at a parameter vector, shape (parameter,)."""
+    """Buffers of the plant at a parameter vector, shape (*batch, parameter)."""
     nominal = dict(plant.named_buffers())
     changed: dict[str, Tensor] = {}
-    for parameter, value in zip(parameters, vector, strict=True):
+    for i, parameter in enumerate(parameters):
         before = changed.get(parameter.buffer, nominal[parameter.buffer])
+        value = vector[..., i].reshape(*vector.shape[:-1], *[1] * parameter.basis.ndim)
         changed[parameter.buffer] = before + value * parameter.basis
     return changed

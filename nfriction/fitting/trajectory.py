@@ -12,10 +12,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nfriction.fitting.plant_parameters import PlantParameter, adjusted_buffers
-from nfriction.fitting.sensitivity import step_maps
+from nfriction.fitting.plant_parameters import adjusted_buffers
+from nfriction.fitting.sensitivity import StepJacobian, step_maps
 from nfriction.fitting.windows import Windows
-from nfriction.friction import FrictionModel
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.simulation import Rollout, integrate
 from nfriction.solve.levenberg import LeastSquaresResult, LevenbergMarquardt, Quadratic, Step
@@ -35,26 +34,25 @@ class TrajectoryProblem:
     The vector of unknowns is [friction parameters, plant parameters, q0 and qd0 of each window].
 
     Args:
-        plant: the mechanism; in free swing its first gravity term is the scale.
-        friction: model whose schedule is varied in place.
+        jacobian: derivatives of a step, with the mechanism, the friction model whose schedule is
+            varied in place, and the adjustable terms of the plant.
         windows: what was measured.
-        plant_terms: adjustable terms of the plant.
         noise_sd: standard deviation of a position residual [rad], scale of the priors.
         mixing: matrix (joint, joint) from joint coordinates to those in which the recording's
             positions were measured; errors are counted there.
         substeps: integration steps to a sample.
     """
 
-    plant: PendulumChain | LinearAxis
-    friction: FrictionModel
+    jacobian: StepJacobian
     windows: Windows
-    plant_terms: list[PlantParameter]
     noise_sd: float
     mixing: Tensor
     substeps: int = 1
 
     def __post_init__(self) -> None:
         w = self.windows
+        self.plant, self.friction = self.jacobian.plant, self.jacobian.friction
+        self.plant_terms = self.jacobian.parameters
         self.friction_count = self.friction.schedule.parameter_vector().numel()
         self.shared_count = self.friction_count + len(self.plant_terms)
         self.step = w.step.repeat_interleave(self.substeps, 1) / self.substeps
@@ -156,8 +154,7 @@ class TrajectoryProblem:
 
         sample = 0
         for maps in step_maps(
-            self.plant, self.friction, motion, self.tau, self.step, self.plant_terms,
-            plant_vector, RUN * self.substeps,
+            self.jacobian, motion, self.tau, self.step, plant_vector, RUN * self.substeps
         ):  # fmt: skip
             rows = []
             n = maps.parameters.shape[-1]
@@ -191,12 +188,13 @@ def solve_trajectory(
     x0: Tensor,
     *,
     max_steps: int = 30,
+    cost_tolerance: float = 1e-6,
     callback: Callable[[Tensor, Step], bool | None] | None = None,
 ) -> LeastSquaresResult:
     """Minimise a trajectory problem from `x0`, leaving the best parameters in its model."""
     lower, upper = problem.bounds()
     solver = LevenbergMarquardt(
-        max_steps=max_steps, gradient_tolerance=1e-6, cost_tolerance=1e-6, step_tolerance=1e-8
+        max_steps=max_steps, gradient_tolerance=1e-6, cost_tolerance=cost_tolerance, step_tolerance=1e-8
     )
     result = solver.minimise(
         problem.quadratic, x0, cost=problem.cost, lower=lower, upper=upper, callback=callback

@@ -70,9 +70,7 @@ def cut_windows(
         weight[i, : n + 1] = 1.0
         if recording.tau is not None:
             tau[i, :n] = recording.tau[a:b]
-    start = [
-        np.stack([getattr(m, name)[a] for _, m, a, _ in pieces]) for name in ("q", "qd")
-    ]
+    start = [np.stack([getattr(m, name)[a] for _, m, a, _ in pieces]) for name in ("q", "qd")]
     q_, tau_, step_, weight_, q0, qd0 = (
         torch.as_tensor(x, dtype=torch.float64) for x in (q, tau, step, weight, *start)
     )

@@ -57,7 +57,7 @@ class Law:
         ValueError: if there is no coefficient, or two bear the same name.
 
     Examples:
-        >>> def drag(qd, load, coefficients, v_smooth):
+        >>> def drag(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
         ...     return coefficients[..., 0] * qd * qd.abs()
         >>> DRAG = Law("drag", (Coefficient("D", "N m s^2/rad^2"),), drag)
     """

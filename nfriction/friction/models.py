@@ -82,11 +82,11 @@ class FrictionModel(nn.Module):
         like = next(self.parameters(), torch.zeros((), dtype=torch.float64))
         rest = torch.zeros(self.joints, dtype=like.dtype, device=like.device)
         load = torch.ones_like(rest)
-        with torch.no_grad():
-            held = self.coefficients(rest, torch.zeros_like(rest))
-            return torch.func.jvp(
-                lambda qd: self.torque(qd, load, held), (rest,), (torch.ones_like(rest),)
-            )[1]
+        held = self.coefficients(rest, torch.zeros_like(rest)).detach()
+        with torch.enable_grad():
+            qd = rest.requires_grad_()
+            # A law is elementwise, so the sum's gradient is each joint's slope.
+            return torch.autograd.grad(self.torque(qd, load, held).sum(), qd)[0]
 
     def options(self) -> dict[str, Any]:
         """Constructor arguments beyond `joints` and `v_smooth`, as plain JSON."""

@@ -187,14 +187,20 @@ class Anfis(nn.Module):
             Shape (samples, groups * outputs, parameters), parameters in the order of
             `named_parameters`.
         """
-        return dense_jacobian(self.jacobian_columns(x), self.jacobian_maps())
+        return dense_jacobian(self.jacobian_columns(x), self.jacobian_maps(), self.outputs)
+
+    def regressor_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
+        """`regressors` with the samples last, (groups, regressors, samples), written to `out`."""
+        return anfis_jacobian.regressor_columns(self, x, out)
 
     def jacobian_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
-        """What the derivatives of all outputs combine, (groups, columns, samples).
+        """What the derivatives of all outputs combine, first the regressors.
 
         Args:
             x: inputs, shape (samples, groups, inputs).
             out: where to write the result, its shape; fresh memory costs more than the arithmetic.
+        Returns:
+            Shape (groups, columns, samples).
         """
         return anfis_jacobian.jacobian_columns(self, x, out)
 

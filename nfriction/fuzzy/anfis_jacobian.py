@@ -30,6 +30,16 @@ def column_count(anfis: Anfis) -> tuple[int, int]:
 
 
 @torch.no_grad()
+def regressor_columns(anfis: Anfis, x: Tensor, out: Tensor | None = None) -> Tensor:
+    """`Anfis.regressors` with the samples last, (groups, regressors, samples), written to `out`."""
+    u = to_columns(x)
+    shape = (u.shape[0], column_count(anfis)[0], u.shape[2])
+    out = u.new_empty(shape) if out is None else out
+    _write_regressors(out, anfis.strength_columns(u), _terms(anfis, u))
+    return out
+
+
+@torch.no_grad()
 def jacobian_columns(anfis: Anfis, x: Tensor, out: Tensor | None = None) -> Tensor:
     """The regressors, then for each output Q h, Q h z and, for bells, Q dlog m / dlog b.
 
@@ -40,15 +50,11 @@ def jacobian_columns(anfis: Anfis, x: Tensor, out: Tensor | None = None) -> Tens
         Shape (groups, regressors + outputs * (2 or 3) sets, samples).
     """
     u = to_columns(x)
-    groups, _, samples = u.shape
     shared, own = column_count(anfis)
-    F = u.new_empty(groups, shared + anfis.outputs * own, samples) if out is None else out
-    terms = torch.ones_like(u[:, :1])
-    if anfis.order == 1:
-        terms = torch.cat([u, terms], 1)
-    strengths = anfis.strength_columns(u)
-    regressors = F[:, :shared].unflatten(1, (anfis.rules, terms.shape[1]))
-    torch.mul(strengths.unsqueeze(2), terms.unsqueeze(1), out=regressors)
+    shape = (u.shape[0], shared + anfis.outputs * own, u.shape[2])
+    F = u.new_empty(shape) if out is None else out
+    strengths, terms = anfis.strength_columns(u), _terms(anfis, u)
+    _write_regressors(F[:, :shared], strengths, terms)
     z, h, by_slope = _premises(anfis, u)
     # Which rules use which set; the strengths' sums over them are the sets' shares.
     uses = _incidence(anfis.terms).to(u)
@@ -94,6 +100,17 @@ def jacobian_maps(anfis: Anfis) -> dict[str, Tensor]:
             start = shared + k * own + first
             maps[name][:, k, start : start + rows.shape[1]] = rows
     return maps
+
+
+def _terms(anfis: Anfis, u: Tensor) -> Tensor:
+    """What a rule's output is linear in: the inputs and 1, or 1."""
+    one = torch.ones_like(u[:, :1])
+    return torch.cat([u, one], 1) if anfis.order == 1 else one
+
+
+def _write_regressors(out: Tensor, strengths: Tensor, terms: Tensor) -> None:
+    by_rule = out.unflatten(1, (strengths.shape[1], terms.shape[1]))
+    torch.mul(strengths.unsqueeze(2), terms.unsqueeze(1), out=by_rule)
 
 
 def _premises(anfis: Anfis, u: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:

@@ -53,6 +53,27 @@ class AnfisRBF(nn.Module):
         y = self.anfis(x)
         return y + self.head(torch.cat([x, y], -1))
 
+    @torch.no_grad()
+    def jacobian(self, x: Tensor) -> Tensor:
+        """Derivative of every output by every trained parameter, as solvers ask for it.
+
+        Args:
+            x: inputs, shape (samples, groups, inputs).
+        Returns:
+            Shape (samples, groups * outputs, parameters), parameters in the order of
+            `named_parameters`.
+        """
+        y = self.anfis(x)
+        seen = torch.cat([x, y], -1)
+        # (groups, outputs, parameter, sample): what the layer says, and through the head again.
+        said = self.anfis.jacobian(x).permute(1, 2, 0).unflatten(0, (self.groups, self.outputs))
+        by_input = self.head.input_jacobian(seen)[:, :, self.inputs :]
+        J = said.clone()
+        for j in range(self.outputs):
+            J.addcmul_(by_input[:, :, j].unsqueeze(2), said[:, j].unsqueeze(1))
+        head = self.head.jacobian(seen).permute(1, 2, 0)
+        return torch.cat([J.flatten(0, 1), head], 1).permute(2, 0, 1)
+
     def init_grid(self, lower: float | Tensor, upper: float | Tensor, seed: int = 0) -> None:
         """Even sets over the inputs' range, the head's centres drawn from it (outputs: ±1).
 

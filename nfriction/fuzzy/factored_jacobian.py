@@ -17,19 +17,20 @@ from torch import Tensor, nn
 
 
 @torch.no_grad()
-def dense_jacobian(columns: Tensor, maps: Mapping[str, Tensor]) -> Tensor:
+def dense_jacobian(columns: Tensor, maps: Mapping[str, Tensor], outputs: int) -> Tensor:
     """The Jacobian itself.
 
     Args:
         columns: shape (groups, columns, samples).
         maps: for each parameter (groups, outputs, columns, entries of a group).
+        outputs: of a group; no parameter might tell it.
     Returns:
         Shape (samples, groups * outputs, parameters), lying (output, parameter, sample) in memory,
         which products of matrices want.
     """
     groups, _, samples = columns.shape
     blocks = list(maps.values())
-    outputs, entries = blocks[0].shape[1], [block.shape[-1] for block in blocks]
+    entries = [block.shape[-1] for block in blocks]
     J = columns.new_zeros(groups, outputs, groups * sum(entries), samples)
     start = 0
     for block, count in zip(blocks, entries, strict=True):

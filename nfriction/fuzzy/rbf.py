@@ -84,11 +84,40 @@ class RBFNetwork(nn.Module):
             Shape (samples, groups * outputs, parameters), parameters in the order of
             `named_parameters`.
         """
-        return dense_jacobian(self.jacobian_columns(x), self.jacobian_maps())
+        return dense_jacobian(self.jacobian_columns(x), self.jacobian_maps(), self.outputs)
+
+    @torch.no_grad()
+    def input_jacobian(self, x: Tensor) -> Tensor:
+        """Derivative of every output by the inputs of its group.
+
+        Args:
+            x: inputs, shape (samples, groups, inputs).
+        Returns:
+            Shape (groups, outputs, inputs, samples).
+        """
+        phi, precision = self._activations(x), torch.exp(-2.0 * self.log_widths)
+        by_input = []
+        for i in range(self.inputs):
+            # phi (c - x) / s^2, split so that each part is one product of matrices.
+            pull, weight = self.centres[:, :, i] * precision[:, :, i], self.output_weight
+            part = torch.bmm(weight * pull.unsqueeze(1), phi)
+            part -= torch.bmm(weight * precision[:, None, :, i], phi) * x[..., i].T.unsqueeze(1)
+            by_input.append(part)
+        return torch.stack(by_input, 2)
+
+    @torch.no_grad()
+    def regressor_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
+        """`regressors` with the samples last, (groups, units + 1, samples), written to `out`."""
+        phi = self._activations(x)
+        if out is None:
+            out = phi.new_empty(phi.shape[0], self.units + 1, phi.shape[2])
+        out[:, :-1] = phi
+        out[:, -1] = 1.0
+        return out
 
     @torch.no_grad()
     def jacobian_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
-        """What the derivatives of all outputs combine: phi z, phi z^2 and phi of each unit, and 1.
+        """What the derivatives of all outputs combine: the regressors, phi z and phi z^2.
 
         Here z = (x - c)/s. `jacobian_maps` says how they combine.
 
@@ -96,25 +125,20 @@ class RBFNetwork(nn.Module):
             x: inputs, shape (samples, groups, inputs).
             out: where to write the result, its shape; fresh memory costs more than the arithmetic.
         Returns:
-            Shape (groups, (2 inputs + 1) units + 1, samples).
+            Shape (groups, units + 1 + 2 units inputs, samples).
         """
-        moving, columns = self.units * self.inputs, to_columns(x)
-        shape = (len(columns), 2 * moving + self.units + 1, columns.shape[-1])
+        columns = to_columns(x)
+        size = (self.units, self.inputs)
+        shared, moving = self.units + 1, self.units * self.inputs
+        shape = (len(columns), shared + 2 * moving, columns.shape[-1])
         F = columns.new_empty(shape) if out is None else out
-        by_centre, by_width = (
-            F[:, i * moving : (i + 1) * moving].unflatten(1, (self.units, self.inputs))
-            for i in (0, 1)
-        )
-        z, phi = by_width, F[:, 2 * moving : -1]
-        torch.sub(columns.unsqueeze(1), self.centres.unsqueeze(-1), out=z)
+        phi = self.regressor_columns(x, F[:, :shared])[:, :-1]
+        by_centre = F[:, shared : shared + moving].unflatten(1, size)
+        by_width = F[:, shared + moving :].unflatten(1, size)
+        z = torch.sub(columns.unsqueeze(1), self.centres.unsqueeze(-1), out=by_width)
         z.mul_(torch.exp(-self.log_widths).unsqueeze(-1))
-        torch.mul(z[:, :, 0], z[:, :, 0], out=phi)
-        for i in range(1, self.inputs):
-            phi.addcmul_(z[:, :, i], z[:, :, i])
-        phi.mul_(-0.5).exp_()
         torch.mul(z, phi.unsqueeze(2), out=by_centre)
         by_width.mul_(by_centre)
-        F[:, -1] = 1.0
         return F
 
     @torch.no_grad()
@@ -132,10 +156,10 @@ class RBFNetwork(nn.Module):
         slope = weight * torch.exp(-self.log_widths).flatten(1).unsqueeze(1)
         own, one = (torch.eye(n).to(weight) for n in (self.outputs, units))
         blocks = {
-            "centres": (0, torch.diag_embed(slope)),
-            "log_widths": (moving, torch.diag_embed(weight)),
-            "output_weight": (2 * moving, torch.einsum("ab,uv->aubv", own, one).flatten(2)),
-            "output_bias": (columns - 1, own.unsqueeze(1)),
+            "centres": (units + 1, torch.diag_embed(slope)),
+            "log_widths": (units + 1 + moving, torch.diag_embed(weight)),
+            "output_weight": (0, torch.einsum("ab,uv->aubv", own, one).flatten(2)),
+            "output_bias": (units, own.unsqueeze(1)),
         }
         maps = {}
         for name in trained(self):

@@ -35,7 +35,7 @@ def coefficient_surfaces(
     *,
     joint_names: Sequence[str] | None = None,
     unit: str = "rad",
-    width: float = style.PAGE,
+    width: float | None = None,
 ) -> Figure:
     """Coefficients of a neuro-fuzzy model as maps over |velocity| and acceleration.
 
@@ -48,7 +48,7 @@ def coefficient_surfaces(
         width: of the figure [in].
 
     Returns:
-        A row a coefficient, a column a joint.
+        A map a coefficient and joint.
 
     Raises:
         ValueError: if the model's coefficients do not follow a neuro-fuzzy schedule.
@@ -56,23 +56,28 @@ def coefficient_surfaces(
     schedule = neuro_fuzzy(model)
     names = style.joint_labels(joint_names, model.joints)
     coefficients = model.law.coefficients
-    width = width if model.joints > 1 else min(width, style.COLUMN)
+    # The fewer of the two stand side by side: the maps with their bars need the room.
+    across = model.joints <= len(coefficients)
+    rows, columns = sorted((model.joints, len(coefficients)), reverse=True)
+    share = "col" if across else "row"
     figure, axes = style.panels(
-        len(coefficients), model.joints, width, 0.35 + 1.5 * len(coefficients),
-        sharex="col", sharey="col",
+        rows, columns, width or (style.COLUMN if columns == 1 else style.PAGE), 0.7 + 1.5 * rows,
+        sharex=share, sharey=share,
     )  # fmt: skip
     along = " along motion" if schedule.along_motion else ""
-    for j, name in enumerate(names):
+    for j, maps in enumerate(axes.T if across else axes):
         edges = _edges(schedule, j)
         values = _surface(schedule, j, edges)
-        seen = np.ones(values.shape[:2], bool) if motions is None else (
-            _occupied(schedule, motions, j, edges)
-        )  # fmt: skip
-        for k, coefficient in enumerate(coefficients):
+        seen = None if motions is None else _occupied(schedule, motions, j, edges)
+        for ax, value, coefficient in zip(
+            maps, np.moveaxis(values, -1, 0), coefficients, strict=True
+        ):
             label = style.sliding(coefficient.unit, unit)
-            _map(figure, axes[k, j], edges, values[..., k], seen, coefficient.name, label)
-        style.title(axes[0, j], name)
-        axes[-1, j].set_xlabel(f"|velocity| [{unit}/s]")
+            _map(figure, ax, edges, value, seen, coefficient.name, label)
+            style.title(ax, names[j])
+            # Ranges differ between joints, so every map says its own.
+            ax.tick_params(labelbottom=True, labelleft=True)
+    figure.supxlabel(f"|velocity| [{unit}/s]", fontsize=style.LABEL, color=style.INK)
     figure.supylabel(f"acceleration{along} [{unit}/s²]", fontsize=style.LABEL, color=style.INK)
     return figure
 

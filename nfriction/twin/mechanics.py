@@ -201,8 +201,8 @@ def simulate(
             state = _runge_kutta(rates, time, state, acceleration, step)
         if advance is not None and (sample + 1) % rate == 0:
             advance(1.0)
-    angle, speed, acceleration, tau_f = np.split(np.array(rows), 4, axis=1)
-    return TrueMotion(_joint(angle), _joint(speed), _joint(acceleration), tau_f)
+    angles, speeds, accelerations, tau_f = np.split(np.array(rows), 4, axis=1)
+    return TrueMotion(_joint(angles), _joint(speeds), _joint(accelerations), tau_f)
 
 
 def _runge_kutta(rates: _Rates, time: float, state: _State, a: Vector, h: float) -> _State:

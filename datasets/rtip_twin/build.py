@@ -1,0 +1,14 @@
+"""Build the recordings of the RTIP twin; the card beside this file describes them."""
+
+import sys
+from collections.abc import Sequence
+
+from nfriction.twin.command import main as build_twin
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    return build_twin("rtip", argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,158 @@
+"""Exact derivatives of a traced program, in forward mode on its scalar graph."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+from nfriction.codegen.errors import UnsupportedOperation
+from nfriction.codegen.graph import Port, Program
+from nfriction.codegen.scalar import Graph, Node, is_predicate, reachable
+
+Tangents = Mapping[int, Node]
+Rule = Callable[..., Node]
+
+
+def with_jacobian(program: Program, wrt: Sequence[str]) -> Program:
+    """The program with its Jacobian as a further, last output.
+
+    Args:
+        program: what was traced.
+        wrt: names of the inputs to differentiate by.
+
+    Returns:
+        The program with an output of shape (elements of all outputs, elements of all `wrt`), both
+        flat and in order.
+
+    Raises:
+        UnsupportedOperation: see `tangents`.
+    """
+    graph = program.graph
+    outputs = [node for port in program.outputs for node in port.nodes]
+    one, zero = graph.constant(1.0), graph.constant(0.0)
+    named = {port.name: port for port in program.inputs}
+    columns = [
+        tangents(graph, outputs, {node.number: one}) for name in wrt for node in named[name].nodes
+    ]
+    entries = tuple(column.get(node.number, zero) for node in outputs for column in columns)
+    jacobian = Port("jacobian", (len(outputs), len(columns)), entries)
+    return Program(graph, program.inputs, (*program.outputs, jacobian))
+
+
+def tangents(graph: Graph, outputs: Iterable[Node], seed: Tangents) -> dict[int, Node]:
+    """Derivative of every node that `outputs` need along one direction.
+
+    What does not depend on the direction is left out, so its derivative is zero and costs nothing.
+
+    Args:
+        graph: the graph to extend.
+        outputs: nodes whose derivatives are wanted.
+        seed: derivative of input nodes along the direction, by node number.
+
+    Returns:
+        Derivative by node number.
+
+    Raises:
+        UnsupportedOperation: an operation without a rule lies on the way, named.
+    """
+    found = dict(seed)
+    for node in reachable(outputs):
+        if not any(a.number in found for a in node.args) or is_predicate(node):
+            continue
+        moving = [found.get(a.number) for a in node.args]
+        rule = _RULES.get(node.op)
+        if rule is None:
+            raise UnsupportedOperation(node.op, "has no derivative here")
+        found[node.number] = rule(graph, node, *moving)
+    return found
+
+
+def _add(g: Graph, node: Node, da: Node | None, db: Node | None) -> Node:
+    if da is None or db is None:
+        return _one(da, db)
+    return g.apply("add", da, db)
+
+
+def _sub(g: Graph, node: Node, da: Node | None, db: Node | None) -> Node:
+    if db is None:
+        return _one(da)
+    return g.apply("neg", db) if da is None else g.apply("sub", da, db)
+
+
+def _mul(g: Graph, node: Node, da: Node | None, db: Node | None) -> Node:
+    a, b = node.args
+    terms = [g.apply("mul", d, x) for d, x in ((da, b), (db, a)) if d is not None]
+    return g.total(terms)
+
+
+def _div(g: Graph, node: Node, da: Node | None, db: Node | None) -> Node:
+    b = node.args[1]
+    if db is None:
+        return g.apply("div", _one(da), b)
+    fall = g.apply("mul", node, db)
+    over = g.apply("neg", fall) if da is None else g.apply("sub", da, fall)
+    return g.apply("div", over, b)
+
+
+def _where(g: Graph, node: Node, _: Node | None, da: Node | None, db: Node | None) -> Node:
+    zero = g.constant(0.0)
+    return g.apply("where", node.args[0], da or zero, db or zero)
+
+
+def _select(op: str) -> Rule:
+    """The larger or smaller operand's derivative."""
+
+    def rule(g: Graph, node: Node, da: Node | None, db: Node | None) -> Node:
+        zero = g.constant(0.0)
+        a, b = node.args
+        first = g.apply("lt", b, a) if op == "max" else g.apply("lt", a, b)
+        return g.apply("where", first, da or zero, db or zero)
+
+    return rule
+
+
+def _chain(slope: Callable[[Graph, Node, Node], Node]) -> Rule:
+    """A function of one argument; `slope` is given the graph, the argument and the value."""
+
+    def rule(g: Graph, node: Node, da: Node | None) -> Node:
+        return g.apply("mul", slope(g, node.args[0], node), _one(da))
+
+    return rule
+
+
+def _one(*candidates: Node | None) -> Node:
+    return next(c for c in candidates if c is not None)
+
+
+def _abs_slope(g: Graph, a: Node, value: Node) -> Node:
+    negative = g.apply("lt", a, g.constant(0.0))
+    return g.apply("where", negative, g.constant(-1.0), g.constant(1.0))
+
+
+def _tanh_slope(g: Graph, a: Node, value: Node) -> Node:
+    return g.apply("sub", g.constant(1.0), g.apply("mul", value, value))
+
+
+def _atan_slope(g: Graph, a: Node, value: Node) -> Node:
+    return g.apply("div", g.constant(1.0), g.apply("add", g.constant(1.0), g.apply("mul", a, a)))
+
+
+def _sqrt_slope(g: Graph, a: Node, value: Node) -> Node:
+    return g.apply("div", g.constant(0.5), value)
+
+
+_RULES: dict[str, Rule] = {
+    "add": _add,
+    "sub": _sub,
+    "mul": _mul,
+    "div": _div,
+    "where": _where,
+    "max": _select("max"),
+    "min": _select("min"),
+    "neg": lambda g, node, da: g.apply("neg", da),
+    "abs": _chain(_abs_slope),
+    "sqrt": _chain(_sqrt_slope),
+    "exp": _chain(lambda g, a, value: value),
+    "log": _chain(lambda g, a, value: g.apply("div", g.constant(1.0), a)),
+    "sin": _chain(lambda g, a, value: g.apply("cos", a)),
+    "cos": _chain(lambda g, a, value: g.apply("neg", g.apply("sin", a))),
+    "tanh": _chain(_tanh_slope),
+    "atan": _chain(_atan_slope),
+}

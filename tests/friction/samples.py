@@ -1,0 +1,50 @@
+"""A law of a user's own, and models and motions to test with."""
+
+import torch
+from torch import Tensor
+
+from nfriction.friction import MODELS, Coefficient, FrictionModel, Law
+from nfriction.friction.laws import LINEAR, NONLINEAR, STRIBECK, VISCOUS
+
+LAWS = (VISCOUS, LINEAR, NONLINEAR, STRIBECK)
+
+
+def quadratic(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
+    """Linear and quadratic drag, the latter growing with the load."""
+    d1, d2 = coefficients.unbind(-1)
+    return d1 * qd + d2 * load * qd * qd.abs()
+
+
+QUADRATIC = Law(
+    "quadratic", (Coefficient("D_1", "N m s/rad"), Coefficient("D_2", "N m s^2/rad^2")), quadratic
+)
+
+
+def normal(*shape: int, seed: int = 0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(shape, dtype=torch.float64, generator=generator)
+
+
+def motion(*shape: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    """Velocity, acceleration and load, at times beyond the default trained range."""
+    qd, qdd, load = (normal(*shape, seed=3 * seed + i) for i in range(3))
+    return 10 * qd, 100 * qdd, load.abs()
+
+
+@torch.no_grad()
+def randomise(model: torch.nn.Module, spread: float = 1.0, seed: int = 0) -> None:
+    """Move every parameter, as training could."""
+    for i, p in enumerate(model.parameters()):
+        p.add_(spread * normal(*p.shape, seed=1000 * seed + i).to(p))
+
+
+def named_models(joints: int = 3) -> dict[str, FrictionModel]:
+    """Every named model, moved off its start, and the neuro-fuzzy one with every option."""
+    models: dict[str, FrictionModel] = {name: make(joints) for name, make in MODELS.items()}
+    models["NFLFM, other options"] = MODELS["NFLFM"](
+        joints, [1e-3, 2e-3], v_smooth=1e-2, terms=(3, 2), head_units=4, acceleration="signed",
+        interpretable=True, prior_sd=0.1,
+    )  # fmt: skip
+    for seed, model in enumerate(models.values()):
+        randomise(model, 0.3, seed)
+    return models

@@ -1,0 +1,129 @@
+"""Friction laws: odd, passive, smooth through zero, broadcasting; and what describes them."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from nfriction.friction import Coefficient, Law
+from nfriction.friction.laws import STRIBECK, linear, nonlinear, smooth_sign, stribeck
+from tests.friction.samples import LAWS, QUADRATIC, motion, normal
+
+V_SMOOTH = 3e-3
+every_law = pytest.mark.parametrize("law", [*LAWS, QUADRATIC], ids=lambda law: law.name)
+positive = st.floats(0, 1e3)
+
+
+def positive_coefficients(law: Law, *shape: int, seed: int = 0) -> Tensor:
+    """Random coefficients with an offset, where there is one, of zero."""
+    values = normal(*shape, len(law.names), seed=seed).exp()
+    signed = torch.tensor([not c.positive for c in law.coefficients])
+    return values.masked_fill(signed, 0.0)
+
+
+@every_law
+@given(data=st.data())
+def test_friction_without_an_offset_never_drives(law: Law, data: st.DataObject) -> None:
+    qd, load = (data.draw(st.floats(-1e3, 1e3)), data.draw(positive))
+    values = [data.draw(positive) if c.positive else 0.0 for c in law.coefficients]
+    for k, c in enumerate(law.coefficients):
+        if c.name == "v_s":  # a width; a schedule never gives zero
+            values[k] += 1e-12
+    qd, load, coefficients = (torch.tensor(v, dtype=torch.float64) for v in (qd, load, values))
+    power = qd * law.torque(qd, load, coefficients, V_SMOOTH)
+    assert power >= 0
+
+
+@every_law
+def test_friction_without_an_offset_is_odd(law: Law) -> None:
+    qd, _, load = motion(200, 3)
+    coefficients = positive_coefficients(law, 3)
+    forth = law.torque(qd, load, coefficients, V_SMOOTH)
+    assert torch.equal(law.torque(-qd, load, coefficients, V_SMOOTH), -forth)
+
+
+def test_the_offset_is_the_torque_at_rest() -> None:
+    coefficients = torch.tensor([0.3, 0.1, 0.1, 0.1, 1.0], dtype=torch.float64)
+    zero = torch.zeros((), dtype=torch.float64)
+    assert nonlinear(zero, zero, coefficients, V_SMOOTH) == 0.3
+
+
+@every_law
+def test_gradients_are_those_of_differences_at_and_around_rest(law: Law) -> None:
+    # v_smooth of the steps' size would make the differences inaccurate, not the gradients.
+    qd = torch.tensor([0.0, -0.0, 0.05, -2.0], dtype=torch.float64, requires_grad=True)
+    load = torch.tensor([1.0, 0.5, 0.0, 2.0], dtype=torch.float64, requires_grad=True)
+    coefficients = positive_coefficients(law, 4).requires_grad_()
+
+    def torque(qd: Tensor, load: Tensor, coefficients: Tensor) -> Tensor:
+        return law.torque(qd, load, coefficients, 0.3)
+
+    assert torch.autograd.gradcheck(torque, (qd, load, coefficients))
+
+
+@every_law
+def test_gradients_stay_finite_where_functions_overflow(law: Law) -> None:
+    speeds = torch.tensor([0.0, 1e-300, -1e-8, 1.0, 1e3, -1e6], dtype=torch.float64)
+    sizes = torch.tensor([1e-12, 1e-3, 1.0, 1e3], dtype=torch.float64)
+    qd = speeds[:, None].expand(6, 4).clone().requires_grad_()
+    coefficients = sizes[:, None].expand(4, len(law.names)).clone().requires_grad_()
+    law.torque(qd, torch.ones_like(qd), coefficients, V_SMOOTH).sum().backward()
+    assert torch.isfinite(qd.grad).all()
+    assert torch.isfinite(coefficients.grad).all()
+
+
+@every_law
+def test_a_batch_of_coefficients_is_each_of_them(law: Law) -> None:
+    qd, _, load = motion(7, 3)
+    many = positive_coefficients(law, 5, 1, 3)
+    together = law.torque(qd, load, many, V_SMOOTH)
+    assert together.shape == (5, 7, 3)
+    for one, torque in zip(many, together, strict=True):
+        torch.testing.assert_close(law.torque(qd, load, one, V_SMOOTH), torque, rtol=1e-14, atol=0)
+
+
+@every_law
+def test_dtype_follows_the_inputs(law: Law) -> None:
+    qd = torch.ones(3, dtype=torch.float32)
+    assert law.torque(qd, qd, torch.ones(3, len(law.names)), V_SMOOTH).dtype == torch.float32
+
+
+def test_coulomb_friction_grows_with_the_load_alone() -> None:
+    qd, _, load = motion(50, 2)
+    coefficients = torch.tensor([0.0, 0.7], dtype=torch.float64)
+    expected = 0.7 * load * smooth_sign(qd, V_SMOOTH)
+    torch.testing.assert_close(linear(qd, load, coefficients, V_SMOOTH), expected)
+
+
+def test_stribeck_falls_from_breakaway_to_coulomb_friction() -> None:
+    f_c, f_d, v_s = 1.0, 0.5, 0.1
+    load = torch.ones((), dtype=torch.float64)
+
+    def torque(qd: float, delta: float = 2.0, f_v: float = 0.0) -> float:
+        coefficients = torch.tensor([f_c, f_d, f_v, v_s, delta], dtype=torch.float64)
+        return float(stribeck(torch.tensor(qd, dtype=torch.float64), load, coefficients, 1e-9))
+
+    # Just above standstill the sign is complete (1e-6 >> 1e-9) and the drop of order (1e-5)^2.
+    assert torque(1e-6) == pytest.approx(f_c + f_d, rel=1e-9)
+    assert torque(20 * v_s) == pytest.approx(f_c, rel=1e-12)
+    assert torque(20 * v_s, f_v=0.3) == pytest.approx(f_c + 0.3 * 20 * v_s, rel=1e-12)
+    for delta in (0.5, 1.0, 2.0, 50.0):
+        # At v_s a share 1/e is left, whatever the exponent.
+        assert torque(v_s, delta) == pytest.approx(f_c + f_d / torch.e, rel=1e-9)
+    speeds = torch.logspace(-5, 1, 50).tolist()
+    torques = [torque(v) for v in speeds]
+    assert all(a >= b for a, b in zip(torques, torques[1:], strict=False))
+
+
+def test_the_exponent_of_stribeck_is_kept_by_default() -> None:
+    assert [c.name for c in STRIBECK.coefficients if not c.fitted] == ["delta"]
+
+
+def test_a_law_is_refused_that_could_not_be_fitted_or_told() -> None:
+    with pytest.raises(ValueError, match="search"):
+        Coefficient("v_s", "rad/s", linear=False)
+    with pytest.raises(ValueError, match="names of their own"):
+        Law("twice", (Coefficient("B", "N m"), Coefficient("B", "N m")), linear)
+    with pytest.raises(ValueError, match="names of their own"):
+        Law("none", (), linear)

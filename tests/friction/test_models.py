@@ -1,0 +1,179 @@
+"""Friction models: law times schedule, one of a user's own included."""
+
+import pytest
+import torch
+
+from nfriction.friction import (
+    LFM,
+    MODELS,
+    NFLFM,
+    NLFM,
+    Constant,
+    FrictionModel,
+    NeuroFuzzy,
+    Schedule,
+    model_by_name,
+)
+from nfriction.friction.laws import LINEAR, VISCOUS
+from nfriction.friction.schedules import Sensitivity
+from tests.friction.samples import QUADRATIC, motion, named_models, normal, quadratic
+
+every_model = pytest.mark.parametrize("name", named_models())
+
+
+@every_model
+def test_the_torque_is_the_law_of_the_coefficients(name: str) -> None:
+    model = named_models()[name]
+    qd, qdd, load = motion(20, 3)
+    coefficients = model.coefficients(qd, qdd)
+    expected = model.law.torque(qd, load, coefficients, model.v_smooth)
+    found = model(qd, qdd, load)
+    assert found.shape == (20, 3)
+    assert found.dtype == torch.float64
+    assert torch.equal(found, expected)
+    assert torch.equal(model.torque(qd, load, coefficients), expected)
+
+
+@every_model
+def test_any_batch_shape_is_samples(name: str) -> None:
+    model = named_models()[name]
+    inputs = motion(4, 5, 3)
+    flat = model(*(x.reshape(-1, 3) for x in inputs))
+    torch.testing.assert_close(model(*inputs).reshape(-1, 3), flat, rtol=1e-12, atol=1e-15)
+    torch.testing.assert_close(model(*(x[0, 0] for x in inputs)), flat[0], rtol=1e-12, atol=1e-15)
+
+
+@every_model
+def test_double_precision_throughout_and_single_where_asked(name: str) -> None:
+    model = named_models()[name]
+    assert all(t.dtype == torch.float64 for t in model.state_dict().values())
+    qd, qdd, load = motion(20, 3)
+    expected = model(qd, qdd, load)
+    single = model.to(torch.float32)(qd.float(), qdd.float(), load.float())
+    assert single.dtype == torch.float32
+    # Single precision's 1e-7, times what scaling, exponentials and sums add.
+    torch.testing.assert_close(single.double(), expected, rtol=1e-3, atol=1e-4)
+
+
+@every_model
+def test_every_trained_parameter_has_a_gradient(name: str) -> None:
+    model = named_models()[name]
+    model(*motion(50, 3)).square().sum().backward()
+    for parameter in model.parameters():
+        assert parameter.grad is not None
+        assert torch.isfinite(parameter.grad).all()
+        assert parameter.grad.any()
+
+
+@every_model
+def test_the_slope_at_rest_is_that_of_differences(name: str) -> None:
+    model = named_models()[name]
+    rest, load = torch.zeros(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64)
+    step = 1e-4 * model.v_smooth
+    held = model.coefficients(rest, rest)
+    ahead, behind = (model.torque(rest + s, load, held) for s in (step, -step))
+    slope = model.slope_at_rest()
+    # Truncation is (step / v_smooth)^2 / 3.
+    torch.testing.assert_close(slope, ((ahead - behind) / (2 * step)).detach(), rtol=1e-7, atol=0)
+    assert slope.shape == (3,)
+    assert not slope.requires_grad
+
+
+def test_the_slope_of_coulomb_friction_is_its_size_over_the_smoothing() -> None:
+    model = LFM(2, [[0.1, 0.5], [0.2, 0.7]], v_smooth=1e-2)
+    expected = torch.tensor([0.1 + 0.5e2, 0.2 + 0.7e2], dtype=torch.float64)
+    torch.testing.assert_close(model.slope_at_rest(), expected, rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("make", [Constant, NeuroFuzzy])
+def test_a_law_of_ones_own_works_like_the_named_ones(make: type[Schedule]) -> None:
+    values = torch.tensor([[0.1, 0.2], [0.3, 0.4]], dtype=torch.float64)
+    model = FrictionModel(QUADRATIC, make(QUADRATIC, 2, values))
+    qd, qdd, load = motion(30, 2)
+    expected = quadratic(qd, load, values, model.v_smooth)
+    torch.testing.assert_close(model(qd, qdd, load), expected, rtol=1e-13, atol=0)
+    assert "law=quadratic" in repr(model)
+
+
+class WithoutParameters(Schedule):
+    """A schedule of a user's own: viscous friction that falls with the speed."""
+
+    def forward(self, qd: torch.Tensor, qdd: torch.Tensor) -> torch.Tensor:
+        return torch.exp(-qd.abs()).unsqueeze(-1)
+
+    def parameter_vector(self) -> torch.Tensor:
+        return torch.zeros(0, dtype=torch.float64)
+
+    def set_parameter_vector(self, vector: torch.Tensor) -> None:
+        pass
+
+    def bounds(self) -> tuple[torch.Tensor, torch.Tensor]:
+        return self.parameter_vector(), self.parameter_vector()
+
+    def sensitivities(self, qd: torch.Tensor, qdd: torch.Tensor) -> Sensitivity:
+        raise NotImplementedError
+
+
+def test_a_schedule_of_ones_own_works_even_without_parameters() -> None:
+    model = FrictionModel(VISCOUS, WithoutParameters(VISCOUS, 2))
+    qd, qdd, load = motion(30, 2)
+    torch.testing.assert_close(model(qd, qdd, load), torch.exp(-qd.abs()) * qd)
+    torch.testing.assert_close(model.slope_at_rest(), torch.ones(2, dtype=torch.float64))
+
+
+def test_held_coefficients_come_in_batches() -> None:
+    model = NLFM(3)
+    qd, _, load = motion(7, 3)
+    held = normal(4, 7, 3, 5).exp()
+    together = model.torque(qd, load, held)
+    for one, torque in zip(held, together, strict=True):
+        torch.testing.assert_close(model.torque(qd, load, one), torque, rtol=1e-14, atol=0)
+
+
+def test_nan_in_nan_out() -> None:
+    for name, model in named_models().items():
+        for which in range(3):
+            inputs = list(motion(4, 3))
+            clean = model(*inputs)
+            changed = clean.clone()
+            changed[1, 2] = torch.nan
+            # What a model does not read cannot harm it.
+            reads = torch.autograd.functional.jacobian(
+                lambda x, w=which, m=model: m(*(x if i == w else y for i, y in enumerate(motion(3)))),
+                motion(3)[which],
+            ).any()
+            inputs[which][1, 2] = torch.nan
+            expected = changed if reads else clean
+            assert torch.equal(torch.isnan(model(*inputs)), torch.isnan(expected)), (name, which)
+
+
+def test_options_are_those_given() -> None:
+    options = dict(
+        terms=[3, 2], head_units=4, acceleration="signed", interpretable=True, prior_sd=0.1
+    )
+    assert NFLFM(2, **options).options() == options
+    assert LFM(2).options() == {}
+    # Made by hand, a model still tells them.
+    assert FrictionModel(LINEAR, NeuroFuzzy(LINEAR, 2, **options)).options() == options
+
+
+def test_the_number_of_joints_must_fit() -> None:
+    with pytest.raises(ValueError, match="3 joints, got last axis 2"):
+        LFM(3)(*motion(5, 2))
+
+
+@pytest.mark.parametrize("v_smooth", [0.0, -1.0, float("nan"), float("inf")])
+def test_the_smoothing_must_be_positive(v_smooth: float) -> None:
+    with pytest.raises(ValueError, match="`v_smooth` must be positive and finite"):
+        LFM(1, v_smooth=v_smooth)
+
+
+def test_a_schedule_for_another_law_is_refused() -> None:
+    with pytest.raises(ValueError, match="the schedule gives C_p, but the law 'linear' takes B, C"):
+        FrictionModel(LINEAR, Constant(VISCOUS, 2))
+
+
+def test_models_are_found_by_name() -> None:
+    assert all(model_by_name(name) is make for name, make in MODELS.items())
+    with pytest.raises(ValueError, match=r"'LFN'; there are NCFM, LFM, .*NFNLFM"):
+        model_by_name("LFN")

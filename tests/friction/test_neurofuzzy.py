@@ -1,0 +1,281 @@
+"""Neuro-fuzzy coefficients: a constant law until trained, positive, clamped, told to fits."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.func import functional_call, jacrev
+
+from nfriction.friction import Constant, FrictionModel, NeuroFuzzy
+from nfriction.friction.laws import LINEAR, NONLINEAR, STRIBECK, VISCOUS
+from nfriction.friction.neurofuzzy import LEAST_RATIO, soft_positive, soft_positive_inverse
+from tests.friction.samples import LAWS, QUADRATIC, motion, normal, randomise
+
+every_law = pytest.mark.parametrize("law", [*LAWS, QUADRATIC], ids=lambda law: law.name)
+both_ways = pytest.mark.parametrize("acceleration", ["along_motion", "signed"])
+
+
+def trained(law=LINEAR, joints: int = 2, spread: float = 0.5, seed: int = 0, **options: object):
+    schedule = NeuroFuzzy(law, joints, **options)
+    randomise(schedule, spread, seed)
+    return schedule
+
+
+@given(st.floats(-1e100, 1e100), st.floats(1e-6, 1.0))
+def test_the_positive_map_is_positive_and_hardly_changes_what_is(u: float, roundness: float):
+    y = soft_positive(torch.tensor(u, dtype=torch.float64), roundness)
+    assert y >= 0
+    assert y >= u
+    assert abs(float(y) - max(u, 0.0)) <= roundness * (1 + 1e-9) + 1e-15 * abs(u)
+
+
+@given(st.floats(1e-2, 1e6))
+def test_the_positive_map_is_undone(y: float) -> None:
+    u = soft_positive_inverse(torch.tensor(y, dtype=torch.float64), 0.05)
+    # For y below the roundness, u is negative and up to 25 times as large: two digits are lost.
+    assert float(soft_positive(u, 0.05)) == pytest.approx(y, rel=1e-13)
+
+
+@every_law
+def test_untrained_it_is_the_constant_law(law) -> None:
+    constant = Constant(law, 3)
+    schedule = NeuroFuzzy(law, 3, constant.values)
+    qd, qdd, _ = motion(100, 3)
+    expected = constant.values.expand(100, -1, -1)
+    torch.testing.assert_close(schedule(qd, qdd), expected, rtol=1e-14, atol=0)
+    torch.testing.assert_close(schedule.reference_coefficients(), constant.values)
+
+
+def test_a_coefficient_near_zero_can_rise() -> None:
+    schedule = NeuroFuzzy(LINEAR, 1)
+    scale = torch.tensor([[1.0, 2.0]], dtype=torch.float64)
+    schedule.set_reference(torch.tensor([[0.0, 0.5]], dtype=torch.float64), scale)
+    found = schedule.reference_coefficients()
+    torch.testing.assert_close(found, torch.tensor([[LEAST_RATIO, 0.5]], dtype=torch.float64))
+    assert torch.equal(schedule.scale, scale)
+
+
+def test_a_signed_coefficient_of_zero_starts_at_zero() -> None:
+    schedule = NeuroFuzzy(NONLINEAR, 2)
+    assert not schedule(*motion(5, 2)[:2])[..., 0].any()
+
+
+@every_law
+@settings(max_examples=20)
+@given(seed=st.integers(0, 1000), spread=st.floats(0.01, 100.0))
+def test_coefficients_are_positive_whatever_the_parameters(law, seed: int, spread: float):
+    schedule = trained(law, 2, spread, seed)
+    values = schedule(*motion(50, 2, seed=seed)[:2])
+    assert torch.isfinite(values).all()
+    assert (values[..., schedule.positive] >= 0).all()
+
+
+@every_law
+@both_ways
+@settings(max_examples=20)
+@given(seed=st.integers(0, 1000), spread=st.floats(0.01, 10.0))
+def test_without_an_offset_it_never_drives(law, acceleration: str, seed: int, spread: float):
+    schedule = trained(law, 2, spread, seed, acceleration=acceleration)
+    silence_offset(schedule)
+    qd, qdd, load = motion(50, 2, seed=seed)
+    assert (qd * FrictionModel(law, schedule)(qd, qdd, load) >= 0).all()
+
+
+@torch.no_grad()
+def silence_offset(schedule: NeuroFuzzy) -> None:
+    """Keep signed coefficients at zero, as a user without an offset would."""
+    signed = ~schedule.positive
+    schedule.network.anfis.consequents[:, signed] = 0.0
+    schedule.network.head.output_weight[:, signed] = 0.0
+    schedule.network.head.output_bias[:, signed] = 0.0
+
+
+@every_law
+def test_turning_the_other_way_only_turns_the_torque(law) -> None:
+    schedule = trained(law)
+    silence_offset(schedule)
+    model = FrictionModel(law, schedule)
+    qd, qdd, load = motion(100, 2)
+    assert torch.equal(model(-qd, -qdd, load), -model(qd, qdd, load))
+
+
+def test_with_signed_acceleration_the_directions_differ() -> None:
+    schedule = trained(acceleration="signed")
+    qd, qdd, _ = motion(100, 2)
+    assert not torch.allclose(schedule(-qd, -qdd), schedule(qd, qdd), rtol=1e-3)
+    torch.testing.assert_close(schedule(-qd, qdd), schedule(qd, qdd), rtol=0, atol=0)
+
+
+@both_ways
+def test_beyond_the_trained_range_coefficients_stay_what_they_are_at_its_edge(acceleration: str):
+    schedule = trained(acceleration=acceleration)
+    schedule.set_range([4.0, 5.0], [[-30.0, 60.0], [-20.0, 20.0]])
+    edge = torch.tensor([4.0, 5.0], dtype=torch.float64), torch.tensor([60.0, 20.0]).double()
+    outside = torch.tensor([400.0, 5.1], dtype=torch.float64), torch.tensor([61.0, 1e9]).double()
+    assert torch.equal(schedule(*edge), schedule(*outside))
+    inside = edge[0] - 0.1, edge[1] - 1.0
+    assert (schedule(*edge) != schedule(*inside)).all()
+
+
+@pytest.mark.parametrize(
+    ("velocity", "acceleration"),
+    [(0.0, [-1, 1]), (1.0, [1, 1]), (float("nan"), [-1, 1]), (1.0, [-float("inf"), 1])],
+)
+def test_an_empty_range_is_refused(velocity: float, acceleration: list[float]) -> None:
+    schedule = NeuroFuzzy(LINEAR, 2)
+    before = schedule.velocity_range.clone()
+    with pytest.raises(ValueError, match="finite and not empty"):
+        schedule.set_range(velocity, acceleration)
+    assert torch.equal(schedule.velocity_range, before)
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_nan_of_one_sample_and_joint_stays_there(which: int) -> None:
+    schedule = trained()
+    inputs = list(motion(5, 2)[:2])
+    clean = schedule(*inputs)
+    inputs[which][2, 1] = torch.nan
+    found = schedule(*inputs)
+    lost = torch.zeros(5, 2, 1, dtype=torch.bool)
+    lost[2, 1] = True
+    assert torch.equal(torch.isnan(found), lost.expand(found.shape))
+    assert torch.equal(torch.where(lost, clean, found), clean)
+
+
+def test_joints_do_not_see_one_another() -> None:
+    schedule = trained(joints=3)
+    qd, qdd, _ = motion(10, 3)
+    together = schedule(qd, qdd)
+    qd[:, 1], qdd[:, 1] = 1.0, 2.0
+    apart = schedule(qd, qdd)
+    assert torch.equal(together[:, [0, 2]], apart[:, [0, 2]])
+    assert not torch.equal(together[:, 1], apart[:, 1])
+
+
+def test_any_batch_shape_is_samples() -> None:
+    schedule = trained()
+    qd, qdd, _ = motion(3, 4, 2)
+    flat = schedule(qd.reshape(-1, 2), qdd.reshape(-1, 2))
+    torch.testing.assert_close(schedule(qd, qdd).reshape(flat.shape), flat, rtol=1e-13, atol=0)
+    torch.testing.assert_close(schedule(qd[0, 0], qdd[0, 0]), flat[0], rtol=1e-13, atol=0)
+
+
+def test_the_parameter_vector_goes_round_bit_for_bit() -> None:
+    schedule, other = trained(), NeuroFuzzy(LINEAR, 2)
+    vector = schedule.parameter_vector()
+    other.set_parameter_vector(vector)
+    assert torch.equal(other.parameter_vector(), vector)
+    before = vector.clone()
+    vector.zero_()  # a copy: the model must not follow
+    assert torch.equal(schedule.parameter_vector(), before)
+    with pytest.raises(RuntimeError):
+        other.set_parameter_vector(before[1:])
+
+
+def test_the_prior_pulls_to_the_reference() -> None:
+    schedule = trained(prior_sd=0.2)
+    mean, sd = schedule.prior()
+    assert (sd == 0.2).all()
+    with torch.no_grad():
+        schedule.network.head.output_bias.zero_()
+    schedule.set_parameter_vector(mean)
+    expected = schedule.reference_coefficients().expand(5, -1, -1)
+    torch.testing.assert_close(schedule(*motion(5, 2)[:2]), expected, rtol=1e-14, atol=0)
+
+
+def test_a_coefficient_that_is_not_fitted_stays_constant() -> None:
+    schedule = NeuroFuzzy(STRIBECK, 2)
+    lower, upper = schedule.bounds()
+    fixed = lower == upper
+    # One output of five, of every rule's plane and of every unit, at both joints.
+    assert int(fixed.sum()) == 2 * (25 * 3 + 10)
+    assert torch.isinf(lower[~fixed]).all()
+    assert torch.isinf(upper[~fixed]).all()
+    schedule.set_parameter_vector(normal(len(lower)).clamp(lower, upper))
+    found = schedule(*motion(20, 2)[:2])
+    delta = STRIBECK.names.index("delta")
+    torch.testing.assert_close(found[..., delta], torch.full((20, 2), 2.0, dtype=torch.float64))
+    assert (found.std(0)[:, :delta] > 1e-3 * found.mean(0)[:, :delta]).all()
+
+
+def by_parameters(schedule: NeuroFuzzy, qd: Tensor, qdd: Tensor) -> Tensor:
+    """Jacobian (sample, joint, coefficient, parameter) by reverse differentiation of everything."""
+    values = schedule.trained()
+    by_identity = {id(p): name for name, p in schedule.named_parameters()}
+    names = [by_identity[id(p)] for p in values]
+    sizes = [p.numel() for p in values]
+
+    def coefficients(vector: Tensor) -> Tensor:
+        parts = zip(vector.split(sizes), values, strict=True)
+        state = dict(zip(names, (part.reshape(p.shape) for part, p in parts), strict=True))
+        return functional_call(schedule, state, (qd, qdd))
+
+    return jacrev(coefficients)(schedule.parameter_vector())
+
+
+@both_ways
+@pytest.mark.parametrize("interpretable", [False, True])
+def test_parameter_sensitivities_are_the_whole_jacobian(acceleration: str, interpretable: bool):
+    schedule = trained(
+        NONLINEAR, 2, terms=(3, 2), head_units=4, acceleration=acceleration,
+        interpretable=interpretable,
+    )  # fmt: skip
+    qd, qdd, _ = motion(6, 2)
+    qd[0] = 0.0
+    found = schedule.sensitivities(qd, qdd)
+    own = torch.nn.functional.one_hot(found.joint, 2).T.to(qd)  # (joint, parameter)
+    expanded = found.parameters[:, None] * own[:, None]
+    expected = by_parameters(schedule, qd, qdd).detach()
+    torch.testing.assert_close(expanded, expected, rtol=1e-11, atol=1e-14)
+    assert not found.parameters.requires_grad
+
+
+def central(function: Callable[[Tensor], Tensor], x: Tensor, step: float) -> Tensor:
+    with torch.no_grad():
+        return (function(x + step) - function(x - step)) / (2 * step)
+
+
+@both_ways
+def test_motion_sensitivities_are_those_of_differences(acceleration: str) -> None:
+    schedule = trained(acceleration=acceleration)
+    qd, qdd, _ = motion(40, 2)
+    # Away from where |qd| and the clamp to the trained range have corners.
+    qd = qd.sign() * (0.5 + qd.abs()).clamp(max=19.0)
+    qdd = qdd.clamp(-190, 190)
+    found = schedule.sensitivities(qd, qdd)
+    scale = schedule.scale
+    by_qd = central(lambda v: schedule(v, qdd), qd, 1e-5)
+    by_qdd = central(lambda a: schedule(qd, a), qdd, 1e-4)
+    # Truncation step^2, rounding 1e-16 / step, both below 1e-9 of the coefficients' scale.
+    assert ((found.qd - by_qd).abs() / scale).max() < 1e-8
+    assert ((found.qdd - by_qdd).abs() / scale).max() < 1e-8
+    assert (found.qdd.abs() / scale).max() > 1e-4
+
+
+def test_sensitivities_at_rest_are_finite() -> None:
+    zero = torch.zeros(3, 2, dtype=torch.float64)
+    assert all(torch.isfinite(t).all() for t in trained().sensitivities(zero, zero))
+
+
+@pytest.mark.parametrize("outputs", [1, 2])
+def test_the_heads_bias_would_say_what_the_rules_constants_say(outputs: int) -> None:
+    law = (VISCOUS, LINEAR)[outputs - 1]
+    biased, shifted = NeuroFuzzy(law, 2), NeuroFuzzy(law, 2)
+    with torch.no_grad():
+        biased.network.head.output_bias.fill_(0.3)
+        shifted.network.anfis.consequents[..., -1] = 0.3
+    qd, qdd, _ = motion(20, 2)
+    torch.testing.assert_close(biased(qd, qdd), shifted(qd, qdd), rtol=1e-13, atol=0)
+    assert not any(p is biased.network.head.output_bias for p in biased.trained())
+
+
+def test_options_are_refused_by_name() -> None:
+    with pytest.raises(ValueError, match='"along_motion" or "signed", got \'papers\''):
+        NeuroFuzzy(LINEAR, 2, acceleration="papers")
+    with pytest.raises(ValueError, match="`prior_sd` must be positive"):
+        NeuroFuzzy(LINEAR, 2, prior_sd=0.0)
+    with pytest.raises(ValueError, match="2 inputs"):
+        NeuroFuzzy(LINEAR, 2, terms=(5, 5, 5))
