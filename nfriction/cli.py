@@ -7,13 +7,14 @@ import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 import torch
 from tqdm import tqdm
 
+from nfriction import twin
 from nfriction.angles import AngleConvention
 from nfriction.codegen import CodegenError
 from nfriction.comparison import Comparison, compare
@@ -82,7 +83,9 @@ def _parser() -> argparse.ArgumentParser:
         "demo", parents=[common], help="simulate a rig with hidden friction, then compare models"
     )
     demo.add_argument("--models", default=DEFAULT_MODELS)
-    demo.add_argument("--seed", type=int, default=0)
+    demo.add_argument("--seed", type=int, default=0, help="of encoder errors and jitter")
+    demo.add_argument("--seconds", type=float, default=twin.QUICK_DURATION,
+                      help="length of each recording")  # fmt: skip
     _add_output(demo)
     demo.set_defaults(run=_demo, out=Path("runs/demo"))
 
@@ -137,10 +140,17 @@ def _compare(arguments: argparse.Namespace) -> int:
 
 
 def _demo(arguments: argparse.Namespace) -> int:
-    from nfriction.demonstration import simulated_recordings
-
-    plant, train, held_out = simulated_recordings(seed=arguments.seed)
-    print(f"simulated {len(train)} recordings to train and {len(held_out)} to hold out")
+    simulated = twin.make(
+        "tlrip",
+        seed=arguments.seed,
+        duration=arguments.seconds,
+        progress=sys.stderr.isatty(),
+    )
+    plant, train, held_out = simulated.plant, simulated.part("train"), simulated.part("held_out")
+    print(
+        f"simulated the papers' rig with friction unknown to every model: {len(train)} recordings "
+        f"of {arguments.seconds:g} s to train on, {len(held_out)} held out"
+    )
     return _run_comparison(plant, train, held_out, arguments, {"fit_plant": False})
 
 
@@ -219,8 +229,9 @@ def _read(
 ) -> list[Recording]:
     text = arguments.angles or ",".join(plant.convention)
     convention = AngleConvention.parse(text)
+    unit: Literal["rad", "m"] = "m" if plant.unit == "m" else "rad"
     return [
-        Recording.read(path, degrees=arguments.degrees, convention=convention, unit=plant.unit)
+        Recording.read(path, degrees=arguments.degrees, convention=convention, unit=unit)
         for path in paths
     ]
 

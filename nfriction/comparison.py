@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from nfriction.fitting import Fit, fit
-from nfriction.friction import Constant, FrictionModel, model_by_name
+from nfriction.friction import Constant, FrictionModel, NeuroFuzzy, model_by_name
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.recording import Recording
 from nfriction.scoring import HORIZONS, Score, improvement_table, rmse_table, score
@@ -141,11 +141,9 @@ def coefficient_summary(model: FrictionModel) -> dict[str, Any]:
     names = schedule.coefficient_names
     if isinstance(schedule, Constant):
         return {n: schedule.values[:, k].tolist() for k, n in enumerate(names)}
-    return {
-        "reference": {
-            n: (schedule.scale * schedule.reference)[:, k].tolist() for k, n in enumerate(names)
-        }
-    }
+    assert isinstance(schedule, NeuroFuzzy)
+    reference = schedule.scale * schedule.reference
+    return {"reference": {n: reference[:, k].tolist() for k, n in enumerate(names)}}
 
 
 def _nearest(fits: Mapping[str, Fit], model: FrictionModel) -> Fit | None:

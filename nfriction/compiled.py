@@ -93,7 +93,7 @@ def integrate_compiled(
     steps = step.shape[-1] * substeps
     drive = None
     if measured is not None:
-        drive = tuple(finer(rows(m, 2), -2) for m in measured)
+        drive = (finer(rows(measured[0], 2), -2), finer(rows(measured[1], 2), -2))
     found = compiled(
         q.detach().reshape(-1, joints).contiguous(),
         qd.detach().reshape(-1, joints).contiguous(),
@@ -110,7 +110,7 @@ def integrate_compiled(
 
 def _compiled(plant: Any, friction: Any, backend: Backend) -> "codegen.CompiledRollout | None":
     """The compiled rollout of this structure, from the cache where it is there."""
-    if not (isinstance(plant, nn.Module) and isinstance(friction, nn.Module)):
+    if backend == "torch" or not all(isinstance(m, nn.Module) for m in (plant, friction)):
         return None
     key = (backend, _structure(plant), _structure(friction))
     if key in _cache:

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from nfriction.atomic import write_atomically
 from nfriction.comparison import Comparison
 from nfriction.export import ExportError, torchscript
 from nfriction.fitting import Fit
-from nfriction.modelfile import ModelInfo, save, write_atomically
+from nfriction.modelfile import ModelInfo, save
 from nfriction.recording import Recording
 
 logger = logging.getLogger(__name__)

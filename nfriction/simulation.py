@@ -8,7 +8,7 @@ acceleration needs friction.
 import contextlib
 import logging
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -269,12 +269,9 @@ def _integrate(
 
 def _asks_gradients(plant: Plant, friction: Friction | None, *inputs: Tensor) -> bool:
     """Whether anything that shapes the motion requires a gradient."""
-    owned = [
-        t
-        for module in (plant, friction)
-        if isinstance(module, nn.Module)
-        for t in (*module.parameters(), *module.buffers())
-    ]
+    given: tuple[Any, ...] = (plant, friction)
+    modules = [m for m in given if isinstance(m, nn.Module)]
+    owned = [t for m in modules for t in (*m.parameters(), *m.buffers())]
     return any(t.requires_grad for t in (*inputs, *owned))
 
 

@@ -15,7 +15,7 @@ settings.load_profile("default")
 
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
-    """Folder of the real recordings: `NFRICTION_DATA`, else `../shared/data` beside the checkout."""
+    """Folder of the real recordings: `NFRICTION_DATA`, else `../shared/data`."""
     beside = Path(__file__).resolve().parents[2] / "shared" / "data"
     folder = Path(os.environ.get("NFRICTION_DATA", beside))
     if not folder.is_dir():

@@ -224,8 +224,8 @@ class CompiledRollout:
         self._run(count, threads, shared)
         if isinstance(q0, Tensor):
             tensors = [torch.from_numpy(a) for a in (*out, diverged)]
-            return Trajectories(*tensors)
-        return Trajectories(*out, diverged)
+            return Trajectories(tensors[0], tensors[1], tensors[2], tensors[3])
+        return Trajectories(out[0], out[1], out[2], diverged)
 
     def check(self, states: int = 3) -> None:
         """Compare two steps from random states with the same steps in eager torch.

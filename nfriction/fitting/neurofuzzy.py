@@ -32,7 +32,7 @@ Callback = Callable[[EvidenceState], "bool | None"]
 # What moves a start away from the given one, in units of the scaled inputs or of logarithms.
 SHAKE = 0.3
 # The few samples of the search leave the sets almost where all samples want them.
-REFINING_STEPS = 10
+REFINING_STEPS, RANKING_STEPS = 10, 3
 GAUSSIAN = ("gaussian", "left_shoulder", "right_shoulder")
 
 
@@ -90,6 +90,8 @@ def train_on_controller(
     samples: int = 40_000,
     seed: int = 0,
     starts: int = 1,
+    search_samples: int = 4000,
+    search_steps: int = 50,
     max_steps: int = 30,
     tolerance: float = 1e-3,
     noise_floor: float = 0.0,
@@ -99,13 +101,14 @@ def train_on_controller(
     """Teach a network, in place, what fuzzy controllers say: the papers' neuro-fuzzy step.
 
     An ANFIS starts from a controller's own sets where it has as many, else from an even grid over
-    the universes; a radial basis network from k-means.
+    the universes; a radial basis network from units chosen by orthogonal least squares.
 
     Args:
         network: from inputs in SI to outputs in SI, a group for each controller.
         controllers: one for each group.
         samples, seed: see `controller_targets`; group g draws with seed + g.
-        starts, max_steps, tolerance, noise_floor, callback, progress: see `train_network`.
+        starts, search_samples, search_steps: see `train_network`.
+        max_steps, tolerance, noise_floor, callback, progress: likewise.
     Returns:
         A fit for each group; fewer if an interrupt or the callback ended the training.
     References:
@@ -122,7 +125,7 @@ def train_on_controller(
     drawn = [controller_targets(c, samples, seed + g) for g, c in enumerate(given)]
     x, y = (torch.stack(parts, 1) for parts in zip(*drawn, strict=True))
     if isinstance(network, RBFNetwork):
-        network.init_kmeans(x, seed)
+        network.init_ols(x, y, width=0.5)
     else:
         _take_sets(network.anfis if isinstance(network, AnfisRBF) else network, given)
     return train_network(
@@ -131,6 +134,8 @@ def train_on_controller(
         y,
         seed=seed,
         starts=starts,
+        search_samples=search_samples,
+        search_steps=search_steps,
         max_steps=max_steps,
         tolerance=tolerance,
         noise_floor=noise_floor,
@@ -157,7 +162,8 @@ def train_network(
     """Train a network in place on samples by Bayesian regularisation, each group for itself.
 
     Sets (or units) are first moved with the output layer eliminated, on few samples and from
-    several starts; the start with the largest evidence goes on, on all samples. There every group
+    several starts, then a little on all, where the start with the largest evidence goes
+    on. Every group
     of parameters has its own prior: centres, widths and their like around where they stood when
     the training was called, output layers around zero (in scaled units).
 
@@ -252,14 +258,15 @@ class _Group:
                 _restart(trial, x, seed + number)
             start = _moving(trial)
             project(trial, x, y, steps)
+            if len(x) < len(self.x):
+                project(trial, self.x, self.y, REFINING_STEPS if starts == 1 else RANKING_STEPS)
             evidence = 0.0
             if starts > 1:
-                evidence = _regularise(trial, x, y, start, max_steps=10).log_evidence
+                # On all samples: on few, the start that overfits them would win.
+                evidence = _regularise(trial, self.x, self.y, start, max_steps=1).log_evidence
             if evidence > best:
                 best, prior, found = evidence, start, deepcopy(trial.state_dict())
         self.carrier.load_state_dict(found)
-        if len(x) < len(self.x):
-            project(self.carrier, self.x, self.y, REFINING_STEPS)
         return prior
 
     def regularise(self, prior: dict[str, Tensor], seed: int, **options: Any) -> EvidenceResult:
@@ -283,15 +290,15 @@ class _Group:
 
 def one_group(network: FuzzyNetwork, group: int) -> FuzzyNetwork:
     """A network of its own with the values of one group of `network`."""
-    single = deepcopy(network)
+    single: FuzzyNetwork = deepcopy(network)
     for module in single.modules():
         if isinstance(module, Anfis | AnfisRBF | RBFNetwork):
             module.groups = 1
         for name, value in list(module.named_parameters(recurse=False)):
             part = value.detach()[group : group + 1].clone()
             setattr(module, name, nn.Parameter(part, requires_grad=value.requires_grad))
-        for name, value in list(module.named_buffers(recurse=False)):
-            setattr(module, name, value[group : group + 1].clone())
+        for name, buffer in list(module.named_buffers(recurse=False)):
+            setattr(module, name, buffer[group : group + 1].clone())
     return single
 
 

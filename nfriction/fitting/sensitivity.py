@@ -80,12 +80,8 @@ class StepJacobian:
         if self._compiled is not None:
             given = (q, qd, held, tau, step, vector[None])
             return torch.from_numpy(self._compiled(*given)[-1])
-        return torch.cat(
-            [
-                self._eager(*piece, vector)
-                for piece in zip(*(x.split(CHUNK) for x in (q, qd, held, tau, step)), strict=True)
-            ]
-        )
+        pieces = zip(*(x.split(CHUNK) for x in (q, qd, held, tau, step)), strict=True)
+        return torch.cat([self._eager(a, b, c, d, e, vector) for a, b, c, d, e in pieces])
 
     def _after(
         self, q: Tensor, qd: Tensor, held: Tensor, tau: Tensor, step: Tensor, vector: Tensor

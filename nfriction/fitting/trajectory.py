@@ -194,7 +194,10 @@ def solve_trajectory(
     """Minimise a trajectory problem from `x0`, leaving the best parameters in its model."""
     lower, upper = problem.bounds()
     solver = LevenbergMarquardt(
-        max_steps=max_steps, gradient_tolerance=1e-6, cost_tolerance=cost_tolerance, step_tolerance=1e-8
+        max_steps=max_steps,
+        gradient_tolerance=1e-6,
+        cost_tolerance=cost_tolerance,
+        step_tolerance=1e-8,
     )
     result = solver.minimise(
         problem.quadratic, x0, cost=problem.cost, lower=lower, upper=upper, callback=callback

@@ -18,6 +18,7 @@ from torch import Tensor
 from nfriction.fuzzy.factored_jacobian import trained
 from nfriction.fuzzy.layout import to_columns
 from nfriction.fuzzy.membership import log_bell
+from nfriction.fuzzy.partition import FreePartition
 
 if TYPE_CHECKING:
     from nfriction.fuzzy.anfis import Anfis
@@ -137,6 +138,14 @@ def _incidence(terms: list[int]) -> Tensor:
 
 def _partition_jacobian(anfis: Anfis) -> dict[str, Tensor]:
     """d (centres, widths) / d parameter over the width, (groups, 2 sets, entries of a group)."""
+    if isinstance(anfis.partition, FreePartition):
+        # Written out: the first automatic one of a process takes two seconds to load.
+        inverse = torch.exp(-anfis.partition.log_widths.detach())
+        zero = torch.zeros_like(inverse).diag_embed()
+        return {
+            "centres": torch.cat([inverse.diag_embed(), zero], 1),
+            "log_widths": torch.cat([zero, torch.ones_like(inverse).diag_embed()], 1),
+        }
     parameters = dict(anfis.partition.named_parameters())
     detached = {name: value.detach() for name, value in parameters.items()}
     names = [name for name in trained(anfis) if name.startswith("partition.")]

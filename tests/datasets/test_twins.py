@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from scipy.integrate import trapezoid
 
 from nfriction import Recording, rigs, rollout, twin
 from nfriction.recording import read_initial_states
@@ -81,7 +82,7 @@ def test_energy_is_kept_without_friction_and_lost_to_it_with() -> None:
     assert np.all(motion.qd * motion.tau_f >= 0)
     assert np.all(np.diff(left) <= 0)
     # The trapezoid rule over a few reversals of dry friction is good to a part in a thousand.
-    assert left[0] - left[-1] == pytest.approx(np.trapezoid(power, dx=1e-3), rel=1e-3)
+    assert left[0] - left[-1] == pytest.approx(trapezoid(power, dx=1e-3), rel=1e-3)
 
 
 def test_bearings_carry_the_links_weight_and_inertia() -> None:
@@ -102,14 +103,15 @@ def test_bearings_carry_the_links_weight_and_inertia() -> None:
     force = np.array(rig["mass"])[:, None] * acceleration
     carried = np.linalg.norm(np.cumsum(force[:, ::-1], axis=1)[:, ::-1], axis=-1)
     sign = np.tanh(motion.qd / probe.v_smooth)[1:-1]
-    # Second differences at 1 ms of motions below 30 rad/s² per 0.1 s.
+    # Second differences at 1 ms leave errors of some 1e-5 of the acceleration.
     np.testing.assert_allclose(motion.tau_f[1:-1] / arm, carried * sign, rtol=1e-3, atol=1e-2)
 
 
 def test_friction_has_the_effects_that_the_card_names() -> None:
     _, friction = truth_of("tlrip")
     torque = friction.joint(0)
-    assert torque(0.02, 18.0, 1.0) > torque(0.6, 18.0, 1.0)  # Stribeck, against viscous growth
+    dry = replace(friction, viscous=(0.0,) * 3).joint(0)
+    assert dry(0.02, 18.0, 1.0) > 1.5 * dry(1.0, 18.0, 1.0)  # Stribeck
     assert torque(1.0, 30.0, 1.0) > torque(1.0, 18.0, 1.0)  # load
     assert torque(1.0, 18.0, 1.0) > -torque(-1.0, 18.0, 1.0)  # direction
     thin = replace(friction, seal=(0.0,) * 3, bearing_arm=(0.0,) * 3).joint(0)
@@ -218,7 +220,7 @@ def test_full_twin_dies_out_and_matches_its_card(name: str) -> None:
     made = twin.make(name)
     for label, recording in made.recordings.items():
         assert np.ptp(recording.q[-1000:], axis=0).max() <= QUANTUM * 1.001, label
-        assert f"{recording.digest()[:16]}" in card, label
+        assert recording.digest() in card, label
 
 
 @pytest.mark.slow
@@ -238,7 +240,8 @@ def test_held_out_motions_are_predictable(name: str) -> None:
 def test_builder_script(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = DATASETS / f"{name}_twin" / "build.py"
     spec = importlib.util.spec_from_file_location(f"build_{name}_twin", path)
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     script = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(script)
     assert script.main(["--out", str(tmp_path), "--quick"]) == 0

@@ -1,5 +1,7 @@
 """Friction laws: odd, passive, smooth through zero, broadcasting; and what describes them."""
 
+import itertools
+
 import pytest
 import torch
 from hypothesis import given
@@ -113,7 +115,7 @@ def test_stribeck_falls_from_breakaway_to_coulomb_friction() -> None:
         assert torque(v_s, delta) == pytest.approx(f_c + f_d / torch.e, rel=1e-9)
     speeds = torch.logspace(-5, 1, 50).tolist()
     torques = [torque(v) for v in speeds]
-    assert all(a >= b for a, b in zip(torques, torques[1:], strict=False))
+    assert all(a >= b for a, b in itertools.pairwise(torques))
 
 
 def test_the_exponent_of_stribeck_is_kept_by_default() -> None:

@@ -139,7 +139,9 @@ def test_nan_in_nan_out() -> None:
             changed[1, 2] = torch.nan
             # What a model does not read cannot harm it.
             reads = torch.autograd.functional.jacobian(
-                lambda x, w=which, m=model: m(*(x if i == w else y for i, y in enumerate(motion(3)))),
+                lambda x, w=which, m=model: m(
+                    *(x if i == w else y for i, y in enumerate(motion(3)))
+                ),
                 motion(3)[which],
             ).any()
             inputs[which][1, 2] = torch.nan
@@ -148,9 +150,13 @@ def test_nan_in_nan_out() -> None:
 
 
 def test_options_are_those_given() -> None:
-    options = dict(
-        terms=[3, 2], head_units=4, acceleration="signed", interpretable=True, prior_sd=0.1
-    )
+    options = {
+        "terms": [3, 2],
+        "head_units": 4,
+        "acceleration": "signed",
+        "interpretable": True,
+        "prior_sd": 0.1,
+    }
     assert NFLFM(2, **options).options() == options
     assert LFM(2).options() == {}
     # Made by hand, a model still tells them.

@@ -1,0 +1,28 @@
+# Everything runs in an environment of its own, made on first use.
+PYTHON ?= python3
+# A torch that is installed as it is here; any from pyproject.toml's range serves.
+TORCH ?= torch==2.13.0
+BIN := .venv/bin
+
+.PHONY: demo test lint clean
+
+demo: .venv/installed
+	$(BIN)/nfriction demo --out runs/demo
+
+test: .venv/installed
+	$(BIN)/python -m pytest -n auto -m "not slow"
+
+lint: .venv/installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+.venv/installed: pyproject.toml
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet "$(TORCH)"
+	$(BIN)/python -m pip install --quiet --editable ".[test,dev]"
+	touch $@
+
+clean:
+	rm -rf .venv runs build dist

@@ -1,0 +1,182 @@
+"""TorchScript: equal to the model, alone with torch, silent, and never half written."""
+
+import json
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from nfriction.export import ExportError, torchscript
+from nfriction.export.script import METADATA, sample_inputs
+from nfriction.friction import LFM, NFLFM, Coefficient, Constant, FrictionModel, Law, NeuroFuzzy
+from nfriction.modelfile import ModelInfo, parameter_hash
+from tests.friction.samples import QUADRATIC, named_models, randomise
+
+# Whatever the export lets through fails the test.
+pytestmark = pytest.mark.filterwarnings("error")
+
+
+def load(path: Path) -> torch.nn.Module:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return torch.jit.load(str(path))
+
+
+def assert_equal(model: FrictionModel, path: Path) -> None:
+    inputs = sample_inputs(model, 2000, seed=7)
+    with torch.no_grad():
+        expected, found = model(*inputs), load(path)(*inputs)
+    assert found.dtype == torch.float64
+    # Sums may be taken in another order: some roundings of full scale.
+    assert (found - expected).abs().max() <= 1e-12 * expected.abs().max()
+
+
+@pytest.mark.parametrize("name", named_models())
+def test_every_named_model_scripts_silently_and_equals_itself(name: str, tmp_path: Path) -> None:
+    model = named_models()[name]
+    training = model.training
+    path = torchscript(model, tmp_path / "model.pt")
+    assert_equal(model, path)
+    # The model itself stays as it was.
+    assert model.training == training
+    assert all(p.requires_grad for p in model.parameters())
+
+
+@pytest.mark.parametrize("make", [Constant, NeuroFuzzy])
+def test_a_law_of_ones_own_scripts(make: type, tmp_path: Path) -> None:
+    model = FrictionModel(QUADRATIC, make(QUADRATIC, 2))
+    randomise(model, 0.3)
+    assert_equal(model, torchscript(model, tmp_path / "own.pt"))
+
+
+def test_any_batch_shape_and_nan(tmp_path: Path) -> None:
+    model = named_models()["NFLFM"]
+    loaded = load(torchscript(model, tmp_path / "model.pt"))
+    qd, qdd, load_ = sample_inputs(model, 20, seed=1)
+    flat = loaded(qd, qdd, load_)
+    shaped = loaded(*(x.reshape(4, 5, 3) for x in (qd, qdd, load_)))
+    torch.testing.assert_close(shaped.reshape(20, 3), flat, rtol=1e-12, atol=1e-14)
+    one = loaded(qd[0], qdd[0], load_[0])
+    torch.testing.assert_close(one, flat[0], rtol=1e-12, atol=1e-14)
+    qdd[3, 1] = torch.nan
+    lost = torch.isnan(loaded(qd, qdd, load_))
+    assert lost[3, 1]
+    assert lost.sum() == 1
+
+
+def test_single_precision_models_are_written_in_double(tmp_path: Path) -> None:
+    model = NFLFM(2).to(torch.float32)
+    path = torchscript(model, tmp_path / "model.pt")
+    assert_equal(model.to(torch.float64), path)
+
+
+ALONE = """
+import json, sys
+import torch
+
+files = {"nfriction.json": ""}
+module = torch.jit.load(sys.argv[1], _extra_files=files)
+told = json.loads(files["nfriction.json"])
+inputs = torch.load(sys.argv[2], weights_only=True)
+torch.save(module(*inputs), sys.argv[3])
+assert "nfriction" not in sys.modules
+json.dump(told, sys.stdout)
+"""
+
+
+def test_it_runs_and_tells_of_itself_with_torch_alone(tmp_path: Path) -> None:
+    model = named_models()["NFNLFM"]
+    info = ModelInfo(
+        joint_names=["a", "b", "c"], sample_time=1e-3, input_ranges={"qd": [[-1.0, 1.0]] * 3}
+    )
+    path = torchscript(model, tmp_path / "model.pt", info)
+    inputs = sample_inputs(model, 100, seed=3)
+    torch.save(inputs, tmp_path / "inputs")
+    run = subprocess.run(
+        [sys.executable, "-c", ALONE, path, tmp_path / "inputs", tmp_path / "outputs"],
+        capture_output=True, text=True, cwd=tmp_path, check=False,
+    )  # fmt: skip
+    assert run.returncode == 0, run.stderr
+    found = torch.load(tmp_path / "outputs", weights_only=True)
+    expected = model(*inputs).detach()
+    assert (found - expected).abs().max() <= 1e-12 * expected.abs().max()
+    told = json.loads(run.stdout)
+    assert told["joint_names"] == ["a", "b", "c"]
+    assert told["sample_time"] == 1e-3
+    assert told["input_ranges"] == {"qd": [[-1.0, 1.0]] * 3}
+    assert told["units"]["tau_f"] == "N m"
+    assert told["parameter_hash"] == parameter_hash(model.state_dict())
+    assert METADATA == "nfriction.json"  # others read it by this name
+
+
+# Refusals
+
+
+def law(function: object) -> Law:
+    return Law("odd one", (Coefficient("a", "N m"),), function)
+
+
+def through_numpy(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
+    return coefficients.select(-1, 0) * torch.as_tensor(qd.numpy().copy())
+
+
+def any_number(*inputs: Tensor) -> Tensor:
+    return inputs[2].select(-1, 0) * inputs[0]
+
+
+def without_annotations(qd, load, coefficients, v_smooth):
+    return coefficients.select(-1, 0) * torch.tanh(qd / v_smooth)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda qd, load, coefficients, v_smooth: coefficients.select(-1, 0) * qd,
+        through_numpy,
+        any_number,
+        without_annotations,
+    ],
+    ids=["lambda", "numpy", "any number", "without annotations"],
+)
+def test_what_does_not_script_is_refused_and_leaves_nothing_behind(
+    function: object, tmp_path: Path
+) -> None:
+    model = FrictionModel(law(function), Constant(law(function), 2))
+    for _ in range(2):  # a second try must say the same
+        with pytest.raises(ExportError, match="does not script"):
+            torchscript(model, tmp_path / "model.pt")
+    assert not list(tmp_path.iterdir())
+    # Nor does it spoil what comes after.
+    torchscript(LFM(2), tmp_path / "good.pt")
+
+
+def training_only(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
+    """A law that computes something else when it is scripted."""
+    if torch.jit.is_scripting():
+        return coefficients.select(-1, 0) * qd * (1 + 1e-9)
+    return coefficients.select(-1, 0) * qd
+
+
+def test_an_artefact_that_differs_from_its_model_is_not_written(tmp_path: Path) -> None:
+    path = torchscript(LFM(2), tmp_path / "model.pt")
+    before = path.read_bytes()
+    model = FrictionModel(law(training_only), Constant(law(training_only), 2))
+    with pytest.raises(ExportError, match=r"differs from its model by 1\.0e-09"):
+        torchscript(model, path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_names_of_the_joints_must_be_one_a_joint(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="name 2 joints"):
+        torchscript(LFM(2), tmp_path / "model.pt", ModelInfo(joint_names=["a"]))
+
+
+def test_an_impossible_path_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match=r"cannot write the file .*model\.pt"):
+        torchscript(LFM(2), tmp_path / "file" / "model.pt")

@@ -1,0 +1,214 @@
+"""How the package hangs together: arrows point one way, and a few habits hold everywhere."""
+
+import ast
+import re
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+import nfriction
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "nfriction"
+
+# What each part of the package may import of the rest; a part is a module or a subpackage.
+# Parts that are not named here lie on top and may import all that is.
+LEAVES = {"version", "atomic", "angles", "formats"}
+FOUNDATIONS = LEAVES | {"recording", "signals"}
+ALLOWED: dict[str, set[str]] = {
+    **{leaf: set() for leaf in LEAVES},
+    "recording": {"angles", "formats"},
+    "signals": {"recording"},
+    "plant": set(),
+    "fuzzy": set(),
+    "solve": set(),
+    "codegen": set(),
+    "friction": {"fuzzy"},
+    "compiled": {"codegen"},
+    "simulation": {"plant", "friction", "codegen", "compiled"},
+    "fitting": FOUNDATIONS
+    | {"plant", "fuzzy", "friction", "codegen", "simulation", "compiled", "solve"},
+    "scoring": FOUNDATIONS | {"plant", "friction", "simulation"},
+    "modelfile": {"version", "atomic", "friction"},
+    "export": {"version", "atomic", "friction", "codegen", "modelfile"},
+}
+# Only command lines talk to a person: the program's, and the one that scripts share.
+MAY_PRINT = {"cli.py", "twin/command.py"}
+# TorchScript is deprecated upstream; it has one home. Asking whether one is being scripted is no
+# use of it: a module elsewhere may have to.
+MAY_SCRIPT = {"export"}
+
+
+@cache
+def tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+
+
+def modules() -> list[Path]:
+    return sorted(PACKAGE.rglob("*.py"))
+
+
+def part(path: Path) -> str:
+    """The module or subpackage of `nfriction` that a file belongs to."""
+    return path.relative_to(PACKAGE).with_suffix("").parts[0]
+
+
+def imported(path: Path) -> Iterator[str]:
+    """Full names of all that a file imports, wherever it does."""
+    for node in ast.walk(tree(path)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def parts_imported(path: Path) -> set[str]:
+    names = (name.split(".") for name in imported(path))
+    found = {name[1] if len(name) > 1 else "__init__" for name in names if name[0] == "nfriction"}
+    return found - {part(path)}
+
+
+def dotted(node: ast.AST) -> str:
+    """`a.b.c` of an expression, empty for anything else."""
+    if isinstance(node, ast.Attribute):
+        return f"{dotted(node.value)}.{node.attr}"
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+def report(found: list[str]) -> None:
+    assert not found, "\n" + "\n".join(found)
+
+
+def test_the_checks_see_the_package() -> None:
+    assert len(modules()) > 50
+    assert set(ALLOWED) - {"compiled"} <= {part(path) for path in modules()}
+
+
+def test_lower_layers_never_import_higher_ones() -> None:
+    report(
+        [
+            f"{path.relative_to(ROOT)} imports nfriction.{other}"
+            for path in modules()
+            if part(path) in ALLOWED
+            for other in sorted(parts_imported(path) - ALLOWED[part(path)])
+        ]
+    )
+
+
+def test_the_allowed_arrows_make_no_circle() -> None:
+    settled: set[str] = set()
+    while len(settled) < len(ALLOWED):
+        ready = {name for name in ALLOWED if ALLOWED[name] <= settled} - settled
+        assert ready, f"a circle among {sorted(set(ALLOWED) - settled)}"
+        settled |= ready
+
+
+@pytest.mark.parametrize("folder", ["datasets", "trainers", "examples", "benchmarks", "tests"])
+def test_folders_of_scripts_are_no_packages(folder: str) -> None:
+    # With one, `datasets/` would hide another package of that name.
+    report([str(p.relative_to(ROOT)) for p in (ROOT / folder).rglob("__init__.py")])
+
+
+def test_no_public_name_hides_a_module() -> None:
+    # A package that offers a function of its module's name can only show one of them.
+    report(
+        [
+            f"{path.relative_to(ROOT)} offers {name}, which hides the module"
+            for path in modules()
+            if path.name == "__init__.py"
+            for name in imported(path)
+            for *home, last in [name.split(".")]
+            if (path.parent / f"{last}.py").exists() and home != list(package(path))
+        ]
+    )
+
+
+def package(path: Path) -> tuple[str, ...]:
+    """Full name of the package that a file lies in."""
+    return path.parent.relative_to(ROOT).parts
+
+
+def test_every_module_says_what_it_is_for() -> None:
+    report([str(p.relative_to(ROOT)) for p in modules() if ast.get_docstring(tree(p)) is None])
+
+
+def test_every_public_name_is_there_and_says_what_it_is_for() -> None:
+    assert sorted(nfriction.__all__) == sorted(set(nfriction.__all__))
+    for name in nfriction.__all__:
+        thing = getattr(nfriction, name)
+        assert isinstance(thing, str) or thing.__doc__, name
+
+
+def test_only_command_lines_print() -> None:
+    report(
+        [
+            f"{path.relative_to(ROOT)}:{node.lineno}"
+            for path in modules()
+            if path.relative_to(PACKAGE).as_posix() not in MAY_PRINT
+            for node in ast.walk(tree(path))
+            if isinstance(node, ast.Call) and dotted(node.func) in ("print", "sys.stdout.write")
+        ]
+    )
+
+
+def test_nothing_is_pickled_evaluated_or_given_to_a_shell() -> None:
+    modules_refused = {"pickle", "dill", "cloudpickle", "marshal", "shelve"}
+    calls_refused = {"eval", "os.system", "torch.load"}
+    found = []
+    for path in modules():
+        where = path.relative_to(ROOT)
+        found += [
+            f"{where} imports {n}" for n in imported(path) if n.split(".")[0] in modules_refused
+        ]
+        for node in ast.walk(tree(path)):
+            if not isinstance(node, ast.Call):
+                continue
+            given = {k.arg: k.value for k in node.keywords}
+            true = {n for n, v in given.items() if isinstance(v, ast.Constant) and v.value is True}
+            if "shell" in given or "allow_pickle" in true:
+                found.append(f"{where}:{node.lineno} shell or allow_pickle")
+            if dotted(node.func) in calls_refused and "weights_only" not in true:
+                found.append(f"{where}:{node.lineno} {dotted(node.func)}")
+    report(found)
+
+
+def test_torchscript_has_one_home() -> None:
+    report(
+        [
+            f"{path.relative_to(ROOT)}:{node.lineno} {dotted(node)}"
+            for path in modules()
+            if part(path) not in MAY_SCRIPT
+            for node in ast.walk(tree(path))
+            if isinstance(node, ast.Attribute)
+            and dotted(node).startswith("torch.jit.")
+            and dotted(node) != "torch.jit.is_scripting"
+        ]
+        + [
+            f"{path.relative_to(ROOT)} imports {name}"
+            for path in modules()
+            if part(path) not in MAY_SCRIPT
+            for name in imported(path)
+            if name.startswith("torch.jit")
+        ]
+    )
+
+
+def test_errors_are_caught_by_name() -> None:
+    broad = {"Exception", "BaseException"}
+    report(
+        [
+            f"{path.relative_to(ROOT)}:{node.lineno}"
+            for path in modules()
+            for node in ast.walk(tree(path))
+            if isinstance(node, ast.ExceptHandler)
+            and (node.type is None or broad & {dotted(n) for n in ast.walk(node.type)})
+        ]
+    )
+
+
+def test_the_version_is_told_once() -> None:
+    told = re.search(r'^version = "(.*)"$', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
+    assert told is None or told[1] == nfriction.__version__
