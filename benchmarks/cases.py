@@ -75,7 +75,6 @@ class Numbers(NamedTuple):
 
 
 def numbers(plant: PendulumChain, friction: FrictionModel) -> Numbers:
-    body = [getattr(plant, n).numpy() for n in ("inertia_coupling", "gravity_moment", "load_lever")]
     network = None
     schedule = friction.schedule
     if isinstance(schedule, NeuroFuzzy):
@@ -98,4 +97,11 @@ def numbers(plant: PendulumChain, friction: FrictionModel) -> Numbers:
         network |= {"turn": np.array(schedule.turn), "roundness": np.array(schedule.roundness)}
     rest = torch.zeros(3, dtype=torch.float64)
     values = friction.coefficients(rest, rest).detach().numpy()
-    return Numbers(*body, friction.v_smooth, values, network)
+    return Numbers(
+        coupling=plant.inertia_coupling.numpy(),
+        gravity=plant.gravity_moment.numpy(),
+        lever=plant.load_lever.numpy(),
+        v_smooth=friction.v_smooth,
+        constant=values,
+        network=network,
+    )

@@ -1,6 +1,7 @@
 """Fair timing: one pinned thread, contestants that take turns, medians, one table."""
 
 import os
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,7 +11,10 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_name] = "1"
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
 
-import numpy as np
+import numpy as np  # noqa: E402
+
+# Windows counts processor time in ticks of 16 ms.
+CLOCK = time.perf_counter if sys.platform == "win32" else time.process_time
 
 
 @dataclass(frozen=True)
@@ -24,6 +28,7 @@ class Contestant:
         tolerance: how far the final state may lie from the reference.
         rounds: in how many rounds it takes part; slow ones sit some out.
         note: what a reader must know.
+        expected: state to compare with where `run` stops short of the reference's end.
     """
 
     name: str
@@ -32,30 +37,52 @@ class Contestant:
     tolerance: float = 1e-9
     rounds: int = 10**9
     note: str = ""
+    expected: np.ndarray | None = None
 
 
 def pin() -> str:
-    """Keep this process on one core; a word on whether that was possible."""
+    """Keep this process on the least busy core; a word on whether that was possible."""
     if not hasattr(os, "sched_setaffinity"):
         return "not pinned (this platform cannot)"
-    core = max(os.sched_getaffinity(0))
+
+    def delay(core: int) -> float:
+        """Wall time that 50 ms of work take there."""
+        os.sched_setaffinity(0, {core})
+        start, work = time.perf_counter(), time.process_time()
+        while time.process_time() - work < 0.05:
+            pass
+        return time.perf_counter() - start
+
+    core = min(os.sched_getaffinity(0), key=delay)
     os.sched_setaffinity(0, {core})
     return f"pinned to core {core}"
+
+
+def yardstick() -> str:
+    """How fast this machine is now: absolute times mean nothing without it."""
+    import torch
+
+    x = torch.ones((), dtype=torch.float64)
+    start = CLOCK()
+    for _ in range(20_000):
+        x = x + 1.0
+    return f"yardstick: {(CLOCK() - start) / 20_000 * 1e6:.1f} us an eager scalar addition"
 
 
 def race(contestants: list[Contestant], rounds: int) -> dict[str, tuple[float, int]]:
     """Median seconds and number of runs of each contestant, in turns.
 
-    A busy machine then slows all of them alike. Each must have run once before (compiled, caches
-    filled).
+    Counted is processor time, on one pinned thread the wall time of an idle machine: neighbours
+    that take the core for a while are left out. Taking turns, all see the same clock rate and
+    caches. Each must have run once before (compiled, caches filled).
     """
     times: dict[str, list[float]] = {c.name: [] for c in contestants}
     for k in range(rounds):
         for c in contestants:
             if k < c.rounds:
-                start = time.perf_counter()
+                start = CLOCK()
                 c.run()
-                times[c.name].append(c.scale * (time.perf_counter() - start))
+                times[c.name].append(c.scale * (CLOCK() - start))
     return {name: (float(np.median(t)), len(t)) for name, t in times.items()}
 
 
@@ -71,9 +98,8 @@ def compare(title: str, contestants: list[Contestant], rounds: int) -> dict[str,
     reference = contestants[0].run()
     deviation = {}
     for c in contestants:
-        states = c.run()
-        # A contestant with a shorter horizon is compared by the caller's choice of reference.
-        deviation[c.name] = float(np.abs(states - reference).max())
+        expected = reference if c.expected is None else c.expected
+        deviation[c.name] = float(np.abs(c.run() - expected).max())
         if not deviation[c.name] <= c.tolerance:
             raise SystemExit(
                 f"{c.name} ends {deviation[c.name]:.2g} from {contestants[0].name}, "

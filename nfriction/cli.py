@@ -2,12 +2,18 @@
 
 import argparse
 import logging
+import math
 import shlex
+import signal
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+import threading
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from types import FrameType
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 import pandas as pd
@@ -17,7 +23,7 @@ from tqdm import tqdm
 from nfriction import twin
 from nfriction.angles import AngleConvention
 from nfriction.codegen import CodegenError
-from nfriction.comparison import Comparison, compare
+from nfriction.comparison import Comparison, InitialStates, compare
 from nfriction.export import ExportError, torchscript
 from nfriction.fitting import fit
 from nfriction.friction import MODELS, model_by_name
@@ -25,6 +31,7 @@ from nfriction.modelfile import ModelFileError, info_of, load, save
 from nfriction.plant import LinearAxis, PendulumChain, rigs
 from nfriction.recording import Recording, read_initial_states
 from nfriction.results import model_info, write_results
+from nfriction.version import __version__
 
 DEFAULT_MODELS = "NCFM,LFM,NLFM,NFLFM"
 
@@ -33,35 +40,99 @@ class UsageError(Exception):
     """What the user asked for cannot be done; the message says why and what to do."""
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line, as all others are."""
+
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(f"{message}; see {self.prog} --help.")
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; errors are one line on standard error, and exit status 2."""
-    arguments = _parser().parse_args(argv)
-    logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.WARNING)
-    # Several threads make small tensors up to 100 times slower.
-    torch.set_num_threads(1)
-    arguments.command_line = shlex.join(["nfriction", *(sys.argv[1:] if argv is None else argv)])
+    """Run a command.
+
+    Errors are one line on standard error and exit status 2, an interrupt gives status 130.
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    parser = _parser()
+    arguments = argparse.Namespace(debug="--debug" in words)
     try:
-        return arguments.run(arguments)
-    except KeyboardInterrupt:
-        print("nfriction: interrupted; nothing half-written was left behind", file=sys.stderr)
+        parser.parse_args(words, arguments)
+        if "run" not in arguments:
+            parser.print_help(sys.stderr)
+            return 2
+        logging.basicConfig(format="nfriction: %(levelname)s: %(message)s", level=logging.WARNING)
+        # Several threads make small tensors up to 100 times slower.
+        torch.set_num_threads(1)
+        arguments.command_line = shlex.join(["nfriction", *words])
+        with _interruptible(), _one_line_warnings():
+            return arguments.run(arguments)
+    except KeyboardInterrupt as interrupt:
+        print(f"nfriction: interrupted {interrupt}".rstrip(), file=sys.stderr)
         return 130
     except (UsageError, ModelFileError, ExportError, CodegenError, ValueError, OSError,
             ImportError) as error:  # fmt: skip
         if arguments.debug:
             raise
-        print(f"nfriction: error: {error}", file=sys.stderr)
+        print(f"nfriction: error: {_message(error)}", file=sys.stderr)
         return 2
 
 
+def _message(error: Exception) -> str:
+    """An error in one line."""
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return " ".join(str(error).split())
+
+
+@contextmanager
+def _one_line_warnings() -> Iterator[None]:
+    def show(message: Warning | str, *_: Any, **__: Any) -> None:
+        _warn(" ".join(str(message).split()))
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
+
+
+def _warn(message: str) -> None:
+    print(f"nfriction: warning: {message}", file=sys.stderr)
+
+
+_interrupted = threading.Event()
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Remember a Ctrl-C: solvers keep their best point, but a user wants an end.
+
+    The run ends where it next reports its progress.
+    """
+
+    def interrupt(_signal: int, _frame: FrameType | None) -> None:
+        _interrupted.set()
+        raise KeyboardInterrupt
+
+    _interrupted.clear()
+    if threading.current_thread() is not threading.main_thread():
+        yield  # signals reach the main thread only
+        return
+    before = signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="nfriction",
         description="Learn joint friction from encoder recordings, prove it by simulation.",
     )
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    common = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--version", action="version", version=f"nfriction {__version__}")
+    commands = parser.add_subparsers(metavar="COMMAND")
+    common = _Parser(add_help=False)
     common.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    estimation = argparse.ArgumentParser(add_help=False)
+    estimation = _Parser(add_help=False)
     _add_estimation(estimation)
 
     one = commands.add_parser("fit", parents=[common, estimation], help="fit one model")
@@ -83,8 +154,8 @@ def _parser() -> argparse.ArgumentParser:
         "demo", parents=[common], help="simulate a rig with hidden friction, then compare models"
     )
     demo.add_argument("--models", default=DEFAULT_MODELS)
-    demo.add_argument("--seed", type=int, default=0, help="of encoder errors and jitter")
-    demo.add_argument("--seconds", type=float, default=twin.QUICK_DURATION,
+    demo.add_argument("--seed", type=_count, default=0, help="of encoder errors and jitter")
+    demo.add_argument("--seconds", type=_seconds, default=twin.QUICK_DURATION,
                       help="length of each recording")  # fmt: skip
     _add_output(demo)
     demo.set_defaults(run=_demo, out=Path("runs/demo"))
@@ -107,7 +178,8 @@ def _add_estimation(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plant", choices=("fit", "given"), default="fit",
                         help="adjust inertia and gravity terms within bounds, or not")  # fmt: skip
     parser.add_argument("--drag", action="store_true", help="fit air drag on the links too")
-    parser.add_argument("--max-steps", type=int, default=30, help="steps to each window length")
+    parser.add_argument("--max-steps", type=_count, default=30,
+                        help="steps to each window length")  # fmt: skip
 
 
 def _add_output(parser: argparse.ArgumentParser) -> None:
@@ -117,14 +189,36 @@ def _add_output(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-figures", action="store_true")
 
 
+def _count(text: str) -> int:
+    """A whole number from 0, for argparse."""
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"must be a whole number from 0, got {text!r}")
+    return int(text)
+
+
+def _seconds(text: str) -> float:
+    """A positive duration, for argparse."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"must be positive seconds, got {text!r}")
+    return value
+
+
 def _fit(arguments: argparse.Namespace) -> int:
+    settings = _settings(arguments)
     plant = _rig(arguments.rig)
-    recordings = _read(arguments.recordings, plant, arguments)
     model = model_by_name(arguments.model)(plant.joints)
+    recordings = _read(arguments.recordings, plant, arguments)
+    if arguments.out.is_dir():
+        raise UsageError(f"--out of fit is a file, and {arguments.out} is a folder.")
+    _check_writable(arguments.out.parent)
     with _Progress() as progress:
         progress.stage(f"fit {arguments.model}")
-        found = fit(model, plant, recordings, callback=lambda s, _: progress.step(s),
-                    **_settings(arguments))  # fmt: skip
+        found = fit(model, plant, recordings, callback=lambda s, _: progress.step(s), **settings)
+        progress.stage("write the model")
     save(model, arguments.out, model_info(found, recordings))
     print(f"{arguments.model}: {found.status}")
     print(f"position error over training windows: {1e3 * found.residual:.3g} m{plant.unit}")
@@ -133,13 +227,21 @@ def _fit(arguments: argparse.Namespace) -> int:
 
 
 def _compare(arguments: argparse.Namespace) -> int:
+    settings = _settings(arguments)
+    _models(arguments)
     plant = _rig(arguments.rig)
     train = _read(arguments.train, plant, arguments)
     held_out = _read(arguments.held_out, plant, arguments)
-    return _run_comparison(plant, train, held_out, arguments, _settings(arguments))
+    trained = {recording.digest() for recording in train}
+    seen = [r.name for r in held_out if r.digest() in trained]
+    if seen:
+        raise UsageError(f"{', '.join(seen)}: trained on and held out; a model is judged by "
+                         "recordings it has not seen.")  # fmt: skip
+    return _run_comparison(plant, train, held_out, arguments, settings)
 
 
 def _demo(arguments: argparse.Namespace) -> int:
+    _models(arguments)
     simulated = twin.make(
         "tlrip",
         seed=arguments.seed,
@@ -161,12 +263,8 @@ def _run_comparison(
     arguments: argparse.Namespace,
     settings: dict[str, Any],
 ) -> int:
-    names = [name.strip() for name in arguments.models.split(",") if name.strip()]
-    for name in names:
-        model_by_name(name)
-    states = None
-    if arguments.initial_states is not None:
-        states = read_initial_states(arguments.initial_states)
+    names = _models(arguments)
+    states = _initial_states(arguments.initial_states, plant, [*train, *held_out])
     _check_writable(arguments.out)
     with _Progress(len(names)) as progress:
         comparison = compare(
@@ -181,6 +279,33 @@ def _run_comparison(
     _print_tables(comparison)
     print(f"\nresults, models and figures are in {arguments.out}")
     return 0
+
+
+def _models(arguments: argparse.Namespace) -> list[str]:
+    names = [name.strip() for name in arguments.models.split(",") if name.strip()]
+    if not names:
+        raise UsageError(f"--models takes names of {', '.join(MODELS)}, got none.")
+    for name in names:
+        model_by_name(name)
+    return names
+
+
+def _initial_states(
+    path: Path | None, plant: PendulumChain | LinearAxis, recordings: Sequence[Recording]
+) -> InitialStates | None:
+    """States of these recordings; says which have none and so start from their smoothed motion."""
+    if path is None:
+        return None
+    states = read_initial_states(path)
+    names = [recording.name for recording in recordings]
+    for name in names:
+        if name in states and len(states[name][0]) != plant.joints:
+            raise UsageError(f"{path}: the state of {name} has {len(states[name][0])} joints, "
+                             f"the rig {plant.joints}.")  # fmt: skip
+    without = [name for name in names if name not in states]
+    if without:
+        _warn(f"{path} has no state of {', '.join(without)}; estimated from the recording instead.")
+    return states
 
 
 def _export(arguments: argparse.Namespace) -> int:
@@ -230,18 +355,23 @@ def _read(
     text = arguments.angles or ",".join(plant.convention)
     convention = AngleConvention.parse(text)
     unit: Literal["rad", "m"] = "m" if plant.unit == "m" else "rad"
-    return [
-        Recording.read(path, degrees=arguments.degrees, convention=convention, unit=unit)
-        for path in paths
-    ]
+    recordings = []
+    for path in paths:
+        recording = Recording.read(
+            path, degrees=arguments.degrees, convention=convention, unit=unit
+        )  # fmt: skip
+        if recording.joints != plant.joints:
+            raise UsageError(f"{path} has {recording.joints} joints, the rig has {plant.joints}.")
+        recordings.append(recording)
+    return recordings
 
 
 def _settings(arguments: argparse.Namespace) -> dict[str, Any]:
     try:
-        windows = tuple(float(w) for w in arguments.windows.split(","))
-    except ValueError:
+        windows = tuple(_seconds(w) for w in arguments.windows.split(","))
+    except argparse.ArgumentTypeError:
         raise UsageError(
-            f"--windows takes seconds like 0.5,2, got {arguments.windows!r}."
+            f"--windows takes positive seconds like 0.5,2, got {arguments.windows!r}."
         ) from None
     return {
         "windows": windows,
@@ -253,7 +383,10 @@ def _settings(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def _check_writable(folder: Path) -> None:
     """Refuse an unwritable folder before the work rather than after it."""
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise UsageError(f"cannot make the folder {folder}: there is a file in its way.") from None
     with tempfile.TemporaryFile(dir=folder):
         pass
 
@@ -262,21 +395,30 @@ class _Progress:
     """One bar for a whole run: what is being done, and steps taken."""
 
     def __init__(self, models: int = 1) -> None:
+        self._what = "start"
         self._bar = tqdm(unit=" steps", disable=not sys.stderr.isatty(), leave=False)
 
     def __enter__(self) -> "_Progress":
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, _type: object, error: BaseException | None, _trace: object) -> None:
         self._bar.close()
+        if isinstance(error, KeyboardInterrupt):
+            error.args = (f"({self._what}); no file was left half-written",)
 
     def stage(self, what: str) -> None:
+        self._check()
         self._what = what
         self._bar.set_description(what)
 
     def step(self, stage: str) -> None:
+        self._check()
         self._bar.set_description(f"{self._what}, {stage}")
         self._bar.update()
+
+    def _check(self) -> None:
+        if _interrupted.is_set():
+            raise KeyboardInterrupt
 
 
 if __name__ == "__main__":

@@ -37,6 +37,8 @@ class Comparison:
     def table(self, horizon: str | None = None, *, held_out: bool = True) -> pd.DataFrame:
         """Position error by model and joint, over all recordings of a kind (as Table 10)."""
         scores = self.held_out if held_out else self.train
+        if not scores:
+            raise ValueError("no recording of this kind was scored; see `held_out`.")
         columns = [*self.joint_names, "all"]
         rmse = rmse_table(scores, horizon)
         return pd.DataFrame(rmse, index=pd.Index(list(scores), name="model"), columns=columns)
@@ -99,6 +101,8 @@ def compare(
         ValueError: if a recording is both trained on and held out, or names are not unique.
     """
     names = [r.name for r in (*train, *held_out)]
+    if not models or not train:
+        raise ValueError("at least one model and one training recording are needed.")
     repeated = sorted({n for n in names if names.count(n) > 1})
     if repeated:
         raise ValueError(f"recordings must have different names, {', '.join(repeated)} repeats.")
@@ -142,13 +146,13 @@ def coefficient_summary(model: FrictionModel) -> dict[str, Any]:
     if isinstance(schedule, Constant):
         return {n: schedule.values[:, k].tolist() for k, n in enumerate(names)}
     assert isinstance(schedule, NeuroFuzzy)
-    reference = schedule.scale * schedule.reference
+    reference = schedule.reference_coefficients().detach()
     return {"reference": {n: reference[:, k].tolist() for k, n in enumerate(names)}}
 
 
 def _nearest(fits: Mapping[str, Fit], model: FrictionModel) -> Fit | None:
     """The fit to start from: the constant one of the same law, else the last."""
     for found in fits.values():
-        if found.model.law is model.law and isinstance(found.model.schedule, Constant):
+        if found.model.law == model.law and isinstance(found.model.schedule, Constant):
             return found
     return list(fits.values())[-1] if fits else None

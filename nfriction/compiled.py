@@ -7,9 +7,9 @@ buffers are inputs of the compiled code, so a fit may change them between calls.
 import logging
 from collections import OrderedDict
 from collections.abc import Hashable
-from types import FunctionType
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -110,14 +110,22 @@ def integrate_compiled(
 
 def _compiled(plant: Any, friction: Any, backend: Backend) -> "codegen.CompiledRollout | None":
     """The compiled rollout of this structure, from the cache where it is there."""
-    if backend == "torch" or not all(isinstance(m, nn.Module) for m in (plant, friction)):
+    if backend == "torch":
         return None
+    if not all(isinstance(m, nn.Module) for m in (plant, friction)):
+        if backend == "auto":
+            return None
+        raise codegen.CodegenError(
+            "only a plant and a friction model that are torch modules can be compiled; use "
+            'backend="torch".'
+        )
     key = (backend, _structure(plant), _structure(friction))
     if key in _cache:
         _cache.move_to_end(key)
         return _cache[key]
     compiled = None
     try:
+        _check_compilable(plant, friction)
         compiled = codegen.compile_rollout(plant, friction, backend=backend)
     except codegen.SelfCheckFailed:
         raise
@@ -131,21 +139,49 @@ def _compiled(plant: Any, friction: Any, backend: Backend) -> "codegen.CompiledR
     return compiled
 
 
+def _check_compilable(plant: Any, friction: Any) -> None:
+    """Refuse modules that compiled code would take for others than they are."""
+    for module in (plant, friction):
+        for name, value in (*module.named_parameters(), *module.named_buffers()):
+            if value.is_floating_point() and value.dtype != torch.float64:
+                raise codegen.CodegenError(
+                    f"compiled rollouts need float64, but `{name}` is {value.dtype}"
+                )
+    with torch.no_grad():
+        rest = torch.zeros(plant.joints, dtype=torch.float64)
+        held = friction.coefficients(rest, rest)
+        tau_f = friction.torque(rest, plant.load(rest, rest), held)
+        if plant.forward_dynamics(rest, rest, tau_f).shape != rest.shape:
+            raise codegen.CodegenError(
+                "a plant or friction model with a batch of its own cannot be compiled"
+            )
+
+
 def _structure(module: nn.Module) -> Hashable:
     """All that compiled code bakes in: classes, plain attributes, shapes, tables of indices."""
     parts: list[Hashable] = []
     for name, part in module.named_modules():
         plain = tuple(
-            (key, str(value) if isinstance(value, list | dict) else value)
+            (key, _baked(value))
             for key, value in sorted(vars(part).items())
-            if isinstance(value, bool | int | float | str | tuple | FunctionType)
-            or (isinstance(value, list | dict) and not key.startswith("_"))
+            if not (key.startswith("_") and isinstance(value, list | dict))
         )
         parts.append((name, type(part), plain))
     for name, tensor in (*module.named_parameters(), *module.named_buffers()):
         baked = None if tensor.is_floating_point() else tensor.cpu().numpy().tobytes()
-        parts.append((name, tuple(tensor.shape), baked))
+        parts.append((name, tuple(tensor.shape), tensor.dtype, baked))
     return tuple(parts)
+
+
+def _baked(value: Any) -> Hashable:
+    """A plain attribute as part of a key; functions and objects count as themselves."""
+    if isinstance(value, Tensor):
+        value = value.detach().cpu().numpy()
+    if isinstance(value, np.ndarray):
+        return value.shape, value.tobytes()
+    if isinstance(value, list | tuple):
+        return (type(value), *map(_baked, value))
+    return value if isinstance(value, Hashable) else repr(value)
 
 
 def _values(plant: nn.Module, friction: Any, names: Any) -> dict[str, Tensor]:

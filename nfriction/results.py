@@ -2,6 +2,7 @@
 
 import json
 import logging
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -74,14 +75,19 @@ def write_results(
     for name, fit in comparison.fits.items():
         info = model_info(fit, train)
         written.append(save(fit.model, folder / "models" / f"{name}.json", info))
+        script = folder / "models" / f"{name}.pt"
         try:
-            written.append(torchscript(fit.model, folder / "models" / f"{name}.pt", info))
+            written.append(torchscript(fit.model, script, info))
         except ExportError as error:
-            logger.warning("%s was not exported: %s", name, error)
+            script.unlink(missing_ok=True)  # an earlier run's would pass for this one's
+            logger.warning("%s was not exported: %s", name, " ".join(str(error).split()))
     if figures:
         from nfriction import plots  # matplotlib takes half a second that other commands save
 
-        written += plots.save_all(comparison, [*train, *held_out], folder / "figures")
+        (folder / "figures").mkdir(exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".") as unfinished:
+            for drawn in plots.save_all(comparison, [*train, *held_out], unfinished):
+                written.append(drawn.replace(folder / "figures" / drawn.name))
     return written
 
 

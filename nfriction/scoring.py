@@ -196,4 +196,6 @@ def improvement_table(rmse: Array, reference: int = 0) -> Array:
     References:
         TLRIP paper, Table 11.
     """
-    return 100.0 * (1.0 - rmse / rmse[reference])
+    # Where both diverged there is nothing to compare: NaN.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return 100.0 * (1.0 - rmse / rmse[reference])

@@ -187,10 +187,11 @@ def rollout(
             rest that the integration would be unstable.
         CodegenError: if a backend asked for by name cannot serve.
     """
+    if substeps < 1:
+        raise ValueError(f"`substeps` must be at least 1, got {substeps}.")
     q, qd, torque, step, steps = _prepare(plant, friction, q0, qd0, tau, sample_time, steps)
-    if (drive == "measured") != (measured is not None):
-        raise ValueError('`measured=(qd, qdd)` goes with `drive="measured"`, and only with it.')
-    _refuse_unstable(plant, friction, float(step.max()) / substeps)
+    measured = _driving(drive, measured, q, steps)
+    _refuse_unstable(plant, friction, float(step.max()), substeps)
     if gradients is None:
         gradients = (
             torch.is_grad_enabled()
@@ -275,6 +276,27 @@ def _asks_gradients(plant: Plant, friction: Friction | None, *inputs: Tensor) ->
     return any(t.requires_grad for t in (*inputs, *owned))
 
 
+def _driving(
+    drive: str, measured: tuple[Tensor, Tensor] | None, q: Tensor, steps: int
+) -> tuple[Tensor, Tensor] | None:
+    """Validate the measured motion that drives the coefficients."""
+    if drive not in ("simulated", "measured") or (drive == "measured") != (measured is not None):
+        raise ValueError(
+            '`drive` is "simulated", or "measured" together with `measured=(qd, qdd)`; got '
+            f"{drive!r} {'without' if measured is None else 'with'} `measured`."
+        )
+    if measured is None:
+        return None
+    found = torch.as_tensor(measured[0]).to(q), torch.as_tensor(measured[1]).to(q)
+    for x in found:
+        if x.shape[-2:] != (steps, q.shape[-1]) or not torch.isfinite(x.detach()).all():
+            raise ValueError(
+                f"`measured` must be two finite (*batch, {steps}, {q.shape[-1]}), a value a step, "
+                f"got {tuple(found[0].shape)} and {tuple(found[1].shape)}."
+            )
+    return found
+
+
 def _prepare(
     plant: Plant,
     friction: Friction | None,
@@ -318,24 +340,31 @@ def _prepare(
         raise ValueError(f"`tau` must be (*batch, steps, {joints}), got {tuple(torque.shape)}.")
     if not torch.isfinite(torque.detach()).all():
         raise ValueError("`tau` must be finite, got NaN or infinity.")
-    batch = torch.broadcast_shapes(q0.shape, qd0.shape)
-    return q0.expand(batch), qd0.expand(batch), torque, step, steps
+    shape = torch.broadcast_shapes(
+        q0.shape, qd0.shape, (*torque.shape[:-2], joints), (*step.shape[:-1], joints)
+    )
+    return q0.expand(shape), qd0.expand(shape), torque, step, steps
 
 
-def _refuse_unstable(plant: Plant, friction: Friction | None, longest_step: float) -> None:
+def _refuse_unstable(
+    plant: Plant, friction: Friction | None, sample_time: float, substeps: int
+) -> None:
     if friction is None:
         return
+    longest_step = sample_time / substeps
     slope, limit = friction.slope_at_rest(), stability_limit(plant, longest_step)
     excess = (slope / limit).reshape(-1, plant.joints).amax(0)
-    if bool((excess > 1).any()):
+    # As much slack as `required_substeps` takes, so that what it says is never refused.
+    if bool((excess * (1 - 1e-9) > 1).any()):
         joint = int(excess.argmax())
         v_smooth = getattr(friction, "v_smooth", float("nan"))
         raise ValueError(
             f"friction of joint {joint + 1} is too steep at rest for steps of {longest_step:g} s: "
             f"slope {float(slope.reshape(-1, plant.joints)[:, joint].max()):.3g} N m s/rad, "
             f"stable below {float(limit.reshape(-1, plant.joints)[:, joint].min()):.3g}. "
-            f"Use substeps={int(torch.ceil(excess.max()))} or "
-            f"v_smooth >= {v_smooth * float(excess.max()):.2g} (now {v_smooth:g})."
+            f"Use substeps={required_substeps(plant, friction, sample_time)} or "
+            # A twentieth more outweighs the rounding to two digits.
+            f"v_smooth >= {1.05 * v_smooth * float(excess.max()):.2g} (now {v_smooth:g})."
         )
 
 

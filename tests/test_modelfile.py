@@ -281,6 +281,10 @@ FORGED: dict[str, tuple[Callable[[dict], Any], str]] = {
     "smoothing": (lambda c: c.update(v_smooth=-1.0), "`v_smooth` must be positive"),
     "infinite smoothing": (lambda c: c.update(v_smooth=float("inf")), "must be positive"),
     "wrong shape": (lambda c: c["state"].update({"schedule.raw": [[1.0, 2.0]]}), r"got shape \(1"),
+    "infinite": (
+        lambda c: c["state"].update({"schedule.raw": [[1.0, float("inf")], [1.0, 1.0]]}),
+        "must be finite",
+    ),
     "ragged": (lambda c: c["state"].update({"schedule.raw": [[1.0], [1.0, 2.0]]}), "no array"),
     "text": (lambda c: c["state"].update({"schedule.raw": "abc"}), "no array of numbers"),
     "null": (lambda c: c["state"].update({"schedule.raw": None}), "no array of numbers"),

@@ -49,7 +49,6 @@ def torchscript(model: FrictionModel, path: str | Path, info: ModelInfo | None =
         with warnings.catch_warnings():
             # torch.jit is deprecated upstream; this is the one place that still needs it.
             warnings.filterwarnings("ignore", message=".*torch.jit.*")
-            warnings.filterwarnings("ignore", category=DeprecationWarning, module="torch")
             _compile(frozen, temporary, metadata)
             loaded = torch.jit.load(str(temporary))
         _check(frozen, loaded)
@@ -79,8 +78,9 @@ def _compile(model: FrictionModel, path: Path, metadata: str) -> None:
     refusals = (FrontendError, RuntimeError, TypeError, ValueError, AttributeError, OSError,
                 SyntaxError)  # fmt: skip
     try:
-        # Apart from the model, so that the message is about the law's own lines.
-        torch.jit.script(model.law.torque)
+        # Tried apart from the model, so that the message is about the law's own lines.
+        qd, qdd, load = sample_inputs(model, 1, seed=0)
+        torch.jit.script(model.law.torque)(qd, load, model.schedule(qd, qdd), model.v_smooth)
     except refusals as error:
         raise ExportError(
             f"the law {model.law.name!r} does not script; it must be a function in a file, of "

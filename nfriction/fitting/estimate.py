@@ -56,7 +56,6 @@ class Fit:
     at_bounds: tuple[str, ...]
     steps: int
     motions: tuple[Motion, ...]
-    _plant_vector: Tensor
     _residuals: Tensor
 
     def to_dict(self) -> dict[str, Any]:
@@ -126,9 +125,10 @@ def fit(
         )
         _constant(model).set_coefficients(torque.coefficients)
         if method == "torque":
-            return _torque_only(model, plant, moved, torque)
+            return _torque_only(model, start, plant, moved, torque)
     terms = _terms(plant, joint, fit_plant, drag)
-    vector = None if start is None else start._plant_vector
+    known = {name: value for name, value, _ in start.plant_terms} if start else {}
+    vector = torch.tensor([known.get(t.name, 0.0) for t in terms], dtype=torch.float64)
     # A neuro-fuzzy model starts where its constant law ended: what that left over, at the same
     # window length, is the noise that its prior is weighed against.
     refines = isinstance(model.schedule, NeuroFuzzy)
@@ -143,6 +143,7 @@ def fit(
             noise,
             _mixing(plant, given[0]),
             substeps=_substeps(plant, model, joint),
+            plant_mean=vector if refines else None,
         )
         x0 = problem.start(vector)
         told = _told(callback, f"{length:g} s windows")
@@ -243,15 +244,22 @@ def _start_neurofuzzy(
     """Set a neuro-fuzzy model to the constant fit of its law and to the range of the motion."""
     schedule = model.schedule
     assert isinstance(schedule, NeuroFuzzy)
-    if start is None or start.model.law is not model.law:
+    fits = (
+        start is not None
+        and start.model.law is model.law
+        and isinstance(start.model.schedule, Constant)
+        and start._residuals.numel() > 0
+    )
+    if start is None or not fits:
         constant = FrictionModel(model.law, Constant(model.law, model.joints), model.v_smooth)
         start = fit(constant, plant, recordings, motions=motions, start=start, **settings)
     values = _constant(start.model).values
     qd = torch.as_tensor(np.concatenate([m.qd for m in motions]))
     qdd = torch.as_tensor(np.concatenate([m.qdd for m in motions]))
+    along = qdd * qd.sign() if schedule.along_motion else qdd
     schedule.set_range(
         qd.abs().amax(0),
-        torch.stack([torch.quantile(qdd, 0.001, 0), torch.quantile(qdd, 0.999, 0)], -1),
+        torch.stack([torch.quantile(along, 0.001, 0), torch.quantile(along, 0.999, 0)], -1),
     )
     torque = fit_torque(model.law, start.plant, joint, motions, model.v_smooth)
     schedule.set_reference(values, _natural_scale(model, torque, qd))
@@ -274,13 +282,24 @@ def _natural_scale(model: FrictionModel, torque: TorqueFit, qd: Tensor) -> Tenso
 
 
 def _torque_only(
-    model: FrictionModel, plant: Plant, motions: tuple[Motion, ...], torque: TorqueFit
+    model: FrictionModel,
+    start: Fit | None,
+    plant: Plant,
+    motions: tuple[Motion, ...],
+    torque: TorqueFit,
 ) -> Fit:
-    empty = torch.zeros(0, dtype=torch.float64)
     return Fit(
-        model, plant, (), "converged: linear least squares of the torque", True,
-        float(torque.residual.square().mean().sqrt()), (), 0, motions, empty, empty,
-    )  # fmt: skip
+        model,
+        start.plant if start else plant,
+        start.plant_terms if start else (),
+        "converged: linear least squares of the torque",
+        True,
+        float(torque.residual.square().mean().sqrt()),
+        (),
+        0,
+        motions,
+        torch.zeros(0, dtype=torch.float64),
+    )
 
 
 def _fit_of(
@@ -298,11 +317,11 @@ def _fit_of(
             for j in range(schedule.joints)
             for name in schedule.coefficient_names
         ]
-    free = [*schedule.fitted_mask] * (len(names) // len(schedule.fitted_mask))
-    bound = (result.at_lower | result.at_upper)[: problem.shared_count].tolist()
     names += [t.name for t in problem.plant_terms]
-    free += [True] * len(problem.plant_terms)
-    at_bounds = tuple(n for n, b, f in zip(names, bound, free, strict=False) if b and f)
+    lower, upper = problem.bounds()
+    # What was not to be fitted has equal bounds.
+    hit = ((result.at_lower | result.at_upper) & (lower < upper))[: problem.shared_count].tolist()
+    at_bounds = tuple(n for n, h in zip(names, hit, strict=True) if h)
     return Fit(
         model=problem.friction,
         plant=problem.plant_at(vector),
@@ -315,6 +334,5 @@ def _fit_of(
         at_bounds=at_bounds,
         steps=result.steps,
         motions=motions,
-        _plant_vector=vector.clone(),
         _residuals=residuals,
     )

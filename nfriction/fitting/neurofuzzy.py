@@ -161,11 +161,10 @@ def train_network(
 ) -> list[NetworkFit]:
     """Train a network in place on samples by Bayesian regularisation, each group for itself.
 
-    Sets (or units) are first moved with the output layer eliminated, on few samples and from
-    several starts, then a little on all, where the start with the largest evidence goes
-    on. Every group
-    of parameters has its own prior: centres, widths and their like around where they stood when
-    the training was called, output layers around zero (in scaled units).
+    Sets (or units) are first moved with the output layer eliminated, from several starts, on few
+    samples and then a little on all; the start with the largest evidence goes on. Every kind of
+    parameter has its own prior: centres, widths and their like around where that start placed
+    them, output layers around zero (in scaled units).
 
     Args:
         network: as its sets (or units) should start; of the output layer no start is needed.
@@ -262,8 +261,9 @@ class _Group:
                 project(trial, self.x, self.y, REFINING_STEPS if starts == 1 else RANKING_STEPS)
             evidence = 0.0
             if starts > 1:
-                # On all samples: on few, the start that overfits them would win.
-                evidence = _regularise(trial, self.x, self.y, start, max_steps=1).log_evidence
+                # On all samples: on few, the start that overfits them would win. The precisions
+                # are first estimated after one step, and good for a ranking after another.
+                evidence = _regularise(trial, self.x, self.y, start, max_steps=3).log_evidence
             if evidence > best:
                 best, prior, found = evidence, start, deepcopy(trial.state_dict())
         self.carrier.load_state_dict(found)

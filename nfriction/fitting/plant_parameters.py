@@ -80,7 +80,8 @@ def plant_parameters(
             unit = torch.eye(joints, dtype=torch.float64)[j]
             shift(f"angle offset {j + 1} [rad]", "angle_offset", unit, -ANGLE_BOUND, ANGLE_BOUND,
                   ANGLE_SD)  # fmt: skip
-    for name in ("armature", "mass"):
+    # Without torque a mass alone is but the scale of the friction.
+    for name in ("armature", "mass") if driven else ("armature",):
         for j in range(buffers[name].shape[-1] if name in buffers else 0):
             ratio(f"{name} {j + 1}", name, (j,))
     if driven:

@@ -111,6 +111,29 @@ class StepJacobian:
             return forward_ad.unpack_dual(after).tangent.permute(1, 2, 0)
 
 
+def start_slope(
+    jacobian: StepJacobian, q: Tensor, qd: Tensor, tau: Tensor, vector: Tensor
+) -> Tensor:
+    """Derivative of the acceleration known before the first step, which is without friction.
+
+    Args:
+        jacobian: holds the mechanism and its adjustable terms.
+        q, qd, tau: initial state and torque, (window, joint).
+        vector: parameters of the plant.
+
+    Returns:
+        By q, qd and the plant's parameters, (window, joint, direction).
+    """
+
+    def acceleration(q: Tensor, qd: Tensor, vector: Tensor, tau: Tensor) -> Tensor:
+        buffers = adjusted_buffers(jacobian.plant, jacobian.parameters, vector)
+        plant = jacobian.plant.replace(**buffers) if buffers else jacobian.plant
+        return plant.forward_dynamics(q, qd, tau)
+
+    slope = torch.func.vmap(torch.func.jacfwd(acceleration, (0, 1, 2)), (0, 0, None, 0))
+    return torch.cat(slope(q, qd, vector, tau), -1)
+
+
 def step_maps(
     jacobian: StepJacobian, motion: Rollout, tau: Tensor, step: Tensor, vector: Tensor, run: int
 ) -> Iterator[StepMaps]:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.plant_parameters import adjusted_buffers
-from nfriction.fitting.sensitivity import StepJacobian, step_maps
+from nfriction.fitting.sensitivity import StepJacobian, start_slope, step_maps
 from nfriction.fitting.windows import Windows
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.simulation import Rollout, integrate
@@ -41,6 +41,7 @@ class TrajectoryProblem:
         mixing: matrix (joint, joint) from joint coordinates to those in which the recording's
             positions were measured; errors are counted there.
         substeps: integration steps to a sample.
+        plant_mean: where the prior of the plant's terms is centred; default the plant as given.
     """
 
     jacobian: StepJacobian
@@ -48,6 +49,7 @@ class TrajectoryProblem:
     noise_sd: float
     mixing: Tensor
     substeps: int = 1
+    plant_mean: Tensor | None = None
 
     def __post_init__(self) -> None:
         w = self.windows
@@ -125,6 +127,8 @@ class TrajectoryProblem:
         mean = torch.zeros(self.shared_count, dtype=torch.float64)
         sd = torch.full_like(mean, torch.inf)
         mean[:n], sd[:n] = self.friction.schedule.prior()
+        if self.plant_mean is not None:
+            mean[n:] = self.plant_mean
         sd[n:] = torch.tensor([t.prior_sd for t in self.plant_terms], dtype=torch.float64)
         start = torch.cat([w.q0, w.qd0], -1)
         spread = torch.cat(
@@ -141,6 +145,11 @@ class TrajectoryProblem:
         columns = self.shared_count + 2 * joints
         carried = torch.zeros(windows, 3 * joints, columns, dtype=torch.float64)
         carried[:, : 2 * joints, self.shared_count :] = torch.eye(2 * joints, dtype=torch.float64)
+        by_q, by_plant = start_slope(
+            self.jacobian, motion.q[:, 0], motion.qd[:, 0], self.tau[:, 0], plant_vector
+        ).tensor_split([2 * joints], -1)
+        carried[:, 2 * joints :, self.friction_count : self.shared_count] = by_plant
+        carried[:, 2 * joints :, self.shared_count :] = by_q
         slope = torch.zeros(windows, columns, dtype=torch.float64)
         curvature = torch.zeros(windows, columns, columns, dtype=torch.float64)
 

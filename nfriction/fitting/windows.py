@@ -50,10 +50,17 @@ def cut_windows(
     Raises:
         ValueError: if a recording has so few samples that no window fits.
     """
+    if not length > 0:
+        raise ValueError(f"`length` must be positive [s], got {length}.")
     pieces = []
     for recording, motion in zip(recordings, motions, strict=True):
         span = recording.time[-1] - recording.time[0]
         count = max(1, int(span / length + 0.5))
+        if count >= len(recording.time):
+            raise ValueError(
+                f"{recording.name or 'a recording'} has {len(recording.time)} samples in {span:g} "
+                f"s, too few for windows of {length:g} s; use longer windows."
+            )
         edges = np.linspace(0, len(recording.time) - 1, count + 1).astype(int)
         pieces += [(recording, motion, a, b) for a, b in pairwise(edges)]
     steps = max(b - a for _, _, a, b in pieces)

@@ -10,8 +10,8 @@ from nfriction.friction.laws import Law
 from nfriction.friction.schedules import Constant, Schedule, Sensitivity
 from nfriction.fuzzy import AnfisRBF
 
-# Below a hundredth of its scale a coefficient is as good as zero, and must be able to rise.
-LEAST_RATIO = 0.01
+# Below a thousandth of its scale a coefficient is as good as zero, and must be able to rise.
+LEAST_RATIO = 1e-3
 
 
 def soft_positive(u: Tensor, roundness: float) -> Tensor:
@@ -48,7 +48,7 @@ class NeuroFuzzy(Schedule):
     """
 
     # Final, so that TorchScript takes them for constants.
-    roundness: Final[float] = 0.05  # of the positive map, in units of a coefficient's scale
+    roundness: Final[float] = 0.005  # of the positive map, in units of a coefficient's scale
     turn: Final[float] = 3e-3  # where qdd sgn(qd) turns, in units of the velocity's range
 
     reference: Tensor
@@ -117,7 +117,7 @@ class NeuroFuzzy(Schedule):
     def set_reference(self, values: Tensor, scale: Tensor | None = None) -> None:
         """Set the constant law from which the network deviates.
 
-        A positive coefficient below a hundredth of its scale becomes a hundredth of it.
+        A positive coefficient below a thousandth of its scale becomes a thousandth of it.
 
         Args:
             values: coefficients in SI, (joint, coefficient).

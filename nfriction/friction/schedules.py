@@ -5,6 +5,7 @@ shape (*batch, joint) -> (*batch, joint, coefficient). Fits see it through `para
 `bounds` and `sensitivities`, so any schedule can be estimated from torques or trajectories.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -12,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from nfriction.friction.laws import Law
+from nfriction.friction.laws import Coefficient, Law
 
 # Smallest value a positive coefficient takes: far below any torque that a sensor can tell.
 SMALLEST = 1e-12
@@ -47,12 +48,14 @@ class Schedule(nn.Module, ABC):
     Attributes:
         coefficient_names: names of the last axis.
         fitted_mask: which coefficients are estimated by default.
+        limits: between what values a fit may move each coefficient.
         positive: which coefficients are positive by physics, a buffer (coefficient,).
     """
 
     joints: int
     coefficient_names: list[str]
     fitted_mask: list[bool]
+    limits: list[tuple[float, float]]
     positive: Tensor
 
     def __init__(self, law: Law, joints: int) -> None:
@@ -62,6 +65,7 @@ class Schedule(nn.Module, ABC):
         self.joints = joints
         self.coefficient_names = list(law.names)
         self.fitted_mask = [c.fitted for c in law.coefficients]
+        self.limits = [_limits(c) for c in law.coefficients]
         positive = torch.tensor([c.positive for c in law.coefficients])
         self.register_buffer("positive", positive, persistent=False)
 
@@ -96,6 +100,14 @@ class Schedule(nn.Module, ABC):
     def options(self) -> dict[str, Any]:
         """Constructor arguments beyond law, joints and initial values, as plain JSON."""
         return {}
+
+
+def _limits(coefficient: Coefficient) -> tuple[float, float]:
+    """Between what values a fit may move a coefficient."""
+    if coefficient.search:
+        # Ten times beyond what is tried, its effect no longer shows in the range of the motion.
+        return 0.1 * min(coefficient.search), 10.0 * max(coefficient.search)
+    return (SMALLEST if coefficient.positive else -math.inf), math.inf
 
 
 class Constant(Schedule):
@@ -173,10 +185,14 @@ class Constant(Schedule):
     def bounds(self) -> tuple[Tensor, Tensor]:
         values = self.values
         fitted = torch.tensor(self.fitted_mask, device=values.device)
-        free = torch.full_like(values, torch.inf)
-        lower = torch.where(self.positive, torch.full_like(values, SMALLEST), -free)
-        lower = torch.where(fitted, lower, values)
-        return lower.reshape(-1), torch.where(fitted, free, values).reshape(-1)
+        lower, upper = (
+            torch.tensor(limits, dtype=values.dtype, device=values.device).expand_as(values)
+            for limits in zip(*self.limits, strict=True)
+        )
+        return (
+            torch.where(fitted, lower, values).reshape(-1),
+            torch.where(fitted, upper, values).reshape(-1),
+        )
 
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
         joints, k = self.raw.shape

@@ -79,15 +79,17 @@ def test_joints_are_at_least_one() -> None:
 
 @every_law
 def test_the_parameter_vector_is_the_coefficients_and_goes_round_unchanged(law: Law) -> None:
-    schedule = Constant(law, 3, random_values(law, 3))
-    raw = schedule.raw.detach().clone()
+    schedule = Constant(law, 100)
+    raw = 5 * normal(100, len(law.names))  # for many of these log(exp(raw)) is not raw
+    with torch.no_grad():
+        schedule.raw.copy_(raw)
     vector = schedule.parameter_vector()
-    assert torch.equal(vector.reshape(3, -1), schedule.values)
+    assert torch.equal(vector.reshape(100, -1), schedule.values)
     schedule.set_parameter_vector(vector)
     assert torch.equal(schedule.raw, raw)
     vector.zero_()  # a copy: the model must not follow
     assert torch.equal(schedule.raw, raw)
-    other = Constant(law, 3)
+    other = Constant(law, 100)
     other.set_parameter_vector(schedule.parameter_vector())
     torch.testing.assert_close(other.values, schedule.values, rtol=1e-14, atol=0)
 
@@ -97,9 +99,14 @@ def test_bounds_keep_what_is_not_fitted_and_the_sign_of_the_rest(law: Law) -> No
     schedule = Constant(law, 2, random_values(law, 2))
     lower, upper = (b.reshape(2, -1) for b in schedule.bounds())
     for k, c in enumerate(law.coefficients):
-        if c.fitted:
+        if c.fitted and c.linear:
             assert (lower[:, k] == (SMALLEST if c.positive else -torch.inf)).all()
             assert (upper[:, k] == torch.inf).all()
+        elif c.fitted:  # free well beyond what is tried, but not without end
+            assert (lower[:, k] > 0).all()
+            assert (lower[:, k] < min(c.search)).all()
+            assert (upper[:, k] > max(c.search)).all()
+            assert torch.isfinite(upper[:, k]).all()
         else:
             assert torch.equal(lower[:, k], schedule.values[:, k])
             assert torch.equal(upper[:, k], schedule.values[:, k])

@@ -1,0 +1,127 @@
+"""Chaotic Mackey-Glass series, predicted six steps ahead from four values (Jang 1993).
+
+Run from the repository's root: `python benchmarks/mackey_glass.py [--steps 300]`, on one thread.
+Series: tau = 17, x(0) = 1.2, x(t) = 0 before, Runge-Kutta 4 with step 0.1. Inputs x(t-18),
+x(t-12), x(t-6), x(t), output x(t+6), t = 118 ... 1117; the first 500 pairs train, the other 500
+test. NDEI is the error's RMS over the standard deviation of the targets. Peers that are not
+installed (scikit-learn) are named and skipped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import sys
+import time
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from nfriction.fitting.neurofuzzy import train_network
+from nfriction.fuzzy import Anfis, train_hybrid
+
+Predictor = Callable[[Tensor], Tensor]
+
+
+def mackey_glass(last: int, tau: int = 17, step: float = 0.1) -> Tensor:
+    """x(0), x(1), ... x(last) of dx/dt = 0.2 x(t - tau) / (1 + x(t - tau)^10) - 0.1 x(t)."""
+    per_unit = round(1 / step)
+    x = [1.2]
+
+    def slope(value: float, delayed: float) -> float:
+        return 0.2 * delayed / (1 + delayed**10) - 0.1 * value
+
+    for n in range(last * per_unit):
+        past = n - tau * per_unit
+        # The delayed value half a step on is half way between its neighbours.
+        before, after = (x[k] if k >= 0 else 0.0 for k in (past, past + 1))
+        middle = 0.5 * (before + after)
+        k1 = slope(x[n], before)
+        k2 = slope(x[n] + 0.5 * step * k1, middle)
+        k3 = slope(x[n] + 0.5 * step * k2, middle)
+        k4 = slope(x[n] + step * k3, after)
+        x.append(x[n] + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4))
+    return torch.tensor(x[::per_unit], dtype=torch.float64)
+
+
+def pairs(series: Tensor) -> tuple[Tensor, Tensor]:
+    """Inputs (1000, 4) and outputs (1000, 1) for t = 118 ... 1117."""
+    t = torch.arange(118, 1118)
+    x = torch.stack([series[t - lag] for lag in (18, 12, 6, 0)], 1)
+    return x, series[t + 6].unsqueeze(1)
+
+
+def by_evidence(x: Tensor, y: Tensor, terms: int, steps: int) -> Predictor:
+    """ANFIS with `terms` sets an input, by Bayesian regularisation."""
+    anfis = Anfis(1, 4, [terms] * 4, 1)
+    anfis.init_grid(x.min(), x.max())
+    train_network(anfis, x.unsqueeze(1), y.unsqueeze(1), search_steps=40, max_steps=steps)
+    return lambda inputs: anfis(inputs.unsqueeze(1))[:, 0]
+
+
+def classical(x: Tensor, y: Tensor, epochs: int) -> Predictor:
+    """Jang's own: two bell sets an input, hybrid learning."""
+    anfis = Anfis(1, 4, [2] * 4, 1, kind="bell")
+    anfis.init_grid(x.min(), x.max())
+    train_hybrid(anfis, x.unsqueeze(1), y.unsqueeze(1), epochs)
+    return lambda inputs: anfis(inputs.unsqueeze(1))[:, 0]
+
+
+def perceptron(x: Tensor, y: Tensor) -> Predictor:
+    """scikit-learn's multilayer perceptron, 20 tanh units, L-BFGS."""
+    from sklearn.neural_network import MLPRegressor
+
+    net = MLPRegressor(hidden_layer_sizes=(20,), activation="tanh", solver="lbfgs",
+                       max_iter=20_000, max_fun=10**6, alpha=1e-8, tol=1e-12,
+                       random_state=0)  # fmt: skip
+    net.fit(x.numpy(), y[:, 0].numpy())
+    return lambda inputs: torch.as_tensor(net.predict(inputs.numpy())).unsqueeze(1)
+
+
+def gaussian_process(x: Tensor, y: Tensor) -> Predictor:
+    """scikit-learn's Gaussian process with a width for each input."""
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel
+
+    kernel = ConstantKernel(10.0, (1e-2, 1e5)) * RBF([1.0] * 4, (1e-2, 1e3))
+    net = GaussianProcessRegressor(kernel, alpha=1e-9, normalize_y=True)
+    net.fit(x.numpy(), y[:, 0].numpy())
+    return lambda inputs: torch.as_tensor(net.predict(inputs.numpy())).unsqueeze(1)
+
+
+def ndei(predicted: Tensor, wanted: Tensor) -> float:
+    return float((predicted - wanted).square().mean().sqrt() / wanted.std(correction=0))
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--steps", type=int, default=200, help="of Bayesian regularisation")
+    parser.add_argument("--epochs", type=int, default=500, help="of the hybrid learning")
+    options = parser.parse_args(argv)
+    torch.set_num_threads(1)
+    x, y = pairs(mackey_glass(1123))
+    x_train, y_train, x_test, y_test = x[:500], y[:500], x[500:], y[500:]
+    runs: dict[str, Callable[[], Predictor]] = {
+        "ANFIS, 2^4 rules, Bayesian": lambda: by_evidence(x_train, y_train, 2, options.steps),
+        "ANFIS, 3^4 rules, Bayesian": lambda: by_evidence(x_train, y_train, 3, options.steps),
+        "ANFIS, 2^4 rules, hybrid": lambda: classical(x_train, y_train, options.epochs),
+    }
+    if importlib.util.find_spec("sklearn") is None:
+        print("scikit-learn is not installed: its rows are left out")
+    else:
+        runs["scikit-learn perceptron"] = lambda: perceptron(x_train, y_train)
+        runs["scikit-learn Gaussian process"] = lambda: gaussian_process(x_train, y_train)
+    print(f"{'method':32} {'seconds':>8} {'NDEI train':>11} {'NDEI test':>11}")
+    for name, run in runs.items():
+        start = time.perf_counter()
+        predict = run()
+        seconds = time.perf_counter() - start
+        with torch.no_grad():
+            errors = ndei(predict(x_train), y_train), ndei(predict(x_test), y_test)
+        print(f"{name:32} {seconds:8.2f} {errors[0]:11.5f} {errors[1]:11.5f}", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,50 @@
+"""Simulated recordings with known friction, as an encoder reports them."""
+
+import numpy as np
+import torch
+
+from nfriction import LinearAxis, PendulumChain, Recording, rollout
+from nfriction.angles import AngleConvention
+from nfriction.friction import FrictionModel
+from nfriction.signals import quantise
+
+F64 = torch.float64
+COUNTS = 8192
+
+
+def pendulum(**settings) -> PendulumChain:
+    return PendulumChain([0.3, 0.2], [0.2, 0.15], inertia=[1e-3, 4e-4], **settings)
+
+
+def swing(
+    plant: PendulumChain,
+    model: FrictionModel,
+    *,
+    seconds: float = 4.0,
+    start: tuple[float, float] = (1.6, 0.8),
+    sample_time: float | np.ndarray = 2e-3,
+    convention: str = "relative,upright",
+    name: str = "swing",
+) -> Recording:
+    """A release from rest, quantised in the convention it is written in."""
+    steps = sample_time if isinstance(sample_time, np.ndarray) else None
+    count = round(seconds / sample_time) if steps is None else len(steps)
+    out = rollout(
+        plant, model, torch.tensor(start, dtype=F64), torch.zeros(2, dtype=F64),
+        sample_time=sample_time if steps is None else torch.as_tensor(steps),
+        steps=count, substeps=4, gradients=False,
+    )  # fmt: skip
+    written = AngleConvention.parse(convention)
+    q = quantise(written.position_from_joint(out.q.numpy()), COUNTS)
+    return Recording(out.time.numpy(), q, convention=written, name=name)
+
+
+def driven_axis(axis: LinearAxis, model: FrictionModel, *, seconds: float = 3.0) -> Recording:
+    """An axis driven by two sines, whose position is read to a micrometre."""
+    time = np.arange(0.0, seconds, 2e-3)
+    force = 6.0 * np.sin(2 * np.pi * time) + 4.0 * np.sin(2 * np.pi * 2.7 * time)
+    tau = torch.as_tensor(force[:, None])
+    zero = torch.zeros(1, dtype=F64)
+    out = rollout(axis, model, zero, zero, tau[:-1], sample_time=2e-3, substeps=2, gradients=False)
+    q = 1e-6 * np.rint(out.q.numpy() / 1e-6)
+    return Recording(time, q, tau=tau.numpy(), unit="m", name="axis")

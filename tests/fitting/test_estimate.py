@@ -1,0 +1,170 @@
+"""Fits recover what made the recording, say how they ended, and refuse what does not match."""
+
+import logging
+
+import numpy as np
+import pytest
+import torch
+
+from nfriction import LFM, NCFM, NFLFM, LinearAxis, Recording, fit
+from nfriction.fitting.estimate import effective_noise
+from tests.fitting.recordings import F64, driven_axis, pendulum, swing
+
+TRUTH = [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]]
+V_SMOOTH = 0.05
+
+
+def true_model():
+    return LFM(2, TRUTH, v_smooth=V_SMOOTH)
+
+
+def assert_coefficients(found, relative):
+    torch.testing.assert_close(
+        found.model.schedule.values, torch.tensor(TRUTH, dtype=F64), rtol=relative, atol=0
+    )
+
+
+@pytest.mark.parametrize("convention", ["relative,upright", "absolute,hanging"])
+def test_known_friction_is_recovered(convention):
+    recording = swing(pendulum(), true_model(), convention=convention)
+    found = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, fit_plant=False, windows=(1.0,))
+    assert_coefficients(found, 0.03)
+    assert found.converged
+    assert found.status.startswith("converged")
+    # What is left over is the encoder's rounding, nothing else.
+    assert found.residual == pytest.approx(2 * np.pi / 8192 / 12**0.5, rel=0.2)
+    assert found.at_bounds == ()
+    assert found.plant_terms == ()
+
+
+@pytest.mark.slow
+def test_perturbed_plant_ratios_are_recovered():
+    plant = pendulum()
+    recordings = [swing(plant, true_model(), name="a"),
+                  swing(plant, true_model(), start=(2.4, -1.0), name="b")]  # fmt: skip
+    given = plant.replace(
+        gravity_moment=plant.gravity_moment * torch.tensor([1.0, 0.95], dtype=F64)
+    )
+    found = fit(LFM(2, v_smooth=V_SMOOTH), given, recordings)
+    terms = {name: value for name, value, _ in found.plant_terms}
+    assert terms["gravity 2"] == pytest.approx(1 / 0.95 - 1, abs=0.01)
+    assert max(abs(v) for n, v in terms.items() if n.startswith("inertia")) < 0.02
+    torch.testing.assert_close(found.plant.gravity_moment, plant.gravity_moment, rtol=0.01, atol=0)
+    assert_coefficients(found, 0.05)
+    assert len(found.motions) == 2
+
+
+def test_a_driven_axis_gives_mass_and_offset():
+    axis = LinearAxis(2.0, torque_offset=0.3)
+    recording = driven_axis(axis, LFM(1, [3.0, 1.0], v_smooth=V_SMOOTH))
+    found = fit(LFM(1, v_smooth=V_SMOOTH), LinearAxis(1.9), recording, windows=(0.5,))
+    assert float(found.plant.mass) == pytest.approx(2.0, rel=0.01)
+    assert float(found.plant.torque_offset) == pytest.approx(0.3, abs=0.03)
+    values = found.model.schedule.values[0].tolist()
+    assert values == pytest.approx([3.0, 1.0], rel=0.05)
+
+
+def test_irregular_stamps_are_followed():
+    step = np.random.default_rng(0).uniform(1e-3, 3e-3, 1500)
+    recording = swing(pendulum(), true_model(), sample_time=step)
+    found = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, fit_plant=False, windows=(1.0,))
+    assert_coefficients(found, 0.05)
+
+
+def test_a_torque_fit_stops_there_and_starts_another():
+    recording = swing(pendulum(), true_model(), seconds=2.0)
+    first = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, method="torque")
+    assert first.steps == 0
+    # Accelerations of a coarse encoder bias the friction, but it explains part of the torque.
+    assert (first.model.schedule.values >= 0).all()
+    assert first.residual > 0
+    assert first.plant_terms == ()
+    second = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, start=first,
+                 motions=first.motions, windows=(1.0,), max_steps=2)  # fmt: skip
+    assert second.plant_terms
+    third = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, method="torque", start=second)
+    assert third.plant is second.plant
+    assert third.plant_terms == second.plant_terms
+    with pytest.raises(ValueError, match="neuro-fuzzy"):
+        fit(NFLFM(2), pendulum(), recording, method="torque")
+
+
+def test_terms_of_an_earlier_fit_are_taken_by_name():
+    """The earlier fit may have had other terms, or none."""
+    recording = swing(pendulum(), true_model(), seconds=1.0)
+    settings = {"windows": (0.5,), "max_steps": 1}
+    bare = fit(NCFM(2), pendulum(), recording, fit_plant=False, **settings)
+    full = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, start=bare, **settings)
+    assert full.plant_terms
+    less = fit(
+        LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, fit_plant=False, start=full, **settings
+    )
+    assert less.plant_terms == ()
+
+
+def test_a_stop_keeps_what_was_reached():
+    recording = swing(pendulum(), true_model(), seconds=2.0)
+    seen = []
+
+    def stop(stage, step):
+        seen.append((stage, step.cost))
+        return True
+
+    model = LFM(2, v_smooth=V_SMOOTH)
+    found = fit(model, pendulum(), recording, fit_plant=False, windows=(0.5, 1.0), callback=stop)
+    assert [stage for stage, _ in seen] == ["0.5 s windows"]
+    assert not found.converged
+    assert "topped" in found.status
+    assert found.steps == 1
+    assert found.model is model
+
+
+@pytest.mark.slow
+def test_a_neuro_fuzzy_model_with_little_data_stays_near_its_constant_law():
+    recording = swing(pendulum(), true_model(), seconds=1.5)
+    constant = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, fit_plant=False)
+    model = NFLFM(2, v_smooth=V_SMOOTH)
+    found = fit(model, pendulum(), recording, fit_plant=False, start=constant)
+    qd, qdd = torch.as_tensor(found.motions[0].qd), torch.as_tensor(found.motions[0].qdd)
+    load = torch.ones_like(qd)
+    with torch.no_grad():
+        bent, flat = model(qd, qdd, load), constant.model(qd, qdd, load)
+    assert float((bent - flat).square().mean()) ** 0.5 < 0.1 * float(flat.square().mean()) ** 0.5
+    assert found.residual < 1.05 * constant.residual
+
+
+def test_effective_noise_of_white_and_of_correlated_residuals():
+    g = torch.Generator().manual_seed(0)
+    white = 0.3 * torch.randn(20, 4000, 2, generator=g, dtype=F64)
+    assert effective_noise(white) == pytest.approx(0.3, rel=0.05)
+    phi = 0.9
+    noise = torch.randn(20, 4000, 2, generator=g, dtype=F64)
+    rows = [noise[:, 0] / (1 - phi**2) ** 0.5]
+    for k in range(1, 4000):
+        rows.append(phi * rows[-1] + noise[:, k])
+    ar = torch.stack(rows, 1)
+    expected = ((1 + phi) / (1 - phi)) ** 0.5 / (1 - phi**2) ** 0.5
+    assert effective_noise(ar) == pytest.approx(expected, rel=0.05)
+    assert effective_noise(10 * ar) == pytest.approx(10 * effective_noise(ar))
+
+
+def test_what_does_not_match_is_refused():
+    recording = swing(pendulum(), true_model(), seconds=0.5)
+    other = swing(pendulum(), true_model(), seconds=0.5, convention="absolute,hanging", name="o")
+    for arguments, message in (
+        ((LFM(2), pendulum(), []), "at least one recording"),
+        ((LFM(3), pendulum(), recording), "must agree"),
+        ((LFM(2), LinearAxis(1.0), recording), "must agree"),
+        ((LFM(2), pendulum(), [recording, other]), "convention"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            fit(*arguments)
+    with pytest.raises(ValueError, match="windows"):
+        fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=())
+
+
+def test_nothing_is_logged_as_a_warning_in_a_plain_fit(caplog):
+    recording: Recording = swing(pendulum(), true_model(), seconds=1.0)
+    with caplog.at_level(logging.WARNING, "nfriction"):
+        fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, fit_plant=False, windows=(0.5,))
+    assert not caplog.records

@@ -1,0 +1,277 @@
+"""Laws of training fuzzy networks by Bayesian regularisation, on samples and on controllers."""
+
+import math
+from copy import deepcopy
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from nfriction.fitting.layer_equations import LayerEquations
+from nfriction.fitting.neurofuzzy import (
+    controller_targets,
+    one_group,
+    project,
+    train_network,
+    train_on_controller,
+)
+from nfriction.fitting.scaling import Scaling, to_own_units
+from nfriction.fuzzy import Anfis, AnfisRBF, RBFNetwork, paper_controller
+from nfriction.solve import EvidenceState
+from nfriction.solve.jacobian import flatten, normal_equations, per_sample_jacobian, trainable
+
+FLOAT64 = torch.float64
+
+
+def samples(*shape: int, seed: int = 0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return 2 * torch.rand(shape, generator=generator, dtype=FLOAT64) - 1
+
+
+def surface(x: Tensor) -> Tensor:
+    return torch.stack([torch.sin(2 * x[..., 0]) * x[..., 1], x[..., 0] ** 2 + x[..., 1]], -1)
+
+
+def shaken(module: nn.Module, size: float = 0.3) -> nn.Module:
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for p in module.parameters():
+            p.add_(size * torch.randn(p.shape, generator=generator, dtype=p.dtype))
+    return module
+
+
+NETWORKS = {
+    "anfis": lambda g: Anfis(g, 2, [3, 2], 2),
+    "zero order": lambda g: Anfis(g, 2, [3, 3], 2, order=0),
+    "bells": lambda g: Anfis(g, 2, [2, 3], 2, kind="bell"),
+    "interpretable": lambda g: Anfis(g, 2, [3, 3], 2, interpretable=True),
+    "interpretable bells": lambda g: Anfis(g, 2, [3, 2], 2, kind="bell", interpretable=True),
+    "network": lambda g: RBFNetwork(g, units=4),
+    "head": lambda g: AnfisRBF(g, 2, [3, 2], 2, units=3),
+}
+
+
+@pytest.mark.parametrize("groups", [1, 2])
+@pytest.mark.parametrize("kind", NETWORKS)
+def test_written_jacobians_are_those_of_reverse_differentiation(kind: str, groups: int) -> None:
+    network, x = shaken(NETWORKS[kind](groups)), samples(20, groups, 2)
+
+    def automatic(parameters: dict[str, Tensor]) -> Tensor:
+        return torch.func.functional_call(network, parameters, (x,)).flatten(1)
+
+    parameters = trainable(network)
+    wanted = torch.func.jacrev(automatic)(parameters)
+    joined = torch.cat([block.flatten(2) for block in wanted.values()], -1)
+    torch.testing.assert_close(network.jacobian(x), joined, rtol=1e-12, atol=1e-12)
+    # What the solver asks for: other values than the module's own, and some of them frozen.
+    names = list(parameters)
+    dict(network.named_parameters())[names[0]].requires_grad_(False)
+    del parameters[names[0]]
+    offset = {name: value + 0.1 for name, value in parameters.items()}
+    written = per_sample_jacobian(network, offset, x)
+    plain = per_sample_jacobian(
+        lambda values, inputs: torch.func.functional_call(network, dict(values), (inputs,)),
+        offset,
+        x,
+    )
+    torch.testing.assert_close(written, plain, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in NETWORKS if kind != "head"])
+def test_shared_columns_give_the_normal_equations_of_the_whole_jacobian(kind: str) -> None:
+    layer, x = shaken(NETWORKS[kind](1)), samples(300, 1, 2)
+    y = surface(x)
+    equations = LayerEquations(layer, x, y)
+    got = equations.normal_equations(equations.w)
+    wanted = normal_equations(layer, trainable(layer), x, y)
+    for ours, theirs in zip(got, wanted, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-11, atol=1e-11 * float(theirs.abs().max()))
+    torch.testing.assert_close(equations.squares(equations.w), got.squares, rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in NETWORKS if kind != "head"])
+def test_eliminated_problem_has_the_slope_of_its_cost(kind: str) -> None:
+    layer, x = shaken(NETWORKS[kind](1), 0.1), samples(400, 1, 2)
+    equations = LayerEquations(layer, x, surface(x), ridge=1e-3)
+    theta = equations.w[equations.moving]
+    local = equations.projected(theta)
+    step, slopes = 1e-5, []
+    for i in range(len(theta)):
+        ahead, behind = theta.clone(), theta.clone()
+        ahead[i] += step
+        behind[i] -= step
+        rise = equations.projected_cost(ahead) - equations.projected_cost(behind)
+        slopes.append(float(rise) / (2 * step))
+    # Central differences: error of order step^2, and rounding over step.
+    torch.testing.assert_close(local.gradient.tolist(), slopes, rtol=1e-4, atol=1e-6)
+    eigenvalues = torch.linalg.eigvalsh(local.hessian)
+    assert eigenvalues.min() > -1e-9 * eigenvalues.max()
+
+
+@pytest.mark.parametrize("kind", NETWORKS)
+def test_change_of_units_is_exact_and_leads_back(kind: str) -> None:
+    network, x = shaken(NETWORKS[kind](2)), samples(50, 2, 2)
+    random = [samples(2, 2, seed=seed) for seed in range(4)]
+    scaling = Scaling(random[0], random[1].abs() + 0.1, random[2], random[3].abs() + 0.1)
+    with torch.no_grad():
+        before, start = network(x), deepcopy(network.state_dict())
+        to_own_units(network, scaling)
+        own = x * scaling.x_half + scaling.x_middle
+        torch.testing.assert_close(scaling.outputs(network(own)), before, rtol=1e-10, atol=1e-11)
+        to_own_units(network, scaling.inverse())
+    for name, value in network.state_dict().items():
+        torch.testing.assert_close(value, start[name], rtol=1e-11, atol=1e-11)
+
+
+def rmse(network: nn.Module, x: Tensor, y: Tensor) -> float:
+    with torch.no_grad():
+        return float(((network(x) - y) / (y.amax(0) - y.amin(0))).square().mean().sqrt())
+
+
+def test_targets_are_what_the_controller_says_over_its_universes() -> None:
+    controller = paper_controller(2)
+    x, y = controller_targets(controller, 3000, seed=3)
+    torch.testing.assert_close(controller(x[:, 0], x[:, 1]), y, rtol=1e-12, atol=0)
+    lower, upper = (end * controller.si_factor for end in (controller.lower, controller.upper))
+    assert (x >= lower).all()
+    assert (x <= upper).all()
+    # The mean of n uniform draws lies within five of its standard deviations.
+    middle = (x.mean(0) - 0.5 * (lower + upper)).abs() / (upper - lower)
+    assert middle.max() < 5 * math.sqrt(1 / 12 / 3000)
+    again, _ = controller_targets(controller, 3000, seed=3)
+    assert torch.equal(x, again)
+    assert not torch.equal(x, controller_targets(controller, 3000, seed=4)[0])
+
+
+@pytest.mark.parametrize("kind", ["anfis", "interpretable", "network", "head"])
+def test_training_beats_the_least_squares_start(kind: str) -> None:
+    controller = paper_controller(2)
+    network = NETWORKS[kind](1)
+    x, y = controller_targets(controller, 1500)
+    start = NETWORKS[kind](1)
+    train_on_controller(start, controller, samples=1500, search_steps=0, max_steps=0)
+    fits = train_on_controller(network, controller, samples=1500, search_steps=20, max_steps=10)
+    assert len(fits) == 1
+    assert rmse(network, x[:, None], y[:, None]) < 0.95 * rmse(start, x[:, None], y[:, None])
+    # It learns the function, not the samples.
+    x, y = controller_targets(controller, 1500, seed=9)
+    assert rmse(network, x[:, None], y[:, None]) < 0.95 * rmse(start, x[:, None], y[:, None])
+
+
+def test_identities_hold_at_convergence() -> None:
+    x = samples(400, 1, 2)
+    y = surface(x) + 0.05 * torch.randn(
+        400, 1, 2, generator=torch.Generator().manual_seed(2), dtype=FLOAT64
+    )
+    network = Anfis(1, 2, [2, 2], 2)
+    fit = train_network(network, x, y, max_steps=500, tolerance=1e-6)[0].evidence
+    assert fit.converged
+    for group, gamma in fit.gamma.items():
+        shrinkage = 2 * fit.alpha[group] * fit.parameter_squares[group]
+        assert abs(gamma - shrinkage) <= 1e-5 * max(1, gamma)
+    unexplained = fit.samples - fit.effective_parameters
+    assert math.isclose(fit.beta, unexplained / (2 * fit.error_squares), rel_tol=1e-5)
+    assert set(fit.alpha) == {"centres", "widths", "consequents"}
+
+
+def test_error_bars_are_in_the_units_of_the_samples() -> None:
+    x = samples(500, 1, 2)
+    noise = torch.randn(500, 1, 2, generator=torch.Generator().manual_seed(2), dtype=FLOAT64)
+    y = 100.0 * surface(x) + torch.tensor([3.0, 5.0], dtype=FLOAT64) * noise
+    fit = train_network(Anfis(1, 2, [3, 3], 2), 7.0 + 20 * x, y, max_steps=100)[0]
+    deviation = fit.predictive_std(7.0 + 20 * x[:, 0])
+    assert deviation.shape == (500, 2)
+    # One noise level for outputs scaled by their ranges: its share of each range is the same.
+    y_range = y.amax(0) - y.amin(0)
+    wanted = (torch.tensor([[3.0, 5.0]], dtype=FLOAT64) / y_range).square().mean().sqrt() * y_range
+    torch.testing.assert_close(deviation.mean(0), wanted[0], rtol=0.1, atol=0)
+
+
+def test_same_seed_same_network_and_more_starts_no_less_evidence() -> None:
+    controller = paper_controller(2)
+    options = {"samples": 1000, "search_steps": 15, "max_steps": 10}
+    twins = [RBFNetwork(1, units=5) for _ in range(2)]
+    fits = [train_on_controller(net, controller, starts=3, **options)[0] for net in twins]
+    assert torch.equal(flatten(trainable(twins[0])), flatten(trainable(twins[1])))
+    assert fits[0].evidence.log_evidence == fits[1].evidence.log_evidence
+    alone = train_on_controller(RBFNetwork(1, units=5), controller, **options)[0]
+    assert fits[0].evidence.log_evidence >= alone.evidence.log_evidence - 1e-6
+
+
+def test_groups_train_as_if_alone() -> None:
+    controllers = [paper_controller(joint) for joint in (2, 4)]
+    both, alone = Anfis(2, 2, [3, 3], 2), Anfis(1, 2, [3, 3], 2)
+    options = {"samples": 800, "search_steps": 10, "max_steps": 5}
+    pair = train_on_controller(both, controllers, seed=5, **options)
+    # Group g draws its samples with seed + g.
+    single = train_on_controller(alone, controllers[1], seed=6, **options)
+    assert pair[1].evidence.log_evidence == pytest.approx(single[0].evidence.log_evidence, rel=1e-9)
+    x = controller_targets(controllers[1], 100)[0].unsqueeze(1)
+    with torch.no_grad():
+        torch.testing.assert_close(one_group(both, 1)(x), alone(x), rtol=1e-7, atol=1e-12)
+
+
+def test_interrupt_leaves_a_usable_network() -> None:
+    controllers = [paper_controller(joint) for joint in (2, 3)]
+    network = Anfis(2, 2, [3, 3], 2)
+
+    def interrupt(state: EvidenceState) -> None:
+        if state.step == 2:
+            raise KeyboardInterrupt
+
+    fits = train_on_controller(network, controllers, samples=1000, callback=interrupt)
+    assert [fit.evidence.status for fit in fits] == ["stopped"]
+    # The first group keeps what it reached, the second its least-squares start.
+    for g, (controller, worst) in enumerate(zip(controllers, (0.05, 0.1), strict=True)):
+        x, y = controller_targets(controller, 1000, seed=7)
+        assert rmse(one_group(network, g), x[:, None], y[:, None]) < worst
+
+
+def test_interrupt_of_the_search_is_passed_on_with_the_best_so_far() -> None:
+    x = samples(300, 1, 2)
+    calls = 0
+
+    class Interrupted(RBFNetwork):
+        def jacobian_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
+            nonlocal calls
+            calls += 1
+            if calls == 5:
+                raise KeyboardInterrupt
+            return super().jacobian_columns(x, out)
+
+    network = Interrupted(1, units=5)
+    network.solve_output(x, surface(x))
+    before = rmse(network, x, surface(x))
+    with pytest.raises(KeyboardInterrupt):
+        project(network, x, surface(x), 50)
+    assert rmse(network, x, surface(x)) < before
+
+
+def test_frozen_parameters_stay() -> None:
+    x = 3.0 + samples(300, 1, 2)
+    network = Anfis(1, 2, [3, 3], 2)
+    network.init_grid(2.0, 4.0)
+    network.partition.requires_grad_(False)
+    before = flatten(dict(network.partition.named_parameters())).clone()
+    fit = train_network(network, x, surface(x), max_steps=20)[0].evidence
+    assert set(fit.alpha) == {"consequents"}
+    after = flatten(dict(network.partition.named_parameters()))
+    torch.testing.assert_close(after, before, rtol=1e-12, atol=1e-13)
+
+
+def test_misfits_are_refused_at_the_border() -> None:
+    network, x = RBFNetwork(1, units=3), samples(50, 1, 2)
+    with pytest.raises(ValueError, match="must be"):
+        train_network(network, x[:, 0], surface(x))
+    with pytest.raises(ValueError, match="finite"):
+        train_network(network, x * math.nan, surface(x))
+    with pytest.raises(ValueError, match="vary"):
+        train_network(network, x * torch.tensor([1.0, 0.0]), surface(x))
+    with pytest.raises(ValueError, match="starts"):
+        train_network(network, x, surface(x), starts=0)
+    with pytest.raises(TypeError, match="Linear"):
+        train_network(nn.Linear(2, 2), x, surface(x))
+    with pytest.raises(ValueError, match="controllers"):
+        train_on_controller(network, [paper_controller(2)] * 2)
+    with pytest.raises(ValueError, match="at least 1"):
+        controller_targets(paper_controller(2), 0)

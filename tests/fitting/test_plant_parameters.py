@@ -1,0 +1,82 @@
+"""Adjustable plant terms: what data can tell, linear in the buffers, within bounds."""
+
+import pytest
+import torch
+
+from nfriction import LinearAxis
+from nfriction.fitting.plant_parameters import RATIO_BOUND, adjusted_buffers, plant_parameters
+from tests.fitting.recordings import F64, pendulum
+
+
+def names(plant, **settings):
+    return [p.name for p in plant_parameters(plant, **settings)]
+
+
+def test_free_swing_keeps_one_gravity_term_as_the_scale():
+    free = names(pendulum(), driven=False)
+    assert "gravity 1" not in free
+    assert {"inertia 11", "inertia 12", "inertia 22", "gravity 2"} < set(free)
+    driven = names(pendulum(), driven=True, largest_torque=1.0)
+    assert set(driven) - set(free) == {
+        "gravity 1", "torque offset 1 [N m]", "torque offset 2 [N m]"
+    }  # fmt: skip
+
+
+def test_terms_that_are_not_there_are_not_adjusted():
+    assert not [n for n in names(pendulum(), driven=False) if "armature" in n or "drag" in n]
+    assert "armature 2" in names(pendulum(armature=[0.0, 1e-4]), driven=False)
+    assert "armature 1" not in names(pendulum(armature=[0.0, 1e-4]), driven=False)
+    assert names(pendulum(), driven=False, drag=True)[-2:] == ["drag linear", "drag quadratic"]
+    assert names(LinearAxis(2.0), driven=True, largest_torque=1.0) == [
+        "mass 1", "torque offset 1 [N m]"
+    ]  # fmt: skip
+    assert names(LinearAxis(2.0), driven=False) == []
+
+
+def test_ratios_scale_their_terms_and_nothing_else():
+    plant = pendulum()
+    terms = plant_parameters(plant, driven=False)
+    vector = torch.zeros(len(terms), dtype=F64)
+    index = [t.name for t in terms].index("inertia 12")
+    vector[index] = 0.1
+    coupling = adjusted_buffers(plant, terms, vector)["inertia_coupling"]
+    expected = plant.inertia_coupling.clone()
+    expected[0, 1] *= 1.1
+    expected[1, 0] *= 1.1
+    torch.testing.assert_close(coupling, expected)
+    assert all(t.upper == RATIO_BOUND for t in terms if "inertia" in t.name)
+
+
+def test_buffers_are_linear_in_the_parameters_and_nominal_at_zero():
+    plant = pendulum(armature=[1e-4, 1e-4])
+    terms = plant_parameters(plant, driven=True, largest_torque=2.0, drag=True)
+    own = dict(plant.named_buffers())
+    zero = adjusted_buffers(plant, terms, torch.zeros(len(terms), dtype=F64))
+    for name, value in zero.items():
+        assert torch.equal(value, own[name])
+    g = torch.Generator().manual_seed(0)
+    a, b = 0.1 * torch.randn(2, len(terms), generator=g, dtype=F64)
+    at = {k: adjusted_buffers(plant, terms, v) for k, v in {"a": a, "b": b, "s": a + b}.items()}
+    for name in zero:
+        torch.testing.assert_close(at["s"][name] + own[name], at["a"][name] + at["b"][name])
+
+
+def test_a_batch_of_vectors_gives_a_batch_of_plants():
+    plant = pendulum()
+    terms = plant_parameters(plant, driven=False)
+    vectors = 0.05 * torch.randn(
+        3, len(terms), dtype=F64, generator=torch.Generator().manual_seed(1)
+    )
+    state = torch.tensor([[1.0, 0.5], [2.0, 4.0], [0.0, 0.0]], dtype=F64)
+    plants = plant.replace(**adjusted_buffers(plant, terms, vectors))
+    together = plants.forward_dynamics(*state)
+    for vector, row in zip(vectors, together, strict=True):
+        one = plant.replace(**adjusted_buffers(plant, terms, vector))
+        torch.testing.assert_close(one.forward_dynamics(*state), row)
+
+
+def test_bounds_hold_the_given_plant():
+    terms = plant_parameters(pendulum(), driven=True, largest_torque=2.0, drag=True)
+    assert all(t.lower <= 0.0 < t.upper and t.prior_sd > 0 for t in terms)
+    offset = next(t for t in terms if t.buffer == "torque_offset")
+    assert offset.upper == pytest.approx(0.6)

@@ -1,0 +1,82 @@
+"""The torque fit is exact on exact torques, and least squares within bounds otherwise."""
+
+import numpy as np
+import pytest
+import torch
+
+from nfriction import Recording
+from nfriction.fitting.torque import EDGE, fit_torque, friction_torque
+from nfriction.friction import MODELS
+from nfriction.friction.laws import LINEAR
+from nfriction.signals import Motion
+from tests.fitting.recordings import pendulum
+
+V_SMOOTH = 0.05
+TRUTH = {
+    "NCFM": [[2e-3], [1e-3]],
+    "LFM": [[2e-3, 3e-3], [1e-3, 5e-4]],
+    "NLFM": [[1e-3, 2e-3, 3e-3, 4e-3, 3.0], [-1e-3, 1e-3, 2e-3, 1e-3, 0.3]],
+    "Stribeck": [[2e-3, 3e-3, 1e-3, 0.3, 2.0], [1e-3, 2e-3, 2e-3, 1.0, 2.0]],
+}
+
+
+def moved(model, plant, *, driven=True):
+    """A motion made up in closed form, and the torques that it takes with this friction."""
+    time = np.arange(0, 4, 2e-3)
+    w, phase = np.array([3.0, 5.0]), np.array([0.0, 0.7])
+    angle = w * time[:, None] + phase
+    motion = Motion(time, np.sin(angle), w * np.cos(angle), -(w**2) * np.sin(angle))
+    q, qd, qdd = (torch.as_tensor(x) for x in (motion.q, motion.qd, motion.qdd))
+    tau_f = model(qd, qdd, plant.load(q, qd)).detach()
+    tau = (plant.inverse_dynamics(q, qd, qdd) + tau_f).numpy()
+    return Recording(time, motion.q, tau=tau if driven else None), motion, tau_f
+
+
+@pytest.mark.parametrize("name", TRUTH)
+def test_noiseless_torques_give_the_exact_coefficients(name):
+    plant = pendulum()
+    model = MODELS[name](2, TRUTH[name], v_smooth=V_SMOOTH)
+    recording, motion, tau_f = moved(model, plant)
+    found = fit_torque(model.law, plant, [recording], [motion], V_SMOOTH)
+    truth = torch.tensor(TRUTH[name], dtype=torch.float64)
+    torch.testing.assert_close(found.coefficients, truth, rtol=1e-6, atol=1e-10)
+    assert float(found.residual.max()) < 1e-9 * float(found.torque.max())
+    inside = slice(round(EDGE / 2e-3), -round(EDGE / 2e-3))
+    rms = tau_f[inside].square().mean(0).sqrt()
+    torch.testing.assert_close(found.torque, rms, rtol=2e-3, atol=0)
+
+
+def test_the_torque_of_a_motion_leaves_the_ends_out():
+    plant = pendulum()
+    model = MODELS["LFM"](2, TRUTH["LFM"], v_smooth=V_SMOOTH)
+    recording, motion, tau_f = moved(model, plant)
+    qd, load, torque = friction_torque(plant, recording, motion)
+    inside = (recording.time > EDGE - 1e-9) & (recording.time < recording.time[-1] - EDGE + 1e-9)
+    assert abs(len(torque) - int(inside.sum())) <= 2  # stamps that round to the border
+    middle = slice(100, 200)
+    offset = int(np.flatnonzero(recording.time >= recording.time[0] + EDGE)[0])
+    torch.testing.assert_close(
+        torque[middle], tau_f[offset + 100 : offset + 200], rtol=0, atol=1e-12
+    )
+    assert qd.shape == load.shape == torque.shape
+
+
+def test_recordings_are_weighed_together_by_their_samples():
+    plant = pendulum()
+    models = [MODELS["NCFM"](2, [c], v_smooth=V_SMOOTH) for c in (1e-3, 3e-3)]
+    parts = [moved(m, plant) for m in models]
+    both = fit_torque(models[0].law, plant, [p[0] for p in parts], [p[1] for p in parts], V_SMOOTH)
+    torch.testing.assert_close(both.coefficients, torch.full((2, 1), 2e-3, dtype=torch.float64))
+
+
+def test_what_is_positive_by_physics_stays_so():
+    plant = pendulum()
+    model = MODELS["NLFM"](2, [-5e-3, 1e-3, 1e-3, 0.0, 1.0], v_smooth=V_SMOOTH)
+    recording, motion, _ = moved(model, plant)
+    backwards = Recording(recording.time, recording.q, tau=2 * np.asarray(
+        plant.inverse_dynamics(*(torch.as_tensor(x) for x in (motion.q, motion.qd, motion.qdd)))
+    ) - recording.tau)  # fmt: skip
+    found = fit_torque(LINEAR, plant, [backwards], [motion], V_SMOOTH)
+    assert (found.coefficients >= 0).all()
+    signed = fit_torque(model.law, plant, [recording], [motion], V_SMOOTH)
+    assert (signed.coefficients[:, 0] < 0).all()

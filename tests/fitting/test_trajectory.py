@@ -1,0 +1,126 @@
+"""The quadratic model of a trajectory problem is the derivative of its cost."""
+
+import pytest
+import torch
+
+from nfriction import LFM, NFLFM
+from nfriction.fitting.plant_parameters import plant_parameters
+from nfriction.fitting.sensitivity import StepJacobian
+from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
+from nfriction.fitting.windows import Windows
+from nfriction.simulation import integrate
+from tests.fitting.recordings import F64, pendulum
+
+ABSOLUTE = torch.tensor([[1.0, 0.0], [1.0, 1.0]], dtype=F64)
+
+
+def windows(steps=20, step=2e-3) -> Windows:
+    """Two windows with torque, the second of them shorter."""
+    g = torch.Generator().manual_seed(5)
+    q0 = torch.tensor([[1.6, 0.5], [2.5, -0.4]], dtype=F64)
+    qd0 = torch.tensor([[2.0, -3.0], [-1.0, 4.0]], dtype=F64)
+    tau = 0.05 * torch.randn(2, steps, 2, generator=g, dtype=F64)
+    steps_ = torch.full((2, steps), step, dtype=F64)
+    weight = torch.ones(2, steps + 1, dtype=F64)
+    steps_[1, -4:], weight[1, -4:] = 0.0, 0.0
+    truth = LFM(2, [[4e-3, 3e-3], [2e-3, 1e-3]], v_smooth=0.1)
+    q = integrate(pendulum(), truth, q0, qd0, tau, steps_).q
+    return Windows(q, tau, steps_, weight, q0, qd0, ("a", "b"))
+
+
+def problem(model, substeps=2) -> TrajectoryProblem:
+    plant = pendulum()
+    terms = plant_parameters(plant, driven=True, largest_torque=0.1)
+    jacobian = StepJacobian(plant, model, terms)
+    return TrajectoryProblem(jacobian, windows(), 1e-3, ABSOLUTE, substeps=substeps)
+
+
+def bent(name):
+    """A model with coefficients away from the truth, the network's away from zero."""
+    if name == "LFM":
+        return LFM(2, [5e-3, 2e-3], v_smooth=0.1)
+    model = NFLFM(2, [5e-3, 2e-3], v_smooth=0.1, terms=(2, 2), head_units=2)
+    model.schedule.set_range(5.0, [-300.0, 300.0])
+    g = torch.Generator().manual_seed(1)
+    vector = model.schedule.parameter_vector()
+    model.schedule.set_parameter_vector(0.3 * torch.randn(vector.shape, generator=g, dtype=F64))
+    return model
+
+
+def point(p: TrajectoryProblem) -> torch.Tensor:
+    """Unknowns away from the prior's means, and inside every bound."""
+    g = torch.Generator().manual_seed(2)
+    x = p.start(torch.full((len(p.plant_terms),), 0.02, dtype=F64))
+    x[p.shared_count :] += 0.01 * torch.randn(x.numel() - p.shared_count, generator=g, dtype=F64)
+    return x
+
+
+@pytest.mark.parametrize("name", ["LFM", "NFLFM"])
+@pytest.mark.parametrize("substeps", [1, 2])
+def test_gradient_and_hessian_against_finite_differences(name, substeps):
+    p = problem(bent(name), substeps)
+    x = point(p)
+    found = p.quadratic(x)
+    torch.testing.assert_close(found.cost, p.cost(x))
+    precision, mean = p._prior()
+    columns = []
+    for i in range(x.numel()):
+        unit = torch.zeros_like(x)
+        # Fourth order: truncation and rounding are both far below the tolerance.
+        unit[i] = 1e-4 * max(
+            0.1 if i < p.friction_count and name == "NFLFM" else 1e-3, float(x[i].abs())
+        )
+        ends = [p.residuals(x + s * unit).flatten() for s in (-2, -1, 1, 2)]
+        columns.append((ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * unit[i]))
+    jacobian, r = torch.stack(columns, -1), p.residuals(x).flatten()
+    gradient = jacobian.T @ r + precision * (x - mean)
+    hessian = jacobian.T @ jacobian + torch.diag(precision)
+    # Entries differ by orders of magnitude: compared in units of the diagonal.
+    scale = hessian.diagonal().clamp_min(1e-12).rsqrt()
+    size = float((scale * gradient).abs().max())
+    torch.testing.assert_close(scale * found.gradient, scale * gradient, rtol=0, atol=1e-6 * size)
+    torch.testing.assert_close(
+        scale[:, None] * found.hessian * scale, scale[:, None] * hessian * scale, rtol=0, atol=1e-6
+    )
+
+
+def test_padding_counts_for_nothing():
+    p = problem(bent("LFM"))
+    x = point(p)
+    before = p.quadratic(x)
+    p.windows.q[1, -4:] += 100.0
+    after = p.quadratic(x)
+    assert torch.equal(before.gradient, after.gradient)
+    assert float(before.cost) == float(after.cost)
+
+
+def test_residuals_are_counted_in_the_recording_s_coordinates():
+    p = problem(bent("LFM"))
+    x = p.start()
+    joint = TrajectoryProblem(p.jacobian, p.windows, 1e-3, torch.eye(2, dtype=F64), p.substeps)
+    r, own = p.residuals(x), joint.residuals(x)
+    torch.testing.assert_close(r[..., 0], own[..., 0])
+    torch.testing.assert_close(r[..., 1], own[..., 0] + own[..., 1])
+
+
+def test_an_exact_problem_is_solved_exactly():
+    """Positions without noise: the coefficients come out, and the model is left at them."""
+    model = LFM(2, [2e-3, 2e-3], v_smooth=0.1)
+    plant = pendulum()
+    w = windows(steps=60, step=5e-3)
+    p = TrajectoryProblem(StepJacobian(plant, model, []), w, 1e-7, ABSOLUTE)
+    result = solve_trajectory(p, p.start(), cost_tolerance=1e-14)
+    assert result.converged
+    truth = torch.tensor([[4e-3, 3e-3], [2e-3, 1e-3]], dtype=F64)
+    torch.testing.assert_close(model.schedule.values, truth, rtol=1e-4, atol=0)
+    torch.testing.assert_close(p.split(result.x)[0].reshape(2, 2), model.schedule.values)
+
+
+def test_the_prior_of_the_plant_may_be_centred_elsewhere():
+    p = problem(bent("LFM"))
+    mean = torch.full((len(p.plant_terms),), 0.03, dtype=F64)
+    moved = TrajectoryProblem(p.jacobian, p.windows, 1e-3, ABSOLUTE, 2, plant_mean=mean)
+    x = p.start(mean)
+    sd = torch.tensor([t.prior_sd for t in p.plant_terms], dtype=F64)
+    prior = 0.5 * float(((mean / sd) ** 2).sum())
+    assert float(p.cost(x) - moved.cost(x)) == pytest.approx(prior)

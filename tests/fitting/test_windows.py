@@ -1,0 +1,60 @@
+"""Windows cover recordings, restart at their own samples, and pad without weight."""
+
+import numpy as np
+import pytest
+import torch
+
+from nfriction import Recording
+from nfriction.fitting.windows import cut_windows
+from nfriction.signals import Motion
+
+
+def made(samples, seed=0, tau=False, name="r"):
+    rng = np.random.default_rng(seed)
+    time = np.cumsum(rng.uniform(5e-3, 15e-3, samples))
+    q = rng.normal(size=(samples, 2))
+    recording = Recording(time, q, tau=rng.normal(size=(samples, 2)) if tau else None, name=name)
+    return recording, Motion(time, q + 0.1, q + 0.2, q + 0.3)
+
+
+@pytest.mark.parametrize("length", [0.1, 0.5, 0.77, 100.0])
+def test_windows_cover_the_recording_without_gaps(length):
+    recording, motion = made(301, tau=True)
+    w = cut_windows([recording], [motion], length)
+    steps = w.weight.sum(1).to(torch.int64) - 1
+    assert int(steps.sum()) == 300
+    assert int(steps.max() - steps.min()) <= 1
+    first = 0
+    for i, n in enumerate(steps.tolist()):
+        part = slice(first, first + n + 1)
+        np.testing.assert_array_equal(w.q[i, : n + 1], recording.q[part])
+        np.testing.assert_array_equal(w.tau[i, :n], recording.tau[part][:-1])
+        np.testing.assert_allclose(w.step[i, :n], np.diff(recording.time[part]))
+        np.testing.assert_array_equal(w.q0[i], motion.q[first])
+        np.testing.assert_array_equal(w.qd0[i], motion.qd[first])
+        assert not w.step[i, n:].any()
+        assert not w.weight[i, n + 1 :].any()
+        assert torch.isfinite(w.q).all()
+        first += n
+    span = float(w.step.sum())
+    assert span == pytest.approx(recording.duration)
+    if length < span:
+        assert span / len(w) == pytest.approx(length, rel=0.35)
+
+
+def test_several_recordings_share_one_stack():
+    parts = [made(100, 1, name="long"), made(30, 2, tau=True, name="short")]
+    w = cut_windows([r for r, _ in parts], [m for _, m in parts], 0.3)
+    assert w.names.count("long") + w.names.count("short") == len(w)
+    assert w.names == tuple(sorted(w.names))
+    first_short = w.names.index("short")
+    assert not w.tau[:first_short].any()
+    assert w.tau[first_short:].any()
+
+
+def test_windows_too_short_for_a_step_are_refused():
+    recording, motion = made(8)
+    with pytest.raises(ValueError, match="too few"):
+        cut_windows([recording], [motion], 1e-3)
+    with pytest.raises(ValueError, match="positive"):
+        cut_windows([recording], [motion], 0.0)

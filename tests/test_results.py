@@ -1,0 +1,106 @@
+"""What a comparison leaves in its folder, where models diverge or cannot be exported."""
+
+import dataclasses
+import json
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nfriction import NCFM, PendulumChain, Recording, cli, results
+from nfriction.comparison import Comparison
+from nfriction.export import ExportError
+from nfriction.fitting import fit
+from nfriction.scoring import Rmse, Score
+
+TIME = 2e-3 * np.arange(200)
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    q = np.pi + 0.5 * np.exp(-0.3 * TIME) * np.cos(8 * TIME)
+    return Recording(time=TIME, q=q[:, None], name="r")
+
+
+def scored(rmse: float) -> Score:
+    error = Rmse((rmse,), rmse)
+    return Score("r", error, {"1": error}, None, TIME, np.zeros((len(TIME), 1)), np.inf)
+
+
+@pytest.fixture(scope="module")
+def comparison(recording: Recording) -> Comparison:
+    """One model that predicts and one that diverges."""
+    plant = PendulumChain(mass=[0.15], com=[0.15], length=[0.3], inertia=[1e-4])
+    found = fit(NCFM(1), plant, recording, method="torque")
+    scores = {"no friction": [scored(0.2)], "good": [scored(0.1)], "wild": [scored(np.inf)]}
+    fits = {"good": found, "wild": found}
+    return Comparison(fits, scores, {}, unit="rad", joint_names=("joint1",))
+
+
+def test_divergence_is_null_and_stops_no_other_model(
+    comparison: Comparison, recording: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    written = results.write_results(comparison, [recording], [], tmp_path, figures=False)
+    assert all(path.is_file() for path in written)
+    assert {p.name for p in written} >= {"table.csv", "results.json", "good.json", "wild.pt"}
+    found = json.loads((tmp_path / "results.json").read_text(), parse_constant=pytest.fail)
+    assert found["models"]["wild"]["train"]["r"]["free_run"] == {"joints": [None], "all": None}
+    assert found["models"]["good"]["train"]["r"]["free_run"]["all"] == 0.1
+    assert found["recordings"]["train"] == {"r": recording.digest()}
+    cli._print_tables(comparison)
+    rows = {line.split()[0]: line for line in capsys.readouterr().out.splitlines() if line.strip()}
+    assert "diverged" in rows["wild"]
+    assert "diverged" not in rows["good"]
+
+
+def test_long_table_has_every_error_once(comparison: Comparison) -> None:
+    table = results.long_table(comparison)
+    keys = ["model", "recording", "kind", "horizon", "joint"]
+    assert not table.duplicated(keys).any()
+    # models × horizons × (joint and all)
+    assert len(table) == 3 * 2 * 2
+    assert list(table.columns) == [*keys, "rmse [rad]"]
+    metres = results.long_table(dataclasses.replace(comparison, unit="m"))
+    assert "rmse [m]" in metres.columns
+
+
+def test_input_ranges_are_those_of_the_motion(comparison: Comparison, recording: Recording) -> None:
+    info = results.model_info(comparison.fits["good"], [recording])
+    (motion,) = comparison.fits["good"].motions
+    assert info.input_ranges["qd"] == [[motion.qd.min(), motion.qd.max()]]
+    assert info.sample_time == pytest.approx(2e-3)
+    assert info.training_data == {"r": recording.digest()}
+
+
+def test_a_failed_export_is_told_and_leaves_no_older_script(
+    comparison: Comparison,
+    recording: Recording,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    results.write_results(comparison, [recording], [], tmp_path, figures=False)
+
+    def refuse(*_: object) -> Path:
+        raise ExportError("it does not\nscript")
+
+    monkeypatch.setattr(results, "torchscript", refuse)
+    with caplog.at_level(logging.WARNING):
+        results.write_results(comparison, [recording], [], tmp_path, figures=False)
+    assert caplog.messages[0] == "good was not exported: it does not script"
+    assert not list(tmp_path.rglob("*.pt"))
+
+
+def test_figures_that_fail_leave_nothing_half_drawn(
+    comparison: Comparison, recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def half(_: object, __: object, folder: str) -> list[Path]:
+        (Path(folder) / "half.png").write_bytes(b"\x89")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("nfriction.plots.save_all", half)
+    with pytest.raises(KeyboardInterrupt):
+        results.write_results(comparison, [recording], [], tmp_path)
+    assert not list(tmp_path.rglob("*.png"))
+    assert not list(tmp_path.glob(".*"))
