@@ -46,14 +46,14 @@ def classical(controller: MamdaniController, samples: int, epochs: int) -> Predi
     return lambda x: network(((x - middle) / half).unsqueeze(1))[:, 0] * scale
 
 
-def perceptron(controller: MamdaniController, samples: int, hidden: int) -> Predictor:
+def perceptron(controller: MamdaniController, samples: int) -> Predictor:
     """scikit-learn's multilayer perceptron on standardised data."""
     from sklearn.neural_network import MLPRegressor
 
     x, y = controller_targets(controller, samples, 0)
     x_mean, x_std, y_mean, y_std = x.mean(0), x.std(0), y.mean(0), y.std(0)
-    net = MLPRegressor(hidden_layer_sizes=(hidden,), activation="tanh", solver="lbfgs",
-                       max_iter=2000, max_fun=10**6, alpha=1e-6, tol=1e-7,
+    net = MLPRegressor(hidden_layer_sizes=(10,), activation="tanh", solver="lbfgs",
+                       max_iter=500, max_fun=10**6, alpha=1e-6, tol=1e-7,
                        random_state=0)  # fmt: skip
     net.fit(((x - x_mean) / x_std).numpy(), ((y - y_mean) / y_std).numpy())
 
@@ -97,8 +97,7 @@ def learning(controller: MamdaniController, samples: int) -> dict[str, Callable[
         print("scikit-learn is not installed: its rows are left out")
         return rows
     return rows | {
-        "scikit-learn perceptron 2-10-2": partial(perceptron, controller, samples, 10),
-        "scikit-learn perceptron 2-40-2": partial(perceptron, controller, samples, 40),
+        "scikit-learn perceptron 2-10-2": partial(perceptron, controller, samples),
         "scikit-learn boosted trees": partial(trees, controller, samples),
     }
 

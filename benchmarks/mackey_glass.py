@@ -75,8 +75,14 @@ def perceptron(x: Tensor, y: Tensor) -> Predictor:
     net = MLPRegressor(hidden_layer_sizes=(20,), activation="tanh", solver="lbfgs",
                        max_iter=20_000, max_fun=10**6, alpha=1e-8, tol=1e-12,
                        random_state=0)  # fmt: skip
-    net.fit(x.numpy(), y[:, 0].numpy())
-    return lambda inputs: torch.as_tensor(net.predict(inputs.numpy())).unsqueeze(1)
+    x_mean, x_std, y_mean, y_std = x.mean(0), x.std(0), y.mean(), y.std()
+    net.fit(((x - x_mean) / x_std).numpy(), ((y[:, 0] - y_mean) / y_std).numpy())
+
+    def predict(inputs: Tensor) -> Tensor:
+        said = net.predict(((inputs - x_mean) / x_std).numpy())
+        return torch.as_tensor(said).unsqueeze(1) * y_std + y_mean
+
+    return predict
 
 
 def gaussian_process(x: Tensor, y: Tensor) -> Predictor:

@@ -171,8 +171,8 @@ def rollout(
         drive: what drives motion-dependent coefficients: the simulated motion, or the
             `measured` one, as in the papers.
         measured: velocity and acceleration for `drive="measured"`, each (*batch, steps, joint).
-        gradients: record gradients; None does so where any input asks for it and there are at
-            most 10,000 steps (a longer graph takes gigabytes).
+        gradients: record gradients; None does so where any input asks for it, no compiled backend
+            is named, and there are at most 10,000 steps (a longer graph takes gigabytes).
         backend: `"torch"` steps in eager torch; `"c"` and `"numba"` compile the same definition
             (no gradients); `"auto"` compiles where it can.
         threads: a compiled batch is shared out among this many.
@@ -194,7 +194,8 @@ def rollout(
     _refuse_unstable(plant, friction, float(step.max()), substeps)
     if gradients is None:
         gradients = (
-            torch.is_grad_enabled()
+            backend in ("auto", "torch")
+            and torch.is_grad_enabled()
             and steps <= GRADIENT_STEPS
             and _asks_gradients(plant, friction, q, qd, torque)
         )

@@ -313,8 +313,8 @@ def _fit_of(
     names = [f"parameter {i + 1}" for i in range(friction.numel())]
     if isinstance(schedule, Constant):
         names = [
-            f"{name} of joint {j + 1}"
-            for j in range(schedule.joints)
+            f"{name} of {joint}"
+            for joint in problem.plant.joint_names
             for name in schedule.coefficient_names
         ]
     names += [t.name for t in problem.plant_terms]

@@ -52,6 +52,10 @@ class LayerEquations:
         # Written again and again: the first touch of fresh memory costs more than the arithmetic.
         self.buffer = x.new_empty(1, self.total, rows)
         self.target_squares = y.square().sum()
+        # With the whole output layer among the parameters the columns tell the outputs too.
+        self.readable = not any(
+            name.endswith(LINEAR) and not p.requires_grad for name, p in layer.named_parameters()
+        )
         self._eliminated: _Eliminated | None = None
 
     @property
@@ -62,11 +66,7 @@ class LayerEquations:
     @property
     def separable(self) -> bool:
         """Whether there are sets to place, and a whole output layer to eliminate for them."""
-        frozen = any(
-            name.endswith(LINEAR) and not p.requires_grad
-            for name, p in self.layer.named_parameters()
-        )
-        return bool(self.moving.any()) and not frozen
+        return bool(self.moving.any()) and self.readable
 
     @torch.no_grad()
     def assign(self, w: Tensor) -> None:
@@ -87,18 +87,18 @@ class LayerEquations:
     def normal_equations(self, w: Tensor) -> NormalEquations:
         """J^T J, J^T e and sum e^2 of all parameters: one product of the shared columns."""
         self.assign(w)
+        maps = self._maps()
+        readout = (maps[:, : self.shared] @ w).T
         G = self.x.new_zeros(self.total, self.total)
         b, squares = self.x.new_zeros(self.total, self.y.shape[-1]), self.x.new_zeros(())
         for rows in self._chunks():
             F = self._columns(rows)
-            error = (self.layer(self.x[rows]) - self.y[rows])[:, 0]
+            said = F[: self.shared].T @ readout if self.readable else self.layer(self.x[rows])[:, 0]
+            error = said - self.y[rows, 0]
             G.addmm_(F, F.T)
             b.addmm_(F, error)
             squares += error.square().sum()
-        maps = self._maps()
-        return NormalEquations(
-            _gathered(maps, G), (maps.mT @ b.T.unsqueeze(-1)).sum(0)[:, 0], squares
-        )
+        return NormalEquations(_gathered(maps, G), _pulled_back(maps, b), squares)
 
     @torch.no_grad()
     def projected_cost(self, theta: Tensor) -> Tensor:
@@ -119,8 +119,8 @@ class LayerEquations:
         factor = torch.linalg.cholesky_ex(G + self.ridge * torch.eye(self.shared).to(G)).L
         weights = torch.cholesky_solve(b, factor)
         # In a regressor's coordinates an output layer's maps pick, so that their transpose places.
-        placed = self._maps()[:, : self.shared].mT @ weights.T.unsqueeze(-1)
-        w[self.linear] = placed.sum(0)[self.linear, 0]
+        placed = _pulled_back(self._maps()[:, : self.shared], weights)
+        w[self.linear] = placed[self.linear]
         self.assign(w)
         cost = 0.5 * (self.target_squares - (b * weights).sum())
         self._eliminated = _Eliminated(theta.clone(), weights, factor, cost)
@@ -147,7 +147,7 @@ class LayerEquations:
             b.addmm_(F[shared:], F[:shared].T @ known.weights - self.y[rows, 0])
         explained = A[:, :shared] @ torch.cholesky_solve(A[:, :shared].T, known.factor)
         maps = self._maps()[:, shared:, self.moving]
-        gradient = (maps.mT @ b.T.unsqueeze(-1)).sum(0)[:, 0]
+        gradient = _pulled_back(maps, b)
         return Quadratic(known.cost, gradient, _gathered(maps, A[:, shared:] - explained))
 
     def _maps(self) -> Tensor:
@@ -174,3 +174,8 @@ class _Eliminated:
 def _gathered(maps: Tensor, gram: Tensor) -> Tensor:
     """Sum over the outputs of M^T G M."""
     return (maps.mT @ gram @ maps).sum(0)
+
+
+def _pulled_back(maps: Tensor, columns: Tensor) -> Tensor:
+    """Sum over the outputs k of M_k^T b_k, for b of shape (columns, outputs)."""
+    return (maps.mT @ columns.T.unsqueeze(-1)).sum(0)[:, 0]

@@ -68,7 +68,7 @@ class StepJacobian:
         try:
             self._compiled = codegen.compile_function(self._after, example, jacobian=(0, 1, 2, 5))
         except codegen.CodegenError as error:
-            logger.info("steps are linearised in eager torch: %s", error)
+            logger.warning("fits run slowly, as steps are linearised in eager torch: %s", error)
 
     def __call__(
         self, q: Tensor, qd: Tensor, held: Tensor, tau: Tensor, step: Tensor, vector: Tensor

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from nfriction.fitting.layer_equations import LayerEquations
+from nfriction.fitting.layer_equations import LINEAR, LayerEquations
 from nfriction.fitting.neurofuzzy import (
     controller_targets,
     one_group,
@@ -87,6 +87,14 @@ def test_shared_columns_give_the_normal_equations_of_the_whole_jacobian(kind: st
     for ours, theirs in zip(got, wanted, strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-11, atol=1e-11 * float(theirs.abs().max()))
     torch.testing.assert_close(equations.squares(equations.w), got.squares, rtol=1e-12, atol=0)
+    # With a part of the output layer frozen the columns no longer tell the outputs.
+    next(p for n, p in layer.named_parameters() if n.endswith(LINEAR)).requires_grad_(False)
+    equations = LayerEquations(layer, x, y)
+    part = equations.normal_equations(equations.w)
+    torch.testing.assert_close(part.squares, got.squares, rtol=1e-12, atol=0)
+    wanted = normal_equations(layer, trainable(layer), x, y)
+    size = float(wanted.Jte.abs().max())
+    torch.testing.assert_close(part.Jte, wanted.Jte, rtol=1e-11, atol=1e-11 * size)
 
 
 @pytest.mark.parametrize("kind", [kind for kind in NETWORKS if kind != "head"])
