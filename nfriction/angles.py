@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Literal, get_args
+from typing import Literal, Protocol, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +19,16 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 Angles = Literal["relative", "absolute"]
 MeasuredFrom = Literal["upright", "hanging"]
+
+
+class Mechanism(Protocol):
+    """What tells how a mechanism's encoders write: every plant does."""
+
+    @property
+    def convention(self) -> Sequence[str]: ...
+
+    @property
+    def first_link(self) -> int: ...
 
 
 @dataclass(frozen=True)
@@ -58,6 +69,26 @@ class AngleConvention:
             settings[key] = word
         return cls(**settings)  # type: ignore[arg-type]
 
+    @classmethod
+    def of(cls, given: ConventionLike) -> AngleConvention:
+        """Convention from whatever says one.
+
+        Args:
+            given: a convention, words as `parse` takes them, in one string or several, or a plant.
+        Raises:
+            ValueError: anything else.
+        """
+        said = getattr(given, "convention", given)
+        if isinstance(said, cls):
+            return said
+        words = [said] if isinstance(said, str) else said
+        if isinstance(words, Sequence) and all(isinstance(word, str) for word in words):
+            return cls.parse(",".join(words))
+        raise ValueError(
+            f"an angle convention is words such as 'absolute,hanging', an AngleConvention, or a "
+            f"plant that has one; got {given!r}."
+        )
+
     def __str__(self) -> str:
         return f"{self.angles},{self.measured_from}"
 
@@ -97,6 +128,9 @@ class AngleConvention:
     def _first_zero(self) -> float:
         """Where the first angle's zero lies, as an angle from upright [rad]."""
         return math.pi if self.measured_from == "hanging" else 0.0
+
+
+ConventionLike: TypeAlias = AngleConvention | str | Sequence[str] | Mechanism
 
 
 def _links(q: ArrayLike, first_link: int) -> Array:

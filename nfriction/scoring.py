@@ -1,5 +1,6 @@
 """Scores: position errors of free runs and of windows, in the recording's own coordinates."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,11 +13,17 @@ from nfriction.friction import FrictionModel
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.recording import Recording
 from nfriction.signals import Motion, kalman_smoother
-from nfriction.simulation import required_substeps, rollout
+from nfriction.simulation import Friction, required_substeps, rollout
+
+logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
+Start = tuple[Array, Array]
 
 HORIZONS = (1.0, 2.0, 5.0)
+# A sign that passes within a hundredth of a sample is a wall, not friction: scoring it would take
+# minutes, and its search has failed anyhow.
+MOST_SUBSTEPS = 100
 
 
 @dataclass(frozen=True)
@@ -56,7 +63,8 @@ class Score:
         floor: error of the free run when every initial position is off by one encoder count:
             below it, differences between models mean nothing. None where the count is unknown.
         time, simulated: the free run, in the recording's coordinates, for figures.
-        diverged_at: time at which the free run diverged [s], infinity where it did not.
+        diverged_at: time at which the free run diverged [s], infinity where it did not. Friction
+            too steep at rest to be simulated at all counts as diverged from the start.
     """
 
     recording: str
@@ -82,7 +90,7 @@ def score(
     recording: Recording,
     *,
     motion: Motion | None = None,
-    initial_state: tuple[Array, Array] | None = None,
+    initial_state: Start | None = None,
     horizons: Sequence[float] = HORIZONS,
 ) -> Score:
     """Simulate a recording and measure the position error.
@@ -90,7 +98,8 @@ def score(
     Args:
         plant: the mechanism.
         friction: friction model, or None for no friction.
-        recording: what was measured, in any convention.
+        recording: what was measured; where it does not say how its angles are written, then as
+            the plant says.
         motion: its smoothed motion in joint coordinates; computed where not given.
         initial_state: q0 and qd0 of the free run in the recording's convention, (joint,) each;
             default from the smoothed motion.
@@ -99,24 +108,20 @@ def score(
     Returns:
         Errors in the recording's coordinates and unit.
     """
-    first_link = plant.first_link
-    joint = recording.joint_coordinates(first_link)
+    first_link, convention = plant.first_link, recording.convention_on(plant)
+    joint = recording.joint_coordinates(plant)
     motion = motion or kalman_smoother(joint.time, joint.q)
     q0, qd0 = motion.q[0], motion.qd[0]
     if initial_state is not None:
-        q0 = recording.convention.position_to_joint(np.asarray(initial_state[0]), first_link)
-        qd0 = recording.convention.rate_to_joint(np.asarray(initial_state[1]), first_link)
-    tau = None if joint.tau is None else torch.as_tensor(joint.tau[:-1].copy())
-    step = torch.as_tensor(np.diff(joint.time))
-    substeps = 1 if friction is None else required_substeps(plant, friction, float(step.max()))
+        q0 = convention.position_to_joint(np.asarray(initial_state[0]), first_link)
+        qd0 = convention.rate_to_joint(np.asarray(initial_state[1]), first_link)
+    tau = None if joint.tau is None else joint.tau[:-1]
+    step = np.diff(joint.time)
+    substeps = _substeps(plant, friction, float(step.max()), recording.name)
     quantum = getattr(plant, "position_quantum", None)
     starts = [q0] if quantum is None else [q0, *(q0 + quantum * e for e in np.eye(len(q0)))]
-    with torch.no_grad():
-        run = rollout(
-            plant, friction, torch.as_tensor(np.stack(starts)), torch.as_tensor(qd0.copy()),
-            tau, sample_time=step, substeps=substeps,
-        )  # fmt: skip
-    simulated = recording.convention.position_from_joint(run.q.numpy(), first_link)
+    run, diverged_at = _simulate(plant, friction, (np.stack(starts), qd0), tau, step, substeps)
+    simulated = convention.position_from_joint(run, first_link)
     floor = None
     if quantum is not None:
         # Independent errors of every joint add in the mean square.
@@ -124,27 +129,76 @@ def score(
     return Score(
         recording=recording.name,
         free_run=Rmse.of(simulated[0] - recording.q),
-        windows=_windows(plant, friction, recording, joint, motion, horizons, substeps),
+        windows=_windows(plant, friction, recording, motion, horizons, substeps),
         floor=floor,
         time=recording.time,
         simulated=simulated[0],
-        diverged_at=float(run.diverged_at[0]),
+        diverged_at=float(diverged_at[0]),
     )
+
+
+def _substeps(
+    plant: PendulumChain | LinearAxis, friction: Friction | None, longest: float, name: str
+) -> int | None:
+    """Integration steps to a sample; None where friction is too steep to be simulated."""
+    if friction is None:
+        return 1
+    # Of a slope that is no number nothing can be required.
+    if torch.isfinite(friction.slope_at_rest()).all():
+        needed = required_substeps(plant, friction, longest)
+        if needed <= MOST_SUBSTEPS:
+            return needed
+        found = f"needs {needed} integration steps to the longest sample of {longest:g} s"
+    else:
+        found = "has no finite slope"
+    logger.warning(
+        "%s: friction %s at rest, at most %d are taken; scored as diverged. A larger `v_smooth` "
+        "makes it less steep.", name, found, MOST_SUBSTEPS,
+    )  # fmt: skip
+    return None
+
+
+def _simulate(
+    plant: PendulumChain | LinearAxis,
+    friction: Friction | None,
+    start: Start,
+    tau: Array | None,
+    step: Array,
+    substeps: int | None,
+    memory: torch.Tensor | None = None,
+) -> tuple[Array, Array]:
+    """Positions (*batch, sample, joint) in joint coordinates, and when they diverged (*batch,)."""
+    q0, qd0 = start
+    if substeps is None:
+        lost = np.full((len(q0), step.shape[-1] + 1, q0.shape[-1]), np.nan)
+        return lost, np.zeros(len(q0))
+    # Copies, for a recording's arrays are read-only and tensors know no such thing.
+    torque = None if tau is None else torch.tensor(tau)
+    with torch.no_grad():
+        run = rollout(
+            plant, friction, torch.tensor(q0), torch.tensor(qd0), torque,
+            sample_time=torch.tensor(step), substeps=substeps, memory=memory,
+        )  # fmt: skip
+    return run.q.numpy(), run.diverged_at.numpy()
 
 
 def _windows(
     plant: PendulumChain | LinearAxis,
     friction: FrictionModel | None,
     recording: Recording,
-    joint: Recording,
     motion: Motion,
     horizons: Sequence[float],
-    substeps: int,
+    substeps: int | None,
 ) -> dict[str, Rmse]:
     """Error of windows that follow each other, restarted from the smoothed motion."""
+    convention = recording.convention_on(plant)
     time = recording.time - recording.time[0]
     steps = np.diff(time)
     found = {}
+    # What a controller would remember of the recording at the start of each window.
+    known = None
+    if friction is not None and friction.state_size:
+        known = friction.schedule.states(torch.tensor(motion.qd), torch.tensor(motion.qdd))
     for horizon in horizons:
         # A recording a few samples short of a whole number of windows still gives that number.
         count = int(time[-1] / horizon + 0.02)
@@ -155,18 +209,11 @@ def _windows(
         if length < 1:
             continue
         index = np.array(starts)[:, None] + np.arange(length)
-        tau = None if joint.tau is None else torch.as_tensor(joint.tau[index])
-        with torch.no_grad():
-            run = rollout(
-                plant,
-                friction,
-                torch.as_tensor(motion.q[starts]),
-                torch.as_tensor(motion.qd[starts]),
-                tau,
-                sample_time=torch.as_tensor(steps[index]),
-                substeps=substeps,
-            )
-        simulated = recording.convention.position_from_joint(run.q.numpy(), plant.first_link)
+        tau = None if recording.tau is None else recording.tau[index]
+        state = motion.q[starts], motion.qd[starts]
+        memory = None if known is None else known[starts]
+        run, _ = _simulate(plant, friction, state, tau, steps[index], substeps, memory)
+        simulated = convention.position_from_joint(run, plant.first_link)
         measured = recording.q[np.array(starts)[:, None] + np.arange(length + 1)]
         found[f"{horizon:g}"] = Rmse.of(simulated - measured)
     return found

@@ -98,3 +98,20 @@ def test_bad_fields_are_refused() -> None:
         AngleConvention("polar")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="`first_link` must be a column"):
         AngleConvention().position_to_joint(np.zeros((4, 1)), first_link=1)
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS, ids=str)
+def test_whatever_says_a_convention_is_understood(convention: AngleConvention) -> None:
+    class Plant:
+        first_link = 0
+
+    plant = Plant()
+    plant.convention = (convention.angles, convention.measured_from)  # type: ignore[attr-defined]
+    for said in (convention, str(convention), str(convention).split(","), plant):
+        assert AngleConvention.of(said) == convention  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("given", [None, 3, "", (), [1, 2], {"absolute": "hanging"}, b"absolute"])
+def test_what_says_no_convention_is_refused(given: object) -> None:
+    with pytest.raises(ValueError, match="an angle convention is"):
+        AngleConvention.of(given)  # type: ignore[arg-type]

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from nfriction import __version__
+from nfriction import PendulumChain, __version__, rollout, score
 from nfriction.friction import (
     LFM,
     NCFM,
@@ -31,9 +31,11 @@ from nfriction.modelfile import (
     info_of,
     load,
     parameter_hash,
+    plant_of,
     read_model_file,
     save,
 )
+from tests.fitting.recordings import pendulum, swing
 from tests.friction.samples import QUADRATIC, motion, named_models, quadratic, randomise
 
 INFO = ModelInfo(
@@ -110,6 +112,59 @@ def test_what_is_said_of_a_model_comes_back(tmp_path: Path) -> None:
     assert content["units"]["tau_f"] == "N m"
     assert content["parameter_hash"] == parameter_hash(model.state_dict())
     assert info_of(save(model, path)) == ModelInfo(joint_names=[])
+
+
+def test_a_model_is_scored_from_its_file_alone(tmp_path: Path) -> None:
+    """The fitted mechanism comes back to the last bit, and with it every simulated sample."""
+    given = pendulum(convention=("absolute", "hanging"), position_quantum=1e-4)
+    plant = given.replace(gravity_moment=1.03 * given.gravity_moment)
+    model = LFM(2, [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]], v_smooth=0.05)
+    path = save(model, tmp_path / "model.json", ModelInfo(rig=plant.to_dict()))
+    recording = swing(plant, model, seconds=0.5, convention="absolute,hanging")
+    there = score(plant_of(path), load(path), recording, horizons=())
+    here = score(plant, model, recording, horizons=())
+    assert there.free_run == here.free_run
+    assert (there.simulated == here.simulated).all()
+
+
+def test_a_loaded_model_is_compiled_by_default_and_trained_on_demand(tmp_path: Path) -> None:
+    path = save(LFM(2, [1e-3, 1e-3], v_smooth=0.05), tmp_path / "model.json")
+    model, plant = load(path), pendulum()
+    q0 = torch.tensor([0.1, 0.2], dtype=torch.float64)
+    assert not rollout(plant, model, q0, 0 * q0, steps=3).q.requires_grad
+    rollout(plant, model.requires_grad_(True), q0, 0 * q0, steps=3).q.sum().backward()
+    assert model.schedule.raw.grad is not None
+    own = LFM(2, v_smooth=0.05)
+    assert load(path, into=own) is own
+    assert own.schedule.raw.requires_grad
+
+
+@pytest.mark.parametrize(
+    ("rig", "message"),
+    [
+        (None, "says nothing of the mechanism"),
+        ({}, "no mechanism .*missing keys"),
+        ({"kind": ["chain"]}, "no mechanism"),
+        ({"kind": "chain", "mass": [1.0] * 100, "length": [1.0] * 100}, "100 masses"),
+        ({"kind": "chain", "mass": [1.0], "length": [1.0]}, "1 joints, the model 2"),
+        ({"kind": "chain", "mass": [1.0, -1.0], "length": [1.0, 1.0]}, "`mass` must be positive"),
+        ({"kind": "chain", "mass": "heavy", "length": 3}, "no mechanism"),
+        ({"mass": [1.0, 1.0], "length": [1.0, 1.0], "buffers": [1]}, "no mechanism"),
+        ({"mass": [1.0, 1.0], "length": [1.0, 1.0], "buffers": {"length": "a"}}, "no mechanism"),
+        ({"mass": [1.0, 1.0], "length": [1.0, 1.0], "arm": {"mass": {}}}, "no mechanism"),
+        ({"mass": [1.0, 1.0], "length": [1.0, 1.0], "convention": 7}, "no mechanism"),
+    ],
+)
+def test_a_file_without_a_sound_mechanism_gives_none(
+    rig: dict | None, message: str, tmp_path: Path
+) -> None:
+    path = save(LFM(2), tmp_path / "model.json", ModelInfo(rig=rig))
+    assert isinstance(load(path), LFM)
+    with pytest.raises(ModelFileError, match=message) as raised:
+        plant_of(path)
+    assert str(path) in str(raised.value)
+    assert isinstance(plant_of(save(LFM(2), path, ModelInfo(rig=pendulum().to_dict()))),
+                      PendulumChain)  # fmt: skip
 
 
 def test_units_of_a_sliding_axis_are_those_of_forces() -> None:

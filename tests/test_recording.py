@@ -3,8 +3,10 @@
 import gzip
 import sys
 import warnings
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,6 +16,14 @@ from nfriction.angles import AngleConvention
 from nfriction.recording import Recording, RecordingWarning, read_initial_states
 
 ENDINGS = [".csv", ".csv.gz", ".parquet", ".npz"]
+
+
+@dataclass
+class Rig:
+    """As much of a plant as a recording asks for."""
+
+    convention: tuple[str, str]
+    first_link: int
 
 
 def swing(n: int = 60, joints: int = 2, **settings: object) -> Recording:
@@ -124,7 +134,7 @@ def test_a_failed_write_leaves_the_old_file(
     def full(*_: object) -> None:
         raise OSError("no space left on device")
 
-    monkeypatch.setattr("nfriction.formats.os.replace", full)
+    monkeypatch.setattr("nfriction.formats.files.os.replace", full)
     with pytest.raises(OSError, match="no space"):
         swing(n=30).write(path)
     assert path.read_bytes() == before
@@ -148,8 +158,8 @@ def test_truncated_files_are_named(tmp_path: Path, ending: str, share: float) ->
 def test_absent_and_empty_and_unknown_files(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"no recording at .*lost\.csv"):
         Recording.read(tmp_path / "lost.csv")
-    with pytest.raises(ValueError, match=r"run\.mat.*must end in one of \.csv"):
-        Recording.read(tmp_path / "run.mat")
+    with pytest.raises(ValueError, match=r"run\.doc.*must end in one of \.csv"):
+        Recording.read(tmp_path / "run.doc")
     for ending in ENDINGS:
         (tmp_path / f"empty{ending}").touch()
         with pytest.raises(ValueError, match="is empty"):
@@ -315,15 +325,67 @@ def test_digest_sees_content_and_nothing_else() -> None:
 
 def test_joint_coordinates() -> None:
     recording = swing(joints=3, convention=AngleConvention("absolute", "hanging"))
-    joint = recording.joint_coordinates(first_link=1)
+    on_arm = Rig(("relative", "upright"), 1)
+    joint = recording.joint_coordinates(on_arm)
     assert joint.convention == AngleConvention()
     assert np.array_equal(joint.q[:, 0], recording.q[:, 0])
     np.testing.assert_allclose(joint.q[:, 1], recording.q[:, 1] + np.pi, atol=1e-15)
     np.testing.assert_allclose(joint.qd[:, 2], recording.qd[:, 2] - recording.qd[:, 1])  # type: ignore[index]
     assert np.array_equal(joint.tau, recording.tau)  # type: ignore[arg-type]
-    assert joint.joint_coordinates(first_link=1).digest() == joint.digest()
+    assert joint.joint_coordinates(on_arm).digest() == joint.digest()
     axis = changed(unit="m", convention=AngleConvention("absolute", "hanging"))
     assert axis.joint_coordinates() is axis
+
+
+def test_what_a_recording_does_not_say_the_plant_says() -> None:
+    hanging = Rig(("absolute", "hanging"), 0)
+    said = swing(convention="absolute,hanging")
+    unsaid = replace(said, convention=None)
+    assert unsaid.convention is None
+    assert unsaid.convention_on(hanging) == said.convention
+    assert unsaid.joint_coordinates(hanging).digest() == said.joint_coordinates().digest()
+    # What it says itself is stronger.
+    assert said.convention_on(Rig(("relative", "upright"), 0)) == said.convention
+    with pytest.raises(ValueError, match="does not say how its angles are written; give the plant"):
+        unsaid.joint_coordinates()
+    assert unsaid.digest() != said.digest()
+    assert "that of the plant" in repr(unsaid)
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_convention_that_is_not_said_stays_so(tmp_path: Path, ending: str) -> None:
+    swing().write(tmp_path / f"run{ending}")
+    back = Recording.read(tmp_path / f"run{ending}")
+    assert back.convention is None
+    assert back.digest() == swing().digest()
+    assert Recording.from_pandas(swing().to_pandas()).convention is None
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        "absolute,hanging",
+        ("absolute", "hanging"),
+        ["hanging", "absolute"],
+        AngleConvention("absolute", "hanging"),
+        Rig(("absolute", "hanging"), 0),
+    ],
+)
+def test_a_convention_is_said_in_many_ways(tmp_path: Path, given: Any) -> None:
+    swing().write(tmp_path / "run.csv")
+    expected = AngleConvention("absolute", "hanging")
+    assert Recording.read(tmp_path / "run.csv", convention=given).convention == expected
+    assert Recording.from_pandas(swing().to_pandas(), convention=given).convention == expected
+    assert swing(convention=given).convention == expected
+
+
+@pytest.mark.parametrize("given", ["", "sideways", (), ("absolute", 3), 7, object(), True])
+def test_a_wrong_convention_is_refused_at_once(given: Any) -> None:
+    # Before the file is looked for.
+    with pytest.raises(ValueError, match="an angle convention is"):
+        Recording.read("absent.csv", convention=given)
+    with pytest.raises(ValueError, match="an angle convention is"):
+        swing(convention=given)
 
 
 # --- the real files --------------------------------------------------------------------------

@@ -1,6 +1,8 @@
 """Scores: near the encoder's noise for the true model, honest for a diverging one."""
 
 import json
+import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -32,6 +34,40 @@ def test_the_true_model_is_as_good_as_the_encoder(convention):
     assert wrong.free_run.all > 10 * found.free_run.all
     assert all(w.all < 10 * QUANTUM for w in found.windows.values())
     assert found.diverged_at == np.inf
+
+
+def test_angles_are_written_as_the_plant_says_unless_the_recording_says_otherwise():
+    """An encoder log that says nothing, on a rig that writes absolute angles from hanging."""
+    hanging = pendulum(convention=("absolute", "hanging"), position_quantum=QUANTUM)
+    said = swing(plant(), MODEL, convention="absolute,hanging", seconds=1.0)
+    unsaid = replace(said, convention=None)
+    q0 = said.convention.position_from_joint(np.array([1.6, 0.8]))
+    start = {"initial_state": (q0, np.zeros(2))}
+    found = [score(hanging, MODEL, r, **start) for r in (said, unsaid)]
+    assert found[0].free_run == found[1].free_run
+    assert found[0].windows == found[1].windows
+    assert found[1].free_run.all < QUANTUM
+    # What a recording says counts, whatever the plant says.
+    assert score(plant(), MODEL, said, **start).free_run == found[0].free_run
+    assert score(plant(), MODEL, unsaid, **start).free_run.all > 0.1
+
+
+def test_friction_too_steep_to_simulate_is_diverged_and_said(caplog):
+    recording = swing(plant(), MODEL, seconds=1.0)
+    nan = LFM(2, [1e-3, 1e-3], v_smooth=0.05)
+    with torch.no_grad():
+        nan.schedule.raw[0, 0] = torch.nan
+    for model, told in (
+        (LFM(2, [1e-3, 1e3], v_smooth=1e-3), r"swing: friction needs \d+ integration steps"),
+        (nan, "no finite slope"),
+    ):
+        caplog.clear()
+        found = score(plant(), model, recording, horizons=(0.5,))
+        assert found.free_run.all == found.windows["0.5"].all == found.floor.all == np.inf
+        assert found.diverged_at == 0.0
+        assert found.simulated.shape == recording.q.shape
+        assert json.dumps(found.to_dict(), allow_nan=False)
+        assert re.search(told, caplog.text)
 
 
 def test_joints_and_all_are_one_sum_of_squares():

@@ -1,0 +1,14 @@
+"""Recordings of a mechanism: validated arrays in SI units, from files and tables and back."""
+
+from nfriction.recording.record import Recording, Unit
+from nfriction.recording.states import read_initial_states
+from nfriction.recording.validation import MINIMUM_SAMPLES, RecordingWarning, is_uniform
+
+__all__ = [
+    "MINIMUM_SAMPLES",
+    "Recording",
+    "RecordingWarning",
+    "Unit",
+    "is_uniform",
+    "read_initial_states",
+]

@@ -1,0 +1,303 @@
+"""Recording: what an encoder log says, validated, in SI units, one column per joint."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from nfriction.angles import AngleConvention, ConventionLike, Mechanism
+from nfriction.formats import read_table, stem, table_arrays, write_table
+from nfriction.recording.validation import (
+    check_content,
+    check_shapes,
+    frozen,
+    is_uniform,
+    warn_of_units,
+)
+
+Array = NDArray[np.float64]
+Unit = Literal["rad", "m"]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Recording:
+    """Positions of a mechanism's joints over time, with torque and velocity where measured.
+
+    Arrays are copied to read-only float64. Irregular time stamps are allowed and kept. Two
+    recordings hold the same data when their `digest()` agree.
+
+    A recording need not say how its angles are written: it is then taken to be written as the
+    mechanism's encoders write, which every plant knows. Motion simulated in joint coordinates is
+    not, so of that say `convention="relative,upright"`.
+
+    Args:
+        time: [s], increasing, shape (time,).
+        q: position [rad, or m where `unit` says so], shape (time, joint).
+        tau: joint torque [N m, or N], shape like `q`.
+        qd: measured velocity [rad/s, or m/s], shape like `q`.
+        names: one name per joint, "joint1" … by default.
+        convention: how `q` and `qd` are written, or None for as the plant says; words such as
+            "absolute,hanging" or a plant become an `AngleConvention`. Torques are joint torques
+            in every convention.
+        unit: of position.
+        name: what to call the recording, such as the file's stem.
+    Raises:
+        ValueError: arrays that do not fit together, NaN or infinity, stamps that do not increase,
+            fewer than 8 samples.
+    Warns:
+        RecordingWarning: positions that look like degrees, stamps that look like milliseconds.
+    """
+
+    time: Array
+    q: Array
+    tau: Array | None = None
+    qd: Array | None = None
+    names: tuple[str, ...] = ()
+    convention: AngleConvention | None = None
+    unit: Unit = "rad"
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        for key in ("time", "q", "tau", "qd"):
+            if getattr(self, key) is not None:
+                object.__setattr__(self, key, frozen(getattr(self, key), key))
+        if self.q.ndim != 2:
+            raise ValueError(
+                f"`q` must be (time, joint), got shape {self.q.shape}; "
+                f"a single joint is `q[:, None]`."
+            )
+        if self.convention is not None:
+            object.__setattr__(self, "convention", AngleConvention.of(self.convention))
+        names = tuple(self.names) or tuple(f"joint{k + 1}" for k in range(self.joints))
+        object.__setattr__(self, "names", names)
+        check_shapes(self)
+        check_content(self)
+        warn_of_units(self)
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        return self.q.shape[1]
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last sample [s]."""
+        return float(self.time[-1] - self.time[0])
+
+    @property
+    def sample_time(self) -> float:
+        """Median step between samples [s]."""
+        return float(np.median(np.diff(self.time)))
+
+    @property
+    def is_uniform(self) -> bool:
+        """Whether all steps are alike but for the rounding of the stamps."""
+        return is_uniform(self.time)
+
+    @property
+    def _said(self) -> str | None:
+        return None if self.convention is None else str(self.convention)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def __repr__(self) -> str:
+        stamps = "uniform" if self.is_uniform else "irregular"
+        extras = [key for key in ("tau", "qd") if getattr(self, key) is not None]
+        return (
+            f"Recording({self.name!r}, joints={list(self.names)}, samples={len(self)}, "
+            f"duration={self.duration:.6g} s, sample_time={self.sample_time:.4g} s {stamps}, "
+            f"convention={self._said or 'that of the plant'!r}, unit={self.unit!r}, with={extras})"
+        )
+
+    def __getitem__(self, samples: slice) -> Recording:
+        """Samples as a recording, `recording[100:200]`; the stamps stay."""
+        if not isinstance(samples, slice):
+            raise TypeError(
+                f"a recording is cut by a slice of samples, got {samples!r}; "
+                f"columns are `recording.q[:, k]`."
+            )
+        tau = None if self.tau is None else self.tau[samples]
+        qd = None if self.qd is None else self.qd[samples]
+        return replace(self, time=self.time[samples], q=self.q[samples], tau=tau, qd=qd)
+
+    def window(self, start: float, stop: float) -> Recording:
+        """The samples from `start` to `stop` [s of the recording's own time], both included."""
+        # A stamp that is a rounding error away counts as being there.
+        slack = 1e-6 * self.sample_time
+        first, last = np.searchsorted(self.time, [start - slack, stop + slack])
+        return self[int(first) : int(last)]
+
+    def windows(self, length: float, stride: float | None = None) -> list[Recording]:
+        """Windows of `length` seconds, every `stride` seconds (`length` by default).
+
+        Windows in a row share the sample between them; what is left at the end is dropped.
+        """
+        stride = length if stride is None else stride
+        if not (length > 0 and stride > 0):
+            raise ValueError(f"`length` and `stride` must be positive, got {length} and {stride}.")
+        fitting = (self.duration - length + 1e-6 * self.sample_time) / stride
+        starts = self.time[0] + stride * np.arange(int(np.floor(fitting)) + 1)
+        return [self.window(start, start + length) for start in starts]
+
+    def convention_on(self, plant: Mechanism) -> AngleConvention:
+        """How this recording of a plant is written: as it says itself, else as the plant says.
+
+        Sliding joints have no angles; for them it is the convention that changes nothing.
+        """
+        if self.unit == "m":
+            return AngleConvention()
+        return AngleConvention.of(plant) if self.convention is None else self.convention
+
+    def joint_coordinates(self, plant: Mechanism | None = None) -> Recording:
+        """The same motion in joint coordinates: first angle from upright, the others relative.
+
+        Args:
+            plant: whose recording this is; may be left out where the recording says its convention
+                and its first column is a link's.
+        Raises:
+            ValueError: neither recording nor plant say how the angles are written.
+        """
+        if self.unit == "m":
+            return self
+        convention = self.convention if plant is None else self.convention_on(plant)
+        if convention is None:
+            raise ValueError(
+                "the recording does not say how its angles are written; give the plant, or read "
+                "it with convention='absolute,hanging' or the like."
+            )
+        first_link = 0 if plant is None else plant.first_link
+        qd = None if self.qd is None else convention.rate_to_joint(self.qd, first_link)
+        q = convention.position_to_joint(self.q, first_link)
+        return replace(self, q=q, qd=qd, convention=AngleConvention())
+
+    def digest(self) -> str:
+        """SHA-256 of the content in hexadecimal: arrays, joint names, convention and unit."""
+        digest = hashlib.sha256(repr((self.names, self._said, self.unit)).encode())
+        for key in ("time", "q", "tau", "qd"):
+            values = getattr(self, key)
+            digest.update(f"{key} {None if values is None else values.shape}".encode())
+            if values is not None:
+                # Adding zero makes -0.0 the 0.0 it equals.
+                digest.update((values + 0.0).astype("<f8").tobytes())
+        return digest.hexdigest()
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Table with columns time, q1 …, qd1 …, tau1 …; `attrs` tell unit, names and convention."""
+        columns = {"time": self.time}
+        for key in ("q", "qd", "tau"):
+            values = getattr(self, key)
+            if values is not None:
+                columns |= {f"{key}{k + 1}": values[:, k] for k in range(self.joints)}
+        table = pd.DataFrame(columns)
+        names = ", ".join(self.names)
+        table.attrs = {"unit": self.unit, "names": names}
+        if self.convention is not None:
+            table.attrs["convention"] = str(self.convention)
+        return table
+
+    @classmethod
+    def from_pandas(
+        cls,
+        table: pd.DataFrame,
+        *,
+        columns: Mapping[str, str] | None = None,
+        degrees: bool = False,
+        convention: ConventionLike | None = None,
+        unit: Unit | None = None,
+        name: str = "",
+    ) -> Recording:
+        """Recording from a table with columns time, q1 …, and perhaps qd1 … and tau1 ….
+
+        Velocity and torque are taken where every joint has them; other columns are ignored.
+
+        Args:
+            table: a row per sample.
+            columns: the table's name for ours where they differ, perhaps with its unit after a
+                colon, {"time": "t:ms", "q1": "enc_1:deg"}. Units: s, ms, us, ns; rad, mrad, deg,
+                rev, counts/8192 (any number a revolution), m, mm; these per second, rpm; N m,
+                mN m, N, mN.
+            degrees: positions and velocities that say no unit are in degrees.
+            convention: of the angles, such as "absolute,hanging" or ("absolute", "hanging"), an
+                `AngleConvention`, or a plant; else `table.attrs["convention"]`, else None: that
+                of the plant in whose fit or score the recording is used.
+            unit: of position; else `table.attrs["unit"]`, else rad.
+            name: what to call the recording.
+        """
+        attributes = table.attrs
+        said = attributes.get("convention") if convention is None else convention
+        arrays, slides = table_arrays(table, columns, degrees=degrees)
+        told: Unit | None = None if slides is None else "m" if slides else "rad"
+        unit = unit or attributes.get("unit") or told or "rad"
+        if told and told != unit:
+            raise ValueError(
+                f"`unit` is {unit!r}, but the columns say {told!r}; drop one of the two."
+            )
+        if degrees and unit == "m":
+            raise ValueError("`degrees=True` needs angles, but `unit` is 'm'; drop one of the two.")
+        given = str(attributes.get("names", "")).split(",")
+        names = [part.strip() for part in given if part.strip()]
+        return cls(
+            time=arrays["time"],
+            q=arrays["q"],
+            tau=arrays.get("tau"),
+            qd=arrays.get("qd"),
+            names=tuple(names),
+            convention=None if said is None else AngleConvention.of(said),
+            unit=unit,
+            name=name,
+        )
+
+    @classmethod
+    def read(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        columns: Mapping[str, str] | None = None,
+        degrees: bool = False,
+        convention: ConventionLike | None = None,
+        unit: Unit | None = None,
+        name: str | None = None,
+    ) -> Recording:
+        """Recording from a .csv (.csv.gz, .tsv, .txt), .parquet, .npz, .mat, .h5 or .mf4 file.
+
+        A CSV file may begin with comment lines `# convention: absolute,hanging` and `# unit: rad`;
+        arguments override what the file says. Cells may be separated by commas, semicolons, tabs
+        or blanks, as the header is; numbers may have a decimal comma where no comma separates. A
+        row of units under the header, or units in it as in `time [ms]`, are followed. Arrays of
+        .mat and .h5 files are named by their path, `data.Y.q1`, `enc[0]`; what dSPACE ControlDesk
+        recorded, by its name. The name is the file's without its ending.
+
+        Args:
+            path: of the file.
+            columns, degrees, convention, unit, name: as for `from_pandas`.
+        Raises:
+            FileNotFoundError: there is no such file.
+            ImportError: a format whose library is not installed.
+            ValueError: broken content or missing columns; names the file.
+        """
+        if convention is not None:
+            convention = AngleConvention.of(convention)
+        table = read_table(path, list((columns or {}).values()))
+        try:
+            return cls.from_pandas(
+                table,
+                columns=columns,
+                degrees=degrees,
+                convention=convention,
+                unit=unit,
+                name=stem(path) if name is None else name,
+            )
+        except ValueError as error:
+            raise ValueError(f"'{path}': {error}") from error
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write to .csv, .csv.gz, .parquet or .npz, whole or not at all; `read` gives it back."""
+        write_table(self.to_pandas(), path)

@@ -1,0 +1,44 @@
+"""Initial states: where each recording's free run starts."""
+
+from __future__ import annotations
+
+import os
+import re
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nfriction.formats import column_numbers, read_table
+
+Array = NDArray[np.float64]
+
+
+def read_initial_states(path: str | os.PathLike[str]) -> dict[str, tuple[Array, Array]]:
+    """Initial position and velocity per recording from a table with columns id, q0_1, qd0_1, ….
+
+    Cells of joints that a mechanism lacks are empty. States are written as the recordings are.
+
+    Args:
+        path: of the table, such as a data set's `recordings.csv`.
+    Returns:
+        {id: (q0, qd0)}, each (joint,).
+    """
+    table = read_table(path)
+    joints = sorted((c[3:] for c in table.columns if re.fullmatch(r"q0_\d+", c)), key=int)
+    wanted = ["id", *(f"{key}_{k}" for key in ("q0", "qd0") for k in joints or ["1"])]
+    missing = [c for c in wanted if c not in table.columns]
+    if missing:
+        raise ValueError(f"'{path}' lacks columns {missing}; found {list(table.columns)}.")
+    q0, qd0 = (
+        np.stack([column_numbers(table, f"{key}_{k}") for k in joints], axis=1)
+        for key in ("q0", "qd0")
+    )
+    states: dict[str, tuple[Array, Array]] = {}
+    for row, label in enumerate(table["id"].astype(str)):
+        present = ~np.isnan(q0[row])
+        if label in states or not present.any() or np.any(present == np.isnan(qd0[row])):
+            raise ValueError(
+                f"'{path}': {label!r} must come once, with q0 and qd0 of the same joints."
+            )
+        states[label] = (q0[row][present], qd0[row][present])
+    return states

@@ -1,0 +1,121 @@
+"""What a recording must fulfil: shapes, content, units that look right."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    from nfriction.recording.record import Recording
+
+Array = NDArray[np.float64]
+
+MINIMUM_SAMPLES = 8
+
+
+class RecordingWarning(UserWarning):
+    """A recording is valid but looks as if its units were not SI."""
+
+
+def is_uniform(time: Array) -> bool:
+    """Whether all steps between stamps are alike.
+
+    Stamps rounded to a microsecond at 1 kHz differ by 1e-3 of a step; real jitter is larger.
+    """
+    step = np.diff(time)
+    return bool(np.all(np.abs(step - np.median(step)) <= 2e-3 * np.median(step)))
+
+
+def frozen(values: ArrayLike, key: str) -> Array:
+    try:
+        array = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"`{key}` must be a rectangular array of numbers ({error}); "
+            f"every sample needs a number for every joint."
+        ) from error
+    array.setflags(write=False)
+    return array
+
+
+def check_shapes(recording: Recording) -> None:
+    time, q, names = recording.time, recording.q, recording.names
+    if q.shape[1] == 0 or time.shape != q.shape[:1]:
+        raise ValueError(
+            f"`time` must be (time,) and `q` (time, joint) with as many samples, "
+            f"got {time.shape} and {q.shape}."
+        )
+    for key in ("tau", "qd"):
+        values = getattr(recording, key)
+        if values is not None and values.shape != q.shape:
+            raise ValueError(
+                f"`{key}` must be shaped like `q` {q.shape}, got {values.shape}; "
+                f"a single joint is `{key}[:, None]`."
+            )
+    if len(names) != q.shape[1] or len(set(names)) < len(names):
+        raise ValueError(f"`names` must name each of {q.shape[1]} joints once, got {names}.")
+    if any(not re.fullmatch(r"[^\s,#]([^,#\n]*[^\s,#])?", name) for name in names):
+        raise ValueError(f"`names` must be free of commas, # and outer blanks, got {names}.")
+    if recording.unit not in ("rad", "m"):
+        raise ValueError(
+            f"`unit` must be 'rad' or 'm', got {recording.unit!r}; "
+            f"degrees are converted by `Recording.read(..., degrees=True)`."
+        )
+    if len(time) < MINIMUM_SAMPLES:
+        raise ValueError(
+            f"a recording needs at least {MINIMUM_SAMPLES} samples, got {len(time)}; "
+            f"take a longer file or window."
+        )
+
+
+def check_content(recording: Recording) -> None:
+    for key in ("time", "q", "qd", "tau"):
+        values = getattr(recording, key)
+        if values is None:
+            continue
+        bad = np.argwhere(~np.isfinite(values))
+        if len(bad):
+            sample, *joint = bad[0]
+            label = key + "".join(str(j + 1) for j in joint)
+            raise ValueError(
+                f"`{label}` must be finite, got {values[tuple(bad[0])]} at sample {sample} "
+                f"({len(bad)} such values in `{key}`); cut them off or drop those rows."
+            )
+    stuck = np.flatnonzero(np.diff(recording.time) <= 0)
+    if len(stuck):
+        k = int(stuck[0])
+        raise ValueError(
+            f"`time` must increase, got {recording.time[k]!r} then {recording.time[k + 1]!r} s at "
+            f"sample {k + 1} ({len(stuck)} such steps); sort the rows and drop repeated stamps."
+        )
+
+
+def warn_of_units(recording: Recording) -> None:
+    step = np.diff(recording.time)
+    if np.median(step) >= 0.5:
+        # At two samples a second no joint's motion can be told.
+        _warn(recording, "`time` looks like milliseconds", "divide it by 1000")
+        return
+    if recording.unit == "m":
+        return
+    # A pendulum of 0.1 m falls from upright through the bottom at 20 rad/s, and of a whirling chain
+    # the first link seldom goes round. So joints that all pass a full turn and one of them 30 rad/s
+    # are driven wheels, or in degrees. Wrapped angles never span more than a turn.
+    turns = np.ptp(recording.q, axis=0).min() / (2 * np.pi)
+    speed = np.abs(np.diff(recording.q, axis=0) / step[:, None]).max()
+    if turns > 1 and speed > 30.0:
+        _warn(
+            recording,
+            f"`q` looks like degrees (every joint turns at least {turns:.1f} times, at up to "
+            f"{speed:.0f} rad/s)",
+            "read it with `degrees=True`",
+        )
+
+
+def _warn(recording: Recording, finding: str, mend: str) -> None:
+    label = f"recording '{recording.name}': " if recording.name else ""
+    warnings.warn(f"{label}{finding}; if so, {mend}.", RecordingWarning, stacklevel=5)

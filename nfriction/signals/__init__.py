@@ -1,0 +1,25 @@
+"""From encoder positions to motion: quantisation, causal velocity, smoothing, initial states.
+
+Two ways lead from positions to velocity and acceleration. The causal way (`causal_motion`) is what
+a controller runs: frequency counting and a second-order IIR filter. The smoothers
+(`savitzky_golay`, `kalman_smoother`) see the whole record and serve the fit.
+
+Arrays are (time, joint); time is (time,) in seconds; positions are in radians (or metres).
+"""
+
+from nfriction.signals.causal import SecondOrderLowPass, causal_motion
+from nfriction.signals.encoder import frequency_counting, quantise
+from nfriction.signals.kalman import kalman_smoother
+from nfriction.signals.motion import Motion
+from nfriction.signals.polynomial import initial_state, savitzky_golay
+
+__all__ = [
+    "Motion",
+    "SecondOrderLowPass",
+    "causal_motion",
+    "frequency_counting",
+    "initial_state",
+    "kalman_smoother",
+    "quantise",
+    "savitzky_golay",
+]

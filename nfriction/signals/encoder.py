@@ -1,0 +1,89 @@
+"""What an incremental encoder says: counts, and velocity from the time between edges."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nfriction.signals.motion import checked
+
+Array = NDArray[np.float64]
+
+
+def quantise(q: ArrayLike, counts_per_revolution: float, *, offset: float = 0.0) -> Array:
+    """Position as an incremental encoder reports it: the nearest of its evenly spaced counts.
+
+    Args:
+        q: position [rad], any shape.
+        counts_per_revolution: counts after quadrature; an encoder of 2048 lines has 8192.
+        offset: position of one count's centre [rad].
+    Returns:
+        Quantised position [rad], shape like `q`.
+    """
+    quantum = _quantum(counts_per_revolution)
+    return offset + quantum * np.rint((np.asarray(q, dtype=np.float64) - offset) / quantum)
+
+
+def frequency_counting(
+    time: ArrayLike,
+    q: ArrayLike,
+    counts_per_revolution: float,
+    *,
+    offset: float = 0.0,
+    edge_time: ArrayLike | None = None,
+) -> Array:
+    """Causal velocity from the time between encoder edges.
+
+    The velocity is the way between the last two samples that saw an edge, over the time between
+    those edges. While no further edge comes, the joint cannot have moved by more than a count, so
+    the speed falls as one count over the time since the last edge. An edge crossed back and forth
+    counts as no way at all. Before the second edge the velocity is zero.
+
+    Args:
+        time: sample times [s], shape (time,).
+        q: position [rad], shape (time, joint); quantised here, which leaves counts as they are.
+        counts_per_revolution: counts after quadrature.
+        offset: position of one count's centre [rad].
+        edge_time: time of the last edge at or before each sample [s], shape like `q`, where the
+            hardware latches it; without it edges are known to the sample clock.
+    Returns:
+        Velocity [rad/s], shape (time, joint).
+    """
+    time, q = checked(time, q)
+    quantum = _quantum(counts_per_revolution)
+    counts = np.rint((q - offset) / quantum)
+    latched = np.broadcast_to(time[:, None], q.shape) if edge_time is None else edge_time
+    latched = np.asarray(latched, dtype=np.float64)
+    if latched.shape != q.shape:
+        raise ValueError(f"`edge_time` must be shaped like `q` {q.shape}, got {latched.shape}.")
+    velocity = np.zeros_like(q)
+    for joint in range(q.shape[1]):
+        step = np.diff(counts[:, joint])
+        edges = np.flatnonzero(step) + 1
+        if len(edges) < 2:
+            continue
+        place = counts[edges, joint] - 0.5 * np.sign(step[edges - 1])
+        moment = latched[edges, joint]
+        if np.any(np.diff(moment) <= 0):
+            raise ValueError("`edge_time` must increase from edge to edge.")
+        at_edge = quantum * np.diff(place) / np.diff(moment)
+        # For every sample the number of the last edge, counted from the second one on.
+        last = np.searchsorted(edges, np.arange(len(q)), side="right") - 2
+        known = last >= 0
+        v = at_edge[last[known]]
+        # |v| · waited is the way since the edge at that speed: beyond one count it slows down.
+        waited = time[known] - moment[last[known] + 1]
+        way = np.abs(v) * waited
+        velocity[known, joint] = v * quantum / np.maximum(way, quantum)
+    return velocity
+
+
+def _quantum(counts_per_revolution: float) -> float:
+    if not counts_per_revolution > 0:
+        raise ValueError(
+            f"`counts_per_revolution` must be positive, got {counts_per_revolution}; "
+            f"an encoder of 2048 lines has 8192 counts after quadrature."
+        )
+    return 2 * math.pi / counts_per_revolution

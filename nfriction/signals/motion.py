@@ -1,0 +1,43 @@
+"""Motion: position, velocity and acceleration over time, and what every way to it asks for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Position, velocity and acceleration of every joint over time.
+
+    Args:
+        time: [s], shape (time,).
+        q: position [rad], shape (time, joint).
+        qd: velocity [rad/s], shape like `q`.
+        qdd: acceleration [rad/s²], shape like `q`.
+        std: standard deviations of `q`, `qd` and `qdd` where the method knows them.
+    """
+
+    time: Array
+    q: Array
+    qd: Array
+    qdd: Array
+    std: Motion | None = None
+
+
+def checked(time: ArrayLike, q: ArrayLike) -> tuple[Array, Array]:
+    time, q = np.asarray(time, dtype=np.float64), np.asarray(q, dtype=np.float64)
+    if q.ndim != 2 or time.shape != q.shape[:1]:
+        raise ValueError(
+            f"`time` must be (time,) and `q` (time, joint), got {time.shape} and {q.shape}; "
+            f"a single joint is `q[:, None]`."
+        )
+    if len(time) < 8:
+        raise ValueError(f"at least 8 samples are needed, got {len(time)}.")
+    if not (np.all(np.isfinite(q)) and np.all(np.diff(time) > 0)):
+        raise ValueError("`q` must be finite and `time` increasing; `Recording` tells where not.")
+    return time, q
