@@ -6,7 +6,7 @@ buffers are inputs of the compiled code, so a fit may change them between calls.
 
 import logging
 from collections import OrderedDict
-from collections.abc import Hashable
+from collections.abc import Hashable, Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -66,8 +66,14 @@ def integrate_compiled(
     measured: tuple[Tensor, Tensor] | None,
     backend: Backend,
     threads: int,
+    parameters: Mapping[str, Tensor] | None = None,
+    memory: Tensor | None = None,
 ) -> tuple[Tensor, ...] | None:
     """States at every sample: q, qd, qdd, each (*batch, steps + 1, joint).
+
+    Args:
+        parameters: values of the friction model's parameters by name that differ from its own,
+            each (*batch, *the parameter's shape); the other arguments as in `integrate`.
 
     Returns:
         None where `backend="auto"` finds no way to compile, so that eager torch serves.
@@ -94,16 +100,24 @@ def integrate_compiled(
     drive = None
     if measured is not None:
         drive = (finer(rows(measured[0], 2), -2), finer(rows(measured[1], 2), -2))
+    values = _values(plant, friction, compiled.parameter_names)
+    for name, value in (parameters or {}).items():
+        own = value.shape[len(batch) :]
+        values[f"friction.{name}"] = value.detach().reshape(-1, *own)
+    # Coefficients with a memory are held as a controller would, at the sample rate.
+    remembers = getattr(friction, "state_size", 0) > 0
     found = compiled(
         q.detach().reshape(-1, joints).contiguous(),
         qd.detach().reshape(-1, joints).contiguous(),
         steps=steps,
         time_step=finer(rows(step, 1) / substeps, -1),
         tau=finer(rows(tau, 2), -2),
-        parameters=_values(plant, friction, compiled.parameter_names),
+        parameters=values,
         drive=drive,
         threads=threads,
         record_every=substeps,
+        hold_for=substeps if remembers else 1,
+        memory=None if memory is None else rows(memory, 2).reshape(-1, *memory.shape[-2:]),
     )
     return tuple(x.reshape(*batch, -1, joints) for x in (found.q, found.qd, found.qdd))
 

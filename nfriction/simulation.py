@@ -8,8 +8,9 @@ acceleration needs friction.
 import contextlib
 import logging
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from tqdm import tqdm
@@ -44,6 +45,16 @@ class Friction(Protocol):
     def coefficients(self, qd: Tensor, qdd: Tensor) -> Tensor: ...
     def torque(self, qd: Tensor, load: Tensor, coefficients: Tensor) -> Tensor: ...
     def slope_at_rest(self) -> Tensor: ...
+
+
+class RememberingFriction(Friction, Protocol):
+    """A friction model whose coefficients have a memory; see `nfriction.friction.Schedule`."""
+
+    state_size: int
+
+    def initial_state(self, qd: Tensor, qdd: Tensor) -> Tensor: ...
+    def advance(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor: ...
+    def coefficients_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor: ...
 
 
 @dataclass(frozen=True)
@@ -152,12 +163,17 @@ def rollout(
     substeps: int = 1,
     drive: Literal["simulated", "measured"] = "simulated",
     measured: tuple[Tensor, Tensor] | None = None,
+    memory: Tensor | None = None,
     gradients: bool | None = None,
     backend: Backend = "auto",
     threads: int = 1,
     progress: bool = False,
 ) -> Rollout:
     """Simulate a plant with friction from an initial state.
+
+    Models that `fit` and `load` return ask for no gradients and are compiled, thousands of times
+    faster than eager torch. To train through a rollout ask for them first,
+    `model.requires_grad_(True)`; a new model of one's own does so by itself.
 
     Args:
         plant: the mechanism, e.g. `rigs.tlrip()`.
@@ -167,10 +183,14 @@ def rollout(
             (*batch, steps, joint); None for none.
         sample_time: step [s], or steps of their own, shape (steps,) or (*batch, steps).
         steps: number of steps; may be left out where `tau` or `sample_time` gives it.
-        substeps: Runge-Kutta steps to each sample.
+        substeps: Runge-Kutta steps to each sample. Coefficients with a memory advance once a
+            sample; others are held anew at each of these steps.
         drive: what drives motion-dependent coefficients: the simulated motion, or the
             `measured` one, as in the papers.
         measured: velocity and acceleration for `drive="measured"`, each (*batch, steps, joint).
+        memory: what the coefficients remember after the first sample, (*batch, joint,
+            state_size), where the motion goes on from an earlier one (see `Schedule.states`); by
+            default what they would of the first sample alone.
         gradients: record gradients; None does so where any input asks for it, no compiled backend
             is named, and there are at most 10,000 steps (a longer graph takes gigabytes).
         backend: `"torch"` steps in eager torch; `"c"` and `"numba"` compile the same definition
@@ -192,6 +212,11 @@ def rollout(
     q, qd, torque, step, steps = _prepare(plant, friction, q0, qd0, tau, sample_time, steps)
     measured = _driving(drive, measured, q, steps)
     _refuse_unstable(plant, friction, float(step.max()), substeps)
+    memory = _remembered(friction, memory, q)
+    if memory is not None:
+        shape = np.broadcast_shapes(q.shape, memory.shape[:-1])
+        q, qd = q.expand(shape), qd.expand(shape)
+    _compare_sample_times(friction, float(step.mean()))
     if gradients is None:
         gradients = (
             backend in ("auto", "torch")
@@ -200,7 +225,7 @@ def rollout(
             and _asks_gradients(plant, friction, q, qd, torque)
         )
     return integrate(
-        plant, friction, q, qd, torque, step, substeps=substeps, measured=measured,
+        plant, friction, q, qd, torque, step, substeps=substeps, measured=measured, memory=memory,
         gradients=gradients, backend=backend, threads=threads, progress=progress,
     )  # fmt: skip
 
@@ -215,6 +240,7 @@ def integrate(
     *,
     substeps: int = 1,
     measured: tuple[Tensor, Tensor] | None = None,
+    memory: Tensor | None = None,
     gradients: bool = False,
     backend: Backend = "auto",
     threads: int = 1,
@@ -228,11 +254,14 @@ def integrate(
     states = None
     if wants_compiled(backend, q0, gradients):
         states = integrate_compiled(
-            plant, friction, q0, qd0, tau, step, substeps, measured, backend, threads
-        )
+            plant, friction, q0, qd0, tau, step, substeps, measured, backend, threads,
+            memory=memory,
+        )  # fmt: skip
     if states is None:
         with contextlib.nullcontext() if gradients else torch.no_grad():
-            states = _integrate(plant, friction, q0, qd0, tau, step, substeps, measured, progress)
+            states = _integrate(
+                plant, friction, q0, qd0, tau, step, substeps, measured, memory, progress
+            )
     time = torch.cat([torch.zeros_like(step[..., :1]), step.cumsum(-1)], -1)
     q, qd, qdd = states
     diverged_at = _divergence(time, q, qd)
@@ -251,22 +280,55 @@ def _integrate(
     step: Tensor,
     substeps: int,
     measured: tuple[Tensor, Tensor] | None,
+    first: Tensor | None,
     progress: bool,
 ) -> tuple[Tensor, ...]:
     """States at every sample in eager torch: q, qd, qdd, each (*batch, steps + 1, joint)."""
     inner = step / substeps
     qdd = plant.forward_dynamics(q, qd, tau[..., 0, :])
     states = [(q, qd, qdd)]
+    remembering = _remembering(friction)
+    memory: Tensor | None = None
+    held: Tensor | None = None
     for k in tqdm(range(step.shape[-1]), disable=not progress, unit="step", leave=False):
         driven = None if measured is None else (measured[0][..., k, :], measured[1][..., k, :])
+        if remembering is not None:
+            seen = driven or (qd, qdd)
+            if memory is not None:
+                memory = remembering.advance(*seen, memory)
+            else:
+                memory = remembering.initial_state(*seen) if first is None else first
+            held = remembering.coefficients_from(*seen, memory)
         for _ in range(substeps):
-            held = None if friction is None else friction.coefficients(*(driven or (qd, qdd)))
+            if friction is not None and remembering is None:
+                held = friction.coefficients(*(driven or (qd, qdd)))
             q, qd, qdd = rk4_step(plant, friction, q, qd, tau[..., k, :], held, inner[..., k, None])
         states.append((q, qd, qdd))
     shape = states[-1][0].shape
     return tuple(
         torch.stack([x.expand(shape) for x in one], -2) for one in zip(*states, strict=True)
     )
+
+
+def _remembering(friction: Friction | None) -> RememberingFriction | None:
+    """The friction model if its coefficients have a memory."""
+    if getattr(friction, "state_size", 0) > 0:
+        return cast(RememberingFriction, friction)
+    return None
+
+
+def _remembered(friction: Friction | None, memory: Tensor | None, q: Tensor) -> Tensor | None:
+    """Validate a given memory."""
+    if memory is None:
+        return None
+    given, size = torch.as_tensor(memory).to(q), getattr(friction, "state_size", 0)
+    if size == 0:
+        raise ValueError("`memory` is for friction whose coefficients have one; leave it out.")
+    if given.shape[-2:] != (q.shape[-1], size) or not torch.isfinite(given).all():
+        raise ValueError(
+            f"`memory` must be finite (*batch, {q.shape[-1]}, {size}), got {tuple(given.shape)}."
+        )
+    return given
 
 
 def _asks_gradients(plant: Plant, friction: Friction | None, *inputs: Tensor) -> bool:
@@ -341,7 +403,7 @@ def _prepare(
         raise ValueError(f"`tau` must be (*batch, steps, {joints}), got {tuple(torque.shape)}.")
     if not torch.isfinite(torque.detach()).all():
         raise ValueError("`tau` must be finite, got NaN or infinity.")
-    shape = torch.broadcast_shapes(
+    shape = np.broadcast_shapes(
         q0.shape, qd0.shape, (*torque.shape[:-2], joints), (*step.shape[:-1], joints)
     )
     return q0.expand(shape), qd0.expand(shape), torque, step, steps
@@ -367,6 +429,16 @@ def _refuse_unstable(
             # A twentieth more outweighs the rounding to two digits.
             f"v_smooth >= {1.05 * v_smooth * float(excess.max()):.2g} (now {v_smooth:g})."
         )
+
+
+def _compare_sample_times(friction: Friction | None, step: float) -> None:
+    """Warn of a memory that fades at another rate than the model was made for."""
+    meant = getattr(getattr(friction, "schedule", None), "sample_time", None)
+    if meant is not None and not 0.5 < step / meant < 2.0:
+        logger.warning(
+            "samples of %.3g s advance a memory made for %.3g s, so it fades over %.2g times its "
+            "time; see `Adaptive.set_sample_time`", step, meant, step / meant,
+        )  # fmt: skip
 
 
 def _divergence(time: Tensor, q: Tensor, qd: Tensor) -> Tensor:

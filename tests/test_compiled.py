@@ -148,6 +148,27 @@ def test_without_a_backend_eager_torch_serves_and_says_so_once(compilations, mon
         rollout(CHAIN, LFM(2, v_smooth=0.05), Q0, QD0, steps=5, gradients=False, backend="c")
 
 
+@pytest.mark.slow
+def test_each_executor_serves_where_the_ones_before_it_are_hidden(
+    compilations, monkeypatch, tmp_path, caplog
+):
+    """The C compiler, then numba: the public call goes on and ends at the same place."""
+    monkeypatch.setenv("NFRICTION_CACHE", str(tmp_path / "cache"))
+    first = both(LFM(2, v_smooth=0.05))
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    compiled._cache.clear()
+    second = both(LFM(2, v_smooth=0.05))
+    assert [c.backend for c in compiled._cache.values()] == ["numba"]
+    monkeypatch.setattr("importlib.util.find_spec", lambda name, *rest: None)
+    compiled._cache.clear()
+    third = both(LFM(2, v_smooth=0.05))
+    assert list(compiled._cache.values()) == [None]
+    assert "eager torch" in caplog.text
+    torch.testing.assert_close(second, first, rtol=0, atol=1e-12)
+    torch.testing.assert_close(third, first, rtol=0, atol=1e-12)
+
+
 def test_an_operation_without_scalar_form_falls_back_unless_asked_by_name(compilations):
     def torque(qd, load, coefficients, v_smooth):
         return coefficients[..., 0] * torch.special.i0(qd * 0.1) * torch.tanh(qd)

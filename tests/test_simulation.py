@@ -7,9 +7,10 @@ from itertools import pairwise
 import pytest
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from nfriction import LFM, NFLFM, LinearAxis, PendulumChain, rollout
-from nfriction.friction import MODELS, Coefficient, Constant, FrictionModel, Law
+from nfriction.friction import MODELS, Adaptive, Coefficient, Constant, FrictionModel, Law
 from nfriction.simulation import required_substeps, stability_limit
 
 F64 = torch.float64
@@ -37,7 +38,15 @@ def named_model(name: str) -> FrictionModel:
     initial = [1e-3, 1e-3, 1e-3, 1e-3, 1.0] if name == "NFNLFM" else None
     model = MODELS[name](2, initial, v_smooth=0.05)
     generator = torch.Generator().manual_seed(3)
-    if not isinstance(model.schedule, Constant):
+    if isinstance(model.schedule, Adaptive):
+        # Classes far apart, and a memory short enough to change them within a thousand steps.
+        model = MODELS[name](2, v_smooth=0.05, time_constant=0.1, sample_time=5e-4)
+        with torch.no_grad():
+            model.schedule.raw.add_(
+                0.7 * torch.randn(model.schedule.raw.shape, generator=generator, dtype=F64)
+            )
+        model.schedule.set_classes([[30.0, 70.0], [40.0, 120.0]])
+    elif not isinstance(model.schedule, Constant):
         # A network that really bends the coefficients.
         vector = model.schedule.parameter_vector()
         model.schedule.set_parameter_vector(
@@ -76,8 +85,11 @@ def test_frictionless_energy_is_kept():
 
 @pytest.mark.parametrize("name", MODELS)
 def test_passive_friction_never_adds_energy(name):
-    out = run(named_model(name) if name != "NFNLFM" else MODELS[name](2, v_smooth=0.05),
-              *MOVING, sample_time=1e-3, steps=1000)  # fmt: skip
+    model = named_model(name) if name != "NFNLFM" else MODELS[name](2, v_smooth=0.05)
+    if name == "ANLFM":
+        with torch.no_grad():
+            model.schedule.raw[..., 0] = 0.0  # f_o pushes, so it is no dissipation
+    out = run(model, *MOVING, sample_time=1e-3, steps=1000)
     energy = sum(CHAIN.energy(out.q, out.qd))
     assert float(energy.diff().max()) < 1e-9  # rounding and the integrator's own error
     assert float(energy[-1]) < float(energy[0]) - 1e-4
@@ -134,7 +146,7 @@ def test_torques_or_steps_alone_may_bring_the_batch(backend):
 
 
 # Eager torch takes a second or more for a thousand steps, so the default run has one of each kind.
-OFTEN = ("LFM", "NFLFM", "user")
+OFTEN = ("LFM", "ALFM", "NFLFM", "user")
 NAMES = [n if n in OFTEN else pytest.param(n, marks=pytest.mark.slow) for n in (*MODELS, "user")]
 
 
@@ -151,16 +163,65 @@ def test_torch_and_c_agree(name):
     torch.testing.assert_close(c.qdd, eager.qdd, rtol=1e-10, atol=1e-9)
 
 
+def recorded(steps: int) -> dict:
+    """All that a recording of two runs may bring: torques, irregular stamps, a measured motion."""
+    generator = torch.Generator().manual_seed(5)
+
+    def random(*shape: int, scale: float) -> Tensor:
+        return scale * torch.randn(*shape, generator=generator, dtype=F64)
+
+    return {
+        "tau": random(2, steps, 2, scale=0.05),
+        "sample_time": 3e-4 + 4e-4 * torch.rand(2, steps, generator=generator, dtype=F64),
+        "drive": "measured",
+        "measured": (random(2, steps, 2, scale=3.0), random(2, steps, 2, scale=60.0)),
+    }
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [*MODELS, "user"])
 def test_c_and_numba_agree(name):
     model = FrictionModel(DRAG, Constant(DRAG, 2), 1.0) if name == "user" else named_model(name)
-    c, numba = (
-        run(model, *MOVING, sample_time=5e-4, steps=1000, backend=backend)
-        for backend in ("c", "numba")
-    )
-    torch.testing.assert_close(numba.q, c.q, rtol=0, atol=1e-12)
-    torch.testing.assert_close(numba.qd, c.qd, rtol=0, atol=1e-12)
+    for given in ({"sample_time": 5e-4, "steps": 1000}, recorded(1000)):
+        c, numba = (run(model, *MOVING, backend=backend, **given) for backend in ("c", "numba"))
+        torch.testing.assert_close(numba.q, c.q, rtol=0, atol=1e-12)
+        torch.testing.assert_close(numba.qd, c.qd, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_torque_drag_irregular_stamps_and_a_measured_drive_agree(name):
+    model = FrictionModel(DRAG, Constant(DRAG, 2), 1.0) if name == "user" else named_model(name)
+    plant = CHAIN.replace(drag_quadratic=torch.tensor([0.02, 0.01], dtype=F64))
+    given = recorded(200 if name in OFTEN else 1000)
+    eager, c = (run(model, *MOVING, plant, backend=b, **given) for b in ("torch", "c"))
+    torch.testing.assert_close(c.q, eager.q, rtol=0, atol=1e-12)
+    torch.testing.assert_close(c.qd, eager.qd, rtol=0, atol=1e-12)
+    undriven = run(model, *MOVING, plant, backend="c", tau=given["tau"],
+                   sample_time=given["sample_time"])  # fmt: skip
+    assert torch.equal(undriven.q, c.q) == isinstance(model.schedule, Constant)
+
+
+class Reads(TorchDispatchMode):
+    """Counts how often a tensor's value is asked for, which makes a GPU wait."""
+
+    def __init__(self):
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
+        waits = ("aten::_local_scalar_dense", "aten::nonzero", "aten::equal", "aten::masked_select")
+        self.count += operation.name().split(".")[0] in waits
+        return operation(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_no_value_is_asked_for_within_the_loop(name):
+    counts = []
+    for steps in (3, 9):
+        with Reads() as reads:
+            run(named_model(name), *MOVING, sample_time=5e-4, steps=steps, backend="torch")
+        counts.append(reads.count)
+    assert counts[0] == counts[1] > 0
 
 
 @pytest.mark.parametrize("backend", ["torch", "c"])
@@ -198,6 +259,87 @@ def test_the_simulated_motion_as_measured_one_gives_itself():
     slow = tuple(torch.zeros_like(m) for m in measured)
     other = run(model, *MOVING, steps=60, drive="measured", measured=slow)
     assert not torch.allclose(other.q, free.q, atol=1e-8)
+
+
+@pytest.mark.parametrize("backend", ["torch", "c"])
+def test_a_memory_advances_once_a_sample(backend):
+    """Substeps refine the integration; the class changes at samples only, as in a controller."""
+    seen = []
+
+    class Watched(Adaptive):
+        def advance(self, qd, qdd, state):
+            seen.append(1)
+            return super().advance(qd, qdd, state)
+
+    model = named_model("ALFM")
+    fine = run(model, *MOVING, sample_time=5e-4, steps=300, substeps=4, backend=backend)
+    model.schedule.__class__ = Watched
+    watched = run(model, *MOVING, sample_time=5e-4, steps=300, substeps=4, backend="torch")
+    assert len(seen) == 299
+    torch.testing.assert_close(watched.q, fine.q, rtol=0, atol=1e-12)
+    known = model.schedule.classes(fine.qd, fine.qdd)
+    assert len(known.unique()) > 1
+
+
+@pytest.mark.parametrize("backend", ["torch", "c"])
+def test_a_motion_goes_on_with_what_it_remembers(backend):
+    """Cut in two with the memory handed over, a run is the uncut one."""
+    model = named_model("ALFM")
+    settings = {"sample_time": 5e-4, "backend": backend}
+    whole = run(model, *MOVING, steps=400, **settings)
+    # The acceleration that a restart knows at first is another, so its class must not count.
+    states = model.schedule.states(whole.qd, whole.qdd)
+    rest = run(model, whole.q[200], whole.qd[200], steps=200, memory=states[200], **settings)
+    torch.testing.assert_close(rest.q, whole.q[200:], rtol=0, atol=1e-12)
+    other = states[200].clone()
+    other[:, 0], other[:, 1] = 4 * model.schedule.thresholds[:, 1], 2.0
+    lost = run(model, whole.q[200], whole.qd[200], steps=200, memory=other, **settings)
+    assert not torch.allclose(lost.q, whole.q[200:], rtol=0, atol=1e-9)
+    two = torch.stack([states[200], other])
+    both = run(model, whole.q[200], whole.qd[200], steps=200, memory=two, **settings)
+    torch.testing.assert_close(both.q, torch.stack([rest.q, lost.q]), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("backend", ["torch", "c"])
+def test_a_measured_motion_drives_the_memory_too(backend):
+    model = named_model("ALFM")
+    settings = {"sample_time": 5e-4, "steps": 300, "backend": backend}
+    free = run(model, *MOVING, **settings)
+    measured = (free.qd[:-1], free.qdd[:-1])
+    same = run(model, *MOVING, drive="measured", measured=measured, **settings)
+    torch.testing.assert_close(same.q, free.q, rtol=0, atol=1e-13)
+    calm = tuple(torch.zeros_like(m) for m in measured)
+    other = run(model, *MOVING, drive="measured", measured=calm, **settings)
+    low = LFM(2, model.schedule.values[:, 0], v_smooth=0.05)
+    torch.testing.assert_close(other.q, run(low, *MOVING, **settings).q, rtol=0, atol=1e-12)
+    assert not torch.allclose(other.q, free.q, atol=1e-6)
+
+
+def test_a_memory_made_for_other_samples_is_warned_of(caplog):
+    with caplog.at_level(logging.WARNING, "nfriction"):
+        run(named_model("ALFM"), sample_time=5e-4, steps=2)
+        assert not caplog.records
+        run(named_model("ALFM"), sample_time=2e-3, steps=2)
+    assert "set_sample_time" in caplog.text
+
+
+def test_a_memory_must_fit_the_model():
+    with pytest.raises(ValueError, match="leave it out"):
+        run(smooth_model(), steps=2, memory=torch.zeros(2, 2))
+    for wrong in (torch.zeros(2, 3), torch.full((2, 2), torch.nan)):
+        with pytest.raises(ValueError, match="memory"):
+            run(named_model("ALFM"), steps=2, memory=wrong)
+
+
+def test_gradients_reach_every_class_that_was_there():
+    model = named_model("ALFM")
+    out = rollout(CHAIN, model, *MOVING, sample_time=5e-4, steps=60)
+    out.q.sum().backward()
+    slope = model.schedule.raw.grad
+    known = model.schedule.classes(out.qd.detach()[:-1], out.qdd.detach()[:-1])
+    for joint in range(2):
+        for c in range(3):
+            assert bool(slope[joint, c].any()) == bool((known[:, joint] == c).any())
 
 
 def test_threads_change_nothing():

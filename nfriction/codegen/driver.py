@@ -2,17 +2,22 @@
 
 `driver_c` and `driver_python` put the same RK4 driver around them. Both give it the same entry
 point `nf_rollout` with the same arguments: candidates `first` to `last`, flat arrays and strides.
+Python's also takes what C computes once a candidate.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from nfriction.codegen.graph import Program
 from nfriction.codegen.partition import partition
-from nfriction.codegen.scalar import Level, Node
+from nfriction.codegen.scalar import Level, Node, evaluate
 
 LEVELS = {
     "qd_held": Level.STEP,
     "qdd_held": Level.STEP,
+    "memory": Level.STEP,
     "tau": Level.STEP,
     "q": Level.STAGE,
     "qd": Level.STAGE,
@@ -31,7 +36,10 @@ class Pieces:
         step: values computed once a step.
         stage: acceleration with friction.
         start: acceleration without friction, which seeds the held acceleration.
+        begin: memory of the coefficients after the first sample; empty where they have none.
+        advance: memory after a sample, from that before.
         inputs: text of the input nodes by number, elements of arrays.
+        offsets: where each parameter begins in the array `p`.
     """
 
     joints: int
@@ -40,7 +48,27 @@ class Pieces:
     step: tuple[Node, ...]
     stage: tuple[Node, ...]
     start: tuple[Node, ...]
+    begin: tuple[Node, ...]
+    advance: tuple[Node, ...]
     inputs: dict[int, str]
+    offsets: dict[str, int]
+
+    def evaluate(
+        self, outputs: Sequence[Node], given: Mapping[str, np.ndarray], rows: int
+    ) -> np.ndarray:
+        """Values of some of these nodes in NumPy, all candidates at once, flat.
+
+        Args:
+            outputs: what to compute.
+            given: arrays by the names that `inputs` uses, (rows or 1, size).
+            rows: number of candidates.
+        """
+        inputs = {name: given["p"][:, offset:] for name, offset in self.offsets.items()}
+        columns = evaluate(outputs, {**inputs, **given})
+        table = np.empty((rows, len(outputs)))
+        for i, column in enumerate(columns):
+            table[:, i] = column
+        return table.reshape(-1)
 
     @property
     def hoisted(self) -> dict[int, str]:
@@ -50,17 +78,26 @@ class Pieces:
 
 
 def pieces(program: Program) -> Pieces:
-    """Arrange a program with outputs (stage, start) by how often its values are needed."""
-    stage, start = program.outputs
+    """Arrange a program's outputs by how often their values are needed.
+
+    Args:
+        program: with outputs (stage, start), or (stage, start, begin, advance) where the
+            coefficients have a memory.
+    """
+    stage, start, *remembered = program.outputs
+    begin, advance = (port.nodes for port in remembered) if remembered else ((), ())
     joints = len(stage.nodes)
     split = partition(program.graph, stage.nodes)
     inputs: dict[int, str] = {}
+    offsets: dict[str, int] = {}
     offset = 0
     for port in program.inputs:
         held = port.name in LEVELS
         for i, node in enumerate(port.nodes):
             inputs[node.number] = f"{port.name}[{i}]" if held else f"p[{offset + i}]"
-        offset += 0 if held else len(port.nodes)
+        if not held:
+            offsets[port.name] = offset
+            offset += len(port.nodes)
     return Pieces(
         joints,
         offset,
@@ -68,12 +105,17 @@ def pieces(program: Program) -> Pieces:
         split.hoisted[Level.STEP],
         split.outputs,
         start.nodes,
+        begin,
+        advance,
         inputs,
+        offsets,
     )
 
 
 # Argument arrays of the functions, in order.
 ONCE = ["p"]
-STEP = ["p", "once", "tau", "qd_held", "qdd_held"]
-STAGE = ["p", "once", "step", "tau", "qd_held", "qdd_held", "q", "qd"]
+STEP = ["p", "once", "tau", "qd_held", "qdd_held", "memory"]
+STAGE = ["p", "once", "step", "tau", "qd_held", "qdd_held", "memory", "q", "qd"]
 START = ["p", "tau", "q", "qd"]
+BEGIN = ["p", "qd_held", "qdd_held"]
+ADVANCE = ["p", "qd_held", "qdd_held", "memory"]

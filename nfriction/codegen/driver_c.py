@@ -3,7 +3,7 @@
 from string import Template
 
 from nfriction.codegen import lanes
-from nfriction.codegen.driver import ONCE, STAGE, START, STEP, Pieces
+from nfriction.codegen.driver import ADVANCE, BEGIN, ONCE, STAGE, START, STEP, Pieces
 from nfriction.codegen.emit import c_function, c_prelude
 
 
@@ -18,8 +18,17 @@ def c_source(parts: Pieces) -> str:
         c_function("nf_stage", STAGE, {"qdd": parts.stage}, known, collect=True),
         c_function("nf_start", START, {"qdd": parts.start}, parts.inputs, qualifier=seldom),
     ]
+    if parts.advance:
+        functions += [
+            c_function("nf_begin", BEGIN, {"next": parts.begin}, parts.inputs, qualifier=seldom),
+            c_function("nf_advance", ADVANCE, {"next": parts.advance}, parts.inputs),
+        ]
     driver = _C_DRIVER.substitute(
-        N=parts.joints, NO=max(1, len(parts.once)), NS=max(1, len(parts.step))
+        N=parts.joints,
+        NO=max(1, len(parts.once)),
+        NS=max(1, len(parts.step)),
+        NM=max(1, len(parts.advance)),
+        remember=_C_REMEMBER if parts.advance else "",
     )
     return "\n".join([c_prelude(), lanes.PRELUDE, _SELDOM, *functions, driver])
 
@@ -33,6 +42,16 @@ _SELDOM = """\
 #endif
 """
 
+# Through a second array, for a function reads its inputs to its last line.
+_C_REMEMBER = """
+            if (k > 0)
+                nf_advance(p, held, seen, memory, advanced);
+            else if (first)
+                for (i = 0; i < NM; ++i) advanced[i] = first[i];
+            else
+                nf_begin(p, held, seen, advanced);
+            for (i = 0; i < NM; ++i) memory[i] = advanced[i];"""
+
 _C_DRIVER = Template("""\
 #if defined(_WIN32)
 #define NF_EXPORT __declspec(dllexport)
@@ -40,6 +59,7 @@ _C_DRIVER = Template("""\
 #define NF_EXPORT
 #endif
 #define N $N
+#define NM $NM
 
 /* Not finite compares false, so NaN and infinity count as beyond the limit. */
 static int nf_within(const double *q, const double *qd, double limit)
@@ -51,17 +71,20 @@ static int nf_within(const double *q, const double *qd, double limit)
 }
 
 /* Fills the records of one candidate; returns the step at which it diverged, or -1. */
-static ptrdiff_t nf_candidate(ptrdiff_t steps, ptrdiff_t every, double limit, const double *p,
-    const double *q0, const double *qd0, const double *h, ptrdiff_t h_step,
+static ptrdiff_t nf_candidate(ptrdiff_t steps, ptrdiff_t every, ptrdiff_t hold, double limit,
+    const double *p, const double *q0, const double *qd0, const double *h, ptrdiff_t h_step,
     const double *torque, ptrdiff_t torque_step,
-    const double *qd_drive, const double *qdd_drive, ptrdiff_t drive_step,
+    const double *qd_drive, const double *qdd_drive, ptrdiff_t drive_step, const double *first,
     double *q_out, double *qd_out, double *qdd_out)
 {
     double once[$NO], step[$NS];
-    double q[N], qd[N], held[N], prev[N], x[N], tau[N];
+    double memory[NM], advanced[NM];
+    double q[N], qd[N], held[N], seen[N], prev[N], x[N], tau[N];
     double a1[N], a2[N], a3[N], a4[N], v2[N], v3[N], v4[N];
-    ptrdiff_t k, next = every;
+    ptrdiff_t k, next = every, renew = 0;
     int i;
+    (void)first;
+    for (i = 0; i < NM; ++i) memory[i] = advanced[i] = 0.0;
     for (i = 0; i < N; ++i) {
         q_out[i] = q[i] = q0[i];
         qd_out[i] = qd[i] = qd0[i];
@@ -74,32 +97,31 @@ static ptrdiff_t nf_candidate(ptrdiff_t steps, ptrdiff_t every, double limit, co
     qdd_out += N;
     for (k = 0; k < steps; ++k) {
         const double dt = h[k * h_step], half = 0.5 * dt, sixth = dt / 6.0;
-        for (i = 0; i < N; ++i) {
-            tau[i] = torque[k * torque_step + i];
-            held[i] = qd[i];
-        }
-        if (drive_step)
+        for (i = 0; i < N; ++i) tau[i] = torque[k * torque_step + i];
+        if (k == renew) {
+            renew += hold;
             for (i = 0; i < N; ++i) {
-                held[i] = qd_drive[k * drive_step + i];
-                prev[i] = qdd_drive[k * drive_step + i];
-            }
-        nf_step(p, once, tau, held, prev, step);
-        nf_stage(p, once, step, tau, held, prev, q, qd, a1);
+                held[i] = drive_step ? qd_drive[k * drive_step + i] : qd[i];
+                seen[i] = drive_step ? qdd_drive[k * drive_step + i] : prev[i];
+            }$remember
+        }
+        nf_step(p, once, tau, held, seen, memory, step);
+        nf_stage(p, once, step, tau, held, seen, memory, q, qd, a1);
         for (i = 0; i < N; ++i) {
             x[i] = q[i] + half * qd[i];
             v2[i] = qd[i] + half * a1[i];
         }
-        nf_stage(p, once, step, tau, held, prev, x, v2, a2);
+        nf_stage(p, once, step, tau, held, seen, memory, x, v2, a2);
         for (i = 0; i < N; ++i) {
             x[i] = q[i] + half * v2[i];
             v3[i] = qd[i] + half * a2[i];
         }
-        nf_stage(p, once, step, tau, held, prev, x, v3, a3);
+        nf_stage(p, once, step, tau, held, seen, memory, x, v3, a3);
         for (i = 0; i < N; ++i) {
             x[i] = q[i] + dt * v3[i];
             v4[i] = qd[i] + dt * a3[i];
         }
-        nf_stage(p, once, step, tau, held, prev, x, v4, a4);
+        nf_stage(p, once, step, tau, held, seen, memory, x, v4, a4);
         for (i = 0; i < N; ++i) {
             q[i] += sixth * (qd[i] + 2.0 * (v2[i] + v3[i]) + v4[i]);
             qd[i] += sixth * (a1[i] + 2.0 * (a2[i] + a3[i]) + a4[i]);
@@ -127,18 +149,20 @@ static ptrdiff_t nf_candidate(ptrdiff_t steps, ptrdiff_t every, double limit, co
 }
 
 NF_EXPORT void nf_rollout(ptrdiff_t first, ptrdiff_t last, ptrdiff_t steps, ptrdiff_t every,
-    double limit, const double *p, ptrdiff_t p_row, const double *q0, const double *qd0,
-    const double *h, ptrdiff_t h_row, ptrdiff_t h_step,
+    ptrdiff_t hold, double limit, const double *p, ptrdiff_t p_row,
+    const double *q0, const double *qd0, const double *h, ptrdiff_t h_row, ptrdiff_t h_step,
     const double *torque, ptrdiff_t torque_row, ptrdiff_t torque_step,
     const double *qd_drive, const double *qdd_drive, ptrdiff_t drive_row, ptrdiff_t drive_step,
+    const double *memory, ptrdiff_t remembered,
     double *q_out, double *qd_out, double *qdd_out, ptrdiff_t *diverged)
 {
     const ptrdiff_t records = (steps / every + 1) * N;
     ptrdiff_t c;
     for (c = first; c < last; ++c)
-        diverged[c] = nf_candidate(steps, every, limit, p + c * p_row, q0 + c * N, qd0 + c * N,
-            h + c * h_row, h_step, torque + c * torque_row, torque_step,
+        diverged[c] = nf_candidate(steps, every, hold, limit, p + c * p_row,
+            q0 + c * N, qd0 + c * N, h + c * h_row, h_step, torque + c * torque_row, torque_step,
             qd_drive + c * drive_row, qdd_drive + c * drive_row, drive_step,
+            remembered ? memory + c * NM : NULL,
             q_out + c * records, qd_out + c * records, qdd_out + c * records);
 }
 """)

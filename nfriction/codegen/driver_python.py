@@ -2,13 +2,17 @@
 
 from string import Template
 
-from nfriction.codegen.driver import LEVELS, ONCE, STAGE, START, STEP, Pieces
+from nfriction.codegen import lanes_python
+from nfriction.codegen.driver import ADVANCE, BEGIN, LEVELS, STAGE, STEP, Pieces
 from nfriction.codegen.emit import PYTHON_PRELUDE, python_function
 
 
 def python_source(parts: Pieces) -> str:
-    """The Python module of a rollout, for numba."""
-    n = parts.joints
+    """The Python module of a rollout, for numba.
+
+    What is computed once a rollout comes as an argument: long functions that run once would take
+    most of the time to compile.
+    """
     known = parts.inputs | parts.hoisted
     below = {node.number: known[node.number] for node in parts.once} | parts.inputs
 
@@ -16,21 +20,31 @@ def python_source(parts: Pieces) -> str:
         # States are scalars rather than arrays: numba keeps those in registers.
         return {number: _scalar(text) for number, text in bound.items()}
 
-    stage = [a for name in STAGE for a in (_names(name, n) if name in LEVELS else [name])]
-    step = [a for name in STEP for a in (_names(name, n) if name in LEVELS else [name])]
-    start = [a for name in START for a in (_names(name, n) if name in LEVELS else [name])]
+    def spread(arguments: list[str]) -> list[str]:
+        return [a for name in arguments for a in _spread(name, parts)]
+
     functions = [
-        python_function("nf_once", ONCE, parts.once, parts.inputs, into="once"),
-        python_function("nf_step", step, parts.step, scalars(below), into="step"),
-        python_function("nf_stage", stage, parts.stage, scalars(known)),
-        python_function("nf_start", start, parts.start, scalars(parts.inputs)),
+        lanes_python.function("nf_step", spread(STEP), parts.step, scalars(below), into="step"),
+        lanes_python.function("nf_stage", spread(STAGE), parts.stage, scalars(known)),
     ]
+    if parts.advance:
+        functions += [
+            python_function("nf_begin", spread(BEGIN), parts.begin, scalars(parts.inputs)),
+            python_function("nf_advance", spread(ADVANCE), parts.advance, scalars(parts.inputs)),
+        ]
     driver = _PYTHON_DRIVER.substitute(_python_names(parts))
-    return "\n\n".join([PYTHON_PRELUDE, *functions, driver])
+    return "\n\n".join([PYTHON_PRELUDE + lanes_python.prelude(), *functions, driver])
 
 
 def _names(name: str, n: int) -> list[str]:
     return [f"{name}_{i}" for i in range(n)]
+
+
+def _spread(name: str, parts: Pieces) -> list[str]:
+    """A state's array as the scalars that stand for it; what lives longer stays an array."""
+    if name not in LEVELS:
+        return [name]
+    return _names(name, len(parts.advance) if name == "memory" else parts.joints)
 
 
 def _scalar(text: str) -> str:
@@ -49,26 +63,26 @@ def _python_names(parts: Pieces) -> dict[str, object]:
     def lines(pattern: str, indent: int) -> str:
         return ("\n" + " " * indent).join(pattern.replace("#", str(i)) for i in n)
 
-    held = ", ".join([*_names("tau", count), *_names("qd_held", count), *_names("qdd_held", count)])
+    held, memory = _names("qd_held", count) + _names("qdd_held", count), _spread("memory", parts)
     return {
         "N": count,
-        "NO": max(1, len(parts.once)),
+        "NM": max(1, len(parts.advance)),
         "NS": max(1, len(parts.step)),
-        "held": held,
+        "held": ", ".join([*_names("tau", count), *held, *memory]),
         "q": each("q_#"),
         "qd": each("qd_#"),
         "q_args": ", ".join(_names("q", count)),
         "qd_args": ", ".join(_names("qd", count)),
-        "tau_args": ", ".join(_names("tau", count)),
         "initial": lines("q_# = q0[#]; qd_# = qd0[#]; q_out[#] = q_#; qd_out[#] = qd_#", 4),
-        "first_tau": lines("tau_# = torque[#]", 4),
-        "first_qdd": lines("qdd_out[#] = qdd_held_#", 4),
-        "start_out": each("qdd_held_#"),
-        "seed": lines("qdd_held_# = 0.0", 4),
-        "take": lines("tau_# = torque[k * torque_step + #]; qd_held_# = qd_#", 8),
+        "first_qdd": lines("prev_# = start[#]; qdd_out[#] = prev_#", 4),
+        "seed": lines("qd_held_# = qdd_held_# = 0.0", 4),
+        "memory_seed": "\n    ".join(f"{name} = 0.0" for name in memory),
+        "take": lines("tau_# = torque[k * torque_step + #]", 8),
+        "hold": lines("qd_held_# = qd_#; qdd_held_# = prev_#", 12),
+        "remember": _remember(", ".join(held), ", ".join(memory)) if memory else "",
         "drive": lines(
             "qd_held_# = qd_drive[k * drive_step + #]; qdd_held_# = qdd_drive[k * drive_step + #]",
-            12,
+            16,
         ),
         "a1": each("a1_#"),
         "a2": each("a2_#"),
@@ -83,39 +97,49 @@ def _python_names(parts: Pieces) -> dict[str, object]:
         "v4": ", ".join(_names("v4", count)),
         "advance": lines(
             "q_# += sixth * (qd_# + 2.0 * (v2_# + v3_#) + v4_#); "
-            "qd_# += sixth * (a1_# + 2.0 * (a2_# + a3_#) + a4_#); qdd_held_# = a1_#",
+            "qd_# += sixth * (a1_# + 2.0 * (a2_# + a3_#) + a4_#); prev_# = a1_#",
             8,
         ),
         "within": " and ".join(f"abs(qd_{i}) <= limit and q_{i} - q_{i} == 0.0" for i in n),
-        "record": lines(
-            "q_out[at + #] = q_#; qd_out[at + #] = qd_#; qdd_out[at + #] = qdd_held_#", 12
-        ),
+        "record": lines("q_out[at + #] = q_#; qd_out[at + #] = qd_#; qdd_out[at + #] = prev_#", 12),
     }
+
+
+def _remember(held: str, memory: str) -> str:
+    given = f"{memory}, = " + ", ".join(f"first[{i}]" for i in range(memory.count(",") + 1))
+    return f"""
+            if k > 0:
+                {memory}, = nf_advance(p, {held}, {memory})
+            elif remembered:
+                {given},
+            else:
+                {memory}, = nf_begin(p, {held})"""
 
 
 _PYTHON_DRIVER = Template("""\
 @njit(error_model="numpy", fastmath={"contract"})
 def nf_candidate(
-    steps, every, limit, p, q0, qd0, h, h_step, torque, torque_step,
-    qd_drive, qdd_drive, drive_step, q_out, qd_out, qdd_out,
+    once, start, steps, every, hold, limit, p, q0, qd0, h, h_step, torque, torque_step,
+    qd_drive, qdd_drive, drive_step, first, remembered, q_out, qd_out, qdd_out,
 ):
-    once = np.empty($NO)
     step = np.empty($NS)
     $initial
     $seed
-    nf_once(p, once)
-    $first_tau
-    $start_out = nf_start(p, $tau_args, $q_args, $qd_args)
     $first_qdd
     at = $N
     next = every
+    renew = 0
+    $memory_seed
     for k in range(steps):
         dt = h[k * h_step]
         half = 0.5 * dt
         sixth = dt / 6.0
         $take
-        if drive_step:
-            $drive
+        if k == renew:
+            renew += hold
+            $hold
+            if drive_step:
+                $drive$remember
         nf_step(p, once, $held, step)
         $a1 = nf_stage(p, once, step, $held, $q_args, $qd_args)
         $to2
@@ -139,16 +163,19 @@ def nf_candidate(
 
 @njit(error_model="numpy", nogil=True, cache=True)
 def nf_rollout(
-    first, last, steps, every, limit, p, p_row, q0, qd0, h, h_row, h_step,
-    torque, torque_row, torque_step, qd_drive, qdd_drive, drive_row, drive_step,
+    once, once_row, start, first, last, steps, every, hold, limit, p, p_row,
+    q0, qd0, h, h_row, h_step, torque, torque_row, torque_step,
+    qd_drive, qdd_drive, drive_row, drive_step, memory, remembered,
     q_out, qd_out, qdd_out, diverged,
 ):
     records = (steps // every + 1) * $N
     for c in range(first, last):
         diverged[c] = nf_candidate(
-            steps, every, limit, p[c * p_row :], q0[c * $N :], qd0[c * $N :],
+            once[(c - first) * once_row :], start[(c - first) * $N :],
+            steps, every, hold, limit, p[c * p_row :], q0[c * $N :], qd0[c * $N :],
             h[c * h_row :], h_step, torque[c * torque_row :], torque_step,
             qd_drive[c * drive_row :], qdd_drive[c * drive_row :], drive_step,
+            memory[c * $NM * remembered :], remembered,
             q_out[c * records : (c + 1) * records], qd_out[c * records : (c + 1) * records],
             qdd_out[c * records : (c + 1) * records],
         )

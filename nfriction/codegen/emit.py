@@ -18,7 +18,7 @@ Real = Literal["double", "float"]
 _INLINE = 64  # characters; longer single-use values get a line of their own
 
 # How tightly an operator binds; an atom or a call binds tightest.
-_ATOM, _UNARY, _PRODUCT, _SUM, _COMPARE, _NOT, _AND, _OR = 9, 8, 7, 6, 5, 4, 3, 2
+ATOM, _UNARY, _PRODUCT, _SUM, _COMPARE, _NOT, _AND, _OR = 9, 8, 7, 6, 5, 4, 3, 2
 _INFIX = {
     "add": ("+", _SUM),
     "sub": ("-", _SUM),
@@ -154,17 +154,17 @@ def statements(
 
     def write(node: Node) -> None:
         if node.number in bound:
-            texts[node.number] = bound[node.number], _ATOM
+            texts[node.number] = bound[node.number], ATOM
         elif node.op == "constant":
-            texts[node.number] = dialect.literal(node.value), _ATOM
+            texts[node.number] = dialect.literal(node.value), ATOM
         elif node.op == "input":
             raise AssertionError(f"input {node.value} has no name here")
         else:
-            text, binding = _expression(node, texts, dialect)
+            text, binding = expression(node.op, [texts[a.number] for a in node.args], dialect)
             if uses[node.number] > 1 or len(text) > _INLINE:
                 name = f"t{len(lines)}"
                 lines.append(dialect.define(name, text, is_predicate(node)))
-                text, binding = name, _ATOM
+                text, binding = name, ATOM
             texts[node.number] = text, binding
 
     waiting: dict[str, list[Node]] = {}
@@ -192,33 +192,32 @@ def _collected(
     call = lanes.call(family, len(lines), [texts[number][0] for number in arguments])
     for node in calls:
         results = call.cosines if node.op == "cos" else call.results
-        texts[node.number] = results[arguments.index(node.args[0].number)], _ATOM
+        texts[node.number] = results[arguments.index(node.args[0].number)], ATOM
     lines += call.lines
 
 
-def _expression(
-    node: Node, texts: Mapping[int, tuple[str, int]], dialect: Dialect
-) -> tuple[str, int]:
-    def operand(argument: Node, binding: int) -> str:
-        text, own = texts[argument.number]
+def expression(op: str, operands: Sequence[tuple[str, int]], dialect: Dialect) -> tuple[str, int]:
+    """Text of an operation, and how tightly it binds, of operands given likewise."""
+
+    def operand(i: int, binding: int) -> str:
+        text, own = operands[i]
         return text if own >= binding else f"({text})"
 
-    args = node.args
-    if node.op in _INFIX:
-        sign, binding = _INFIX[node.op]
+    if op in _INFIX:
+        sign, binding = _INFIX[op]
         # Python chains comparisons, so those never stand side by side.
-        left = operand(args[0], binding + (binding == _COMPARE))
-        return f"{left} {sign} {operand(args[1], binding + 1)}", binding
-    if node.op == "neg":
-        return f"-{operand(args[0], _ATOM)}", _UNARY
-    if node.op == "not":
-        return f"{dialect.logical('not')}{operand(args[0], _ATOM)}", _NOT
-    if node.op in ("and", "or"):
-        sides = f" {dialect.logical(node.op)} ".join(operand(a, _ATOM) for a in args)
-        return sides, _AND if node.op == "and" else _OR
-    if node.op == "where":
-        return dialect.where(*(operand(a, _SUM) for a in args)), _ATOM
-    return dialect.call(node.op, [texts[a.number][0] for a in args]), _ATOM
+        left = operand(0, binding + (binding == _COMPARE))
+        return f"{left} {sign} {operand(1, binding + 1)}", binding
+    if op == "neg":
+        return f"-{operand(0, ATOM)}", _UNARY
+    if op == "not":
+        return f"{dialect.logical('not')}{operand(0, ATOM)}", _NOT
+    if op in ("and", "or"):
+        sides = [operand(i, ATOM) for i in range(len(operands))]
+        return f" {dialect.logical(op)} ".join(sides), _AND if op == "and" else _OR
+    if op == "where":
+        return dialect.where(*(operand(i, _SUM) for i in range(3))), ATOM
+    return dialect.call(op, [text for text, _ in operands]), ATOM
 
 
 def c_function(

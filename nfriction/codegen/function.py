@@ -2,6 +2,7 @@
 
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -191,26 +192,58 @@ def emit_c(
     names = [name, *inputs, *outputs]
     if len(set(names)) < len(names) or not all(n.isidentifier() and n.isascii() for n in names):
         raise ValueError(f"names must be different C identifiers, got {names}.")
-    lifted = Lifted(Method(function))
-    program = lifted.trace(dict(inputs), dict.fromkeys(inputs, Level.STAGE))
+    folded = fold(function, inputs)
+    program, groups = folded.program, folded.outputs
     if len(outputs) != len(program.outputs):
         raise ValueError(f"`outputs` must name {len(program.outputs)} tensors, got {outputs}.")
-    split, groups = _split(program)
-    table = _read_parameters(split)
-    values = evaluate(table, _port_values(program, lifted))
-    bound = {node.number: f"{name}_table[{i}]" for i, node in enumerate(table)}
+    bound = {number: f"{name}_table[{i}]" for i, number in enumerate(folded.known)}
     bound |= {n.number: f"{p.name}[{i}]" for p in program.inputs for i, n in enumerate(p.nodes)
               if p.name in inputs}  # fmt: skip
+    values = list(folded.known.values())
     body = c_function(
         name, list(inputs), dict(zip(outputs, groups, strict=True)), bound, real, qualifier=""
     )
     return "\n".join([c_prelude(real), _table(name, values, real), body])
 
 
-def _table(name: str, values: Sequence[Array], real: Real) -> str:
+@dataclass(frozen=True)
+class Folded:
+    """A traced function in which all that depends on parameters alone is a known number.
+
+    Attributes:
+        program: what was traced.
+        outputs: nodes of each output, in row-major order.
+        known: value of each node that the parameters decide and others read, by node number.
+    """
+
+    program: Program
+    outputs: list[tuple[Node, ...]]
+    known: dict[int, float]
+
+
+def fold(function: Callable[..., Any], inputs: Mapping[str, Tensor]) -> Folded:
+    """Trace a function and compute, in float64, what its parameters decide.
+
+    Args:
+        function: a module, a bound method of one, or any callable.
+        inputs: example tensors (float64) by name, in the order of the function's arguments.
+
+    Raises:
+        UnsupportedOperation: an operation without scalar form.
+    """
+    lifted = Lifted(Method(function))
+    program = lifted.trace(dict(inputs), dict.fromkeys(inputs, Level.STAGE))
+    split, groups = _split(program)
+    table = _read_parameters(split)
+    values = evaluate(table, _port_values(program, lifted))
+    known = {node.number: float(v) for node, v in zip(table, values, strict=True)}
+    return Folded(program, groups, known)
+
+
+def _table(name: str, values: Sequence[float], real: Real) -> str:
     if not values:
         return ""
-    literals = [C(real).literal(float(v)) for v in values]
+    literals = [C(real).literal(v) for v in values]
     lines = [", ".join(literals[i : i + 4]) for i in range(0, len(literals), 4)]
     body = ",\n    ".join(lines)
     return f"static const {real} {name}_table[{len(values)}] = {{\n    {body}\n}};\n"

@@ -60,10 +60,10 @@ def _horner(target: str, variable: str, coefficients: Sequence[str]) -> str:
     return "\n".join(f"        {target} = {target} * {variable} + {c};" for c in coefficients)
 
 
-_EXP = ["479001600.0", "39916800.0", "3628800.0", "362880.0", "40320.0", "5040.0", "720.0",
+EXP = ["479001600.0", "39916800.0", "3628800.0", "362880.0", "40320.0", "5040.0", "720.0",
         "120.0", "24.0", "6.0", "2.0"]  # fmt: skip
-_SIN = ["-1307674368000.0", "6227020800.0", "-39916800.0", "362880.0", "-5040.0", "120.0", "-6.0"]
-_COS = ["-87178291200.0", "479001600.0", "-3628800.0", "40320.0", "-720.0", "24.0"]
+SIN = ["-1307674368000.0", "6227020800.0", "-39916800.0", "362880.0", "-5040.0", "120.0", "-6.0"]
+COS = ["-87178291200.0", "479001600.0", "-3628800.0", "40320.0", "-720.0", "24.0"]
 
 PRELUDE = f"""
 #include <stdint.h>
@@ -89,7 +89,7 @@ NF_LANES void nf_exp4(double *x)
         const double r = (v - n * 0.6931471803691238) - n * 1.9082149292705877e-10;
         double p = 1.0 / 6227020800.0, scale;
         uint64_t bits;
-{_horner("p", "r", [f"1.0 / {c}" for c in _EXP])}
+{_horner("p", "r", [f"1.0 / {c}" for c in EXP])}
         memcpy(&bits, &t, 8);
         bits = (bits + 1023) << 52;
         memcpy(&scale, &bits, 8);
@@ -107,7 +107,7 @@ NF_LANES void nf_tanh4(double *x)
         const double r = (v - n * 0.6931471803691238) - n * 1.9082149292705877e-10;
         double p = 1.0 / 6227020800.0, scale, e;
         uint64_t bits;
-{_horner("p", "r", [f"1.0 / {c}" for c in _EXP])}
+{_horner("p", "r", [f"1.0 / {c}" for c in EXP])}
         memcpy(&bits, &t, 8);
         bits = (bits + 1023) << 52;
         memcpy(&scale, &bits, 8);
@@ -133,8 +133,8 @@ NF_LANES void nf_sincos4(double *NF_APART x, double *NF_APART c)
         const double z = r * r;
         double s = 1.0 / 355687428096000.0, d = 1.0 / 20922789888000.0, w;
         uint64_t bits, sine, cosine, swap;
-{_horner("s", "z", [f"1.0 / {c}" for c in _SIN])}
-{_horner("d", "z", [f"1.0 / {c}" for c in _COS])}
+{_horner("s", "z", [f"1.0 / {c}" for c in SIN])}
+{_horner("d", "z", [f"1.0 / {c}" for c in COS])}
         s = r + r * z * s;
         w = 1.0 - 0.5 * z;
         d = w + (((1.0 - w) - 0.5 * z) + z * z * d);

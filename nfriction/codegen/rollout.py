@@ -34,7 +34,11 @@ class Plant(Protocol):
 
 
 class Friction(Protocol):
-    """What a rollout needs of a friction model; a module."""
+    """What a rollout needs of a friction model; a module.
+
+    One whose coefficients have a memory also has `state_size` > 0, `initial_state(qd, qdd)`,
+    `advance(qd, qdd, state)` and `coefficients_from(qd, qdd, state)`.
+    """
 
     def coefficients(self, qd: Tensor, qdd: Tensor) -> Tensor: ...
     def torque(self, qd: Tensor, load: Tensor, coefficients: Tensor) -> Tensor: ...
@@ -66,14 +70,28 @@ class _Fused(nn.Module):
         self.plant = cast(Any, plant)
         self.friction = cast(Any, friction)
         self.hold = hold
+        self.remembers = int(getattr(friction, "state_size", 0)) > 0
 
     def forward(
-        self, q: Tensor, qd: Tensor, tau: Tensor, qd_held: Tensor, qdd_held: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        c = self.friction.coefficients(qd_held if self.hold else qd, qdd_held)
+        self,
+        q: Tensor,
+        qd: Tensor,
+        tau: Tensor,
+        qd_held: Tensor,
+        qdd_held: Tensor,
+        memory: Tensor | None = None,
+    ) -> tuple[Tensor, ...]:
+        if memory is None:
+            c = self.friction.coefficients(qd_held if self.hold else qd, qdd_held)
+        else:
+            c = self.friction.coefficients_from(qd_held, qdd_held, memory)
         tau_f = self.friction.torque(qd, self.plant.load(q, qd), c)
         with_friction = self.plant.forward_dynamics(q, qd, tau - tau_f)
-        return with_friction, self.plant.forward_dynamics(q, qd, tau)
+        without = self.plant.forward_dynamics(q, qd, tau)
+        if memory is None:
+            return with_friction, without
+        begin = self.friction.initial_state(qd_held, qdd_held)
+        return with_friction, without, begin, self.friction.advance(qd_held, qdd_held, memory)
 
 
 def compile_rollout(
@@ -91,30 +109,42 @@ def compile_rollout(
         backend: "c", "numba", or "auto" for the first of them that is there.
         hold: hold the coefficients over a step, from its first state and the step before's
             acceleration; otherwise evaluate them in every stage, with that same acceleration.
+            Coefficients with a memory are always held.
 
     Raises:
         NoBackend: no C compiler and no numba.
         UnsupportedOperation: the modules use an operation that has no scalar form here.
         CompilerError: the C compiler failed; the message tells how.
         SelfCheckFailed: the compiled acceleration is not the eager one.
+        ValueError: coefficients with a memory are not to be held.
     """
     served = build.choose(backend)
     for name, module in (("plant", plant), ("friction", friction)):
         if not isinstance(module, nn.Module):
             raise TypeError(f"`{name}` must be a torch module, got {type(module).__name__}.")
-    lifted = Lifted(_Fused(plant, friction, hold))
-    examples = dict(zip(driver.LEVELS, _states(plant.joints, seed=0), strict=True))
+    fused = _Fused(plant, friction, hold)
+    if fused.remembers and not hold:
+        raise ValueError("coefficients with a memory are held over a step; use `hold=True`.")
+    lifted = Lifted(fused)
+    examples = dict(zip(EXAMPLES, _states(plant.joints, seed=0), strict=True))
+    if fused.remembers:
+        with torch.no_grad():
+            rest = torch.zeros(plant.joints, dtype=torch.float64, device=lifted.device)
+            examples["memory"] = fused.friction.initial_state(rest, rest)
     parts = driver.pieces(lifted.trace(examples, driver.LEVELS))
     source = (driver_c.c_source if served == "c" else driver_python.python_source)(parts)
-    kernel = _c_kernel(source) if served == "c" else build.build_numba(source).nf_rollout
+    kernel = _c_kernel(source) if served == "c" else _numba_kernel(source, parts)
     compiled = CompiledRollout(served, source, lifted, kernel)
     compiled.check()
     return compiled
 
 
+EXAMPLES = ("qd_held", "qdd_held", "tau", "q", "qd")
+
+
 def _states(joints: int, seed: int) -> list[Tensor]:
     generator = torch.Generator().manual_seed(seed)
-    scales = (3.0, 10.0, 1.0, 1.0, 3.0)  # qd_held, qdd_held, tau, q, qd: as mechanisms move
+    scales = (3.0, 10.0, 1.0, 1.0, 3.0)  # of `EXAMPLES`, as mechanisms move
     return [s * torch.randn(joints, generator=generator, dtype=torch.float64) for s in scales]
 
 
@@ -123,13 +153,36 @@ def _c_kernel(source: str) -> Callable[..., None]:
     size, real, array = ctypes.c_ssize_t, ctypes.c_double, ctypes.c_void_p
     function.restype = None
     function.argtypes = [
-        *(size, size, size, size, real, array, size, array, array, array, size, size),
-        *(array, size, size, array, array, size, size, array, array, array, array),
+        *(size, size, size, size, size, real, array, size, array, array, array, size, size),
+        *(array, size, size, array, array, size, size, array, size),
+        *(array, array, array, array),
     ]
 
     def call(*args: Any) -> None:
         # ctypes lets go of the GIL while the function runs.
         function(*(a.ctypes.data if isinstance(a, np.ndarray) else a for a in args))
+
+    return call
+
+
+def _numba_kernel(source: str, parts: driver.Pieces) -> Callable[..., None]:
+    function = build.build_numba(source).nf_rollout
+
+    def call(first: int, last: int, *args: Any) -> None:
+        p, p_row, q0, qd0 = args[4:8]
+        tau, tau_row = args[11:13]
+        n, count = parts.joints, last - first
+
+        def rows(flat: Array, stride: int, width: int) -> Array:
+            begins = stride * np.arange(first, last) if stride else np.zeros(1, dtype=int)
+            return flat[begins[:, None] + np.arange(width)]
+
+        # Once a candidate, so NumPy is quick enough, and numba has less to compile.
+        given = {"p": rows(p, p_row, parts.parameters), "tau": rows(tau, tau_row, n)}
+        given |= {"q": rows(q0, n, n), "qd": rows(qd0, n, n)}
+        once = parts.evaluate(parts.once, given, count if p_row else 1)
+        start = parts.evaluate(parts.start, given, count)
+        function(once, len(parts.once) if p_row else 0, start, first, last, *args)
 
     return call
 
@@ -166,6 +219,8 @@ class CompiledRollout:
         drive: tuple[Any, Any] | None = None,
         threads: int = 1,
         record_every: int | None = 1,
+        hold_for: int = 1,
+        memory: Any = None,
         speed_limit: float = SPEED_LIMIT,
     ) -> Trajectories:
         """Integrate all candidates from their initial states.
@@ -183,6 +238,10 @@ class CompiledRollout:
             threads: candidates are shared out among this many.
             record_every: record the initial state and every `record_every`-th one; None records the
                 initial and the final state.
+            hold_for: steps over which held coefficients stay as they are; where they have a
+                memory, it advances as often.
+            memory: what the coefficients remember after the first sample, (candidate, joint,
+                state_size), one row serves all; by default what they would of that sample alone.
             speed_limit: a candidate faster than this [rad/s] has diverged and is stopped.
 
         Returns:
@@ -195,6 +254,11 @@ class CompiledRollout:
             raise ValueError(
                 "`steps` must be 0 or more, `record_every` and `threads` 1 or more, got "
                 f"{steps}, {record_every} and {threads}."
+            )
+        if hold_for < 1 or (hold_for > 1 and not self._fused.hold):
+            raise ValueError(
+                f"`hold_for` must be 1 or more, and 1 unless compiled with `hold=True`, got "
+                f"{hold_for}."
             )
         if drive is not None and not self._fused.hold:
             raise ValueError("`drive` holds the coefficients; compile with `hold=True` for it.")
@@ -209,16 +273,19 @@ class CompiledRollout:
         if len({(m.rows, m.step) for m in measured}) > 1 or (drive and not measured[0].step):
             raise ValueError("`drive` must be two arrays of one shape, each with a value a step.")
         p, counts = arguments.parameter_rows(self._lifted.values(), parameters or {})
+        counts |= {} if memory is None else {"memory": len(memory)}
         counts |= {"q0": len(q), "qd0": len(qd), "time_step": h.rows, "tau": torque.rows}
         count = arguments.candidates({**counts, "drive": measured[0].rows})
+        remembered = self._memory(memory, count)
         out = [np.empty((count, steps // every + 1, n)) for _ in range(3)]
         diverged = np.empty(count, dtype=np.intp)
         shared = (
-            *(steps, every, float(speed_limit)),
+            *(steps, every, hold_for, float(speed_limit)),
             *(p.reshape(-1), p.shape[1] if len(p) > 1 else 0),
             *(arguments.repeated(q, count), arguments.repeated(qd, count)),
             *(h.values, h.row, h.step, torque.values, torque.row, torque.step),
             *(measured[0].values, measured[1].values, measured[0].row, measured[0].step),
+            *(remembered, int(memory is not None)),
             *(*(a.reshape(-1) for a in out), diverged),
         )
         self._run(count, threads, shared)
@@ -226,6 +293,17 @@ class CompiledRollout:
             tensors = [torch.from_numpy(a) for a in (*out, diverged)]
             return Trajectories(tensors[0], tensors[1], tensors[2], tensors[3])
         return Trajectories(out[0], out[1], out[2], diverged)
+
+    def _memory(self, memory: Any, count: int) -> Array:
+        """Given memory of every candidate, flat; a placeholder where none is given."""
+        if memory is None:
+            return np.zeros(1)
+        array = arguments.to_array(memory)
+        shape = (self.joints, getattr(self._fused.friction, "state_size", 0))
+        if array.shape[1:] != shape or not shape[1]:
+            raise ValueError(f"`memory` must be (candidate, {shape[0]}, {shape[1]}), got "
+                             f"{array.shape}.")  # fmt: skip
+        return arguments.repeated(array, count)
 
     def check(self, states: int = 3) -> None:
         """Compare two steps from random states with the same steps in eager torch.
@@ -252,16 +330,22 @@ class CompiledRollout:
         device = self._lifted.device
         q, qd, tau = (x.to(device) for x in (q, qd, tau))
         with torch.no_grad():
+            friction = self._fused.friction
             prev = self._fused.plant.forward_dynamics(q, qd, tau)
-            for _ in range(steps):
-                held = (qd, prev)
-                a1, _ = self._fused(q, qd, tau, *held)
+            memory: tuple[Tensor, ...] = ()
+            for k in range(steps):
+                held: tuple[Tensor, ...] = (qd, prev)
+                if self._fused.remembers:
+                    begun = friction.advance(*held, *memory) if k else friction.initial_state(*held)
+                    memory = (begun,)
+                held += memory
+                a1 = self._fused(q, qd, tau, *held)[0]
                 v2 = qd + dt / 2 * a1
-                a2, _ = self._fused(q + dt / 2 * qd, v2, tau, *held)
+                a2 = self._fused(q + dt / 2 * qd, v2, tau, *held)[0]
                 v3 = qd + dt / 2 * a2
-                a3, _ = self._fused(q + dt / 2 * v2, v3, tau, *held)
+                a3 = self._fused(q + dt / 2 * v2, v3, tau, *held)[0]
                 v4 = qd + dt * a3
-                a4, _ = self._fused(q + dt * v3, v4, tau, *held)
+                a4 = self._fused(q + dt * v3, v4, tau, *held)[0]
                 q = q + dt / 6 * (qd + 2 * (v2 + v3) + v4)
                 qd, prev = qd + dt / 6 * (a1 + 2 * (a2 + a3) + a4), a1
         return qd

@@ -79,10 +79,11 @@ EVALUATE: dict[str, Callable[..., Any]] = {
     "or": np.logical_or,
     "not": np.logical_not,
     "where": np.where,
+    "finite": np.isfinite,  # made by `finite.py` alone, for C that tells it by the bits
 }
 """Every scalar operation with its meaning; the emitters spell the same ones in C and Python."""
 
-PREDICATES = frozenset({"lt", "le", "eq", "ne", "and", "or", "not"})
+PREDICATES = frozenset({"lt", "le", "eq", "ne", "and", "or", "not", "finite"})
 _COMMUTATIVE = frozenset({"add", "mul", "max", "min", "eq", "ne", "and", "or"})
 
 

@@ -1,39 +1,58 @@
 """TorchScript: a frozen module that runs with torch alone, in Python or LibTorch."""
 
-import copy
-import json
+import io
 import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from nfriction.atomic import replacing
+from nfriction.export.contract import Contract, Runner, contract_of, verify
+from nfriction.export.controller import (
+    AnyController,
+    Controller,
+    FilteredController,
+    MemoryController,
+    controller_of,
+)
+from nfriction.export.errors import ExportError, first_line
 from nfriction.friction import FrictionModel
-from nfriction.modelfile import ModelInfo, describe
+from nfriction.modelfile import ModelInfo
 
 # Name under which the metadata lie in the archive.
 METADATA = "nfriction.json"
 # Largest difference from the model over the largest torque: sums may be taken in another order.
 TOLERANCE = 1e-12
+LARGEST_FILE = 256 * 2**20
 
 
-class ExportError(RuntimeError):
-    """An artefact could not be made, or does not equal its model."""
-
-
-def torchscript(model: FrictionModel, path: str | Path, info: ModelInfo | None = None) -> Path:
+def torchscript(
+    model: FrictionModel,
+    path: str | Path,
+    info: ModelInfo | None = None,
+    *,
+    torque_limit: float | Sequence[float] | None = None,
+    with_filter: bool = False,
+    cutoff_hz: float = 20.0,
+) -> Path:
     """Write a model as TorchScript, frozen, all joints in stacked tensors.
 
     The artefact is `module(qd, qdd, load) -> tau_f`, every argument (*batch, joint) in SI and
-    float64, on the CPU; its metadata (names, units, ranges, hashes) are JSON under
-    `nfriction.json` in `_extra_files`. It is loaded again and compared with the model before it
-    takes its place.
+    float64, on the CPU. `module.step` gives torque, coefficients and status: `step(qd, qdd, load)`;
+    with a memory `step(qd, qdd, load, state)` from `initial_state(qd, qdd)`, with the filter
+    `step(q, load, state)` from `initial_state(q)`, both with the next state as a fourth result. The
+    metadata (see `Contract`) are JSON under `nfriction.json` in `_extra_files`. It is loaded again
+    and compared with the model before it takes its place.
 
     Args:
         model: a friction model.
         path: file to write, by custom `.pt`; missing folders are made.
         info: what the metadata say of the model besides its parameters.
+        torque_limit, with_filter, cutoff_hz: see `controller_of`.
 
     Returns:
         The path.
@@ -41,18 +60,126 @@ def torchscript(model: FrictionModel, path: str | Path, info: ModelInfo | None =
     Raises:
         ExportError: if this torch has no TorchScript, the model's law or schedule does not
             script, or the artefact differs from the model by more than 1e-12 of full scale.
+        ValueError: if `info` or an option is malformed.
         OSError: if the file cannot be written.
     """
-    frozen = copy.deepcopy(model).to("cpu", torch.float64).eval().requires_grad_(False)
-    metadata = json.dumps(describe(frozen, info or ModelInfo()), indent=1, allow_nan=False)
+    controller = controller_of(
+        model, info, torque_limit=torque_limit, with_filter=with_filter, cutoff_hz=cutoff_hz
+    )
+    contract = contract_of(model, controller, info)
+    buffer = io.BytesIO()  # into memory, so that the temporary file's name is not kept inside
+    with _silent():
+        scripted = _compile(controller)
+        torch.jit.save(scripted, buffer, _extra_files={METADATA: contract.to_json()})
     with replacing(path) as temporary:
-        with warnings.catch_warnings():
-            # torch.jit is deprecated upstream; this is the one place that still needs it.
-            warnings.filterwarnings("ignore", message=".*torch.jit.*")
-            _compile(frozen, temporary, metadata)
+        temporary.write_bytes(buffer.getvalue())
+        with _silent():
             loaded = torch.jit.load(str(temporary))
-        _check(frozen, loaded)
+        _check(controller, loaded, contract)
     return Path(path)
+
+
+def run_torchscript(module: Any, inputs: Sequence[Tensor], state_size: int) -> tuple[Tensor, ...]:
+    """Torque, coefficients and status of samples in order, as `verify` asks for them.
+
+    Args:
+        module: what `torch.jit.load` gave.
+        inputs: (sample, joint) each.
+        state_size: numbers a joint that the module carries from sample to sample.
+    """
+    if not state_size:
+        return tuple(module.step(*inputs))
+    state = module.initial_state(*(x[0] for x in inputs[:-1]))
+    found = []
+    for sample in zip(*inputs, strict=True):
+        *outputs, state = module.step(*sample, state)
+        found.append(outputs)
+    return tuple(torch.stack(column) for column in zip(*found, strict=True))
+
+
+def open_torchscript(path: str | Path) -> tuple[Contract, Runner]:
+    """Load an artefact: what it says of itself, and how to run it.
+
+    Raises:
+        ExportError: if it is no TorchScript, or lacks the methods of ours.
+        ContractError: if its metadata are absent or damaged.
+    """
+    if Path(path).stat().st_size > LARGEST_FILE:
+        raise ExportError(f"{path}: too large for a TorchScript of nfriction.")
+    files = {METADATA: ""}
+    with _silent():
+        try:
+            module = torch.jit.load(str(path), map_location="cpu", _extra_files=files)
+        except (RuntimeError, ValueError) as error:
+            raise ExportError(f"{path}: no TorchScript ({first_line(error)}).") from error
+    contract = Contract.from_json(files[METADATA])
+    if not hasattr(module, "step"):
+        raise ExportError(f"{path}: a TorchScript, but none of nfriction: it has no `step`.")
+    size = contract.state_size
+
+    @torch.no_grad()
+    def run(*inputs: Tensor) -> tuple[Tensor, ...]:
+        return run_torchscript(module, inputs, size)
+
+    return contract, run
+
+
+class _Stateless(nn.Module):
+    """What a controller without a state looks like from outside."""
+
+    def __init__(self, controller: Controller) -> None:
+        super().__init__()
+        self.controller = controller
+
+    def forward(self, qd: Tensor, qdd: Tensor, load: Tensor) -> Tensor:
+        return self.controller.torque(qd, qdd, load)
+
+    def step(self, qd: Tensor, qdd: Tensor, load: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return self.controller(qd, qdd, load)
+
+
+class _Remembering(nn.Module):
+    """What a controller with a memory looks like from outside."""
+
+    def __init__(self, controller: MemoryController) -> None:
+        super().__init__()
+        self.controller = controller
+
+    def forward(self, qd: Tensor, qdd: Tensor, load: Tensor) -> Tensor:
+        return self.controller.torque(qd, qdd, load)
+
+    def step(
+        self, qd: Tensor, qdd: Tensor, load: Tensor, state: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return self.controller(qd, qdd, load, state)
+
+    def initial_state(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        return self.controller.initial_state(qd, qdd)
+
+
+class _Filtering(nn.Module):
+    """What a controller with the filter inside looks like from outside."""
+
+    def __init__(self, controller: FilteredController) -> None:
+        super().__init__()
+        self.controller = controller
+
+    def forward(self, qd: Tensor, qdd: Tensor, load: Tensor) -> Tensor:
+        return self.controller.inner.torque(qd, qdd, load)
+
+    def step(self, q: Tensor, load: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return self.controller(q, load, state)
+
+    def initial_state(self, q: Tensor) -> Tensor:
+        return self.controller.initial_state(q)
+
+
+def _wrapped(controller: AnyController) -> nn.Module:
+    if isinstance(controller, FilteredController):
+        return _Filtering(controller)
+    if isinstance(controller, MemoryController):
+        return _Remembering(controller)
+    return _Stateless(controller)
 
 
 def sample_inputs(model: FrictionModel, count: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -66,8 +193,16 @@ def sample_inputs(model: FrictionModel, count: int, seed: int) -> tuple[Tensor, 
     return normal(10.0), normal(100.0), normal(1.0).abs()
 
 
-def _compile(model: FrictionModel, path: Path, metadata: str) -> None:
-    """Script, freeze and write a model."""
+@contextmanager
+def _silent() -> Iterator[None]:
+    """torch.jit is deprecated upstream; this is the one place that still needs it."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*torch.jit.*")
+        yield
+
+
+def _compile(controller: AnyController) -> Any:
+    """Script and freeze a controller."""
     try:
         from torch.jit.frontend import FrontendError
     except ImportError as error:
@@ -77,6 +212,7 @@ def _compile(model: FrictionModel, path: Path, metadata: str) -> None:
     # TorchScript has no error class of its own for code that it cannot compile.
     refusals = (FrontendError, RuntimeError, TypeError, ValueError, AttributeError, OSError,
                 SyntaxError)  # fmt: skip
+    model = _model(controller)
     try:
         # Tried apart from the model, so that the message is about the law's own lines.
         qd, qdd, load = sample_inputs(model, 1, seed=0)
@@ -86,17 +222,36 @@ def _compile(model: FrictionModel, path: Path, metadata: str) -> None:
             f"the law {model.law.name!r} does not script; it must be a function in a file, of "
             f"torch operations and annotated arguments:\n{error}"
         ) from error
+    module = _wrapped(controller).eval()
+    methods = [name for name in ("step", "initial_state") if hasattr(module, name)]
+    for name in methods:
+        torch.jit.export(getattr(type(module), name))
     try:
-        scripted = torch.jit.freeze(torch.jit.script(model))
+        return torch.jit.freeze(torch.jit.script(module), preserved_attrs=methods)
     except refusals as error:
         raise ExportError(f"the model does not script:\n{error}") from error
-    torch.jit.save(scripted, str(path), _extra_files={METADATA: metadata})
 
 
-def _check(model: FrictionModel, loaded: torch.nn.Module) -> None:
+def _model(controller: AnyController) -> FrictionModel:
+    inner = controller.inner if isinstance(controller, FilteredController) else controller
+    assert isinstance(inner, (Controller, MemoryController))
+    return inner.model
+
+
+def _check(controller: AnyController, loaded: Any, contract: Contract) -> None:
+    """Refuse an artefact that is not the model."""
+    model = _model(controller)
     inputs = sample_inputs(model, 1000, seed=0)
+    inner = controller.inner if isinstance(controller, FilteredController) else controller
+    assert isinstance(inner, (Controller, MemoryController))
     with torch.no_grad():
-        expected, got = model(*inputs), loaded(*inputs)
-    error = float((got - expected).abs().max() / expected.abs().max().clamp_min(1e-300))
-    if not error <= TOLERANCE:
-        raise ExportError(f"the TorchScript differs from its model by {error:.1e} of full scale.")
+        expected, got = inner.torque(*inputs), loaded(*inputs)
+        error = float((got - expected).abs().max() / expected.abs().max().clamp_min(1e-300))
+        if not error <= TOLERANCE:
+            raise ExportError(
+                f"the TorchScript differs from its model by {error:.1e} of full scale."
+            )
+        size = contract.state_size
+        parity = verify(lambda *x: run_torchscript(loaded, x, size), contract)
+    if not parity.passed:
+        raise ExportError(f"the TorchScript differs from its model: {parity}.")

@@ -225,6 +225,64 @@ def test_bad_arguments_are_told(coulomb, change, message):
         compiled(**{**given, **change})
 
 
+class Remembering(Coulomb):
+    """Friction that grows with the path travelled, a memory of one number a joint."""
+
+    state_size = 1
+
+    def initial_state(self, qd, qdd):
+        return qd.abs()[..., None]
+
+    def advance(self, qd, qdd, state):
+        return 0.99 * state + qd.abs()[..., None]
+
+    def coefficients_from(self, qd, qdd, state):
+        return self.log.exp() * (1.0 + 0.1 * state)
+
+    def coefficients(self, qd, qdd):
+        return self.coefficients_from(qd, qdd, self.initial_state(qd, qdd))
+
+
+@pytest.mark.parametrize("backend", ["c", pytest.param("numba", marks=pytest.mark.slow)])
+def test_a_memory_agrees_with_eager_steps(backend):
+    plant, friction = Pendulum(2), Remembering(2)
+    compiled = compile_rollout(plant, friction, backend=backend)
+
+    class Replayed(Coulomb):
+        """The same friction for `reference`, which calls once a step."""
+
+        state = None
+
+        def coefficients(self, qd, qdd):
+            begun = self.state is None
+            self.state = (
+                friction.initial_state(qd, qdd) if begun else friction.advance(qd, qdd, self.state)
+            )
+            return friction.coefficients_from(qd, qdd, self.state)
+
+    q, qd = start(2, batch=2)
+    got = compiled(q, qd, steps=1000, time_step=1e-3)
+    assert_same(got, reference(plant, Replayed(2), q, qd, 1000, 1e-3))
+    memory = torch.tensor([[[5.0], [1.0]], [[0.0], [9.0]]], dtype=F64)
+    given = compiled(q, qd, steps=50, time_step=1e-3, memory=memory, threads=2)
+    for i in range(2):
+        alone = compiled(q[i : i + 1], qd[i : i + 1], steps=50, time_step=1e-3,
+                         memory=memory[i : i + 1])  # fmt: skip
+        np.testing.assert_array_equal(given.q[i], alone.q[0])
+    assert not np.allclose(given.q, got.q[:, :51], atol=1e-6)
+    with pytest.raises(ValueError, match="memory"):
+        compiled(q, qd, steps=5, time_step=1e-3, memory=memory[0])
+
+
+def test_a_memory_is_always_held():
+    with pytest.raises(ValueError, match="hold=True"):
+        compile_rollout(Pendulum(2), Remembering(2), backend="c", hold=False)
+    with pytest.raises(ValueError, match="hold_for"):
+        compile_rollout(Pendulum(2), Coulomb(2), backend="c")(
+            np.ones((1, 2)), np.ones((1, 2)), steps=5, time_step=1e-3, hold_for=0
+        )
+
+
 def test_measured_drive_needs_held_coefficients():
     compiled = compile_rollout(Pendulum(2), Coulomb(2), backend="c", hold=False)
     drive = (np.ones((5, 2)), np.ones((5, 2)))

@@ -11,10 +11,14 @@ import torch
 from torch import Tensor
 
 from nfriction.export import ExportError, torchscript
-from nfriction.export.script import METADATA, sample_inputs
+from nfriction.export.contract import ContractError, compare, run_through, verify
+from nfriction.export.controller import controller_of
+from nfriction.export.points import draw
+from nfriction.export.script import METADATA, open_torchscript, sample_inputs
 from nfriction.friction import LFM, NFLFM, Coefficient, Constant, FrictionModel, Law, NeuroFuzzy
 from nfriction.friction.laws import TorqueFunction
 from nfriction.modelfile import ModelInfo, parameter_hash
+from tests.export.artefacts import INFO, rising
 from tests.friction.samples import QUADRATIC, named_models, randomise
 
 # Whatever the export lets through fails the test.
@@ -112,6 +116,72 @@ def test_it_runs_and_tells_of_itself_with_torch_alone(tmp_path: Path) -> None:
     assert told["units"]["tau_f"] == "N m"
     assert told["parameter_hash"] == parameter_hash(model.state_dict())
     assert METADATA == "nfriction.json"  # others read it by this name
+
+
+# The contract
+
+
+@pytest.mark.parametrize("name", named_models())
+def test_step_gives_all_of_the_contract_to_beyond_the_range(name: str, tmp_path: Path) -> None:
+    model = named_models()[name]
+    check_parity(model, tmp_path / "model.pt", 5000 if not model.state_size else 300)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", named_models())
+def test_parity_over_very_many_points(name: str, tmp_path: Path) -> None:
+    model = named_models()[name]
+    check_parity(model, tmp_path / "model.pt", 200_000 if not model.state_size else 5000)
+
+
+def check_parity(model: FrictionModel, path: Path, points: int) -> None:
+    contract, run = open_torchscript(torchscript(model, path, INFO, torque_limit=50.0))
+    controller = controller_of(model, INFO, torque_limit=50.0)
+    inputs = draw(controller, points, seed=11)
+    parity = compare(run_through(controller, inputs), run(*inputs), 1e-12)
+    assert parity.points == points
+    assert parity.passed, parity
+    assert verify(run, contract).passed
+
+
+def test_a_schedule_of_ones_own_is_clamped_in_the_artefact(tmp_path: Path) -> None:
+    check_parity(rising(), tmp_path / "model.pt", 1000)
+
+
+def test_nan_and_infinity_give_nan_from_the_short_call_too(tmp_path: Path) -> None:
+    model = named_models()["NCFM"]  # whose law looks at neither acceleration nor load
+    loaded = load(torchscript(model, tmp_path / "model.pt"))
+    for which in range(3):
+        for bad in (torch.nan, torch.inf, -torch.inf):
+            inputs = sample_inputs(model, 5, seed=2)
+            inputs[which][3, 1] = bad
+            lost = torch.isnan(loaded(*inputs))
+            assert lost[3, 1]
+            assert lost.sum() == 1
+
+
+@pytest.mark.parametrize("name", ["LFM", "ALFM", "NFLFM"])
+def test_the_filter_inside_equals_the_one_outside(name: str, tmp_path: Path) -> None:
+    model = named_models()[name]
+    path = torchscript(model, tmp_path / "model.pt", INFO, with_filter=True)
+    contract, run = open_torchscript(path)
+    assert contract.state_size == 6 + model.state_size
+    assert verify(run, contract).passed
+    assert_equal(model, path)  # the short call takes motions as ever
+
+
+def test_what_is_no_artefact_is_refused(tmp_path: Path) -> None:
+    good = torchscript(LFM(2), tmp_path / "good.pt").read_bytes()
+    bad = tmp_path / "bad.pt"
+    for content in (b"", b"junk", good[: len(good) // 2]):
+        bad.write_bytes(content)
+        with pytest.raises(ExportError, match="no TorchScript"):
+            open_torchscript(bad)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.jit.save(torch.jit.script(torch.nn.Linear(2, 2)), str(bad))
+    with pytest.raises(ContractError, match="no JSON"):
+        open_torchscript(bad)
 
 
 # Refusals

@@ -1,0 +1,167 @@
+"""C for controllers: one source file and its header, a self-test, and skeletons around them."""
+
+import string
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from nfriction.atomic import write_atomically
+from nfriction.codegen.emit import Real
+from nfriction.export.c_dialect import ControllerC, bits, is_identifier
+from nfriction.export.c_source import source_of
+from nfriction.export.contract import COEFFICIENT_SLACK, Contract, contract_of
+from nfriction.export.controller import controller_of
+from nfriction.friction import FrictionModel
+from nfriction.modelfile import ModelInfo
+
+# How much more a controller may err that rounds motions between filter and model.
+ROUNDED = 5.0
+REALS: dict[str, Real] = {"float64": "double", "float32": "float"}
+
+
+def c(
+    model: FrictionModel,
+    folder: str | Path,
+    info: ModelInfo | None = None,
+    *,
+    dtype: str = "float64",
+    name: str = "nfriction",
+    prefix: str = "nf",
+    with_filter: bool = False,
+    torque_limit: float | Sequence[float] | None = None,
+    cutoff_hz: float = 20.0,
+) -> list[Path]:
+    """Write a model as C for controllers.
+
+    The C is C89 and C++ alike, allocates nothing, has no globals that change, and calls nothing
+    but `exp`, `tanh` and their like, in its own precision. What several joints or rules share is
+    code in a loop over tables, so a neuro-fuzzy joint takes about 2.4 kB on a Cortex-M4F.
+
+    Args:
+        model: a friction model.
+        folder: where to write; made if missing. The same model gives the same bytes.
+        info: what the metadata say of the model besides its parameters.
+        dtype: "float64" or "float32", in which the controller computes.
+        name: of the files.
+        prefix: of functions and types, so that two controllers can live in one program.
+        with_filter: write the causal filter from raw positions too.
+        torque_limit, cutoff_hz: see `controller_of`.
+
+    Returns:
+        What was written: `<name>.c` and `<name>.h`; `<name>.json` with the metadata and test
+        vectors; `<prefix>_selftest.c`, a program that returns 0 where these agree; `<prefix>.hpp`
+        for C++; `<name>_sfun.c` for Simulink and `<name>.ino` for Arduino.
+
+    Raises:
+        ExportError: if the law or schedule uses an operation that has no C form.
+        ValueError: if `info` or an option is malformed.
+        OSError: if a file cannot be written.
+    """
+    if dtype not in REALS:
+        raise ValueError(f'`dtype` must be "float64" or "float32", got {dtype!r}.')
+    for key, value in (("name", name), ("prefix", prefix)):
+        if not is_identifier(value):
+            raise ValueError(
+                f"`{key}` must be an identifier of C of up to 31 letters, got {value!r}."
+            )
+    controller = controller_of(
+        model, info, torque_limit=torque_limit, with_filter=with_filter, cutoff_hz=cutoff_hz
+    )
+    contract = contract_of(model, controller, info, dtype=dtype)
+    described = {**contract.description, "prefix": prefix}
+    contract = Contract(described, contract.inputs, contract.outputs, contract.tolerance)
+    real = REALS[dtype]
+    source = source_of(controller, described, real, name, prefix)
+    words = _words(contract, real, name, prefix)
+    files = {
+        f"{name}.c": source.code,
+        f"{name}.h": source.header,
+        f"{name}.json": contract.to_json() + "\n",
+        f"{prefix}_selftest.c": _filled("selftest.c", {**words, **_vectors(contract, real)}),
+        f"{prefix}.hpp": _filled("wrapper.hpp", words),
+        f"{name}_sfun.c": _filled("simulink.c", words),
+        f"{name}.ino": _filled("arduino.ino", words),
+    }
+    return [write_atomically(Path(folder) / key, text.encode("ascii"))
+            for key, text in files.items()]  # fmt: skip
+
+
+class _Template(string.Template):
+    # `$prefix_step` is `$prefix` and `_step`: names end where the letters do, but for our own.
+    idpattern = "(?:TORQUE_TOLERANCE|COEFFICIENT_TOLERANCE|TORQUE_UNIT|[A-Z]+|prefix)"
+    flags = 0  # type: ignore[assignment]
+
+
+def _filled(template: str, words: Mapping[str, str]) -> str:
+    text = resources.files("nfriction.export").joinpath("c_templates", template).read_text("ascii")
+    return _Template(text).substitute(words)
+
+
+def _words(contract: Contract, real: Real, name: str, prefix: str) -> dict[str, str]:
+    description = contract.description
+    sample_time = description["sample_time"] or 1e-3
+    return {
+        "REAL": real,
+        "NAME": name,
+        "HEADER": f"{name}.h",
+        "TITLE": f"Friction of {description['joints']} joints",
+        "PREFIX": prefix.upper(),
+        "prefix": prefix,
+        "UNIT": str(description["unit"]),
+        "TORQUE_UNIT": str(description["units"]["tau_f"]),
+        "PERIOD": str(max(1, round(1e6 * sample_time))),
+    }
+
+
+def _vectors(contract: Contract, real: Real) -> dict[str, str]:
+    """The test vectors as tables of the self-test."""
+    dialect = ControllerC(real)
+    tables = []
+    for key, values in contract.inputs.items():
+        kinds = torch.isnan(values).int() + 2 * torch.isposinf(values) + 3 * torch.isneginf(values)
+        finite = torch.nan_to_num(values, 0.0, 0.0, 0.0)
+        tables += [
+            _table(f"test_{key}", finite, dialect),
+            _table(f"test_{key}_kind", kinds, dialect, "unsigned char"),
+        ]
+    tau, coefficients, status = (
+        torch.nan_to_num(contract.outputs[key], 0.0) for key in ("tau_f", "coefficients", "status")
+    )
+    # What the filter gives is rounded to single precision on its way to the model.
+    rounded = real == "float" and contract.description["filter"] is not None
+    tolerance = (ROUNDED if rounded else 1.0) * contract.tolerance
+    scales = tau.abs().amax(0)[None], coefficients.abs().amax((0, 1))[None]
+    tables += [
+        _table("test_tau", tau, dialect),
+        _table("test_coefficients", coefficients.flatten(1), dialect),
+        _table("test_status", status, dialect, "unsigned char"),
+        _row("test_torque_scale", scales[0], dialect),
+        _row("test_coefficient_scale", scales[1], dialect),
+    ]
+    return {
+        "COUNT": str(len(tau)),
+        "BITS": bits("test", real),
+        "ARRAYS": "\n".join(tables),
+        "TORQUE_TOLERANCE": dialect.literal(tolerance),
+        "COEFFICIENT_TOLERANCE": dialect.literal(COEFFICIENT_SLACK * tolerance),
+    }
+
+
+def _literals(values: Tensor, dialect: ControllerC, kind: str) -> str:
+    literal = dialect.literal if kind == dialect.real else str
+    return ", ".join(literal(x) for x in values.tolist())
+
+
+def _table(name: str, values: Tensor, dialect: ControllerC, kind: str = "") -> str:
+    kind = kind or dialect.real
+    rows = ",\n".join(f"    {{{_literals(row, dialect, kind)}}}" for row in values)
+    columns = values.shape[1]
+    return f"static const {kind} {name}[VECTORS][{columns}] = {{\n{rows}\n}};\n"
+
+
+def _row(name: str, values: Tensor, dialect: ControllerC) -> str:
+    numbers = _literals(values[0], dialect, dialect.real)
+    return f"static const {dialect.real} {name}[{values.shape[1]}] = {{{numbers}}};\n"

@@ -1,0 +1,214 @@
+"""torch.export: a `.pt2` program for runtimes that take one, with the metadata inside."""
+
+import io
+import json
+import math
+import re
+import warnings
+import zipfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from nfriction.atomic import replacing
+from nfriction.export.contract import Contract, Runner, contract_of, verify
+from nfriction.export.controller import (
+    AnyController,
+    Controller,
+    FilteredController,
+    MemoryController,
+    controller_of,
+)
+from nfriction.export.errors import ExportError, first_line
+from nfriction.export.points import draw
+from nfriction.friction import FrictionModel
+from nfriction.modelfile import ModelInfo
+
+# Name under which the metadata lie in the archive.
+METADATA = "nfriction.json"
+LARGEST_ARCHIVE = 256 * 2**20
+# All that an archive of ours holds.
+_OURS = re.compile(
+    r"data/weights/(weight_\d+|model_weights_config\.json)"
+    r"|data/constants/(tensor_\d+|model_constants_config\.json)"
+    r"|data/sample_inputs/model\.pt|models/model\.json|extra/nfriction\.json"
+    r"|archive_format|archive_version|byteorder|version|\.data/(version|serialization_id|.*)"
+)
+
+
+def pt2(
+    model: FrictionModel,
+    path: str | Path,
+    info: ModelInfo | None = None,
+    *,
+    torque_limit: float | Sequence[float] | None = None,
+    with_filter: bool = False,
+    cutoff_hz: float = 20.0,
+) -> Path:
+    """Write a model as a `torch.export` program with a batch of any size.
+
+    `torch.export.load(path).module()(qd, qdd, load)` gives torque, coefficients and status, every
+    argument (batch, joint) in SI and float64. Where the controller has a state, that is the last
+    argument and the last result, (batch, joint, number); one that is NaN is a fresh start. The
+    metadata (see `Contract`) are JSON under `nfriction.json` in `extra_files`. The file is loaded
+    again and compared with the model before it takes its place.
+
+    Args:
+        model: a friction model.
+        path: file to write, by custom `.pt2`; missing folders are made.
+        info: what the metadata say of the model besides its parameters.
+        torque_limit, with_filter, cutoff_hz: see `controller_of`.
+
+    Returns:
+        The path.
+
+    Raises:
+        ExportError: if torch cannot export the model, or the artefact differs from it.
+        ValueError: if `info` or an option is malformed.
+        OSError: if the file cannot be written.
+    """
+    controller = controller_of(
+        model, info, torque_limit=torque_limit, with_filter=with_filter, cutoff_hz=cutoff_hz
+    )
+    contract = contract_of(model, controller, info)
+    program = exported(controller)
+    program.example_inputs = None  # torch would pickle them
+    buffer = io.BytesIO()  # into memory, so that the temporary file's name is not kept inside
+    with silent():
+        torch.export.save(program, buffer, extra_files={METADATA: contract.to_json()})
+    with replacing(path) as temporary:
+        temporary.write_bytes(buffer.getvalue())
+        contract, run = open_pt2(temporary)
+        parity = verify(run, contract)
+        if not parity.passed:
+            raise ExportError(f"the program differs from its model: {parity}.")
+    return Path(path)
+
+
+def open_pt2(path: str | Path) -> tuple[Contract, Runner]:
+    """Load an artefact: what it says of itself, and how to run it.
+
+    Raises:
+        ExportError: if it is no program of `torch.export`, or holds what is not ours.
+        ContractError: if its metadata are absent or damaged.
+    """
+    _refuse_foreign_objects(path)
+    files = {METADATA: ""}
+    try:
+        with silent(), Path(path).open("rb") as file:
+            module = torch.export.load(file, extra_files=files).module()
+    except (RuntimeError, AttributeError, AssertionError, KeyError, TypeError) as error:
+        raise ExportError(f"{path}: no program of nfriction ({first_line(error)}).") from error
+    contract = Contract.from_json(files[METADATA])
+    size = contract.state_size
+
+    @torch.no_grad()
+    def run(*inputs: Tensor) -> tuple[Any, ...]:
+        return run_stateful(module, inputs, size)
+
+    return contract, run
+
+
+def _refuse_foreign_objects(path: str | Path) -> None:
+    """Refuse an archive that holds more than tensors and JSON: torch would unpickle it."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = archive.infolist()
+            if sum(entry.file_size for entry in entries) > LARGEST_ARCHIVE:
+                raise ExportError(f"{path}: too large for a program of nfriction.")
+            for entry in entries:
+                inner = entry.filename.partition("/")[2]
+                if not _OURS.fullmatch(inner):
+                    raise ExportError(f"{path}: holds {entry.filename[:80]!r}, which is not ours.")
+                content = archive.read(entry)
+                if inner.endswith("_config.json"):
+                    config = json.loads(content)["config"]
+                    if any(entry["use_pickle"] for entry in config.values()):
+                        raise ExportError(f"{path}: holds pickled objects, which are refused.")
+                if inner.endswith(".pt") and content:
+                    raise ExportError(f"{path}: holds pickled inputs, which are refused.")
+    except zipfile.BadZipFile as error:
+        raise ExportError(f"{path}: no program of nfriction ({first_line(error)}).") from error
+    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
+        if isinstance(error, ExportError):
+            raise
+        raise ExportError(f"{path}: damaged ({first_line(error)}).") from error
+
+
+def run_stateful(step: Any, inputs: Sequence[Tensor], state_size: int) -> tuple[Any, ...]:
+    """Torque, coefficients and status of samples in order, by a program whose state starts as NaN.
+
+    Args:
+        step: takes the inputs and, where there is one, the state, (batch, joint, ...) each.
+        inputs: (sample, joint) each.
+        state_size: numbers a joint that it carries from sample to sample.
+    """
+    if not state_size:
+        return tuple(step(*inputs))
+    state = inputs[0].new_full((1, inputs[0].shape[1], state_size), math.nan)
+    found = []
+    for sample in zip(*inputs, strict=True):
+        *outputs, state = step(*(x[None] for x in sample), state)
+        found.append([torch.as_tensor(x)[0] for x in outputs])
+        state = torch.as_tensor(state)
+    return tuple(torch.stack(column) for column in zip(*found, strict=True))
+
+
+class SelfStartingMemory(nn.Module):
+    """A controller with a memory that starts by itself where its state is NaN."""
+
+    def __init__(self, controller: MemoryController) -> None:
+        super().__init__()
+        self.controller = controller
+
+    def forward(self, qd: Tensor, qdd: Tensor, load: Tensor, state: Tensor) -> Any:
+        fresh = self.controller.initial_state(qd, qdd)
+        return self.controller(qd, qdd, load, torch.where(state == state, state, fresh))
+
+
+class SelfStartingFilter(nn.Module):
+    """The same of a controller with the filter inside."""
+
+    def __init__(self, controller: FilteredController) -> None:
+        super().__init__()
+        self.controller = controller
+
+    def forward(self, q: Tensor, load: Tensor, state: Tensor) -> Any:
+        fresh = self.controller.initial_state(q)
+        return self.controller(q, load, torch.where(state == state, state, fresh))
+
+
+def exported(controller: AnyController) -> torch.export.ExportedProgram:
+    """The controller as a `torch.export` program with a dynamic batch.
+
+    Raises:
+        ExportError: if torch cannot export it.
+    """
+    example = draw(controller, 7)
+    module: nn.Module = controller
+    if not isinstance(controller, Controller):
+        example = (*example, example[0].new_zeros(7, controller.joints, controller.state_size))
+        if isinstance(controller, MemoryController):
+            module = SelfStartingMemory(controller)
+        else:
+            module = SelfStartingFilter(controller)
+    batch = torch.export.Dim("batch")
+    try:
+        with silent():
+            shapes = tuple({0: batch} for _ in example)
+            return torch.export.export(module.eval(), example, dynamic_shapes=shapes)
+    except (RuntimeError, TypeError, ValueError, AttributeError) as error:
+        raise ExportError(f"torch cannot export the model:\n{error}") from error
+
+
+@contextmanager
+def silent() -> Iterator[None]:
+    """Leave out what torch says to its own developers."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", category=FutureWarning)
+        warnings.filterwarnings("ignore", category=DeprecationWarning)
+        yield

@@ -1,0 +1,34 @@
+"""Models, ranges and schedules to export in tests."""
+
+import torch
+from torch import Tensor
+
+from nfriction.friction import Constant, FrictionModel, Law
+from nfriction.friction.laws import LINEAR
+from nfriction.modelfile import ModelInfo
+from tests.friction.samples import randomise
+
+INFO = ModelInfo(
+    sample_time=1e-3,
+    input_ranges={
+        "qd": [[-15.0, 15.0], [-10.0, 12.0], [-20.0, 20.0]],
+        "qdd": [[-150.0, 150.0]] * 3,
+    },
+)
+
+
+class Rising(Constant):
+    """Coefficients that grow with speed and acceleration for ever: one that has no range."""
+
+    bounded = False
+
+    def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        growth = 1.0 + 0.1 * qd.abs() + 0.01 * qdd.abs()
+        return torch.exp(self.raw) * growth.unsqueeze(-1)
+
+
+def rising(joints: int = 3, law: Law = LINEAR) -> FrictionModel:
+    """A model with a schedule of a user's own, which must be clamped from outside."""
+    model = FrictionModel(law, Rising(law, joints, [1e-3, 2e-3]))
+    randomise(model, 0.3)
+    return model

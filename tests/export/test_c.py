@@ -1,0 +1,420 @@
+"""Exported C: strict C89 and C++, equal to its model, and true to the contract at the edges."""
+
+import re
+import shutil
+import subprocess
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nfriction.codegen import UnsupportedOperation
+from nfriction.export.c_dialect import comment
+from nfriction.export.c_export import c
+from nfriction.export.c_run import c_contract, c_runner
+from nfriction.export.contract import compare, run_through, verify
+from nfriction.export.controller import CLAMPED, NOT_FINITE, SATURATED, controller_of
+from nfriction.export.errors import ExportError
+from nfriction.export.points import draw
+from nfriction.friction import MODELS, Coefficient, FrictionModel, Law
+from nfriction.friction.schedules import Constant
+from nfriction.modelfile import ModelInfo
+
+STUBS = Path(__file__).parent / "stubs"
+GCC, GXX = shutil.which("gcc"), shutil.which("g++")
+pytestmark = pytest.mark.skipif(not (GCC and GXX), reason="needs gcc and g++")
+
+STRICT = ["-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Werror"]
+C89 = ["gcc", "-std=c89", "-pedantic", *STRICT]
+CXX = ["g++", "-std=c++17", "-Wall", "-Wextra", "-Werror"]
+# Of full scale. A double rounds to 1e-16 and sums of some dozen terms come before the torque.
+TOLERANCE = {"float64": 1e-14, "float32": 5e-7}
+# Constants of the size that the papers' rigs have.
+INITIAL = {
+    "viscous": [0.02],
+    "linear": [0.02, 0.05],
+    "nonlinear": [0.005, 0.05, 0.02, 0.02, 2.0],
+    "stribeck": [0.05, 0.02, 0.02, 0.3, 1.5],
+}
+INFO = ModelInfo(
+    joint_names=("shoulder", "elbow", "wrist"),
+    sample_time=1e-3,
+    input_ranges={"qd": [[-8.0, 7.1], [-6.0, 6.0], [-9.3, 9.0]], "qdd": [[-60.0, 50.1]] * 3},
+)
+
+
+def random_model(name: str, joints: int = 3, seed: int = 0) -> FrictionModel:
+    """A named model, every parameter off its start."""
+    random = torch.Generator().manual_seed(seed)
+    kind = MODELS[name]
+    initial = INITIAL[kind(1).law.name]
+    factors = 1.0 + 0.3 * torch.rand(joints, len(initial), generator=random, dtype=torch.float64)
+    model = kind(joints, factors * torch.tensor(initial, dtype=torch.float64))
+    with torch.no_grad():
+        for p in model.parameters():
+            p.add_(0.1 * torch.randn(p.shape, generator=random, dtype=p.dtype))
+    return model
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """Exports the named models, each once a dtype; gives model, controller and folder."""
+
+    @cache
+    def export(name: str, dtype: str, **options):
+        folder = tmp_path_factory.mktemp(f"{name}_{dtype}")
+        model = random_model(name)
+        c(model, folder, INFO, dtype=dtype, **options)
+        controller = controller_of(model, INFO, **options)
+        return model, controller, folder
+
+    return export
+
+
+def build(command, folder: Path) -> None:
+    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert not result.returncode, result.stderr
+
+
+def self_test(folder: Path, *flags: str, source: str = "nfriction.c") -> None:
+    build(["gcc", *flags, "nf_selftest.c", source, "-o", "selftest", "-lm"], folder)
+    result = subprocess.run([folder / "selftest"], capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout[-500:]
+    assert "0 wrong" in result.stdout
+
+
+def points(controller, dtype: str, count: int):
+    inputs = draw(controller, count, seed=3)
+    return tuple(x.float().double() for x in inputs) if dtype == "float32" else inputs
+
+
+cases = pytest.mark.parametrize("dtype", ["float64", "float32"])
+names = pytest.mark.parametrize("name", list(MODELS))
+few = pytest.mark.parametrize("name", ["Stribeck", "ALFM", "NFLFM"])  # one of each kind
+
+
+@cases
+@names
+def test_is_strict_c89_and_passes_its_own_test(exported, name, dtype):
+    _, _, folder = exported(name, dtype)
+    build([*C89, "-O1", "-c", "nfriction.c", "-o", "n.o"], folder)
+    imports = subprocess.run(["nm", "-u", "n.o"], cwd=folder, capture_output=True, text=True)
+    single = "f" if dtype == "float32" else ""
+    allowed = {f + single for f in ("exp", "tanh", "atan", "log", "sqrt")}
+    assert set(re.findall(r"U (\w+)", imports.stdout)) <= allowed
+    data = subprocess.run(["size", "-A", "n.o"], cwd=folder, capture_output=True, text=True).stdout
+    sizes = dict(re.findall(r"^(\.data|\.bss)\s+(\d+)", data, re.M))
+    assert sizes == {".data": "0", ".bss": "0"}, "no globals that change"
+    self_test(folder, source="n.o")
+    assert len(c_contract(folder / "nfriction.c").outputs["status"]) >= 200
+
+
+@cases
+@few
+def test_is_valid_cpp(exported, name, dtype):
+    _, _, folder = exported(name, dtype)
+    build([*CXX, "-Wconversion", "-fsyntax-only", "-x", "c++", "nfriction.c"], folder)
+
+
+@cases
+@few
+def test_equals_its_model_to_beyond_the_range(exported, name, dtype):
+    _, controller, folder = exported(name, dtype)
+    # Models with a memory are stepped through one sample at a time in torch.
+    inputs = points(controller, dtype, 500 if hasattr(controller, "state_size") else 5000)
+    run = c_runner(folder / "nfriction.c")
+    parity = compare(run_through(controller, inputs), run(*inputs), TOLERANCE[dtype])
+    assert parity.passed, parity
+    assert verify(run, c_contract(folder / "nfriction.c")).passed
+
+
+@pytest.mark.slow
+@cases
+@names
+def test_is_valid_cpp_and_passes_its_own_test_under_fast_math(exported, name, dtype):
+    _, _, folder = exported(name, dtype)
+    build([*CXX, "-O2", "-c", "-x", "c++", "nfriction.c", "-o", "cpp.o"], folder)
+    self_test(folder, "-O3", "-ffast-math")
+
+
+@pytest.mark.slow
+@cases
+@names
+def test_equals_its_model_at_200000_points(exported, name, dtype):
+    _, controller, folder = exported(name, dtype)
+    inputs = points(controller, dtype, 20_000 if hasattr(controller, "state_size") else 200_000)
+    expected = run_through(controller, inputs)
+    for flags in (("-std=c89", "-O2"), ("-O3", "-ffast-math")):
+        found = c_runner(folder / "nfriction.c", flags)(*inputs)
+        parity = compare(expected, found, TOLERANCE[dtype])
+        assert parity.passed, (flags, parity)
+
+
+def test_the_self_test_can_fail(exported, tmp_path):
+    shutil.copytree(exported("LFM", "float64")[2], tmp_path / "c")
+    source = tmp_path / "c" / "nfriction.c"
+    number = re.search(r"\d\.\d{9,}", source.read_text()).group()
+    source.write_text(source.read_text().replace(number, f"{float(number) * (1 + 1e-9)!r}"))
+    build(["gcc", "nf_selftest.c", "nfriction.c", "-o", "selftest", "-lm"], source.parent)
+    assert subprocess.run([tmp_path / "c" / "selftest"], capture_output=True).returncode == 1
+
+
+@cases
+@pytest.mark.parametrize("flags", [("-O0",), ("-O3", "-ffast-math")])
+@pytest.mark.parametrize("name", ["NFLFM", "ALFM"])
+def test_what_is_not_finite_stays_with_its_joint(exported, name, dtype, flags):
+    _, controller, folder = exported(name, dtype)
+    run = c_runner(folder / "nfriction.c", flags)
+    sound = [x[:1] for x in points(controller, dtype, 1)]
+    clean = run(*sound)
+    for which in range(3):
+        for bad in (np.nan, np.inf, -np.inf):
+            given = [x.clone() for x in sound]
+            given[which][0, 1] = bad
+            tau, coefficients, status = run(*given)
+            assert np.isnan(tau[0, 1])
+            assert np.isnan(coefficients[0, 1]).all()
+            assert status[0, 1] == NOT_FINITE
+            for joint in (0, 2):
+                assert tau[0, joint] == clean[0][0, joint]
+                assert status[0, joint] == clean[2][0, joint]
+
+
+def test_running_fast_math_leaves_this_process_alone(exported):
+    _, controller, folder = exported("LFM", "float64")
+    c_runner(folder / "nfriction.c", ("-O3", "-ffast-math"))(*points(controller, "float64", 5))
+    tiny = np.full(3, 1e-310)
+    assert (tiny * 0.5 > 0).all()
+
+
+@cases
+def test_torque_that_overflows_is_not_finite(exported, dtype):
+    _, _, folder = exported("LFM", dtype)
+    huge = 1e38 if dtype == "float32" else 1e308
+    x = np.full((1, 3), huge)
+    tau, _, status = c_runner(folder / "nfriction.c")(x, 0 * x, x)
+    stays = np.isfinite(tau) == (status & NOT_FINITE == 0)
+    assert stays.all()
+
+
+def test_status_tells_clamping_and_saturation(exported):
+    _, controller, folder = exported("NFLFM", "float64", torque_limit=0.05)
+    inputs = draw(controller, 2000, seed=1)
+    tau, _, status = c_runner(folder / "nfriction.c")(*inputs)
+    np.testing.assert_array_equal(status, run_through(controller, inputs)[2])
+    assert np.abs(tau).max() == 0.05
+    for bit in (CLAMPED, SATURATED):
+        assert 0 < (status & bit > 0).mean() < 1
+    self_test(folder)
+
+
+@cases
+@pytest.mark.parametrize("name", ["LFM", "ALFM"])
+def test_the_filter_runs_inside(exported, name, dtype):
+    _, controller, folder = exported(name, dtype, with_filter=True)
+    build([*C89, "-c", "nfriction.c", "-o", "n.o"], folder)
+    build([*CXX, "-fsyntax-only", "-x", "c++", "nfriction.c"], folder)
+    self_test(folder, "-O2")
+    self_test(folder, "-O3", "-ffast-math")
+    if dtype == "float64":
+        inputs = draw(controller, 300)
+        found = c_runner(folder / "nfriction.c")(*inputs)
+        # Differences over a millisecond, taken twice, raise rounding a thousandfold each.
+        parity = compare(run_through(controller, inputs), found, 1e-10)
+        assert parity.passed, parity
+
+
+def test_the_same_model_gives_the_same_bytes(exported, tmp_path):
+    for name in ("NFNLFM", "ANLFM"):
+        _, _, folder = exported(name, "float32")
+        for path in c(random_model(name), tmp_path / name, INFO, dtype="float32"):
+            assert path.read_bytes() == (folder / path.name).read_bytes(), path.name
+
+
+@given(st.text(max_size=40))
+@settings(max_examples=100)
+def test_foreign_text_cannot_leave_its_comment(text):
+    inside = comment(text)
+    assert "*/" not in f" * {inside}\n */"[:-3]
+    assert inside.isascii()
+    assert not re.search(r"[\n\r\\]|\?\?", inside)
+
+
+def test_hostile_names_do_not_become_code(tmp_path):
+    names = ("*/ int evil(void) { return 1; } /*", "a\\\nint evil;", "??/\n#error")
+    info = ModelInfo(joint_names=names, training_data={"*/ int evil;": "*/"})
+    c(random_model("LFM"), tmp_path, info)
+    build([*C89, "-c", "nfriction.c", "-o", "n.o"], tmp_path)
+    symbols = subprocess.run(["nm", "n.o"], cwd=tmp_path, capture_output=True, text=True).stdout
+    assert "evil" not in symbols
+    for bad in ("int", "a b", "1a", "x;y", "", "a" * 40, "ß"):
+        for key in ("name", "prefix"):
+            with pytest.raises(ValueError, match=key):
+                c(random_model("LFM"), tmp_path, **{key: bad})
+
+
+def test_two_controllers_live_in_one_program(tmp_path):
+    for name in ("NFLFM", "NLFM"):
+        c(random_model(name), tmp_path, name=name.lower(), prefix=f"{name.lower()}_c")
+    (tmp_path / "main.c").write_text(
+        '#include "nflfm.h"\n#include "nlfm.h"\nint main(void) {\n'
+        "    double x[3] = {1, 1, 1}, tau[3], c[15];\n    int s[3];\n"
+        "    nflfm_c_step(x, x, x, tau, c, s);\n    nlfm_c_step(x, x, x, tau, c, s);\n"
+        "    return s[0];\n}\n"
+    )
+    build([*C89, "main.c", "nflfm.c", "nlfm.c", "-o", "both", "-lm"], tmp_path)
+    assert subprocess.run([tmp_path / "both"]).returncode == 0
+
+
+@cases
+@pytest.mark.parametrize("with_filter", [False, True])
+@pytest.mark.parametrize("name", ["NLFM", "ALFM"])
+def test_skeletons_and_wrapper_compile(exported, name, dtype, with_filter):
+    _, _, folder = exported(name, dtype, **({"with_filter": True} if with_filter else {}))
+    build([*C89[:-1], "-Wno-conversion", "-Werror", f"-I{STUBS}", "-c", "nfriction_sfun.c",
+           "-o", "s.o"], folder)  # fmt: skip
+    build([*CXX, f"-I{STUBS}", "-fsyntax-only", "-x", "c++", "nfriction.ino"], folder)
+    build(
+        [
+            *CXX,
+            "-Wconversion",
+            "-fsyntax-only",
+            "-x",
+            "c++",
+            "nf.hpp",
+            "-Wno-pragma-once-outside-header",
+        ],
+        folder,
+    )
+
+
+def test_simulink_and_cpp_give_the_torque_of_the_c(exported):
+    _, _, folder = exported("ALFM", "float64")
+    (folder / "main.cpp").write_text(
+        '#include <cstdio>\n#include "nf.hpp"\n#include "simstruc.h"\n'
+        'extern "C" { void stub_sizes(SimStruct *); void stub_outputs(SimStruct *); }\n'
+        "int main() {\n    static SimStruct S;\n    nf::Friction friction;\n    stub_sizes(&S);\n"
+        "    double worst = 0;\n    for (int k = 0; k < 500; ++k) {\n"
+        "        nf::Joints qd{}, qdd{}, load{};\n        for (unsigned j = 0; j < 3; ++j) {\n"
+        "            S.in[0][j] = qd[j] = 0.01 * k - j;\n"
+        "            S.in[1][j] = qdd[j] = 300.0 / (1 + k) - 2.0 * j;\n"
+        "            S.in[2][j] = load[j] = 1;\n        }\n        stub_outputs(&S);\n"
+        "        const nf::Output out = friction.step(qd, qdd, load);\n"
+        "        for (unsigned j = 0; j < 3; ++j) {\n"
+        "            const double d = S.out[0][j] - out.tau[j];\n"
+        "            worst = d > worst ? d : -d > worst ? -d : worst;\n        }\n    }\n"
+        '    std::printf("%g %.17g\\n", worst, S.out[0][1]);\n    return worst > 0;\n}\n'
+    )
+    build(["gcc", f"-I{STUBS}", "-c", "nfriction_sfun.c", "nfriction.c"], folder)
+    build(
+        ["g++", f"-I{STUBS}", "main.cpp", "nfriction_sfun.o", "nfriction.o", "-o", "both"], folder
+    )
+    result = subprocess.run([folder / "both"], capture_output=True, text=True)
+    assert result.returncode == 0, result.stdout
+    assert float(result.stdout.split()[1]) != 0.0
+
+
+def drag(qd, load, coefficients, v_smooth):
+    return coefficients.select(-1, 0) * qd * qd.abs() + 0.1 * coefficients.sum(-1) * load
+
+
+DRAG = Law("drag", (Coefficient("D", "N m s^2/rad^2"), Coefficient("E", "N m")), drag)
+
+
+class Sums(Constant):
+    """A schedule of one's own that couples the joints, so that no two are alike."""
+
+    def forward(self, qd, qdd):
+        spread = torch.cos(torch.cumsum(qd, -1)).unsqueeze(-1)
+        return super().forward(qd, qdd) * (2.0 + spread + 1e-3 * qdd.sum(-1)[..., None, None])
+
+
+@cases
+@pytest.mark.parametrize("schedule", [Constant, Sums])
+def test_a_law_and_schedule_of_ones_own_export(tmp_path, schedule, dtype):
+    model = FrictionModel(DRAG, schedule(DRAG, 3, [[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]]))
+    c(model, tmp_path, INFO, dtype=dtype)
+    controller = controller_of(model, INFO)
+    inputs = points(controller, dtype, 2000)
+    run = c_runner(tmp_path / "nfriction.c")
+    parity = compare(run_through(controller, inputs), run(*inputs), TOLERANCE[dtype])
+    assert parity.passed, parity
+
+
+def test_an_operation_without_c_form_is_named(tmp_path):
+    def bessel(qd, load, coefficients, v_smooth):
+        return torch.special.bessel_j0(qd) * coefficients.select(-1, 0)
+
+    law = Law("bessel", (Coefficient("A", "N m"),), bessel)
+    with pytest.raises(ExportError, match="bessel_j0") as caught:
+        c(FrictionModel(law, Constant(law, 2)), tmp_path)
+    assert isinstance(caught.value.__cause__, UnsupportedOperation)
+    assert not list(tmp_path.iterdir())
+
+
+ARM = ["-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16"]
+START = """
+extern void _start(void);
+void reset(void)
+{
+    *(volatile unsigned *)0xE000ED88 |= 0xFu << 20; /* the FPU is off after reset */
+    __asm volatile("dsb\\n isb");
+    _start();
+}
+__attribute__((section(".vectors"), used)) static const void *const vectors[2] = {
+    (const void *)0x20300000, (const void *)reset};
+"""
+PLACES = ["-Wl,--section-start=.vectors=0", "-Wl,-Ttext=0x10000", "-Wl,-Tdata=0x20000000"]
+
+
+@pytest.mark.skipif(
+    not (shutil.which("arm-none-eabi-gcc") and shutil.which("qemu-system-arm")),
+    reason="needs arm-none-eabi-gcc with newlib, and qemu-system-arm",
+)
+@pytest.mark.parametrize(("name", "flags"), [("NFLFM", ("-Os",)), ("ALFM", ("-O3", "-ffast-math"))])
+def test_passes_on_a_cortex_m4(exported, name, flags):
+    _, _, folder = exported(name, "float32")
+    (folder / "start.c").write_text(START)
+    build(["arm-none-eabi-gcc", *flags, *ARM, "--specs=rdimon.specs", *PLACES, "start.c",
+           "nf_selftest.c", "nfriction.c", "-o", "m4.elf", "-lm"], folder)  # fmt: skip
+    machine = ["qemu-system-arm", "-M", "mps2-an386", "-nographic", "-monitor", "none",
+               "-serial", "none", "-semihosting-config", "enable=on,target=native"]  # fmt: skip
+    result = subprocess.run(
+        [*machine, "-kernel", folder / "m4.elf"], capture_output=True, text=True, timeout=120
+    )
+    assert result.returncode == 0, result.stdout
+    assert "0 wrong" in result.stdout + result.stderr
+
+
+@pytest.mark.skipif(not shutil.which("arm-none-eabi-gcc"), reason="needs arm-none-eabi-gcc")
+def test_a_joint_fits_a_small_flash(tmp_path):
+    info = ModelInfo(input_ranges={"qd": [[-8.0, 7.1]], "qdd": [[-60.0, 50.1]]})
+    c(random_model("NFLFM", joints=1), tmp_path, info, dtype="float32")
+    build(["arm-none-eabi-gcc", "-std=c89", "-Os", *ARM, "-c", "nfriction.c", "-o", "m4.o"],
+          tmp_path)  # fmt: skip
+    sizes = subprocess.run(
+        ["arm-none-eabi-size", tmp_path / "m4.o"], capture_output=True, text=True
+    )
+    text, data, bss = map(int, sizes.stdout.splitlines()[1].split()[:3])
+    assert text <= 2400
+    assert data == bss == 0
+
+
+@pytest.mark.skipif(
+    not (shutil.which("powerpc-linux-gnu-gcc") and shutil.which("qemu-ppc")),
+    reason="needs powerpc-linux-gnu-gcc and qemu-ppc",
+)
+@cases
+@pytest.mark.parametrize(("name", "flags"), [("NFLFM", ("-O1",)), ("ALFM", ("-O3", "-ffast-math"))])
+def test_passes_on_a_big_endian_powerpc(exported, name, dtype, flags):
+    _, _, folder = exported(name, dtype)
+    build(["powerpc-linux-gnu-gcc", *flags, "-static", "nf_selftest.c", "nfriction.c", "-o", "ppc",
+           "-lm"], folder)  # fmt: skip
+    result = subprocess.run(
+        ["qemu-ppc", folder / "ppc"], capture_output=True, text=True, timeout=120
+    )
+    assert result.returncode == 0, result.stdout

@@ -1,0 +1,179 @@
+"""What an artefact carries: vectors that cover the edges, JSON that survives, and hostile ones."""
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from nfriction.export.contract import (
+    Contract,
+    ContractError,
+    compare,
+    contract_of,
+    run_through,
+    verify,
+)
+from nfriction.export.controller import NOT_FINITE, controller_of
+from nfriction.friction import LFM
+from nfriction.modelfile import ModelInfo
+from tests.export.artefacts import INFO
+from tests.friction.samples import named_models
+
+MODELS = named_models()
+
+
+def contract(name: str = "LFM", with_filter: bool = False, **options: Any) -> Contract:
+    controller = controller_of(MODELS[name], INFO, with_filter=with_filter)
+    return contract_of(MODELS[name], controller, INFO, **options)
+
+
+@pytest.mark.parametrize("name", ["LFM", "ALFM", "NFLFM"])
+@pytest.mark.parametrize("with_filter", [False, True])
+def test_vectors_cover_the_range_what_lies_beyond_and_what_is_broken(
+    name: str, with_filter: bool
+) -> None:
+    found = contract(name, with_filter)
+    status = found.outputs["status"]
+    assert len(status) >= 200
+    for x in found.inputs.values():
+        for test in (torch.isnan, torch.isposinf, torch.isneginf):
+            assert test(x).any(0).all()
+    assert all((status == code).any() for code in (0, 1, NOT_FINITE))
+    if not with_filter:
+        qd = found.inputs["qd"]
+        low, high = torch.tensor(INFO.input_ranges["qd"]).unbind(-1)
+        finite = torch.where(torch.isfinite(qd), qd, 0.0)
+        assert (finite > high).any(0).all()
+        assert (finite < low).any(0).all()
+        assert (finite <= high + 0.1 * (high - low) + 1e-9).all()
+        assert (qd == 0).any(0).all()
+
+
+@pytest.mark.parametrize("name", ["LFM", "ALFM"])
+def test_json_gives_the_same_back_and_the_same_model_the_same_bytes(name: str) -> None:
+    found = contract(name)
+    text = found.to_json()
+    assert text == contract(name).to_json()
+    json.loads(text, parse_constant=pytest.fail)  # a bare NaN is no JSON; some readers refuse it
+    back = Contract.from_json(text)
+    assert back.to_json() == text
+    for side in ("inputs", "outputs"):
+        for key, value in getattr(found, side).items():
+            torch.testing.assert_close(
+                getattr(back, side)[key], value, rtol=0, atol=0, equal_nan=True
+            )
+
+
+def test_it_says_what_a_host_needs() -> None:
+    info = ModelInfo(joint_names=["a", "b", "c"], sample_time=2e-3, training_data={"run": "ab12"})
+    controller = controller_of(MODELS["LFM"], info, torque_limit=2.0)
+    told = json.loads(contract_of(MODELS["LFM"], controller, info).to_json())
+    assert told["joint_names"] == ["a", "b", "c"]
+    assert told["units"]["tau_f"] == "N m"
+    assert told["sample_time"] == 2e-3
+    assert told["training_data"] == {"run": "ab12"}
+    assert told["torque_limit"] == [2.0, 2.0, 2.0]
+    assert told["status_bits"] == {"clamped": 1, "not_finite": 2, "saturated": 4}
+    assert {"version", "schema", "parameter_hash", "model", "edges", "tolerance"} <= told.keys()
+
+
+def broken_torque(tau_f: Tensor, coefficients: Tensor, status: Tensor) -> tuple[Tensor, ...]:
+    tau_f = tau_f.clone()
+    tau_f[5, 1] += 1e-11 * tau_f[:200].abs().max()
+    return tau_f, coefficients, status
+
+
+def broken_coefficient(tau_f: Tensor, coefficients: Tensor, status: Tensor) -> tuple[Tensor, ...]:
+    return tau_f, coefficients * (1 + 1e-9), status
+
+
+def broken_status(tau_f: Tensor, coefficients: Tensor, status: Tensor) -> tuple[Tensor, ...]:
+    status = status.clone()
+    status[0, 0] ^= 1
+    return tau_f, coefficients, status
+
+
+def without_nan(tau_f: Tensor, coefficients: Tensor, status: Tensor) -> tuple[Tensor, ...]:
+    return torch.nan_to_num(tau_f), coefficients, status
+
+
+def infinite(tau_f: Tensor, coefficients: Tensor, status: Tensor) -> tuple[Tensor, ...]:
+    tau_f = tau_f.clone()
+    tau_f[3, 0] = torch.inf
+    return tau_f, coefficients, status
+
+
+@pytest.mark.parametrize(
+    "harm", [broken_torque, broken_coefficient, broken_status, without_nan, infinite]
+)
+def test_every_difference_is_found(harm: Callable[..., tuple[Tensor, ...]]) -> None:
+    found = contract("NFLFM")
+    controller = controller_of(MODELS["NFLFM"], INFO)
+    assert verify(lambda *x: run_through(controller, x), found).passed
+    assert not verify(lambda *x: harm(*run_through(controller, x)), found).passed
+
+
+def test_errors_are_relative_to_each_joints_own_scale() -> None:
+    tau_f = torch.tensor([[1e-3, 1e3], [-2e-3, 1e3]], dtype=torch.float64)
+    rest = torch.ones(2, 2, 1), torch.zeros(2, 2)
+    moved = tau_f + torch.tensor([2e-9, 0.0], dtype=torch.float64)
+    assert compare((tau_f, *rest), (moved, *rest), 1e-12).torque_error == pytest.approx(1e-6)
+    with pytest.raises(ContractError, match="shapes"):
+        compare((tau_f, *rest), (tau_f[:1], *rest), 1e-12)
+
+
+def test_single_precision_is_judged_by_what_it_costs_the_model() -> None:
+    assert contract("LFM", dtype="float32").tolerance == pytest.approx(5e-7, rel=0.5)
+    assert 5e-7 <= contract("NFLFM", dtype="float32").tolerance < 1e-5
+    with pytest.raises(ValueError, match="float32"):
+        contract("LFM", dtype="float16")
+
+
+def edited(**changes: Any) -> str:
+    content = json.loads(contract().to_json())
+    for key, value in changes.items():
+        if value is None:
+            del content[key]
+        else:
+            content[key] = value
+    return json.dumps(content)
+
+
+VECTORS = contract().to_dict()["vectors"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "no JSON"),
+        (contract().to_json()[:-50], "cut short"),
+        ("[]", "not those of a controller"),
+        ("[" * 100_000, "no JSON|not those"),
+        (edited(format="other"), "not those of a controller"),
+        (edited(schema=99), "schema is '99', not 1"),
+        (edited(vectors=None), "missing or damaged"),
+        (edited(vectors={"inputs": {}, "outputs": {}}), "do not fit"),
+        (edited(vectors={**VECTORS, "inputs": {"qd": [["one"]]}}), "damaged"),
+        (edited(vectors={**VECTORS, "inputs": {"qd": [[True]]}}), "damaged"),
+        (edited(vectors={**VECTORS, "inputs": {"qd": [[1.0]]}}), "do not fit"),
+        (edited(vectors={**VECTORS, "inputs": {"qd": [0.0] * 200_000}}), "too long"),
+        (edited(tolerance="wide"), "damaged"),
+        (edited(tolerance=2.0), "do not fit"),
+        (edited(state_size=-1), "lack"),
+        (edited(state_size=10**9), "lack"),
+        (edited(dtype="float8"), "lack"),
+        (edited(inputs=["a"]), "lack"),
+    ],
+)
+def test_hostile_metadata_are_refused(text: str, message: str) -> None:
+    with pytest.raises(ContractError, match=message):
+        Contract.from_json(text)
+
+
+def test_names_must_be_one_a_joint() -> None:
+    model = LFM(2)
+    with pytest.raises(ValueError, match="name 2 joints"):
+        contract_of(model, controller_of(model), ModelInfo(joint_names=["a"]))

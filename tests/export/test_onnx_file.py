@@ -1,0 +1,163 @@
+"""ONNX: equal to the model in double, as close as single precision allows, and refusals."""
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from nfriction.export import ExportError, onnx
+from nfriction.export.contract import ContractError, compare, run_through, verify
+from nfriction.export.controller import controller_of
+from nfriction.export.onnx_file import METADATA, open_onnx
+from nfriction.export.points import draw
+from nfriction.friction import LFM, Coefficient, Constant, FrictionModel, Law
+from tests.export.artefacts import INFO, rising
+from tests.friction.samples import named_models
+
+MODELS = named_models()
+QUICK = ["NLFM", "ALFM", "NFLFM"]
+
+needs_onnx = pytest.mark.skipif(
+    importlib.util.find_spec("onnx") is None, reason="the extra onnx is not installed"
+)
+
+
+@needs_onnx
+@pytest.mark.parametrize("name", QUICK)
+def test_in_double_it_equals_the_model(name: str, tmp_path: Path) -> None:
+    check_parity(MODELS[name], tmp_path / "m.onnx", "float64", 5000)
+
+
+@needs_onnx
+@pytest.mark.parametrize("name", ["LFM", "NFLFM"])
+def test_in_single_precision_it_is_as_close_as_that_allows(name: str, tmp_path: Path) -> None:
+    check_parity(MODELS[name], tmp_path / "m.onnx", "float32", 5000)
+
+
+@needs_onnx
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("joints", [1, 2, 3, 4])
+@pytest.mark.parametrize("name", MODELS)
+def test_parity_over_very_many_points(name: str, joints: int, dtype: str, tmp_path: Path) -> None:
+    check_parity(named_models(joints)[name], tmp_path / "m.onnx", dtype, 200_000, joints)
+
+
+@needs_onnx
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["LFM", "ALFM", "NFLFM"])
+def test_the_filter_starts_by_itself(name: str, tmp_path: Path) -> None:
+    contract, run = open_onnx(onnx(MODELS[name], tmp_path / "m.onnx", INFO, with_filter=True))
+    assert verify(run, contract).passed
+
+
+def check_parity(
+    model: FrictionModel, path: Path, dtype: str, points: int, joints: int = 3
+) -> None:
+    info = INFO if joints == 3 else None
+    contract, run = open_onnx(onnx(model, path, info, dtype=dtype))
+    assert verify(run, contract).passed
+    controller = controller_of(model, info)
+    inputs = draw(controller, points if not model.state_size else min(points // 20, 3000), seed=11)
+    if dtype == "float32":
+        inputs = tuple(x.float().double() for x in inputs)
+    tolerance = 1e-12 if dtype == "float64" else contract.tolerance
+    parity = compare(run_through(controller, inputs), run(*inputs), tolerance)
+    assert parity.passed, parity
+
+
+@needs_onnx
+def test_a_schedule_of_ones_own_is_clamped_and_metadata_go_along(tmp_path: Path) -> None:
+    package: Any = pytest.importorskip("onnx")
+    check_parity(rising(), tmp_path / "m.onnx", "float64", 1000)
+    file = package.load(tmp_path / "m.onnx")
+    assert [prop.key for prop in file.metadata_props] == [METADATA]
+    assert [x.name for x in file.graph.input] == ["qd", "qdd", "load"]
+    assert [x.name for x in file.graph.output] == ["tau_f", "coefficients", "status"]
+    doubles = {package.TensorProto.DOUBLE, package.TensorProto.INT32, package.TensorProto.INT64,
+               package.TensorProto.BOOL}  # fmt: skip
+    # Nothing in double has gone through single precision on its way.
+    assert {x.data_type for x in file.graph.initializer} <= doubles
+
+
+@needs_onnx
+def test_without_onnx_runtime_the_packages_own_evaluator_serves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    check_parity(MODELS["NLFM"], tmp_path / "m.onnx", "float64", 500)
+
+
+@needs_onnx
+def test_the_arctangent_is_double_everywhere(tmp_path: Path) -> None:
+    law = Law("arctangent", (Coefficient("a", "N m"),), arctangent)
+    model = FrictionModel(law, Constant(law, 1, [1.0]))
+    _, run = open_onnx(onnx(model, tmp_path / "m.onnx"))
+    x = torch.cat([torch.linspace(-40, 40, 4001), torch.logspace(-12, 30, 500)]).double()[:, None]
+    tau_f = run(x, torch.zeros_like(x), torch.zeros_like(x))[0]
+    np.testing.assert_allclose(np.asarray(tau_f), np.arctan(x.numpy()), rtol=0, atol=1e-15)
+
+
+def arctangent(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
+    return coefficients.select(-1, 0) * torch.atan(qd)
+
+
+def through_erf(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
+    return coefficients.select(-1, 0) * torch.erf(qd)
+
+
+@needs_onnx
+def test_an_operation_without_a_form_is_named(tmp_path: Path) -> None:
+    law = Law("error function", (Coefficient("a", "N m"),), through_erf)
+    with pytest.raises(ExportError, match=r"aten\.erf.*no ONNX form"):
+        onnx(FrictionModel(law, Constant(law, 2)), tmp_path / "m.onnx")
+    assert not list(tmp_path.iterdir())
+
+
+@needs_onnx
+def test_hostile_files_are_refused(tmp_path: Path) -> None:
+    package: Any = pytest.importorskip("onnx")
+    good = onnx(LFM(2), tmp_path / "good.onnx")
+    bad = tmp_path / "bad.onnx"
+    for content in (b"", b"junk", good.read_bytes()[:300]):
+        bad.write_bytes(content)
+        with pytest.raises((ExportError, ContractError)):
+            open_onnx(bad)
+    file = package.load(good)
+    del file.metadata_props[:]
+    package.save(file, bad)
+    with pytest.raises(ContractError, match="no JSON"):
+        open_onnx(bad)
+
+
+def test_a_filter_in_single_precision_is_refused(tmp_path: Path) -> None:
+    if importlib.util.find_spec("onnx") is None:
+        pytest.skip("the extra onnx is not installed")
+    with pytest.raises(ValueError, match="filter needs"):
+        onnx(LFM(3), tmp_path / "m.onnx", INFO, dtype="float32", with_filter=True)
+
+
+WITHOUT = """
+import sys
+sys.modules["onnx"] = None
+from nfriction import LFM
+from nfriction.export import onnx
+try:
+    onnx(LFM(1), sys.argv[1])
+except ImportError as error:
+    print(error)
+"""
+
+
+def test_without_the_package_the_mend_is_told(tmp_path: Path) -> None:
+    run = subprocess.run(
+        [sys.executable, "-c", WITHOUT, tmp_path / "m.onnx"],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert "pip install nfriction[onnx]" in run.stdout

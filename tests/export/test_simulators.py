@@ -1,0 +1,126 @@
+"""Joints of simulators: what can be told exactly is, what cannot has its price told."""
+
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import torch
+
+from nfriction.export import collapse, mjcf, urdf
+from nfriction.friction import ALFM, LFM, NCFM, NFLFM, NLFM
+from nfriction.modelfile import ModelInfo
+from nfriction.signals import Motion
+from tests.friction.samples import randomise
+
+TIME = 1e-3 * np.arange(3000)
+
+
+def swing(joints: int = 2, amplitude: float = 1.0) -> Motion:
+    phase = 7 * TIME[:, None] + np.arange(joints)
+    q = amplitude * np.sin(phase)
+    return Motion(TIME, q, 7 * amplitude * np.cos(phase), -49 * q)
+
+
+@pytest.mark.parametrize(
+    ("model", "frictionloss"), [(NCFM(2, [0.3]), 0.0), (LFM(2, [0.3, 0.7]), 0.7)]
+)
+def test_what_damping_and_friction_loss_can_say_costs_nothing(
+    model: NCFM | LFM, frictionloss: float
+) -> None:
+    found = collapse(model, swing())
+    assert found.damping == pytest.approx([0.3, 0.3], rel=1e-9)
+    assert found.frictionloss == pytest.approx([frictionloss] * 2, abs=1e-9)
+    assert max(found.relative_error) < 1e-9
+
+
+def test_the_price_is_the_least_there_is() -> None:
+    model = NFLFM(2, [0.1, 0.2])
+    randomise(model, 0.3)
+    motion = swing()
+    found = collapse(model, motion)
+    qd, qdd = torch.as_tensor(motion.qd), torch.as_tensor(motion.qdd)
+    tau = model(qd, qdd, torch.ones_like(qd)).detach().numpy()
+
+    def rms(damping: np.ndarray, frictionloss: np.ndarray) -> np.ndarray:
+        nearest = damping * motion.qd + frictionloss * np.tanh(motion.qd / model.v_smooth)
+        return np.sqrt(((tau - nearest) ** 2).mean(0))
+
+    d, f = np.array(found.damping), np.array(found.frictionloss)
+    best = rms(d, f)
+    np.testing.assert_allclose(best, found.rms_error, rtol=1e-9)
+    np.testing.assert_allclose(np.sqrt((tau**2).mean(0)), found.rms_torque)
+    for factor in (0.99, 1.01):
+        assert (rms(factor * d, f) > best).all()
+        assert (rms(d, factor * f) > best).all()
+
+
+def test_neither_number_feeds_energy_in() -> None:
+    # Friction that falls with speed would want negative damping.
+    falling = NLFM(1, [0.0, 1.0, 0.0, 0.0, 1.0])
+    found = collapse(falling, swing(1))
+    assert min(*found.damping, *found.frictionloss) >= 0
+    offset = collapse(NLFM(1, [-1.0, 0.01, 0.0, 0.0, 1.0]), swing(1))
+    assert min(*offset.damping, *offset.frictionloss) >= 0
+    assert offset.relative_error[0] > 0.9  # a constant offset is all lost, and it says so
+
+
+def test_load_and_memory_go_in() -> None:
+    heavy = collapse(LFM(2, [0.3, 0.7]), swing(), load=lambda q, qd: torch.full_like(q, 2.0))
+    assert heavy.frictionloss == pytest.approx([1.4, 1.4])
+    adaptive = ALFM(2, torch.tensor([[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]]).repeat(2, 1, 1))
+    # Slow motion of small acceleration has the coefficients of the lowest class, fast the highest.
+    slow, fast = swing(amplitude=0.01), swing(amplitude=5.0)
+    assert collapse(adaptive, slow).damping == pytest.approx([0.1, 0.1], rel=1e-6)
+    # The first joint starts without acceleration, in the lowest class.
+    assert collapse(adaptive, fast).damping[1] == pytest.approx(0.5, rel=1e-6)
+    both = collapse(adaptive, [slow, fast])
+    assert max(both.relative_error) > 1e-6
+
+
+def test_a_motion_that_says_nothing_is_refused() -> None:
+    still = Motion(TIME, *(np.zeros((len(TIME), 2)) for _ in range(3)))
+    with pytest.raises(ValueError, match="stands still"):
+        collapse(LFM(2), still)
+    with pytest.raises(ValueError, match="with 2 joints"):
+        collapse(LFM(2), swing(3))
+
+
+ROBOT = """<mujoco><!-- kept -->
+  <worldbody>
+    <body><joint name="shoulder" type="hinge" axis="0 1 0"/><geom size="0.1" mass="1"/>
+      <body pos="0 0 1"><joint name="elbow" axis="0 1 0" damping="9"/>
+        <geom size="0.1" mass="1"/></body></body>
+  </worldbody>
+  <equality><joint joint1="elbow" active="false"/></equality>
+</mujoco>"""
+
+
+def test_mujoco_damps_as_the_numbers_say(tmp_path: Path) -> None:
+    mujoco: Any = pytest.importorskip("mujoco")
+    (tmp_path / "robot.xml").write_text(ROBOT)
+    info = ModelInfo(joint_names=["elbow", "shoulder"])
+    model = LFM(2, [[0.3, 0.7], [0.5, 0.9]])
+    found = mjcf(model, tmp_path / "out.xml", swing(), info, into=tmp_path / "robot.xml")
+    loaded = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
+    state = mujoco.MjData(loaded)
+    state.qvel[:] = [2.0, -3.0]  # of shoulder and elbow, in the robot's own order
+    mujoco.mj_forward(loaded, state)
+    np.testing.assert_allclose(state.qfrc_passive, [-0.5 * 2.0, 0.3 * 3.0], rtol=1e-9)
+    np.testing.assert_allclose(loaded.dof_frictionloss, [0.9, 0.7], rtol=1e-9)
+    assert found.damping == pytest.approx([0.3, 0.5])
+    assert "kept" in (tmp_path / "out.xml").read_text()
+
+
+def test_the_snippets_load_and_tell_their_price(tmp_path: Path) -> None:
+    mujoco: Any = pytest.importorskip("mujoco")
+    info = ModelInfo(joint_names=['a "b" --', "c"])  # as awkward as names can be
+    found = mjcf(LFM(2, [0.3, 0.7]), tmp_path / "friction.xml", swing(), info)
+    mujoco.MjModel.from_xml_path(str(tmp_path / "friction.xml"))
+    assert "RMS" in (tmp_path / "friction.xml").read_text()
+    assert "damping 0.3 N m s/rad, friction loss 0.7 N m" in str(found)
+    urdf(LFM(2, [0.3, 0.7]), tmp_path / "friction.urdf", swing(), info)
+    tree = ElementTree.parse(tmp_path / "friction.urdf")
+    assert [joint.get("name") for joint in tree.iter("joint")] == list(info.joint_names)
+    assert [float(x.attrib["friction"]) for x in tree.iter("dynamics")] == pytest.approx([0.7, 0.7])

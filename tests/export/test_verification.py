@@ -1,0 +1,91 @@
+"""Proofs of artefacts: those of the model pass, those of another model or doctored ones do not."""
+
+from pathlib import Path
+
+import pytest
+
+from nfriction.codegen.build import find_compiler
+from nfriction.export import ContractError, ExportError, c, torchscript, verify_artefact
+from nfriction.export.contract import Contract
+from nfriction.friction import LFM
+from tests.export.artefacts import INFO
+from tests.friction.samples import named_models, randomise
+
+MODELS = named_models()
+
+
+@pytest.mark.parametrize("name", ["LFM", "NFLFM", "ALFM"])
+def test_torchscript_is_its_model(name: str, tmp_path: Path) -> None:
+    path = torchscript(MODELS[name], tmp_path / "m.pt", INFO, torque_limit=[5.0, 6.0, 7.0])
+    verdict = verify_artefact(path, MODELS[name], INFO, points=200)
+    assert verdict.passed
+    assert verdict.vectors.points >= 200
+    assert verdict.points.points == 200
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="needs a C compiler")
+@pytest.mark.parametrize("name", ["LFM", "NFLFM", "ALFM"])
+@pytest.mark.parametrize("with_filter", [False, True])
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_c_is_its_model(name: str, with_filter: bool, dtype: str, tmp_path: Path) -> None:
+    c(MODELS[name], tmp_path, INFO, name="m", with_filter=with_filter, dtype=dtype)
+    verdict = verify_artefact(tmp_path / "m.c", MODELS[name], INFO, points=200)
+    assert verdict.passed, verdict
+
+
+def test_an_artefact_of_another_model_is_found_out(tmp_path: Path) -> None:
+    other = LFM(3, [1e-3, 2e-3])
+    randomise(other, 1e-9)
+    path = torchscript(other, tmp_path / "m.pt", INFO)
+    verdict = verify_artefact(path, LFM(3, [1e-3, 2e-3]), INFO)
+    assert verdict.vectors.passed  # it is what it says, but
+    assert not verdict.points.passed
+    assert not verdict.passed
+    assert ["parameters" in x for x in verdict.differences] == [True]
+    with pytest.raises(ExportError, match="3 joints, the model 2"):
+        verify_artefact(path, LFM(2), INFO)
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="needs a C compiler")
+def test_doctored_c_is_found_out(tmp_path: Path) -> None:
+    c(MODELS["LFM"], tmp_path, INFO, name="m")
+    source = tmp_path / "m.c"
+    text = source.read_text()
+    assert "tanh" in text
+    source.write_text(text.replace("tanh", "sin"))
+    verdict = verify_artefact(source, MODELS["LFM"], INFO, points=100)
+    assert not verdict.vectors.passed
+    source.write_text("no C at all")
+    with pytest.raises(ExportError, match="failed"):
+        verify_artefact(source, MODELS["LFM"], INFO)
+    beside = tmp_path / "m.json"
+    beside.write_text(beside.read_text()[:-100])
+    with pytest.raises(ContractError, match="cut short"):
+        verify_artefact(source, MODELS["LFM"], INFO)
+    beside.unlink()
+    with pytest.raises(ContractError, match="beside it"):
+        verify_artefact(source, MODELS["LFM"], INFO)
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "m.exe").touch()
+    with pytest.raises(ExportError, match=r"one of \.c, \.pt, \.pt2, \.onnx"):
+        verify_artefact(tmp_path / "m.exe", LFM(2))
+    with pytest.raises(FileNotFoundError):
+        verify_artefact(tmp_path / "absent.pt", LFM(2))
+
+
+def test_huge_files_are_refused_before_they_are_read(tmp_path: Path) -> None:
+    for name in ("m.pt", "m.c"):
+        with (tmp_path / name).open("wb") as file:
+            file.truncate(2**29)  # sparse
+    (tmp_path / "m.json").write_text(a_contract().to_json())
+    for name in ("m.pt", "m.c"):
+        with pytest.raises(ExportError, match="too large"):
+            verify_artefact(tmp_path / name, LFM(2))
+
+
+def a_contract() -> Contract:
+    from nfriction.export import contract_of, controller_of
+
+    return contract_of(LFM(2), controller_of(LFM(2)))
