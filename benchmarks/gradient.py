@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
@@ -29,13 +30,32 @@ def peak_memory() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
 
 
-def median_time(work: Callable[[], object], repeats: int) -> float:
-    times = []
+def median_time(work: Callable[[], object], repeats: int) -> tuple[float, float]:
+    """Median processor and wall time [s]: on an idle machine the same."""
+    times: tuple[list[float], list[float]] = ([], [])
     for _ in range(repeats):
-        start = timing.CLOCK()
+        start = timing.CLOCK(), time.perf_counter()
         work()
-        times.append(timing.CLOCK() - start)
-    return sorted(times)[len(times) // 2]
+        times[0].append(timing.CLOCK() - start[0])
+        times[1].append(time.perf_counter() - start[1])
+    processor, wall = (sorted(found)[repeats // 2] for found in times)
+    return processor, wall
+
+
+def operations(work: Callable[[], object]) -> int:
+    """How many operations eager torch is asked for, those of the backward pass included."""
+    from torch.utils._python_dispatch import TorchDispatchMode
+
+    class Counter(TorchDispatchMode):
+        count = 0
+
+        def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+            Counter.count += 1
+            return function(*args, **(kwargs or {}))
+
+    with Counter():
+        work()
+    return Counter.count
 
 
 def torch_gradient(repeats: int) -> None:
@@ -57,16 +77,18 @@ def torch_gradient(repeats: int) -> None:
         motion = rollout(plant, model, q0, qd0, steps=STEPS, gradients=True)
         (motion.q - target).square().mean().backward()
 
-    seconds = median_time(gradient, repeats)
+    seconds, wall = median_time(gradient, repeats)
+    peak, calls = peak_memory(), operations(gradient)
     count = sum(p.numel() for p in model.parameters())
     missing = [n for n, p in model.named_parameters() if p.grad is None]
     if missing or not all(torch.isfinite(p.grad).all() for p in model.parameters()):
         raise SystemExit(f"the gradient is not finite, or lacks {missing}")
     print(
-        f"  {count} parameters; memory {before:.0f} MB before, {peak_memory():.0f} MB at the peak"
+        f"  {count} parameters; memory {before:.0f} MB before, {peak:.0f} MB at the peak; "
+        f"{wall:.2f} s by the wall; {calls} operations, {1e6 * seconds / calls:.1f} us each"
     )
     verdict("gradient in eager torch [s]", seconds, 1.0)
-    verdict("peak memory of the process [GB]", peak_memory() / 1e3, 1.0)
+    verdict("peak memory of the process [GB]", peak / 1e3, 1.0)
 
 
 def gauss_newton(repeats: int) -> None:
@@ -99,9 +121,62 @@ def gauss_newton(repeats: int) -> None:
         found = problem.quadratic(x)
         if not torch.isfinite(found.hessian).all():
             raise SystemExit("the Gauss-Newton model is not finite")
-        seconds = median_time(lambda p=problem, x=x: p.quadratic(x), repeats)
+        seconds, _ = median_time(lambda p=problem, x=x: p.quadratic(x), repeats)
         print(f"  {name}: {problem.friction_count} friction parameters and {x.numel()} unknowns: "
               f"{seconds:.3f} s, peak {peak_memory():.0f} MB", flush=True)  # fmt: skip
+
+
+def one_width_a_unit():
+    """The papers' 2-10-2 network: 10 centres in the plane, 10 widths, 52 parameters."""
+    import torch
+    from torch import nn
+
+    from nfriction.fuzzy import RBFNetwork
+
+    class PaperNetwork(RBFNetwork):
+        """Offers the columns that its outputs share, as a user's own module may."""
+
+        def __init__(self) -> None:
+            super().__init__(1)
+            self.log_widths = nn.Parameter(self.log_widths.detach()[..., :1].clone())
+
+        @torch.no_grad()
+        def jacobian_columns(self, x, out=None):
+            shared, moving = self.units + 1, self.units * self.inputs
+            u, inverse = x.movedim(0, -1).unsqueeze(1), torch.exp(-self.log_widths)
+            F = x.new_empty(1, shared + moving + self.units, len(x)) if out is None else out
+            phi = self.regressor_columns(x, F[:, :shared])[:, :-1]
+            z = F[:, shared : shared + moving].unflatten(1, (self.units, self.inputs))
+            torch.sub(u, self.centres.unsqueeze(-1), out=z)
+            z.mul_(inverse.unsqueeze(-1))
+            torch.mul(z[:, :, 0], z[:, :, 0], out=F[:, -self.units :])
+            F[:, -self.units :].addcmul_(z[:, :, 1], z[:, :, 1]).mul_(phi)
+            z.mul_(phi.unsqueeze(2))
+            return F
+
+        @torch.no_grad()
+        def jacobian_maps(self):
+            inputs, units, weight = self.inputs, self.units, self.output_weight.detach()
+            slope = (weight * torch.exp(-self.log_widths).mT).repeat_interleave(inputs, 2)
+            own, one = (torch.eye(n).to(weight) for n in (self.outputs, units))
+            blocks = (
+                torch.diag_embed(slope),
+                torch.diag_embed(weight),
+                torch.einsum("ab,uv->aubv", own, one).flatten(2),
+                own.unsqueeze(1),
+            )
+            names, maps = [name for name, _ in self.named_parameters()], {}
+            starts = {"centres": units + 1, "log_widths": units + 1 + units * inputs,
+                      "output_weight": 0, "output_bias": units}  # fmt: skip
+            by_name = dict(zip(starts, blocks, strict=True))
+            for name in names:
+                block, start = by_name[name], starts[name]
+                columns = units * (2 + inputs) + 1
+                maps[name] = weight.new_zeros(1, self.outputs, columns, block.shape[-1])
+                maps[name][:, :, start : start + block.shape[-2]] = block
+            return maps
+
+    return PaperNetwork()
 
 
 def regularised(repeats: int) -> None:
@@ -109,23 +184,41 @@ def regularised(repeats: int) -> None:
     import torch
 
     from nfriction.fuzzy import RBFNetwork
-    from nfriction.solve import bayesian_regularisation
+    from nfriction.solve import bayesian_regularisation, per_sample_jacobian
+    from nfriction.solve.jacobian import trainable
 
     torch.set_num_threads(1)
     random = torch.Generator().manual_seed(0)
     x = 2 * torch.rand(40_000, 1, 2, generator=random, dtype=torch.float64) - 1
     y = torch.stack([torch.sin(3 * x[..., 0]) * x[..., 1], torch.exp(-x.square().sum(-1))], -1)
     y = y + 0.01 * torch.randn(y.shape, generator=random, dtype=torch.float64)
-    network = RBFNetwork(1)
-    stamps = [timing.CLOCK()]
-    bayesian_regularisation(
-        network, x, y, max_steps=3 * repeats, callback=lambda _: stamps.append(timing.CLOCK())
-    )
-    steps = sorted(b - a for a, b in pairwise(stamps[1:]))
-    count = sum(p.numel() for p in network.parameters())
-    print(f"  {count} parameters (a width per axis; 52 with one width a unit), "
-          f"{len(steps)} iterations")  # fmt: skip
-    verdict("iteration of Bayesian regularisation [ms]", 1e3 * steps[len(steps) // 2], 30.0)
+    for name, network in (
+        ("a width a unit", one_width_a_unit()),
+        ("a width per axis", RBFNetwork(1)),
+    ):
+        written = per_sample_jacobian(network, trainable(network), x[:50])
+        plain = per_sample_jacobian(
+            lambda p, inputs, n=network: torch.func.functional_call(n, dict(p), (inputs,)),
+            trainable(network),
+            x[:50],
+        )
+        if not torch.allclose(written, plain, rtol=1e-10, atol=1e-10):
+            raise SystemExit("the written Jacobian is not the automatic one")
+        stamps = [(timing.CLOCK(), time.perf_counter())]
+        bayesian_regularisation(
+            network,
+            x,
+            y,
+            max_steps=3 * repeats,
+            callback=lambda _, s=stamps: s.append((timing.CLOCK(), time.perf_counter())),
+        )
+        steps, walls = (
+            sorted(1e3 * (b[i] - a[i]) for a, b in pairwise(stamps[1:])) for i in range(2)
+        )
+        middle, count = len(steps) // 2, sum(p.numel() for p in network.parameters())
+        print(f"  {count} parameters ({name}), {len(steps)} iterations, "
+              f"{walls[middle]:.0f} ms by the wall")  # fmt: skip
+        verdict("iteration of Bayesian regularisation [ms]", steps[middle], 30.0)
 
 
 FIRST_CALL = """

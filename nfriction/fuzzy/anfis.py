@@ -204,6 +204,10 @@ class Anfis(nn.Module):
         """
         return anfis_jacobian.jacobian_columns(self, x, out)
 
+    def readout(self) -> Tensor:
+        """The consequents as (groups, outputs, regressors): outputs of the first columns."""
+        return self.consequents.flatten(2)
+
     def jacobian_maps(self) -> dict[str, Tensor]:
         """How `jacobian_columns` combine, (groups, outputs, columns, entries of a group)."""
         return anfis_jacobian.jacobian_maps(self)

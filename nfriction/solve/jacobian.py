@@ -13,6 +13,8 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call, vjp, vmap
 
+from nfriction.solve.shared_columns import accumulate_columns, shares_columns
+
 Function: TypeAlias = Callable[[Mapping[str, Tensor], Tensor], Tensor]
 
 # 4 MiB of Jacobian at a time: below, the calls cost more than the arithmetic; above, the backward
@@ -115,6 +117,8 @@ def normal_equations(
     """Normal equations of the least-squares problem f(parameters, inputs) = targets.
 
     Accumulated chunk by chunk: 40,000 samples of 52 parameters never hold their whole Jacobian.
+    A module that offers the columns its outputs share (`shared_columns`) is asked for these, one
+    that offers `jacobian` for that, others are differentiated.
 
     Args:
         model, parameters, inputs, chunk: as for `per_sample_jacobian`.
@@ -124,6 +128,11 @@ def normal_equations(
         ValueError: if targets or weights do not fit.
     """
     check_samples(inputs, targets, weights)
+    if isinstance(model, nn.Module) and shares_columns(model) and _all_trained(model, parameters):
+        _errors(_function(model)(parameters, inputs[:1]), targets[:1])
+        return NormalEquations(
+            *accumulate_columns(model, parameters, inputs, targets, weights, chunk)
+        )
     p = sum(value.numel() for value in parameters.values())
     JtJ, Jte, squares = inputs.new_zeros(p, p), inputs.new_zeros(p), inputs.new_zeros(())
     for rows, output, jacobians in jacobian_pieces(model, parameters, inputs, chunk):
@@ -191,9 +200,9 @@ def _function(model: nn.Module | Function) -> Function:
     return model
 
 
-def _knows_jacobian(model: nn.Module, parameters: Mapping[str, Tensor]) -> bool:
-    has_method = callable(getattr(model, "jacobian", None))
-    return has_method and list(parameters) == list(trainable(model))
+def _all_trained(model: nn.Module, parameters: Mapping[str, Tensor]) -> bool:
+    """Whether these are what a module's own derivatives are by, in their order."""
+    return list(parameters) == list(trainable(model))
 
 
 def _differentiated(
@@ -201,7 +210,8 @@ def _differentiated(
 ) -> Callable[[Tensor], tuple[Tensor, Sequence[Tensor]]]:
     """Batch of inputs -> outputs (m, *outputs) and a Jacobian (m, p) for each of them."""
     function = _function(model)
-    if isinstance(model, nn.Module) and _knows_jacobian(model, parameters):
+    written = callable(getattr(model, "jacobian", None))
+    if isinstance(model, nn.Module) and written and _all_trained(model, parameters):
         own = _OwnJacobian(model)
         prefixed = {f"model.{name}": value for name, value in parameters.items()}
 

@@ -44,9 +44,10 @@ def maximise_evidence(
     """Fit parameters, noise precision and one prior precision per group to normal equations.
 
     A step solves (S + mu diag S) d = -(beta J^T e + alpha (w - w0)) and is taken if
-    beta E_D + sum alpha_g E_g falls; then mu/10 and new alpha and beta, else mu*10. Errors that are
-    not finite reject a step. The damping is relative to the diagonal, so that the units of the
-    parameters do not matter; the first step has hardly any prior, as in Foresee and Hagan.
+    beta E_D + sum alpha_g E_g falls; else, or where errors are not finite, mu*10. Then come new
+    alpha and beta, and mu/10 if the first trial fell about as predicted. The damping is relative to
+    the diagonal, so that the units of the parameters do not matter; the first step has hardly any
+    prior, as in Foresee and Hagan.
 
     Args:
         equations: J^T J, J^T e and E_D = sum e^2 at given parameters.
@@ -218,18 +219,24 @@ class _Fit:
                 # The weights are where these alpha and beta want them: only those move on.
                 self.state = replace(state, step=state.step + 1)
                 return None
-            there = self._attempt(state.w + step, precision, objective)
-            if there is not None:
-                moved = replace(
-                    state, w=state.w + step, damping=max(damping / 10, 1e-15), step=state.step + 1
-                )
-                self.local, self.state = there, moved
+            found = self._attempt(state.w + step, precision, objective)
+            if found is not None:
+                there, fall = found
+                # After a rejected trial, or a poor model, less damping would cost another trial.
+                if fall > 0.75 * predicted and damping <= state.damping:
+                    damping = max(damping / 10, 1e-15)
+                elif fall < 0.25 * predicted:
+                    damping *= 4
+                self.local = there
+                self.state = replace(state, w=state.w + step, damping=damping, step=state.step + 1)
                 return None
             damping *= 10
         return "not_finite" if self.not_finite else "stalled"
 
-    def _attempt(self, w: Tensor, precision: Tensor, objective: float) -> NormalEquations | None:
-        """Normal equations at `w` if all is finite and the objective falls, else None."""
+    def _attempt(
+        self, w: Tensor, precision: Tensor, objective: float
+    ) -> tuple[NormalEquations, float] | None:
+        """Normal equations at `w` and the objective's fall if all is finite and there is one."""
         state, data = self.state, self.data
         shrinkage = float(precision @ (w - data.centre).square())
         if data.squares is not None:
@@ -240,8 +247,8 @@ class _Fit:
         there = data.equations(w)
         self.not_finite = not _finite(there)
         # The very sum that the next objective starts from decides, not its cheap twin.
-        falls = float(state.beta * there.squares) + shrinkage < objective
-        return there if falls and not self.not_finite else None
+        fall = objective - float(state.beta * there.squares) - shrinkage
+        return (there, fall) if fall > 0 and not self.not_finite else None
 
     def result(self, status: Status) -> EvidenceResult:
         state, data = self.state, self.data
