@@ -6,14 +6,20 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from torch import Tensor
 
 from nfriction.fitting import Fit, fit
 from nfriction.friction import Constant, FrictionModel, NeuroFuzzy, model_by_name
+from nfriction.friction.adaptive import CLASSES, Adaptive
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.recording import Recording
 from nfriction.scoring import HORIZONS, Score, improvement_table, rmse_table, score
+from nfriction.signals import Motion, kalman_smoother
 
 NO_FRICTION = "no friction"
+JUDGED_BY = "free-run RMSE over all joints and held-out recordings"
+# Errors that agree to three digits do not tell two models apart.
+TIE = 1e-3
 InitialStates = Mapping[str, tuple[np.ndarray, np.ndarray]]
 
 
@@ -26,6 +32,7 @@ class Comparison:
         train, held_out: scores by model name, then recording, `"no friction"` among them.
         unit: of the errors, `"rad"` or `"m"`.
         joint_names: columns of the tables.
+        horizons_asked: window lengths that were to be scored [s].
     """
 
     fits: dict[str, Fit]
@@ -33,12 +40,22 @@ class Comparison:
     held_out: dict[str, list[Score]]
     unit: str
     joint_names: tuple[str, ...]
+    horizons_asked: tuple[float, ...] = ()
 
-    def table(self, horizon: str | None = None, *, held_out: bool = True) -> pd.DataFrame:
-        """Position error by model and joint, over all recordings of a kind (as Table 10)."""
+    def scores(self, *, held_out: bool = True) -> dict[str, list[Score]]:
+        """Scores of a kind by model name.
+
+        Raises:
+            ValueError: if no recording of the kind was scored.
+        """
         scores = self.held_out if held_out else self.train
         if not scores:
             raise ValueError("no recording of this kind was scored; see `held_out`.")
+        return scores
+
+    def table(self, horizon: str | None = None, *, held_out: bool = True) -> pd.DataFrame:
+        """Position error by model and joint, over all recordings of a kind (as Table 10)."""
+        scores = self.scores(held_out=held_out)
         columns = [*self.joint_names, "all"]
         rmse = rmse_table(scores, horizon)
         return pd.DataFrame(rmse, index=pd.Index(list(scores), name="model"), columns=columns)
@@ -50,13 +67,47 @@ class Comparison:
             improvement_table(table.to_numpy()), index=table.index, columns=table.columns
         )
 
-    def horizons(self) -> list[str]:
-        """Window lengths that every recording has."""
-        scores = [s for of in (self.train, self.held_out) for many in of.values() for s in many]
+    def horizons(self, *, held_out: bool | None = None) -> list[str]:
+        """Window lengths that every recording has; of a kind, or by default of both."""
+        kinds = (self.train, self.held_out)
+        of = kinds if held_out is None else (kinds[held_out],)
+        scores = [s for kind in of for many in kind.values() for s in many]
         return [h for h in scores[0].windows if all(h in s.windows for s in scores)]
 
+    def too_short(self, *, held_out: bool = True) -> dict[str, dict[str, float]]:
+        """Recordings too short for a window length: duration [s] by length and recording."""
+        scores = next(iter(self.scores(held_out=held_out).values()))
+        found = {
+            f"{h:g}": {
+                s.recording: float(s.time[-1] - s.time[0])
+                for s in scores
+                if f"{h:g}" not in s.windows
+            }
+            for h in self.horizons_asked
+        }
+        return {horizon: short for horizon, short in found.items() if short}
+
+    def best(self) -> str | None:
+        """What predicts the held-out recordings best, `"no friction"` included.
+
+        Judged by the free run over all joints and recordings; of those that are equal within a
+        thousandth, the one with the fewest parameters. None where nothing was held out, or every
+        free run diverged.
+        """
+        if not self.held_out:
+            return None
+        rmse = self.table()["all"]
+        if not np.isfinite(rmse.min()):
+            return None
+
+        def parameters(name: str) -> int:
+            found = self.fits.get(name)
+            return sum(p.numel() for p in found.model.parameters()) if found else 0
+
+        return min(rmse.index[rmse <= (1 + TIE) * rmse.min()], key=parameters)
+
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON: coefficients, scores and how each fit ended."""
+        """Plain JSON: coefficients, scores, how each fit ended, and which model is best."""
         models: dict[str, Any] = {}
         for name in self.held_out or self.train:
             models[name] = {
@@ -69,7 +120,13 @@ class Comparison:
                     "coefficients": coefficient_summary(found.model),
                     "fit": found.to_dict(),
                 }
-        return {"models": models, "units": self.unit, "joints": list(self.joint_names)}
+        best = self.best()
+        return {
+            "models": models,
+            "best": None if best is None else {"model": best, "by": JUDGED_BY},
+            "units": self.unit,
+            "joints": list(self.joint_names),
+        }
 
 
 def compare(
@@ -85,6 +142,9 @@ def compare(
     **fit_settings: Any,
 ) -> Comparison:
     """Fit models one after the other and score each on every recording.
+
+    No friction is scored on the plant as given, so it does not depend on any model's fit; each
+    model is scored on the plant that was fitted with it.
 
     Args:
         plant: the mechanism as given.
@@ -118,36 +178,63 @@ def compare(
             callback=None if on_step is None else lambda stage, _: on_step(stage),
             **fit_settings,
         )  # fmt: skip
-    first = next(iter(fits.values()))
+    # Smoothed once: the fits have done so for the recordings that they saw.
+    seen = next(iter(fits.values())).motions
+    moved = (seen, [_motion(plant, r) for r in held_out])
     scored: tuple[dict[str, list[Score]], dict[str, list[Score]]] = ({}, {})
     states = initial_states or {}
     for name in (NO_FRICTION, *fits):
         found = fits.get(name)
         say(f"score {name}")
-        for scores, recordings in zip(scored, (train, held_out), strict=True):
+        for scores, recordings, motions in zip(scored, (train, held_out), moved, strict=True):
             if recordings:
                 scores[name] = [
                     score(
-                        (found or first).plant,
+                        found.plant if found else plant,
                         found.model if found else None,
-                        r,
-                        initial_state=states.get(r.name),
+                        recording,
+                        motion=motion,
+                        initial_state=states.get(recording.name),
                         horizons=horizons,
                     )
-                    for r in recordings
+                    for recording, motion in zip(recordings, motions, strict=True)
                 ]
-    return Comparison(fits, *scored, unit=plant.unit, joint_names=tuple(plant.joint_names))
+    return Comparison(
+        fits, *scored, unit=plant.unit, joint_names=tuple(plant.joint_names),
+        horizons_asked=tuple(horizons),
+    )  # fmt: skip
+
+
+def coefficient_sets(model: FrictionModel) -> dict[str, Tensor]:
+    """The coefficients that tell a model, (joint, coefficient) each, by what they hold for.
+
+    `"always"` of a constant model; of an adaptive one those of each class of acceleration; of a
+    neuro-fuzzy one those `"at_rest"`, and the constant `"reference"` from which it deviates.
+    """
+    schedule = model.schedule
+    sets = schedule.rest_coefficients().detach()
+    if isinstance(schedule, Constant):
+        return {"always": sets}
+    if isinstance(schedule, Adaptive):
+        return dict(zip(CLASSES, sets, strict=True))
+    if isinstance(schedule, NeuroFuzzy):
+        return {"at_rest": sets, "reference": schedule.reference_coefficients().detach()}
+    return {"at_rest": sets}
 
 
 def coefficient_summary(model: FrictionModel) -> dict[str, Any]:
-    """Coefficients by name: a value a joint, or what a schedule deviates from."""
-    schedule = model.schedule
-    names = schedule.coefficient_names
-    if isinstance(schedule, Constant):
-        return {n: schedule.values[:, k].tolist() for k, n in enumerate(names)}
-    assert isinstance(schedule, NeuroFuzzy)
-    reference = schedule.reference_coefficients().detach()
-    return {"reference": {n: reference[:, k].tolist() for k, n in enumerate(names)}}
+    """Coefficients by name, a value a joint; by set first where a model has several."""
+    names = model.schedule.coefficient_names
+    summary = {
+        label: {name: values[:, k].tolist() for k, name in enumerate(names)}
+        for label, values in coefficient_sets(model).items()
+    }
+    return summary.get("always", summary)
+
+
+def _motion(plant: PendulumChain | LinearAxis, recording: Recording) -> Motion:
+    joint = recording.joint_coordinates(plant)
+    return kalman_smoother(joint.time, joint.q)
 
 
 def _nearest(fits: Mapping[str, Fit], model: FrictionModel) -> Fit | None:

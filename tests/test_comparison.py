@@ -1,10 +1,16 @@
 """Comparisons: every model fitted and scored, tables with names, results as plain JSON."""
 
+import dataclasses
 import json
 
+import numpy as np
 import pytest
 
-from nfriction import LFM, compare
+from nfriction import LFM, NFLFM, compare
+from nfriction.comparison import Comparison, coefficient_summary
+from nfriction.friction.models import ALFM
+from nfriction.scoring import Rmse, Score
+from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import pendulum, swing
 
 MODEL = LFM(2, [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]], v_smooth=0.05)
@@ -66,3 +72,75 @@ def test_without_held_out_recordings_there_is_no_such_table(comparison):
     with pytest.raises(ValueError, match="held_out"):
         found.table()
     assert set(found.to_dict()["models"]) == {"no friction", "NCFM"}
+
+
+def test_no_friction_is_judged_on_the_plant_as_given(comparison):
+    found, _ = comparison
+    other = compare(pendulum(), ["LFM"], [A], [B], horizons=(0.5,), windows=(0.5,), max_steps=2)
+    for kind in ("train", "held_out"):
+        (before,), (after,) = (getattr(c, kind)["no friction"] for c in (found, other))
+        assert before.free_run == after.free_run
+        assert before.windows["0.5"] == after.windows["0.5"]
+
+
+def test_every_recording_is_smoothed_once(monkeypatch):
+    smoothed = []
+
+    def counting(time, q, **settings):
+        smoothed.append(len(time))
+        return kalman_smoother(time, q, **settings)
+
+    for user in ("comparison", "scoring", "fitting.estimate"):
+        monkeypatch.setattr(f"nfriction.{user}.kalman_smoother", counting)
+    compare(pendulum(), ["NCFM", "LFM"], [A], [B], windows=(0.5,), max_steps=1)
+    assert len(smoothed) == 2
+
+
+def test_recordings_too_short_for_a_window_are_named(comparison):
+    found, _ = comparison
+    assert found.too_short() == found.too_short(held_out=False) == {}
+    asked = dataclasses.replace(found, horizons_asked=(1.0, 2.0))
+    assert asked.too_short() == {"2": {"b": pytest.approx(1.5)}}
+    # A window length that one kind of recording lacks is still there for the other.
+    shorter = {n: [dataclasses.replace(s, windows={}) for s in of] for n, of in found.train.items()}
+    mixed = dataclasses.replace(found, train=shorter)
+    assert mixed.horizons() == mixed.horizons(held_out=False) == []
+    assert mixed.horizons(held_out=True) == ["0.5", "1"]
+
+
+def judged(found: Comparison, **errors: float) -> str | None:
+    """The best of a comparison in which these were the errors of free runs."""
+    held_out = {
+        name.replace("_", " "): [
+            Score("b", Rmse((e, e), e), {}, None, np.zeros(1), np.zeros((1, 2)), np.inf)
+        ]
+        for name, e in errors.items()
+    }
+    return dataclasses.replace(found, held_out=held_out).best()
+
+
+def test_best_is_the_least_error_and_of_equals_the_simplest(comparison):
+    found, _ = comparison
+    assert found.to_dict()["best"]["model"] == found.best() == "LFM"
+    assert judged(found, no_friction=3.0, NCFM=2.0, LFM=1.0) == "LFM"
+    assert judged(found, no_friction=3.0, LFM=1.0, NCFM=1.0005) == "NCFM"
+    assert judged(found, no_friction=3.0, LFM=1.0, NCFM=1.002) == "LFM"
+    assert judged(found, no_friction=1.0, NCFM=1.0, LFM=2.0) == "no friction"
+    assert judged(found, no_friction=np.inf, NCFM=np.inf, LFM=4.0) == "LFM"
+    assert judged(found, no_friction=np.inf, NCFM=np.inf, LFM=np.inf) is None
+    alone = dataclasses.replace(found, held_out={})
+    assert alone.best() is None
+    assert alone.to_dict()["best"] is None
+
+
+def test_coefficients_that_follow_the_motion_say_what_they_hold_for():
+    assert coefficient_summary(LFM(2, [3.0, 4.0])) == {
+        "B": pytest.approx([3.0, 3.0]),
+        "C": pytest.approx([4.0, 4.0]),
+    }
+    adaptive = coefficient_summary(ALFM(1, [[[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]]))
+    assert [adaptive[known]["C"] for known in ("low", "medium", "high")] == [
+        pytest.approx([2.0]), pytest.approx([4.0]), pytest.approx([6.0])
+    ]  # fmt: skip
+    fuzzy = coefficient_summary(NFLFM(1, [3.0, 4.0]))
+    assert fuzzy["at_rest"] == {n: pytest.approx(v) for n, v in fuzzy["reference"].items()}

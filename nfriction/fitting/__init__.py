@@ -1,5 +1,20 @@
 """Estimation of friction and plant terms from recordings."""
 
+from nfriction.fitting.adaptive import fit_adaptive, fit_by_search
+from nfriction.fitting.classes import AccelerationClasses, find_classes
 from nfriction.fitting.estimate import Fit, fit
+from nfriction.fitting.neurofuzzy import NetworkFit, train_network, train_on_controller
+from nfriction.fitting.search import SearchState
 
-__all__ = ["Fit", "fit"]
+__all__ = [
+    "AccelerationClasses",
+    "Fit",
+    "NetworkFit",
+    "SearchState",
+    "find_classes",
+    "fit",
+    "fit_adaptive",
+    "fit_by_search",
+    "train_network",
+    "train_on_controller",
+]

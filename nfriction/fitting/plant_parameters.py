@@ -16,6 +16,9 @@ RATIO_BOUND, RATIO_SD = 0.3, 0.1
 ANGLE_BOUND, ANGLE_SD = 0.1, 0.02
 # Air drag: the quadratic term of a slender bar is 0.5 rho c_d width, below 0.1 N s^2/m^3.
 DRAG_SD = 0.05
+# The last link's end is where nobody measures: what stands in the air may end before the tip or
+# be widest near the joint.
+REACH_LOWER, REACH_UPPER, REACH_SD = -0.7, 1.0, 0.3
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,8 @@ def plant_parameters(
         driven: torque was measured. Free swing tells only ratios, so the first gravity term is
             kept as the scale.
         largest_torque: largest torque in the recordings [N m]; bounds a torque offset.
-        drag: fit air drag on the links, one linear and one quadratic coefficient for all links.
+        drag: fit air drag on the links: one quadratic coefficient for all; of several links also
+            a linear one, and how far the last reaches into the air.
 
     Returns:
         Ratios of inertia, gravity, armature and mass terms, angle offsets, torque offsets of
@@ -90,9 +94,16 @@ def plant_parameters(
             bound = 0.3 * largest_torque
             shift(f"torque offset {j + 1} [N m]", "torque_offset", unit, -bound, bound, bound / 3)
     if drag:
-        for name in ("drag_linear", "drag_quadratic"):
+        length = buffers["length"]
+        # On a single link, linear drag is viscous friction of the joint, and the reach the scale
+        # of the quadratic drag.
+        for name in ("drag_linear", "drag_quadratic") if len(length) > 1 else ("drag_quadratic",):
             ones = torch.ones_like(buffers[name])
             shift(name.replace("_", " "), name, ones, 0.0, 1.0, DRAG_SD)
+        if len(length) > 1:
+            last = torch.zeros_like(length)
+            last[-1] = length[-1]
+            shift("drag reach", "length", last, REACH_LOWER, REACH_UPPER, REACH_SD)
     return found
 
 

@@ -6,8 +6,8 @@ are found together by Levenberg-Marquardt with exact sensitivities.
 """
 
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -16,6 +16,7 @@ from nfriction.fitting.plant_parameters import adjusted_buffers
 from nfriction.fitting.sensitivity import StepJacobian, start_slope, step_maps
 from nfriction.fitting.windows import Windows
 from nfriction.plant import LinearAxis, PendulumChain
+from nfriction.signals import Motion
 from nfriction.simulation import Rollout, integrate
 from nfriction.solve.levenberg import LeastSquaresResult, LevenbergMarquardt, Quadratic, Step
 
@@ -88,6 +89,20 @@ class TrajectoryProblem:
         changed = adjusted_buffers(self.plant, self.plant_terms, vector)
         return self.plant.replace(**changed) if changed else self.plant
 
+    def traced(self, x: Tensor, motions: Sequence[Motion]) -> tuple[Motion, ...]:
+        """The motions with position and velocity from the windows simulated at `x`.
+
+        Longer windows then start from states that a fit has found, not a smoother.
+        """
+        run = self._simulate(x)
+        states = [(m.q.copy(), m.qd.copy()) for m in motions]
+        # A sample that two windows share is taken from the later one's fitted start.
+        for w, (place, first, last) in enumerate(self.windows.spans):
+            n = self.substeps * (last - first) + 1
+            for kept, found in zip(states[place], (run.q, run.qd), strict=True):
+                kept[first : last + 1] = found[w, : n : self.substeps].numpy()
+        return tuple(replace(m, q=q, qd=qd) for m, (q, qd) in zip(motions, states, strict=True))
+
     def residuals(self, x: Tensor) -> Tensor:
         """Weighted position error over the noise, (window, step + 1, joint)."""
         q = self._simulate(x).q[:, :: self.substeps]
@@ -96,13 +111,13 @@ class TrajectoryProblem:
 
     def cost(self, x: Tensor) -> Tensor:
         """Half the sum of squares of residuals and prior."""
-        precision, mean = self._prior()
+        precision, mean = self.prior()
         return 0.5 * (self.residuals(x).square().sum() + (precision * (x - mean) ** 2).sum())
 
     def quadratic(self, x: Tensor) -> Quadratic:
         """Gauss-Newton model of the cost at `x`."""
         r = self.residuals(x)
-        precision, mean = self._prior()
+        precision, mean = self.prior()
         gradient, hessian = precision * (x - mean), torch.diag(precision)
         own, shared = self._normal_equations(x, r)
         self._scatter(gradient, hessian, own, shared)
@@ -120,7 +135,7 @@ class TrajectoryProblem:
         self._simulated = (x.clone(), motion)
         return motion
 
-    def _prior(self) -> tuple[Tensor, Tensor]:
+    def prior(self) -> tuple[Tensor, Tensor]:
         """Prior precision and mean of every unknown."""
         n = self.friction_count
         w = self.windows

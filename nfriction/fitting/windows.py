@@ -23,6 +23,7 @@ class Windows:
         weight: 1 where a sample counts, 0 where it pads, (window, step + 1).
         q0, qd0: smoothed state at the start, (window, joint).
         names: recording that each window comes from.
+        spans: of each window, the recording's place among those given, its first and last sample.
     """
 
     q: Tensor
@@ -32,6 +33,7 @@ class Windows:
     q0: Tensor
     qd0: Tensor
     names: tuple[str, ...]
+    spans: tuple[tuple[int, int, int], ...] = ()
 
     def __len__(self) -> int:
         return self.q.shape[0]
@@ -53,7 +55,7 @@ def cut_windows(
     if not length > 0:
         raise ValueError(f"`length` must be positive [s], got {length}.")
     pieces = []
-    for recording, motion in zip(recordings, motions, strict=True):
+    for place, (recording, motion) in enumerate(zip(recordings, motions, strict=True)):
         span = recording.time[-1] - recording.time[0]
         count = max(1, int(span / length + 0.5))
         if count >= len(recording.time):
@@ -62,14 +64,14 @@ def cut_windows(
                 f"s, too few for windows of {length:g} s; use longer windows."
             )
         edges = np.linspace(0, len(recording.time) - 1, count + 1).astype(int)
-        pieces += [(recording, motion, a, b) for a, b in pairwise(edges)]
-    steps = max(b - a for _, _, a, b in pieces)
+        pieces += [(place, recording, motion, int(a), int(b)) for a, b in pairwise(edges)]
+    steps = max(b - a for *_, a, b in pieces)
     joints = recordings[0].q.shape[1]
     q = np.zeros((len(pieces), steps + 1, joints))
     tau = np.zeros((len(pieces), steps, joints))
     step = np.zeros((len(pieces), steps))
     weight = np.zeros((len(pieces), steps + 1))
-    for i, (recording, _, a, b) in enumerate(pieces):
+    for i, (_, recording, _, a, b) in enumerate(pieces):
         n = b - a
         q[i, : n + 1] = recording.q[a : b + 1]
         q[i, n + 1 :] = recording.q[b]
@@ -77,8 +79,10 @@ def cut_windows(
         weight[i, : n + 1] = 1.0
         if recording.tau is not None:
             tau[i, :n] = recording.tau[a:b]
-    start = [np.stack([getattr(m, name)[a] for _, m, a, _ in pieces]) for name in ("q", "qd")]
+    start = [np.stack([getattr(m, name)[a] for _, _, m, a, _ in pieces]) for name in ("q", "qd")]
     q_, tau_, step_, weight_, q0, qd0 = (
         torch.as_tensor(x, dtype=torch.float64) for x in (q, tau, step, weight, *start)
     )
-    return Windows(q_, tau_, step_, weight_, q0, qd0, tuple(r.name for r, _, _, _ in pieces))
+    names = tuple(r.name for _, r, *_ in pieces)
+    spans = tuple((place, a, b) for place, _, _, a, b in pieces)
+    return Windows(q_, tau_, step_, weight_, q0, qd0, names, spans)

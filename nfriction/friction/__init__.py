@@ -1,7 +1,12 @@
 """Friction models: laws times schedules."""
 
+from nfriction.friction.adaptive import CLASSES, Adaptive
+from nfriction.friction.controller_schedule import RadialBasis
 from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.models import (
+    ALFM,
+    ANCFM,
+    ANLFM,
     LFM,
     MODELS,
     NCFM,
@@ -17,6 +22,10 @@ from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.friction.schedules import Constant, Schedule
 
 __all__ = [
+    "ALFM",
+    "ANCFM",
+    "ANLFM",
+    "CLASSES",
     "LFM",
     "MODELS",
     "NCFM",
@@ -24,11 +33,13 @@ __all__ = [
     "NFNCFM",
     "NFNLFM",
     "NLFM",
+    "Adaptive",
     "Coefficient",
     "Constant",
     "FrictionModel",
     "Law",
     "NeuroFuzzy",
+    "RadialBasis",
     "Schedule",
     "Stribeck",
     "model_by_name",

@@ -8,6 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from nfriction.friction import laws
+from nfriction.friction.adaptive import Adaptive
+from nfriction.friction.controller_schedule import RadialBasis
 from nfriction.friction.laws import Law
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.friction.schedules import Constant, Schedule
@@ -51,6 +53,7 @@ class FrictionModel(nn.Module):
         self.schedule = schedule
         self.v_smooth = float(v_smooth)
         self.joints = schedule.joints
+        self.state_size = schedule.state_size
         # TorchScript compiles a function held as an attribute; the Law itself it would refuse.
         self.law_torque = law.torque
 
@@ -70,6 +73,18 @@ class FrictionModel(nn.Module):
         """
         return self.schedule(qd, qdd)
 
+    def initial_state(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        """Memory of the schedule after the first sample, (*batch, joint, state_size)."""
+        return self.schedule.initial_state(qd, qdd)
+
+    def advance(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
+        """Memory of the schedule after a sample, from that after the sample before."""
+        return self.schedule.advance(qd, qdd, state)
+
+    def coefficients_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
+        """Coefficients of the law at a sample and the memory after it."""
+        return self.schedule.coefficients_from(qd, qdd, state)
+
     def torque(self, qd: Tensor, load: Tensor, coefficients: Tensor) -> Tensor:
         """Friction torque with coefficients given, as a simulation holds them over a step."""
         return self.law_torque(qd, load, coefficients, self.v_smooth)
@@ -77,16 +92,17 @@ class FrictionModel(nn.Module):
     def slope_at_rest(self) -> Tensor:
         """Slope of the torque over velocity at rest under unit load [N m s/rad], (joint,).
 
-        What decides whether an explicit integrator stays stable near standstill.
+        What decides whether an explicit integrator stays stable near standstill; the steepest,
+        where the coefficients at rest depend on what went before.
         """
-        like = next(self.parameters(), torch.zeros((), dtype=torch.float64))
-        rest = torch.zeros(self.joints, dtype=like.dtype, device=like.device)
+        held = self.schedule.rest_coefficients().detach()
+        rest = held.new_zeros(held.shape[:-1])
         load = torch.ones_like(rest)
-        held = self.coefficients(rest, torch.zeros_like(rest)).detach()
         with torch.enable_grad():
             qd = rest.requires_grad_()
             # A law is elementwise, so the sum's gradient is each joint's slope.
-            return torch.autograd.grad(self.torque(qd, load, held).sum(), qd)[0]
+            slope = torch.autograd.grad(self.torque(qd, load, held).sum(), qd)[0]
+        return slope.reshape(-1, self.joints).amax(0)
 
     def options(self) -> dict[str, Any]:
         """Constructor arguments beyond `joints` and `v_smooth`, as plain JSON."""
@@ -141,6 +157,58 @@ class Stribeck(ConstantModel):
     definition = laws.STRIBECK
 
 
+class AdaptiveModel(FrictionModel):
+    """A law with constant coefficients for each class of acceleration: low, medium, high.
+
+    Args:
+        joints: number of joints.
+        initial: start values in SI, shape (joint, class, coefficient), (joint, coefficient) or
+            (coefficient,).
+        v_smooth: see `FrictionModel`.
+        hysteresis, time_constant, sample_time: see `Adaptive`.
+    """
+
+    definition: Law
+
+    def __init__(
+        self,
+        joints: int,
+        initial: Tensor | Sequence | None = None,
+        *,
+        v_smooth: float = V_SMOOTH,
+        hysteresis: float = 0.2,
+        time_constant: float = 2.0,
+        sample_time: float = 1e-3,
+    ) -> None:
+        schedule = Adaptive(
+            self.definition,
+            joints,
+            initial,
+            hysteresis=hysteresis,
+            time_constant=time_constant,
+            sample_time=sample_time,
+        )
+        super().__init__(self.definition, schedule, v_smooth)
+
+
+class ANCFM(AdaptiveModel):
+    """Viscous friction, its constant one for each class of acceleration (TLRIP paper)."""
+
+    definition = laws.VISCOUS
+
+
+class ALFM(AdaptiveModel):
+    """Viscous plus load-dependent Coulomb friction, B and C for each class (TLRIP paper)."""
+
+    definition = laws.LINEAR
+
+
+class ANLFM(AdaptiveModel):
+    """Five constants f_o, f_c, f_v, f_a, f_b for each class of acceleration (TLRIP paper)."""
+
+    definition = laws.NONLINEAR
+
+
 class NeuroFuzzyModel(FrictionModel):
     """A law whose coefficients an ANFIS layer with a radial basis head gives.
 
@@ -149,6 +217,8 @@ class NeuroFuzzyModel(FrictionModel):
         initial: constant reference from which training starts, as in `ConstantModel`.
         v_smooth: see `FrictionModel`.
         terms, head_units, acceleration, interpretable, prior_sd: see `NeuroFuzzy`.
+        network: `"rbf"` takes the papers' network alone (`RadialBasis`) in place of the ANFIS
+            layer with its head; `head_units` are its units, and sets it has none.
     """
 
     definition: Law
@@ -164,17 +234,26 @@ class NeuroFuzzyModel(FrictionModel):
         acceleration: Literal["along_motion", "signed"] = "along_motion",
         interpretable: bool = False,
         prior_sd: float = 0.3,
+        network: Literal["anfis", "rbf"] = "anfis",
     ) -> None:
-        schedule = NeuroFuzzy(
-            self.definition,
-            joints,
-            initial,
-            terms=terms,
-            head_units=head_units,
-            acceleration=acceleration,
-            interpretable=interpretable,
-            prior_sd=prior_sd,
-        )
+        schedule: Schedule
+        if network == "rbf":
+            schedule = RadialBasis(
+                self.definition, joints, initial, units=head_units, acceleration=acceleration
+            )
+        elif network == "anfis":
+            schedule = NeuroFuzzy(
+                self.definition,
+                joints,
+                initial,
+                terms=terms,
+                head_units=head_units,
+                acceleration=acceleration,
+                interpretable=interpretable,
+                prior_sd=prior_sd,
+            )
+        else:
+            raise ValueError(f'`network` must be "anfis" or "rbf", got {network!r}.')
         super().__init__(self.definition, schedule, v_smooth)
 
 
@@ -196,12 +275,15 @@ class NFNLFM(NeuroFuzzyModel):
     definition = laws.NONLINEAR
 
 
-MODELS: dict[str, type[ConstantModel] | type[NeuroFuzzyModel]] = {
-    model.__name__: model for model in (NCFM, LFM, NLFM, Stribeck, NFNCFM, NFLFM, NFNLFM)
+NamedModel = type[ConstantModel] | type[AdaptiveModel] | type[NeuroFuzzyModel]
+
+MODELS: dict[str, NamedModel] = {
+    model.__name__: model
+    for model in (NCFM, LFM, NLFM, Stribeck, ANCFM, ALFM, ANLFM, NFNCFM, NFLFM, NFNLFM)
 }
 
 
-def model_by_name(name: str) -> type[ConstantModel] | type[NeuroFuzzyModel]:
+def model_by_name(name: str) -> NamedModel:
     """The named model's class.
 
     Raises:

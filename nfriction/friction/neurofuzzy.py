@@ -12,6 +12,9 @@ from nfriction.fuzzy import AnfisRBF
 
 # Below a thousandth of its scale a coefficient is as good as zero, and must be able to rise.
 LEAST_RATIO = 1e-3
+# Three times as much, and friction fitted to large swings is a third too high at small ones, where
+# no data held it.
+PRIOR_SD = 0.1
 
 
 def soft_positive(u: Tensor, roundness: float) -> Tensor:
@@ -67,7 +70,7 @@ class NeuroFuzzy(Schedule):
         head_units: int = 10,
         acceleration: Literal["along_motion", "signed"] = "along_motion",
         interpretable: bool = False,
-        prior_sd: float = 0.3,
+        prior_sd: float = PRIOR_SD,
     ) -> None:
         super().__init__(law, joints)
         if acceleration not in ("along_motion", "signed"):
@@ -180,6 +183,21 @@ class NeuroFuzzy(Schedule):
         trained = self.trained()
         for p, part in zip(trained, vector.split([p.numel() for p in trained]), strict=True):
             p.copy_(part.reshape(p.shape))
+
+    def parameter_names(self, joint_names: Sequence[str]) -> list[str]:
+        rules, weights = (p[0, 0].numel() for p in self.trained())
+        columns = ("velocity slope", "acceleration slope", "constant")
+        planes = [
+            f"{columns[k % len(columns)]} of rule {k // len(columns) + 1}" for k in range(rules)
+        ]
+        head = [f"head weight {k + 1}" for k in range(weights)]
+        return [
+            f"{name} of {joint}: {part}"
+            for parts in (planes, head)
+            for joint in joint_names
+            for name in self.coefficient_names
+            for part in parts
+        ]
 
     def bounds(self) -> tuple[Tensor, Tensor]:
         vector = self.parameter_vector()

@@ -50,6 +50,9 @@ class Schedule(nn.Module, ABC):
         fitted_mask: which coefficients are estimated by default.
         limits: between what values a fit may move each coefficient.
         positive: which coefficients are positive by physics, a buffer (coefficient,).
+        state_size: numbers a joint that the schedule carries from one sample to the next. At
+            every sample a simulation or controller calls `advance` (`initial_state` at the
+            first), then `coefficients_from`, and holds these coefficients until the next.
     """
 
     joints: int
@@ -57,6 +60,7 @@ class Schedule(nn.Module, ABC):
     fitted_mask: list[bool]
     limits: list[tuple[float, float]]
     positive: Tensor
+    state_size: int = 0
 
     def __init__(self, law: Law, joints: int) -> None:
         super().__init__()
@@ -76,6 +80,42 @@ class Schedule(nn.Module, ABC):
         Shape (*batch, joint, coefficient), or without the batch where the motion does not matter.
         """
 
+    def initial_state(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        """Memory after the first sample, shape (*batch, joint, state_size)."""
+        return qd.new_zeros((*qd.shape, 0))
+
+    def advance(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
+        """Memory after a sample at velocity and acceleration (*batch, joint), without look-ahead.
+
+        Args:
+            qd: joint velocity [rad/s].
+            qdd: joint acceleration [rad/s^2].
+            state: memory after the sample before, (*batch, joint, state_size).
+        """
+        return state
+
+    def coefficients_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
+        """Coefficients at a sample and the memory after it, (*batch, joint, coefficient).
+
+        `forward` is this with the memory of a first sample.
+        """
+        coefficients: Tensor = self(qd, qdd)
+        return coefficients
+
+    def states(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        """Memory after every sample of a motion (sample, joint): (sample, joint, state_size)."""
+        rows = [self.initial_state(qd[0], qdd[0])]
+        for v, a in zip(qd[1:], qdd[1:], strict=True):
+            rows.append(self.advance(v, a, rows[-1]))
+        return torch.stack(rows)
+
+    def rest_coefficients(self) -> Tensor:
+        """Every set of coefficients that may hold at rest, (*set, joint, coefficient)."""
+        like = next(self.parameters(), torch.zeros((), dtype=torch.float64))
+        rest = torch.zeros(self.joints, dtype=like.dtype, device=like.device)
+        coefficients: Tensor = self(rest, torch.zeros_like(rest))
+        return coefficients
+
     @abstractmethod
     def parameter_vector(self) -> Tensor:
         """What a fit varies, flat; a copy."""
@@ -83,6 +123,14 @@ class Schedule(nn.Module, ABC):
     @abstractmethod
     def set_parameter_vector(self, vector: Tensor) -> None:
         """Write a vector of the form that `parameter_vector` gives."""
+
+    def parameter_names(self, joint_names: Sequence[str]) -> list[str]:
+        """What each entry of the parameter vector is, in words for a person.
+
+        Args:
+            joint_names: one per joint.
+        """
+        return [f"parameter {k + 1}" for k in range(self.parameter_vector().numel())]
 
     @abstractmethod
     def bounds(self) -> tuple[Tensor, Tensor]:
@@ -110,8 +158,8 @@ def _limits(coefficient: Coefficient) -> tuple[float, float]:
     return (SMALLEST if coefficient.positive else -math.inf), math.inf
 
 
-class Constant(Schedule):
-    """Coefficients that do not depend on the motion.
+class Tabulated(Schedule):
+    """A table of coefficients, from which the motion may choose.
 
     Positive coefficients live in log space. A fit varies the coefficients themselves, bounded
     below by zero, because the logarithm's gradient dies where a coefficient belongs at zero.
@@ -119,30 +167,40 @@ class Constant(Schedule):
     Args:
         law: the law whose coefficients these are.
         joints: number of joints.
-        initial: start values in SI, shape (joint, coefficient) or (coefficient,);
-            default 1e-3 (search middle where the torque is not linear in it, zero where signed).
+        initial: start values in SI, the table's whole shape, (joint, coefficient) or
+            (coefficient,); default 1e-3 (search middle where the torque is not linear in it, zero
+            where signed).
+        cells: shape of the table of one joint.
     """
 
-    def __init__(self, law: Law, joints: int, initial: Tensor | Sequence | None = None) -> None:
+    def __init__(
+        self,
+        law: Law,
+        joints: int,
+        initial: Tensor | Sequence | None = None,
+        cells: tuple[int, ...] = (),
+    ) -> None:
         super().__init__(law, joints)
-        self.raw = nn.Parameter(torch.zeros(joints, len(law.names), dtype=torch.float64))
+        shape = (joints, *cells, len(law.names))
+        self.raw = nn.Parameter(torch.zeros(shape, dtype=torch.float64))
         default = [
             c.search[len(c.search) // 2] if c.search else (1e-3 if c.positive else 0.0)
             for c in law.coefficients
         ]
         self.set_coefficients(default if initial is None else initial)
 
-    def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
+    def table(self) -> Tensor:
+        """The coefficients with their gradient, shape (joint, *cells, coefficient)."""
         return torch.where(self.positive, torch.exp(self.raw), self.raw)
 
     @property
     def values(self) -> Tensor:
-        """The coefficients, shape (joint, coefficient)."""
+        """The coefficients, shape (joint, *cells, coefficient)."""
         return torch.where(self.positive, torch.exp(self.raw), self.raw).detach()
 
     @torch.no_grad()
     def set_coefficients(self, values: Tensor | Sequence) -> None:
-        """Set the coefficients in SI, shape (joint, coefficient) or (coefficient,).
+        """Set the coefficients in SI, the table's shape, (joint, coefficient) or (coefficient,).
 
         Raises:
             ValueError: if the shape does not fit, a coefficient is not finite, or one that is
@@ -151,29 +209,34 @@ class Constant(Schedule):
         given = self._numbers(values)
         bad = ~torch.isfinite(given) | (self.positive & (given < 0))
         if bad.any():
-            joint, k = (int(i) for i in bad.nonzero()[0])
+            where = tuple(int(i) for i in bad.nonzero()[0])
+            joint, k = where[0], where[-1]
             raise ValueError(
                 f"`{self.coefficient_names[k]}` of joint {joint + 1} must be finite"
-                f"{' and not negative' if self.positive[k] else ''}, got {given[joint, k]:g}."
+                f"{' and not negative' if self.positive[k] else ''}, got {given[where]:g}."
             )
         raw = torch.where(self.positive, torch.log(given.clamp_min(SMALLEST)), given)
         # exp(log(x)) may miss x in its last digits; what stays the same keeps its bits.
         self.raw.copy_(torch.where(given == self.values, self.raw, raw))
 
     def _numbers(self, values: Tensor | Sequence) -> Tensor:
-        """Given coefficients as a tensor (joint, coefficient)."""
+        """Given coefficients as a tensor (joint, *cells, coefficient)."""
         try:
             given = torch.as_tensor(values, dtype=self.raw.dtype, device=self.raw.device)
         except (TypeError, ValueError) as error:
             raise ValueError(
                 f"coefficients must be an array of numbers, got {values!r}."
             ) from error
-        if given.shape not in (self.raw.shape, self.raw.shape[1:]):
+        flat = torch.Size([self.joints, self.raw.shape[-1]])
+        if given.shape not in (self.raw.shape, flat, flat[1:]):
+            whole = "" if self.raw.shape == flat else f"the whole table {tuple(self.raw.shape)}, "
             raise ValueError(
-                f"coefficients must be (joint, coefficient) = {tuple(self.raw.shape)} or one row "
+                f"coefficients must be {whole}(joint, coefficient) = {tuple(flat)} or one row "
                 f"for all joints ({', '.join(self.coefficient_names)}), got shape "
                 f"{tuple(given.shape)}."
             )
+        if given.shape == flat:
+            given = given.reshape(self.joints, *(1,) * (self.raw.ndim - 2), -1)
         return given.expand(self.raw.shape)
 
     def parameter_vector(self) -> Tensor:
@@ -181,6 +244,9 @@ class Constant(Schedule):
 
     def set_parameter_vector(self, vector: Tensor) -> None:
         self.set_coefficients(vector.reshape(self.raw.shape))
+
+    def parameter_names(self, joint_names: Sequence[str]) -> list[str]:
+        return [f"{name} of {joint}" for joint in joint_names for name in self.coefficient_names]
 
     def bounds(self) -> tuple[Tensor, Tensor]:
         values = self.values
@@ -193,6 +259,23 @@ class Constant(Schedule):
             torch.where(fitted, lower, values).reshape(-1),
             torch.where(fitted, upper, values).reshape(-1),
         )
+
+
+class Constant(Tabulated):
+    """Coefficients that do not depend on the motion.
+
+    Args:
+        law: the law whose coefficients these are.
+        joints: number of joints.
+        initial: start values in SI, shape (joint, coefficient) or (coefficient,); default as in
+            `Tabulated`.
+    """
+
+    def __init__(self, law: Law, joints: int, initial: Tensor | Sequence | None = None) -> None:
+        super().__init__(law, joints, initial)
+
+    def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        return self.table()
 
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
         joints, k = self.raw.shape

@@ -249,14 +249,10 @@ class PendulumChain(Plant):
             belongs to angles from hanging, and taken literally feeds energy in.
         """
         self._check(q=q, qd=qd)
-        joint = (q + self.angle_offset).unbind(-1)[self.first_link :]
-        rates = qd.unbind(-1)[self.first_link :]
-        levers = self.load_lever.unbind(-1)
-        loads = [
-            (lever * rate * rate - angle.cos()).abs()
-            for lever, rate, angle in zip(levers, rates, absolute(joint, 0), strict=True)
-        ]
-        return stack([torch.ones_like(loads[0])] * self.first_link + loads)
+        angle = (q + self.angle_offset)[..., self.first_link :].cumsum(-1)
+        rate = qd[..., self.first_link :]
+        load = (self.load_lever * rate * rate - angle.cos()).abs()
+        return torch.cat([torch.ones_like(load[..., :1]), load], -1) if self.first_link else load
 
     @torch.no_grad()
     def mobility(self) -> Tensor:

@@ -1,6 +1,7 @@
 """Fits recover what made the recording, say how they ended, and refuse what does not match."""
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -62,6 +63,36 @@ def test_a_driven_axis_gives_mass_and_offset():
     assert float(found.plant.torque_offset) == pytest.approx(0.3, abs=0.03)
     values = found.model.schedule.values[0].tolist()
     assert values == pytest.approx([3.0, 1.0], rel=0.05)
+
+
+def test_drag_is_fitted_by_itself_where_a_chain_swings_freely():
+    recording = swing(pendulum(), true_model(), seconds=1.0)
+    settings = {"windows": (0.5,), "max_steps": 1}
+
+    def drag(**more):
+        found = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings, **more)
+        return [name for name, _, _ in found.plant_terms if "drag" in name]
+
+    assert drag() == ["drag linear", "drag quadratic", "drag reach"]
+    assert drag(drag=False) == []
+    assert drag(fit_plant=False) == []
+
+
+def test_air_drag_is_told_from_joint_friction():
+    """With drag in the recording, joint coefficients mean joints only where drag is fitted."""
+    plant = pendulum()
+    air = plant.replace(drag_quadratic=torch.full((2,), 0.05, dtype=F64))
+    recording = swing(air, true_model(), seconds=6.0)
+    errors = []
+    for drag in (True, False):
+        found = fit(LFM(2, v_smooth=V_SMOOTH), plant, recording, drag=drag, windows=(0.5, 2.0))
+        truth = torch.tensor(TRUTH, dtype=F64)
+        errors.append(float((found.model.schedule.values / truth - 1).abs().max()))
+        if drag:
+            told = {i.name: i for i in found.intervals}["drag quadratic"]
+            assert told.low < 0.05 < told.high
+            assert {"intervals", "lost", "warnings"} <= found.to_dict().keys()
+    assert errors[0] < 0.2 * errors[1]
 
 
 def test_irregular_stamps_are_followed():
@@ -168,3 +199,41 @@ def test_nothing_is_logged_as_a_warning_in_a_plain_fit(caplog):
     with caplog.at_level(logging.WARNING, "nfriction"):
         fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, fit_plant=False, windows=(0.5,))
     assert not caplog.records
+
+
+def test_angles_are_written_as_the_plant_says_unless_the_recording_says_otherwise():
+    hanging = pendulum(convention=("absolute", "hanging"))
+    said = swing(pendulum(), true_model(), convention="absolute,hanging", seconds=1.0)
+    unsaid = replace(said, convention=None)
+    settings = {"fit_plant": False, "windows": (0.5,), "max_steps": 3}
+    found = [
+        fit(LFM(2, v_smooth=V_SMOOTH), plant, recording, **settings)
+        for plant, recording in ((hanging, unsaid), (pendulum(), said))
+    ]
+    assert torch.equal(found[0].model.schedule.values, found[1].model.schedule.values)
+    assert found[0].residual == found[1].residual
+    with pytest.raises(ValueError, match=r"absolute,hanging and relative,upright"):
+        fit(LFM(2), pendulum(), [said, unsaid])
+
+
+def test_a_fitted_model_asks_for_no_gradients_and_may_be_fitted_again():
+    recording = swing(pendulum(), true_model(), seconds=0.5)
+    model = LFM(2, v_smooth=V_SMOOTH)
+    first = fit(model, pendulum(), recording, method="torque")
+    assert first.model is model
+    assert not model.schedule.raw.requires_grad
+    assert (first.residual_unit, first.to_dict()["residual_unit"]) == ("N m", "N m")
+    settings = {"fit_plant": False, "windows": (0.25,), "max_steps": 2}
+    again = fit(model, pendulum(), recording, **settings)
+    assert (again.residual_unit, again.steps > 0) == ("rad", True)
+    bent = NFLFM(2, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2)
+    for _ in range(2):
+        found = fit(bent, pendulum(), recording, start=again, **settings)
+        assert found.steps > 0
+        assert not any(p.requires_grad for p in bent.parameters())
+
+
+def test_a_method_that_is_none_is_named():
+    recording = swing(pendulum(), true_model(), seconds=0.5)
+    with pytest.raises(ValueError, match=r"one of \('trajectory', 'torque'\), got 'torqe'"):
+        fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, method="torqe")

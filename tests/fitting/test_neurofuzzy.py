@@ -7,18 +7,12 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from nfriction.fitting.layer_equations import LINEAR, LayerEquations
-from nfriction.fitting.neurofuzzy import (
-    controller_targets,
-    one_group,
-    project,
-    train_network,
-    train_on_controller,
-)
+from nfriction.fitting.network_group import one_group
+from nfriction.fitting.neurofuzzy import controller_targets, train_network, train_on_controller
 from nfriction.fitting.scaling import Scaling, to_own_units
 from nfriction.fuzzy import Anfis, AnfisRBF, RBFNetwork, paper_controller
 from nfriction.solve import EvidenceState
-from nfriction.solve.jacobian import flatten, normal_equations, per_sample_jacobian, trainable
+from nfriction.solve.jacobian import flatten, trainable
 
 FLOAT64 = torch.float64
 
@@ -49,71 +43,6 @@ NETWORKS = {
     "network": lambda g: RBFNetwork(g, units=4),
     "head": lambda g: AnfisRBF(g, 2, [3, 2], 2, units=3),
 }
-
-
-@pytest.mark.parametrize("groups", [1, 2])
-@pytest.mark.parametrize("kind", NETWORKS)
-def test_written_jacobians_are_those_of_reverse_differentiation(kind: str, groups: int) -> None:
-    network, x = shaken(NETWORKS[kind](groups)), samples(20, groups, 2)
-
-    def automatic(parameters: dict[str, Tensor]) -> Tensor:
-        return torch.func.functional_call(network, parameters, (x,)).flatten(1)
-
-    parameters = trainable(network)
-    wanted = torch.func.jacrev(automatic)(parameters)
-    joined = torch.cat([block.flatten(2) for block in wanted.values()], -1)
-    torch.testing.assert_close(network.jacobian(x), joined, rtol=1e-12, atol=1e-12)
-    # What the solver asks for: other values than the module's own, and some of them frozen.
-    names = list(parameters)
-    dict(network.named_parameters())[names[0]].requires_grad_(False)
-    del parameters[names[0]]
-    offset = {name: value + 0.1 for name, value in parameters.items()}
-    written = per_sample_jacobian(network, offset, x)
-    plain = per_sample_jacobian(
-        lambda values, inputs: torch.func.functional_call(network, dict(values), (inputs,)),
-        offset,
-        x,
-    )
-    torch.testing.assert_close(written, plain, rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize("kind", [kind for kind in NETWORKS if kind != "head"])
-def test_shared_columns_give_the_normal_equations_of_the_whole_jacobian(kind: str) -> None:
-    layer, x = shaken(NETWORKS[kind](1)), samples(300, 1, 2)
-    y = surface(x)
-    equations = LayerEquations(layer, x, y)
-    got = equations.normal_equations(equations.w)
-    wanted = normal_equations(layer, trainable(layer), x, y)
-    for ours, theirs in zip(got, wanted, strict=True):
-        torch.testing.assert_close(ours, theirs, rtol=1e-11, atol=1e-11 * float(theirs.abs().max()))
-    torch.testing.assert_close(equations.squares(equations.w), got.squares, rtol=1e-12, atol=0)
-    # With a part of the output layer frozen the columns no longer tell the outputs.
-    next(p for n, p in layer.named_parameters() if n.endswith(LINEAR)).requires_grad_(False)
-    equations = LayerEquations(layer, x, y)
-    part = equations.normal_equations(equations.w)
-    torch.testing.assert_close(part.squares, got.squares, rtol=1e-12, atol=0)
-    wanted = normal_equations(layer, trainable(layer), x, y)
-    size = float(wanted.Jte.abs().max())
-    torch.testing.assert_close(part.Jte, wanted.Jte, rtol=1e-11, atol=1e-11 * size)
-
-
-@pytest.mark.parametrize("kind", [kind for kind in NETWORKS if kind != "head"])
-def test_eliminated_problem_has_the_slope_of_its_cost(kind: str) -> None:
-    layer, x = shaken(NETWORKS[kind](1), 0.1), samples(400, 1, 2)
-    equations = LayerEquations(layer, x, surface(x), ridge=1e-3)
-    theta = equations.w[equations.moving]
-    local = equations.projected(theta)
-    step, slopes = 1e-5, []
-    for i in range(len(theta)):
-        ahead, behind = theta.clone(), theta.clone()
-        ahead[i] += step
-        behind[i] -= step
-        rise = equations.projected_cost(ahead) - equations.projected_cost(behind)
-        slopes.append(float(rise) / (2 * step))
-    # Central differences: error of order step^2, and rounding over step.
-    torch.testing.assert_close(local.gradient.tolist(), slopes, rtol=1e-4, atol=1e-6)
-    eigenvalues = torch.linalg.eigvalsh(local.hessian)
-    assert eigenvalues.min() > -1e-9 * eigenvalues.max()
 
 
 @pytest.mark.parametrize("kind", NETWORKS)
@@ -164,6 +93,33 @@ def test_training_beats_the_least_squares_start(kind: str) -> None:
     # It learns the function, not the samples.
     x, y = controller_targets(controller, 1500, seed=9)
     assert rmse(network, x[:, None], y[:, None]) < 0.95 * rmse(start, x[:, None], y[:, None])
+
+
+def test_it_starts_from_the_controllers_own_sets_or_from_an_even_grid() -> None:
+    controllers = [paper_controller(joint) for joint in (2, 4)]
+    frozen = {"samples": 300, "search_steps": 0, "max_steps": 0}
+    network = Anfis(2, 2, [len(v.sets) for v in controllers[0].rule_base.inputs], 2)
+    train_on_controller(network, controllers, **frozen)
+    centres, widths = network.sets()
+    for g, controller in enumerate(controllers):
+        terms = [
+            [float(factor) * number for number in term.parameters[:2]]
+            for variable, factor in zip(
+                controller.rule_base.inputs, controller.si_factor, strict=True
+            )
+            for term in variable.sets
+        ]
+        assert torch.stack([centres[g], widths[g]], 1).tolist() == [
+            pytest.approx(term, rel=1e-9, abs=1e-9) for term in terms
+        ]
+    other = Anfis(2, 2, [4, 3], 2)
+    train_on_controller(other, controllers, **frozen)
+    grid = deepcopy(other)
+    ends = [torch.stack([getattr(c, e) * c.si_factor for c in controllers])
+            for e in ("lower", "upper")]  # fmt: skip
+    grid.init_grid(*ends)
+    for ours, wanted in zip(other.sets(), grid.sets(), strict=True):
+        torch.testing.assert_close(ours, wanted, rtol=1e-9, atol=1e-9)
 
 
 def test_identities_hold_at_convergence() -> None:
@@ -233,26 +189,6 @@ def test_interrupt_leaves_a_usable_network() -> None:
     for g, (controller, worst) in enumerate(zip(controllers, (0.05, 0.1), strict=True)):
         x, y = controller_targets(controller, 1000, seed=7)
         assert rmse(one_group(network, g), x[:, None], y[:, None]) < worst
-
-
-def test_interrupt_of_the_search_is_passed_on_with_the_best_so_far() -> None:
-    x = samples(300, 1, 2)
-    calls = 0
-
-    class Interrupted(RBFNetwork):
-        def jacobian_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
-            nonlocal calls
-            calls += 1
-            if calls == 5:
-                raise KeyboardInterrupt
-            return super().jacobian_columns(x, out)
-
-    network = Interrupted(1, units=5)
-    network.solve_output(x, surface(x))
-    before = rmse(network, x, surface(x))
-    with pytest.raises(KeyboardInterrupt):
-        project(network, x, surface(x), 50)
-    assert rmse(network, x, surface(x)) < before
 
 
 def test_frozen_parameters_stay() -> None:

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nfriction import LinearAxis
+from nfriction import LinearAxis, rigs
 from nfriction.fitting.plant_parameters import RATIO_BOUND, adjusted_buffers, plant_parameters
 from tests.fitting.recordings import F64, pendulum
 
@@ -26,7 +26,11 @@ def test_terms_that_are_not_there_are_not_adjusted():
     assert not [n for n in names(pendulum(), driven=False) if "armature" in n or "drag" in n]
     assert "armature 2" in names(pendulum(armature=[0.0, 1e-4]), driven=False)
     assert "armature 1" not in names(pendulum(armature=[0.0, 1e-4]), driven=False)
-    assert names(pendulum(), driven=False, drag=True)[-2:] == ["drag linear", "drag quadratic"]
+    drag = ["drag linear", "drag quadratic", "drag reach"]
+    assert names(pendulum(), driven=False, drag=True)[-3:] == drag
+    # A single link's reach is but the scale of its drag, and its linear drag viscous friction.
+    single = names(rigs.multiarm_single(), driven=False, drag=True)
+    assert [n for n in single if "drag" in n] == ["drag quadratic"]
     assert names(LinearAxis(2.0), driven=True, largest_torque=1.0) == [
         "mass 1", "torque offset 1 [N m]"
     ]  # fmt: skip

@@ -1,5 +1,8 @@
 """The quadratic model of a trajectory problem is the derivative of its cost."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
 
@@ -8,6 +11,7 @@ from nfriction.fitting.plant_parameters import plant_parameters
 from nfriction.fitting.sensitivity import StepJacobian
 from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
 from nfriction.fitting.windows import Windows
+from nfriction.signals import Motion
 from nfriction.simulation import integrate
 from tests.fitting.recordings import F64, pendulum
 
@@ -62,7 +66,7 @@ def test_gradient_and_hessian_against_finite_differences(name, substeps):
     x = point(p)
     found = p.quadratic(x)
     torch.testing.assert_close(found.cost, p.cost(x))
-    precision, mean = p._prior()
+    precision, mean = p.prior()
     columns = []
     for i in range(x.numel()):
         unit = torch.zeros_like(x)
@@ -124,3 +128,22 @@ def test_the_prior_of_the_plant_may_be_centred_elsewhere():
     sd = torch.tensor([t.prior_sd for t in p.plant_terms], dtype=F64)
     prior = 0.5 * float(((mean / sd) ** 2).sum())
     assert float(p.cost(x) - moved.cost(x)) == pytest.approx(prior)
+
+
+def test_a_traced_motion_is_the_simulated_one_where_windows_lie():
+    """Longer windows start from it; samples outside every window keep the smoother's state."""
+    w = windows()
+    w = replace(w, names=("a", "a"), spans=((0, 0, 20), (0, 20, 36)))
+    model, plant = bent("LFM"), pendulum()
+    p = TrajectoryProblem(StepJacobian(plant, model, []), w, 1e-3, ABSOLUTE, substeps=2)
+    x, zero = point(p), np.zeros((40, 2))
+    before = Motion(np.arange(40.0), zero, zero, zero)
+    (after,) = p.traced(x, [before])
+    state = p.split(x)[2].numpy()
+    for window, sample in ((0, 0), (1, 20)):
+        np.testing.assert_allclose(after.q[sample], state[window, :2], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(after.qd[sample], state[window, 2:], rtol=0, atol=1e-12)
+    error = (p.residuals(x)[1, 16] * p.noise_sd).numpy() @ np.linalg.inv(ABSOLUTE.numpy()).T
+    np.testing.assert_allclose(after.q[36], w.q[1, 16].numpy() + error, rtol=0, atol=1e-12)
+    assert not after.q[37:].any()
+    assert not before.q.any()

@@ -279,3 +279,28 @@ def test_options_are_refused_by_name() -> None:
         NeuroFuzzy(LINEAR, 2, prior_sd=0.0)
     with pytest.raises(ValueError, match="2 inputs"):
         NeuroFuzzy(LINEAR, 2, terms=(5, 5, 5))
+
+
+def test_parameter_names_say_where_a_parameter_acts() -> None:
+    schedule = trained()
+    joints = [f"pivot {k + 1}" for k in range(schedule.joints)]
+    names = schedule.parameter_names(joints)
+    vector = schedule.parameter_vector()
+    assert len(set(names)) == len(names) == len(vector)
+    qd, qdd, _ = motion(30, schedule.joints)
+    # The head takes what the rules say, so with one other coefficients of the joint would follow.
+    vector[[k for k, name in enumerate(names) if "head" in name]] = 0.0
+    schedule.set_parameter_vector(vector)
+    before = schedule(qd, qdd).detach()
+    acting = 0
+    tried = range(0, len(names), 7)
+    for k in tried:
+        schedule.set_parameter_vector(vector + 0.1 * (torch.arange(len(vector)) == k))
+        moved = (schedule(qd, qdd).detach() - before).abs().amax(0)
+        found = {
+            f"{schedule.coefficient_names[c]} of {joints[j]}" for j, c in moved.nonzero().tolist()
+        }
+        assert found <= {names[k].split(":")[0]}
+        acting += len(found)
+    # Rules that no sample of the motion fires do nothing.
+    assert acting > 0.5 * len(tried)

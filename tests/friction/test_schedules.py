@@ -153,3 +153,13 @@ def test_dtype_follows_the_module() -> None:
 
 def test_it_says_what_it_holds() -> None:
     assert "C_p=0.25" in repr(Constant(VISCOUS, 2, [0.25]))
+
+
+@every_law
+def test_parameter_names_say_where_a_parameter_acts(law: Law) -> None:
+    schedule = Constant(law, 2)
+    names = schedule.parameter_names(["shoulder", "elbow"])
+    schedule.set_parameter_vector(torch.arange(1.0, len(names) + 1, dtype=torch.float64))
+    for joint, row in zip(["shoulder", "elbow"], schedule.values.tolist(), strict=True):
+        for coefficient, value in zip(law.names, row, strict=True):
+            assert names[round(value) - 1] == f"{coefficient} of {joint}"

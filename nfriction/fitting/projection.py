@@ -1,29 +1,48 @@
-"""Least squares of a fuzzy layer, by the columns that the derivatives of its outputs share.
+"""Variable projection: where sets (or units) belong once the output layer is eliminated.
 
-Two views of one problem: normal equations of all parameters, for Bayesian regularisation, and the
-problem left for the sets (or units) once the output layer is eliminated, for a good start.
+For given sets the best output layer follows by linear least squares, so only the sets are left to
+search; the search is shorter and better conditioned than one over all parameters.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from nfriction.fuzzy import Anfis, RBFNetwork
-from nfriction.solve import NormalEquations, Quadratic
+from nfriction.solve import LevenbergMarquardt, Quadratic
 from nfriction.solve.jacobian import flatten, trainable, unflatten
+from nfriction.solve.shared_columns import CHUNK_ENTRIES
 
 LINEAR = ("consequents", "output_weight", "output_bias")
 """Parameters in which a layer is linear; its leading columns are their regressors."""
 
-# 4 MiB of columns at a time: fewer samples cost more calls, more fall out of the cache.
-CHUNK_ENTRIES = 2**19
+
+def project(layer: Anfis | RBFNetwork, x: Tensor, y: Tensor, steps: int) -> None:
+    """Place the sets (or units) by least squares with the output layer eliminated, in place.
+
+    Args:
+        layer: of one group; left alone if its output layer or all of its sets are frozen.
+        x, y: samples, shapes (samples, 1, inputs) and (samples, 1, outputs).
+        steps: limit of Levenberg-Marquardt's steps.
+    Raises:
+        KeyboardInterrupt: if interrupted; the best sets so far are in the layer.
+    """
+    problem = Projection(layer, x, y)
+    if not problem.separable:
+        return
+    solver = LevenbergMarquardt(max_steps=steps, cost_tolerance=1e-6)
+    result = solver.minimise(problem.quadratic, problem.theta, cost=problem.cost)
+    problem.cost(result.x)
+    if result.status == "stopped":
+        raise KeyboardInterrupt
 
 
-class LayerEquations:
-    """Errors of one layer on samples, as a function of the layer's parameters.
+class Projection:
+    """Squared errors of a layer as a function of its sets alone.
 
     The layer's parameters are overwritten by every evaluation.
 
@@ -31,8 +50,7 @@ class LayerEquations:
         layer: of one group.
         x: inputs, shape (samples, 1, inputs).
         y: targets, shape (samples, 1, outputs).
-        ridge: precision of the output layer around zero, over that of the errors, while it is
-            eliminated.
+        ridge: precision of the output layer around zero, over that of the errors.
     """
 
     def __init__(
@@ -42,73 +60,40 @@ class LayerEquations:
             raise ValueError(f"`layer` must be of one group, got {layer.groups}.")
         self.layer, self.x, self.y, self.ridge = layer, x, y, ridge
         self.parameters = {n: p for n, p in layer.named_parameters() if p.requires_grad}
-        names = list(self.parameters)
         sizes = torch.tensor([p.numel() for p in self.parameters.values()])
-        linear = torch.tensor([name in LINEAR for name in names]).repeat_interleave(sizes)
+        linear = torch.tensor([n in LINEAR for n in self.parameters]).repeat_interleave(sizes)
         self.linear, self.moving = linear.to(x.device), ~linear.to(x.device)
-        self.shared = layer.regressor_columns(x[:1]).shape[1]
+        self.shared = layer.readout().shape[2]
         self.total = layer.jacobian_columns(x[:1]).shape[1]
         rows = min(len(x), max(1, CHUNK_ENTRIES // self.total))
         # Written again and again: the first touch of fresh memory costs more than the arithmetic.
         self.buffer = x.new_empty(1, self.total, rows)
         self.target_squares = y.square().sum()
-        # With the whole output layer among the parameters the columns tell the outputs too.
-        self.readable = not any(
-            name.endswith(LINEAR) and not p.requires_grad for name, p in layer.named_parameters()
-        )
         self._eliminated: _Eliminated | None = None
 
     @property
-    def w(self) -> Tensor:
-        """The layer's present parameters in one vector."""
-        return flatten(trainable(self.layer)).clone()
+    def theta(self) -> Tensor:
+        """The layer's present sets (or units) in one vector."""
+        return flatten(trainable(self.layer))[self.moving].clone()
 
     @property
     def separable(self) -> bool:
         """Whether there are sets to place, and a whole output layer to eliminate for them."""
-        return bool(self.moving.any()) and self.readable
-
-    @torch.no_grad()
-    def assign(self, w: Tensor) -> None:
-        """Write parameters into the layer."""
-        for name, value in unflatten(w, self.parameters).items():
-            self.parameters[name].copy_(value)
-
-    @torch.no_grad()
-    def squares(self, w: Tensor) -> Tensor:
-        """Sum of squared errors."""
-        self.assign(w)
-        return sum(
-            ((self.layer(self.x[rows]) - self.y[rows]).square().sum() for rows in self._chunks()),
-            start=self.x.new_zeros(()),
+        whole = not any(
+            name.endswith(LINEAR) and not p.requires_grad
+            for name, p in self.layer.named_parameters()
         )
+        return whole and bool(self.moving.any())
 
     @torch.no_grad()
-    def normal_equations(self, w: Tensor) -> NormalEquations:
-        """J^T J, J^T e and sum e^2 of all parameters: one product of the shared columns."""
-        self.assign(w)
-        maps = self._maps()
-        readout = (maps[:, : self.shared] @ w).T
-        G = self.x.new_zeros(self.total, self.total)
-        b, squares = self.x.new_zeros(self.total, self.y.shape[-1]), self.x.new_zeros(())
-        for rows in self._chunks():
-            F = self._columns(rows)
-            said = F[: self.shared].T @ readout if self.readable else self.layer(self.x[rows])[:, 0]
-            error = said - self.y[rows, 0]
-            G.addmm_(F, F.T)
-            b.addmm_(F, error)
-            squares += error.square().sum()
-        return NormalEquations(_gathered(maps, G), _pulled_back(maps, b), squares)
-
-    @torch.no_grad()
-    def projected_cost(self, theta: Tensor) -> Tensor:
-        """Half the squares left at `theta` (what is not linear) by the best output layer for it.
+    def cost(self, theta: Tensor) -> Tensor:
+        """Half the squares that the best output layer for the sets `theta` leaves.
 
         The ridge's share is counted in. That output layer is written into the layer.
         """
-        w = self.w
+        w = flatten(trainable(self.layer)).clone()
         w[self.moving] = theta
-        self.assign(w)
+        self._assign(w)
         G = self.x.new_zeros(self.shared, self.shared)
         b = self.x.new_zeros(self.shared, self.y.shape[-1])
         for rows in self._chunks():
@@ -121,42 +106,43 @@ class LayerEquations:
         # In a regressor's coordinates an output layer's maps pick, so that their transpose places.
         placed = _pulled_back(self._maps()[:, : self.shared], weights)
         w[self.linear] = placed[self.linear]
-        self.assign(w)
+        self._assign(w)
         cost = 0.5 * (self.target_squares - (b * weights).sum())
         self._eliminated = _Eliminated(theta.clone(), weights, factor, cost)
         return cost
 
     @torch.no_grad()
-    def projected(self, theta: Tensor) -> Quadratic:
-        """Local quadratic of `projected_cost`, with Kaufman's approximation of its Hessian.
+    def quadratic(self, theta: Tensor) -> Quadratic:
+        """Local quadratic of `cost`, with Kaufman's approximation of its Hessian.
 
         References:
             Golub and Pereyra (1973); L. Kaufman, BIT 15 (1975) 49-57.
         """
         known = self._eliminated
         if known is None or not torch.equal(known.theta, theta):
-            self.projected_cost(theta)
+            self.cost(theta)
             known = self._eliminated
         assert known is not None
         shared = self.shared
         A = self.x.new_zeros(self.total - shared, self.total)
         b = self.x.new_zeros(self.total - shared, self.y.shape[-1])
         for rows in self._chunks():
-            F = self._columns(rows)
+            out = self.buffer[:, :, : rows.stop - rows.start]
+            F = self.layer.jacobian_columns(self.x[rows], out)[0]
             A.addmm_(F[shared:], F.T)
             b.addmm_(F[shared:], F[:shared].T @ known.weights - self.y[rows, 0])
         explained = A[:, :shared] @ torch.cholesky_solve(A[:, :shared].T, known.factor)
         maps = self._maps()[:, shared:, self.moving]
-        gradient = _pulled_back(maps, b)
-        return Quadratic(known.cost, gradient, _gathered(maps, A[:, shared:] - explained))
+        hessian = (maps.mT @ (A[:, shared:] - explained) @ maps).sum(0)
+        return Quadratic(known.cost, _pulled_back(maps, b), hessian)
+
+    def _assign(self, w: Tensor) -> None:
+        for name, value in unflatten(w, self.parameters).items():
+            self.parameters[name].copy_(value)
 
     def _maps(self) -> Tensor:
         """Shape (outputs, columns, parameters)."""
         return torch.cat(list(self.layer.jacobian_maps().values()), -1)[0]
-
-    def _columns(self, rows: slice) -> Tensor:
-        out = self.buffer[:, :, : rows.stop - rows.start]
-        return self.layer.jacobian_columns(self.x[rows], out)[0]
 
     def _chunks(self) -> Iterator[slice]:
         n = len(self.x)
@@ -164,16 +150,14 @@ class LayerEquations:
             yield slice(start, min(start + self.buffer.shape[-1], n))
 
 
+@dataclass(frozen=True, eq=False)
 class _Eliminated:
     """The best output layer at `theta`: weights (regressors, outputs), factor of their Gram."""
 
-    def __init__(self, theta: Tensor, weights: Tensor, factor: Tensor, cost: Tensor) -> None:
-        self.theta, self.weights, self.factor, self.cost = theta, weights, factor, cost
-
-
-def _gathered(maps: Tensor, gram: Tensor) -> Tensor:
-    """Sum over the outputs of M^T G M."""
-    return (maps.mT @ gram @ maps).sum(0)
+    theta: Tensor
+    weights: Tensor
+    factor: Tensor
+    cost: Tensor
 
 
 def _pulled_back(maps: Tensor, columns: Tensor) -> Tensor:

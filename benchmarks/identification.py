@@ -1,0 +1,188 @@
+"""Identification put to the test: friction that is known, and recordings that were left out.
+
+    python benchmarks/identification.py recovery [--seconds 10 20 40] [--seeds 1]
+    python benchmarks/identification.py real DATA [--only triple ...] [--models NCFM LFM NFLFM]
+
+Run from the repository's root, on one thread. `recovery` simulates the papers' three links with
+viscous and Coulomb friction, reads them with encoders of 8192 counts at 1 kHz and fits friction
+and plant with everything else unknown too. It prints the largest error of the six coefficients,
+the share of 95 % intervals that hold the truth, the seconds of processor time, and what the fit
+says cannot be told. The model starts at three times the true friction.
+
+`real` leaves one recording out at a time, fits the others and simulates the one left out from its
+first state. DATA holds a folder to each set, with a `recordings.csv` of initial states.
+"""
+
+import argparse
+import math
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import cases
+import numpy as np
+import pandas as pd
+import torch
+
+from nfriction import FrictionModel, Recording, rigs, rollout
+from nfriction.fitting import Fit, fit
+from nfriction.friction import Constant, model_by_name
+from nfriction.plant import LinearAxis, PendulumChain
+from nfriction.scoring import score
+from nfriction.selection import nearest_fit
+from nfriction.signals import quantise
+
+COUNTS, RATE = 8192, 1000
+# Released from rest; joint angles from upright [rad].
+RELEASES = {
+    "swing": (math.pi + 0.8, 0.4, -0.3),
+    "179 degrees": (math.radians(1.0), 0.0, 0.0),
+}
+
+
+class Set(NamedTuple):
+    """Recordings of one mechanism: folder, files, plant, unit and its factor in the table."""
+
+    folder: str
+    names: tuple[str, ...]
+    plant: Callable[[], PendulumChain | LinearAxis]
+    unit: str = "mrad"
+
+
+SETS = {
+    "single": Set("multiarm_pendulum", ("single_b0", "single_b2", "single_b4"),
+                  rigs.multiarm_single),
+    "double": Set("multiarm_pendulum", ("double_b0", "double_b2", "double_b4", "double_b6"),
+                  rigs.multiarm_double),
+    "triple": Set("multiarm_pendulum", ("triple_b0", "triple_b2"), rigs.multiarm_triple),
+    "C1": Set("dfki_double_pendulum", ("C1_143339", "C1_143601", "C1_143747", "C1_144003"),
+              lambda: rigs.dfki("C1")),
+    "C0": Set("dfki_double_pendulum", ("C0_00", "C0_02", "C0_04", "C0_06"),
+              lambda: rigs.dfki("C0")),
+    "A0": Set("dfki_double_pendulum", ("A0_00", "A0_02", "A0_12"), lambda: rigs.dfki("A0")),
+    "emps": Set("emps", ("emps_first",), rigs.emps, "mm"),
+    "xl330": Set("xl330_servo_pendulum", ("drop_kp100", "drop_kp400"), rigs.xl330),
+}  # fmt: skip
+
+
+def simulated(seconds: float, release: Sequence[float], seed: int) -> Recording:
+    """What the encoders see of a release from about `release` [rad]."""
+    random = torch.Generator().manual_seed(seed)
+    q0 = torch.tensor(release, dtype=torch.float64)
+    q0 = q0 + 0.01 * torch.randn(3, generator=random, dtype=torch.float64)
+    run = rollout(
+        cases.rig(), cases.constant(), q0, torch.zeros_like(q0), sample_time=1 / RATE,
+        steps=round(seconds * RATE), gradients=False,
+    )  # fmt: skip
+    return Recording(time=run.time.numpy(), q=quantise(run.q.numpy(), COUNTS), name="simulated")
+
+
+def recovery(seconds: Sequence[float], seeds: int) -> None:
+    """Print how well known friction is found again."""
+    truth = torch.tensor([cases.VISCOUS, cases.COULOMB], dtype=torch.float64).T
+    law = cases.VISCOUS_COULOMB
+    print("release        seconds  largest error [%]  held by 95 %  processor [s]  lost")
+    for name, release in RELEASES.items():
+        for span in seconds:
+            errors, held, spent, lost = [], [], 0.0, set()
+            for seed in range(seeds):
+                model = FrictionModel(law, Constant(law, 3, 3 * truth))
+                start = time.process_time()
+                found = fit(model, cases.rig(), simulated(span, release, seed))
+                spent += time.process_time() - start
+                errors.append((found.model.schedule.values / truth - 1).abs())
+                told = found.intervals[: truth.numel()]
+                held += [i.low <= t <= i.high for i, t in zip(told, truth.flatten(), strict=True)]
+                lost |= set(found.lost)
+            print(
+                f"{name:14} {span:7g} {100 * float(torch.stack(errors).max()):18.2f} "
+                f"{100 * np.mean(held):12.1f}% {spent / seeds:14.1f}  {', '.join(lost) or '-'}",
+                flush=True,
+            )
+
+
+def read(data: Path, of: Set) -> list[Recording]:
+    """The recordings of a set; a lone one is halved in time."""
+    found = []
+    for name in of.names:
+        (path,) = (p for p in (data / of.folder).glob(f"{name}.csv*"))
+        recording = Recording.read(path, unit="m" if of.unit == "mm" else "rad", name=name)
+        found.append(recording)
+    if len(found) == 1:
+        half = len(found[0]) // 2
+        found = [found[0][: half + 1], found[0][half:]]
+    return found
+
+
+def first_state(data: Path, of: Set, recording: Recording) -> tuple[np.ndarray, np.ndarray] | None:
+    """Initial state of a whole recording as its card gives it."""
+    table = pd.read_csv(data / of.folder / "recordings.csv").set_index("id")
+    if len(of.names) == 1 or recording.name not in table.index:
+        return None
+    row = table.loc[recording.name]
+    q, qd = (
+        np.array([row[f"{key}_{k + 1}"] for k in range(recording.joints)], dtype=float)
+        for key in ("q0", "qd0")
+    )
+    return q, qd
+
+
+def real(data: Path, only: Sequence[str], models: Sequence[str]) -> None:
+    """Print the error of every model on recordings left out, one at a time."""
+    print("set      model     free run   5 s   left out one by one (free run)        processor [s]")
+    for name in only:
+        of = SETS[name]
+        plant, recordings = of.plant(), read(data, of)
+        free: dict[str, list[float]] = {m: [] for m in models}
+        short: dict[str, list[float]] = {m: [] for m in models}
+        spent = dict.fromkeys(models, 0.0)
+        for k, left in enumerate(recordings):
+            fits: list[Fit] = []
+            for m in models:
+                start = time.process_time()
+                model = model_by_name(m)(plant.joints)
+                before = nearest_fit(fits, model)
+                others = [*recordings[:k], *recordings[k + 1 :]]
+                fits.append(fit(model, plant, others, start=before,
+                                motions=before.motions if before else None))  # fmt: skip
+                spent[m] += time.process_time() - start
+                state = first_state(data, of, left)
+                told = score(fits[-1].plant, fits[-1].model, left, initial_state=state)
+                free[m].append(1e3 * told.free_run.all)
+                short[m].append(1e3 * told.windows["5"].all if "5" in told.windows else math.nan)
+        for m in models:
+            rows = "  ".join(f"{e:.3g}" for e in free[m])
+            print(
+                f"{name:8} {m:8} {root_mean_square(free[m]):9.2f} {root_mean_square(short[m]):6.2f}"
+                f"   {rows:36} {spent[m]:10.0f}   {of.unit}",
+                flush=True,
+            )
+
+
+def root_mean_square(values: Sequence[float]) -> float:
+    return math.sqrt(sum(v * v for v in values) / len(values))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    commands = parser.add_subparsers(required=True, dest="command")
+    known = commands.add_parser("recovery", help="simulated friction found again")
+    known.add_argument("--seconds", type=float, nargs="+", default=[10.0, 20.0, 40.0])
+    known.add_argument("--seeds", type=int, default=1)
+    given = commands.add_parser("real", help="recordings left out one by one")
+    given.add_argument("data", type=Path)
+    given.add_argument("--only", nargs="+", default=list(SETS), choices=list(SETS))
+    given.add_argument("--models", nargs="+", default=["NCFM", "LFM", "NFLFM"])
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    if arguments.command == "recovery":
+        recovery(arguments.seconds, arguments.seeds)
+    else:
+        real(arguments.data, arguments.only, arguments.models)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

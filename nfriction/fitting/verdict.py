@@ -1,0 +1,153 @@
+"""What a fit may claim: intervals, what the data cannot tell, and what to be wary of.
+
+The linear theory of least squares around the minimum, with two corrections that make it honest:
+residuals that last for many samples count as few, and what is at a bound is not taken for known.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+# Two-sided 95 % of a normal distribution.
+NORMAL_95 = 1.959964
+# A direction is lost where it is worse determined than its parameters alone by this factor.
+LOST = 1e3
+# Below this share of its parameter's largest entry, a direction's entry is not worth naming.
+NAMED = 0.3
+# Left over beyond this many times the encoder's rounding is the model's own error.
+MODEL_ERROR = 3.0
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A fitted value and the 95 % interval around it, within its bounds.
+
+    Attributes:
+        name: of the parameter.
+        value: as fitted.
+        low, high: ends; at a bound the bound itself, infinite where the data tell nothing.
+    """
+
+    name: str
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the data say of the shared parameters, once window states are eliminated.
+
+    Attributes:
+        data: curvature by the data, in units of one independent residual, (p, p).
+        prior: prior precision, (p,).
+    """
+
+    data: Tensor
+    prior: Tensor
+
+
+def evidence(
+    hessian: Tensor, precision: Tensor, shared: int, noise_sd: float, effective_sd: float
+) -> Evidence:
+    """Curvature over the shared parameters with every window's state eliminated.
+
+    Args:
+        hessian: of the cost that counted residuals over `noise_sd`, prior included, (n, n).
+        precision: of the prior, (n,); its window states come last.
+        shared: number of friction and plant parameters.
+        noise_sd: what the residuals were counted in.
+        effective_sd: of a residual, enlarged for its correlation in time.
+    """
+    data = (hessian - torch.diag(precision)) * (noise_sd / effective_sd) ** 2
+    own = data[shared:, shared:] + torch.diag(precision[shared:])
+    across = data[:shared, shared:]
+    eliminated = data[:shared, :shared] - across @ torch.linalg.solve(own, across.T)
+    return Evidence(0.5 * (eliminated + eliminated.T), precision[:shared])
+
+
+def standard_deviations(known: Evidence) -> Tensor:
+    """Posterior standard deviation of each parameter, infinite where nothing is known, (p,)."""
+    scale, values, vectors = _spectrum(known.data + torch.diag(known.prior))
+    floor = torch.finfo(values.dtype).eps * len(values)
+    roots = vectors * values.clamp(min=floor).rsqrt()
+    sd = scale * roots.norm(dim=1)
+    # Where the huge variance of a lost direction rules, no number means anything.
+    lost = (vectors.square() * (values <= 10 * floor)).sum(1) > 1e-12
+    return torch.where(lost, torch.inf, sd)
+
+
+def intervals(
+    names: Sequence[str], values: Tensor, sd: Tensor, lower: Tensor, upper: Tensor
+) -> tuple[Interval, ...]:
+    """95 % intervals within the bounds."""
+    low = torch.maximum(values - NORMAL_95 * sd, lower)
+    high = torch.minimum(values + NORMAL_95 * sd, upper)
+    rows = zip(names, values.tolist(), low.tolist(), high.tolist(), strict=True)
+    return tuple(Interval(*row) for row in rows)
+
+
+def lost_directions(names: Sequence[str], known: Evidence) -> tuple[str, ...]:
+    """Parameters and combinations of them that the data cannot tell, in words.
+
+    A prior may still hold them; it is not asked here, except that a parameter of which the data
+    say a millionth of what its prior says counts as lost.
+
+    Args:
+        names: of the shared parameters.
+        known: what is known of them.
+    """
+    diagonal = known.data.diagonal()
+    seen = diagonal > known.prior * LOST**-2
+    found = [names[i] for i in (~seen).nonzero().flatten().tolist()]
+    index = seen.nonzero().flatten()
+    _, values, vectors = _spectrum(known.data[index][:, index])
+    for value, vector in zip(values, vectors.T, strict=True):
+        if value > LOST**-2:
+            break
+        size = vector.abs()
+        order = size.argsort(descending=True).tolist()
+        parts = [names[int(index[i])] for i in order if size[i] > NAMED * size.max()]
+        found.append(" with ".join(parts))
+    return tuple(found)
+
+
+def warnings_of(
+    *,
+    converged: bool,
+    at_bounds: Sequence[str],
+    lost: Sequence[str],
+    residual: float,
+    effective_sd: float,
+    quantum: float | None,
+    unit: str,
+) -> tuple[str, ...]:
+    """Sentences on what to be wary of; none for a fit without blemish."""
+    found = []
+    if not converged:
+        found.append("The search did not end at a minimum; intervals may be too narrow.")
+    if at_bounds:
+        found.append(
+            f"At a bound: {', '.join(at_bounds)}; the data ask for less than the model allows."
+        )
+    if lost:
+        found.append(f"The data cannot tell: {'; '.join(lost)}.")
+    rounding = None if quantum is None else quantum / 12**0.5
+    if rounding and residual > MODEL_ERROR * rounding:
+        count = (effective_sd / residual) ** 2
+        found.append(
+            f"Left over are {residual:.3g} {unit}, {residual / rounding:.0f} times the encoder's "
+            f"rounding: the model's own error, alike for about {count:.0f} samples. Intervals "
+            "allow for its size, not for what is missing in the model."
+        )
+    return tuple(found)
+
+
+def _spectrum(matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """1/sqrt(diagonal), eigenvalues (ascending) and vectors of the matrix of unit diagonal."""
+    diagonal = matrix.diagonal()
+    scale = torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
+    values, vectors = torch.linalg.eigh(scale[:, None] * matrix * scale)
+    return scale, values, vectors

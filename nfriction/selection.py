@@ -1,0 +1,238 @@
+"""Choice of a law on training data alone, by cross-validation over blocks of time."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from nfriction.fitting import Fit, fit
+from nfriction.friction import Constant, FrictionModel, model_by_name
+from nfriction.plant import LinearAxis, PendulumChain
+from nfriction.recording import Recording
+from nfriction.scoring import score
+from nfriction.signals import Motion, kalman_smoother
+
+# A block of fewer samples than this says nothing [samples].
+SHORTEST = 100
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """How one model fared on blocks that it had not seen.
+
+    Attributes:
+        name: of the model.
+        errors: root mean square position error of each block [rad or m], infinite where the model
+            diverged; blocks in the same order for all candidates.
+        parameters: how many numbers a fit varies in the friction model.
+        converged: whether every fold's fit converged.
+    """
+
+    name: str
+    errors: tuple[float, ...]
+    parameters: int
+    converged: bool
+
+    @property
+    def error(self) -> float:
+        """Root mean square over the blocks."""
+        return math.sqrt(sum(e * e for e in self.errors) / len(self.errors))
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Models compared by cross-validation, and the one to take.
+
+    Attributes:
+        chosen: name of the model.
+        reason: why, in a sentence.
+        candidates: all models, in the order given.
+        horizon: length of the simulations that were judged [s].
+        unit: of the errors.
+    """
+
+    chosen: str
+    reason: str
+    candidates: tuple[Candidate, ...]
+    horizon: float
+    unit: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON; a diverged block has no number."""
+        return {
+            "chosen": self.chosen,
+            "reason": self.reason,
+            "horizon": self.horizon,
+            "units": self.unit,
+            "candidates": {
+                c.name: {
+                    "error": _finite(c.error),
+                    "blocks": [_finite(e) for e in c.errors],
+                    "parameters": c.parameters,
+                    "converged": c.converged,
+                }
+                for c in self.candidates
+            },
+        }
+
+
+class Block(NamedTuple):
+    """A stretch of a recording, with its motion in joint coordinates."""
+
+    recording: Recording
+    motion: Motion
+
+
+def select(
+    plant: PendulumChain | LinearAxis,
+    models: Sequence[str],
+    recordings: Sequence[Recording],
+    *,
+    folds: int = 3,
+    horizon: float = 5.0,
+    tolerance: float = 0.02,
+    on_stage: Callable[[str], None] | None = None,
+    **fit_settings: Any,
+) -> Selection:
+    """Choose a friction model from training recordings alone.
+
+    Every recording is cut into as many blocks of time as there are folds. Each fold leaves one
+    block of every recording out, fits all models to the rest and simulates the blocks left out. A
+    model with fewer parameters is preferred where its error cannot be told from the least one:
+    within `tolerance`, or within the standard error of the difference over blocks.
+
+    Args:
+        plant: the mechanism as given.
+        models: names of models, simple ones first.
+        recordings: what may be trained on.
+        folds: at least 2.
+        horizon: length of the simulations [s]; a block where that is shorter.
+        tolerance: relative difference of errors that counts as none.
+        on_stage: told what is being done, for a progress display.
+        fit_settings: see `fit`.
+
+    Returns:
+        The choice, with every model's error on every block.
+
+    Raises:
+        ValueError: if there are fewer than two folds, no model or no recording, or a recording is
+            too short to be cut.
+    """
+    if folds < 2 or not models or not recordings:
+        raise ValueError(
+            "a choice needs models, recordings and at least 2 folds, got "
+            f"{len(models)} models, {len(recordings)} recordings and {folds} folds."
+        )
+    names = list(dict.fromkeys(models))
+    blocks = [cut_blocks(plant, recording, folds) for recording in recordings]
+    horizon = min(horizon, *(b.recording.duration for row in blocks for b in row))
+    errors: dict[str, list[float]] = {name: [] for name in names}
+    converged = dict.fromkeys(names, True)
+    parameters: dict[str, int] = {}
+    for fold in range(folds):
+        # Staggered, so that no fold lacks the same stretch of every recording.
+        out = [(fold + i) % folds for i in range(len(blocks))]
+        unseen = [row[k] for row, k in zip(blocks, out, strict=True)]
+        seen = [b for row, k in zip(blocks, out, strict=True) for b in (*row[:k], *row[k + 1 :])]
+        fits: list[Fit] = []
+        for name in names:
+            if on_stage is not None:
+                on_stage(f"fold {fold + 1} of {folds}: {name}")
+            model = model_by_name(name)(plant.joints)
+            found = fit(
+                model, plant, [b.recording for b in seen], motions=[b.motion for b in seen],
+                start=nearest_fit(fits, model), **fit_settings,
+            )  # fmt: skip
+            fits.append(found)
+            errors[name] += [block_error(found, b, horizon) for b in unseen]
+            converged[name] &= found.converged
+            parameters[name] = model.schedule.parameter_vector().numel()
+    candidates = tuple(Candidate(n, tuple(errors[n]), parameters[n], converged[n]) for n in names)
+    return Selection(*choose(candidates, tolerance), candidates, horizon, plant.unit)
+
+
+def choose(candidates: Sequence[Candidate], tolerance: float = 0.02) -> tuple[str, str]:
+    """The model with the fewest parameters whose error cannot be told from the least.
+
+    Args:
+        candidates: with errors of the same blocks.
+        tolerance: relative difference of errors that counts as none.
+
+    Returns:
+        Its name, and why, in a sentence.
+    """
+    best = min(candidates, key=lambda c: c.error)
+    if not math.isfinite(best.error):
+        simplest = min(candidates, key=lambda c: c.parameters)
+        return simplest.name, "every model diverged on a block left out; the simplest is taken."
+    alike = [c for c in candidates if _alike(c, best, tolerance)]
+    chosen = min(alike, key=lambda c: (c.parameters, c.error))
+    if chosen is not best:
+        return chosen.name, (
+            f"its error on blocks left out, {chosen.error:.3g}, cannot be told from the least, "
+            f"{best.error:.3g} of {best.name}, and it has fewer parameters "
+            f"({chosen.parameters} against {best.parameters})."
+        )
+    others = sorted((c for c in candidates if c is not best), key=lambda c: c.error)
+    if not others:
+        return best.name, "it is the only model."
+    return best.name, (
+        f"its error on blocks left out, {best.error:.3g}, is the least; {others[0].name} follows "
+        f"with {others[0].error:.3g}."
+    )
+
+
+def cut_blocks(plant: PendulumChain | LinearAxis, recording: Recording, count: int) -> list[Block]:
+    """Blocks of a recording that follow each other, of equal numbers of samples.
+
+    The whole recording is smoothed once: a block's ends are then as well known as its middle.
+
+    Raises:
+        ValueError: if the blocks would have fewer than 100 samples.
+    """
+    if len(recording) < SHORTEST * count:
+        raise ValueError(
+            f"{recording.name or 'a recording'} has {len(recording)} samples, too few for "
+            f"{count} blocks of at least {SHORTEST}; give fewer folds or longer recordings."
+        )
+    joint = recording.joint_coordinates(plant)
+    motion = kalman_smoother(joint.time, joint.q)
+    edges = np.linspace(0, len(recording) - 1, count + 1).astype(int).tolist()
+    blocks = []
+    for k in range(count):
+        part = slice(edges[k], edges[k + 1] + 1)
+        own = Motion(motion.time[part], motion.q[part], motion.qd[part], motion.qdd[part])
+        blocks.append(Block(recording[part], own))
+    return blocks
+
+
+def block_error(found: Fit, block: Block, horizon: float) -> float:
+    """Root mean square position error of simulations of `horizon` seconds over a block."""
+    result = score(
+        found.plant, found.model, block.recording, motion=block.motion, horizons=(horizon,)
+    )
+    return result.windows[f"{horizon:g}"].all
+
+
+def nearest_fit(fits: Sequence[Fit], model: FrictionModel) -> Fit | None:
+    """The fit to start from: the constant one of the same law, else the last."""
+    for found in fits:
+        if found.model.law == model.law and isinstance(found.model.schedule, Constant):
+            return found
+    return fits[-1] if fits else None
+
+
+def _alike(one: Candidate, best: Candidate, tolerance: float) -> bool:
+    """Whether two mean squares differ by no more than their blocks make them."""
+    if not math.isfinite(one.error):
+        return False
+    difference = np.square(one.errors) - np.square(best.errors)
+    n = len(difference)
+    error = float(difference.std(ddof=1)) / math.sqrt(n) if n > 1 else 0.0
+    return one.error <= (1 + tolerance) * best.error or float(difference.mean()) <= error
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

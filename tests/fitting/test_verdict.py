@@ -1,0 +1,93 @@
+"""Intervals cover as often as they say, and what nobody can tell is named."""
+
+import pytest
+import torch
+
+from nfriction.fitting.verdict import (
+    Evidence,
+    evidence,
+    intervals,
+    lost_directions,
+    standard_deviations,
+    warnings_of,
+)
+
+F64 = torch.float64
+NAMES = ("a", "b", "c")
+
+
+def regression(samples=200, parameters=3):
+    g = torch.Generator().manual_seed(3)
+    return torch.randn(samples, parameters, generator=g, dtype=F64), g
+
+
+def test_intervals_of_a_linear_fit_cover_as_often_as_they_say():
+    design, g = regression()
+    truth, noise = torch.tensor([1.0, -2.0, 0.5], dtype=F64), 0.3
+    known = evidence(design.T @ design, torch.zeros(3, dtype=F64), 3, 1.0, noise)
+    sd, free = standard_deviations(known), torch.full((3,), torch.inf, dtype=F64)
+    hits = []
+    for _ in range(400):
+        y = design @ truth + noise * torch.randn(len(design), generator=g, dtype=F64)
+        found = torch.linalg.lstsq(design, y[:, None]).solution[:, 0]
+        told = intervals(NAMES, found, sd, -free, free)
+        hits += [i.low <= t <= i.high for i, t in zip(told, truth.tolist(), strict=True)]
+    # 1200 trials of 95 %: a standard deviation is 0.6 %.
+    assert sum(hits) / len(hits) == pytest.approx(0.95, abs=0.02)
+
+
+def test_eliminating_window_states_is_marginalising_them():
+    design, _ = regression(parameters=5)
+    precision = torch.tensor([0.0, 2.0, 0.0, 1.0, 3.0], dtype=F64)
+    noise_sd, sd = 0.5, 0.7
+    hessian = design.T @ design / noise_sd**2 + torch.diag(precision)
+    whole = torch.linalg.inv(design.T @ design / sd**2 + torch.diag(precision))
+    found = standard_deviations(evidence(hessian, precision, 3, noise_sd, sd))
+    torch.testing.assert_close(found, whole.diagonal()[:3].sqrt())
+
+
+def test_units_do_not_matter():
+    design, _ = regression()
+    units = torch.tensor([1e-6, 1.0, 1e5], dtype=F64)
+    zero = torch.zeros(3, dtype=F64)
+    scaled = design * units
+    one = standard_deviations(Evidence(design.T @ design, zero))
+    other = standard_deviations(Evidence(scaled.T @ scaled, zero))
+    torch.testing.assert_close(other * units, one)
+
+
+def test_a_singular_direction_and_a_blind_parameter_are_named():
+    design, _ = regression()
+    design[:, 1] = 2.0 * design[:, 0]
+    known = Evidence(design.T @ design, torch.zeros(3, dtype=F64))
+    (direction,) = lost_directions(NAMES, known)
+    assert set(direction.split(" with ")) == {"a", "b"}
+    assert torch.isinf(standard_deviations(known)).tolist() == [True, True, False]
+    design[:, 1] = 0.0
+    blind = Evidence(design.T @ design, torch.tensor([0.0, 1.0, 0.0], dtype=F64))
+    assert lost_directions(NAMES, blind) == ("b",)
+    # Its prior still says what it says.
+    assert float(standard_deviations(blind)[1]) == pytest.approx(1.0)
+
+
+def test_nothing_is_lost_where_all_is_told():
+    design, _ = regression()
+    assert lost_directions(NAMES, Evidence(design.T @ design, torch.zeros(3, dtype=F64))) == ()
+
+
+def test_intervals_end_at_the_bounds():
+    value, sd = torch.tensor([0.1], dtype=F64), torch.tensor([1.0], dtype=F64)
+    (told,) = intervals(("c",), value, sd, torch.zeros(1), torch.full((1,), 0.5))
+    assert (told.low, told.high) == (0.0, 0.5)
+
+
+def test_warnings_name_what_is_wrong_and_are_silent_otherwise():
+    good = {"converged": True, "at_bounds": (), "lost": (), "residual": 3e-4,
+            "effective_sd": 3e-4, "quantum": 1e-3, "unit": "rad"}  # fmt: skip
+    assert warnings_of(**good) == ()
+    bad = warnings_of(**good | {"converged": False, "at_bounds": ["B of joint1"],
+                                "lost": ["drag reach"], "residual": 3e-3})  # fmt: skip
+    assert len(bad) == 4
+    assert "B of joint1" in bad[1]
+    assert "drag reach" in bad[2]
+    assert "10 times" in bad[3]

@@ -1,0 +1,75 @@
+"""The choice of a law: by error on blocks left out, and the simpler one where that is a draw."""
+
+import math
+from itertools import pairwise
+
+import pytest
+
+from nfriction import LFM, NCFM
+from nfriction.selection import Candidate, choose, cut_blocks, select
+from tests.fitting.recordings import pendulum, swing
+
+
+def candidate(name, errors, parameters):
+    return Candidate(name, tuple(errors), parameters, True)
+
+
+def test_the_least_error_is_chosen():
+    name, reason = choose([candidate("A", (3, 3, 3), 1), candidate("B", (1, 1, 1), 9)])
+    assert name == "B"
+    assert "A follows" in reason
+
+
+def test_a_draw_goes_to_the_simpler_model():
+    simple, rich = candidate("A", (1.01, 1.0, 1.0), 1), candidate("B", (1, 1, 1), 9)
+    name, reason = choose([rich, simple])
+    assert name == "A"
+    assert "fewer parameters" in reason
+
+
+def test_what_one_block_alone_decides_is_a_draw():
+    """The mean differs, but by no more than its standard error over blocks."""
+    simple, rich = candidate("A", (1.0, 1.0, 3.0), 1), candidate("B", (1.0, 1.0, 1.0), 9)
+    assert choose([simple, rich])[0] == "A"
+    steady = candidate("A", (1.4, 1.5, 1.6), 1)
+    assert choose([steady, rich])[0] == "B"
+
+
+def test_what_diverges_is_not_chosen():
+    lost, fine = candidate("A", (math.inf, 1.0), 1), candidate("B", (5.0, 5.0), 9)
+    assert choose([lost, fine])[0] == "B"
+    assert choose([lost])[0] == "A"
+
+
+def test_blocks_cover_a_recording_and_share_their_ends():
+    recording = swing(pendulum(), LFM(2, [1e-3, 1e-3], v_smooth=0.05), seconds=1.0)
+    blocks = cut_blocks(pendulum(), recording, 3)
+    assert blocks[0].recording.time[0] == recording.time[0]
+    assert blocks[-1].recording.time[-1] == recording.time[-1]
+    for before, after in pairwise(blocks):
+        assert before.recording.time[-1] == after.recording.time[0]
+        assert len(before.motion.q) == len(before.recording)
+
+
+def test_bad_input_is_refused():
+    recording = swing(pendulum(), NCFM(2, [[1e-3]] * 2), seconds=0.4)
+    for arguments, message in (
+        ((["NCFM"], [recording], 1), "2 folds"),
+        (([], [recording], 2), "0 models"),
+        ((["NCFM"], [recording], 3), "too few"),
+    ):
+        models, recordings, folds = arguments
+        with pytest.raises(ValueError, match=message):
+            select(pendulum(), models, recordings, folds=folds)
+
+
+@pytest.mark.slow
+def test_the_law_that_made_the_recording_is_chosen():
+    """Dry friction is not viscous, and viscous friction is not worth a Coulomb coefficient."""
+    settings = {"folds": 2, "fit_plant": False, "windows": (0.5,)}
+    dry = swing(pendulum(), LFM(2, [[1e-5, 3e-3], [1e-5, 2e-3]], v_smooth=0.05), seconds=4.0)
+    found = select(pendulum(), ["NCFM", "LFM"], [dry], **settings)
+    assert found.chosen == "LFM"
+    assert found.to_dict()["candidates"]["LFM"]["error"] > 0
+    wet = swing(pendulum(), NCFM(2, [[2e-3], [1e-3]]), seconds=4.0)
+    assert select(pendulum(), ["NCFM", "LFM"], [wet], **settings).chosen == "NCFM"
