@@ -10,9 +10,13 @@ from nfriction.version import __version__
 
 if TYPE_CHECKING:
     from nfriction import export, plots
+    from nfriction.angles import AngleConvention
     from nfriction.comparison import Comparison, compare
-    from nfriction.fitting import Fit, fit
+    from nfriction.fitting import Fit, fit, fit_adaptive, fit_by_search
     from nfriction.friction import (
+        ALFM,
+        ANCFM,
+        ANLFM,
         LFM,
         NCFM,
         NFLFM,
@@ -22,16 +26,20 @@ if TYPE_CHECKING:
         FrictionModel,
         Stribeck,
     )
-    from nfriction.modelfile import ModelInfo, load, save
+    from nfriction.modelfile import ModelInfo, info_of, load, plant_of, save
     from nfriction.plant import LinearAxis, PendulumChain, rigs
     from nfriction.recording import Recording
     from nfriction.scoring import Score, score
     from nfriction.simulation import Rollout, rollout
 
 _HOME = {
+    "angles": ("AngleConvention",),
     "comparison": ("Comparison", "compare"),
-    "fitting": ("Fit", "fit"),
+    "fitting": ("Fit", "fit", "fit_adaptive", "fit_by_search"),
     "friction": (
+        "ALFM",
+        "ANCFM",
+        "ANLFM",
         "LFM",
         "NCFM",
         "NFLFM",
@@ -41,7 +49,7 @@ _HOME = {
         "FrictionModel",
         "Stribeck",
     ),
-    "modelfile": ("ModelInfo", "load", "save"),
+    "modelfile": ("ModelInfo", "info_of", "load", "plant_of", "save"),
     "plant": ("LinearAxis", "PendulumChain", "rigs"),
     "recording": ("Recording",),
     "scoring": ("Score", "score"),
@@ -50,12 +58,16 @@ _HOME = {
 _MODULE = {name: module for module, names in _HOME.items() for name in names}
 
 __all__ = [
+    "ALFM",
+    "ANCFM",
+    "ANLFM",
     "LFM",
     "NCFM",
     "NFLFM",
     "NFNCFM",
     "NFNLFM",
     "NLFM",
+    "AngleConvention",
     "Comparison",
     "Fit",
     "FrictionModel",
@@ -70,7 +82,11 @@ __all__ = [
     "compare",
     "export",
     "fit",
+    "fit_adaptive",
+    "fit_by_search",
+    "info_of",
     "load",
+    "plant_of",
     "plots",
     "rigs",
     "rollout",

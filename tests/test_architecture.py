@@ -31,11 +31,11 @@ ALLOWED: dict[str, set[str]] = {
     "fitting": FOUNDATIONS
     | {"plant", "fuzzy", "friction", "codegen", "simulation", "compiled", "solve"},
     "scoring": FOUNDATIONS | {"plant", "friction", "simulation"},
-    "modelfile": {"version", "atomic", "friction"},
-    "export": {"version", "atomic", "friction", "codegen", "modelfile"},
+    "modelfile": {"version", "atomic", "plant", "friction"},
+    "export": {"version", "atomic", "friction", "codegen", "modelfile", "signals"},
 }
 # Only command lines talk to a person: the program's, and the one that scripts share.
-MAY_PRINT = {"cli.py", "twin/command.py"}
+MAY_PRINT = ("cli/", "twin/command.py")
 # TorchScript is deprecated upstream; it has one home. Asking whether one is being scripted is no
 # use of it: a module elsewhere may have to.
 MAY_SCRIPT = {"export"}
@@ -147,7 +147,7 @@ def test_only_command_lines_print() -> None:
         [
             f"{path.relative_to(ROOT)}:{node.lineno}"
             for path in modules()
-            if path.relative_to(PACKAGE).as_posix() not in MAY_PRINT
+            if not path.relative_to(PACKAGE).as_posix().startswith(MAY_PRINT)
             for node in ast.walk(tree(path))
             if isinstance(node, ast.Call) and dotted(node.func) in ("print", "sys.stdout.write")
         ]

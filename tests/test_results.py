@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nfriction import NCFM, PendulumChain, Recording, cli, results
+from nfriction import NCFM, PendulumChain, Recording, results
+from nfriction.cli.report import error_tables
 from nfriction.comparison import Comparison
 from nfriction.export import ExportError
 from nfriction.fitting import fit
@@ -39,7 +40,7 @@ def comparison(recording: Recording) -> Comparison:
 
 
 def test_divergence_is_null_and_stops_no_other_model(
-    comparison: Comparison, recording: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    comparison: Comparison, recording: Recording, tmp_path: Path
 ) -> None:
     written = results.write_results(comparison, [recording], [], tmp_path, figures=False)
     assert all(path.is_file() for path in written)
@@ -48,8 +49,7 @@ def test_divergence_is_null_and_stops_no_other_model(
     assert found["models"]["wild"]["train"]["r"]["free_run"] == {"joints": [None], "all": None}
     assert found["models"]["good"]["train"]["r"]["free_run"]["all"] == 0.1
     assert found["recordings"]["train"] == {"r": recording.digest()}
-    cli._print_tables(comparison)
-    rows = {line.split()[0]: line for line in capsys.readouterr().out.splitlines() if line.strip()}
+    rows = {line.split()[0]: line for line in error_tables(comparison).splitlines() if line.strip()}
     assert "diverged" in rows["wild"]
     assert "diverged" not in rows["good"]
 

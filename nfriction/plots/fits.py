@@ -44,7 +44,7 @@ def torque_over_velocity(
         motions: their smoothed motion in joint coordinates; computed where not given.
         width: of the figure [in].
     """
-    joint = [r.joint_coordinates(plant.first_link) for r in recordings]
+    joint = [r.joint_coordinates(plant) for r in recordings]
     motions = motions or [kalman_smoother(r.time, r.q) for r in joint]
     with torch.no_grad():
         parts = [friction_torque(plant, r, m) for r, m in zip(joint, motions, strict=True)]

@@ -1,0 +1,76 @@
+"""Command line: fit, compare, inspect and export friction models.
+
+Each command is a module with `add(commands, common)`, which registers its parser, and
+`run(arguments) -> int`. Only `run` imports what is slow to load (torch, pandas, matplotlib), so
+that help and usage errors come at once.
+"""
+
+import argparse
+import logging
+import shlex
+import sys
+from collections.abc import Sequence
+
+from nfriction.cli import compare, demo, export, fit, info, reproduce, verify
+from nfriction.cli.console import Parser, UsageError, interruptible, message_of, one_line_warnings
+from nfriction.version import __version__
+
+# In the order in which the help lists them.
+COMMANDS = (fit, compare, demo, info, export, verify, reproduce)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command.
+
+    Errors are one line on standard error and exit status 2, an interrupt gives status 130.
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    parser = make_parser()
+    arguments = argparse.Namespace(debug="--debug" in words)
+    try:
+        parser.parse_args(words, arguments)
+        if "run" not in arguments:
+            parser.print_help(sys.stderr)
+            return 2
+        arguments.command_line = shlex.join(["nfriction", *words])
+        return _run(arguments)
+    except KeyboardInterrupt as interrupt:
+        print(f"nfriction: interrupted {interrupt}".rstrip(), file=sys.stderr)
+        return 130
+    except (UsageError, ValueError, OSError, ImportError) as error:
+        if arguments.debug:
+            raise
+        print(f"nfriction: error: {message_of(error)}", file=sys.stderr)
+        return 2
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The parser of all commands."""
+    parser = Parser(
+        prog="nfriction",
+        description="Learn joint friction from encoder recordings, prove it by simulation.",
+    )
+    parser.add_argument("--version", action="version", version=f"nfriction {__version__}")
+    commands = parser.add_subparsers(metavar="COMMAND")
+    common = Parser(add_help=False)
+    common.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    for command in COMMANDS:
+        command.add(commands, common)
+    return parser
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    """Run a command whose arguments are sound."""
+    import torch
+
+    from nfriction.codegen import CodegenError
+    from nfriction.export import ExportError
+
+    logging.basicConfig(format="nfriction: %(levelname)s: %(message)s", level=logging.WARNING)
+    # Several threads make small tensors up to 100 times slower.
+    torch.set_num_threads(1)
+    try:
+        with interruptible(), one_line_warnings():
+            return arguments.run(arguments)
+    except (CodegenError, ExportError) as error:
+        raise UsageError(str(error)) from error

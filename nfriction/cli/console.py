@@ -1,0 +1,165 @@
+"""What a person meets at the console: errors and warnings in a line, progress, Ctrl-C."""
+
+import argparse
+import math
+import re
+import signal
+import sys
+import tempfile
+import threading
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any, NoReturn
+
+
+class UsageError(Exception):
+    """What the user asked for cannot be done; the message says why and what to do."""
+
+
+class _Help(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
+    """Tells defaults where there is one to tell; leaves examples as they are written."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        if action.default in (None, False, []):
+            return action.help
+        return super()._get_help_string(action)
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line, as all others are, and whose help tells defaults."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(formatter_class=_Help, **kwargs)
+
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(f"{message}; see {self.prog} --help.")
+
+
+def count(text: str) -> int:
+    """A whole number from 0, for argparse."""
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"must be a whole number from 0, got {text!r}")
+    return int(text)
+
+
+def seconds(text: str) -> float:
+    """A positive duration, for argparse."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"must be positive seconds, got {text!r}")
+    return value
+
+
+def check_writable(folder: Path) -> None:
+    """Refuse an unwritable folder before the work rather than after it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise UsageError(f"cannot make the folder {folder}: there is a file in its way.") from None
+    with tempfile.TemporaryFile(dir=folder):
+        pass
+
+
+# The library advises its caller in Python; who types a command has options instead.
+_OPTIONS = (
+    (re.compile(r'columns=\{"(\w+)": "\.\.\."\}'), r"--columns \1=NAME"),
+    (re.compile(r"`degrees=True`"), "--degrees"),
+    (re.compile(r"`columns`"), "--columns"),
+)
+
+
+def one_line(message: object) -> str:
+    """A message of the library in one line, its advice in options of the command line."""
+    text = " ".join(str(message).split())
+    for argument, option in _OPTIONS:
+        text = argument.sub(option, text)
+    return text
+
+
+def message_of(error: Exception) -> str:
+    """An error in one line."""
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return one_line(error)
+
+
+def warn(message: str) -> None:
+    """Tell the user what may be wrong, on standard error."""
+    print(f"nfriction: warning: {message}", file=sys.stderr)
+
+
+@contextmanager
+def one_line_warnings() -> Iterator[None]:
+    """Print Python's warnings as the command line's own."""
+
+    def show(message: Warning | str, *_: Any, **__: Any) -> None:
+        warn(one_line(message))
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
+
+
+_interrupted = threading.Event()
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Remember a Ctrl-C: solvers keep their best point, but a user wants an end.
+
+    The run ends where it next reports its progress.
+    """
+
+    def interrupt(_signal: int, _frame: FrameType | None) -> None:
+        _interrupted.set()
+        raise KeyboardInterrupt
+
+    _interrupted.clear()
+    if threading.current_thread() is not threading.main_thread():
+        yield  # signals reach the main thread only
+        return
+    before = signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+class Progress:
+    """One bar for a whole run: what is being done, and steps taken."""
+
+    def __init__(self) -> None:
+        from tqdm import tqdm
+
+        self._what = "start"
+        self._bar = tqdm(unit=" steps", disable=not sys.stderr.isatty(), leave=False)
+
+    def __enter__(self) -> "Progress":
+        return self
+
+    def __exit__(self, _type: object, error: BaseException | None, _trace: object) -> None:
+        self._bar.close()
+        if isinstance(error, KeyboardInterrupt):
+            error.args = (f"({self._what}); no file was left half-written",)
+
+    def stage(self, what: str) -> None:
+        """Say what is done from here on."""
+        self._check()
+        self._what = what
+        self._bar.set_description(what)
+
+    def step(self, stage: str) -> None:
+        """Count a step of a solver."""
+        self._check()
+        self._bar.set_description(f"{self._what}, {stage}")
+        self._bar.update()
+
+    def _check(self) -> None:
+        if _interrupted.is_set():
+            raise KeyboardInterrupt

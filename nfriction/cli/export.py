@@ -1,0 +1,148 @@
+"""`nfriction export`: write a model file as artefacts for controllers and simulators."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from nfriction.cli import names
+from nfriction.cli.console import Parser, UsageError, check_writable, seconds
+
+if TYPE_CHECKING:
+    from nfriction.friction import FrictionModel
+    from nfriction.modelfile import ModelInfo
+
+EXAMPLE = """example:
+  nfriction export model.json --to torchscript,c --out artefacts"""
+
+# Ending of the file that each target is written to; C is a folder of files.
+CONTROLLERS = {"torchscript": ".pt", "c": ".c", "pt2": ".pt2", "onnx": ".onnx"}
+SIMULATORS = {"mjcf": ".xml", "urdf": ".urdf"}
+TARGETS = (*CONTROLLERS, *SIMULATORS)
+# What computes in single precision where asked to; the others are in double at any rate.
+IN_SINGLE = ("c", "onnx")
+
+
+def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
+    """Register the command."""
+    parser = commands.add_parser(
+        "export", parents=[common], help="write artefacts for controllers and simulators",
+        description="Write a fitted model as artefacts for controllers, proven equal to it, or as "
+        "the nearest joint parameters of a simulator.", epilog=EXAMPLE,
+    )  # fmt: skip
+    parser.add_argument("model", type=names.file, metavar="MODEL", help="model file")
+    parser.add_argument("--to", type=_targets, default="torchscript", metavar="TARGETS",
+                        help=f"with commas between them: {', '.join(TARGETS)}")  # fmt: skip
+    parser.add_argument("--out", type=Path, default=Path(), help="folder to write to")
+    parser.add_argument("--dtype", choices=("float64", "float32"), default="float64",
+                        help=f"precision of {' and '.join(IN_SINGLE)}")  # fmt: skip
+    parser.add_argument("--torque-limit", type=_numbers, metavar="LIMIT,...",
+                        help="largest torque given out, one number or one a joint")  # fmt: skip
+    parser.add_argument("--with-filter", action="store_true",
+                        help="take raw positions, with the causal filter inside")  # fmt: skip
+    parser.add_argument("--cutoff", type=_numbers, default="20", metavar="HZ",
+                        help="cut-off of that filter [Hz]")  # fmt: skip
+    group = parser.add_argument_group("mjcf and urdf")
+    group.add_argument("--recording", type=names.file, action="append", default=[],
+                       help="motion along which the nearest parameters are sought; can be given "
+                       "several times")  # fmt: skip
+    group.add_argument("--rig", type=names.rig,
+                       help="rig file or name (default: the one in the model file)")  # fmt: skip
+    group.add_argument("--into", type=names.file, metavar="ROBOT",
+                       help="robot description whose joints of these names get them")  # fmt: skip
+    group.add_argument("--angles", metavar="HOW,ZERO", help="of the recordings; see fit")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Load, then write each artefact."""
+    from nfriction.modelfile import info_of, load
+
+    wanted = [target for target in arguments.to if target in SIMULATORS]
+    if wanted and not arguments.recording:
+        raise UsageError(f"{wanted[0]} needs a motion: give --recording FILE.")
+    if arguments.into and len(wanted) != 1:
+        raise UsageError("--into takes one of mjcf and urdf in --to.")
+    if len(arguments.cutoff) != 1:
+        raise UsageError("--cutoff takes one number.")
+    model, info = load(arguments.model), info_of(arguments.model)
+    check_writable(arguments.out)
+    for target in arguments.to:
+        if target in SIMULATORS:
+            _write_simulator(target, model, info, arguments)
+        else:
+            for path in _write_controller(target, model, info, arguments):
+                print(f"wrote {path}")
+    return 0
+
+
+def _write_controller(
+    target: str, model: "FrictionModel", info: "ModelInfo", arguments: argparse.Namespace
+) -> list[Path]:
+    """Write an artefact, and tell its files."""
+    from nfriction import export
+
+    options: dict[str, Any] = {
+        "torque_limit": _limit(arguments.torque_limit),
+        "with_filter": arguments.with_filter,
+        "cutoff_hz": arguments.cutoff[0],
+    }
+    if target in IN_SINGLE:
+        options["dtype"] = arguments.dtype
+    stem = arguments.model.stem
+    if target == "c":
+        name = "".join(x if x.isascii() and x.isalnum() else "_" for x in stem)[:24]
+        name = name if name[0].isalpha() else f"nf_{name}"
+        return export.c(model, arguments.out, info, name=name, **options)
+    writer = getattr(export, target)
+    return [writer(model, arguments.out / f"{stem}{CONTROLLERS[target]}", info, **options)]
+
+
+def _write_simulator(
+    target: str, model: "FrictionModel", info: "ModelInfo", arguments: argparse.Namespace
+) -> None:
+    """Write joint parameters, and tell what they cost."""
+    from nfriction import export
+    from nfriction.cli import estimation
+    from nfriction.plant import rigfile
+    from nfriction.signals import kalman_smoother
+
+    if arguments.rig:
+        plant = estimation.read_rig(arguments.rig)
+    elif info.rig is not None:
+        plant = rigfile.from_dict(info.rig)
+    else:
+        raise UsageError("the model file tells no rig; give --rig, whose loads friction needs.")
+    arguments.columns, arguments.degrees = None, False
+    recordings = estimation.read_recordings(arguments.recording, plant, arguments)
+    moved = (recording.joint_coordinates(plant) for recording in recordings)
+    motions = [kalman_smoother(recording.time, recording.q) for recording in moved]
+    path = arguments.out / f"{arguments.model.stem}{SIMULATORS[target]}"
+    writer = getattr(export, target)
+    print(writer(model, path, motions, info, load=plant.load, into=arguments.into))
+    print(f"wrote {path}")
+
+
+def _limit(numbers: list[float] | None) -> float | list[float] | None:
+    return numbers[0] if numbers and len(numbers) == 1 else numbers
+
+
+def _targets(text: str) -> list[str]:
+    """Names of targets with commas between them, for argparse."""
+    targets = [name.strip() for name in text.split(",") if name.strip()]
+    for target in targets:
+        if target not in TARGETS:
+            raise argparse.ArgumentTypeError(
+                f"cannot export to {target!r}; there are {', '.join(TARGETS)}"
+            )
+    if not targets:
+        raise argparse.ArgumentTypeError(f"takes some of {', '.join(TARGETS)}, got none")
+    return targets
+
+
+def _numbers(text: str) -> list[float]:
+    """Positive numbers with commas between them, for argparse."""
+    try:
+        # Positive and finite, as durations are.
+        return [seconds(part) for part in text.split(",")]
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(f"takes positive numbers, got {text!r}") from None

@@ -1,0 +1,66 @@
+"""`nfriction info`: what a model file says."""
+
+import argparse
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING
+
+from nfriction.cli import names
+from nfriction.cli.console import Parser
+
+if TYPE_CHECKING:
+    from nfriction.friction import FrictionModel
+    from nfriction.modelfile import ModelInfo
+
+EXAMPLE = """example:
+  nfriction info runs/mine/models/LFM.json"""
+
+
+def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
+    """Register the command."""
+    parser = commands.add_parser(
+        "info", parents=[common], help="tell what a model file says", epilog=EXAMPLE,
+        description="Tell what a model file says: model, joints, coefficients, trained ranges, how "
+        "the fit ended, rig.",
+    )  # fmt: skip
+    parser.add_argument("model", type=names.file, metavar="MODEL", help="model file")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Load and print."""
+    from nfriction.cli.report import coefficient_table
+    from nfriction.modelfile import info_of, load
+
+    model, info = load(arguments.model), info_of(arguments.model)
+    for what, said in _facts(model, info):
+        print(f"{what + ':':14} {said}")
+    print(coefficient_table(model, info.joint_names, info.unit))
+    return 0
+
+
+def _facts(model: "FrictionModel", info: "ModelInfo") -> Iterator[tuple[str, str]]:
+    yield "model", f"{type(model).__name__}, law {model.law.name}"
+    yield "joints", ", ".join(info.joint_names) or str(model.joints)
+    if info.rig is not None:
+        yield "rig", str(info.rig.get("name", "unnamed"))
+    if info.sample_time is not None:
+        yield "sample time", f"{info.sample_time:.4g} s"
+    yield "sign turns", f"over {model.v_smooth:g} {info.unit}/s"
+    for key, unit in (("qd", f"{info.unit}/s"), ("qdd", f"{info.unit}/s^2")):
+        if key in info.input_ranges:
+            ranges = (f"{low:.3g} to {high:.3g}" for low, high in info.input_ranges[key])
+            yield f"trained {key}", f"{', '.join(ranges)} {unit}"
+    if info.training_data:
+        yield "trained on", ", ".join(info.training_data)
+    if "status" in info.fit:
+        yield "fit", _fit(info.fit, info.unit)
+
+
+def _fit(fit: Mapping[str, object], unit: str) -> str:
+    said = str(fit["status"]).rstrip(".")
+    residual, bounds = fit.get("residual"), fit.get("at_bounds")
+    if isinstance(residual, float):
+        said += f", {1e3 * residual:.3g} m{unit} over the training windows"
+    if isinstance(bounds, list) and bounds:
+        said += f"; at a bound: {', '.join(map(str, bounds))}"
+    return said

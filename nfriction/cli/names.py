@@ -1,0 +1,53 @@
+"""Names that options take, told apart from their makers, which load torch.
+
+A test holds them equal to `friction.MODELS` and `rigs.names()`.
+"""
+
+import argparse
+from pathlib import Path
+
+MODELS = (
+    "NCFM", "LFM", "NLFM", "Stribeck", "ANCFM", "ALFM", "ANLFM", "NFNCFM", "NFLFM", "NFNLFM",
+)  # fmt: skip
+RIGS = (
+    "tlrip", "rtip", "multiarm-single", "multiarm-double", "multiarm-triple",
+    "dfki-A0", "dfki-C0", "dfki-C1", "emps", "xl330",
+)  # fmt: skip
+DEFAULT_MODELS = "NCFM,LFM,NLFM,NFLFM"
+
+
+def model(text: str) -> str:
+    """The name of a friction model, for argparse."""
+    if text not in MODELS:
+        raise argparse.ArgumentTypeError(
+            f"no friction model is called {text!r}; there are {', '.join(MODELS)}"
+        )
+    return text
+
+
+def models(text: str) -> list[str]:
+    """Names of friction models with commas between them, for argparse."""
+    names = [model(name.strip()) for name in text.split(",") if name.strip()]
+    if not names:
+        raise argparse.ArgumentTypeError(f"takes names of {', '.join(MODELS)}, got none")
+    return names
+
+
+def rig(text: str) -> str:
+    """A named rig or a rig file, for argparse."""
+    if text in RIGS:
+        return text
+    if Path(text).suffix.lower() not in (".json", ".toml"):
+        raise argparse.ArgumentTypeError(
+            f"no rig is called {text!r}; give a .json file or one of {', '.join(RIGS)}"
+        )
+    return str(file(text))
+
+
+def file(text: str) -> Path:
+    """A file that is there, for argparse."""
+    path = Path(text)
+    if not path.is_file():
+        what = "is no file" if path.exists() else "is not there"
+        raise argparse.ArgumentTypeError(f"{text} {what}; check the path")
+    return path

@@ -1,0 +1,69 @@
+"""A fit as files, so that a later one can start from it in another process."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from nfriction.atomic import replacing
+from nfriction.fitting import Fit
+from nfriction.modelfile import info_of, load, plant_of, save
+from nfriction.recording import Recording
+from nfriction.results import model_info
+from nfriction.signals import Motion
+
+
+def save_fit(found: Fit, path: Path, recordings: Sequence[Recording]) -> None:
+    """Write a fit as a model file and, beside it, an `.npz` of what a later fit asks for.
+
+    The model file is written last: where it is, the fit is whole.
+
+    Args:
+        found: the fit.
+        path: of the model file, `.json`.
+        recordings: those fitted.
+    """
+    names, values, bounds = zip(*found.plant_terms, strict=True) if found.plant_terms else ((),) * 3
+    with replacing(path.with_suffix(".npz")) as temporary, temporary.open("wb") as file:
+        np.savez(
+            file,
+            residuals=found._residuals.numpy(),
+            term_names=np.array(names, dtype=str),
+            term_values=np.array(values, dtype=np.float64),
+            term_bounds=np.array(bounds, dtype=np.float64),
+            steps=np.array(found.steps),
+        )
+    save(found.model, path, model_info(found, recordings))
+
+
+def load_fit(path: Path, motions: Sequence[Motion]) -> Fit:
+    """Read what `save_fit` wrote.
+
+    Args:
+        path: of the model file.
+        motions: smoothed motion of each recording fitted; they are not in the files.
+
+    Raises:
+        ModelFileError: if the model file is absent or damaged.
+    """
+    told = info_of(path).fit
+    with np.load(path.with_suffix(".npz")) as kept:
+        terms = zip(
+            kept["term_names"].tolist(),
+            kept["term_values"].tolist(),
+            kept["term_bounds"].tolist(),
+            strict=True,
+        )
+        return Fit(
+            model=load(path),
+            plant=plant_of(path),
+            plant_terms=tuple(terms),
+            status=told["status"],
+            converged=told["converged"],
+            residual=told["residual"],
+            at_bounds=tuple(told["at_bounds"]),
+            steps=int(kept["steps"]),
+            motions=tuple(motions),
+            _residuals=torch.as_tensor(kept["residuals"]),
+        )

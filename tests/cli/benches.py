@@ -1,0 +1,48 @@
+"""A bench as a user has it: a rig file, recordings, and runs of the command line on them."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from nfriction import LFM, PendulumChain, Recording, cli, rollout
+
+QUICK = ["--windows", "0.5", "--max-steps", "3"]
+
+
+def pendulum(**changes: object) -> PendulumChain:
+    """A bench whose files count from hanging."""
+    return PendulumChain(
+        mass=[0.15], com=[0.15], length=[0.3], inertia=[1e-4], name="bench",
+        convention=("absolute", "hanging"), position_quantum=1e-4, **changes,
+    )  # fmt: skip
+
+
+def swing(name: str, start: float) -> Recording:
+    """A second of a released pendulum with known friction, seen by an encoder."""
+    q0 = torch.tensor([start + np.pi], dtype=torch.float64)
+    friction = LFM(1, [[2e-4, 1e-3]])
+    with torch.no_grad():
+        run = rollout(
+            pendulum(), friction, q0, torch.zeros_like(q0), sample_time=2e-3, steps=500
+        )  # fmt: skip
+    q = np.round((run.q.numpy() - np.pi) / 1e-4) * 1e-4
+    time = 2e-3 * np.arange(len(q))
+    return Recording(time=time, q=q, convention="absolute,hanging", name=name)
+
+
+def compare(bench: Path, out: Path, *more: str, models: str = "NCFM") -> int:
+    """`nfriction compare` of the bench's recordings, quickly."""
+    files = [str(bench / "a.csv.gz"), "--held-out", str(bench / "b.csv")]
+    rig = ["--rig", str(bench / "bench.json"), "--models", models, "--out", str(out)]
+    return cli.main(["compare", *files, *rig, *QUICK, *more])
+
+
+def results(out: Path) -> dict:
+    """What a comparison wrote to `results.json`, which must be strict JSON."""
+
+    def refuse(word: str) -> None:
+        raise AssertionError(f"{word} is no JSON")
+
+    return json.loads((out / "results.json").read_text(), parse_constant=refuse)

@@ -1,0 +1,41 @@
+"""Fixtures of the command line's tests."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from nfriction import cli, rigs
+from tests.cli.benches import compare, pendulum, swing
+
+
+@pytest.fixture(scope="session")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a rig, a recording to train on and one held out."""
+    folder = tmp_path_factory.mktemp("bench")
+    rigs.write(pendulum(), folder / "bench.json")
+    swing("a", 1.5).write(folder / "a.csv.gz")
+    swing("b", 2.0).write(folder / "b.csv")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def compared(bench: Path) -> Path:
+    """What a comparison of two models left."""
+    out = bench / "out"
+    assert compare(bench, out, models="NCFM,LFM") == 0
+    return out
+
+
+@pytest.fixture
+def failing(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Run a command that must fail: status 2 and one line, which is returned."""
+
+    def run(*words: object) -> str:
+        assert cli.main([str(w) for w in words]) == 2
+        printed = capsys.readouterr()
+        assert printed.err.startswith("nfriction: error: ")
+        assert printed.err.count("\n") == 1
+        return printed.err
+
+    return run

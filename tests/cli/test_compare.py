@@ -1,0 +1,187 @@
+"""`compare` and `demo` as a user meets them: what they write and print, how they stop."""
+
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from nfriction import cli, load
+from nfriction.cli.console import Progress
+from tests.cli.benches import compare, results
+
+
+def test_compare_writes_the_promised_schema(compared: Path) -> None:
+    found = results(compared)
+    assert found["units"] == "rad"
+    assert list(found["models"]) == ["no friction", "NCFM", "LFM"]
+    for name, model in found["models"].items():
+        assert ("coefficients" in model) == (name != "no friction")
+        for kind, recording in (("train", "a"), ("held_out", "b")):
+            score = model[kind][recording]
+            assert list(score["windows"]) == ["1"]  # 2 and 5 s do not fit into a second
+            for rmse in (score["free_run"], *score["windows"].values()):
+                assert rmse["all"] == pytest.approx(np.sqrt(np.mean(np.square(rmse["joints"]))))
+    assert "compare" in found["command"]
+    assert found["best"]["model"] == "LFM"
+    assert "held-out" in found["best"]["by"]
+
+
+def test_friction_predicts_better_than_none(compared: Path) -> None:
+    error = {
+        n: m["held_out"]["b"]["free_run"]["all"] for n, m in results(compared)["models"].items()
+    }
+    assert error["LFM"] < error["NCFM"] < error["no friction"]
+
+
+def test_table_holds_the_errors_of_the_results(compared: Path) -> None:
+    table = pd.read_csv(compared / "table.csv")
+    models = results(compared)["models"]
+    of = table[(table.horizon == "free run") & (table.joint == "all") & (table.recording == "b")]
+    for row in of.itertuples():
+        assert row[-1] == models[row.model]["held_out"]["b"]["free_run"]["all"]
+    assert set(of.model) == set(models)
+
+
+def test_models_load_and_scripts_need_torch_alone(compared: Path) -> None:
+    qd = torch.linspace(-3, 3, 7, dtype=torch.float64)[:, None]
+    inputs = (qd, torch.zeros_like(qd), torch.ones_like(qd))
+    for name in ("NCFM", "LFM"):
+        script = torch.jit.load(compared / "models" / f"{name}.pt")
+        model = load(compared / "models" / f"{name}.json")
+        torch.testing.assert_close(script(*inputs), model(*inputs), rtol=0, atol=1e-12)
+    code = (
+        "import sys, torch; torch.jit.load(sys.argv[1]);"
+        "assert not any(m.startswith('nfriction') for m in sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code, compared / "models" / "LFM.pt"], check=True)
+
+
+def test_figures_are_drawn_and_nothing_unfinished_stays(compared: Path) -> None:
+    drawn = {path.stem for path in (compared / "figures").glob("*.png")}
+    assert {"rmse_held_out", "positions_held_out_b", "torque_over_velocity"} <= drawn
+    assert not list(compared.rglob(".*"))
+
+
+def test_equal_input_gives_equal_bytes(bench: Path, compared: Path) -> None:
+    assert compare(bench, bench / "again", "--no-figures", models="NCFM,LFM") == 0
+    assert not (bench / "again" / "figures").exists()
+    assert (bench / "again/table.csv").read_bytes() == (compared / "table.csv").read_bytes()
+    assert results(bench / "again") | {"command": ""} == results(compared) | {"command": ""}
+
+
+def test_verdict_names_the_winner_and_its_file(
+    bench: Path, compared: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = bench / "told"
+    assert compare(bench, out, "--no-figures", models="NCFM,LFM") == 0
+    said = capsys.readouterr().out
+    assert "best on held-out recordings: LFM" in said
+    (file,) = re.findall(r"its model file: (.*)", said)
+    assert Path(file).is_file()
+    coefficients = results(out)["models"]["LFM"]["coefficients"]
+    told = said.partition("coefficients of LFM\n")[2]
+    header, row, *_ = told.splitlines()
+    assert re.split(r"\s{2,}", header.strip()) == ["B [N m s/rad]", "C [N m]"]
+    values = [float(word) for word in row.split()[1:]]
+    # Four digits are printed.
+    assert values == pytest.approx([coefficients["B"][0], coefficients["C"][0]], rel=1e-3)
+    assert "windows of 5 s: none, b lasts 1 s" in said
+    assert said.splitlines()[-1] == f"results and models are in {out}"
+
+
+def test_without_held_out_recordings_there_is_no_verdict(
+    bench: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [str(bench / "a.csv.gz"), "--rig", str(bench / "bench.json"), "--models", "NCFM"]
+    quick = ["--max-steps", "1", "--windows", "0.5", "--no-figures", "--out", str(bench / "alone")]
+    assert cli.main(["compare", *words, *quick]) == 0
+    assert "no verdict: nothing was held out" in capsys.readouterr().out
+    assert results(bench / "alone")["best"] is None
+
+
+def test_initial_states_are_used_and_missing_ones_named(
+    bench: Path, compared: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    states = bench / "recordings.csv"
+    states.write_text("id,q0_1,qd0_1\nb,2.1,0\n")
+    assert compare(bench, bench / "s", "--initial-states", str(states), "--no-figures") == 0
+    assert f"warning: {states} has no state of a;" in capsys.readouterr().err
+    plain, off = (results(out)["models"]["NCFM"] for out in (compared, bench / "s"))
+    assert off["train"] == plain["train"]
+    # The run starts 0.1 rad off and so ends about as far off.
+    assert off["held_out"]["b"]["free_run"]["all"] > 0.03
+
+
+def test_plant_given_adjusts_nothing_and_drag_adds_terms(bench: Path) -> None:
+    terms = []
+    for k, option in enumerate((["--plant", "given"], [], ["--drag"])):
+        out = bench / f"plant{k}"
+        assert compare(bench, out, *option, "--max-steps", "1", "--no-figures") == 0
+        terms.append(set(results(out)["models"]["NCFM"]["fit"]["plant"]))
+    given, fitted, drag = terms
+    assert not given
+    assert given < fitted < drag
+
+
+def test_ctrl_c_ends_the_run_though_the_solver_survives_it(
+    bench: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = []
+    step = Progress.step
+
+    def interrupted_step(self: Progress, stage: str) -> None:
+        told.append(stage)
+        signal.raise_signal(signal.SIGINT)
+        step(self, stage)
+
+    monkeypatch.setattr(Progress, "step", interrupted_step)
+    out = bench / "interrupted"
+    before = signal.getsignal(signal.SIGINT)
+    assert compare(bench, out, models="NCFM,LFM") == 130
+    assert len(told) == 1  # the second model was never begun
+    assert "interrupted (fit NCFM)" in capsys.readouterr().err
+    assert not list(out.iterdir())
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_interrupt_outside_a_solver(
+    bench: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("nfriction.comparison.fit", stop)
+    assert compare(bench, bench / "stopped") == 130
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not list((bench / "stopped").iterdir())
+
+
+@pytest.mark.slow
+def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["demo", "--seconds", "1", "--models", "NCFM", "--out", str(tmp_path), "--no-figures"]
+    assert cli.main(words) == 0
+    assert "2 held out" in capsys.readouterr().out
+    assert list(results(tmp_path)["models"]) == ["no friction", "NCFM"]
+
+
+@pytest.mark.slow
+def test_triple_pendulum_held_out(data_dir: Path, tmp_path: Path) -> None:
+    """Half of the card's experiment: viscous friction leaves 11.6 mrad in 10 s, 6.1 mrad in 5 s."""
+    data = data_dir / "multiarm_pendulum"
+    words = [str(data / "triple_b0.csv.gz"), "--held-out", str(data / "triple_b2.csv.gz")]
+    words += ["--rig", "multiarm-triple", "--initial-states", str(data / "recordings.csv")]
+    words += ["--models", "NCFM,LFM", "--no-figures", "--out", str(tmp_path)]
+    assert cli.main(["compare", *words]) == 0
+    found = {n: m["held_out"]["triple_b2"] for n, m in results(tmp_path)["models"].items()}
+    for name in ("NCFM", "LFM"):
+        pairs = zip(found[name]["free_run"]["joints"], found["no friction"]["free_run"]["joints"],
+                    strict=True)  # fmt: skip
+        assert all(own < none for own, none in pairs)
+    assert found["NCFM"]["free_run"]["all"] == pytest.approx(11.6e-3, rel=0.15)
+    assert found["NCFM"]["windows"]["5"]["all"] == pytest.approx(6.1e-3, rel=0.15)

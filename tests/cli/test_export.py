@@ -1,0 +1,93 @@
+"""`export` and `verify`: a model file to every target, and a verdict by the exit status."""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nfriction import LFM, ModelInfo, Recording, cli, rigs, save
+from nfriction.cli import verify
+from nfriction.cli.console import Parser
+from nfriction.codegen.build import find_compiler
+from tests.friction.samples import randomise
+
+RIG = rigs.tlrip()
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    made = LFM(RIG.joints)
+    randomise(made, 0.3)
+    info = ModelInfo(joint_names=tuple(RIG.joint_names), sample_time=1e-3, rig=RIG.to_dict())
+    return save(made, tmp_path / "lfm.json", info)
+
+
+def run_verify(*words: Any) -> int:
+    parser = Parser()
+    verify.add(parser.add_subparsers(), Parser(add_help=False))
+    arguments = parser.parse_args(["verify", *map(str, words)], argparse.Namespace())
+    return int(arguments.run(arguments))
+
+
+def test_to_controllers_and_back(
+    model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    limits = ",".join(["3"] * RIG.joints)
+    words = ["--to", "torchscript,c", "--out", str(out), "--torque-limit", limits]
+    assert cli.main(["export", str(model), *words]) == 0
+    said = capsys.readouterr().out
+    assert str(out / "lfm.pt") in said
+    artefacts = [out / "lfm.pt", *([out / "lfm.c"] if find_compiler() else [])]
+    for artefact in artefacts:
+        assert run_verify(artefact, model, "--points", 300) == 0
+        said = capsys.readouterr().out
+        assert "drawn points" in said
+        assert f"{artefact.name} is lfm.json" in said
+    other = save(LFM(RIG.joints, [1.0, 1.0]), tmp_path / "other.json")
+    assert run_verify(out / "lfm.pt", other) == 1
+    said = capsys.readouterr().out
+    assert "DIFFERENT" in said
+    assert "lfm.pt IS NOT other.json" in said
+
+
+def test_to_simulators(model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    time = 1e-3 * np.arange(2000)
+    phase = 5 * time[:, None] + np.arange(RIG.joints)
+    recording = Recording(time, np.sin(phase), names=tuple(RIG.joint_names))
+    recording.write(tmp_path / "run.csv")
+    words = ["--to", "mjcf,urdf", "--recording", str(tmp_path / "run.csv")]
+    assert cli.main(["export", str(model), *words, "--out", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert said.count("RMS") == 2 * RIG.joints
+    for name in ("lfm.xml", "lfm.urdf"):
+        assert RIG.joint_names[0] in (tmp_path / name).read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--to", "basic"], "cannot export to 'basic'; there are torchscript, c, pt2"),
+        (["--to", ","], "takes some of"),
+        (["--to", "mjcf"], "--recording"),
+        (["--torque-limit", "-1"], "positive numbers"),
+        (["--torque-limit", "1,2"], "torque_limit"),
+        (["--cutoff", "1,2"], "takes one number"),
+        (["--with-filter", "--cutoff", "900"], "cutoff_hz"),
+    ],
+)
+def test_what_cannot_be_done_is_said(
+    model: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["export", str(model), *words, "--out", str(model.parent / "out")]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_the_filter_goes_in(model: Path, tmp_path: Path) -> None:
+    words = ["--with-filter", "--cutoff", "30", "--to", "c", "--out", str(tmp_path / "out")]
+    assert cli.main(["export", str(model), *words]) == 0
+    told = json.loads((tmp_path / "out" / "lfm.json").read_text())
+    assert told["filter"]["cutoff_hz"] == 30.0

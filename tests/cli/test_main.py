@@ -1,0 +1,151 @@
+"""The command line before it does any work: help, errors, names, and how fast they come."""
+
+import argparse
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from nfriction import cli, rigs, twin
+from nfriction.cli import demo, names
+from nfriction.friction import MODELS
+from nfriction.version import __version__
+
+
+def commands() -> dict[str, argparse.ArgumentParser]:
+    (found,) = (a for a in cli.make_parser()._actions if isinstance(a, argparse._SubParsersAction))
+    return found.choices
+
+
+def example(parser: argparse.ArgumentParser) -> list[str]:
+    """The words of the command with which a help ends."""
+    block = parser.format_help().partition("\nexample:\n")[2].partition("\n\n")[0]
+    return block.replace("\\\n", " ").split()
+
+
+def test_names_are_those_of_the_library() -> None:
+    assert list(MODELS) == list(names.MODELS)
+    assert rigs.names() == list(names.RIGS)
+    assert names.models(names.DEFAULT_MODELS)
+    assert demo.DURATION == twin.QUICK_DURATION
+
+
+def test_table_of_commands_and_parsers_agree() -> None:
+    modules = [command.__name__.rpartition(".")[2] for command in cli.COMMANDS]
+    assert list(commands()) == modules
+
+
+@pytest.mark.parametrize("name", list(commands()))
+def test_help_explains_every_option_and_ends_with_an_example(name: str) -> None:
+    parser = commands()[name]
+    for action in parser._actions:
+        assert action.help, f"{name} {action.dest} says nothing"
+    assert example(parser)[:2] == ["nfriction", name]
+    told = " ".join(parser.format_help().split())
+    for action in parser._actions:
+        if action.option_strings and action.default not in (None, False, [], "==SUPPRESS=="):
+            assert f"(default: {action.default})" in told
+
+
+@pytest.mark.parametrize("name", list(commands()))
+def test_examples_parse(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = example(commands()[name])[1:]
+    monkeypatch.chdir(tmp_path)
+    for file in (Path(word) for word in words if word.endswith((".csv", ".json"))):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.touch()
+    assert cli.make_parser().parse_args(words).run
+
+
+def test_help_and_usage_errors_load_nothing_slow() -> None:
+    slow = ["torch", "numpy", "pandas", "scipy", "matplotlib", "tqdm"]
+    code = f"""
+import contextlib, io, sys
+from nfriction.cli import COMMANDS, main
+asked = [["--help"], ["--version"], *([c.__name__.split(".")[-1], "--help"] for c in COMMANDS)]
+with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+    for words in asked:
+        try:
+            main(words)
+        except SystemExit as end:
+            assert end.code == 0
+    for wrong in (["nothing"], ["fit"], ["fit", "absent.csv", "--rig", "emps"], ["demo", "--seed"],
+                  ["demo", "--models="], ["compare", "--rig", "nowhere"], ["info", "absent.json"]):
+        assert main(wrong) == 2
+assert not set({slow}) & set(sys.modules), set({slow}) & set(sys.modules)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_version_and_bare_command(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        cli.main(["--version"])
+    assert end.value.code == 0
+    assert capsys.readouterr().out == f"nfriction {__version__}\n"
+    assert cli.main([]) == 2
+    assert "usage: nfriction" in capsys.readouterr().err
+
+
+def test_installed_command_fails_in_one_line() -> None:
+    words = [sys.executable, "-m", "nfriction", "fit", "absent.csv", "--rig", "tlrip"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert re.fullmatch(r"nfriction: error: .*absent\.csv.*\n", done.stderr)
+
+
+def test_debug_shows_the_error_itself(bench: Path) -> None:
+    (bench / "none.csv").touch()
+    with pytest.raises(ValueError, match="is empty"):
+        cli.main(["fit", str(bench / "none.csv"), "--rig", "emps", "--debug"])
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--windows", "0"], "--windows: takes positive"),
+        (["--windows=-1"], "--windows: takes positive"),
+        (["--windows", "1,nan"], "--windows: takes positive"),
+        (["--max-steps", "-1"], "whole number"),
+        (["--models", ","], "NCFM, LFM"),
+        (["--models", "NCFM,FOO"], "NCFM, LFM"),
+        (["--rig", "nowhere"], "multiarm-triple"),
+        (["--rig", "absent.json"], "absent.json is not there"),
+        (["--angles", "sideways"], "absolute,hanging"),
+        (["--plant", "guess"], "--help"),
+        (["--columns", "time"], "time=t,q1=enc_1"),
+        (["--columns", "speed=v"], "--columns maps time, q1"),
+        (["--initial-states", "absent.csv"], "absent.csv"),
+    ],
+)
+def test_options_that_make_no_sense(bench: Path, failing, more: list[str], said: str) -> None:
+    words = ["compare", bench / "a.csv.gz", "--rig", bench / "bench.json", "--out", bench / "bad"]
+    assert said in failing(*words, *more)
+    assert not (bench / "bad").exists()
+
+
+def test_folders_and_files_in_the_way(bench: Path, failing) -> None:
+    words = [bench / "a.csv.gz", "--rig", bench / "bench.json", "--out"]
+    for out in (bench / "b.csv", bench / "b.csv" / "under"):
+        assert "in its way" in failing("compare", *words, out)
+    assert "is a folder" in failing("fit", *words, bench)
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root writes anywhere")
+def test_folder_that_must_not_be_written(bench: Path, failing) -> None:
+    locked = bench / "locked"
+    locked.mkdir(mode=0o500)
+    words = ["compare", bench / "a.csv.gz", "--rig", bench / "bench.json", "--out", locked]
+    assert "ermission denied" in failing(*words)
+
+
+def test_export_info_and_demo_say_what_they_cannot(bench: Path, compared: Path, failing) -> None:
+    for command in ("export", "info"):
+        assert "check the path" in failing(command, bench / "absent.json")
+        assert "model file" in failing(command, bench / "bench.json")
+    assert "torchscript" in failing("export", compared / "models" / "NCFM.json", "--to", "basic")
+    assert "positive seconds" in failing("demo", "--seconds", "nan")
+    assert "whole number" in failing("demo", "--seed", "-1")
+    assert "NCFM, LFM" in failing("demo", "--models", "FOO")

@@ -1,0 +1,62 @@
+"""`fit`, `info` and `export`: from a recording to a model file, what it says, and its artefact."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from nfriction import LFM, NFLFM, ModelInfo, cli, load, save
+from tests.cli.benches import QUICK
+
+
+@pytest.fixture(scope="module")
+def fitted(bench: Path) -> Path:
+    model = bench / "fit" / "m.json"
+    rig = ["--rig", str(bench / "bench.json"), "--model", "LFM", "--out", str(model)]
+    assert cli.main(["fit", str(bench / "a.csv.gz"), *rig, *QUICK]) == 0
+    return model
+
+
+def values(text: str, row: str) -> list[float]:
+    """Coefficients that a command printed in a row of its table."""
+    (found,) = (line for line in text.splitlines() if line.startswith(f"{row} "))
+    return [float(word) for word in found.removeprefix(row).split()]
+
+
+def test_what_fit_prints_next_works(
+    bench: Path, fitted: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = ["--rig", str(bench / "bench.json"), "--model", "LFM", "--out", str(fitted)]
+    assert cli.main(["fit", str(bench / "a.csv.gz"), *rig, *QUICK]) == 0
+    said = capsys.readouterr().out
+    model = load(fitted)
+    assert isinstance(model, LFM)
+    # Four digits are printed.
+    assert values(said, "joint1") == pytest.approx(model.schedule.values[0].tolist(), rel=1e-3)
+    (command,) = (line for line in said.splitlines() if line.startswith("next: "))
+    words = command.split()[2:]
+    assert cli.main([*words, "--out", str(bench / "x")]) == 0
+    assert str(bench / "x" / "m.pt") in capsys.readouterr().out
+    torch.jit.load(bench / "x" / "m.pt")
+
+
+def test_info_tells_what_the_file_says(fitted: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["info", str(fitted)]) == 0
+    said = capsys.readouterr().out
+    model = load(fitted)
+    assert values(said, "joint1") == pytest.approx(model.schedule.values[0].tolist(), rel=1e-3)
+    for word in ("LFM", "bench", "0.002 s", "rad/s^2", "B [N m s/rad]", "C [N m]", "trained on:"):
+        assert word in said
+
+
+def test_info_of_a_file_that_says_little(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = NFLFM(2, [3.0, 4.0])
+    save(model, tmp_path / "m.json", ModelInfo(unit="m"))
+    assert cli.main(["info", str(tmp_path / "m.json")]) == 0
+    said = capsys.readouterr().out
+    assert "B [N s/m]" in said
+    # An untrained network deviates nowhere from its reference.
+    for row in ("joint2, at rest", "joint2, reference"):
+        assert values(said, row) == pytest.approx([3.0, 4.0])

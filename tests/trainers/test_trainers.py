@@ -1,0 +1,118 @@
+"""The scripts that train: what they write, and that an interruption changes no result."""
+
+import json
+import runpy
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from nfriction import load
+from nfriction.modelfile import info_of
+from nfriction.reproduction import training
+
+TRAINERS = Path(__file__).resolve().parents[2] / "trainers"
+SCRIPTS = sorted(path.name for path in TRAINERS.glob("train_*.py"))
+QUICK = ["--seconds", "1", "--windows", "0.5", "--max-steps", "2"]
+SEARCH = ["train_constant.py", "--twin", "rtip", "--seconds", "2", "--model", "LFM",
+          "--method", "pattern", "--horizon", "1", "--max-evaluations", "400"]  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def same_interrupt() -> Iterator[None]:
+    """A trainer takes Ctrl-C for itself; the other tests want it back."""
+    before = signal.getsignal(signal.SIGINT)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def train(*words: object) -> None:
+    """Run a trainer within this process, which has torch loaded already."""
+    script, *others = map(str, words)
+    sys.argv, before = [script], sys.argv
+    try:
+        main = runpy.run_path(str(TRAINERS / script))["main"]
+        assert main(others) == 0
+    finally:
+        sys.argv = before
+
+
+def test_there_is_a_script_for_each_kind_of_model() -> None:
+    assert SCRIPTS == ["train_adaptive.py", "train_constant.py", "train_neurofuzzy.py"]
+
+
+@pytest.mark.slow
+def test_a_model_is_trained_written_and_read_by_resume(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["train_constant.py", *QUICK, "--model", "NCFM", "--out", tmp_path]
+    train(*words)
+    first = capsys.readouterr().out
+    assert "held out" in first
+    model = (tmp_path / "NCFM.json").read_bytes()
+    assert load(tmp_path / "NCFM.json").joints == 3
+    assert (tmp_path / "NCFM.pt").exists()
+    train(*words, "--resume")
+    assert capsys.readouterr().out == first
+    assert (tmp_path / "NCFM.json").read_bytes() == model
+
+
+def test_checkpoints_of_other_options_are_refused(tmp_path: Path) -> None:
+    def start(*words: str) -> training.Training:
+        given = training.parser("").parse_args([*words, "--out", str(tmp_path)])
+        return training.Training(given)
+
+    start("--seed", "3")
+    start("--seed", "3", "--resume")
+    with pytest.raises(ValueError, match="other options"):
+        start("--seed", "4", "--resume")
+    (tmp_path / "checkpoints" / "constant.json").write_text("of an earlier run")
+    start("--seed", "4")  # anew
+    assert not (tmp_path / "checkpoints" / "constant.json").exists()
+
+
+def test_recordings_need_a_rig(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match="--rig"):
+        train("train_adaptive.py", "run.csv", "--out", tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("script", "model", "options"),
+    [
+        ("train_adaptive.py", "ANCFM", []),
+        ("train_neurofuzzy.py", "NFNCFM", []),
+        ("train_neurofuzzy.py", "NFNCFM", ["--procedure", "papers", "--samples", "200"]),
+    ],
+)
+def test_every_kind_of_model_is_trained(
+    tmp_path: Path, script: str, model: str, options: list[str]
+) -> None:
+    train(script, *QUICK, "--model", model, "--out", tmp_path, *options)
+    assert type(load(tmp_path / f"{model}.json")).__name__ == model
+    assert (tmp_path / "checkpoints" / "constant.json").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_a_search_that_is_ended_goes_on_to_the_same_result(tmp_path: Path, how: int) -> None:
+    train(*SEARCH, "--out", tmp_path / "whole")
+    folder = tmp_path / "ended"
+    words = [sys.executable, str(TRAINERS / SEARCH[0]), *SEARCH[1:], "--out", str(folder)]
+    process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    state = folder / "checkpoints" / "search-state.json"
+    deadline = time.monotonic() + 120
+    while not state.exists() and time.monotonic() < deadline and process.poll() is None:
+        time.sleep(0.005)
+    process.send_signal(how)
+    assert process.wait(60) != 0
+    assert 0 < json.loads(state.read_text())["evaluations"] < 400
+    assert not (folder / "LFM.json").exists()
+    train(*SEARCH, "--out", folder, "--resume")
+    ours, theirs = (load(f / "LFM.json").state_dict() for f in (folder, tmp_path / "whole"))
+    assert all((ours[name] == theirs[name]).all() for name in theirs)
+    assert info_of(folder / "LFM.json").fit == info_of(tmp_path / "whole" / "LFM.json").fit
