@@ -11,7 +11,8 @@ from torch import Tensor
 
 from nfriction.fitting import estimate
 from nfriction.fitting.classes import AccelerationClasses, find_classes
-from nfriction.fitting.estimate import Fit, Plant, effective_noise
+from nfriction.fitting.estimate import Fit, Plant
+from nfriction.fitting.residuals import effective_noise
 from nfriction.fitting.search import (
     Box,
     Callback,
@@ -174,7 +175,7 @@ def fit_adaptive(
     )  # fmt: skip
     told = estimate._told(callback, f"{windows[-1]:g} s windows, by class")
     result = solve_trajectory(problem, problem.start(vector), max_steps=max_steps, callback=told)
-    residuals = problem.residuals(result.x) * problem.noise_sd
+    residuals = problem.errors(result.x)
     found = estimate._fit_of(problem, result, residuals, moved)
     states = problem.split(result.x)[2].chunk(2, -1)
     return _settled(

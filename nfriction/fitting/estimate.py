@@ -12,6 +12,7 @@ from torch import Tensor
 
 from nfriction.angles import AngleConvention
 from nfriction.fitting.plant_parameters import PlantParameter, plant_parameters
+from nfriction.fitting.residuals import correlation_time, effective_noise
 from nfriction.fitting.sensitivity import StepJacobian
 from nfriction.fitting.torque import TorqueFit, fit_torque
 from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
@@ -45,6 +46,9 @@ WINDOWS = (0.5, 2.0, 5.0)
 LOOSE = 1e-4
 # Residuals grow with the windows, but not so much unless the search went astray.
 LOST_TRACK = 10.0
+# Samples counted within the time that errors last, and the most that are passed over: a network
+# leaves errors that last less long than its constant law's.
+CORRELATED, MOST_STRIDE = 8, 20
 # Substeps beyond this say that the sign's passage is too steep for the sample time.
 MOST_SUBSTEPS = 8
 
@@ -190,7 +194,10 @@ def fit(
     # A neuro-fuzzy model starts where its constant law ended: what that left over, at the same
     # window length, is the noise that its prior is weighed against.
     refines = isinstance(model.schedule, NeuroFuzzy)
-    noise = effective_noise(start._residuals) if refines and start else FIRST_NOISE
+    noise, stride = FIRST_NOISE, 1
+    if refines and start:
+        noise = effective_noise(start._residuals)
+        stride = int(min(max(correlation_time(start._residuals) / CORRELATED, 1), MOST_STRIDE))
     if not windows:
         raise ValueError("`windows` must name at least one window length [s].")
     jacobian = StepJacobian(plant, model, terms)
@@ -204,13 +211,14 @@ def fit(
             _mixing(plant, given[0].convention_on(plant)),
             substeps=_substeps(plant, model, joint),
             plant_mean=vector if refines else None,
+            stride=stride,
         )
         told = _told(callback, f"{length:g} s windows")
         result = solve_trajectory(
             problem, problem.start(vector), max_steps=max_steps, callback=told,
             cost_tolerance=LOOSE if refines or length != windows[-1] else _flat(problem),
         )  # fmt: skip
-        stage = _Stage(problem, result, problem.residuals(result.x) * problem.noise_sd)
+        stage = _Stage(problem, result, problem.errors(result.x))
         if reached is not None and stage.lost_since(reached):
             logger.warning("%g s windows are too long for this motion; left out", length)
             model.schedule.set_parameter_vector(reached.problem.split(reached.result.x)[0])
@@ -248,27 +256,6 @@ def _told(
     callback: Callable[[str, Step], bool | None] | None, stage: str
 ) -> Callable[[Tensor, Step], bool | None] | None:
     return None if callback is None else lambda _, step: callback(stage, step)
-
-
-def effective_noise(residuals: Tensor) -> float:
-    """Standard deviation of position residuals, enlarged for their correlation in time.
-
-    Errors of a model last for many samples; `n` of them weigh like `n / tau` independent ones,
-    `tau` the integrated autocorrelation time in samples.
-
-    Args:
-        residuals: [rad], shape (window, sample, joint).
-    """
-    centred = residuals - residuals.mean(1, keepdim=True)
-    n = centred.shape[1]
-    spectrum = torch.fft.rfft(centred, n=2 * n, dim=1).abs().square()
-    correlation = torch.fft.irfft(spectrum, dim=1)[:, :n].sum((0, 2))
-    correlation = correlation / correlation[0].clamp_min(1e-300)
-    # Summed up to its first zero, beyond which the estimate is noise.
-    negative = (correlation < 0).nonzero()
-    end = int(negative[0]) if len(negative) else n
-    tau = 1.0 + 2.0 * float(correlation[1:end].sum())
-    return float(residuals.square().mean().sqrt()) * max(1.0, tau) ** 0.5
 
 
 def _in_joint_coordinates(

@@ -43,6 +43,8 @@ class TrajectoryProblem:
             positions were measured; errors are counted there.
         substeps: integration steps to a sample.
         plant_mean: where the prior of the plant's terms is centred; default the plant as given.
+        stride: only every so many-th sample counts, for as many: errors of a model last far
+            longer than a sample, and the sums over many parameters are what a step costs.
     """
 
     jacobian: StepJacobian
@@ -51,9 +53,13 @@ class TrajectoryProblem:
     mixing: Tensor
     substeps: int = 1
     plant_mean: Tensor | None = None
+    stride: int = 1
 
     def __post_init__(self) -> None:
         w = self.windows
+        counted = torch.zeros_like(w.weight)
+        counted[:, :: self.stride] = w.weight[:, :: self.stride] * self.stride**0.5
+        self._scale = counted[..., None] / self.noise_sd
         self.plant, self.friction = self.jacobian.plant, self.jacobian.friction
         self.plant_terms = self.jacobian.parameters
         self.friction_count = self.friction.schedule.parameter_vector().numel()
@@ -103,11 +109,15 @@ class TrajectoryProblem:
                 kept[first : last + 1] = found[w, : n : self.substeps].numpy()
         return tuple(replace(m, q=q, qd=qd) for m, (q, qd) in zip(motions, states, strict=True))
 
-    def residuals(self, x: Tensor) -> Tensor:
-        """Weighted position error over the noise, (window, step + 1, joint)."""
+    def errors(self, x: Tensor) -> Tensor:
+        """Position error at every sample of the windows [rad or m], (window, step + 1, joint)."""
         q = self._simulate(x).q[:, :: self.substeps]
-        error = (q - self.windows.q) @ self.mixing.T
-        return error * (self.windows.weight[..., None] / self.noise_sd)
+        return (q - self.windows.q) @ self.mixing.T * self.windows.weight[..., None]
+
+    def residuals(self, x: Tensor) -> Tensor:
+        """Error of the counted samples over the noise, (window, step + 1, joint)."""
+        q = self._simulate(x).q[:, :: self.substeps]
+        return (q - self.windows.q) @ self.mixing.T * self._scale
 
     def cost(self, x: Tensor) -> Tensor:
         """Half the sum of squares of residuals and prior."""
@@ -168,11 +178,10 @@ class TrajectoryProblem:
         slope = torch.zeros(windows, columns, dtype=torch.float64)
         curvature = torch.zeros(windows, columns, columns, dtype=torch.float64)
 
-        def accumulate(rows: list[Tensor], first: int) -> None:
+        def accumulate(rows: list[Tensor], part: list[int]) -> None:
             stacked = torch.stack(rows, 1)
-            part = slice(first, first + len(rows))
-            weight = self.windows.weight[:, part, None, None] / self.noise_sd
-            jacobian = ((self.mixing @ stacked) * weight).reshape(windows, -1, columns)
+            scale = self._scale[:, part, None]
+            jacobian = ((self.mixing @ stacked) * scale).reshape(windows, -1, columns)
             slope.add_((r[:, part].reshape(windows, 1, -1) @ jacobian).squeeze(1))
             curvature.add_(jacobian.transpose(1, 2) @ jacobian)
 
@@ -180,17 +189,21 @@ class TrajectoryProblem:
         for maps in step_maps(
             self.jacobian, motion, self.tau, self.step, plant_vector, RUN * self.substeps
         ):  # fmt: skip
-            rows = []
+            rows, counted = [], []
             n = maps.parameters.shape[-1]
             for k in range(maps.state.shape[0]):
-                if k % self.substeps == 0:
+                at, inner = divmod(k, self.substeps)
+                if inner == 0 and (sample + at) % self.stride == 0:
                     rows.append(carried[:, :joints])
+                    counted.append(sample + at)
                 carried = maps.state[k] @ carried
                 carried[..., :n] += maps.parameters[k]
                 carried[..., n : self.shared_count] += maps.plant[k]
-            accumulate(rows, sample)
-            sample += len(rows)
-        accumulate([carried[:, :joints]], sample)
+            if rows:
+                accumulate(rows, counted)
+            sample += maps.state.shape[0] // self.substeps
+        if sample % self.stride == 0:
+            accumulate([carried[:, :joints]], [sample])
         return slope, curvature
 
     def _scatter(self, gradient: Tensor, hessian: Tensor, own: Tensor, shared: Tensor) -> None:

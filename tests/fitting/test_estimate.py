@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from nfriction import LFM, NCFM, NFLFM, LinearAxis, Recording, fit
-from nfriction.fitting.estimate import effective_noise
+from nfriction.fitting.residuals import effective_noise
 from tests.fitting.recordings import F64, driven_axis, pendulum, swing
 
 TRUTH = [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]]
