@@ -1,18 +1,17 @@
-"""Gradients, regularised fits and start-up: what a fit of a neuro-fuzzy model costs.
+"""Gradients and regularised fits: what training a neuro-fuzzy model costs.
 
 Run from the repository's root: `python benchmarks/gradient.py`. Each part runs in a fresh process
 on one pinned thread, so that its peak memory is its own.
 """
 
 import argparse
-import os
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
+from unittest import mock
 
 import timing  # first: it sets what libraries read when they are loaded
 from timing import verdict
@@ -64,6 +63,7 @@ def torch_gradient(repeats: int) -> None:
     import torch
 
     from nfriction import rollout
+    from nfriction.compiled import Backend
 
     torch.set_num_threads(1)
     plant, model = cases.rig(), cases.neurofuzzy(terms=(5, 6))
@@ -72,23 +72,32 @@ def torch_gradient(repeats: int) -> None:
         target = rollout(plant, model, q0, qd0, steps=STEPS, backend="torch").q + 1e-3
     before = peak_memory()
 
-    def gradient() -> None:
+    def gradient(backend: Backend = "auto") -> None:
         model.zero_grad(set_to_none=True)
-        motion = rollout(plant, model, q0, qd0, steps=STEPS, gradients=True)
+        motion = rollout(plant, model, q0, qd0, steps=STEPS, gradients=True, backend=backend)
         (motion.q - target).square().mean().backward()
 
     seconds, wall = median_time(gradient, repeats)
     peak, calls = peak_memory(), operations(gradient)
+    found = [p.grad for p in model.parameters()]
+    if not all(g is not None and torch.isfinite(g).all() for g in found):
+        raise SystemExit("the gradient is not finite, or lacks a parameter")
     count = sum(p.numel() for p in model.parameters())
-    missing = [n for n, p in model.named_parameters() if p.grad is None]
-    if missing or not all(torch.isfinite(p.grad).all() for p in model.parameters()):
-        raise SystemExit(f"the gradient is not finite, or lacks {missing}")
     print(
         f"  {count} parameters; memory {before:.0f} MB before, {peak:.0f} MB at the peak; "
         f"{wall:.2f} s by the wall; {calls} operations, {1e6 * seconds / calls:.1f} us each"
     )
-    verdict("gradient in eager torch [s]", seconds, 1.0)
+    verdict("gradient, adjoint in eager torch, motion compiled [s]", seconds, 1.0)
     verdict("peak memory of the process [GB]", peak / 1e3, 1.0)
+    with mock.patch("nfriction.simulation.rollouts.integrate_compiled", return_value=None):
+        seconds, _ = median_time(gradient, repeats)
+    verdict("the same with nothing compiled [s]", seconds, 1.0)
+    seconds, _ = median_time(lambda: gradient("torch"), 1)
+    difference = max(
+        float((p.grad - g).abs().max() / g.abs().max())
+        for p, g in zip(model.parameters(), found, strict=True)
+    )
+    print(f"  every step recorded: {seconds:.2f} s; the gradients agree to {difference:.0e}")
 
 
 def gauss_newton(repeats: int) -> None:
@@ -221,84 +230,10 @@ def regularised(repeats: int) -> None:
         verdict("iteration of Bayesian regularisation [ms]", steps[middle], 30.0)
 
 
-FIRST_CALL = """
-import time, torch
-start = time.perf_counter()
-from nfriction import LFM, rigs, rollout
-zero = torch.zeros(3, dtype=torch.float64)
-rollout(rigs.tlrip(), LFM(3, [0.01, 0.01]), zero + 3.0, zero, steps=1000, backend={backend!r},
-        gradients=False)
-print(time.perf_counter() - start)
-"""
-IMPORTS = """
-import time
-start = time.perf_counter()
-import torch
-middle = time.perf_counter()
-{more}
-print(time.perf_counter() - middle)
-"""
-
-
-def _python(code: str, *flags: str, cache: str | None = None) -> subprocess.CompletedProcess:
-    environment = dict(os.environ) | ({"NFRICTION_CACHE": cache} if cache else {})
-    return subprocess.run(
-        [sys.executable, *flags, "-c", code],
-        capture_output=True, text=True, check=True, env=environment,
-    )  # fmt: skip
-
-
-def startup(repeats: int) -> None:
-    """First calls in fresh processes, and what `import nfriction` adds to `import torch`."""
-    for backend in ("c", "numba"):
-        with tempfile.TemporaryDirectory() as cache:
-            try:
-                calls = [
-                    float(_python(FIRST_CALL.format(backend=backend), cache=cache).stdout)
-                    for _ in range(1 + repeats)
-                ]
-            except subprocess.CalledProcessError as error:
-                print(f"  {backend} left out: {error.stderr.strip().splitlines()[-1]}")
-                continue
-        verdict(f"first call beyond `import torch`, {backend}, compiling [s]", calls[0], 4.0)
-        verdict("the same, cached [s]", sorted(calls[1:])[repeats // 2], 1.0)
-    # The package loads its parts when they are asked for, so both are told.
-    used = "import nfriction; nfriction.rollout, nfriction.fit, nfriction.NFLFM"
-    for code in ("import nfriction", used):
-        times = sorted(float(_python(IMPORTS.format(more=code)).stdout) for _ in range(repeats))
-        verdict(f"`{code}` beyond `import torch` [s]", times[repeats // 2], 0.3)
-    print("  worst offenders after torch, cumulative [ms]:")
-    log = _python(IMPORTS.format(more=used), "-X", "importtime").stderr
-    for milliseconds, name in offenders(log)[:12]:
-        print(f"    {milliseconds:7.1f}  {name}")
-
-
-def offenders(log: str) -> list[tuple[float, str]]:
-    """Packages that `-X importtime` reports below nfriction, by cumulative time.
-
-    A package within a package of the same family is counted in it.
-    """
-    rows = [line.split(":", 1)[1].split("|") for line in log.splitlines() if "|" in line]
-    rows = [(float(c) / 1e3, n.rstrip()) for _, c, n in rows if c.strip().isdigit()]
-    after = next(i for i, (_, name) in enumerate(rows) if name.strip() == "torch") + 1
-    depth = [len(name) - len(name.lstrip()) for _, name in rows]
-    kept = []
-    for i in range(after, len(rows)):
-        # The importer is the next row with less indentation.
-        importer = next((rows[j][1].strip() for j in range(i + 1, len(rows))
-                         if depth[j] < depth[i]), "")  # fmt: skip
-        name = rows[i][1].strip()
-        own = name.split(".")[0] == importer.split(".")[0]
-        if not own or name.startswith("nfriction"):
-            kept.append((rows[i][0], f"{name}  (by {importer})" if importer else name))
-    return sorted(kept, reverse=True)
-
-
 PARTS: dict[str, tuple[str, Callable[[int], None]]] = {
-    "gradient": (f"Gradient of {WINDOWS} windows x {STEPS} steps, eager torch", torch_gradient),
+    "gradient": (f"Gradient of {WINDOWS} windows x {STEPS} steps", torch_gradient),
     "model": (f"Gauss-Newton model of {WINDOWS} windows x {STEPS} steps", gauss_newton),
     "evidence": ("Bayesian regularisation, network 2-10-2, 40,000 samples", regularised),
-    "startup": ("Start-up in fresh processes (wall time)", startup),
 }
 
 

@@ -11,6 +11,22 @@ static double now(void)
     return 1e9 * (double)t.tv_sec + (double)t.tv_nsec;
 }
 
+/* Nanoseconds a call of `calls` calls in a row, by two readings of the clock. */
+double batch(long calls, long rows, const nf_real *qd, const nf_real *qdd, const nf_real *load,
+             double *total)
+{
+    nf_real tau[NF_JOINTS], coefficients[NF_JOINTS * NF_COEFFICIENTS];
+    const double begin = now();
+    int status[NF_JOINTS];
+    long call;
+    for (call = 0; call < calls; ++call) {
+        const long at = call % rows * NF_JOINTS;
+        nf_step(qd + at, qdd + at, load + at, tau, coefficients, status);
+        *total += (double)tau[0];
+    }
+    return (now() - begin) / (double)calls;
+}
+
 /* Nanoseconds of each of `calls` calls, over `rows` samples in turn; the clock is in them. */
 double latency(long calls, long rows, const nf_real *qd, const nf_real *qdd, const nf_real *load,
                double *ns)

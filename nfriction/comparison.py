@@ -8,9 +8,10 @@ import numpy as np
 import pandas as pd
 from torch import Tensor
 
-from nfriction.fitting import Fit, fit
+from nfriction.fitting import Fit, fit, nearest_fit
 from nfriction.friction import Constant, FrictionModel, NeuroFuzzy, model_by_name
 from nfriction.friction.adaptive import CLASSES, Adaptive
+from nfriction.friction.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.recording import Recording
 from nfriction.scoring import HORIZONS, Score, improvement_table, rmse_table, score
@@ -170,7 +171,7 @@ def compare(
     fits: dict[str, Fit] = {}
     for name in dict.fromkeys(models):
         model = model_by_name(name)(plant.joints)
-        start = _nearest(fits, model)
+        start = nearest_fit(fits.values(), model)
         say(f"fit {name}")
         fits[name] = fit(
             model, plant, list(train), start=start,
@@ -215,7 +216,7 @@ def coefficient_sets(model: FrictionModel) -> dict[str, Tensor]:
     sets = schedule.rest_coefficients().detach()
     if isinstance(schedule, Constant):
         return {"always": sets}
-    if isinstance(schedule, Adaptive):
+    if isinstance(schedule, Adaptive | AdaptiveNeuroFuzzy):
         return dict(zip(CLASSES, sets, strict=True))
     if isinstance(schedule, NeuroFuzzy):
         return {"at_rest": sets, "reference": schedule.reference_coefficients().detach()}
@@ -235,11 +236,3 @@ def coefficient_summary(model: FrictionModel) -> dict[str, Any]:
 def _motion(plant: PendulumChain | LinearAxis, recording: Recording) -> Motion:
     joint = recording.joint_coordinates(plant)
     return kalman_smoother(joint.time, joint.q)
-
-
-def _nearest(fits: Mapping[str, Fit], model: FrictionModel) -> Fit | None:
-    """The fit to start from: the constant one of the same law, else the last."""
-    for found in fits.values():
-        if found.model.law == model.law and isinstance(found.model.schedule, Constant):
-            return found
-    return list(fits.values())[-1] if fits else None

@@ -20,6 +20,15 @@ from nfriction.recording import Recording
 logger = logging.getLogger(__name__)
 
 
+def digests(recordings: Sequence[Recording]) -> dict[str, str]:
+    """Digest of every recording by its name, and by its place too where that is not its own."""
+    names = [recording.name for recording in recordings]
+    return {
+        name if name and names.count(name) == 1 else f"{name or 'recording'} ({place})": r.digest()
+        for place, (name, r) in enumerate(zip(names, recordings, strict=True), 1)
+    }
+
+
 def model_info(fit: Fit, recordings: Sequence[Recording]) -> ModelInfo:
     """What a model file should say of a fit to these recordings."""
     qd = np.concatenate([m.qd for m in fit.motions])
@@ -32,7 +41,7 @@ def model_info(fit: Fit, recordings: Sequence[Recording]) -> ModelInfo:
             "qd": np.stack([qd.min(0), qd.max(0)], -1).tolist(),
             "qdd": np.stack([qdd.min(0), qdd.max(0)], -1).tolist(),
         },
-        training_data={r.name: r.digest() for r in recordings},
+        training_data=digests(recordings),
         rig=fit.plant.to_dict(),
         fit=fit.to_dict(),
     )
@@ -66,8 +75,8 @@ def write_results(
     results = comparison.to_dict() | {
         "command": command,
         "recordings": {
-            "train": {r.name: r.digest() for r in train},
-            "held_out": {r.name: r.digest() for r in held_out},
+            "train": digests(train),
+            "held_out": digests(held_out),
         },
     }
     text = json.dumps(results, indent=1, allow_nan=False)

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nfriction.fitting import Fit, fit
-from nfriction.friction import Constant, FrictionModel, model_by_name
+from nfriction.fitting import Fit, fit, nearest_fit
+from nfriction.friction import model_by_name
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.recording import Recording
 from nfriction.scoring import score
@@ -214,14 +214,6 @@ def block_error(found: Fit, block: Block, horizon: float) -> float:
         found.plant, found.model, block.recording, motion=block.motion, horizons=(horizon,)
     )
     return result.windows[f"{horizon:g}"].all
-
-
-def nearest_fit(fits: Sequence[Fit], model: FrictionModel) -> Fit | None:
-    """The fit to start from: the constant one of the same law, else the last."""
-    for found in fits:
-        if found.model.law == model.law and isinstance(found.model.schedule, Constant):
-            return found
-    return fits[-1] if fits else None
 
 
 def _alike(one: Candidate, best: Candidate, tolerance: float) -> bool:

@@ -1,8 +1,10 @@
 """Recordings: round trips through every format, windows, validation, the real files."""
 
 import gzip
+import io
 import sys
 import warnings
+import zipfile
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -11,6 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 
 from nfriction.angles import AngleConvention
 from nfriction.recording import Recording, RecordingWarning, read_initial_states
@@ -202,6 +205,34 @@ def test_parquet_without_pyarrow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         Recording.read(tmp_path / "run.parquet")
 
 
+def test_an_array_that_claims_more_than_memory_is_refused(tmp_path: Path) -> None:
+    header = io.BytesIO()
+    claim = {"descr": "<f8", "fortran_order": False, "shape": (10**15,)}
+    np.lib.format.write_array_header_1_0(header, claim)  # type: ignore[arg-type]
+    with zipfile.ZipFile(tmp_path / "run.npz", "w") as archive:
+        archive.writestr("q1.npy", header.getvalue() + bytes(80))
+    with pytest.raises(ValueError, match=r"run\.npz.*array q1 is larger than memory"):
+        Recording.read(tmp_path / "run.npz")
+
+
+def test_files_go_to_folders_that_are_made(tmp_path: Path) -> None:
+    recording = Recording(np.arange(9.0) / 100, np.zeros((9, 1)))
+    recording.write(tmp_path / "a" / "b" / "run.csv")
+    assert Recording.read(tmp_path / "a" / "b" / "run.csv").digest() == recording.digest()
+
+
+def test_tables_from_elsewhere_may_number_or_repeat_their_columns() -> None:
+    time, q = np.arange(20) / 1000, np.arange(20) / 50
+    numbered = pd.DataFrame({0: time, 1: q})
+    for columns in ({"time": "0", "q1": "1"}, {"time": 0, "q1": 1}):
+        found = Recording.from_pandas(numbered, columns=columns)  # type: ignore[arg-type]
+        assert np.array_equal(found.q[:, 0], q)
+    assert list(numbered.columns) == [0, 1]
+    repeated = pd.DataFrame(np.stack([time, q, q], axis=1), columns=["time", "q1", "q1"])
+    with pytest.raises(ValueError, match="column q1 is there more than once"):
+        Recording.from_pandas(repeated)
+
+
 # --- validation ------------------------------------------------------------------------------
 
 
@@ -247,6 +278,13 @@ def test_too_few_samples() -> None:
         swing()[:7]
 
 
+def test_tensors_are_taken_without_a_word() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        recording = Recording(torch.arange(20) / 100, torch.ones(20, 1))  # type: ignore[arg-type]
+    assert recording.q.dtype == np.float64
+
+
 def test_arrays_are_copies_and_read_only() -> None:
     q = np.zeros((60, 2))
     recording = changed(q=q)
@@ -260,6 +298,16 @@ def test_milliseconds_are_noticed() -> None:
     recording = swing()
     with pytest.warns(RecordingWarning, match="milliseconds"):
         Recording(recording.time * 1e3, recording.q)
+
+
+def test_gaps_are_noticed_and_jitter_is_not() -> None:
+    time = np.arange(100) / 100
+    jitter = np.random.default_rng(0).uniform(-4e-3, 4e-3, 100)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Recording(time + jitter, np.zeros((100, 1)))
+    with pytest.warns(RecordingWarning, match=r"'a': `time` has gaps \(2\), .* 2\.01 s at 1\.39 s"):
+        Recording(time + 1.0 * (time >= 0.2) + 2.0 * (time >= 0.4), np.zeros((100, 1)), name="a")
 
 
 def test_wrapped_and_whirling_angles_are_not_taken_for_degrees() -> None:
@@ -430,9 +478,14 @@ def test_initial_states_name_their_faults(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"lacks columns \['qd0_1'\]"):
         read_initial_states(path)
     path.write_text("id,q0_1,qd0_1,q0_2,qd0_2\na,0.5,0,1,\n")
-    with pytest.raises(ValueError, match="q0 and qd0 of the same joints"):
+    with pytest.raises(ValueError, match="finite q0 and qd0 of the same joints"):
+        read_initial_states(path)
+    path.write_text("id,q0_1,qd0_1,q0_2,qd0_2\na,0.5,0,inf,inf\n")
+    with pytest.raises(ValueError, match="with finite q0"):
         read_initial_states(path)
     path.write_text("qd0_10,q0_2,id,q0_10,qd0_2\n4,1,a,3,2\n,7,b,,8\n")
     states = read_initial_states(path)
     assert [list(part) for part in states["a"]] == [[1, 3], [2, 4]]
     assert [list(part) for part in states["b"]] == [[7], [8]]
+    for label, parts in read_initial_states(path, degrees=True).items():
+        np.testing.assert_allclose(np.rad2deg(parts), states[label], rtol=4e-16)

@@ -54,6 +54,15 @@ def test_divergence_is_null_and_stops_no_other_model(
     assert "diverged" not in rows["good"]
 
 
+def test_no_digest_is_lost_where_names_repeat_or_lack(recording: Recording) -> None:
+    others = [dataclasses.replace(recording, q=recording.q + k, name=name)
+              for k, name in enumerate(("r", "", "", "s"), 1)]  # fmt: skip
+    told = results.digests([recording, *others])
+    assert list(told) == ["r (1)", "r (2)", "recording (3)", "recording (4)", "s"]
+    assert list(told.values()) == [r.digest() for r in (recording, *others)]
+    assert set(results.digests([recording])) == {"r"}
+
+
 def test_long_table_has_every_error_once(comparison: Comparison) -> None:
     table = results.long_table(comparison)
     keys = ["model", "recording", "kind", "horizon", "joint"]

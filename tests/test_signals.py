@@ -338,6 +338,44 @@ def test_noise_is_found_or_taken() -> None:
         kalman_smoother(truth.time, truth.q, noise=[1.0, 2.0])
 
 
+@pytest.mark.parametrize("gap", [0.3, 10.0, 1e5])
+@pytest.mark.parametrize("cut", [3, 1500, 2990])
+def test_a_gap_parts_a_record_and_spoils_neither_side(gap: float, cut: int) -> None:
+    time = UNIFORM[:3000].copy()
+    time[cut:] += gap
+    truth = sines(time)
+    measured = truth.q + 1e-4 * np.random.default_rng(2).normal(size=truth.q.shape)
+    found = kalman_smoother(time, measured)
+    assert found.std is not None
+    for key in ("q", "qd", "qdd"):
+        score = np.abs(getattr(found, key) - getattr(truth, key)) / getattr(found.std, key)
+        # The largest of 9000 normal deviations is about 4; three samples alone are very unsure.
+        assert score.max() < 6
+    if cut == 1500:
+        halves = [kalman_smoother(time[k : k + 1500], measured[k : k + 1500]) for k in (0, 1500)]
+        apart = np.concatenate([half.qdd for half in halves])
+        # Only the noise ratio, found from all of it, differs, and what the gap still tells.
+        assert rmse(found.qdd, truth.qdd) < 1.2 * rmse(apart, truth.qdd)
+
+
+@pytest.mark.parametrize("gap", [0.1, 100.0])
+def test_no_polynomial_reaches_over_a_gap(gap: float) -> None:
+    time = UNIFORM[:1000].copy()
+    time[400:] += gap
+    time[407:] += gap
+    # Nothing smooth joins the sides; 7 samples are fewer than a window.
+    q = np.where(np.arange(1000) < 400, time**3, 5 - time**2)[:, None]
+    found = savitzky_golay(time, q)
+    wanted = np.where(np.arange(1000) < 400, 6 * time, -2.0)
+    scale = np.abs(q).max()
+    # Seven samples in 6 ms: rounding of q over the square of 1 ms.
+    np.testing.assert_allclose(found.qdd[:, 0], wanted, atol=1e4 * 2e-16 * scale / 1e-6)
+    np.testing.assert_allclose(found.q, q, atol=1e-14 * scale)
+    time[404:] += gap
+    with pytest.raises(ValueError, match=r"only 4 samples lie between gaps.*widen `window_s`"):
+        savitzky_golay(time, q)
+
+
 def test_joint_at_rest_has_no_motion() -> None:
     q = np.full((300, 2), 0.7)
     q[:, 1] = quantise(np.sin(np.arange(300) / 50), COUNTS)
@@ -441,3 +479,10 @@ def test_bad_settings_are_refused() -> None:
         savitzky_golay(time, q, window_s=0.2)
     with pytest.raises(ValueError, match="more than order = 4"):
         savitzky_golay(time, q, window_s=0.002)
+    for window in (-1.0, math.nan, math.inf):
+        with pytest.raises(ValueError, match="`window_s` must be positive and finite"):
+            savitzky_golay(time, q, window_s=window)
+    with pytest.raises(ValueError, match="`duration` must be positive"):
+        initial_state(time, q, duration=-1.0)
+    with pytest.raises(ValueError, match="positive and finite, got inf"):
+        quantise(q, math.inf)

@@ -3,17 +3,20 @@
     python trainers/train_neurofuzzy.py run1.csv run2.csv --rig rig.json --model NFLFM
     python trainers/train_neurofuzzy.py --twin tlrip --model NFNLFM --procedure papers
 
-Ours fits the constant law, then an ANFIS layer with a radial basis head on trajectories. The
-papers fit coefficients by class of acceleration, span a fuzzy controller with them and teach a
-radial basis network what it says on 40,000 samples a joint. `--resume` after a Ctrl-C or a kill
-reads the stages that were finished and begins the one that was not anew, with the same result.
+Both fit the constant law, then coefficients by class of acceleration. Ours corrects these by an
+ANFIS layer with a radial basis head, on trajectories. The papers span a fuzzy controller with them
+and teach a radial basis network what it says on 40,000 samples a joint. `--resume` after a Ctrl-C
+or a kill reads the stages that were finished and begins the one that was not anew, with the same
+result.
 """
 
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 from nfriction.fitting import fit, fit_adaptive
+from nfriction.fitting.by_class import refine_adaptive
 from nfriction.friction import model_by_name
 from nfriction.reproduction import papers_neuro_fuzzy, training
 from nfriction.results import model_info
@@ -36,16 +39,17 @@ def train(argv: Sequence[str] | None) -> str:
     constant = training_run.stage("constant", data, lambda tell: fit(
         model_by_name(name)(joints), data.plant, data.train, callback=tell, **settings
     ))  # fmt: skip
-    if given.procedure == "ours":
-        found = training_run.stage("neuro-fuzzy", data, lambda tell: fit(
-            model_by_name(given.model)(joints), data.plant, data.train, start=constant,
-            callback=tell, **settings
-        ))  # fmt: skip
-        return training_run.finish(data, found.model, model_info(found, data.train), found.plant)
     adaptive = training_run.stage("adaptive", data, lambda tell: fit_adaptive(
         model_by_name(f"A{name}")(joints), data.plant, data.train, start=constant,
         callback=tell, **settings
     ))  # fmt: skip
+    if given.procedure == "ours":
+        options: dict[str, Any] = {"network": "by_class"}
+        found = training_run.stage("neuro-fuzzy", data, lambda tell: refine_adaptive(
+            model_by_name(given.model)(joints, **options), adaptive, data.train,
+            length=given.windows[-1], max_steps=given.max_steps, callback=tell
+        ))  # fmt: skip
+        return training_run.finish(data, found.model, model_info(found, data.train), found.plant)
     model = papers_neuro_fuzzy(
         adaptive.model, data.motions, samples=given.samples, seed=given.seed,
         progress=sys.stderr.isatty(),

@@ -45,6 +45,9 @@ def add_comparison_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--initial-states", type=names.file, metavar="FILE",
                         help="table with columns id, q0_1, qd0_1, ... of the recordings' initial "
                         "states (default: estimated from each recording)")  # fmt: skip
+    parser.add_argument("--select", action="store_true",
+                        help="also say which model the training recordings alone would choose, "
+                        "by simulating blocks of them left out of the fits")  # fmt: skip
     parser.add_argument("--no-figures", action="store_true", help="draw no figures")
 
 
@@ -73,10 +76,17 @@ def run_comparison(
     from nfriction.cli import report
     from nfriction.comparison import compare
     from nfriction.results import write_results
+    from nfriction.selection import select
 
     states = _initial_states(arguments.initial_states, plant, [*train, *held_out])
     check_writable(arguments.out)
+    selection = None
     with Progress() as progress:
+        if arguments.select:
+            selection = select(
+                plant, arguments.models, train, on_stage=progress.stage,
+                callback=lambda stage, _: progress.step(stage), **settings,
+            )  # fmt: skip
         comparison = compare(
             plant, arguments.models, train, held_out, initial_states=states,
             on_stage=progress.stage, on_step=progress.step, **settings,
@@ -88,11 +98,15 @@ def run_comparison(
         )  # fmt: skip
     print(f"\n{report.error_tables(comparison)}\n")
     for name, fit in comparison.fits.items():
-        print(report.fit_line(name, fit))
+        print(report.fit_lines(name, fit))
+    if selection is not None:
+        print(f"\n{report.choice(selection)}")
     print(f"\n{report.verdict(comparison)}")
     best = comparison.fits.get(comparison.best() or "")
     if best is not None:
         print(report.coefficient_table(best.model, plant.joint_names, plant.unit))
+        if intervals := report.interval_table(best):
+            print(intervals)
         print(f"its model file: {arguments.out / 'models' / f'{comparison.best()}.json'}")
     what = "results and models" if arguments.no_figures else "results, models and figures"
     print(f"\n{what} are in {arguments.out}")

@@ -27,22 +27,30 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--columns", type=_columns, metavar="OURS=THEIRS,...",
                         help="the files' names of time, q1, ..., tau1, ... where they differ, "
                         "e.g. time=t,q1=enc_1,q2=enc_2")  # fmt: skip
-    parser.add_argument("--windows", type=_windows, default="0.5,2", metavar="SECONDS",
-                        help="lengths of the fitted windows, one after the other [s]")  # fmt: skip
+    parser.add_argument("--windows", type=_windows, metavar="SECONDS",
+                        help="lengths of the fitted windows, one after the other [s] "
+                        "(default: 0.5,2,5)")  # fmt: skip
     parser.add_argument("--plant", choices=("fit", "given"), default="fit",
                         help="adjust inertia and gravity terms within bounds, or keep those of "
                         "the rig")  # fmt: skip
-    parser.add_argument("--drag", action="store_true", help="fit air drag on the links too")
+    parser.add_argument("--drag", action=argparse.BooleanOptionalAction,
+                        help="fit air drag on the links, or none (default: where nothing drives "
+                        "the rig)")  # fmt: skip
+    parser.add_argument("--eccentricity", choices=("none", "fit", "evidence"), default="none",
+                        help="how far encoders sit off their shafts: none, fitted, or fitted "
+                        "where the evidence asks for it")  # fmt: skip
     parser.add_argument("--max-steps", type=count, default=30, metavar="N",
                         help="most steps of the search at each window length")  # fmt: skip
 
 
 def fit_settings(arguments: argparse.Namespace) -> dict[str, Any]:
-    """What `nfriction.fit` takes of these options."""
+    """What `nfriction.fit` takes of these options; its own default where one is not given."""
+    windows = {} if arguments.windows is None else {"windows": arguments.windows}
     return {
-        "windows": arguments.windows,
+        **windows,
         "fit_plant": arguments.plant == "fit",
         "drag": arguments.drag,
+        "eccentricity": {"none": False, "fit": True, "evidence": None}[arguments.eccentricity],
         "max_steps": arguments.max_steps,
     }
 

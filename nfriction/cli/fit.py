@@ -28,7 +28,7 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Fit, write, say how it went."""
-    from nfriction.cli.report import coefficient_table, fit_line
+    from nfriction.cli.report import coefficient_table, fit_lines, interval_table
     from nfriction.fitting import fit
     from nfriction.friction import model_by_name
     from nfriction.modelfile import save
@@ -48,9 +48,11 @@ def run(arguments: argparse.Namespace) -> int:
         )  # fmt: skip
         progress.stage("write the model")
     save(model, arguments.out, model_info(found, recordings))
-    print(fit_line(arguments.model, found))
+    print(fit_lines(arguments.model, found))
     print(f"position error over training windows: {1e3 * found.residual:.3g} m{plant.unit}")
     print(coefficient_table(model, plant.joint_names, plant.unit))
+    if intervals := interval_table(found):
+        print(intervals)
     print(f"wrote {arguments.out}")
     print(f"next: {shlex.join(['nfriction', 'export', str(arguments.out), '--to', 'torchscript'])}")
     return 0

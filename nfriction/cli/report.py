@@ -9,6 +9,7 @@ from nfriction.comparison import NO_FRICTION, Comparison, coefficient_sets
 from nfriction.fitting import Fit
 from nfriction.friction import FrictionModel
 from nfriction.modelfile import ModelInfo, describe
+from nfriction.selection import Selection
 
 LEGEND = (
     "free run: one simulation over the whole recording; windows: simulations restarted so often "
@@ -47,10 +48,39 @@ def _error_table(comparison: Comparison, held_out: bool) -> str:
     return "\n".join(lines)
 
 
-def fit_line(name: str, fit: Fit) -> str:
-    """How a fit ended."""
+def fit_lines(name: str, fit: Fit) -> str:
+    """How a fit ended and what to be wary of: bounds, lost directions, errors of the model."""
     note = f"; at a bound: {', '.join(fit.at_bounds)}" if fit.at_bounds else ""
-    return f"{name}: {fit.status.rstrip('.')}{note}"
+    return "\n  - ".join([f"{name}: {fit.status.rstrip('.')}{note}", *fit.warnings])
+
+
+def interval_table(fit: Fit) -> str:
+    """Values and 95 % intervals of constant coefficients and of the plant's terms; may be empty.
+
+    Terms of the plant are deviations: ratios from 1, offsets in SI.
+    """
+    if not fit.intervals:
+        return ""
+    rows = {i.name: (i.value, i.low, i.high) for i in fit.intervals}
+    columns = ["value", "low", "high"]
+    table = pd.DataFrame.from_dict(rows, orient="index", columns=columns)
+    text = table.to_string(float_format=lambda x: f"{x:.4g}" if np.isfinite(x) else "unknown")
+    return f"95 % intervals (plant terms: ratios less 1, offsets in SI)\n{text}"
+
+
+def choice(selection: Selection) -> str:
+    """Which model training data alone would choose, why, and the error of each."""
+    rows = {
+        c.name: (1e3 * c.error, c.parameters, "yes" if c.converged else "no")
+        for c in selection.candidates
+    }
+    columns = [f"error [m{selection.unit}]", "parameters", "converged"]
+    table = pd.DataFrame.from_dict(rows, orient="index", columns=columns)
+    text = table.to_string(float_format=lambda x: f"{x:.4g}" if np.isfinite(x) else "diverged")
+    return (
+        f"training data alone would choose {selection.chosen}: {selection.reason}\n"
+        f"position RMSE of {selection.horizon:.3g} s simulations over blocks left out\n{text}"
+    )
 
 
 def verdict(comparison: Comparison) -> str:

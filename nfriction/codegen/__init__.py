@@ -11,7 +11,7 @@ from nfriction.codegen.errors import (
     SelfCheckFailed,
     UnsupportedOperation,
 )
-from nfriction.codegen.function import CompiledFunction, compile_function, emit_c
+from nfriction.codegen.function import CompiledFunction, compile_function
 from nfriction.codegen.operations import supported_operations
 from nfriction.codegen.rollout import CompiledRollout, Trajectories, compile_rollout
 
@@ -27,6 +27,5 @@ __all__ = [
     "cache_folder",
     "compile_function",
     "compile_rollout",
-    "emit_c",
     "supported_operations",
 ]

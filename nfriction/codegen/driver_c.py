@@ -4,7 +4,7 @@ from string import Template
 
 from nfriction.codegen import lanes
 from nfriction.codegen.driver import ADVANCE, BEGIN, ONCE, STAGE, START, STEP, Pieces
-from nfriction.codegen.emit import c_function, c_prelude
+from nfriction.codegen.emit import C_PRELUDE, c_function
 
 
 def c_source(parts: Pieces) -> str:
@@ -30,7 +30,7 @@ def c_source(parts: Pieces) -> str:
         NM=max(1, len(parts.advance)),
         remember=_C_REMEMBER if parts.advance else "",
     )
-    return "\n".join([c_prelude(), lanes.PRELUDE, _SELDOM, *functions, driver])
+    return "\n".join([C_PRELUDE, lanes.PRELUDE, _SELDOM, *functions, driver])
 
 
 # These functions are long and run once a rollout: optimising them would double the compile time.

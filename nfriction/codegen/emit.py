@@ -56,13 +56,13 @@ def _min(a, b):
 """
 
 
-def c_prelude(real: Real = "double") -> str:
-    """Includes and the two functions that the emitted C relies on; both propagate NaN."""
-    return f"""#include <math.h>
+# The two functions that the emitted C relies on both propagate NaN.
+C_PRELUDE = """\
+#include <math.h>
 #include <stddef.h>
 
-static {real} nf_max({real} a, {real} b) {{ return a > b || a != a ? a : b; }}
-static {real} nf_min({real} a, {real} b) {{ return a < b || a != a ? a : b; }}
+static double nf_max(double a, double b) { return a > b || a != a ? a : b; }
+static double nf_min(double a, double b) { return a < b || a != a ? a : b; }
 """
 
 
@@ -225,26 +225,24 @@ def c_function(
     arguments: Sequence[str],
     outputs: Mapping[str, Sequence[Node]],
     bound: Mapping[int, str],
-    real: Real = "double",
     qualifier: str = "static ",
     collect: bool = False,
 ) -> str:
-    """A C function that writes each of `outputs` to the array of that name.
+    """A C function of doubles that writes each of `outputs` to the array of that name.
 
     Args:
         name: of the function.
         arguments: names of its input arrays.
         outputs: nodes by output array.
         bound: text of the input nodes.
-        real: element type.
         qualifier: what stands before `void`.
         collect: see `statements`; needs C99 and `lanes.PRELUDE`.
     """
     nodes = [node for group in outputs.values() for node in group]
-    lines, texts = statements(nodes, bound, C(real), collect)
+    lines, texts = statements(nodes, bound, C(), collect)
     targets = [f"{array}[{i}]" for array, group in outputs.items() for i in range(len(group))]
     lines += [f"{target} = {text};" for target, text in zip(targets, texts, strict=True)]
-    signature = [f"const {real} *{a}" for a in arguments] + [f"{real} *{a}" for a in outputs]
+    signature = [f"const double *{a}" for a in arguments] + [f"double *{a}" for a in outputs]
     unused = [f"(void){a};" for a in (*arguments, *outputs)]
     body = "\n    ".join(lines + unused)
     return f"{qualifier}void {name}({', '.join(signature)})\n{{\n    {body}\n}}\n"

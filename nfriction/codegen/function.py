@@ -1,4 +1,4 @@
-"""Compile single functions, and write them as C for controllers."""
+"""Compile single functions, and fold what their parameters decide."""
 
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
@@ -11,15 +11,8 @@ from torch import Tensor
 
 from nfriction.codegen import arguments, build
 from nfriction.codegen.derivative import with_jacobian
-from nfriction.codegen.emit import (
-    PYTHON_PRELUDE,
-    C,
-    Real,
-    c_function,
-    c_prelude,
-    python_function,
-)
 from nfriction.codegen.errors import SelfCheckFailed
+from nfriction.codegen.function_source import c_source, python_source
 from nfriction.codegen.graph import Program
 from nfriction.codegen.lift import Lifted, Method
 from nfriction.codegen.partition import Partition, partition
@@ -85,7 +78,7 @@ class CompiledFunction:
         self._inputs = [p.shape for p in program.inputs if p.name in inputs]
         self._outputs = [p.shape for p in program.outputs]
         split, groups = _split(program)
-        emit = _c_source if backend == "c" else _python_source
+        emit = c_source if backend == "c" else python_source
         self.source = emit(program, split, groups, self._inputs)
         if backend == "c":
             # A Jacobian is long straight code, whose optimisation takes minutes and gains little.
@@ -165,47 +158,6 @@ def _tuple(found: Any) -> tuple[Tensor, ...]:
     return tuple(found) if isinstance(found, (tuple, list)) else (found,)
 
 
-def emit_c(
-    function: Callable[..., Any],
-    inputs: Mapping[str, Tensor],
-    outputs: Sequence[str],
-    *,
-    name: str = "model",
-    real: Real = "double",
-) -> str:
-    """Write a function as C with its parameters baked in as a static table.
-
-    What depends on parameters alone is computed here, in float64, and only the results go into
-    the table. The C has C89 syntax, calls nothing but `math.h` and allocates nothing.
-
-    Args:
-        function: a module, a bound method of one, or any callable.
-        inputs: example tensors (float64, no batch dimension) by argument name in the C function.
-        outputs: names of the C function's output arrays, one per tensor returned.
-        name: of the C function and prefix of its table.
-        real: "double" or "float".
-
-    Raises:
-        UnsupportedOperation: an operation without scalar form.
-        ValueError: names that are no C identifiers, or a wrong number of outputs.
-    """
-    names = [name, *inputs, *outputs]
-    if len(set(names)) < len(names) or not all(n.isidentifier() and n.isascii() for n in names):
-        raise ValueError(f"names must be different C identifiers, got {names}.")
-    folded = fold(function, inputs)
-    program, groups = folded.program, folded.outputs
-    if len(outputs) != len(program.outputs):
-        raise ValueError(f"`outputs` must name {len(program.outputs)} tensors, got {outputs}.")
-    bound = {number: f"{name}_table[{i}]" for i, number in enumerate(folded.known)}
-    bound |= {n.number: f"{p.name}[{i}]" for p in program.inputs for i, n in enumerate(p.nodes)
-              if p.name in inputs}  # fmt: skip
-    values = list(folded.known.values())
-    body = c_function(
-        name, list(inputs), dict(zip(outputs, groups, strict=True)), bound, real, qualifier=""
-    )
-    return "\n".join([c_prelude(real), _table(name, values, real), body])
-
-
 @dataclass(frozen=True)
 class Folded:
     """A traced function in which all that depends on parameters alone is a known number.
@@ -240,15 +192,6 @@ def fold(function: Callable[..., Any], inputs: Mapping[str, Tensor]) -> Folded:
     return Folded(program, groups, known)
 
 
-def _table(name: str, values: Sequence[float], real: Real) -> str:
-    if not values:
-        return ""
-    literals = [C(real).literal(v) for v in values]
-    lines = [", ".join(literals[i : i + 4]) for i in range(0, len(literals), 4)]
-    body = ",\n    ".join(lines)
-    return f"static const {real} {name}_table[{len(values)}] = {{\n    {body}\n}};\n"
-
-
 def _split(program: Program) -> tuple[Partition, list[tuple[Node, ...]]]:
     nodes = [node for port in program.outputs for node in port.nodes]
     split = partition(program.graph, nodes)
@@ -280,82 +223,6 @@ def _read_parameters(split: Partition) -> list[Node]:
 def _port_values(program: Program, lifted: Lifted) -> dict[str, Array]:
     flat = [value.reshape(-1) for value in lifted.values().values()]
     return {f"p{i}": value for i, value in enumerate(flat)}
-
-
-def _bound(program: Program, split: Partition) -> tuple[dict[int, str], dict[int, str]]:
-    inputs: dict[int, str] = {}
-    offset = 0
-    for port in program.inputs:
-        own = port.name.startswith("x")
-        for i, node in enumerate(port.nodes):
-            inputs[node.number] = f"{port.name}[{i}]" if own else f"p[{offset + i}]"
-        offset += 0 if own else len(port.nodes)
-    once = {n.number: f"once[{i}]" for i, n in enumerate(split.hoisted[Level.PARAMETER])}
-    return inputs, inputs | once
-
-
-def _c_source(
-    program: Program,
-    split: Partition,
-    groups: list[tuple[Node, ...]],
-    shapes: list[tuple[int, ...]],
-) -> str:
-    inputs, known = _bound(program, split)
-    once = split.hoisted[Level.PARAMETER]
-    given, taken = _sizes("x", shapes), _sizes("y", [(len(g),) for g in groups])
-    named = dict(zip(taken, groups, strict=True))
-    arrays = [f"const double *{x}" for x in given] + [f"double *{y}" for y in taken]
-    rows = [f"{a} + r * {size}" for a, size in {**given, **taken}.items()]
-    return "\n".join(
-        [
-            c_prelude(),
-            c_function("nf_once", ["p"], {"once": once}, inputs),
-            c_function("nf_row", ["p", "once", *given], named, known),
-            "#if defined(_WIN32)\n__declspec(dllexport)\n#endif",
-            f"void nf_function(ptrdiff_t rows, const double *p, {', '.join(arrays)})",
-            "{",
-            f"    double once[{max(1, len(once))}];",
-            "    ptrdiff_t r;",
-            "    nf_once(p, once);",
-            "    for (r = 0; r < rows; ++r)",
-            f"        nf_row(p, once, {', '.join(rows)});",
-            "}\n",
-        ]
-    )
-
-
-def _python_source(
-    program: Program,
-    split: Partition,
-    groups: list[tuple[Node, ...]],
-    shapes: list[tuple[int, ...]],
-) -> str:
-    inputs, known = _bound(program, split)
-    once = split.hoisted[Level.PARAMETER]
-    given, taken = _sizes("x", shapes), _sizes("y", [(len(g),) for g in groups])
-    flat = [node for group in groups for node in group]
-    rows = [f"{x}[r * {size} : (r + 1) * {size}]" for x, size in given.items()]
-    names = [f"{y}[r * {size} + {i}]" for y, size in taken.items() for i in range(size)]
-    return "\n".join(
-        [
-            PYTHON_PRELUDE,
-            python_function("nf_once", ["p"], once, inputs, into="once"),
-            python_function("nf_row", ["p", "once", *given], flat, known, into="out"),
-            '@njit(error_model="numpy", nogil=True, cache=True)',
-            f"def nf_function(rows, p, {', '.join([*given, *taken])}):",
-            f"    once = np.empty({max(1, len(once))})",
-            f"    out = np.empty({len(flat)})",
-            "    nf_once(p, once)",
-            "    for r in range(rows):",
-            f"        nf_row(p, once, {', '.join([*rows, 'out'])})",
-            *(f"        {target} = out[{i}]" for i, target in enumerate(names)),
-            "",
-        ]
-    )
-
-
-def _sizes(prefix: str, shapes: Sequence[tuple[int, ...]]) -> dict[str, int]:
-    return {f"{prefix}{i}": int(np.prod(s, dtype=int)) for i, s in enumerate(shapes)}
 
 
 def _c_kernel(source: str, level: str, arrays: int) -> Callable[..., None]:

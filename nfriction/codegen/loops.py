@@ -1,12 +1,13 @@
 """Packed scalars as C89: what is alike in loops over arrays, the rest line by line."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from nfriction.codegen.emit import ATOM, C, expression
 from nfriction.codegen.packs import Operand, Pack, Packing
 from nfriction.codegen.scalar import Node, is_predicate
 
+_FEW_TERMS = 5  # so many are written out
 _FEW_SUMS = 6  # so many have a variable each, which stays in a register
 _INLINE = 64  # characters; longer values get a variable of their own
 
@@ -63,6 +64,7 @@ def body(
     bound: Callable[[Node], str],
     named: Sequence[Node],
     names: Names,
+    in_place: Callable[[Pack], str | None] = lambda made: None,
 ) -> Body:
     """Statements that compute `wanted`.
 
@@ -73,8 +75,10 @@ def body(
         bound: text of an input.
         named: nodes that need a variable of their own, because their address is taken.
         names: taken in the function; constant arrays that the statements need are added.
+        in_place: a C function `f(array, count)` that does a pack's operation of one operand, if
+            there is one for it.
     """
-    writer = _Writer(wanted, packing, dialect, bound, named, names)
+    writer = _Writer(wanted, packing, dialect, bound, named, names, in_place)
     texts = writer.write()
     return Body(writer.declarations(), writer.lines, texts)
 
@@ -87,6 +91,7 @@ class _Writer:
     bound: Callable[[Node], str]
     named: Sequence[Node]
     names: Names
+    in_place: Callable[[Pack], str | None]
     lines: list[str] = field(default_factory=list)
     _uses: dict[int, int] = field(default_factory=dict)
     _texts: dict[int, Text] = field(default_factory=dict)
@@ -172,12 +177,24 @@ class _Writer:
         readers = self._readers.get(id(made), [])
         if not readers or any(n.number in self._uses for n in made.nodes):
             return False
+        if self.in_place(made):
+            return False
         reader = readers[0][0]
+        if self._sums(made) and reader.reduces:
+            return False
         if any(other is not reader for other, _ in readers[1:]):
             return False
-        return not made.reduces and all(
+        return (not made.reduces or _few_terms(made)) and all(
             o.straight and len(o.index) == len(made.nodes) for _, o in readers
         )
+
+    def _sums(self, made: Pack) -> bool:
+        """Whether a pack is a sum, or has one written into it."""
+        return made.reduces or any(self._sums(inner) for inner in self._written_in(made))
+
+    def _written_in(self, made: Pack) -> list[Pack]:
+        sources = [o.source for o in made.reads()]
+        return [s for s in sources if isinstance(s, Pack) and id(s) in self._inlined]
 
     def _type(self, node: Node) -> str:
         return "int" if is_predicate(node) else self.dialect.real
@@ -207,14 +224,45 @@ class _Writer:
             self._gather(operand)
         name = self._declare(self._type(made.nodes[0]), "v", count)
         self._arrays[id(made)] = name
-        if made.reduces:
+        if made.reduces and not _few_terms(made):
             self._reduce(made, name)
+            return
+        function = self.in_place(made)
+        loops = self._loops(made)
+        inside: list[str] = []
+        self._locals.clear()
+        if function:
+            text, _ = self._element(made.operands[0], loops, inside)
         else:
-            inside: list[str] = []
-            self._locals.clear()
-            text, _ = self._value(made, [("i", count)], inside)
-            inside.append(f"{name}[{_index(range(count), [('i', count)])}] = {text};")
-            self._open(("i", count), inside, self.lines)
+            text, _ = self._value(made, loops, inside)
+        inside.append(f"{name}[{_index(range(count), loops)}] = {text};")
+        for loop in reversed(loops[1:]):
+            outer: list[str] = []
+            self._open(loop, inside, outer)
+            inside = outer
+        self._open(loops[0], inside, self.lines)
+        if function:
+            self.lines.append(f"{function}({name}, {count});")
+
+    def _loops(self, made: Pack) -> list[Loop]:
+        """One loop, or two where that makes places in all arrays linear in their variables."""
+        count = len(made.nodes)
+        read = [list(index) for index in self._indices(made)]
+        if not all(_plane(index, count) for index in read):
+            for columns in (d for d in range(2, count) if count % d == 0):
+                if all(_plane(index, columns) for index in read):
+                    return [("k", count // columns), ("i", columns)]
+        return [("i", count)]
+
+    def _indices(self, made: Pack) -> Iterator[tuple[int, ...]]:
+        """Places that each round reads, term by term, those of packs written into it included."""
+        count = len(made.nodes)
+        for operand in made.reads():
+            if isinstance(operand.source, Pack) and id(operand.source) in self._inlined:
+                for index in self._indices(operand.source):
+                    yield from _parts(index, count)
+            elif operand.kind != "node":
+                yield from _parts(operand.index, count)
 
     def _reduce(self, made: Pack, name: str) -> None:
         """Sums side by side, term by term: none waits for the last addition of its own."""
@@ -237,7 +285,7 @@ class _Writer:
             for which, total in sums:
                 self._locals.clear()
                 element = self._element(operand, [("k", rounds), (which, count)], step)
-                step.append(f"{total} = {self._joined(made.op, sign, total, element)};")
+                step.append(f"{total} = {self._joined(made.op, sign, (total, ATOM), element)[0]};")
             inner: list[str] = []
             if not few:
                 self._open(("i", count), step, inner)
@@ -246,11 +294,11 @@ class _Writer:
 
     def _start(self, made: Pack, loops: list[Loop], before: list[str]) -> str:
         """What a sum starts with: its lone terms, or zero; a maximum with its first term."""
-        text = ""
+        text: Text | None = None
         for sign, operand in made.lone:
             text = self._joined(made.op, sign, text, self._element(operand, loops, before))
-        if text or made.op == "add":
-            return text or self.dialect.literal(0.0)
+        if text is not None or made.op == "add":
+            return text[0] if text is not None else self.dialect.literal(0.0)
         operand = made.terms[0][1]
         first = Operand(operand.kind, operand.source, operand.index[: len(made.nodes)])
         return self._element(first, loops, before, operand)[0]
@@ -283,9 +331,26 @@ class _Writer:
 
     def _value(self, made: Pack, loops: list[Loop], before: list[str]) -> Text:
         """What a pack computes in one round; statements needed first go to `before`."""
+        if made.reduces:
+            return self._written_out(made, loops, before)
         return expression(
             made.op, [self._element(o, loops, before) for o in made.operands], self.dialect
         )
+
+    def _written_out(self, made: Pack, loops: list[Loop], before: list[str]) -> Text:
+        """A sum of few terms in one expression: compilers do several of them side by side."""
+        total: Text | None = None
+        for sign, operand in made.lone:
+            total = self._joined(made.op, sign, total, self._element(operand, loops, before))
+        for sign, operand in made.terms:
+            rounds = len(operand.index) // len(made.nodes)
+            for k in range(rounds):
+                self._locals.clear()
+                element = self._element(operand, [(str(k), rounds), *loops], before)
+                total = self._joined(made.op, sign, total, element)
+        self._locals.clear()
+        assert total is not None
+        return total
 
     def _inside(self, made: Pack, loops: list[Loop], before: list[str]) -> Text:
         """A pack within the loop that reads it; read twice, it gets a variable."""
@@ -297,11 +362,11 @@ class _Writer:
             before.append(f"{self._locals[id(made)]} = {text};")
         return self._locals[id(made)], ATOM
 
-    def _joined(self, op: str, sign: int, total: str, text: Text) -> str:
-        if not total:
-            return text[0] if sign > 0 else expression("neg", [text], self.dialect)[0]
+    def _joined(self, op: str, sign: int, total: Text | None, text: Text) -> Text:
+        if total is None:
+            return text if sign > 0 else expression("neg", [text], self.dialect)
         step = op if op != "add" or sign > 0 else "sub"
-        return expression(step, [(total, ATOM), text], self.dialect)[0]
+        return expression(step, [total, text], self.dialect)
 
     def _element(
         self, operand: Operand, loops: list[Loop], before: list[str], of: Operand | None = None
@@ -335,6 +400,14 @@ class _Writer:
         return text
 
 
+def _parts(index: tuple[int, ...], size: int) -> list[tuple[int, ...]]:
+    return [index[i : i + size] for i in range(0, len(index), size)]
+
+
+def _few_terms(made: Pack) -> bool:
+    return all(len(o.index) <= _FEW_TERMS * len(made.nodes) for _, o in made.terms)
+
+
 def _nodes(operand: Operand) -> list[Node]:
     source = operand.source if isinstance(operand.source, tuple) else (operand.source,)
     return [node for node in source if isinstance(node, Node)]
@@ -343,6 +416,11 @@ def _nodes(operand: Operand) -> list[Node]:
 def _index(index: Sequence[int], loops: Sequence[Loop]) -> str | None:
     """`index` as a function of the loops' variables: a plane, or a plane over i / d and i % d."""
     index = list(index)
+    if len(loops) > 1 and loops[0][0].isdigit():
+        # One round of the outermost loop, written out.
+        size = len(index) // loops[0][1]
+        start = size * int(loops[0][0])
+        return _index(index[start : start + size], loops[1:])
     if len(loops) == 2:
         (outer, rows), (inner, columns) = loops
         if rows == 1:

@@ -1,10 +1,9 @@
 """Compile the rollout of a plant with friction, and run many at once."""
 
-import ctypes
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -13,6 +12,8 @@ from torch import Tensor, nn
 from nfriction.codegen import arguments, build, driver, driver_c, driver_python
 from nfriction.codegen.arguments import series
 from nfriction.codegen.errors import SelfCheckFailed
+from nfriction.codegen.fused import Friction, Fused, Plant
+from nfriction.codegen.kernels import c_kernel, numba_kernel
 from nfriction.codegen.lift import Lifted
 
 Array = np.ndarray
@@ -22,26 +23,6 @@ SPEED_LIMIT = 1e6
 
 # Of accelerations over steps of 0.1 ms: velocities of 10 rad/s round to 2e-15, rates to 2e-11.
 _CHECK_TOLERANCE = 1e-9
-
-
-class Plant(Protocol):
-    """What a rollout needs of a mechanism; a module, states of shape (joint,)."""
-
-    joints: int
-
-    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor: ...
-    def load(self, q: Tensor, qd: Tensor) -> Tensor: ...
-
-
-class Friction(Protocol):
-    """What a rollout needs of a friction model; a module.
-
-    One whose coefficients have a memory also has `state_size` > 0, `initial_state(qd, qdd)`,
-    `advance(qd, qdd, state)` and `coefficients_from(qd, qdd, state)`.
-    """
-
-    def coefficients(self, qd: Tensor, qdd: Tensor) -> Tensor: ...
-    def torque(self, qd: Tensor, load: Tensor, coefficients: Tensor) -> Tensor: ...
 
 
 class Trajectories(NamedTuple):
@@ -60,38 +41,6 @@ class Trajectories(NamedTuple):
     qd: Any
     qdd: Any
     diverged_step: Any
-
-
-class _Fused(nn.Module):
-    """Plant and friction as one function, so that the load shares the dynamics' work."""
-
-    def __init__(self, plant: Plant, friction: Friction, hold: bool) -> None:
-        super().__init__()
-        self.plant = cast(Any, plant)
-        self.friction = cast(Any, friction)
-        self.hold = hold
-        self.remembers = int(getattr(friction, "state_size", 0)) > 0
-
-    def forward(
-        self,
-        q: Tensor,
-        qd: Tensor,
-        tau: Tensor,
-        qd_held: Tensor,
-        qdd_held: Tensor,
-        memory: Tensor | None = None,
-    ) -> tuple[Tensor, ...]:
-        if memory is None:
-            c = self.friction.coefficients(qd_held if self.hold else qd, qdd_held)
-        else:
-            c = self.friction.coefficients_from(qd_held, qdd_held, memory)
-        tau_f = self.friction.torque(qd, self.plant.load(q, qd), c)
-        with_friction = self.plant.forward_dynamics(q, qd, tau - tau_f)
-        without = self.plant.forward_dynamics(q, qd, tau)
-        if memory is None:
-            return with_friction, without
-        begin = self.friction.initial_state(qd_held, qdd_held)
-        return with_friction, without, begin, self.friction.advance(qd_held, qdd_held, memory)
 
 
 def compile_rollout(
@@ -122,7 +71,7 @@ def compile_rollout(
     for name, module in (("plant", plant), ("friction", friction)):
         if not isinstance(module, nn.Module):
             raise TypeError(f"`{name}` must be a torch module, got {type(module).__name__}.")
-    fused = _Fused(plant, friction, hold)
+    fused = Fused(plant, friction, hold)
     if fused.remembers and not hold:
         raise ValueError("coefficients with a memory are held over a step; use `hold=True`.")
     lifted = Lifted(fused)
@@ -133,7 +82,7 @@ def compile_rollout(
             examples["memory"] = fused.friction.initial_state(rest, rest)
     parts = driver.pieces(lifted.trace(examples, driver.LEVELS))
     source = (driver_c.c_source if served == "c" else driver_python.python_source)(parts)
-    kernel = _c_kernel(source) if served == "c" else _numba_kernel(source, parts)
+    kernel = c_kernel(source) if served == "c" else numba_kernel(source, parts)
     compiled = CompiledRollout(served, source, lifted, kernel)
     compiled.check()
     return compiled
@@ -146,45 +95,6 @@ def _states(joints: int, seed: int) -> list[Tensor]:
     generator = torch.Generator().manual_seed(seed)
     scales = (3.0, 10.0, 1.0, 1.0, 3.0)  # of `EXAMPLES`, as mechanisms move
     return [s * torch.randn(joints, generator=generator, dtype=torch.float64) for s in scales]
-
-
-def _c_kernel(source: str) -> Callable[..., None]:
-    function = build.build_c(source).nf_rollout
-    size, real, array = ctypes.c_ssize_t, ctypes.c_double, ctypes.c_void_p
-    function.restype = None
-    function.argtypes = [
-        *(size, size, size, size, size, real, array, size, array, array, array, size, size),
-        *(array, size, size, array, array, size, size, array, size),
-        *(array, array, array, array),
-    ]
-
-    def call(*args: Any) -> None:
-        # ctypes lets go of the GIL while the function runs.
-        function(*(a.ctypes.data if isinstance(a, np.ndarray) else a for a in args))
-
-    return call
-
-
-def _numba_kernel(source: str, parts: driver.Pieces) -> Callable[..., None]:
-    function = build.build_numba(source).nf_rollout
-
-    def call(first: int, last: int, *args: Any) -> None:
-        p, p_row, q0, qd0 = args[4:8]
-        tau, tau_row = args[11:13]
-        n, count = parts.joints, last - first
-
-        def rows(flat: Array, stride: int, width: int) -> Array:
-            begins = stride * np.arange(first, last) if stride else np.zeros(1, dtype=int)
-            return flat[begins[:, None] + np.arange(width)]
-
-        # Once a candidate, so NumPy is quick enough, and numba has less to compile.
-        given = {"p": rows(p, p_row, parts.parameters), "tau": rows(tau, tau_row, n)}
-        given |= {"q": rows(q0, n, n), "qd": rows(qd0, n, n)}
-        once = parts.evaluate(parts.once, given, count if p_row else 1)
-        start = parts.evaluate(parts.start, given, count)
-        function(once, len(parts.once) if p_row else 0, start, first, last, *args)
-
-    return call
 
 
 class CompiledRollout:
@@ -204,7 +114,7 @@ class CompiledRollout:
         self.parameter_names = lifted.names
         self._lifted = lifted
         self._kernel = kernel
-        self._fused = cast(_Fused, lifted.module)
+        self._fused = cast(Fused, lifted.module)
         self.joints = int(self._fused.plant.joints)
 
     def __call__(

@@ -53,10 +53,15 @@ class ControllerC(C):
         self.used.add(name)
         return f"{name}({', '.join(args)})"
 
+    def array_exp(self) -> str:
+        """The name of `c_exp.exponential`."""
+        self.used.add("array_exp")
+        return f"{self.prefix}_exp"
+
     def functions(self) -> str:
         """Prototypes that C89 lacks, and the maximum and minimum where they are used."""
         single = "f" if self.real == "float" else ""
-        late = sorted(f for f in self.used - {"abs", "max", "min"} if f not in _C89)
+        late = sorted(f for f in self.used - {"abs", "max", "min", "array_exp"} if f not in _C89)
         parts = []
         if late:
             two = {name + single for name in _TWO_ARGUMENTS}

@@ -9,14 +9,16 @@ import numpy as np
 from torch import Tensor
 
 from nfriction.codegen import finite
-from nfriction.codegen.emit import expression
 from nfriction.codegen.function import fold
 from nfriction.codegen.joints import TABLE, Template, template
 from nfriction.codegen.loops import Names, body
-from nfriction.codegen.packs import Packing, pack
+from nfriction.codegen.packs import Pack, Packing, pack
 from nfriction.codegen.scalar import Node, reachable
 from nfriction.codegen.squares import completed
+from nfriction.export.c_bounds import bounds_of
 from nfriction.export.c_dialect import ControllerC, array, table
+from nfriction.export.c_exp import LARGEST, LEAST
+from nfriction.export.c_whole import whole, whole_leaves
 
 
 @dataclass(frozen=True)
@@ -158,7 +160,7 @@ class _Function:
         wanted: list[Node] = []
         for (output, _), node in zip(self.targets, nodes, strict=True):
             if output.kind == "int":
-                wanted += _whole_leaves(node)
+                wanted += whole_leaves(node)
             else:
                 wanted += [part for part in _guarded(node) if part is not None]
         return list({node.number: node for node in wanted}.values())
@@ -173,7 +175,17 @@ class _Function:
         wanted = self._wanted(nodes)
         tests = [n for n in reachable(wanted) if n.op == "finite"]
         named = [*tests, *(n.args[0] for n in tests)]
-        made = body(wanted, packing, self.dialect, bound, named, self.names)
+        limits = bounds_of(self.one, wanted)
+
+        def in_place(made: Pack) -> str | None:
+            if made.op != "exp":
+                return None
+            within = (limits[n.args[0].number] for n in made.nodes)
+            if not all(low >= LEAST and high <= LARGEST for low, high in within):
+                return None
+            return self.dialect.array_exp()
+
+        made = body(wanted, packing, self.dialect, bound, named, self.names, in_place)
         texts = dict(zip((n.number for n in wanted), made.texts, strict=True))
         return _Block(made.declarations, made.statements, self._stores(nodes, texts))
 
@@ -190,7 +202,7 @@ class _Function:
                 guarded = node.op == "where" and node.args[0].number in tests
                 test = node.args[0] if guarded else None
                 sides = node.args[1:] if guarded else (node,)
-                lines = [f"{target} = {_whole(x, texts, self.dialect)};" for x in sides]
+                lines = [f"{target} = {whole(x, texts, self.dialect)};" for x in sides]
             else:
                 test, value = _guarded(node)
                 lines = [] if value is None else [f"{target} = {texts[value.number]};"]
@@ -284,36 +296,3 @@ def _guarded(node: Node) -> tuple[Node | None, Node | None]:
     if node.op == "where" and _is_nan(node.args[2]):
         return node.args[0], node.args[1]
     return None, node
-
-
-def _is_whole(node: Node) -> bool:
-    """Whether a number is whole because of how it is made."""
-    if node.op == "constant":
-        return isinstance(node.value, float) and node.value.is_integer() and abs(node.value) < 2**15
-    if node.op == "where":
-        return _is_whole(node.args[1]) and _is_whole(node.args[2])
-    return node.op in ("add", "sub", "mul", "trunc") and all(_is_whole(a) for a in node.args)
-
-
-def _whole_leaves(node: Node) -> list[Node]:
-    """What has to be computed as it is for a whole number."""
-    if not _is_whole(node):
-        return [node]
-    if node.op == "where":
-        return [node.args[0], *_whole_leaves(node.args[1]), *_whole_leaves(node.args[2])]
-    return [leaf for a in node.args for leaf in _whole_leaves(a)]
-
-
-def _whole(node: Node, texts: Mapping[int, str], dialect: ControllerC) -> str:
-    """A whole number in the arithmetic of int."""
-    if not _is_whole(node):
-        return f"(int)({texts[node.number]})"
-    if node.op == "constant":
-        return f"{int(node.value)}" if node.value >= 0 else f"({int(node.value)})"
-    if node.op == "trunc":
-        return _whole(node.args[0], texts, dialect)
-    if node.op == "where":
-        test, a, b = texts[node.args[0].number], *(_whole(x, texts, dialect) for x in node.args[1:])
-        return f"(({test}) ? {a} : {b})"
-    text, _ = expression(node.op, [(_whole(a, texts, dialect), 0) for a in node.args], dialect)
-    return text

@@ -11,19 +11,24 @@ from torch import Tensor, nn
 
 from nfriction.codegen import UnsupportedOperation
 from nfriction.codegen.emit import Real
-from nfriction.export.c_dialect import ControllerC, bits, comment
+from nfriction.export.c_dialect import ControllerC, bits
+from nfriction.export.c_exp import exponential
 from nfriction.export.c_function import Emitted, Output, emit
+from nfriction.export.c_header import (
+    filter_signatures,
+    header_of,
+    init_signature,
+    step_signature,
+)
 from nfriction.export.controller import (
-    CLAMPED,
     FILTER_STATE,
-    NOT_FINITE,
-    SATURATED,
     AnyController,
     Controller,
     FilteredController,
     MemoryController,
 )
 from nfriction.export.errors import ExportError
+from nfriction.export.flat import shortened
 
 
 @dataclass(frozen=True)
@@ -86,6 +91,7 @@ def source_of(
     """
     inner = controller.inner if isinstance(controller, FilteredController) else controller
     assert isinstance(inner, (Controller, MemoryController))
+    inner = shortened(inner, number_by_number=True)
     if real == "float":
         inner = _single(inner)
     dialect = ControllerC(real, prefix)
@@ -101,8 +107,9 @@ def source_of(
         raise ExportError(f"the model has no C form: {error}") from error
     includes = "#include <limits.h>\n#include <math.h>\n#include <string.h>\n"
     head = f'/* Made by nfriction; do not edit. {name}.h says what it is. */\n#include "{name}.h"\n'
-    code = [f"{head}\n{includes}", dialect.functions(), bits(prefix, real), *parts]
-    header = _header(controller, inner, description, real, prefix)
+    rapid = exponential(prefix, real) if "array_exp" in dialect.used else ""
+    code = [f"{head}\n{includes}", dialect.functions(), bits(prefix, real), rapid, *parts]
+    header = header_of(controller, inner, description, real, prefix)
     return Source("\n".join(part for part in code if part), header)
 
 
@@ -158,20 +165,7 @@ def _step(inner: Controller | MemoryController, dialect: ControllerC) -> str:
         ]
     arrays = {"following": "state->memory"}
     made = emit(f"{prefix}_step_joint", inner, inputs, outputs, dialect, arrays)
-    return _public(_step_signature(inner, prefix), [made], before)
-
-
-def _step_signature(inner: Controller | MemoryController, prefix: str) -> str:
-    real, joints = f"{prefix}_real", f"{prefix.upper()}_JOINTS"
-    state = [f"{prefix}_state *state"] if isinstance(inner, MemoryController) else []
-    arguments = [
-        *state,
-        *(f"const {real} {x}[{joints}]" for x in ("qd", "qdd", "load")),
-        f"{real} tau[{joints}]",
-        f"{real} coefficients[{joints} * {prefix.upper()}_COEFFICIENTS]",
-        f"int status[{joints}]",
-    ]
-    return f"void {prefix}_step(\n    " + ",\n    ".join(arguments) + ")"
+    return _public(step_signature(inner, prefix), [made], before)
 
 
 def _init(inner: MemoryController, dialect: ControllerC) -> str:
@@ -179,14 +173,7 @@ def _init(inner: MemoryController, dialect: ControllerC) -> str:
     inputs = _examples(inner.joints, "qd", "qdd")
     arrays = {"following": "state->memory"}
     made = emit(name, inner.initial_state, inputs, [Output("following")], dialect, arrays)
-    return _public(_init_signature(dialect.prefix), [made])
-
-
-def _init_signature(prefix: str) -> str:
-    arguments = ", ".join(
-        f"const {prefix}_real {x}[{prefix.upper()}_JOINTS]" for x in ("qd", "qdd")
-    )
-    return f"void {prefix}_init(\n    {prefix}_state *state, {arguments})"
+    return _public(init_signature(dialect.prefix), [made])
 
 
 def _filter(controller: FilteredController, dialect: ControllerC) -> list[str]:
@@ -218,107 +205,10 @@ def _filter(controller: FilteredController, dialect: ControllerC) -> list[str]:
         before.insert(0, "int i;")
         after = [f"for (i = 0; i < {joints}; ++i) {{", "    qd[i] = (float)velocity[i];",
                  "    qdd[i] = (float)acceleration[i];", "}"]  # fmt: skip
-    init, step_signature, reset = _filter_signatures(prefix)
+    init, stepping, reset = filter_signatures(prefix)
     return [
         *([own.functions(), bits(own.prefix, "double")] if single else []),
         _public(init, [rest]),
         f"{reset}\n{{\n    {prefix}_filter_init(filter, q);\n}}\n",
-        _public(step_signature, [step], before, after),
+        _public(stepping, [step], before, after),
     ]
-
-
-def _filter_signatures(prefix: str) -> tuple[str, str, str]:
-    real, joints = f"{prefix}_real", f"{prefix.upper()}_JOINTS"
-    rest = f"({prefix}_filter *filter, const double q[{joints}])"
-    step = (
-        f"void {prefix}_filter_step(\n    {prefix}_filter *filter, const double q[{joints}],\n"
-        f"    {real} qd[{joints}], {real} qdd[{joints}])"
-    )
-    return f"void {prefix}_filter_init{rest}", step, f"void {prefix}_filter_reset{rest}"
-
-
-def _header(
-    controller: AnyController,
-    inner: Controller | MemoryController,
-    description: Mapping[str, Any],
-    real: Real,
-    prefix: str,
-) -> str:
-    upper = prefix.upper()
-    memory = inner.state_size if isinstance(inner, MemoryController) else 0
-    filters = isinstance(controller, FilteredController)
-    sizes = {
-        "JOINTS": inner.joints,
-        "COEFFICIENTS": inner.coefficient_count,
-        "STATE_SIZE": memory,
-        "FILTER_SIZE": FILTER_STATE if filters else 0,
-        "CLAMPED": CLAMPED,
-        "NOT_FINITE": NOT_FINITE,
-        "SATURATED": SATURATED,
-    }
-    parts = [
-        _banner(description),
-        f"#ifndef {upper}_H\n#define {upper}_H\n",
-        "\n".join(f"#define {upper}_{key} {value}" for key, value in sizes.items()) + "\n",
-        '#ifdef __cplusplus\nextern "C" {\n#endif\n',
-        f"typedef {real} {prefix}_real;\n",
-    ]
-    if memory:
-        parts.append(
-            "/* What the coefficients remember of earlier samples. */\ntypedef struct {\n"
-            f"    {prefix}_real memory[{upper}_JOINTS * {upper}_STATE_SIZE];\n"
-            f"}} {prefix}_state;\n\n"
-            "/* Memory before the first sample, whose motion is given. */\n"
-            f"{_init_signature(prefix)};\n"
-        )
-    parts.append(
-        "/* Friction torque, coefficients (joint by joint) and status bits of every joint.\n"
-        " * No array may be NULL, and no output may lie where an input does. */\n"
-        f"{_step_signature(inner, prefix)};\n"
-    )
-    if filters:
-        init, step, reset = _filter_signatures(prefix)
-        parts.append(
-            f"/* Two causal low-pass filters in series, each of {FILTER_STATE // 2 - 1} states.\n"
-            " * Positions are double: their differences would cost float its digits. */\n"
-            f"typedef struct {{\n    double memory[{upper}_JOINTS * {upper}_FILTER_SIZE];\n"
-            f"}} {prefix}_filter;\n\n"
-            f"/* A filter that has rested at positions q; the same to start anew. */\n{init};\n"
-            f"{reset};\n\n"
-            "/* Velocity and acceleration of one more sample, to be taken at the sample time. */\n"
-            f"{step};\n"
-        )
-    parts.append("#ifdef __cplusplus\n}\n#endif\n\n#endif\n")
-    return "\n".join(parts)
-
-
-def _banner(description: Mapping[str, Any]) -> str:
-    """What the controller is, as a comment; names and units are foreign text."""
-    units = description["units"]
-    names = list(description["joint_names"]) or [
-        f"joint {i + 1}" for i in range(description["joints"])
-    ]
-    time = description["sample_time"]
-    lines = [
-        f"{description['model']}: friction of {description['joints']} joints, made by nfriction "
-        f"{description['version']} (schema {description['schema']}).",
-        "",
-        "Inputs: " + ", ".join(f"{x} [{units[x]}]" for x in ("qd", "qdd", "load")) + ".",
-        f"Outputs: tau [{units['tau_f']}], on the left of M(q) qdd + bias(q, qd) + tau = drive; "
-        "coefficients:",
-        "    " + ", ".join(f"{c['name']} [{c['unit']}]" for c in description["coefficients"]),
-        f"Sample time: {'any' if time is None else f'{time!r} s'}.",
-        "Joints, in order:",
-        *(f"    {name}" for name in names),
-        "Trained ranges:",
-        *(f"    {key}: {value}" for key, value in sorted(description["input_ranges"].items())),
-        "Outside them the coefficients stay as at the edge while the law goes on (CLAMPED). NaN or",
-        "infinity gives NaN for that joint (NOT_FINITE), under -ffast-math too. SATURATED: the "
-        "torque limit.",
-        f"Torque limit: {description['torque_limit']}.",
-        f"Filter: {description['filter']}.",
-        f"Parameters: {description['parameter_hash']}.",
-        *(f"Training data: {k}: {v}" for k, v in sorted(description["training_data"].items())),
-    ]
-    wrapped = "\n".join(f" * {comment(line)}".rstrip() for line in lines)
-    return f"/*\n{wrapped}\n */"

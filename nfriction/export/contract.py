@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,12 +20,15 @@ from nfriction.export.controller import (
     MemoryController,
     controller_of,
 )
+from nfriction.export.errors import ContractError
+from nfriction.export.parity import COEFFICIENT_SLACK, Parity, compare
 from nfriction.export.points import draw, trials
 from nfriction.friction import FrictionModel
 from nfriction.modelfile import ModelInfo, describe
 
 __all__ = [
     "CLAMPED",
+    "COEFFICIENT_SLACK",
     "NOT_FINITE",
     "SATURATED",
     "AnyController",
@@ -47,16 +49,10 @@ FORMAT, SCHEMA = "nfriction controller", 1
 # Largest torque error over full scale that a target in double, or in single precision, may show;
 # in single precision it is more where the model itself is steep.
 TOLERANCE = {"float64": 1e-12, "float32": 5e-7}
-# Coefficients come out of longer sums than the torque, some of them small differences.
-COEFFICIENT_SLACK = 20.0
 OUTPUTS = ("tau_f", "coefficients", "status")
 MOST_VECTORS, MOST_STATES = 100_000, 1000
 
 Runner = Callable[..., Sequence[Any]]
-
-
-class ContractError(ValueError):
-    """Metadata of an artefact are absent, damaged or not ours."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,42 +123,6 @@ class Contract:
         return cls(content, inputs, outputs, tolerance)
 
 
-@dataclass(frozen=True)
-class Parity:
-    """How close an artefact comes to its model.
-
-    Attributes:
-        points: samples compared.
-        torque_error: largest |difference| of the torque over the largest |torque| of the joint.
-        coefficient_error: the same of the coefficients, over the largest of each coefficient.
-        edges: samples whose status, or whose NaN, are not those of the model.
-        tolerance: what the torque error may be; the coefficients have 20 times that.
-    """
-
-    points: int
-    torque_error: float
-    coefficient_error: float
-    edges: int
-    tolerance: float
-
-    @property
-    def passed(self) -> bool:
-        """Whether all of it is within tolerance."""
-        return (
-            self.points > 0
-            and self.torque_error <= self.tolerance
-            and self.coefficient_error <= COEFFICIENT_SLACK * self.tolerance
-            and not self.edges
-        )
-
-    def __str__(self) -> str:
-        return (
-            f"{self.points} points: torque {self.torque_error:.1e} and coefficients "
-            f"{self.coefficient_error:.1e} of full scale, {self.edges} wrong at the edges "
-            f"(tolerance {self.tolerance:.0e})"
-        )
-
-
 def contract_of(
     model: FrictionModel,
     controller: AnyController,
@@ -209,8 +169,8 @@ def contract_of(
 def _single_tolerance(controller: AnyController) -> float:
     """What a target in single precision may err.
 
-    A network that is steep in its inputs passes their roundings on: twice what torch errs in
-    single precision is allowed where that is more.
+    A network that is steep in its inputs passes their roundings on: three times what torch errs in
+    single precision over 2000 samples is allowed where that is more.
     """
     inner = controller.inner if isinstance(controller, FilteredController) else controller
     inputs = tuple(x.float() for x in draw(inner, 2000, seed=7))
@@ -224,7 +184,7 @@ def _single_tolerance(controller: AnyController) -> float:
         expected, found = inner(*doubled), single(*inputs)
     parity = compare(expected, found, TOLERANCE["float32"])
     worst = max(parity.torque_error, parity.coefficient_error / COEFFICIENT_SLACK)
-    return max(TOLERANCE["float32"], float(f"{2.0 * worst:.1e}"))
+    return max(TOLERANCE["float32"], float(f"{3.0 * worst:.1e}"))
 
 
 def _interface(controller: AnyController, inputs: Sequence[str]) -> dict[str, Any]:
@@ -286,45 +246,6 @@ def verify(run: Runner, contract: Contract) -> Parity:
     """
     found = run(*contract.inputs.values())
     return compare(tuple(contract.outputs.values()), found, contract.tolerance)
-
-
-def compare(expected: Sequence[Any], found: Sequence[Any], tolerance: float) -> Parity:
-    """Compare torque, coefficients and status with those of the model.
-
-    Args:
-        expected, found: torque (sample, joint), coefficients (sample, joint, coefficient) and
-            status (sample, joint).
-        tolerance: see `Parity`.
-
-    Raises:
-        ContractError: if the shapes differ.
-    """
-    model, artefact = ([_array(x) for x in side] for side in (expected, found))
-    shapes = [[x.shape for x in side] for side in (model, artefact)]
-    if shapes[0] != shapes[1]:
-        raise ContractError(f"the artefact gives shapes {shapes[1]}, the model {shapes[0]}.")
-    wrong = model[2] != artefact[2]
-    wrong |= np.isnan(model[0]) != np.isnan(artefact[0])
-    wrong |= (np.isnan(model[1]) != np.isnan(artefact[1])).any(-1)
-    return Parity(
-        points=len(model[0]),
-        torque_error=_error(model[0], artefact[0], axis=(0,)),
-        coefficient_error=_error(model[1], artefact[1], axis=(0, 1)),
-        edges=int(wrong.sum()),
-        tolerance=tolerance,
-    )
-
-
-def _error(expected: np.ndarray, found: np.ndarray, axis: tuple[int, ...]) -> float:
-    """Largest difference over the largest value along `axis`; where either is NaN is not seen."""
-    difference = np.nan_to_num(np.abs(found - expected), nan=0.0, posinf=math.inf)
-    scale = np.nan_to_num(np.abs(expected), nan=0.0).max(axis, initial=0.0)
-    worst = difference.max(axis, initial=0.0)
-    return float(np.where(worst > 0, worst / np.maximum(scale, 1e-300), 0.0).max(initial=0.0))
-
-
-def _array(x: Any) -> np.ndarray:
-    return np.asarray(x.detach().cpu() if isinstance(x, Tensor) else x, dtype=np.float64)
 
 
 def _plain(x: Tensor) -> list[Any]:

@@ -69,10 +69,10 @@ class _Contracted(nn.Module):
 
     def _seen(self, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Velocity and acceleration that the schedule sees, and whether they leave the range."""
-        if qd.shape[-1] != self.joints:
+        if qd.size(-1) != self.joints:
             raise ValueError(
                 f"inputs must be (*batch, joint) with {self.joints} joints, got last axis "
-                f"{qd.shape[-1]}."
+                f"{qd.size(-1)}."
             )
         qd_held = torch.clamp(qd, self.qd_lower, self.qd_upper)
         qdd_held = torch.clamp(qdd, self.qdd_lower, self.qdd_upper)

@@ -2,8 +2,9 @@
 
 from nfriction.fitting.adaptive import fit_adaptive, fit_by_search
 from nfriction.fitting.classes import AccelerationClasses, find_classes
-from nfriction.fitting.estimate import Fit, fit
+from nfriction.fitting.estimate import fit
 from nfriction.fitting.neurofuzzy import NetworkFit, train_network, train_on_controller
+from nfriction.fitting.outcome import Fit, nearest_fit
 from nfriction.fitting.search import SearchState
 
 __all__ = [
@@ -15,6 +16,7 @@ __all__ = [
     "fit",
     "fit_adaptive",
     "fit_by_search",
+    "nearest_fit",
     "train_network",
     "train_on_controller",
 ]

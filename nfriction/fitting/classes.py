@@ -29,8 +29,9 @@ Intervals = Mapping[str, Mapping[str, Sequence[tuple[str, float, float]]]]
 LEAST_VARIATION = 1.5
 # Below this [rad/s^2] a joint does not accelerate; keeps logarithms finite.
 STILL = 1e-6
-# Accelerations below a thousandth of a joint's largest are one class of "nothing happens".
-DYNAMIC_RANGE = 1e-3
+# Accelerations below a hundredth of a joint's largest are one class of "nothing happens": a joint
+# that creeps to its rest would else have a class, and all that swings only two.
+DYNAMIC_RANGE = 1e-2
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,13 @@ from torch import Tensor, nn
 RATIO_BOUND, RATIO_SD = 0.3, 0.1
 # An encoder's zero is known to about a degree.
 ANGLE_BOUND, ANGLE_SD = 0.1, 0.02
+# A disc sits on its shaft to within some hundredths of a millimetre, at a radius of a centimetre.
+ECCENTRICITY_BOUND, ECCENTRICITY_SD = 0.02, 0.002
+# A force offset is a bias of the drive's current sensor; where friction is dry, a large one and a
+# wrong zero of an angle pass for each other.
+OFFSET_SHARE = 0.01
+# Of the largest force over the largest speed, a guide's asymmetry is a small part.
+ASYMMETRY_SHARE = 0.1
 # Air drag: the quadratic term of a slender bar is 0.5 rho c_d width, below 0.1 N s^2/m^3.
 DRAG_SD = 0.05
 # The last link's end is where nobody measures: what stands in the air may end before the tip or
@@ -42,7 +49,13 @@ class PlantParameter:
 
 
 def plant_parameters(
-    plant: nn.Module, *, driven: bool, largest_torque: float = 0.0, drag: bool = False
+    plant: nn.Module,
+    *,
+    driven: bool,
+    largest_torque: float = 0.0,
+    largest_rate: float = 0.0,
+    drag: bool = False,
+    eccentricity: bool = False,
 ) -> list[PlantParameter]:
     """The terms of a plant that a recording can tell.
 
@@ -51,12 +64,14 @@ def plant_parameters(
         driven: torque was measured. Free swing tells only ratios, so the first gravity term is
             kept as the scale.
         largest_torque: largest torque in the recordings [N m]; bounds a torque offset.
+        largest_rate: largest velocity in the recordings [m/s]; scale of an axis' asymmetry.
         drag: fit air drag on the links: one quadratic coefficient for all; of several links also
             a linear one, and how far the last reaches into the air.
+        eccentricity: fit how far the encoders sit off their shafts, two numbers a link.
 
     Returns:
         Ratios of inertia, gravity, armature and mass terms, angle offsets, torque offsets of
-        driven joints, and drag.
+        driven joints, drag, and eccentricity.
     """
     buffers = dict(plant.named_buffers())
     found: list[PlantParameter] = []
@@ -92,7 +107,11 @@ def plant_parameters(
         joints = buffers["torque_offset"].shape[-1]
         for j, unit in enumerate(torch.eye(joints, dtype=torch.float64)):
             bound = 0.3 * largest_torque
-            shift(f"torque offset {j + 1} [N m]", "torque_offset", unit, -bound, bound, bound / 3)
+            shift(f"torque offset {j + 1} [N m]", "torque_offset", unit, -bound, bound,
+                  OFFSET_SHARE * largest_torque)  # fmt: skip
+    if driven and "asymmetry" in buffers and largest_rate > 0:
+        unit, sd = torch.ones_like(buffers["asymmetry"]), largest_torque / largest_rate
+        shift("asymmetry [N s/m]", "asymmetry", unit, -sd, sd, ASYMMETRY_SHARE * sd)
     if drag:
         length = buffers["length"]
         # On a single link, linear drag is viscous friction of the joint, and the reach the scale
@@ -104,6 +123,12 @@ def plant_parameters(
             last = torch.zeros_like(length)
             last[-1] = length[-1]
             shift("drag reach", "length", last, REACH_LOWER, REACH_UPPER, REACH_SD)
+    if eccentricity:
+        joints = buffers["angle_offset"].shape[-1]
+        for j, unit in enumerate(torch.eye(joints, dtype=torch.float64)):
+            for part in ("cosine", "sine") if j >= joints - len(buffers["length"]) else ():
+                shift(f"encoder {part} {j + 1} [rad]", f"encoder_{part}", unit,
+                      -ECCENTRICITY_BOUND, ECCENTRICITY_BOUND, ECCENTRICITY_SD)  # fmt: skip
     return found
 
 

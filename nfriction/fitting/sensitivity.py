@@ -1,9 +1,10 @@
 """Exact sensitivities of windows of a simulated motion.
 
 A window's motion is a chain of identical step maps. All step maps are linearised at once, in
-forward mode over a few directions (state, held coefficients, plant terms); a recursion of small
-matrix products then carries the sensitivity through time. The cost hardly depends on how many
-parameters shape the coefficients, so constant and neuro-fuzzy models are fitted alike.
+forward mode over a few directions (state, held coefficients, plant terms), and steps between
+samples that count are chained in these directions; a recursion of small matrix products then
+carries the sensitivity through time. The cost hardly depends on how many parameters shape the
+coefficients, so constant and neuro-fuzzy models are fitted alike.
 """
 
 import logging
@@ -17,6 +18,7 @@ from torch import Tensor
 from nfriction import codegen
 from nfriction.fitting.plant_parameters import PlantParameter, adjusted_buffers
 from nfriction.friction import FrictionModel
+from nfriction.friction.schedules import FactoredSensitivity, Sensitivity
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.simulation import Rollout, rk4_step
 
@@ -28,9 +30,9 @@ CHUNK = 1024
 
 @dataclass(frozen=True)
 class StepMaps:
-    """Derivatives of the step maps of a run of steps, each (step, window, 3 joint, ·).
+    """Derivatives of the maps of a run of blocks of steps, each (block, window, 3 joint, ·).
 
-    The rows are q, qd and qdd after the step; the columns those before it, the friction model's
+    The rows are q, qd and qdd after the block; the columns those before it, the friction model's
     parameters, and the plant's.
     """
 
@@ -135,9 +137,19 @@ def start_slope(
 
 
 def step_maps(
-    jacobian: StepJacobian, motion: Rollout, tau: Tensor, step: Tensor, vector: Tensor, run: int
+    jacobian: StepJacobian,
+    motion: Rollout,
+    tau: Tensor,
+    step: Tensor,
+    vector: Tensor,
+    run: int,
+    block: int = 1,
+    states: Tensor | None = None,
 ) -> Iterator[StepMaps]:
-    """Linearise all steps of windows, `run` of them at a time, in order.
+    """Linearise windows, `run` blocks of `block` steps at a time, in order.
+
+    What lies between the ends of a block is composed for few directions before the many
+    parameters come in. Steps after the last whole block are left out.
 
     Args:
         jacobian: derivatives of one step.
@@ -145,47 +157,71 @@ def step_maps(
         tau: torque held over each step, (window, step, joint).
         step: [s], (window, step).
         vector: parameters of the plant.
-        run: steps to a piece.
+        run: blocks to a piece.
+        block: steps to a block.
+        states: memory of the coefficients at every step, (window, step, joint, size), of a
+            schedule that has one; what it owes to the motion is not differentiated.
     """
     windows, steps = step.shape
-    joints = motion.q.shape[-1]
 
-    def samples(x: Tensor, part: slice, width: int) -> Tensor:
-        return x[:, part].transpose(0, 1).reshape(-1, width)
+    def samples(x: Tensor, part: slice) -> Tensor:
+        return x[:, part].unflatten(1, (-1, block)).transpose(0, 1).flatten(0, 2)
 
-    for start in range(0, steps, run):
-        part = slice(start, min(start + run, steps))
-        q, qd, qdd = (samples(x, part, joints) for x in (motion.q, motion.qd, motion.qdd))
-        held = jacobian.friction.coefficients(qd, qdd).detach()
-        held = held.expand(*qd.shape, held.shape[-1])
+    last = steps // block * block
+    for start in range(0, last, run * block):
+        part = slice(start, min(start + run * block, last))
+        q, qd, qdd = (samples(x, part) for x in (motion.q, motion.qd, motion.qdd))
+        schedule = jacobian.friction.schedule
+        if states is None:
+            held, slope = schedule(qd, qdd), schedule.sensitivities(qd, qdd)
+        else:
+            memory = samples(states, part)
+            held = schedule.coefficients_from(qd, qdd, memory)
+            slope = schedule.sensitivities_from(qd, qdd, memory)
+        held = held.detach().expand(*qd.shape, held.shape[-1])
         derivative = jacobian(
-            q, qd, held, samples(tau, part, joints), samples(step, part, 1), vector
+            q, qd, held, samples(tau, part), samples(step[..., None], part), vector
         )
-        maps = _compose(jacobian.friction, derivative, qd, qdd, len(jacobian.parameters))
-        shape = (part.stop - part.start, windows, 3 * joints, -1)
-        yield StepMaps(*(m.reshape(shape) for m in maps))
+        maps = _compose(slope, derivative, block, len(jacobian.parameters))
+        yield StepMaps(*(m.unflatten(0, (len(m) // windows, windows)) for m in maps))
 
 
 def _compose(
-    friction: FrictionModel, derivative: Tensor, qd: Tensor, qdd: Tensor, plant_count: int
+    slope: Sensitivity | FactoredSensitivity, derivative: Tensor, block: int, plant_count: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Close the loop from the state through the coefficients."""
-    samples, joints = qd.shape
+    """Close the loop from the state through the coefficients, and chain the steps of blocks."""
+    samples, joints = slope.qd.shape[:2]
     by_q, by_qd, by_held, by_plant = derivative.split(
         [joints, joints, derivative.shape[-1] - 2 * joints - plant_count, plant_count], dim=-1
     )
-    by_held = by_held.reshape(samples, 3 * joints, joints, -1)
-    slope = friction.schedule.sensitivities(qd, qdd)
-    state = torch.cat(
+    k = by_held.shape[-1] // joints
+    of_joint = by_held.unflatten(-1, (joints, k))
+    by_state = torch.cat(
         [
             by_q,
-            by_qd + torch.einsum("sijk,sjk->sij", by_held, slope.qd),
-            torch.einsum("sijk,sjk->sij", by_held, slope.qdd),
+            by_qd + torch.einsum("sijk,sjk->sij", of_joint, slope.qd),
+            torch.einsum("sijk,sjk->sij", of_joint, slope.qdd),
         ],
         -1,
     )
-    parameters = state.new_empty(samples, 3 * joints, len(slope.joint))
-    for joint in range(joints):
-        own = (slope.joint == joint).nonzero().squeeze(-1)
-        parameters[..., own] = by_held[:, :, joint] @ slope.parameters[..., own]
-    return state, parameters, by_plant
+    steps = (x.unflatten(0, (samples // block, block)) for x in (by_state, by_held, by_plant))
+    state, held, plant = _chained(*steps)
+    return state, slope.pulled(held.unflatten(-1, (joints, k)).transpose(1, 2)), plant
+
+
+def _chained(state: Tensor, held: Tensor, plant: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Derivatives of the ends of blocks from those of their steps, each (block, step, row, ·).
+
+    Returns:
+        By the state before the block; by what was held over each of its steps, step by step; and
+        by what acts in all of them.
+    """
+    steps = state.shape[1]
+    if steps == 1:
+        return state[:, 0], held, plant[:, 0]
+    after, rows, total = state[:, -1], [held[:, -1]], plant[:, -1]
+    for s in range(steps - 2, -1, -1):
+        rows.append(after @ held[:, s])
+        total = total + after @ plant[:, s]
+        after = after @ state[:, s]
+    return after, torch.stack(rows[::-1], 1), total

@@ -93,6 +93,29 @@ def fit_torque(
     )
 
 
+def natural_scale(law: Law, torque: TorqueFit, qd: Tensor) -> Tensor:
+    """Size of each coefficient that alone would explain a third of the friction torque.
+
+    Args:
+        law: whose coefficients they are.
+        torque: its fit to the motion.
+        qd: velocity along the motion [rad/s], (sample, joint).
+
+    Returns:
+        In SI, (joint, coefficient); zero where the torque is not linear in the coefficient.
+    """
+    rms = qd.square().mean(0).sqrt()
+    columns = []
+    for c in law.coefficients:
+        if not c.linear:
+            columns.append(torch.zeros_like(rms))
+        elif c.unit.endswith("s/rad"):
+            columns.append(torque.torque / rms / 3)
+        else:
+            columns.append(torque.torque / 3)
+    return torch.stack(columns, -1)
+
+
 def _linear_fit(
     law: Law,
     qd: Tensor,

@@ -6,7 +6,7 @@ are found together by Levenberg-Marquardt with exact sensitivities.
 """
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -22,8 +22,9 @@ from nfriction.solve.levenberg import LeastSquaresResult, LevenbergMarquardt, Qu
 
 logger = logging.getLogger(__name__)
 
-# Steps whose sensitivities are accumulated together: large enough for fast matrix products.
-RUN = 50
+# Samples, over all windows, whose sensitivities are accumulated together: enough for fast matrix
+# products, few enough for the processor's cache.
+PIECE = 2000
 # Smoothed start states are off by far less; the prior only keeps a window from running away.
 START_Q_SD, START_QD_SD = 0.01, 0.3
 
@@ -45,6 +46,8 @@ class TrajectoryProblem:
         plant_mean: where the prior of the plant's terms is centred; default the plant as given.
         stride: only every so many-th sample counts, for as many: errors of a model last far
             longer than a sample, and the sums over many parameters are what a step costs.
+        memory: of the coefficients at the start of each window, (window, joint, state_size), of a
+            schedule that has one. It advances with every step of the integration.
     """
 
     jacobian: StepJacobian
@@ -54,6 +57,7 @@ class TrajectoryProblem:
     substeps: int = 1
     plant_mean: Tensor | None = None
     stride: int = 1
+    memory: Tensor | None = None
 
     def __post_init__(self) -> None:
         w = self.windows
@@ -128,10 +132,9 @@ class TrajectoryProblem:
         """Gauss-Newton model of the cost at `x`."""
         r = self.residuals(x)
         precision, mean = self.prior()
-        gradient, hessian = precision * (x - mean), torch.diag(precision)
-        own, shared = self._normal_equations(x, r)
-        self._scatter(gradient, hessian, own, shared)
-        return Quadratic(self.cost(x), gradient, hessian)
+        gradient, hessian = self._normal_equations(x, r)
+        hessian.diagonal().add_(precision)
+        return Quadratic(self.cost(x), gradient + precision * (x - mean), hessian)
 
     def _simulate(self, x: Tensor) -> Rollout:
         """Motion at `x`; the last one is kept, as a step's cost and model ask for the same."""
@@ -141,9 +144,19 @@ class TrajectoryProblem:
         self.friction.schedule.set_parameter_vector(parameters)
         q0, qd0 = state.chunk(2, -1)
         plant = self.plant_at(plant_vector)
-        motion = integrate(plant, self.friction, q0, qd0, self.tau, self.step)
+        motion = integrate(plant, self.friction, q0, qd0, self.tau, self.step, memory=self.memory)
         self._simulated = (x.clone(), motion)
         return motion
+
+    @torch.no_grad()
+    def _states(self, motion: Rollout) -> Tensor | None:
+        """Memory at every step of a motion, (window, step + 1, joint, state_size)."""
+        if self.memory is None:
+            return None
+        rows = [self.memory]
+        for qd, qdd in zip(motion.qd.unbind(1)[1:], motion.qdd.unbind(1)[1:], strict=True):
+            rows.append(self.friction.schedule.advance(qd, qdd, rows[-1]))
+        return torch.stack(rows, 1)
 
     def prior(self) -> tuple[Tensor, Tensor]:
         """Prior precision and mean of every unknown."""
@@ -163,61 +176,60 @@ class TrajectoryProblem:
         return sd.square().reciprocal(), torch.cat([mean, start.reshape(-1)])
 
     def _normal_equations(self, x: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
-        """J^T r and J^T J of each window over [friction, plant, its own state]."""
-        _, plant_vector, _ = self.split(x)
+        """J^T r and J^T J of all unknowns."""
+        shared, windows, joints = self.shared_count, *self.windows.q0.shape
+        gradient = torch.zeros_like(x)
+        hessian = torch.zeros(len(x), len(x), dtype=torch.float64)
+        of_state = torch.zeros(windows, 2 * joints, 2 * joints, dtype=torch.float64)
+        mixed = torch.zeros(windows, 2 * joints, shared, dtype=torch.float64)
+        for part, rows in self._sensitivities(x):
+            scaled = (self.mixing @ rows) * self._scale[:, part, :, None]
+            common, own = scaled.flatten(1, 2).split([shared, 2 * joints], -1)
+            left = r[:, part].flatten(1)
+            gradient[:shared] += left.flatten() @ common.flatten(0, 1)
+            gradient[shared:] += (left[:, None] @ own).flatten()
+            # A window's own state has nothing to do with another's.
+            hessian[:shared, :shared] += common.flatten(0, 1).T @ common.flatten(0, 1)
+            mixed += own.mT @ common
+            of_state += own.mT @ own
+        hessian[shared:, :shared] = mixed.flatten(0, 1)
+        hessian[:shared, shared:] = mixed.flatten(0, 1).T
+        hessian[shared:, shared:] = torch.block_diag(*of_state)
+        return gradient, hessian
+
+    def _sensitivities(self, x: Tensor) -> Iterator[tuple[slice, Tensor]]:
+        """Derivatives of the positions at the samples that count, some samples at a time.
+
+        Each (window, sample, joint, column); columns are what is shared, then the window's state.
+        """
+        plant_vector = self.split(x)[1]
         motion = self._simulate(x)
         windows, joints = self.windows.q0.shape
-        columns = self.shared_count + 2 * joints
-        carried = torch.zeros(windows, 3 * joints, columns, dtype=torch.float64)
-        carried[:, : 2 * joints, self.shared_count :] = torch.eye(2 * joints, dtype=torch.float64)
+        n, shared = self.friction_count, self.shared_count
+        carried = torch.zeros(windows, 3 * joints, shared + 2 * joints, dtype=torch.float64)
+        carried[:, : 2 * joints, shared:] = torch.eye(2 * joints, dtype=torch.float64)
         by_q, by_plant = start_slope(
             self.jacobian, motion.q[:, 0], motion.qd[:, 0], self.tau[:, 0], plant_vector
         ).tensor_split([2 * joints], -1)
-        carried[:, 2 * joints :, self.friction_count : self.shared_count] = by_plant
-        carried[:, 2 * joints :, self.shared_count :] = by_q
-        slope = torch.zeros(windows, columns, dtype=torch.float64)
-        curvature = torch.zeros(windows, columns, columns, dtype=torch.float64)
-
-        def accumulate(rows: list[Tensor], part: list[int]) -> None:
-            stacked = torch.stack(rows, 1)
-            scale = self._scale[:, part, None]
-            jacobian = ((self.mixing @ stacked) * scale).reshape(windows, -1, columns)
-            slope.add_((r[:, part].reshape(windows, 1, -1) @ jacobian).squeeze(1))
-            curvature.add_(jacobian.transpose(1, 2) @ jacobian)
-
+        carried[:, 2 * joints :, n:shared] = by_plant
+        carried[:, 2 * joints :, shared:] = by_q
+        block = self.stride * self.substeps
+        run = max(1, PIECE // (windows * block))
         sample = 0
         for maps in step_maps(
-            self.jacobian, motion, self.tau, self.step, plant_vector, RUN * self.substeps
+            self.jacobian, motion, self.tau, self.step, plant_vector, run, block,
+            self._states(motion),
         ):  # fmt: skip
-            rows, counted = [], []
-            n = maps.parameters.shape[-1]
-            for k in range(maps.state.shape[0]):
-                at, inner = divmod(k, self.substeps)
-                if inner == 0 and (sample + at) % self.stride == 0:
-                    rows.append(carried[:, :joints])
-                    counted.append(sample + at)
+            rows = []
+            for k in range(len(maps.state)):
+                rows.append(carried[:, :joints])
                 carried = maps.state[k] @ carried
                 carried[..., :n] += maps.parameters[k]
-                carried[..., n : self.shared_count] += maps.plant[k]
-            if rows:
-                accumulate(rows, counted)
-            sample += maps.state.shape[0] // self.substeps
-        if sample % self.stride == 0:
-            accumulate([carried[:, :joints]], [sample])
-        return slope, curvature
-
-    def _scatter(self, gradient: Tensor, hessian: Tensor, own: Tensor, shared: Tensor) -> None:
-        """Add each window's normal equations to the whole system's."""
-        c = self.shared_count
-        gradient[:c] += own[:, :c].sum(0)
-        gradient[c:] += own[:, c:].reshape(-1)
-        hessian[:c, :c] += shared[:, :c, :c].sum(0)
-        size = own.shape[1] - c
-        for w in range(own.shape[0]):
-            at = slice(c + w * size, c + (w + 1) * size)
-            hessian[at, at] += shared[w, c:, c:]
-            hessian[:c, at] += shared[w, :c, c:]
-            hessian[at, :c] += shared[w, c:, :c]
+                carried[..., n:shared] += maps.plant[k]
+            end = sample + self.stride * len(rows)
+            yield slice(sample, end, self.stride), torch.stack(rows, 1)
+            sample = end
+        yield slice(sample, sample + 1), carried[:, None, :joints]
 
 
 def solve_trajectory(

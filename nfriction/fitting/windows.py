@@ -38,6 +38,16 @@ class Windows:
     def __len__(self) -> int:
         return self.q.shape[0]
 
+    def subset(self, chosen: Tensor) -> "Windows":
+        """Some of the windows, by a mask (window,)."""
+        index = chosen.nonzero().flatten().tolist()
+        return Windows(
+            q=self.q[index], tau=self.tau[index], step=self.step[index],
+            weight=self.weight[index], q0=self.q0[index], qd0=self.qd0[index],
+            names=tuple(self.names[i] for i in index),
+            spans=tuple(self.spans[i] for i in index if self.spans),
+        )  # fmt: skip
+
 
 def cut_windows(
     recordings: Sequence[Recording], motions: Sequence[Motion], length: float

@@ -51,7 +51,11 @@ def read_npz(path: Path, _: object = ()) -> pd.DataFrame:
         refuse_size(sum(entry.file_size for entry in archive.infolist()), "unpacked bytes")
     with np.load(content, allow_pickle=False) as arrays:
         for key in arrays.files:
-            values = arrays[key]
+            try:
+                values = arrays[key]
+            except MemoryError as error:
+                # An array's header may claim any size.
+                raise ValueError(f"array {key} is larger than memory") from error
             if key in ATTRIBUTES:
                 attributes[key] = str(values)
             elif values.ndim == 2:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import uuid
 import zipfile
+import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -36,7 +38,7 @@ _WRITERS: dict[str, _Writer] = {
 # What the readers raise on broken content; ValueError covers pandas' parser, pyarrow and Unicode,
 # NotImplementedError and RuntimeError archives of unknown versions or behind a password.
 _BROKEN = (ValueError, OSError, OverflowError, NotImplementedError, RuntimeError,
-           zipfile.BadZipFile, *text.BROKEN)  # fmt: skip
+           zipfile.BadZipFile, zlib.error, EOFError, csv.Error)  # fmt: skip
 
 
 def read_table(path: str | os.PathLike[str], sources: Sequence[str] = ()) -> pd.DataFrame:
@@ -67,9 +69,17 @@ def read_table(path: str | os.PathLike[str], sources: Sequence[str] = ()) -> pd.
 
 
 def write_table(table: pd.DataFrame, path: str | os.PathLike[str]) -> None:
-    """Write a table whole or not at all; the file's ending tells the format."""
+    """Write a table whole or not at all; the file's ending tells the format.
+
+    Missing folders are made.
+
+    Raises:
+        ValueError: an unknown ending.
+        OSError: the file cannot be written.
+    """
     path = Path(path)
     content = _WRITERS[_ending(path, _WRITERS, "written")](table)
+    path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
     try:
         with open(unfinished, "xb") as file:

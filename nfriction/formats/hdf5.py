@@ -59,7 +59,7 @@ class _Reader:
         self.count += 1
         if depth > DEEPEST or self.count > MOST:
             raise ValueError("it is nested too deeply, or in a loop")
-        if not hasattr(item, "dtype"):
+        if not hasattr(item, "shape"):  # a group, or a type that has a name
             content = self.group(item, depth) if hasattr(item, "keys") else {}
             return _struct_array(content)
         self.bytes += int(item.size or 0) * item.dtype.itemsize
@@ -71,10 +71,14 @@ class _Reader:
         # Samples that lie in other files are not ours to read.
         if item.external or item.is_virtual:
             return None
+        if item.attrs.get("MATLAB_empty"):
+            return None  # what is stored is its shape
         values = np.asarray(item[()])
-        if item.attrs.get("MATLAB_class") == b"char":
+        kind = item.attrs.get("MATLAB_class")
+        if kind == b"char":
             return "".join(map(chr, values.ravel().tolist()))
-        return values
+        # MATLAB counts columns first, so a matrix lies here turned.
+        return values if kind is None else values.T
 
     def _referred(self, item: Any, depth: int) -> list[Any]:
         """What the references of a cell, or of a field of an array of structs, lead to."""

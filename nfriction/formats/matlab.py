@@ -84,8 +84,8 @@ def _unpacked(data: memoryview, limit: int) -> bytes:
     stream = zlib.decompressobj()
     plain = stream.decompress(data, limit + 1)
     refuse_size(LARGEST + len(plain) - limit, "unpacked bytes")
-    if not plain:
-        raise ValueError("a variable in it is empty")
+    if len(plain) < 8:
+        raise ValueError("a variable in it is cut short")
     return plain
 
 
@@ -124,6 +124,7 @@ def _matrix(data: memoryview, state: _State, depth: int) -> tuple[str, Any]:
         if kind not in (_CELL, _STRUCT, _CHAR, *_NUMERIC):
             return "", None
         shape = _numbers(*next(parts), order).tolist()
+        _agree(all(isinstance(length, int) and length >= 0 for length in shape))
         name = _text(*next(parts), order)
         # A complex number is no sample of a joint.
         if kind in _NUMERIC and flags & 0x0800:

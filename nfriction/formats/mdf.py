@@ -1,4 +1,4 @@
-"""ASAM MDF measurement files (.mf4, .mdf, .dat) through asammdf."""
+"""ASAM MDF measurement files (.mf4) through asammdf."""
 
 from __future__ import annotations
 

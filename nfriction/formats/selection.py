@@ -48,12 +48,16 @@ def table_arrays(
     Raises:
         ValueError: a column or unit that is missing, unknown or contradicts another.
     """
-    sources = _sources(table, dict(columns or {}))
+    # A table made elsewhere may number its columns.
+    table = table.set_axis([str(name) for name in table.columns], axis=1)
+    columns = {key: str(name) for key, name in (columns or {}).items()}
+    sources = _sources(table, columns)
     joints = max((int(key[1:]) for key in sources if re.fullmatch(r"q\d+", key)), default=1)
+    # Of a lone q9999 one missing column tells enough.
     needed = ["time", *(f"q{k + 1}" for k in range(min(joints, len(sources) + 1)))]
     missing = [key for key in needed if key not in sources]
     if missing:
-        raise ValueError(_missing(table, dict(columns or {}), missing))
+        raise ValueError(_missing(table, columns, missing))
     arrays = {"time": _column(table, "time", sources["time"])}
     for key in ("q", "qd", "tau"):
         group = [sources.get(f"{key}{k + 1}") for k in range(joints)]
@@ -96,7 +100,7 @@ def _sources(table: pd.DataFrame, columns: dict[str, str]) -> dict[str, Source]:
         raise ValueError(
             f"`columns` maps time, q1 …, qd1 …, tau1 … to the file's names, got keys {unknown}."
         )
-    names = set(map(str, table.columns))
+    names = set(table.columns)
     aliases = _texts(table, "aliases")
     mapped = {
         key: parse_source(spec, names) or parse_source(spec, set(aliases))
@@ -113,7 +117,7 @@ def _sources(table: pd.DataFrame, columns: dict[str, str]) -> dict[str, Source]:
 def _known(table: pd.DataFrame, aliases: dict[str, str], source: Source) -> Source:
     """A source by the table's own name for it, with the unit that the file says."""
     column = aliases.get(source.column, source.column)
-    if column in table.attrs.get("repeated", ()):
+    if column in table.attrs.get("repeated", ()) or (table.columns == column).sum() > 1:
         raise ValueError(f"column {column} is there more than once; rename one of them.")
     said = _texts(table, "units").get(column)
     if source.unit and said and canonical_unit(said) != canonical_unit(source.unit):
@@ -146,7 +150,7 @@ def _column(table: pd.DataFrame, kind: str, source: Source) -> Array:
 
 
 def _missing(table: pd.DataFrame, columns: dict[str, str], missing: list[str]) -> str:
-    found = [str(c) for c in table.attrs.get("found", table.columns)]
+    found = [str(name) for name in table.attrs.get("found", table.columns)]
     shown = ", ".join(found[:30]) + (f" … ({len(found)} in all)" if len(found) > 30 else "")
     first = columns.get(missing[0], missing[0])
     stem, _, unit = first.rpartition(":")

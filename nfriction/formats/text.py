@@ -11,8 +11,6 @@ import csv
 import gzip
 import io
 import re
-import zlib
-from itertools import islice
 from pathlib import Path
 
 import pandas as pd
@@ -56,15 +54,15 @@ def parse_csv(text: str) -> pd.DataFrame:
     Raises:
         ValueError: no header, rows that do not fit it, or numbers that may be read in two ways.
     """
-    content = (line for line in io.StringIO(text) if line.strip() and not line.startswith("#"))
-    lines = list(islice(content, 3))
-    if not lines:
+    # Only whole lines are comments: a name such as "enc #1" is none.
+    content = [line for line in io.StringIO(text) if line.strip() and not _is_comment(line)]
+    if not content:
         raise ValueError("it has no header")
+    lines = content[:3]
     separator = _separator(lines[0].rstrip("\r\n"), lines[1:])
     table = pd.read_csv(
-        io.StringIO(text),
+        io.StringIO("".join(content)),
         sep=r"\s+" if separator == " " else separator,
-        comment="#",
         # Text, for Python's float() is exact where the parser's own default is not.
         dtype=str,
         skipinitialspace=True,
@@ -113,12 +111,16 @@ def _comments(text: str) -> dict[str, str]:
     """What comment lines before the header say."""
     found = {}
     for line in io.StringIO(text):
-        if not line.startswith("#"):
+        if not _is_comment(line):
             break
-        key, _, value = line[1:].partition(":")
+        key, _, value = line.lstrip()[1:].partition(":")
         if key.strip() in ATTRIBUTES:
             found[key.strip()] = value.strip()
     return found
+
+
+def _is_comment(line: str) -> bool:
+    return line.lstrip().startswith("#")
 
 
 def _separator(header: str, rows: list[str]) -> str:
@@ -180,6 +182,3 @@ def _is_number(cell: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-BROKEN = (zlib.error, EOFError, csv.Error)

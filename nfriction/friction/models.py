@@ -1,7 +1,7 @@
 """Friction models: a law times a schedule, `tau_f = model(qd, qdd, load)`."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import torch
@@ -9,9 +9,10 @@ from torch import Tensor, nn
 
 from nfriction.friction import laws
 from nfriction.friction.adaptive import Adaptive
+from nfriction.friction.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
 from nfriction.friction.controller_schedule import RadialBasis
 from nfriction.friction.laws import Law
-from nfriction.friction.neurofuzzy import NeuroFuzzy
+from nfriction.friction.neurofuzzy import PRIOR_SD, NeuroFuzzy
 from nfriction.friction.schedules import Constant, Schedule
 
 # Velocity over which the sign turns [rad/s]; larger values creep, smaller ones make RK4 unstable.
@@ -218,7 +219,9 @@ class NeuroFuzzyModel(FrictionModel):
         v_smooth: see `FrictionModel`.
         terms, head_units, acceleration, interpretable, prior_sd: see `NeuroFuzzy`.
         network: `"rbf"` takes the papers' network alone (`RadialBasis`) in place of the ANFIS
-            layer with its head; `head_units` are its units, and sets it has none.
+            layer with its head; `head_units` are its units, and sets it has none. `"by_class"`
+            lets the network deviate from coefficients by class (`AdaptiveNeuroFuzzy`).
+        memory: options of its `Adaptive` part.
     """
 
     definition: Law
@@ -233,16 +236,18 @@ class NeuroFuzzyModel(FrictionModel):
         head_units: int = 10,
         acceleration: Literal["along_motion", "signed"] = "along_motion",
         interpretable: bool = False,
-        prior_sd: float = 0.3,
-        network: Literal["anfis", "rbf"] = "anfis",
+        prior_sd: float = PRIOR_SD,
+        network: Literal["anfis", "by_class", "rbf"] = "anfis",
+        memory: Mapping[str, float] | None = None,
     ) -> None:
         schedule: Schedule
         if network == "rbf":
             schedule = RadialBasis(
                 self.definition, joints, initial, units=head_units, acceleration=acceleration
             )
-        elif network == "anfis":
-            schedule = NeuroFuzzy(
+        elif network in ("anfis", "by_class"):
+            kind = NeuroFuzzy if network == "anfis" else AdaptiveNeuroFuzzy
+            schedule = kind(
                 self.definition,
                 joints,
                 initial,
@@ -253,7 +258,9 @@ class NeuroFuzzyModel(FrictionModel):
                 prior_sd=prior_sd,
             )
         else:
-            raise ValueError(f'`network` must be "anfis" or "rbf", got {network!r}.')
+            raise ValueError(f'`network` must be "anfis", "by_class" or "rbf", got {network!r}.')
+        if isinstance(schedule, AdaptiveNeuroFuzzy) and memory is not None:
+            schedule.set_memory(**memory)
         super().__init__(self.definition, schedule, v_smooth)
 
 

@@ -8,7 +8,8 @@ shape (*batch, joint) -> (*batch, joint, coefficient). Fits see it through `para
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -19,7 +20,8 @@ from nfriction.friction.laws import Coefficient, Law
 SMALLEST = 1e-12
 
 
-class Sensitivity(NamedTuple):
+@dataclass(frozen=True)
+class Sensitivity:
     """Derivatives of the coefficients at given motions.
 
     A parameter acts on one joint's coefficients only, which `joint` names, so the derivative with
@@ -36,6 +38,69 @@ class Sensitivity(NamedTuple):
     joint: Tensor
     qd: Tensor
     qdd: Tensor
+
+    def pulled(self, held: Tensor) -> Tensor:
+        """Derivatives by the parameters of what depends on the coefficients at many samples.
+
+        Args:
+            held: derivatives by the coefficients, (block, row, sample, joint, coefficient); the
+                blocks' samples are those of this sensitivity, one block after the other.
+
+        Returns:
+            Shape (block, row, parameter).
+        """
+        blocks, rows, samples, joints, k = held.shape
+        by_parameter = self.parameters.reshape(blocks, samples * k, -1)
+        found = held.new_empty(blocks, rows, len(self.joint))
+        for joint in range(joints):
+            own = (self.joint == joint).nonzero().squeeze(-1)
+            found[..., own] = held[..., joint, :].flatten(2) @ by_parameter[..., own]
+        return found
+
+
+@dataclass(frozen=True)
+class FactoredSensitivity:
+    """The same of a schedule whose outputs share features, which are then never multiplied out.
+
+    Parameters come in groups, each laid out as (joint, output, feature).
+
+    Attributes:
+        factors: of each group, the coefficients' derivatives by the outputs, (sample, joint,
+            coefficient, output), and the outputs' by their parameters, (sample, joint, feature).
+        qd, qdd: as in `Sensitivity`.
+    """
+
+    factors: tuple[tuple[Tensor, Tensor], ...]
+    qd: Tensor
+    qdd: Tensor
+
+    @property
+    def parameters(self) -> Tensor:
+        """Multiplied out, as in `Sensitivity`."""
+        whole = [torch.einsum("sjko,sjf->skjof", *factor).flatten(2) for factor in self.factors]
+        return torch.cat(whole, -1)
+
+    @property
+    def joint(self) -> Tensor:
+        """As in `Sensitivity`."""
+        rows = []
+        for mix, features in self.factors:
+            joints = torch.arange(mix.shape[1], device=mix.device)
+            rows.append(joints.repeat_interleave(mix.shape[-1] * features.shape[-1]))
+        return torch.cat(rows)
+
+    def pulled(self, held: Tensor) -> Tensor:
+        """As in `Sensitivity`."""
+        blocks, rows, samples = held.shape[:3]
+        by_sample = held.permute(0, 2, 3, 1, 4)
+        found = []
+        for mix, features in self.factors:
+            mixed = by_sample @ mix.unflatten(0, (blocks, samples))
+            # (block, joint, row and output, sample) by (block, joint, sample, feature).
+            left = mixed.permute(0, 2, 3, 4, 1).flatten(2, 3)
+            both = left @ features.unflatten(0, (blocks, samples)).transpose(1, 2)
+            found.append(both.unflatten(2, (rows, -1)).transpose(1, 2).flatten(2))
+        return torch.cat(found, -1)
 
 
 class Schedule(nn.Module, ABC):
@@ -142,8 +207,14 @@ class Schedule(nn.Module, ABC):
         return torch.zeros_like(vector), torch.full_like(vector, torch.inf)
 
     @abstractmethod
-    def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
+    def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity | FactoredSensitivity:
         """Derivatives of the coefficients at motions of shape (sample, joint)."""
+
+    def sensitivities_from(
+        self, qd: Tensor, qdd: Tensor, state: Tensor
+    ) -> Sensitivity | FactoredSensitivity:
+        """Derivatives of `coefficients_from`, the memory (sample, joint, state_size) held."""
+        return self.sensitivities(qd, qdd)
 
     def options(self) -> dict[str, Any]:
         """Constructor arguments beyond law, joints and initial values, as plain JSON."""

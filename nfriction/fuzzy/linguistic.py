@@ -27,6 +27,7 @@ class LinguisticTerms(nn.Module):
         held: list[Tensor] = []
         for term, family in enumerate(self.families):
             p = self.numbers[term]
+            # Numbers and not their names, for TorchScript sees no globals.
             if family == 0:
                 held.append(two_sided_gaussian(x, p[0], p[1], p[2], p[3]))
             elif family == 1:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -176,24 +177,21 @@ def sets_from_ranges(
         raise ValueError(f"got {len(names)} names but {len(ranges)} ranges; one range a set.")
     if len(ranges) < 2:
         raise ValueError("at least two sets are needed to span a universe with shoulders.")
-    for name, (low, high) in zip(names, ranges, strict=True):
+    spans = list(zip(names, ranges, strict=True))
+    for name, (low, high) in spans:
         if not (math.isfinite(low) and math.isfinite(high) and low < high):
             raise ValueError(f"range of {name!r} must be finite with low < high, got {low, high}.")
-    for (name, before), (after_name, after) in zip(
-        zip(names, ranges, strict=True), list(zip(names, ranges, strict=True))[1:], strict=False
-    ):
+    for (name, before), (after_name, after) in pairwise(spans):
         if not (before[0] < after[0] and before[1] < after[1]):
             raise ValueError(
                 f"ranges must ascend: {after_name!r} {list(after)} comes after "
                 f"{name!r} {list(before)}; write the sets from the smallest values to the largest."
             )
-    last = len(ranges) - 1
-    sets = []
-    for index, (name, (low, high)) in enumerate(zip(names, ranges, strict=True)):
-        if index == 0:
-            sets.append(FuzzySet(name, "left_shoulder", (low, (high - low) / 2)))
-        elif index == last:
-            sets.append(FuzzySet(name, "right_shoulder", (high, (high - low) / 2)))
-        else:
-            sets.append(FuzzySet(name, "gaussian", ((low + high) / 2, (high - low) / 4)))
+    sets = [
+        FuzzySet(name, "gaussian", ((low + high) / 2, (high - low) / 4))
+        for name, (low, high) in spans
+    ]
+    (first, (low, high)), (last, (last_low, last_high)) = spans[0], spans[-1]
+    sets[0] = FuzzySet(first, "left_shoulder", (low, (high - low) / 2))
+    sets[-1] = FuzzySet(last, "right_shoulder", (last_high, (last_high - last_low) / 2))
     return tuple(sets)

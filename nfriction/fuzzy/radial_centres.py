@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from scipy.cluster.vq import kmeans2
 from torch import Tensor
 
 _CANDIDATES = 500
@@ -17,6 +16,8 @@ def kmeans_centres(samples: Tensor, units: int, seed: int) -> Tensor:
         samples: shape (samples, inputs).
         seed: of the k-means++ start; the same seed gives the same centres.
     """
+    from scipy.cluster.vq import kmeans2  # slow to import, and seldom needed
+
     scale = samples.std(0)
     centres, _ = kmeans2((samples / scale).cpu().numpy(), units, iter=50, minit="++", seed=seed)
     return torch.as_tensor(centres).to(samples) * scale

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 from nfriction.fuzzy.membership import FuzzySet
 
@@ -42,12 +42,11 @@ class Variable:
         _refuse_duplicates(f"{where}: sets", self.terms)
         if ANY in self.terms:
             raise ValueError(f"{where}: {ANY!r} stands for any term and cannot name a set.")
-        cores = [term.core for term in self.sets]
-        for before, after in itertools.pairwise(range(len(cores))):
-            if cores[before] > cores[after]:
+        for before, after in pairwise(self.sets):
+            if before.core > after.core:
                 raise ValueError(
-                    f"{where}: sets must ascend, but {self.terms[after]!r} at {cores[after]} comes "
-                    f"after {self.terms[before]!r} at {cores[before]}."
+                    f"{where}: sets must ascend, but {after.name!r} at {after.core} comes "
+                    f"after {before.name!r} at {before.core}."
                 )
 
     @property
@@ -98,13 +97,6 @@ class RuleBase:
             _check_terms(f"rule {number}: then", rule.then, self.outputs)
             if not 0.0 < rule.weight <= 1.0:
                 raise ValueError(f"rule {number}: weight must be in (0, 1], got {rule.weight}.")
-
-    def table(self) -> dict[tuple[str, ...], tuple[str, ...]] | None:
-        """Consequents by the terms of the inputs, if the rules are a full grid; else None."""
-        cells = {rule.given: rule.then for rule in self.rules}
-        grid = list(itertools.product(*(variable.terms for variable in self.inputs)))
-        plain = all(rule.weight == 1.0 for rule in self.rules)
-        return cells if plain and set(cells) == set(grid) else None
 
 
 def _check_terms(where: str, terms: tuple[str, ...], variables: tuple[Variable, ...]) -> None:

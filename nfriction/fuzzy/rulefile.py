@@ -36,7 +36,7 @@ from pathlib import Path
 from typing import Any
 
 from nfriction.fuzzy.membership import FuzzySet, sets_from_ranges
-from nfriction.fuzzy.rulebase import Rule, RuleBase, Variable
+from nfriction.fuzzy.rulebase import ANY, Rule, RuleBase, Variable
 
 FORMAT = "nfriction-rules/1"
 MAX_BYTES = 1_000_000
@@ -51,7 +51,11 @@ def load_rules(path: str | Path) -> RuleBase:
     path = Path(path)
     if path.stat().st_size > MAX_BYTES:
         raise ValueError(f"{path.name}: rule files are at most {MAX_BYTES} bytes.")
-    return parse_rules(path.read_text(encoding="utf-8"), path.name)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path.name}: a rule file is UTF-8 text ({error}).") from error
+    return parse_rules(text, path.name)
 
 
 def parse_rules(text: str, source: str = "rules") -> RuleBase:
@@ -277,11 +281,11 @@ def _format_table(rules: RuleBase) -> str:
         return ""
     columns, rows = rules.inputs
     in_order = [(column, row) for row in rows.terms for column in columns.terms]
-    if rules.table() is None or [rule.given for rule in rules.rules] != in_order:
+    if [rule.given for rule in rules.rules] != in_order:
+        return ""
+    if any(rule.weight != 1.0 or ANY in rule.then for rule in rules.rules):
         return ""
     cells = {rule.given: list(rule.then) for rule in rules.rules}
-    if any("*" in cell for cell in cells.values()):
-        return ""
     body = ",\n".join(
         f"    {json.dumps(row)}: {json.dumps([cells[column, row] for column in columns.terms])}"
         for row in rows.terms

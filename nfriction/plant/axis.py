@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -9,7 +10,7 @@ from nfriction.plant.base import Plant, vector
 
 
 class LinearAxis(Plant):
-    """Equation of motion mass * qdd = tau + torque_offset, q in metres and tau in newtons.
+    """Equation of motion mass * qdd = tau + torque_offset - asymmetry |qd|, in m and N.
 
     Args:
         mass: moved mass, the drive's inertia included [kg].
@@ -19,6 +20,8 @@ class LinearAxis(Plant):
     Attributes:
         mass: (1,) [kg].
         torque_offset: (1,) [N].
+        asymmetry: by how much the drive and guide resist more one way than the other, (1,) [N s/m];
+            zero unless `replace` sets it. With viscous friction B they are passive up to B.
     """
 
     kind = "axis"
@@ -26,6 +29,7 @@ class LinearAxis(Plant):
     optional = ("torque_offset", "name", "joint_names", "position_quantum")
 
     mass: Tensor
+    asymmetry: Tensor
 
     def __init__(
         self,
@@ -42,6 +46,7 @@ class LinearAxis(Plant):
         self.links = 1
         self.register_buffer("mass", vector("mass", [mass], 1, positive=True))
         self.register_buffer("torque_offset", vector("torque_offset", [torque_offset], 1))
+        self.register_buffer("asymmetry", torch.zeros(1, dtype=torch.float64))
         self._given = {"mass": float(mass), "torque_offset": float(torque_offset)}
 
     def mass_matrix(self, q: Tensor) -> Tensor:
@@ -50,9 +55,9 @@ class LinearAxis(Plant):
         return torch.broadcast_tensors(self.mass, q)[0].unsqueeze(-1)
 
     def bias(self, q: Tensor, qd: Tensor) -> Tensor:
-        """Zero force [N], (*batch, 1)."""
+        """What depends on the direction of motion [N], (*batch, 1)."""
         self._check(q=q, qd=qd)
-        return torch.zeros_like(q + qd)
+        return self.asymmetry * qd.abs() + torch.zeros_like(q)
 
     def gravity(self, q: Tensor) -> Tensor:
         """Zero force [N], (*batch, 1)."""
@@ -62,13 +67,13 @@ class LinearAxis(Plant):
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
         """Acceleration [m/s^2], (*batch, 1), under a force with friction subtracted [N]."""
         self._check(q=q, qd=qd, tau=tau)
-        qdd = (tau + self.torque_offset) / self.mass
-        return qdd.expand(torch.broadcast_shapes(qdd.shape, q.shape, qd.shape))
+        qdd = (tau + self.torque_offset - self.asymmetry * qd.abs()) / self.mass
+        return qdd.expand(np.broadcast_shapes(qdd.shape, q.shape, qd.shape))
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
         """Force tau (friction subtracted) that gives the acceleration `qdd` [N], (*batch, 1)."""
         self._check(q=q, qd=qd, qdd=qdd)
-        return self.mass * qdd - self.torque_offset
+        return self.mass * qdd + self.asymmetry * qd.abs() - self.torque_offset
 
     def energy(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
         """Kinetic and (zero) potential energy [J], each (*batch)."""

@@ -4,6 +4,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,6 +18,7 @@ from nfriction.plant.coordinates import (
     relative,
 )
 from nfriction.plant.drag import drag_forces
+from nfriction.plant.encoder import Turned, true_angle
 from nfriction.plant.inertia import inertia_tensors
 from nfriction.plant.linear import Matrix, dot, entries, multiply, solve, stack, stack_matrix
 from nfriction.plant.planar import (
@@ -43,7 +45,9 @@ class PendulumChain(Plant):
 
     Joint coordinates: with a free arm, column 0 is its angle about the vertical; the first link
     is measured from upright, each further one relative to the link before. Friction is not part
-    of a plant (a rollout subtracts it from tau); air drag is, once `replace` sets it.
+    of a plant (a rollout subtracts it from tau); air drag is, once `replace` sets it. So are
+    eccentric encoders: all methods then take and give what the encoders read, except that
+    `mass_matrix`, `bias` and `gravity` are those over the true angles at that reading.
 
     Args:
         mass: of each link [kg].
@@ -63,6 +67,7 @@ class PendulumChain(Plant):
         gravity_moment: g b_i, (links,) [N m].
         armature: (joints,) [kg m^2].
         angle_offset: added to q before the geometry is evaluated, (joints,) [rad].
+        encoder_cosine, encoder_sine: eccentricity of the encoders, see `encoder`, (joints,) [rad].
         torque_offset: added to tau, (joints,) [N m].
         drag_linear, drag_quadratic: k1 [N s/m^2], k2 [N s^2/m^3] per link.
         length: (links,) [m].
@@ -88,6 +93,9 @@ class PendulumChain(Plant):
     gravity_moment: Tensor
     armature: Tensor
     angle_offset: Tensor
+    encoder_cosine: Tensor
+    encoder_sine: Tensor
+    encoder_zero: Tensor
     drag_linear: Tensor
     drag_quadratic: Tensor
     length: Tensor
@@ -137,6 +145,11 @@ class PendulumChain(Plant):
         self.register_buffer("gravity_moment", gravity * moment)
         self.register_buffer("armature", rotor)
         self.register_buffer("angle_offset", torch.zeros_like(rotor))
+        self.register_buffer("encoder_cosine", torch.zeros_like(rotor))
+        self.register_buffer("encoder_sine", torch.zeros_like(rotor))
+        hanging = torch.ones_like(rotor)
+        hanging[first] = -1.0
+        self.register_buffer("encoder_zero", hanging, persistent=False)
         self.register_buffer("torque_offset", torch.zeros_like(rotor))
         self.register_buffer("drag_linear", zero)
         self.register_buffer("drag_quadratic", zero.clone())
@@ -149,6 +162,7 @@ class PendulumChain(Plant):
         # What is zero costs nothing: Python flags, settled here and by `replace`, never in a step.
         self.has_armature = bool(rotor.any())
         self.has_drag = False
+        self.has_eccentricity = False
         self._slender = bool(torch.equal(tensors[:, 1], tensors[:, 2])) and not bool(
             tensors[:, [0, 3, 4, 5]].any()
         )
@@ -176,20 +190,24 @@ class PendulumChain(Plant):
             Symmetric positive definite, (*batch, joint, joint).
         """
         self._check(q=q)
+        q = self._true(q, q)[0]
         mass = stack_matrix(joint_matrix(self._mass(self._geometry(q)), self.first_link))
         # A single link's does not depend on q, yet has its batch.
-        return mass.expand(torch.broadcast_shapes(mass.shape, (*q.shape, self.joints)))
+        return mass.expand(np.broadcast_shapes(mass.shape, (*q.shape, self.joints)))
 
     def bias(self, q: Tensor, qd: Tensor) -> Tensor:
         """Centrifugal, Coriolis, gravity and drag torques [N m], (*batch, joint)."""
         self._check(q=q, qd=qd)
+        q, qd = self._true(q, qd)
         force = self._bias(self._geometry(q), qd)
         return stack(joint_forces(force, self.first_link))
 
     def gravity(self, q: Tensor) -> Tensor:
         """The gravity part of the bias [N m], (*batch, joint): the potential's gradient."""
         self._check(q=q)
-        force = gravity_forces(self._geometry(q).pose, self.gravity_moment.unbind(-1))
+        force = gravity_forces(
+            self._geometry(self._true(q, q)[0]).pose, self.gravity_moment.unbind(-1)
+        )
         own = [torch.zeros_like(force[0])] * self.first_link
         return stack(joint_forces([*own, *force], self.first_link))
 
@@ -203,6 +221,13 @@ class PendulumChain(Plant):
             qdd [rad/s^2], (*batch, joint).
         """
         self._check(q=q, qd=qd, tau=tau)
+        if self.has_eccentricity:
+            turned = self._turned(q)
+            return turned.reading(qd, self._accelerate(turned.angle, turned.slope * qd, tau))
+        return self._accelerate(q, qd, tau)
+
+    def _accelerate(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
+        """True accelerations at true angles and rates."""
         geometry = self._geometry(q)
         force = link_forces((tau + self.torque_offset).unbind(-1), self.first_link)
         bias = self._bias(geometry, qd)
@@ -220,6 +245,9 @@ class PendulumChain(Plant):
             tau [N m], (*batch, joint).
         """
         self._check(q=q, qd=qd, qdd=qdd)
+        if self.has_eccentricity:
+            turned = self._turned(q)
+            q, qd, qdd = turned.angle, turned.slope * qd, turned.acceleration(qd, qdd)
         geometry = self._geometry(q)
         inertial = multiply(self._mass(geometry), absolute(qdd.unbind(-1), self.first_link))
         force = [f + h for f, h in zip(inertial, self._bias(geometry, qd), strict=True)]
@@ -228,6 +256,7 @@ class PendulumChain(Plant):
     def energy(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
         """Kinetic and potential energy [J], each (*batch); zero height is the first joint's."""
         self._check(q=q, qd=qd)
+        q, qd = self._true(q, qd)
         geometry = self._geometry(q)
         rate = absolute(qd.unbind(-1), self.first_link)
         kinetic = dot(rate, multiply(self._mass(geometry), rate)) / 2
@@ -249,6 +278,7 @@ class PendulumChain(Plant):
             belongs to angles from hanging, and taken literally feeds energy in.
         """
         self._check(q=q, qd=qd)
+        q, qd = self._true(q, qd)
         angle = (q + self.angle_offset)[..., self.first_link :].cumsum(-1)
         rate = qd[..., self.first_link :]
         load = (self.load_lever * rate * rate - angle.cos()).abs()
@@ -280,8 +310,20 @@ class PendulumChain(Plant):
                     "no part in it. Use a chain without `arm`."
                 )
             self.has_drag = True
+        if {"encoder_cosine", "encoder_sine"} & set(names):
+            self.has_eccentricity = True
         self.has_armature = self.has_armature or "armature" in names
         self._slender = self._slender and "inertia_tensor" not in names
+
+    def _turned(self, q: Tensor) -> Turned:
+        return true_angle(q, self.encoder_zero, self.encoder_cosine, self.encoder_sine)
+
+    def _true(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
+        """True angles and rates of what the encoders read."""
+        if not self.has_eccentricity:
+            return q, qd
+        turned = self._turned(q)
+        return turned.angle, turned.slope * qd
 
     def _geometry(self, q: Tensor) -> _Geometry:
         pose = pose_of((q + self.angle_offset).unbind(-1)[self.first_link :])

@@ -1,14 +1,19 @@
 """Figures from results, as matplotlib figures that need no display: `figure.savefig(path)`."""
 
+from nfriction.plots.coefficients import coefficient_intervals, coefficients_over_time
+from nfriction.plots.dark import for_dark_screen
 from nfriction.plots.errors import horizon_curve, positions, rmse_bars
 from nfriction.plots.fits import convergence, torque_over_velocity
 from nfriction.plots.fuzzy import coefficient_surfaces, controller_surface, memberships
 from nfriction.plots.saving import save_all
 
 __all__ = [
+    "coefficient_intervals",
     "coefficient_surfaces",
+    "coefficients_over_time",
     "controller_surface",
     "convergence",
+    "for_dark_screen",
     "horizon_curve",
     "memberships",
     "positions",

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation, gaussian_filter
 
 from nfriction.friction import FrictionModel, NeuroFuzzy
 from nfriction.fuzzy import MamdaniController
@@ -41,8 +41,8 @@ def coefficient_surfaces(
 
     Args:
         model: a neuro-fuzzy model.
-        motions: smoothed motions in joint coordinates; where they never came near, the map is
-            hatched.
+        motions: smoothed motions in joint coordinates. White lines hold 50 % and 90 % of their
+            samples; where they never came near, the map is hatched.
         joint_names: for the titles.
         unit: of a position, `"rad"` or `"m"`.
         width: of the figure [in].
@@ -68,12 +68,15 @@ def coefficient_surfaces(
     for j, maps in enumerate(axes.T if across else axes):
         edges = _edges(schedule, j)
         values = _surface(schedule, j, edges)
-        seen = None if motions is None else _occupied(schedule, motions, j, edges)
+        counts = None if motions is None else _visits(schedule, motions, j, edges)
+        seen = None if counts is None else binary_dilation(counts > 0, iterations=NEAR)
         for ax, value, coefficient in zip(
             maps, np.moveaxis(values, -1, 0), coefficients, strict=True
         ):
             label = style.sliding(coefficient.unit, unit)
             _map(figure, ax, edges, value, seen, coefficient.name, label)
+            if counts is not None:
+                _density_lines(ax, edges, counts)
             style.title(ax, names[j])
             # Ranges differ between joints, so every map says its own.
             ax.tick_params(labelbottom=True, labelleft=True)
@@ -192,17 +195,29 @@ def _surface(schedule: NeuroFuzzy, joint: int, edges: Edges) -> Array:
         return schedule(qd, qdd)[:, :, joint].numpy()
 
 
-def _occupied(
-    schedule: NeuroFuzzy, motions: Sequence[Motion], joint: int, edges: Edges
-) -> NDArray[np.bool_]:
-    """Cells near the motions, (acceleration, velocity); outside the range, the edge's."""
+def _visits(schedule: NeuroFuzzy, motions: Sequence[Motion], joint: int, edges: Edges) -> Array:
+    """Samples in each cell, (acceleration, velocity); those outside the range in the edge's."""
     qd = np.concatenate([m.qd[:, joint] for m in motions])
     qdd = np.concatenate([m.qdd[:, joint] for m in motions])
     if schedule.along_motion:
         qdd = qdd * np.sign(qd)
     inside = [np.clip(v, e[0], e[-1]) for v, e in zip((np.abs(qd), qdd), edges, strict=True)]
-    visited = np.histogram2d(inside[1], inside[0], [edges[1], edges[0]])[0] > 0
-    return binary_dilation(visited, iterations=NEAR)
+    return np.histogram2d(inside[1], inside[0], [edges[1], edges[0]])[0]
+
+
+def _density_lines(ax: Axes, edges: Edges, counts: Array) -> None:
+    """Lines around the densest cells that hold half and nine tenths of the samples."""
+    smooth = gaussian_filter(counts, 2.5)
+    falling = np.sort(smooth.ravel())[::-1]
+    held = np.cumsum(falling) / falling.sum()
+    levels = sorted({float(falling[np.searchsorted(held, share)]) for share in (0.5, 0.9)})
+    if levels[0] <= 0 or levels[-1] >= falling[0]:
+        return  # all in one cell: nothing to draw a line around
+    middles = [0.5 * (e[1:] + e[:-1]) for e in edges]
+    dashes = ["--", "-"][-len(levels) :]
+    # Dark below, so that the lines stand out on light and dark parts of the map alike.
+    for colour, width in ((style.INK, 1.4), ("white", 0.7)):
+        ax.contour(*middles, smooth, levels, colors=colour, linewidths=width, linestyles=dashes)
 
 
 def _sets(schedule: NeuroFuzzy, x: Array, joint: int, variable: int) -> Array:

@@ -19,6 +19,7 @@ from nfriction.recording.validation import (
     check_shapes,
     frozen,
     is_uniform,
+    warn_of_gaps,
     warn_of_units,
 )
 
@@ -52,7 +53,8 @@ class Recording:
         ValueError: arrays that do not fit together, NaN or infinity, stamps that do not increase,
             fewer than 8 samples.
     Warns:
-        RecordingWarning: positions that look like degrees, stamps that look like milliseconds.
+        RecordingWarning: positions that look like degrees, stamps that look like milliseconds or
+            leave gaps.
     """
 
     time: Array
@@ -80,6 +82,7 @@ class Recording:
         check_shapes(self)
         check_content(self)
         warn_of_units(self)
+        warn_of_gaps(self)
 
     @property
     def joints(self) -> int:
@@ -235,7 +238,10 @@ class Recording:
         said = attributes.get("convention") if convention is None else convention
         arrays, slides = table_arrays(table, columns, degrees=degrees)
         told: Unit | None = None if slides is None else "m" if slides else "rad"
-        unit = unit or attributes.get("unit") or told or "rad"
+        written = attributes.get("unit")
+        if degrees and written == "deg":
+            written = None  # which says the same
+        unit = unit or written or told or "rad"
         if told and told != unit:
             raise ValueError(
                 f"`unit` is {unit!r}, but the columns say {told!r}; drop one of the two."

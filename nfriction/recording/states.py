@@ -13,15 +13,20 @@ from nfriction.formats import column_numbers, read_table
 Array = NDArray[np.float64]
 
 
-def read_initial_states(path: str | os.PathLike[str]) -> dict[str, tuple[Array, Array]]:
+def read_initial_states(
+    path: str | os.PathLike[str], *, degrees: bool = False
+) -> dict[str, tuple[Array, Array]]:
     """Initial position and velocity per recording from a table with columns id, q0_1, qd0_1, ….
 
-    Cells of joints that a mechanism lacks are empty. States are written as the recordings are.
+    Cells of joints that a mechanism lacks are empty. Angles are in the recordings' convention.
 
     Args:
         path: of the table, such as a data set's `recordings.csv`.
+        degrees: positions and velocities are in degrees.
     Returns:
-        {id: (q0, qd0)}, each (joint,).
+        {id: (q0, qd0)} in SI, each (joint,).
+    Raises:
+        ValueError: missing columns, or a state that is incomplete or comes twice.
     """
     table = read_table(path)
     joints = sorted((c[3:] for c in table.columns if re.fullmatch(r"q0_\d+", c)), key=int)
@@ -33,12 +38,16 @@ def read_initial_states(path: str | os.PathLike[str]) -> dict[str, tuple[Array, 
         np.stack([column_numbers(table, f"{key}_{k}") for k in joints], axis=1)
         for key in ("q0", "qd0")
     )
+    if degrees:
+        q0, qd0 = np.deg2rad(q0), np.deg2rad(qd0)
     states: dict[str, tuple[Array, Array]] = {}
     for row, label in enumerate(table["id"].astype(str)):
-        present = ~np.isnan(q0[row])
-        if label in states or not present.any() or np.any(present == np.isnan(qd0[row])):
+        state = np.stack([q0[row], qd0[row]])
+        present = ~np.isnan(state[0])
+        sound = np.array_equal(present, ~np.isnan(state[1])) and not np.isinf(state).any()
+        if label in states or not present.any() or not sound:
             raise ValueError(
-                f"'{path}': {label!r} must come once, with q0 and qd0 of the same joints."
+                f"'{path}': {label!r} must come once, with finite q0 and qd0 of the same joints."
             )
-        states[label] = (q0[row][present], qd0[row][present])
+        states[label] = (state[0, present], state[1, present])
     return states

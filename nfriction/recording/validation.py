@@ -1,4 +1,4 @@
-"""What a recording must fulfil: shapes, content, units that look right."""
+"""What a recording must fulfil: shapes, content; units and stamps that look right."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MINIMUM_SAMPLES = 8
 
 
 class RecordingWarning(UserWarning):
-    """A recording is valid but looks as if its units were not SI."""
+    """A recording is valid but looks as if its units were not SI, or has gaps."""
 
 
 def is_uniform(time: Array) -> bool:
@@ -32,7 +32,8 @@ def is_uniform(time: Array) -> bool:
 
 def frozen(values: ArrayLike, key: str) -> Array:
     try:
-        array = np.array(values, dtype=np.float64)
+        # First as it is, for a tensor knows no copy.
+        array = np.array(np.asarray(values), dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(
             f"`{key}` must be a rectangular array of numbers ({error}); "
@@ -94,11 +95,25 @@ def check_content(recording: Recording) -> None:
         )
 
 
+def warn_of_gaps(recording: Recording) -> None:
+    step = np.diff(recording.time)
+    # Logs from computers without a real-time system jitter by up to three steps.
+    gaps = np.flatnonzero(step > 5 * np.median(step))
+    if len(gaps):
+        k = gaps[np.argmax(step[gaps])]
+        _warn(
+            recording,
+            f"`time` has gaps ({len(gaps)}), the longest of {step[k]:.4g} s at "
+            f"{recording.time[k]:.6g} s, which a simulation crosses in one step",
+            "cut it there, as by `window`",
+        )
+
+
 def warn_of_units(recording: Recording) -> None:
     step = np.diff(recording.time)
     if np.median(step) >= 0.5:
         # At two samples a second no joint's motion can be told.
-        _warn(recording, "`time` looks like milliseconds", "divide it by 1000")
+        _warn(recording, "`time` looks like milliseconds", "if so, divide it by 1000")
         return
     if recording.unit == "m":
         return
@@ -112,10 +127,10 @@ def warn_of_units(recording: Recording) -> None:
             recording,
             f"`q` looks like degrees (every joint turns at least {turns:.1f} times, at up to "
             f"{speed:.0f} rad/s)",
-            "read it with `degrees=True`",
+            "if so, read it with `degrees=True`",
         )
 
 
 def _warn(recording: Recording, finding: str, mend: str) -> None:
     label = f"recording '{recording.name}': " if recording.name else ""
-    warnings.warn(f"{label}{finding}; if so, {mend}.", RecordingWarning, stacklevel=5)
+    warnings.warn(f"{label}{finding}; {mend}.", RecordingWarning, stacklevel=5)

@@ -8,6 +8,7 @@ import torch
 
 from nfriction.atomic import replacing
 from nfriction.fitting import Fit
+from nfriction.fitting.verdict import Interval
 from nfriction.modelfile import info_of, load, plant_of, save
 from nfriction.recording import Recording
 from nfriction.results import model_info
@@ -33,6 +34,8 @@ def save_fit(found: Fit, path: Path, recordings: Sequence[Recording]) -> None:
             term_values=np.array(values, dtype=np.float64),
             term_bounds=np.array(bounds, dtype=np.float64),
             steps=np.array(found.steps),
+            interval_names=np.array([i.name for i in found.intervals], dtype=str),
+            intervals=np.array([(i.value, i.low, i.high) for i in found.intervals]).reshape(-1, 3),
         )
     save(found.model, path, model_info(found, recordings))
 
@@ -55,6 +58,7 @@ def load_fit(path: Path, motions: Sequence[Motion]) -> Fit:
             kept["term_bounds"].tolist(),
             strict=True,
         )
+        told_of = zip(kept["interval_names"].tolist(), kept["intervals"].tolist(), strict=True)
         return Fit(
             model=load(path),
             plant=plant_of(path),
@@ -66,4 +70,7 @@ def load_fit(path: Path, motions: Sequence[Motion]) -> Fit:
             steps=int(kept["steps"]),
             motions=tuple(motions),
             _residuals=torch.as_tensor(kept["residuals"]),
+            intervals=tuple(Interval(name, *ends) for name, ends in told_of),
+            lost=tuple(told["lost"]),
+            warnings=tuple(told["warnings"]),
         )

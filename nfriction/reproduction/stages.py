@@ -14,6 +14,7 @@ from nfriction import twin
 from nfriction.comparison import coefficient_summary
 from nfriction.export import ExportError, torchscript
 from nfriction.fitting import Fit, fit, fit_adaptive, fit_by_search
+from nfriction.fitting.by_class import refine_adaptive
 from nfriction.fitting.search import SearchMethod
 from nfriction.friction import FrictionModel, model_by_name
 from nfriction.friction.adaptive import CLASSES, Adaptive
@@ -59,8 +60,8 @@ def stages() -> dict[str, Stage]:
     for law in reversed(LAWS):
         found += [
             Stage(law, ("twin-tlrip",), partial(constant, name=law)),
-            Stage(f"NF{law}", (law,), partial(neuro_fuzzy, law=law)),
             Stage(f"A{law}", (law,), partial(adaptive, law=law)),
+            Stage(f"NF{law}", (f"A{law}",), partial(neuro_fuzzy, law=law)),
             Stage(f"NF{law}-papers", (f"A{law}",), partial(papers_way, law=law)),
             Stage(f"rtip-{law}", ("twin-rtip",), partial(second_paper, law=law)),
         ]
@@ -110,21 +111,25 @@ def adaptive(workspace: Workspace, law: str) -> dict[str, Any]:
     found = fit_adaptive(
         model_by_name(name)(bench.plant.joints), bench.plant, bench.train,
         windows=settings.windows, max_steps=settings.max_steps, fit_plant=False,
-        start=_constant_fit(workspace, law, bench), motions=bench.train_motions,
+        start=_kept_fit(workspace, law, bench), motions=bench.train_motions,
     )  # fmt: skip
+    save_fit(found, _fit_file(workspace, name), bench.train)
     return _finish(workspace, name, bench, found)
 
 
 def neuro_fuzzy(workspace: Workspace, law: str) -> dict[str, Any]:
-    """Fit a neuro-fuzzy model our way: ANFIS and radial basis head, on trajectories."""
+    """Fit a neuro-fuzzy model our way: a network corrects the adaptive model, on trajectories."""
     bench, settings = workspace.bench("tlrip"), workspace.settings
     name = f"NF{law}"
-    options: dict[str, Any] = {"terms": settings.terms, "head_units": settings.head_units}
+    options: dict[str, Any] = {
+        "network": "by_class",
+        "terms": settings.terms,
+        "head_units": settings.head_units,
+    }
     model = model_by_name(name)(bench.plant.joints, **options)
-    found = fit(
-        model, bench.plant, bench.train,
-        windows=settings.windows, max_steps=settings.max_steps, fit_plant=False,
-        motions=bench.train_motions, start=_constant_fit(workspace, law, bench),
+    found = refine_adaptive(
+        model, _kept_fit(workspace, f"A{law}", bench), bench.train,
+        length=settings.windows[-1], max_steps=settings.network_steps,
     )  # fmt: skip
     return _finish(workspace, name, bench, found)
 
@@ -191,9 +196,9 @@ def _classes(model: FrictionModel) -> dict[str, Any]:
     }
 
 
-def _constant_fit(workspace: Workspace, law: str, bench: Bench) -> Fit:
-    """The finished fit of a constant law, as a start for the others of that law."""
-    return load_fit(_fit_file(workspace, law), bench.train_motions)
+def _kept_fit(workspace: Workspace, stage: str, bench: Bench) -> Fit:
+    """The finished fit of a stage, as a start for the models that build on it."""
+    return load_fit(_fit_file(workspace, stage), bench.train_motions)
 
 
 def _fit_file(workspace: Workspace, stage: str) -> Path:

@@ -11,14 +11,18 @@ Array = NDArray[np.float64]
 
 # State of the model: position, velocity, acceleration, jerk.
 ORDER = 4
+# Time constants after which a state tells nothing of the next: a longer gap between samples counts
+# as this long, for its own powers would leave nothing but rounding.
+FARTHEST = 1000.0
 
 
 def constant_jerk(delta: Array, process: Array) -> tuple[Array, Array]:
-    """Transition matrices and process noise of steps `delta` (any shape + (order, order))."""
+    """Transition matrices and process noise of steps `delta`, its shape + (order, order)."""
     if np.all(delta == delta[:1]) and len(delta) > 1:
         one = constant_jerk(delta[:1], process)
         shape = (*delta.shape, ORDER, ORDER)
         return np.broadcast_to(one[0], shape), np.broadcast_to(one[1], shape)
+    delta = np.minimum(delta, FARTHEST)
     order = np.arange(ORDER)
     factorial = np.array([math.factorial(k) for k in range(ORDER)])
     ahead = order - order[:, None]
@@ -47,8 +51,12 @@ def priors(spans: Array, y: Array) -> tuple[Array, Array]:
         span = spans[(slice(None), *index)]
         # Within three time constants the model is close to a cubic.
         near = max(int(np.searchsorted(span, 3.0, side="right")), 2 * ORDER)
-        inverse = np.linalg.pinv(span[:near, None] ** np.arange(ORDER) / factorial)
-        mean[index] = inverse @ y[(slice(near), *index)]
+        # A sample errs by its noise and by how far the motion may have left the cubic since, which
+        # is all that counts behind a gap.
+        weight = 1 / np.sqrt(1 + constant_jerk(span[:near], np.ones(1))[1][..., 0, 0])
+        basis = span[:near, None] ** np.arange(ORDER) / factorial
+        inverse = np.linalg.pinv(basis * weight[:, None])
+        mean[index] = inverse @ (y[(slice(near), *index)] * weight[:, None])
         covariance[index] = 100 * inverse @ inverse.T
     return mean, covariance
 

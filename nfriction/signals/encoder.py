@@ -81,9 +81,9 @@ def frequency_counting(
 
 
 def _quantum(counts_per_revolution: float) -> float:
-    if not counts_per_revolution > 0:
+    if not 0 < counts_per_revolution < math.inf:
         raise ValueError(
-            f"`counts_per_revolution` must be positive, got {counts_per_revolution}; "
+            f"`counts_per_revolution` must be positive and finite, got {counts_per_revolution}; "
             f"an encoder of 2048 lines has 8192 counts after quadrature."
         )
     return 2 * math.pi / counts_per_revolution

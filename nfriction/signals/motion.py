@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Motion:
     """Position, velocity and acceleration of every joint over time.
 
@@ -28,6 +28,12 @@ class Motion:
     qdd: Array
     std: Motion | None = None
 
+    def __repr__(self) -> str:
+        known = "" if self.std is None else ", with std"
+        duration = self.time[-1] - self.time[0]
+        samples, joints = self.q.shape
+        return f"Motion(joints={joints}, samples={samples}, duration={duration:.6g} s{known})"
+
 
 def checked(time: ArrayLike, q: ArrayLike) -> tuple[Array, Array]:
     time, q = np.asarray(time, dtype=np.float64), np.asarray(q, dtype=np.float64)
@@ -38,6 +44,8 @@ def checked(time: ArrayLike, q: ArrayLike) -> tuple[Array, Array]:
         )
     if len(time) < 8:
         raise ValueError(f"at least 8 samples are needed, got {len(time)}.")
-    if not (np.all(np.isfinite(q)) and np.all(np.diff(time) > 0)):
-        raise ValueError("`q` must be finite and `time` increasing; `Recording` tells where not.")
+    if not (np.isfinite(q).all() and np.isfinite(time).all() and np.all(np.diff(time) > 0)):
+        raise ValueError(
+            "`time` and `q` must be finite and `time` increasing; `Recording` tells where not."
+        )
     return time, q

@@ -18,7 +18,8 @@ def savitzky_golay(time: ArrayLike, q: ArrayLike, window_s: float = 0.06, order:
     """Motion from a least-squares polynomial around every sample (non-causal).
 
     The window holds a fixed odd number of samples; at both ends it stays inside the record and the
-    polynomial is read off its side. Irregular stamps get a polynomial of their own each.
+    polynomial is read off its side. Irregular stamps get a polynomial of their own each, and none
+    reaches over a gap longer than `window_s`: what lies on either side is a record by itself.
 
     Args:
         time: [s], shape (time,).
@@ -27,14 +28,18 @@ def savitzky_golay(time: ArrayLike, q: ArrayLike, window_s: float = 0.06, order:
         order: of the polynomial, at least 2.
     Returns:
         Smoothed position, velocity and acceleration.
+    Raises:
+        ValueError: arrays or settings that do not fit, or too few samples between two gaps.
     References:
         Savitzky and Golay, Analytical Chemistry 36 (1964) 1627.
     """
     time, q = checked(time, q)
     step = float(np.median(np.diff(time)))
-    window = 2 * round(window_s / (2 * step)) + 1
     if order < 2:
         raise ValueError(f"`order` must be at least 2 to have an acceleration, got {order}.")
+    if not 0 < window_s < math.inf:
+        raise ValueError(f"`window_s` must be positive and finite, got {window_s}.")
+    window = 2 * round(window_s / (2 * step)) + 1
     if not order < window <= len(time):
         raise ValueError(
             f"`window_s` of {window_s} s is {window} samples; it must be more than order = {order} "
@@ -46,13 +51,27 @@ def savitzky_golay(time: ArrayLike, q: ArrayLike, window_s: float = 0.06, order:
             for k in range(3)
         )
         return Motion(time, q, qd, qdd)
+    gaps = np.flatnonzero(np.diff(time) > window_s) + 1
+    pieces = zip(np.split(time, gaps), np.split(q, gaps), strict=True)
+    smoothed = np.concatenate([_smoothed(*piece, window, order) for piece in pieces], axis=1)
+    return Motion(time, smoothed[0], smoothed[1], smoothed[2])
+
+
+def _smoothed(time: Array, q: Array, window: int, order: int) -> Array:
+    """Position, velocity and acceleration (3, time, joint) of samples without a gap."""
+    window = min(window, len(time))
+    if window <= order:
+        raise ValueError(
+            f"only {len(time)} samples lie between gaps at {time[0]:g} s, too few for a polynomial "
+            f"of order {order}; drop them, or widen `window_s`."
+        )
     first = np.clip(np.arange(len(time)) - window // 2, 0, len(time) - window)
     smoothed = np.empty((3, *q.shape))
     for part in np.array_split(np.arange(len(time)), math.ceil(len(time) / 4096)):
         samples = first[part, None] + np.arange(window)
         coefficients = local_polynomial(time[samples] - time[part, None], q[samples], order)
         smoothed[:, part] = coefficients[:, :3].swapaxes(0, 1)
-    return Motion(time, smoothed[0], smoothed[1], smoothed[2])
+    return smoothed
 
 
 def initial_state(
@@ -73,6 +92,8 @@ def initial_state(
         Position [rad] and velocity [rad/s], each (joint,).
     """
     time, q = checked(time, q)
+    if not duration > 0:
+        raise ValueError(f"`duration` must be positive, got {duration}.")
     start = float(time[0]) if start is None else start
     if not time[0] <= start <= time[-1]:
         raise ValueError(f"`start` must lie in {time[0]:g} … {time[-1]:g} s, got {start:g}.")
@@ -93,10 +114,10 @@ def local_polynomial(span: Array, q: Array, order: int) -> Array:
         span: time from the moment asked for [s], (batch, sample).
         q: (batch, sample, joint).
     """
-    scale = np.abs(span).max()
+    scale = np.abs(span).max(axis=1, keepdims=True)[..., None]
     powers = np.arange(order + 1)
     basis = (span[..., None] / scale) ** powers
     transposed = basis.swapaxes(-1, -2)
     coefficients = np.linalg.solve(transposed @ basis, transposed @ q)
     factorial = np.array([math.factorial(k) for k in powers])
-    return np.asarray(coefficients * (factorial / scale**powers)[:, None])
+    return np.asarray(coefficients * (factorial / scale**powers).swapaxes(-1, -2))

@@ -19,8 +19,6 @@ from nfriction.solve.evidence_result import EvidenceResult, EvidenceState
 from nfriction.solve.jacobian import NormalEquations
 from nfriction.solve.marginal import maximise_evidence
 
-__all__ = ["EvidenceResult", "EvidenceState", "bayesian_regularisation", "maximise_evidence"]
-
 
 def bayesian_regularisation(
     model: nn.Module,

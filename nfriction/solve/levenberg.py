@@ -72,12 +72,12 @@ class LevenbergMarquardt:
     scaling: Literal["marquardt", "identity"] = "marquardt"
 
     def __post_init__(self) -> None:
-        if self.damping_up <= 1 or self.damping_down <= 1:
+        if not (self.damping_up > 1 and self.damping_down > 1):
             raise ValueError(
                 "`damping_up` and `damping_down` must be above 1, got "
                 f"{self.damping_up} and {self.damping_down}."
             )
-        if self.initial_damping < 0 or self.max_steps < 0:
+        if not (self.initial_damping >= 0 and self.max_steps >= 0):
             raise ValueError(
                 "`initial_damping` and `max_steps` must not be negative, got "
                 f"{self.initial_damping} and {self.max_steps}."
@@ -130,11 +130,12 @@ class LevenbergMarquardt:
             return "not_finite"
         vanished = search.cost * torch.finfo(search.x.dtype).eps ** 2
         diagonal = search.local.hessian.diagonal()
-        search.scale = diagonal.max().expand_as(diagonal)
+        search.scale = diagonal
+        if self.scaling == "identity" and len(diagonal):
+            search.scale = diagonal.max().expand_as(diagonal)
         while True:
             if self.scaling == "marquardt":
-                largest = diagonal if not search.history else torch.maximum(search.scale, diagonal)
-                search.scale = largest
+                search.scale = torch.maximum(search.scale, diagonal)
             if search.cost <= vanished or search.gradient_cosine() <= self.gradient_tolerance:
                 return "converged_gradient"
             if len(search.history) >= self.max_steps:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from nfriction.angles import AngleConvention
+from nfriction.atomic import replacing
 from nfriction.formats import write_table
 from nfriction.plant import PendulumChain, rigs
 from nfriction.recording import MINIMUM_SAMPLES, Recording
@@ -75,7 +76,7 @@ def make(
         )
     plant = specified.rig()
     links = Links.of(plant)
-    convention = AngleConvention.parse(",".join(plant.convention))
+    convention = AngleConvention.of(plant)
     random = np.random.default_rng([seed, 0])
     encoders = [Encoder.drawn(random) for _ in plant.joint_names]
     truth, recordings = {}, {}
@@ -135,7 +136,8 @@ def build(
         for key in ("q", "qd", "tau_f")
     }
     # Not compressed: the last bits of floats do not shrink, and trying takes longest of all.
-    np.savez(folder / "truth.npz", **arrays)
+    with replacing(folder / "truth.npz") as unfinished, unfinished.open("wb") as file:
+        np.savez(file, **arrays)
     write_table(_overview(twin), folder / "recordings.csv")
     return twin
 
@@ -148,7 +150,7 @@ def _record(
     label: str,
 ) -> Recording:
     """What the rig's computer logs of a motion; its stamps are those of an even clock."""
-    convention = AngleConvention.parse(",".join(plant.convention))
+    convention = AngleConvention.of(plant)
     late = late[:, None]
     moved = motion.q + late * (motion.qd + 0.5 * late * motion.qdd)
     position = convention.position_from_joint(moved)

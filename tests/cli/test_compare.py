@@ -129,6 +129,38 @@ def test_plant_given_adjusts_nothing_and_drag_adds_terms(bench: Path) -> None:
     assert given < fitted < drag
 
 
+def test_the_choice_on_training_data_is_told_with_its_reason(
+    bench: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert compare(bench, bench / "chosen", "--select", "--no-figures", models="NCFM,LFM") == 0
+    told = capsys.readouterr().out.partition("training data alone would choose ")[2]
+    chosen, reason = told.split("\n")[0].split(": ")
+    assert chosen in ("NCFM", "LFM")
+    assert "error on blocks left out" in reason
+    # A third of a second was left out each time.
+    assert re.search(r"0\.33\d* s simulations", told)
+    for name in ("NCFM", "LFM"):
+        assert re.search(rf"^{name} +[\d.]+ +\d +(yes|no)$", told, re.MULTILINE)
+
+
+def test_warnings_and_intervals_of_fits_are_told(
+    bench: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert compare(bench, bench / "wary", "--no-figures", models="NCFM,LFM") == 0
+    said = capsys.readouterr().out
+    found = results(bench / "wary")
+    fits, best = found["models"], found["best"]["model"]
+    for name in ("NCFM", "LFM"):
+        for warning in fits[name]["fit"]["warnings"]:
+            assert f"\n  - {warning}" in said
+    table = said.partition("95 % intervals")[2]
+    for name, (low, high) in fits[best]["fit"]["intervals"].items():
+        (row,) = (line for line in table.splitlines() if line.startswith(f"{name} "))
+        words = row.removeprefix(name).split()[1:]
+        told = [None if word == "unknown" else float(word) for word in words]
+        assert told == [pytest.approx(x, rel=1e-3) for x in (low, high)]
+
+
 def test_ctrl_c_ends_the_run_though_the_solver_survives_it(
     bench: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -176,7 +208,8 @@ def test_triple_pendulum_held_out(data_dir: Path, tmp_path: Path) -> None:
     data = data_dir / "multiarm_pendulum"
     words = [str(data / "triple_b0.csv.gz"), "--held-out", str(data / "triple_b2.csv.gz")]
     words += ["--rig", "multiarm-triple", "--initial-states", str(data / "recordings.csv")]
-    words += ["--models", "NCFM,LFM", "--no-figures", "--out", str(tmp_path)]
+    # As on the card: no air drag.
+    words += ["--models", "NCFM,LFM", "--no-drag", "--no-figures", "--out", str(tmp_path)]
     assert cli.main(["compare", *words]) == 0
     found = {n: m["held_out"]["triple_b2"] for n, m in results(tmp_path)["models"].items()}
     for name in ("NCFM", "LFM"):

@@ -1,5 +1,6 @@
 """How recordings are read as options say, and what a user is told of those that do not fit."""
 
+import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -8,7 +9,24 @@ import pandas as pd
 import pytest
 
 from nfriction import cli, rigs
+from nfriction.cli import estimation
+from nfriction.fitting.estimate import WINDOWS
 from tests.cli.benches import compare, pendulum, results
+
+
+def test_what_is_not_given_is_left_to_the_fit() -> None:
+    parser = argparse.ArgumentParser()
+    estimation.add_options(parser)
+    settings = estimation.fit_settings(parser.parse_args(["--rig", "tlrip"]))
+    assert "windows" not in settings
+    assert settings["drag"] is None
+    assert f"(default: {','.join(f'{w:g}' for w in WINDOWS)})" in " ".join(
+        parser.format_help().split()
+    )
+    told = parser.parse_args(["--rig", "tlrip", "--windows", "1,3", "--no-drag"])
+    settings = estimation.fit_settings(told)
+    assert settings["windows"] == (1.0, 3.0)
+    assert settings["drag"] is False
 
 
 @pytest.mark.parametrize(

@@ -176,9 +176,9 @@ def test_importing_codegen_and_tracing_stay_light():
     """Neither torch._dynamo, torch.distributed nor numba is loaded before it is needed."""
     script = (
         "import sys, torch; before = set(sys.modules)\n"
-        "from nfriction.codegen import emit_c\n"
+        "from nfriction.codegen.function import fold\n"
         "m = torch.nn.Linear(2, 2).double()\n"
-        "emit_c(m, {'x': torch.ones(2, dtype=torch.float64)}, ['y'])\n"
+        "fold(m, {'x': torch.ones(2, dtype=torch.float64)})\n"
         "new = {n for n in set(sys.modules) - before}\n"
         "print([n for n in ('torch._dynamo', 'torch.distributed.tensor', 'numba') if n in new])"
     )

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nfriction.codegen import finite
-from nfriction.codegen.emit import C, c_prelude
+from nfriction.codegen.emit import C_PRELUDE, C
 from nfriction.codegen.function import fold
 from nfriction.codegen.joints import TABLE, Template, template
 from nfriction.codegen.loops import Names, _index, body
@@ -85,7 +85,7 @@ def compiled(one, tmp_path):
     inside = "\n".join([*made.declarations, *made.statements, *stores])
     source = "\n".join(
         [
-            c_prelude(),
+            C_PRELUDE,
             *constants,
             f"void f(const double *{TABLE}, const double *x0, double *out) {{\n{inside}\n}}",
         ]

@@ -5,7 +5,7 @@ import torch
 
 from nfriction import LFM, NFLFM, fit
 from nfriction.fitting import find_classes, fit_adaptive
-from nfriction.fitting.adaptive import Labelled, LabelledProblem
+from nfriction.fitting.labelled import Labelled, LabelledProblem
 from nfriction.fitting.plant_parameters import plant_parameters
 from nfriction.fitting.sensitivity import StepJacobian
 from nfriction.friction import ALFM, FrictionModel
@@ -108,7 +108,7 @@ def test_without_a_difference_between_classes_the_constant_law_stays(case):
 
 def test_coefficients_that_serve_worse_are_not_taken(case, monkeypatch):
     constant = case[-1]
-    monkeypatch.setattr("nfriction.fitting.adaptive.PositionError.residuals",
+    monkeypatch.setattr("nfriction.fitting.settling.PositionError.residuals",
                         lambda self, vector: torch.full((1, 1, 2), 1e9, dtype=F64))  # fmt: skip
     model = ALFM(2, v_smooth=V_SMOOTH)
     found = fitted(case, model, max_steps=1)

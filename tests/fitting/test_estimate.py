@@ -65,6 +65,15 @@ def test_a_driven_axis_gives_mass_and_offset():
     assert values == pytest.approx([3.0, 1.0], rel=0.05)
 
 
+def test_an_asymmetric_axis_is_told_from_its_offset():
+    axis = LinearAxis(2.0, torque_offset=0.3)
+    crooked = axis.replace(asymmetry=torch.tensor([0.8], dtype=F64))
+    recording = driven_axis(crooked, LFM(1, [3.0, 1.0], v_smooth=V_SMOOTH))
+    found = fit(LFM(1, v_smooth=V_SMOOTH), axis, recording, windows=(0.5,))
+    assert float(found.plant.asymmetry) == pytest.approx(0.8, rel=0.1)
+    assert float(found.plant.torque_offset) == pytest.approx(0.3, abs=0.03)
+
+
 def test_drag_is_fitted_by_itself_where_a_chain_swings_freely():
     recording = swing(pendulum(), true_model(), seconds=1.0)
     settings = {"windows": (0.5,), "max_steps": 1}

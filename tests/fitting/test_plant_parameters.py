@@ -35,6 +35,13 @@ def test_terms_that_are_not_there_are_not_adjusted():
         "mass 1", "torque offset 1 [N m]"
     ]  # fmt: skip
     assert names(LinearAxis(2.0), driven=False) == []
+    moved = names(LinearAxis(2.0), driven=True, largest_torque=1.0, largest_rate=0.1)
+    assert moved[-1] == "asymmetry [N s/m]"
+
+
+def test_an_arm_has_no_hanging_position_and_no_encoder_terms():
+    links = [n for n in names(rigs.tlrip("free"), driven=False, eccentricity=True) if "enc" in n]
+    assert links == [f"encoder {part} {j} [rad]" for j in (2, 3, 4) for part in ("cosine", "sine")]
 
 
 def test_ratios_scale_their_terms_and_nothing_else():

@@ -7,7 +7,8 @@ import torch
 
 from nfriction import LFM, NCFM, NFLFM
 from nfriction.fitting import SearchState, fit_by_search
-from nfriction.fitting.search import Box, PositionError, search
+from nfriction.fitting.position_error import PositionError
+from nfriction.fitting.search import Box, search
 from nfriction.fitting.windows import cut_windows
 from nfriction.signals import kalman_smoother
 from nfriction.simulation import integrate

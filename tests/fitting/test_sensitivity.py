@@ -133,3 +133,25 @@ def test_pieces_of_a_run_are_the_whole(run):
         joined = torch.cat([getattr(m, name) for m in maps])
         torch.testing.assert_close(joined, getattr(whole, name), rtol=1e-13, atol=1e-13)
     assert whole.parameters.shape[-1] == model.schedule.parameter_vector().numel()
+
+
+@pytest.mark.parametrize("name", ["LFM", "NFLFM"])
+def test_a_block_is_the_chain_of_its_steps(name):
+    """Two blocks of three steps; the seventh step makes no block and is left out."""
+    plant, model = pendulum(), MODELS[name](2, v_smooth=0.5)
+    jacobian = StepJacobian(plant, model, [])
+    q0, qd0 = torch.ones(2, 2, dtype=F64), torch.zeros(2, 2, dtype=F64)
+    tau, step = torch.zeros(2, 7, 2, dtype=F64), torch.full((2, 7), 1e-3, dtype=F64)
+    motion = integrate(plant, model, q0, qd0, tau, step)
+    empty = torch.zeros(0, dtype=F64)
+    single = next(step_maps(jacobian, motion, tau, step, empty, 7))
+    (blocks,) = step_maps(jacobian, motion, tau, step, empty, 7, block=3)
+    assert len(blocks.state) == 2
+    for b in range(2):
+        state = torch.eye(6, dtype=F64).expand(2, -1, -1)
+        parameters = torch.zeros_like(single.parameters[0])
+        for k in range(3 * b, 3 * b + 3):
+            state = single.state[k] @ state
+            parameters = single.state[k] @ parameters + single.parameters[k]
+        torch.testing.assert_close(blocks.state[b], state, rtol=1e-12, atol=1e-14)
+        torch.testing.assert_close(blocks.parameters[b], parameters, rtol=1e-12, atol=1e-14)

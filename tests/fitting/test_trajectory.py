@@ -32,11 +32,11 @@ def windows(steps=20, step=2e-3) -> Windows:
     return Windows(q, tau, steps_, weight, q0, qd0, ("a", "b"))
 
 
-def problem(model, substeps=2) -> TrajectoryProblem:
+def problem(model, substeps=2, stride=1) -> TrajectoryProblem:
     plant = pendulum()
     terms = plant_parameters(plant, driven=True, largest_torque=0.1)
     jacobian = StepJacobian(plant, model, terms)
-    return TrajectoryProblem(jacobian, windows(), 1e-3, ABSOLUTE, substeps=substeps)
+    return TrajectoryProblem(jacobian, windows(), 1e-3, ABSOLUTE, substeps, stride=stride)
 
 
 def bent(name):
@@ -60,9 +60,10 @@ def point(p: TrajectoryProblem) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("name", ["LFM", "NFLFM"])
-@pytest.mark.parametrize("substeps", [1, 2])
-def test_gradient_and_hessian_against_finite_differences(name, substeps):
-    p = problem(bent(name), substeps)
+@pytest.mark.parametrize(("substeps", "stride"), [(1, 1), (2, 1), (2, 3), (1, 20)])
+def test_gradient_and_hessian_against_finite_differences(name, substeps, stride):
+    """Also where samples are passed over: 3 leaves steps after the last that counts, 20 none."""
+    p = problem(bent(name), substeps, stride)
     x = point(p)
     found = p.quadratic(x)
     torch.testing.assert_close(found.cost, p.cost(x))
@@ -86,6 +87,28 @@ def test_gradient_and_hessian_against_finite_differences(name, substeps):
     torch.testing.assert_close(
         scale[:, None] * found.hessian * scale, scale[:, None] * hessian * scale, rtol=0, atol=1e-6
     )
+
+
+def test_a_stride_counts_each_sample_for_those_that_it_passes_over():
+    """What counts is every third sample, with the square root of three; all of them where one."""
+    every, third = problem(bent("LFM")), problem(bent("LFM"), stride=3)
+    x = point(every)
+    torch.testing.assert_close(every.residuals(x), every.errors(x) / every.noise_sd)
+    expected = torch.zeros_like(every.residuals(x))
+    expected[:, ::3] = 3**0.5 * every.residuals(x)[:, ::3]
+    torch.testing.assert_close(third.residuals(x), expected)
+    assert torch.equal(third.errors(x), every.errors(x))
+
+
+@pytest.mark.parametrize("piece", [1, 7])
+def test_pieces_do_not_show(piece, monkeypatch):
+    """However many samples are accumulated at a time, the model of the cost is the same."""
+    p = problem(bent("NFLFM"), stride=3)
+    whole = p.quadratic(point(p))
+    monkeypatch.setattr("nfriction.fitting.trajectory.PIECE", piece)
+    parts = p.quadratic(point(p))
+    torch.testing.assert_close(parts.gradient, whole.gradient, rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(parts.hessian, whole.hessian, rtol=1e-10, atol=1e-10)
 
 
 def test_padding_counts_for_nothing():

@@ -42,6 +42,17 @@ def test_windows_cover_the_recording_without_gaps(length):
         assert span / len(w) == pytest.approx(length, rel=0.35)
 
 
+def test_a_subset_keeps_what_belongs_to_its_windows():
+    recording, motion = made(301, tau=True)
+    w = cut_windows([recording], [motion], 0.5)
+    chosen = torch.arange(len(w)) % 2 == 0
+    some = w.subset(chosen)
+    assert len(some) == int(chosen.sum())
+    assert some.spans == w.spans[::2]
+    for name in ("q", "tau", "step", "weight", "q0", "qd0"):
+        assert torch.equal(getattr(some, name), getattr(w, name)[::2])
+
+
 def test_several_recordings_share_one_stack():
     parts = [made(100, 1, name="long"), made(30, 2, tau=True, name="short")]
     w = cut_windows([r for r, _ in parts], [m for _, m in parts], 0.3)

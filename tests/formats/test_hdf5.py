@@ -32,6 +32,7 @@ def test_without_h5py_it_is_said_how_to_get_it(
 def test_data_sets_are_named_by_their_path(h5py: Any, tmp_path: Path, spec: str) -> None:
     with h5py.File(tmp_path / "run.h5", "w") as file:
         file["time"] = TIME
+        file["number"] = np.dtype("f8")  # a type is no signal
         file.create_dataset("log/enc", data=np.rad2deg(Q), compression="gzip")
     back = Recording.read(tmp_path / "run.h5", columns={"q1": spec})
     np.testing.assert_allclose(back.q[:, 0], Q[:, 0], rtol=6e-16)
@@ -60,6 +61,23 @@ def test_matlab_7_3_records_are_read_by_name_and_path(h5py: Any, tmp_path: Path)
         back = Recording.read(tmp_path / "run.mat", columns={"q1": names[0], "q2": names[1]})
         assert np.array_equal(back.q, Q)
         assert np.array_equal(back.time, TIME)
+
+
+def test_matrices_of_matlab_7_3_lie_turned_and_empty_ones_are_none(
+    h5py: Any, tmp_path: Path
+) -> None:
+    square = np.arange(64.0).reshape(8, 8)
+    with h5py.File(tmp_path / "run.mat", "w", userblock_size=512) as file:
+        file["time"] = TIME[None, :8]
+        # MATLAB's q(:, 1) is the first row here.
+        file["q"] = square.T
+        file["tau1"] = np.zeros(2, "u8")  # the shape, 0 x 0
+        for name in ("time", "q", "tau1"):
+            file[name].attrs["MATLAB_class"] = np.bytes_("double")
+        file["tau1"].attrs["MATLAB_empty"] = np.uint8(1)
+    back = Recording.read(tmp_path / "run.mat", unit="m")
+    assert np.array_equal(back.q, square)
+    assert back.tau is None
 
 
 def test_nothing_outside_the_file_is_read(h5py: Any, tmp_path: Path) -> None:

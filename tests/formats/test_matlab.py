@@ -1,5 +1,7 @@
 """MATLAB files of version 5: variables, structs, cells, ControlDesk's records, damage."""
 
+import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -131,6 +133,38 @@ def test_what_unpacks_to_far_more_is_refused(
         monkeypatch.setattr(f"nfriction.formats.{module}.LARGEST", 10**6)
     with pytest.raises(ValueError, match="unpacked bytes, more than 1000000 are read"):
         Recording.read(tmp_path / "run.mat")
+
+
+def element(kind: int, content: bytes) -> bytes:
+    return struct.pack("<II", kind, len(content)) + content + bytes(-len(content) % 8)
+
+
+@pytest.mark.parametrize(
+    ("shape", "message"),
+    [
+        (element(9, struct.pack("<dd", 2.0, 1.0)), "contradicts itself"),
+        (element(5, struct.pack("<ii", -2, -1)), "contradicts itself"),
+    ],
+)
+@pytest.mark.parametrize("kind", [1, 6])
+def test_shapes_that_are_none_are_refused(
+    tmp_path: Path, shape: bytes, kind: int, message: str
+) -> None:
+    flags = element(6, struct.pack("<II", kind, 0))
+    array = flags + shape + element(1, b"q1") + element(9, struct.pack("<dd", 1.0, 2.0))
+    refused(tmp_path, element(14, array), message)
+
+
+def test_a_packed_variable_of_a_few_bytes_is_refused(tmp_path: Path) -> None:
+    packed = zlib.compress(b"abc")
+    refused(tmp_path, struct.pack("<II", 15, len(packed)) + packed, "cut short")
+
+
+def refused(folder: Path, content: bytes, message: str) -> None:
+    header = b"x" * 124 + struct.pack("<H", 0x0100) + b"IM"
+    (folder / "run.mat").write_bytes(header + content)
+    with pytest.raises(ValueError, match=rf"run\.mat.*{message}"):
+        Recording.read(folder / "run.mat")
 
 
 @settings(

@@ -93,6 +93,24 @@ def test_lengths_make_a_sliding_axis(tmp_path: Path) -> None:
         read(tmp_path, text, columns={"q1": "x:mm", "q2": "y:m"}, unit="rad")
 
 
+@pytest.mark.parametrize("separator", [",", ";", " "])
+def test_only_whole_lines_are_comments(tmp_path: Path, separator: str) -> None:
+    text = written(separator, False, "time{0}enc#1{0}enc#2").replace("\n", "\n  # noted\n", 4)
+    text = "# convention: absolute,hanging\n  # remark: none\n" + text
+    back = read(tmp_path, text, columns={"q1": "enc#1", "q2": "enc#2"})
+    assert np.array_equal(back.q, Q)
+    assert str(back.convention) == "absolute,hanging"
+
+
+def test_degrees_said_of_the_whole_file_are_converted_when_asked(tmp_path: Path) -> None:
+    text = "# unit: deg\n" + written(",", False)
+    with pytest.raises(ValueError, match="got 'deg'; degrees are converted by"):
+        read(tmp_path, text)
+    back = read(tmp_path, text, degrees=True)
+    assert back.unit == "rad"
+    np.testing.assert_allclose(back.q, np.deg2rad(Q), rtol=4e-16)
+
+
 def test_an_ending_separator_is_no_column(tmp_path: Path) -> None:
     text = written(";", True).replace("\n", ";\n")
     assert np.array_equal(read(tmp_path, text).q, Q)

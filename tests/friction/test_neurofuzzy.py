@@ -12,6 +12,7 @@ from torch.func import functional_call, jacrev
 from nfriction.friction import Constant, FrictionModel, NeuroFuzzy
 from nfriction.friction.laws import LINEAR, NONLINEAR, STRIBECK, VISCOUS
 from nfriction.friction.neurofuzzy import LEAST_RATIO, soft_positive, soft_positive_inverse
+from nfriction.friction.schedules import Sensitivity
 from tests.friction.samples import LAWS, QUADRATIC, motion, normal, randomise
 
 every_law = pytest.mark.parametrize("law", [*LAWS, QUADRATIC], ids=lambda law: law.name)
@@ -233,6 +234,15 @@ def test_parameter_sensitivities_are_the_whole_jacobian(acceleration: str, inter
     assert not found.parameters.requires_grad
 
 
+def test_factored_sensitivities_are_pulled_as_if_multiplied_out() -> None:
+    schedule = trained(NONLINEAR, 2, terms=(3, 2), head_units=4)
+    qd, qdd, _ = motion(6, 2)
+    found = schedule.sensitivities(qd, qdd)
+    whole = Sensitivity(found.parameters, found.joint, found.qd, found.qdd)
+    held = torch.randn(3, 4, 2, 2, 5, generator=torch.Generator().manual_seed(3), dtype=qd.dtype)
+    torch.testing.assert_close(found.pulled(held), whole.pulled(held), rtol=1e-12, atol=1e-14)
+
+
 def central(function: Callable[[Tensor], Tensor], x: Tensor, step: float) -> Tensor:
     with torch.no_grad():
         return (function(x + step) - function(x - step)) / (2 * step)
@@ -257,7 +267,8 @@ def test_motion_sensitivities_are_those_of_differences(acceleration: str) -> Non
 
 def test_sensitivities_at_rest_are_finite() -> None:
     zero = torch.zeros(3, 2, dtype=torch.float64)
-    assert all(torch.isfinite(t).all() for t in trained().sensitivities(zero, zero))
+    found = trained().sensitivities(zero, zero)
+    assert all(torch.isfinite(t).all() for t in (found.parameters, found.qd, found.qdd))
 
 
 @pytest.mark.parametrize("outputs", [1, 2])

@@ -25,6 +25,18 @@ def test_newton() -> None:
     assert (axis.unit, axis.joints, axis.has_drag) == ("m", 1, False)
 
 
+def test_an_asymmetric_axis_resists_more_one_way() -> None:
+    axis = LinearAxis(4.0, torque_offset=2.0)
+    crooked = axis.replace(asymmetry=torch.tensor([3.0], dtype=torch.float64))
+    q, qd, tau = torch.randn(3, 5, 1, dtype=torch.float64)
+    qdd = crooked(q, qd, tau)
+    torch.testing.assert_close(crooked.inverse_dynamics(q, qd, qdd), tau)
+    torch.testing.assert_close(qdd, axis(q, qd, tau) - 3 / 4 * qd.abs())
+    torch.testing.assert_close(4.0 * qdd, tau + 2.0 - crooked.bias(q, qd))
+    again = LinearAxis.from_dict(json.loads(json.dumps(crooked.to_dict())))
+    assert torch.equal(again.asymmetry, crooked.asymmetry)
+
+
 def test_replace_broadcasts_and_carries_gradients() -> None:
     mass = torch.tensor([[1.0], [2.0]], dtype=torch.float64, requires_grad=True)
     axis = LinearAxis(4.0).replace(mass=mass[:, None])

@@ -28,11 +28,17 @@ def states(joints: int, batch: tuple[int, ...] = (20,), seed: int = 0) -> tuple[
 
 
 def every_kind(arm: Any) -> PendulumChain:
-    """Offsets, rotors, full tensors and, with a fixed arm, drag: every term switched on."""
+    """Offsets, rotors, full tensors and, with a fixed arm, drag: every term of the mechanism."""
     rig = rigs.tlrip(arm, FULL_TENSOR)
     joints, links = torch.linspace(0.1, 0.2, rig.joints).double(), torch.ones(3).double()
     drag = {} if rig.first_link else {"drag_linear": 0.02 * links, "drag_quadratic": 0.03 * links}
     return rig.replace(armature=joints / 10, angle_offset=joints, torque_offset=-joints, **drag)
+
+
+def with_encoders(rig: PendulumChain) -> PendulumChain:
+    """Read by eccentric encoders."""
+    joints = torch.linspace(0.01, 0.02, rig.joints).double()
+    return rig.replace(encoder_cosine=joints, encoder_sine=-joints)
 
 
 @st.composite
@@ -138,8 +144,9 @@ def test_mobility_bounds_random_poses(arm: Any) -> None:
 
 @pytest.mark.parametrize("arm", ARMS)
 def test_gradients_of_both_modes(arm: Any) -> None:
-    rig = every_kind(arm)
+    rig = with_encoders(every_kind(arm))
     names = ["inertia_coupling", "gravity_moment", "armature", "angle_offset", "torque_offset"]
+    names += ["encoder_cosine", "encoder_sine"]
     names += ["arm_inertia", "arm_lever", "inertia_tensor"] if rig.first_link else []
     names += [] if rig.first_link else ["drag_linear", "drag_quadratic", "length"]
     values = [getattr(rig, name).clone() for name in names]
@@ -203,7 +210,7 @@ def test_replace_leaves_the_original_alone_and_refuses_strangers() -> None:
 
 @pytest.mark.parametrize("arm", ARMS)
 def test_export_traces_to_core_operations(arm: Any) -> None:
-    rig = every_kind(arm)
+    rig = with_encoders(every_kind(arm))
     program = torch.export.export(rig, states(rig.joints, (7,), seed=1)).run_decompositions()
     other = states(rig.joints, (7,), seed=2)
     torch.testing.assert_close(program.module()(*other), rig(*other), rtol=1e-12, atol=1e-12)

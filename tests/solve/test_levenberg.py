@@ -33,6 +33,15 @@ def line(n: int = 40, noise: float = 0.1) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("scaling", ["marquardt", "identity"])
+def test_nothing_to_fit_is_fitted_at_once(scaling: str) -> None:
+    solver = LevenbergMarquardt(scaling=scaling)  # type: ignore[arg-type]
+    result = solver.minimise(lambda x: Quadratic(2.0, x, x[:, None] * x), vector())
+    assert result.converged
+    assert result.cost == 2.0
+    assert (result.steps, result.covariance(1.0).shape) == (0, (0, 0))
+
+
+@pytest.mark.parametrize("scaling", ["marquardt", "identity"])
 @pytest.mark.parametrize("start", [(-1.2, 1.0), (6.0, -9.0), (0.0, 0.0)])
 def test_rosenbrock_reaches_its_minimum_from_anywhere(scaling: str, start: tuple) -> None:
     solver = LevenbergMarquardt(scaling=scaling)

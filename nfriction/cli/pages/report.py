@@ -1,0 +1,40 @@
+"""`nfriction report`: one self-contained HTML page of a comparison's folder."""
+
+import argparse
+from pathlib import Path
+
+from nfriction.cli.console import Parser, UsageError, warn
+
+EXAMPLE = """example:
+  nfriction report runs/mine --out mine.html"""
+
+
+def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
+    """Register the command."""
+    parser = commands.add_parser(
+        "report", parents=[common], help="write a page of a comparison's folder", epilog=EXAMPLE,
+        description="Write what compare or demo left in a folder as one HTML file that needs "
+        "nothing else: tables that sort, figures that zoom, rules in words, verdicts.",
+    )  # fmt: skip
+    parser.add_argument("folder", type=Path, metavar="RUN", help="folder of compare or demo")
+    parser.add_argument("--out", type=Path, metavar="FILE",
+                        help="file to write (default: report.html in the folder)")  # fmt: skip
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Read, write."""
+    from nfriction.atomic import write_atomically
+    from nfriction.report import read_run, to_html
+
+    if not arguments.folder.is_dir():
+        raise UsageError(f"{arguments.folder} is no folder; give one that compare or demo wrote.")
+    out = arguments.out or arguments.folder / "report.html"
+    if out.is_dir():
+        raise UsageError(f"--out is a file, and {out} is a folder.")
+    found = read_run(arguments.folder)
+    write_atomically(out, to_html(found).encode())
+    for note in found.notes:
+        warn(note)
+    print(f"wrote {out}")
+    return 0

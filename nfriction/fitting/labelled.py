@@ -1,0 +1,110 @@
+"""Fits by class with the classes given: those of the measured motion, sample by sample."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nfriction.fitting.classes import AccelerationClasses
+from nfriction.fitting.outcome import Fit
+from nfriction.fitting.preparation import constant_schedule
+from nfriction.fitting.torque import fit_torque, natural_scale
+from nfriction.fitting.trajectory import TrajectoryProblem
+from nfriction.fitting.windows import Windows
+from nfriction.friction import Adaptive, FrictionModel
+from nfriction.recording import Recording
+from nfriction.signals import Motion
+from nfriction.simulation import Rollout, integrate
+
+
+class Labelled(Adaptive):
+    """A table by class whose class is given: it takes the place of the acceleration.
+
+    So that whatever drives coefficients by a measured motion drives them by known classes.
+
+    Args:
+        model: the model whose law and joints are taken.
+        reference: constant coefficients toward which every class is pulled, (joint, coefficient).
+        sd: standard deviation around them, (joint, coefficient).
+    """
+
+    state_size = 0
+
+    def __init__(self, model: FrictionModel, reference: Tensor, sd: Tensor) -> None:
+        super().__init__(model.law, model.joints, reference)
+        shape = self.raw.shape
+        self._mean = reference[:, None].expand(shape).reshape(-1)
+        self._sd = sd[:, None].expand(shape).reshape(-1)
+
+    def initial_state(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        return torch.stack([qdd, qdd], -1)
+
+    def prior(self) -> tuple[Tensor, Tensor]:
+        return self._mean, self._sd
+
+
+@dataclass
+class LabelledProblem(TrajectoryProblem):
+    """A trajectory problem whose coefficients follow given classes.
+
+    Args:
+        classes: class of every sample, (window, step, joint).
+    """
+
+    classes: Tensor | None = None
+
+    def _simulate(self, x: Tensor) -> Rollout:
+        if self._simulated is not None and torch.equal(self._simulated[0], x):
+            return self._simulated[1]
+        assert self.classes is not None
+        parameters, plant_vector, state = self.split(x)
+        self.friction.schedule.set_parameter_vector(parameters)
+        q0, qd0 = state.chunk(2, -1)
+        classes = self.classes.repeat_interleave(self.substeps, 1)
+        motion = integrate(
+            self.plant_at(plant_vector), self.friction, q0, qd0, self.tau, self.step,
+            measured=(torch.zeros_like(classes), classes),
+        )  # fmt: skip
+        # What a step's derivatives are taken at must be what drove it.
+        motion = replace(motion, qdd=torch.cat([classes, classes[:, -1:]], 1))
+        self._simulated = (x.clone(), motion)
+        return motion
+
+
+def labelled_model(
+    model: FrictionModel,
+    constant: Fit,
+    joint: Sequence[Recording],
+    motions: Sequence[Motion],
+    prior_sd: float,
+) -> FrictionModel:
+    """The model with given classes, at the constant law's coefficients."""
+    values = constant_schedule(constant.model).values
+    sd = prior_sd * torch.maximum(values.abs(), natural_size(model, constant, joint, motions))
+    # Where neither tells a size, the coefficient stays free.
+    sd = torch.where(sd > 0, sd, torch.inf)
+    schedule = Labelled(model, values, sd)
+    return FrictionModel(model.law, schedule, model.v_smooth).requires_grad_(False)
+
+
+def natural_size(
+    model: FrictionModel, constant: Fit, joint: Sequence[Recording], motions: Sequence[Motion]
+) -> Tensor:
+    """Size of each coefficient that alone would explain a third of the friction torque."""
+    torque = fit_torque(model.law, constant.plant, joint, motions, model.v_smooth)
+    qd = torch.as_tensor(np.concatenate([m.qd for m in motions]))
+    return natural_scale(model.law, torque, qd)
+
+
+def driving_classes(classes: AccelerationClasses, cut: Windows) -> Tensor:
+    """Class that drives every step of windows, those without data as the one they stand for."""
+    taken = [
+        torch.stack([of[known] for of, known in zip(classes.stands_for, labels.T, strict=True)], -1)
+        for labels in classes.labels
+    ]
+    driving = torch.zeros_like(cut.tau)
+    for w, (place, first, last) in enumerate(cut.spans):
+        driving[w, : last - first] = taken[place][first:last].to(driving.dtype)
+    return driving

@@ -1,0 +1,188 @@
+"""A fitted model with its verdict: whether the search converged, and what the data tell."""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nfriction.fitting.residuals import effective_noise
+from nfriction.fitting.torque import TorqueFit
+from nfriction.fitting.trajectory import TrajectoryProblem
+from nfriction.fitting.verdict import (
+    Evidence,
+    Interval,
+    evidence,
+    intervals,
+    lost_directions,
+    standard_deviations,
+    warnings_of,
+)
+from nfriction.friction import Constant, FrictionModel
+from nfriction.plant import LinearAxis, PendulumChain
+from nfriction.signals import Motion
+from nfriction.solve.levenberg import LeastSquaresResult
+
+Plant = PendulumChain | LinearAxis
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted model and what is known of the fit.
+
+    Attributes:
+        model: the friction model, trained in place; without gradients, so that rollouts take the
+            compiled way. To train it further: `model.requires_grad_(True)`.
+        plant: the plant with its adjusted terms.
+        plant_terms: name, value and bound of each adjusted term.
+        status: `"converged: ..."` or `"not converged: ..."`, and why, in words.
+        converged: whether the search ended at a minimum.
+        residual: root mean square of what the fit left over, in `residual_unit`: of the position
+            error over the training windows, or of the torque where only torques were fitted.
+        at_bounds: names of what ended at a bound.
+        steps: accepted steps of the last stage.
+        motions: smoothed motion of each recording, in joint coordinates.
+        intervals: 95 % intervals of constant coefficients and of the plant's terms; residuals
+            that last in time count for as few as they are worth. None for a torque fit.
+        lost: what the data cannot tell, parameters or combinations of them, in words.
+        warnings: what to be wary of, a sentence each.
+    """
+
+    model: FrictionModel
+    plant: Plant
+    plant_terms: tuple[tuple[str, float, float], ...]
+    status: str
+    converged: bool
+    residual: float
+    at_bounds: tuple[str, ...]
+    steps: int
+    motions: tuple[Motion, ...]
+    _residuals: Tensor
+    intervals: tuple[Interval, ...] = ()
+    lost: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def residual_unit(self) -> str:
+        """Unit of `residual`: of positions (rad, m), or of torques (N m, N) of a torque fit."""
+        if self._residuals.numel():
+            return self.plant.unit
+        return "N" if self.plant.unit == "m" else "N m"
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "status": self.status,
+            "converged": self.converged,
+            "residual": self.residual,
+            "residual_unit": self.residual_unit,
+            "at_bounds": list(self.at_bounds),
+            "plant": {name: value for name, value, _ in self.plant_terms},
+            "intervals": {
+                i.name: [x if math.isfinite(x) else None for x in (i.low, i.high)]
+                for i in self.intervals
+            },
+            "lost": list(self.lost),
+            "warnings": list(self.warnings),
+        }
+
+
+def nearest_fit(fits: Iterable[Fit], model: FrictionModel) -> Fit | None:
+    """The fit to start from: the constant one of the model's law, else the last."""
+    last = None
+    for last in fits:
+        if last.model.law == model.law and isinstance(last.model.schedule, Constant):
+            break
+    return last
+
+
+def torque_outcome(
+    model: FrictionModel,
+    start: Fit | None,
+    plant: Plant,
+    motions: tuple[Motion, ...],
+    torque: TorqueFit,
+) -> Fit:
+    """The fit of a model whose coefficients come from torques alone."""
+    return Fit(
+        model.requires_grad_(False),
+        start.plant if start else plant,
+        start.plant_terms if start else (),
+        "converged: linear least squares of the torque",
+        True,
+        float(torque.residual.square().mean().sqrt()),
+        (),
+        0,
+        motions,
+        torch.zeros(0, dtype=torch.float64),
+    )
+
+
+def trajectory_outcome(
+    problem: TrajectoryProblem,
+    result: LeastSquaresResult,
+    residuals: Tensor,
+    motions: tuple[Motion, ...],
+) -> Fit:
+    """A fit with its verdict, from where the search ended."""
+    vector = problem.split(result.x)[1]
+    plant, count = problem.plant, problem.shared_count
+    names = problem.friction.schedule.parameter_names(plant.joint_names)
+    names += [t.name for t in problem.plant_terms]
+    lower, upper = (bound[:count] for bound in problem.bounds())
+    # What was not to be fitted has equal bounds.
+    fitted = lower < upper
+    hit = (result.at_lower | result.at_upper)[:count] & fitted
+    at_bounds = tuple(names[i] for i in hit.nonzero().flatten().tolist())
+    noise = effective_noise(residuals)
+    told, lost = _told_by_data(problem, result, names, fitted, noise)
+    residual = float(residuals.square().mean().sqrt())
+    return Fit(
+        model=problem.friction.requires_grad_(False),
+        plant=problem.plant_at(vector),
+        plant_terms=tuple(
+            (t.name, float(v), t.upper) for t, v in zip(problem.plant_terms, vector, strict=True)
+        ),
+        status=("converged: " if result.converged else "not converged: ") + result.message,
+        converged=result.converged,
+        residual=residual,
+        at_bounds=at_bounds,
+        steps=result.steps,
+        motions=motions,
+        _residuals=residuals,
+        intervals=told,
+        lost=lost,
+        warnings=warnings_of(
+            converged=result.converged, at_bounds=at_bounds, lost=lost, residual=residual,
+            effective_sd=noise, quantum=plant.position_quantum, unit=plant.unit,
+        ),
+    )  # fmt: skip
+
+
+def _told_by_data(
+    problem: TrajectoryProblem,
+    result: LeastSquaresResult,
+    names: Sequence[str],
+    fitted: Tensor,
+    noise: float,
+) -> tuple[tuple[Interval, ...], tuple[str, ...]]:
+    """Intervals, and what the data cannot tell; of a network, only of the plant's terms."""
+    count = problem.shared_count
+    if not torch.isfinite(result.hessian).all() or not noise > 0:
+        return (), ()
+    precision, _ = problem.prior()
+    known = evidence(result.hessian, precision, count, problem.noise_sd, noise)
+    constant = isinstance(problem.friction.schedule, Constant)
+    shown = fitted.clone()
+    if not constant:
+        shown[: problem.friction_count] = False
+    index = shown.nonzero().flatten()
+    lower, upper = (bound[index] for bound in problem.bounds())
+    chosen = [names[i] for i in index.tolist()]
+    fixed = fitted.nonzero().flatten()
+    part = Evidence(known.data[fixed][:, fixed], known.prior[fixed])
+    sd = torch.zeros(count, dtype=torch.float64)
+    sd[fixed] = standard_deviations(part)
+    lost = lost_directions([names[i] for i in fixed.tolist()], part) if constant else ()
+    return intervals(chosen, result.x[index], sd[index], lower, upper), lost

@@ -1,0 +1,118 @@
+"""What every fit needs before it searches: joint coordinates, adjustable terms, substeps."""
+
+import logging
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nfriction.angles import AngleConvention
+from nfriction.fitting.outcome import Plant
+from nfriction.fitting.plant_parameters import PlantParameter, plant_parameters
+from nfriction.friction import Constant, FrictionModel
+from nfriction.plant import PendulumChain
+from nfriction.recording import Recording
+from nfriction.simulation import required_substeps
+from nfriction.solve.levenberg import Step
+
+logger = logging.getLogger(__name__)
+
+# Substeps beyond this say that the sign's passage is too steep for the sample time.
+MOST_SUBSTEPS = 8
+
+
+def told_of(
+    callback: Callable[[str, Step], bool | None] | None, stage: str
+) -> Callable[[Tensor, Step], bool | None] | None:
+    """A solver's callback that tells a fit's callback the stage."""
+    return None if callback is None else lambda _, step: callback(stage, step)
+
+
+def in_joint_coordinates(
+    plant: Plant, model: FrictionModel, recordings: Sequence[Recording]
+) -> list[Recording]:
+    """The recordings in joint coordinates, checked against plant and model."""
+    if not recordings:
+        raise ValueError("at least one recording is needed to fit a model.")
+    for recording in recordings:
+        joints = recording.q.shape[1]
+        if joints != plant.joints or joints != model.joints:
+            raise ValueError(
+                f"{recording.name}: {joints} joints recorded, the plant has {plant.joints}, the "
+                f"model {model.joints}; they must agree."
+            )
+    conventions = {str(r.convention_on(plant)) for r in recordings}
+    if len(conventions) > 1:
+        raise ValueError(
+            "recordings fitted together must share one angle convention, got "
+            f"{' and '.join(sorted(conventions))}."
+        )
+    return [r.joint_coordinates(plant) for r in recordings]
+
+
+def constant_schedule(model: FrictionModel) -> Constant:
+    """The model's schedule, which must be constant."""
+    if not isinstance(model.schedule, Constant):
+        raise ValueError(f"cannot fit coefficients of type {type(model.schedule).__name__}.")
+    return model.schedule
+
+
+def _largest_torque(joint: Sequence[Recording]) -> float:
+    return max(0.0 if r.tau is None else float(np.abs(r.tau).max()) for r in joint)
+
+
+def _largest_rate(joint: Sequence[Recording]) -> float:
+    """Over spans long against a step of the encoder."""
+    spans = [max(1, len(r) // 200) for r in joint]
+    rates = [
+        np.abs(r.q[k:] - r.q[:-k]) / (r.time[k:] - r.time[:-k])[:, None]
+        for r, k in zip(joint, spans, strict=True)
+    ]
+    return max(float(rate.max()) for rate in rates)
+
+
+def _swings_freely(plant: Plant, joint: Sequence[Recording]) -> bool:
+    """Whether nothing drives a chain on a fixed pivot."""
+    fixed = isinstance(plant, PendulumChain) and not plant.first_link
+    return fixed and _largest_torque(joint) == 0
+
+
+def adjustable_terms(
+    plant: Plant,
+    joint: Sequence[Recording],
+    fit_plant: bool,
+    drag: bool | None,
+    eccentricity: bool = False,
+) -> list[PlantParameter]:
+    """Terms of the plant that a fit adjusts; `drag` None means where a chain swings freely."""
+    if not fit_plant:
+        return []
+    if drag is None:
+        drag = _swings_freely(plant, joint)
+    largest = _largest_torque(joint)
+    return plant_parameters(
+        plant, driven=largest > 0, largest_torque=largest, largest_rate=_largest_rate(joint),
+        drag=drag, eccentricity=eccentricity,
+    )  # fmt: skip
+
+
+def has_encoder_terms(names: Iterable[str]) -> bool:
+    """Whether an earlier fit's plant terms tell of eccentric encoders."""
+    return any(name.startswith("encoder ") for name in names)
+
+
+def mixing_of(plant: Plant, convention: AngleConvention) -> Tensor:
+    """Matrix from joint coordinates to the recordings', offsets aside."""
+    unit = np.eye(plant.joints)
+    return torch.as_tensor(convention.rate_from_joint(unit, plant.first_link).T.copy())
+
+
+def substeps_of(plant: Plant, model: FrictionModel, joint: Sequence[Recording]) -> int:
+    """Integration steps to a sample."""
+    step = max(float(np.diff(r.time).max()) for r in joint)
+    needed = required_substeps(plant, model, step)
+    if needed > MOST_SUBSTEPS:
+        logger.warning("friction needs %d substeps at rest, %d are used", needed, MOST_SUBSTEPS)
+    # Twice what is needed now, as coefficients may grow on the way.
+    return min(1 if needed == 1 else 2 * needed, MOST_SUBSTEPS)

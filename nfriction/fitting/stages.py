@@ -1,0 +1,131 @@
+"""Stages of a trajectory fit: windows of one length, searched from where the last stage ended."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+from torch import Tensor
+
+from nfriction.fitting.outcome import Plant
+from nfriction.fitting.plant_parameters import PlantParameter
+from nfriction.fitting.preparation import substeps_of
+from nfriction.fitting.residuals import effective_noise
+from nfriction.fitting.sensitivity import StepJacobian
+from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
+from nfriction.fitting.windows import Windows
+from nfriction.friction import FrictionModel
+from nfriction.recording import Recording
+from nfriction.solve.levenberg import LeastSquaresResult, Step
+
+Callback = Callable[[str, Step], bool | None]
+
+# Residuals grow with the windows, but not so much unless the search went astray.
+LOST_TRACK = 10.0
+# Dry friction puts kinks into the cost, along which a search may creep: so many steps in a row
+# that together lower it by no more than their tolerance end it.
+PATIENCE = 3
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Where the search ended with windows of one length.
+
+    Attributes:
+        problem: what was minimised; its model holds the best parameters.
+        result: of the search.
+        residuals: position errors there [rad or m], (window, step + 1, joint).
+    """
+
+    problem: TrajectoryProblem
+    result: LeastSquaresResult
+    residuals: Tensor
+
+    @property
+    def vector(self) -> Tensor:
+        """Values of the plant's terms."""
+        return self.problem.split(self.result.x)[1].clone()
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation that a residual counts with."""
+        return effective_noise(self.residuals)
+
+    def lost_since(self, before: "Stage") -> bool:
+        """Whether longer windows only found that the motion forgets its start within them."""
+        rms = [float(stage.residuals.square().mean().sqrt()) for stage in (before, self)]
+        far = not rms[1] <= LOST_TRACK * rms[0]
+        return far and not self.result.converged
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """Searches of one model and plant over windows of recordings.
+
+    Args:
+        plant: the mechanism as given.
+        model: the friction model, varied in place.
+        joint: recordings in joint coordinates.
+        mixing: from joint coordinates to the recordings' own.
+        terms: adjustable terms of the plant.
+        max_steps: limit to each stage.
+        callback: told every step with its stage; True stops.
+    """
+
+    plant: Plant
+    model: FrictionModel
+    joint: Sequence[Recording]
+    mixing: Tensor
+    terms: list[PlantParameter]
+    max_steps: int = 30
+    callback: Callback | None = None
+    jacobian: StepJacobian = field(init=False)
+
+    def __post_init__(self) -> None:
+        jacobian = StepJacobian(self.plant, self.model, self.terms)
+        object.__setattr__(self, "jacobian", jacobian)
+
+    def problem(
+        self, windows: Windows, noise: float, mean: Tensor | None = None, stride: int = 1
+    ) -> TrajectoryProblem:
+        """The least-squares problem of windows; see `TrajectoryProblem`."""
+        return TrajectoryProblem(
+            self.jacobian, windows, noise, self.mixing,
+            substeps=substeps_of(self.plant, self.model, self.joint), plant_mean=mean,
+            stride=stride,
+        )  # fmt: skip
+
+    def search(
+        self, problem: TrajectoryProblem, vector: Tensor, tolerance: float, name: str
+    ) -> Stage:
+        """Minimise from the model's present parameters and plant terms at `vector`.
+
+        Args:
+            problem: of this refinement.
+            vector: plant terms to start from.
+            tolerance: relative fall of the cost that counts as none.
+            name: of the stage, for the callback.
+        """
+        watch = _Watch(name, tolerance, self.callback)
+        result = solve_trajectory(
+            problem, problem.start(vector), max_steps=self.max_steps, callback=watch,
+            cost_tolerance=tolerance,
+        )  # fmt: skip
+        if watch.creeps and result.status == "stopped":
+            result = replace(result, status="stalled")
+        return Stage(problem, result, problem.errors(result.x))
+
+
+class _Watch:
+    """Tells the caller every step, and ends a search that creeps."""
+
+    def __init__(self, name: str, tolerance: float, callback: Callback | None) -> None:
+        self.name, self.tolerance, self.callback = name, tolerance, callback
+        self.costs: list[float] = []
+        self.creeps = False
+
+    def __call__(self, _: Tensor, step: Step) -> bool:
+        asked = self.callback is not None and self.callback(self.name, step)
+        self.costs.append(step.cost)
+        if not asked and len(self.costs) > PATIENCE:
+            before = self.costs[-1 - PATIENCE]
+            self.creeps = before - step.cost <= PATIENCE * self.tolerance * before
+        return bool(asked) or self.creeps

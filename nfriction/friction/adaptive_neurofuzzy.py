@@ -1,0 +1,152 @@
+"""Coefficients by class of acceleration, corrected by a neuro-fuzzy function of the motion."""
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from nfriction.friction.adaptive import Adaptive
+from nfriction.friction.laws import Law
+from nfriction.friction.neurofuzzy import (
+    LEAST_RATIO,
+    PRIOR_SD,
+    NeuroFuzzy,
+    soft_positive_inverse,
+)
+from nfriction.friction.schedules import SMALLEST, FactoredSensitivity, Schedule
+
+
+class AdaptiveNeuroFuzzy(Schedule):
+    """An adaptive schedule from which a neuro-fuzzy one deviates.
+
+    A network of the present velocity and acceleration cannot know how violent the motion has been
+    lately, nor for how long it has lasted; the classes of an adaptive schedule do. Here they give
+    the reference and the network its correction, so that an untrained one *is* the adaptive
+    schedule, and a fit can only add to it.
+
+    Args:
+        law: the law whose coefficients these are.
+        joints: number of joints.
+        initial: coefficients at the start, as in `Adaptive`.
+        terms, head_units, acceleration, interpretable, prior_sd: of the network, see `NeuroFuzzy`.
+
+    Attributes:
+        adaptive: the reference by class, with its memory.
+        deviation: the network, its inputs' range and the coefficients' scale.
+
+    References:
+        TLRIP paper: its neuro-fuzzy models start from the adaptive ones (AFEM, then NFFEM).
+    """
+
+    state_size: int = 2
+    least: Tensor
+
+    def __init__(
+        self,
+        law: Law,
+        joints: int,
+        initial: Tensor | Sequence | None = None,
+        *,
+        terms: Sequence[int] = (5, 5),
+        head_units: int = 10,
+        acceleration: Literal["along_motion", "signed"] = "along_motion",
+        interpretable: bool = False,
+        prior_sd: float = PRIOR_SD,
+    ) -> None:
+        super().__init__(law, joints)
+        self._law = law
+        self.adaptive = Adaptive(law, joints, initial)
+        # As in the network's own reference, see `LEAST_RATIO`.
+        self.register_buffer("least", self.adaptive.raw.detach().new_tensor(LEAST_RATIO))
+        self.deviation = NeuroFuzzy(
+            law, joints, self.adaptive.values.mean(1), terms=terms, head_units=head_units,
+            acceleration=acceleration, interpretable=interpretable, prior_sd=prior_sd,
+        )  # fmt: skip
+
+    def set_memory(self, **options: float) -> None:
+        """Set hysteresis, time constant and sample time of the classes, see `Adaptive`."""
+        before = self.adaptive
+        self.adaptive = Adaptive(self._law, self.joints, before.values, **options)
+        self.adaptive.set_classes(before.thresholds, before.swing_rate)
+
+    @torch.no_grad()
+    def set_adaptive(self, adaptive: Adaptive, scale: Tensor | None = None) -> None:
+        """Deviate from this schedule, and by nothing yet.
+
+        Args:
+            adaptive: taken over with its classes.
+            scale: how far a coefficient may deviate, see `NeuroFuzzy.set_reference`.
+        """
+        self.set_memory(**adaptive.options())
+        self.adaptive.set_coefficients(adaptive.values)
+        self.adaptive.set_classes(adaptive.thresholds, adaptive.swing_rate)
+        largest = adaptive.values.abs().amax(1)
+        self.deviation.set_reference(
+            adaptive.values.mean(1), largest if scale is None else torch.maximum(largest, scale)
+        )
+        self.set_parameter_vector(torch.zeros_like(self.parameter_vector()))
+        self.least.fill_(LEAST_RATIO)
+
+    @torch.no_grad()
+    def clear(self) -> None:
+        """Take the network back: exactly the adaptive schedule, coefficients of zero included."""
+        self.set_parameter_vector(torch.zeros_like(self.parameter_vector()))
+        self.least.fill_(SMALLEST)
+
+    def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        return self.coefficients_from(qd, qdd, self.initial_state(qd, qdd))
+
+    def initial_state(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        return self.adaptive.initial_state(qd, qdd)
+
+    def advance(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
+        return self.adaptive.advance(qd, qdd, state)
+
+    def coefficients_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
+        return self.deviation.deviating(self._reference(qd, qdd, state), qd, qdd)
+
+    def _reference(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
+        """The class's coefficients in the network's units."""
+        ratio = self.adaptive.coefficients_from(qd, qdd, state) / self.deviation.scale
+        lifted = soft_positive_inverse(torch.maximum(ratio, self.least), self.deviation.roundness)
+        return torch.where(self.positive, lifted, ratio)
+
+    def states(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        return self.adaptive.states(qd, qdd)
+
+    def rest_coefficients(self) -> Tensor:
+        rest = torch.zeros_like(self.adaptive.swing_rate)
+        rows = []
+        for known in range(self.adaptive.raw.shape[1]):
+            state = torch.stack([rest, torch.full_like(rest, float(known))], -1)
+            rows.append(self.coefficients_from(rest, rest, state))
+        return torch.stack(rows)
+
+    def parameter_vector(self) -> Tensor:
+        return self.deviation.parameter_vector()
+
+    def set_parameter_vector(self, vector: Tensor) -> None:
+        self.deviation.set_parameter_vector(vector)
+
+    def parameter_names(self, joint_names: Sequence[str]) -> list[str]:
+        return self.deviation.parameter_names(joint_names)
+
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        return self.deviation.bounds()
+
+    def prior(self) -> tuple[Tensor, Tensor]:
+        """Of the network: zero, where the adaptive schedule is all there is."""
+        return self.deviation.prior()
+
+    def sensitivities(self, qd: Tensor, qdd: Tensor) -> FactoredSensitivity:
+        """Derivatives at motions (sample, joint), each sample taken for a first one."""
+        return self.sensitivities_from(qd, qdd, self.initial_state(qd, qdd))
+
+    def sensitivities_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> FactoredSensitivity:
+        reference = self._reference(qd, qdd, state).detach()
+        return self.deviation.deviating_sensitivities(reference, qd, qdd)
+
+    def options(self) -> dict[str, Any]:
+        memory = {"memory": self.adaptive.options()}
+        return {"network": "by_class", **self.deviation.options(), **memory}

@@ -1,0 +1,139 @@
+"""Rules of a neuro-fuzzy model in words: IF velocity is slow AND ... THEN B = ..."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from nfriction.friction import FrictionModel, NeuroFuzzy
+
+_SPEEDS = {
+    1: ("any",),
+    2: ("slow", "fast"),
+    3: ("slow", "medium", "fast"),
+    4: ("very slow", "slow", "fast", "very fast"),
+    5: ("very slow", "slow", "medium", "fast", "very fast"),
+}
+_SIZES = ("", "strongly ", "very strongly ")
+
+
+@dataclass(frozen=True)
+class Term:
+    """A fuzzy set of one input.
+
+    Attributes:
+        name: in words.
+        centre, width: where it holds fully and its standard deviation, in SI.
+    """
+
+    name: str
+    centre: float
+    width: float
+
+
+@dataclass(frozen=True)
+class Rule:
+    """One rule: the terms that it asks for, and the coefficients where these hold fully.
+
+    Attributes:
+        velocity, acceleration: names of the terms.
+        values: of each coefficient in SI, as the whole model gives them at the middle of both
+            terms, neighbouring rules and the radial basis head included.
+    """
+
+    velocity: str
+    acceleration: str
+    values: tuple[float, ...]
+
+    def sentence(self, coefficients: Sequence[tuple[str, str]]) -> str:
+        """The rule in words; `coefficients` are names and units."""
+        then = " AND ".join(
+            f"{name} = {value:.4g} {unit}".rstrip()
+            for (name, unit), value in zip(coefficients, self.values, strict=True)
+        )
+        return f"{self.condition} THEN {then}"
+
+    @property
+    def condition(self) -> str:
+        """What it asks for, in words."""
+        return f"IF velocity is {self.velocity} AND acceleration is {self.acceleration}"
+
+
+@dataclass(frozen=True)
+class JointRules:
+    """Sets and rules of one joint; velocity's set by velocity's set, acceleration's faster."""
+
+    joint: str
+    velocity: tuple[Term, ...]
+    acceleration: tuple[Term, ...]
+    rules: tuple[Rule, ...]
+
+
+def rules_in_words(model: FrictionModel, joint_names: Sequence[str] = ()) -> list[JointRules]:
+    """The rules of a neuro-fuzzy model, joint by joint; none of a model without rules.
+
+    Sets are named by their order and by where zero lies. Acceleration counts along the motion
+    (braking, speeding up) unless the model takes it signed.
+
+    Args:
+        model: any friction model.
+        joint_names: default joint1, joint2, ...
+
+    Raises:
+        ValueError: if the names are not one a joint.
+    """
+    schedule = model.schedule
+    if not isinstance(schedule, NeuroFuzzy):
+        return []
+    names = list(joint_names) or [f"joint{k + 1}" for k in range(model.joints)]
+    if len(names) != model.joints:
+        raise ValueError(f"`joint_names` must be {model.joints} names, got {names}.")
+    lower = torch.stack([torch.zeros_like(schedule.velocity_range), schedule.acceleration_lower])
+    upper = torch.stack([schedule.velocity_range, schedule.acceleration_upper])
+    counts = list(schedule.terms)
+    with torch.no_grad():
+        centres, widths = (x.split(counts, -1) for x in schedule.network.anfis.sets())
+        # Every pair of centres is a sample, velocity's slower, all joints at once.
+        v, a = (c.clamp(0.0, 1.0).T for c in centres)
+        grid = [v.repeat_interleave(counts[1], 0), a.repeat(counts[0], 1)]
+        found = schedule.network(torch.stack(grid, -1))
+        values = schedule._coefficients(schedule.reference + found)
+    described = []
+    for j, joint in enumerate(names):
+        span = (upper - lower)[:, j]
+        at = [(lower[i, j] + span[i] * centres[i][j]).tolist() for i in range(2)]
+        sigma = [(span[i] * widths[i][j]).tolist() for i in range(2)]
+        speeds = tuple(map(Term, _speed_names(at[0]), at[0], sigma[0]))
+        accelerations = tuple(
+            map(Term, _acceleration_names(at[1], schedule.along_motion), at[1], sigma[1])
+        )
+        pairs = [(x.name, y.name) for x in speeds for y in accelerations]
+        rules = [Rule(*p, tuple(r)) for p, r in zip(pairs, values[:, j].tolist(), strict=True)]
+        described.append(JointRules(joint, speeds, accelerations, tuple(rules)))
+    return described
+
+
+def _speed_names(centres: Sequence[float]) -> list[str]:
+    names = _SPEEDS.get(len(centres)) or [f"speed {k + 1}" for k in range(len(centres))]
+    return _in_order(centres, names)
+
+
+def _acceleration_names(centres: Sequence[float], along_motion: bool) -> list[str]:
+    below, above = ("braking", "speeding up") if along_motion else ("negative", "positive")
+    ordered = sorted(centres)
+    zero = min(range(len(ordered)), key=lambda k: abs(ordered[k]))
+    names = [_size(zero - k) + below for k in range(zero)]
+    names += ["about zero"]
+    names += [_size(k - zero) + above for k in range(zero + 1, len(ordered))]
+    return _in_order(centres, names)
+
+
+def _size(rank: int) -> str:
+    return _SIZES[rank - 1] if rank <= len(_SIZES) else f"{rank} times "
+
+
+def _in_order(centres: Sequence[float], names: Sequence[str]) -> list[str]:
+    """Names from the lowest centre to the highest, given back in the order of the centres."""
+    order = sorted(range(len(centres)), key=lambda k: centres[k])
+    named = dict(zip(order, names, strict=True))
+    return [named[k] for k in range(len(centres))]

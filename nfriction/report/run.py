@@ -1,0 +1,318 @@
+"""Read what a comparison left in its folder, trusting none of it."""
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from nfriction.comparison import Comparison
+from nfriction.friction import MODELS, FrictionModel
+from nfriction.modelfile import ModelFileError, ModelInfo, info_of, load
+from nfriction.scoring import Rmse, Score
+
+# Far beyond any run of ours; what is larger is no results file or figure.
+LARGEST_RESULTS, LARGEST_FIGURE, MOST_FIGURES = 64 * 2**20, 16 * 2**20, 100
+_PNG = b"\x89PNG\r\n\x1a\n"
+
+T = TypeVar("T")
+
+
+class RunError(ValueError):
+    """A folder is not one that a comparison wrote, or it is damaged."""
+
+
+@dataclass(frozen=True)
+class FitRecord:
+    """How a fit ended, as `Fit.to_dict` tells; what an older version left out is empty.
+
+    Attributes:
+        intervals: 95 % interval by parameter, infinite where the data tell nothing.
+        plant: adjusted terms of the plant by name.
+    """
+
+    status: str
+    converged: bool
+    residual: float
+    residual_unit: str
+    at_bounds: tuple[str, ...]
+    warnings: tuple[str, ...]
+    lost: tuple[str, ...]
+    plant: dict[str, float]
+    intervals: dict[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A PNG file with its size in pixels."""
+
+    name: str
+    png: bytes
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Run:
+    """A comparison as its folder tells it.
+
+    Attributes:
+        folder: as it was given.
+        comparison: the scores, without simulated positions and without fits.
+        fits: how each fit ended, by model.
+        coefficients: by model, then by what they hold for (`"always"` for a constant model),
+            then by name: a value a joint.
+        best: name of the best model, None where nothing was held out.
+        judged_by: what it was judged by.
+        command: what made the results.
+        recordings: digest by name of those trained on (`"train"`) and `"held_out"`.
+        models: models and what their files say; those that could be read.
+        figures: in the order of their names.
+        notes: what could not be read, a sentence each.
+    """
+
+    folder: Path
+    comparison: Comparison
+    fits: dict[str, FitRecord]
+    coefficients: dict[str, dict[str, dict[str, tuple[float, ...]]]]
+    best: str | None
+    judged_by: str
+    command: str
+    recordings: dict[str, dict[str, str]]
+    models: dict[str, tuple[FrictionModel, ModelInfo]]
+    figures: tuple[Figure, ...]
+    notes: tuple[str, ...]
+
+
+def read_run(folder: str | Path) -> Run:
+    """Read the folder of `nfriction compare` or `nfriction demo`.
+
+    Raises:
+        RunError: if the folder has no sound `results.json`; one line says what is wrong.
+        OSError: if it cannot be read.
+    """
+    folder = Path(folder)
+    path = folder / "results.json"
+    if not path.is_file():
+        raise RunError(
+            f"{folder}: has no results.json; give a folder that `nfriction compare` or "
+            "`nfriction demo` wrote."
+        )
+    if path.stat().st_size > LARGEST_RESULTS:
+        raise RunError(f"{path}: is too large for results of a comparison.")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
+    except (ValueError, RecursionError) as error:
+        raise RunError(f"{path}: is no JSON, or cut short ({error}).") from error
+    try:
+        return _run(folder, _mapping(content, "the file"))
+    except _UnfitError as error:
+        raise RunError(f"{path}: not results of a comparison: {error}.") from error
+
+
+class _UnfitError(ValueError):
+    """What is wrong with an entry."""
+
+
+def _run(folder: Path, content: Mapping[str, Any]) -> Run:
+    joints = _texts(content.get("joints"), "`joints`")
+    unit = content.get("units")
+    if unit not in ("rad", "m"):
+        raise _UnfitError('`units` must be "rad" or "m"')
+    entries = _mapped(content.get("models"), "`models`", _mapping)
+    if not joints or not entries:
+        raise _UnfitError("it has no joints or no models")
+    scores = {
+        kind: {
+            name: _scores(entry.get(kind, {}), f"{name}, {kind}", len(joints))
+            for name, entry in entries.items()
+        }
+        for kind in ("train", "held_out")
+    }
+    for kind, of in scores.items():
+        # Tables pool the recordings of a model, so all must have been scored on the same.
+        forms = {tuple((s.recording, *s.windows) for s in many) for many in of.values()}
+        if len(forms) > 1:
+            raise _UnfitError(f"its models were scored on different recordings ({kind})")
+    fits = {n: _fit(e["fit"], n) for n, e in entries.items() if "fit" in e}
+    train, held_out = ({n: s for n, s in of.items() if s} for of in scores.values())
+    if not train and not held_out:
+        raise _UnfitError("it has no scores")
+    models, notes = _models(folder, fits, len(joints))
+    figures, unread = _figures(folder / "figures")
+    best = _mapping(content.get("best") or {}, "`best`")
+    if best and best.get("model") not in entries:
+        raise _UnfitError("its best model is none of its models")
+    return Run(
+        folder=folder,
+        comparison=Comparison({}, train, held_out, unit, joints),
+        fits=fits,
+        coefficients={
+            n: _coefficients(e["coefficients"], n, len(joints))
+            for n, e in entries.items()
+            if "coefficients" in e
+        },
+        best=best.get("model"),
+        judged_by=_text(best.get("by", ""), "`best`"),
+        command=_text(content.get("command", ""), "`command`"),
+        recordings={
+            kind: _mapped(digests, "`recordings`", _text)
+            for kind, digests in _mapping(content.get("recordings", {}), "`recordings`").items()
+        },
+        models=models,
+        figures=figures,
+        notes=(*notes, *unread),
+    )
+
+
+def _scores(value: object, where: str, joints: int) -> list[Score]:
+    nothing = np.zeros(0)
+    found = []
+    for recording, entry in _mapped(value, where, _mapping).items():
+        at = f"{where}, {recording}"
+        windows = _mapped(entry.get("windows", {}), at, lambda v, w: _rmse(v, w, joints))
+        for horizon in windows:
+            _seconds(horizon, at)
+        floor = entry.get("floor")
+        diverged_at = entry.get("diverged_at")
+        found.append(
+            Score(
+                recording, _rmse(entry.get("free_run"), at, joints), windows,
+                None if floor is None else _rmse(floor, at, joints), nothing, nothing,
+                math.inf if diverged_at is None else _number(diverged_at, at),
+            )
+        )  # fmt: skip
+    return found
+
+
+def _rmse(value: object, where: str, joints: int) -> Rmse:
+    """Errors of a simulation; one that diverged has null for a number."""
+    entry = _mapping(value, where)
+    of_joints = entry.get("joints")
+    if not isinstance(of_joints, list) or len(of_joints) != joints:
+        raise _UnfitError(f"{where} needs an error for each of {joints} joints")
+    errors = [math.inf if e is None else _number(e, where) for e in (*of_joints, entry.get("all"))]
+    if min(errors) < 0:
+        raise _UnfitError(f"{where} has a negative error")
+    return Rmse(tuple(errors[:-1]), errors[-1])
+
+
+def _fit(value: object, name: str) -> FitRecord:
+    entry, where = _mapping(value, f"fit of {name}"), f"fit of {name}"
+    return FitRecord(
+        status=_text(entry.get("status", "unknown"), where),
+        converged=entry.get("converged") is True,
+        residual=_number(entry.get("residual", math.nan), where),
+        residual_unit=_text(entry.get("residual_unit", ""), where),
+        at_bounds=_texts(entry.get("at_bounds", []), where),
+        warnings=_texts(entry.get("warnings", []), where),
+        lost=_texts(entry.get("lost", []), where),
+        plant=_mapped(entry.get("plant", {}), where, _number),
+        intervals=_mapped(entry.get("intervals", {}), where, _interval),
+    )
+
+
+def _interval(value: object, where: str) -> tuple[float, float]:
+    if not isinstance(value, list) or len(value) != 2:
+        raise _UnfitError(f"an interval of {where} needs two ends")
+    low, high = value
+    return (
+        -math.inf if low is None else _number(low, where),
+        math.inf if high is None else _number(high, where),
+    )
+
+
+def _coefficients(value: object, name: str, joints: int) -> dict[str, dict[str, tuple[float, ...]]]:
+    where = f"coefficients of {name}"
+    entry = _mapping(value, where)
+    sets = entry if all(isinstance(v, dict) for v in entry.values()) else {"always": entry}
+
+    def values(given: object, at: str) -> tuple[float, ...]:
+        if not isinstance(given, list) or len(given) != joints:
+            raise _UnfitError(f"{at} need a value for each of {joints} joints")
+        return tuple(_number(x, at) for x in given)
+
+    return {label: _mapped(of, where, values) for label, of in sets.items()}
+
+
+def _models(
+    folder: Path, fits: Mapping[str, FitRecord], joints: int
+) -> tuple[dict[str, tuple[FrictionModel, ModelInfo]], list[str]]:
+    """Models whose files can be read; of names that are ours, so that no path is made of others."""
+    found: dict[str, tuple[FrictionModel, ModelInfo]] = {}
+    notes = []
+    for name in fits:
+        if name not in MODELS:
+            continue
+        path = folder / "models" / f"{name}.json"
+        try:
+            model, info = load(path), info_of(path)
+        except ModelFileError as error:
+            notes.append(f"{name}: its model file could not be read ({error})")
+            continue
+        if type(model).__name__ != name or model.joints != joints:
+            notes.append(f"{name}: {path} holds another model")
+            continue
+        found[name] = (model, info)
+    return found, notes
+
+
+def _figures(folder: Path) -> tuple[tuple[Figure, ...], list[str]]:
+    found: list[Figure] = []
+    notes = []
+    for path in sorted(folder.glob("*.png"))[:MOST_FIGURES]:
+        if not path.is_file() or path.stat().st_size > LARGEST_FIGURE:
+            notes.append(f"figure {path.name}: no file, or too large")
+            continue
+        png = path.read_bytes()
+        if not png.startswith(_PNG) or len(png) < 24:
+            notes.append(f"figure {path.name}: not a PNG file")
+            continue
+        width, height = (int.from_bytes(png[k : k + 4], "big") for k in (16, 20))
+        found.append(Figure(path.stem, png, width, height))
+    return tuple(found), notes
+
+
+def _mapping(value: object, where: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise _UnfitError(f"{where} must be an object")
+    return value
+
+
+def _mapped(value: object, where: str, of: Callable[[Any, str], T]) -> dict[str, T]:
+    return {key: of(entry, f"{where}, {key}") for key, entry in _mapping(value, where).items()}
+
+
+def _text(value: object, where: str) -> str:
+    if not isinstance(value, str):
+        raise _UnfitError(f"{where} must be text")
+    return value
+
+
+def _texts(value: object, where: str) -> tuple[str, ...]:
+    if not isinstance(value, list):
+        raise _UnfitError(f"{where} must be a list of texts")
+    return tuple(_text(v, where) for v in value)
+
+
+def _number(value: object, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise _UnfitError(f"{where} must be a number")
+    try:
+        return float(value)
+    except OverflowError:
+        raise _UnfitError(f"{where} is too large a number") from None
+
+
+def _seconds(text: str, where: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise _UnfitError(f"{where} has windows of {text!r} seconds") from None
+
+
+def _refuse(name: str) -> float:
+    raise ValueError(f"{name} is not JSON")

@@ -1,0 +1,42 @@
+"""`nfriction report` as a user meets it."""
+
+from pathlib import Path
+
+from nfriction import cli
+from tests.cli.benches import results
+
+
+def test_a_comparison_becomes_a_page(compared: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "pages" / "mine.html"
+    assert cli.main(["report", str(compared), "--out", str(out)]) == 0
+    assert capsys.readouterr().out == f"wrote {out}\n"
+    html = out.read_text(encoding="utf-8")
+    figures = list((compared / "figures").glob("*.png"))
+    assert html.count("data:image/png;base64,") == len(figures) > 0
+    best = results(compared)["best"]["model"]
+    assert f"<strong>{best}</strong> predicts" in html
+    assert "nfriction compare" in html
+
+
+def test_the_page_lies_in_the_folder_by_default(compared: Path) -> None:
+    assert cli.main(["report", str(compared)]) == 0
+    first = (compared / "report.html").read_bytes()
+    assert cli.main(["report", str(compared)]) == 0
+    assert (compared / "report.html").read_bytes() == first
+
+
+def test_what_is_no_run_is_refused_in_a_line(
+    bench: Path, compared: Path, tmp_path, failing
+) -> None:
+    assert "no folder" in failing("report", tmp_path / "absent")
+    assert "results.json" in failing("report", bench)
+    assert "is a folder" in failing("report", compared, "--out", tmp_path)
+    (tmp_path / "results.json").write_text('{"models": {')
+    assert "cut short" in failing("report", tmp_path)
+    assert not (tmp_path / "report.html").exists()
+
+
+def test_a_missing_model_is_warned_of(tmp_path: Path, compared: Path, capsys) -> None:
+    (tmp_path / "results.json").write_bytes((compared / "results.json").read_bytes())
+    assert cli.main(["report", str(tmp_path)]) == 0
+    assert "warning: NCFM: its model file could not be read" in capsys.readouterr().err

@@ -1,0 +1,105 @@
+"""The documentation names only what there is: commands parse, code compiles, names resolve."""
+
+import importlib
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import nfriction
+from nfriction import cli
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
+FILE = re.compile(r"\S+\.(csv|csv\.gz|json|xml|pt|c)$")
+
+
+def blocks(language: str) -> Iterator[tuple[str, str]]:
+    """Page and text of every code block in a language."""
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        for block in re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
+            yield page.name, block
+
+
+def commands() -> list[tuple[str, str]]:
+    found = []
+    for page, block in blocks("sh"):
+        for line in block.replace("\\\n", " ").splitlines():
+            if line.startswith("nfriction "):
+                found.append((page, line.split("#")[0].strip()))
+    return found
+
+
+def test_there_are_pages_and_commands() -> None:
+    assert len(PAGES) > 10
+    assert len(commands()) > 8
+
+
+@pytest.mark.parametrize(("page", "line"), commands())
+def test_commands_parse(
+    page: str, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = line.split()[1:]
+    if words == ["--help"]:
+        return
+    monkeypatch.chdir(tmp_path)
+    for word in filter(FILE.match, words):
+        (tmp_path / word).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / word).touch()
+    assert cli.make_parser().parse_args(words).run
+
+
+@pytest.mark.parametrize(("page", "block"), list(blocks("python")))
+def test_code_compiles_and_imports_what_there_is(page: str, block: str) -> None:
+    for snippet in re.findall(r'^--8<-- "(.*)"$', block, re.MULTILINE):
+        assert (ROOT / snippet).is_file()
+    code = re.sub(r"^--8<--.*$", "", block, flags=re.MULTILINE)
+    compile(code, page, "exec")
+    for names in re.findall(r"^from nfriction import (.*)$", code, re.MULTILINE):
+        for name in names.split(","):
+            assert getattr(nfriction, name.strip())
+
+
+REFERENCES = [
+    name
+    for page in PAGES
+    for name in re.findall(r"^::: (\S+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+]
+
+
+@pytest.mark.parametrize("name", REFERENCES)
+def test_the_reference_describes_what_there_is(name: str) -> None:
+    thing, parts = importlib.import_module("nfriction"), name.split(".")
+    for k, part in enumerate(parts[1:], 2):
+        if not hasattr(thing, part):
+            importlib.import_module(".".join(parts[:k]))
+        thing = getattr(thing, part)
+    assert thing.__doc__
+
+
+def test_every_page_is_in_the_menu_and_every_figure_function_in_the_reference() -> None:
+    menu = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    for page in PAGES:
+        assert page.relative_to(ROOT / "docs").as_posix() in menu
+    from nfriction import plots
+
+    described = {name.rpartition(".")[2] for name in REFERENCES}
+    assert set(plots.__all__) - described <= {"save_all"}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    shutil.which("mkdocs", path=Path(sys.executable).parent) is None,
+    reason="no mkdocs here; `pip install .[docs]` to run this",
+)
+def test_the_site_builds_and_needs_no_network(tmp_path: Path) -> None:
+    command = [str(Path(sys.executable).parent / "mkdocs"), "build", "--strict", "-d", tmp_path]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=300)
+    for page in tmp_path.rglob("*.html"):
+        html = page.read_text(encoding="utf-8")
+        assert not re.findall(r'<(?:script|link|img)[^>]+(?:src|href)="https?://', html), page

@@ -1,0 +1,49 @@
+"""Every example runs with its tiny horizon, through the public API only."""
+
+import ast
+import runpy
+from pathlib import Path
+
+import pytest
+import torch
+
+FOLDER = Path(__file__).resolve().parents[2] / "examples"
+EXAMPLES = sorted(FOLDER.glob("*.py"))
+# The package itself, and subpackages whose `__all__` is public.
+PUBLIC = {"friction", "fuzzy", "fitting", "report", "signals", "twin"}
+
+# What the last lines of each must say, so that a silent failure is none.
+SAID = {
+    "export_to_c": "selftest",
+    "fit_a_recording": "best: ",
+    "fuzzy_rules": "in % of range",
+    "neuro_fuzzy": "THEN C_p = ",
+    "own_law": "true 0.0004",
+    "own_rig": "fitted B, C:",
+}
+
+
+def test_there_are_six() -> None:
+    assert {path.stem for path in EXAMPLES} == set(SAID)
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_runs_quickly(path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    torch.set_num_threads(1)
+    main = runpy.run_path(str(path))["main"]
+    assert main(["--quick", "--out", str(tmp_path / "out")]) == 0
+    printed = capsys.readouterr().out.replace("self-test", "selftest")
+    assert SAID[path.stem] in printed
+    assert "nan" not in printed
+    assert list((tmp_path / "out").rglob("*.*"))
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_is_short_and_uses_what_is_public(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 75
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("nfriction."):
+            assert (node.module or "").split(".")[1:] in [[name] for name in PUBLIC]
+        if isinstance(node, ast.Attribute):
+            assert not node.attr.startswith("_") or node.attr.startswith("__")

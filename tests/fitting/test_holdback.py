@@ -1,0 +1,80 @@
+"""A network is kept only where it predicts what it has not seen better than its constant law."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from nfriction import LFM, NFLFM, fit
+from nfriction.fitting.holdback import FOLDS, gain_on, judged_windows
+from nfriction.fitting.neurofuzzy_start import settle_on, start_at
+from nfriction.fitting.preparation import mixing_of
+from nfriction.fitting.stages import Refinement
+from tests.fitting.recordings import F64, pendulum, swing
+
+V_SMOOTH = 0.05
+TRUTH = [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]]
+SMALL = {"terms": (2, 2), "head_units": 2}
+
+
+@pytest.fixture(scope="module")
+def constant():
+    recording = swing(pendulum(), LFM(2, TRUTH, v_smooth=V_SMOOTH), seconds=3.0)
+    model = LFM(2, v_smooth=V_SMOOTH)
+    found = fit(model, pendulum(), recording, windows=(0.5,), fit_plant=False)
+    return recording.joint_coordinates(pendulum()), found
+
+
+def refinement(constant):
+    joint, found = constant
+    model = NFLFM(2, v_smooth=V_SMOOTH, **SMALL)
+    start_at(model, found, [joint], found.motions)
+    mixing = mixing_of(pendulum(), joint.convention_on(pendulum()))
+    return Refinement(pendulum(), model, [joint], mixing, [])
+
+
+def test_windows_are_shared_out_once(constant):
+    search, motions = refinement(constant), constant[1].motions
+    for length in (0.5, 100.0):
+        seen, held_back = judged_windows(search, motions, length)
+        assert len(held_back) == (len(seen) + len(held_back)) // FOLDS > 0
+        spans = sorted((*seen.spans, *held_back.spans))
+        samples = [np.arange(first, last) for _, first, last in spans]
+        np.testing.assert_array_equal(np.concatenate(samples), np.arange(len(constant[0]) - 1))
+
+
+def test_the_ratio_is_one_for_the_constant_law_and_large_for_nonsense(constant):
+    search, motions = refinement(constant), constant[1].motions
+    seen, held_back = judged_windows(search, motions, 0.5)
+    none = torch.zeros(0, dtype=F64)
+    schedule = search.model.schedule
+    for value, least, most in ((0.0, 1.0, 1.0), (1.0, 1.5, np.inf)):
+        schedule.set_parameter_vector(torch.full_like(schedule.parameter_vector(), value))
+        search_ended = search.search(search.problem(seen, 1e-3), none, 1.0, "")
+        schedule.set_parameter_vector(torch.full_like(schedule.parameter_vector(), value))
+        assert least <= gain_on(held_back, search_ended, none) <= most
+        assert float(schedule.parameter_vector().mean()) == value
+
+
+def test_a_model_settles_on_a_coefficient_of_zero(constant):
+    search, found = refinement(constant), constant[1]
+    zero = replace(found, model=LFM(2, [[0.0, 2e-3]] * 2, v_smooth=V_SMOOTH))
+    settle_on(search.model, zero)
+    rest = search.model.schedule.rest_coefficients()
+    scale = search.model.schedule.scale
+    assert (rest[:, 0] < 2e-6 * scale[:, 0]).all()
+    torch.testing.assert_close(rest[:, 1], torch.full((2,), 2e-3, dtype=F64), rtol=1e-6, atol=0)
+
+
+def test_a_network_that_does_not_win_is_put_back(constant, monkeypatch):
+    joint, found = constant
+    monkeypatch.setattr("nfriction.fitting.estimate.gain_on", lambda *_: 1.1)
+    model = NFLFM(2, v_smooth=V_SMOOTH, **SMALL)
+    kept = fit(model, pendulum(), joint, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
+    assert kept.model is model
+    assert "10 % worse" in kept.status
+    assert any("constant law, which is kept" in w for w in kept.warnings)
+    qd = torch.linspace(-3, 3, 14, dtype=F64).reshape(7, 2)
+    at = qd, torch.zeros_like(qd), torch.ones_like(qd)
+    torch.testing.assert_close(model(*at), found.model(*at), rtol=1e-6, atol=1e-9)

@@ -1,0 +1,67 @@
+"""Coefficients in figures are the models' own, and intervals those that the fit claims."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from nfriction import ALFM, LFM, NCFM, NFLFM, Recording, fit, plots, rigs
+from nfriction.fitting.verdict import Interval
+from nfriction.signals import Motion
+
+
+@pytest.fixture(scope="module")
+def motion() -> Motion:
+    time = np.linspace(0.0, 2.0, 401)
+    q, qd, qdd = (np.stack([a * f(3 * time) for a in (1.0, 2.0)], -1) for f in
+                  (np.sin, lambda t: 3 * np.cos(t), lambda t: -9 * np.sin(t)))  # fmt: skip
+    return Motion(time, q, qd, qdd)
+
+
+def test_lines_are_the_coefficients_along_the_motion(motion):
+    models = {"LFM": LFM(2, [2e-3, 1e-2]), "NFLFM": NFLFM(2, [1e-3, 2e-2])}
+    figure = plots.coefficients_over_time(models, motion, joint_names=["a", "b"])
+    assert len(figure.axes) == 4
+    qd, qdd = torch.tensor(motion.qd), torch.tensor(motion.qdd)
+    for k, j in np.ndindex(2, 2):
+        ax = figure.axes[2 * k + j]
+        factor = 1e3 if "[m" in ax.get_ylabel() else 1.0
+        for line, model in zip(ax.lines, models.values(), strict=True):
+            expected = model.coefficients(qd, qdd).detach().expand(len(qd), -1, -1)[:, j, k]
+            np.testing.assert_allclose(line.get_ydata() / factor, expected, rtol=1e-9)
+    figure.draw_without_rendering()
+
+
+def test_an_adaptive_model_shows_only_its_classes(motion):
+    values = [[1e-3, 1e-2], [2e-3, 2e-2], [3e-3, 3e-2]]
+    figure = plots.coefficients_over_time({"ALFM": ALFM(2, [values, values])}, motion)
+    shown = {round(float(x), 6) for ax in figure.axes[:2] for x in ax.lines[0].get_ydata()}
+    assert shown <= {1.0, 2.0, 3.0}  # mN m s/rad
+    assert shown
+
+
+def test_intervals_are_those_of_the_fit():
+    plant = rigs.multiarm_single()
+    time = np.linspace(0, 1, 501)
+    recording = Recording(time, np.sin(5 * time)[:, None], convention="relative,hanging")
+    found = fit(NCFM(1), plant, recording, method="torque")
+    value = float(found.model.schedule.values)
+    (joint,) = plant.joint_names
+    told = Interval(f"C_p of {joint}", value, 0.5 * value, 2 * value)
+    figure = plots.coefficient_intervals({"known": replace(found, intervals=(told,)),
+                                          "unknown": found})  # fmt: skip
+    (ax,) = figure.axes
+    (low, high), (edge, other) = (
+        bars[0].get_segments()[0][:, 1] for _, _, bars in (c.lines for c in ax.containers)
+    )
+    assert high / low == pytest.approx(4.0)
+    assert (edge, other) == pytest.approx(ax.get_ylim())
+    figure.draw_without_rendering()
+
+
+def test_what_cannot_be_compared_is_refused(motion):
+    with pytest.raises(ValueError, match="one law"):
+        plots.coefficients_over_time({"LFM": LFM(2), "NCFM": NCFM(2)}, motion)
+    with pytest.raises(ValueError, match="one law"):
+        plots.coefficient_intervals({})

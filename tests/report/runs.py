@@ -1,0 +1,93 @@
+"""A comparison's folder, made quickly and with names that mean no good."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from matplotlib.figure import Figure
+
+from nfriction import LFM, NFLFM, ModelInfo, save
+
+EVIL = "<script>document.title='broken'</script>&\"'"
+JOINTS = ["a<b>", "second"]
+
+
+def errors(scale: float | None) -> dict[str, Any]:
+    """An error of two joints, as `Rmse.to_dict` writes it; None diverged."""
+    return {"joints": [scale, scale], "all": scale}
+
+
+def score(scale: float | None) -> dict[str, Any]:
+    return {
+        "free_run": errors(scale),
+        "windows": {"1": errors(None if scale is None else scale / 10)},
+        "floor": errors(1e-4),
+        "diverged_at": 0.5 if scale is None else None,
+    }
+
+
+def fit(**changes: Any) -> dict[str, Any]:
+    found = {
+        "status": "converged: A full step can lower the cost no more.", "converged": True,
+        "residual": 1e-3, "residual_unit": "rad", "at_bounds": [], "plant": {"inertia 1": 0.02},
+        "intervals": {"B of second": [1e-3, None], "inertia 1": [0.01, 0.03]},
+        "lost": [], "warnings": [],
+    }  # fmt: skip
+    return found | changes
+
+
+def results() -> dict[str, Any]:
+    """What `results.json` holds: LFM is best, NLFM diverged, all texts are hostile."""
+    scales = {"no friction": 2.0, "LFM": 0.1, "NLFM": None, "NFLFM": 0.2}
+    recordings = [EVIL, "calm"]
+    models: dict[str, Any] = {
+        name: {
+            "held_out": {recordings[0]: score(scale)},
+            "train": {recordings[1]: score(scale)},
+        }
+        for name, scale in scales.items()
+    }
+    models["LFM"] |= {"fit": fit(), "coefficients": {"B": [2e-3, 3e-3], "C": [1e-3, 1e-2]}}
+    models["NLFM"] |= {
+        "fit": fit(
+            status=f"not converged: {EVIL}", converged=False, warnings=[EVIL],
+            lost=["f_a with f_v"], at_bounds=["f_b"],
+        )
+    }  # fmt: skip
+    sets = {label: {"B": [1e-3, 2e-3], "C": [1e-3, 1e-2]} for label in ("at_rest", "reference")}
+    models["NFLFM"] |= {"fit": fit(intervals={}), "coefficients": sets}
+    return {
+        "models": models,
+        "best": {"model": "LFM", "by": "free-run RMSE"},
+        "units": "rad",
+        "joints": JOINTS,
+        "command": f"nfriction compare {EVIL}",
+        "recordings": {"train": {"calm": "ab" * 32}, "held_out": {EVIL: "cd" * 32}},
+    }
+
+
+def neuro_fuzzy() -> NFLFM:
+    """A model whose rules differ and whose joints have ranges of their own."""
+    model = NFLFM(2, [2e-3, 1e-2])
+    model.schedule.set_range(torch.tensor([10.0, 5.0]), torch.tensor([[-60.0, 20.0], [-30, 30]]))
+    start = model.schedule.parameter_vector()
+    noise = torch.randn(len(start), generator=torch.Generator().manual_seed(2), dtype=start.dtype)
+    model.schedule.set_parameter_vector(start + 0.05 * noise)
+    return model
+
+
+def write(folder: Path, content: dict[str, Any] | None = None) -> Path:
+    """A run's folder with two model files and two figures."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "results.json").write_text(json.dumps(results() if content is None else content))
+    ranges = {"qd": [[-10.0, 10.0], [-5, 5]], "qdd": [[-60.0, 60], [-30, 30]]}
+    info = ModelInfo(joint_names=tuple(JOINTS), input_ranges=ranges, sample_time=1e-3)
+    save(LFM(2, [2e-3, 1e-2]), folder / "models" / "LFM.json", info)
+    save(neuro_fuzzy(), folder / "models" / "NFLFM.json", info)
+    (folder / "figures").mkdir(exist_ok=True)
+    for name in ("rmse_held_out", "positions_train_calm"):
+        figure = Figure(figsize=(4, 2))
+        figure.subplots().plot([0, 1])
+        figure.savefig(folder / "figures" / f"{name}.png")
+    return folder

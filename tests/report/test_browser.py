@@ -1,0 +1,117 @@
+"""The page in a browser: tables sort, figures open and grow, nothing is wider than the screen."""
+
+import json
+import shutil
+import subprocess
+from html import escape, unescape
+from pathlib import Path
+
+import pytest
+
+from nfriction.report import read_run, to_html
+from tests.report.runs import write
+
+BROWSER = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
+
+pytestmark = pytest.mark.skipif(
+    BROWSER is None, reason="no Chromium here; install the package `chromium` to run this"
+)
+
+# Runs beside two frames that hold the page, each as wide as a screen.
+PROBE = """
+const wait = (ms) => new Promise((done) => setTimeout(done, ms));
+const column = (table, k) => [...table.tBodies[0].rows].map((row) => row.cells[k].textContent);
+const look = async (frame) => {
+  const page = frame.contentDocument;
+  const wide = page.documentElement.scrollWidth;
+  const found = {width: frame.clientWidth, wide, title: page.title};
+  const table = page.querySelector("table");
+  const head = table.tHead.rows[0].cells[1];
+  found.before = column(table, 0);
+  head.querySelector("button").click();
+  found.ascending = [column(table, 0), head.getAttribute("aria-sort")];
+  head.querySelector("button").click();
+  found.descending = [column(table, 0), head.getAttribute("aria-sort")];
+  table.tHead.rows[0].cells[0].querySelector("button").click();
+  found.words = [column(table, 0), head.getAttribute("aria-sort")];
+  const dialog = page.querySelector("dialog");
+  page.querySelector(".zoom").click();
+  await wait(300);
+  const large = dialog.querySelector("img");
+  found.opened = [dialog.open, large.alt.length > 0, large.clientWidth];
+  dialog.querySelector("[data-do=in]").click();
+  found.grown = large.clientWidth;
+  dialog.querySelector("[data-do=fit]").click();
+  found.fitted = large.clientWidth;
+  dialog.querySelector("[data-do=close]").click();
+  found.closed = !dialog.open;
+  found.narrow = [...page.querySelectorAll("thead button, .tools button")]
+    .filter((b) => b.clientHeight > 0 && b.clientHeight < 24).length;
+  return found;
+};
+addEventListener("load", async () => {
+  const found = [];
+  for (const frame of document.querySelectorAll("iframe")) found.push(await look(frame));
+  document.body.innerHTML = "<pre></pre>";
+  document.querySelector("pre").textContent = JSON.stringify(found);
+});
+"""
+
+
+@pytest.fixture(scope="module")
+def looks(tmp_path_factory: pytest.TempPathFactory) -> list[dict]:
+    """What the probe saw on a phone and on a desktop."""
+    folder = tmp_path_factory.mktemp("browser")
+    page = escape(to_html(read_run(write(folder / "run"))))
+    frames = "".join(
+        f'<iframe srcdoc="{page}" style="width:{w}px;height:{h}px;border:0"></iframe>'
+        for w, h in ((375, 812), (1280, 900))
+    )
+    outer = folder / "outer.html"
+    outer.write_text(f"<!DOCTYPE html><body>{frames}<script>{PROBE}</script>", encoding="utf-8")
+    return json.loads(seen_by_browser(outer, folder / "profile"))
+
+
+def seen_by_browser(page: Path, profile: Path) -> str:
+    command = [
+        str(BROWSER), "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run",
+        "--disable-background-networking", "--disable-component-update", "--disable-sync",
+        f"--user-data-dir={profile}", "--virtual-time-budget=10000", "--dump-dom", page.as_uri(),
+    ]  # fmt: skip
+    run = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    return unescape(run.stdout.split("<pre>")[1].split("</pre>")[0])
+
+
+def test_nothing_is_wider_than_the_screen(looks):
+    assert [look["width"] for look in looks] == [375, 1280]
+    assert all(look["wide"] <= look["width"] for look in looks)
+
+
+def test_names_from_files_run_no_script(looks):
+    assert all(look["title"].startswith("Friction models") for look in looks)
+
+
+def test_headings_sort_their_table(looks):
+    for look in looks:
+        assert look["before"] == ["no friction", "LFM", "NLFM", "NFLFM"]
+        by_error = ["LFM", "NFLFM", "no friction", "NLFM"]  # NLFM diverged
+        assert look["ascending"] == [by_error, "ascending"]
+        assert look["descending"] == [by_error[::-1], "descending"]
+        assert look["words"] == [["LFM", "NFLFM", "NLFM", "no friction"], "none"]
+
+
+def test_figures_open_grow_and_close(looks):
+    for look in looks:
+        opened, has_alt, width = look["opened"]
+        assert opened
+        assert has_alt
+        assert 0 < width <= look["width"]
+        assert look["grown"] == pytest.approx(1.5 * width, abs=1.5)  # whole pixels
+        assert look["fitted"] == pytest.approx(width, abs=1)
+        assert look["closed"]
+
+
+def test_what_is_pressed_is_large_enough_for_a_finger(looks):
+    assert all(look["narrow"] == 0 for look in looks)

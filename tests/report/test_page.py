@@ -1,0 +1,129 @@
+"""The page needs nothing else, escapes what it was given, and says what the run says."""
+
+import itertools
+import math
+import re
+from html.parser import HTMLParser
+
+import pytest
+
+from nfriction.report import read_run, to_html
+from nfriction.report.markup import Markup, element, joined
+from nfriction.report.tables import error_table, number
+from tests.report.runs import EVIL, write
+
+
+class Page(HTMLParser):
+    """Tags with their attributes and the text of a document; ill-nested tags are an error."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.text: list[str] = []
+        self._open: list[str] = []
+        self.feed(html)
+        assert not self._open
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag not in ("meta", "img"):
+            self._open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self._open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+    def all(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+@pytest.fixture(scope="module")
+def html(tmp_path_factory):
+    return to_html(read_run(write(tmp_path_factory.mktemp("run"))))
+
+
+@pytest.fixture(scope="module")
+def page(html):
+    return Page(html)
+
+
+def test_nothing_comes_from_outside(html, page):
+    for tag, attributes in page.tags:
+        for key in ("src", "href", "action", "poster", "data"):
+            reference = attributes.get(key)
+            assert reference is None or reference.startswith(("data:image/png;base64,", "#")), tag
+        assert not any(key.startswith("on") or key == "style" for key in attributes)
+    assert not page.all("link")
+    style = html[html.index("<style>") : html.index("</style>")]
+    assert "url(" not in style
+    assert "@import" not in style
+
+
+def test_what_files_say_is_text(html, page):
+    assert len(page.all("script")) == 1
+    assert EVIL not in html
+    assert EVIL in "".join(page.text)  # and reads as it was written
+
+
+def test_the_policy_lets_only_the_pages_own_script_run(page):
+    (policy,) = (m["content"] for m in page.all("meta") if "http-equiv" in m)
+    assert policy.startswith("default-src 'none'")
+    assert "unsafe" not in policy
+
+
+def test_what_a_reader_of_the_screen_needs(page):
+    assert page.all("html")[0]["lang"] == "en"
+    assert all(a["alt"] for a in page.all("img")[:-1])  # the last one is the empty large picture
+    tables = len(page.all("table"))
+    assert tables == len(page.all("caption")) > 8
+    assert all("scope" in a for a in page.all("th"))
+    levels = [int(tag[1]) for tag, _ in page.tags if re.fullmatch(r"h\d", tag)]
+    assert levels[0] == 1
+    assert all(b - a <= 1 for a, b in itertools.pairwise(levels))
+    anchors = {a["href"].removeprefix("#") for a in page.all("a")}
+    assert anchors == {a["id"] for a in page.all("h2")}
+
+
+def test_verdicts_warnings_and_rules_are_told(page):
+    text = " ".join("".join(page.text).split())
+    for said in (
+        "LFM predicts the recordings best that no fit has seen: 100 mrad, where no friction "
+        "leaves 2000.",
+        "Not converged.",
+        "The data cannot tell: f_a with f_v.",
+        "At a bound: f_b.",
+        "IF velocity is slow AND acceleration is about zero THEN",
+        "diverged",
+        "nfriction export",
+        "trained on",
+    ):
+        assert said in text
+
+
+def test_the_least_error_of_a_column_is_marked_and_a_diverged_one_never(tmp_path):
+    table = error_table(read_run(write(tmp_path)), "held_out")
+    marked = {(row[0].text, k) for row in table.rows for k, cell in enumerate(row) if cell.best}
+    assert marked == {("LFM", k) for k in range(1, 5)}
+    (lost,) = (row for row in table.rows if row[0].text == "NLFM")
+    assert [cell.text for cell in lost[1:5]] == ["diverged"] * 4
+    saved = {row[0].text: row[-1].value for row in table.rows}
+    assert saved["LFM"] == pytest.approx(95.0)
+
+
+def test_markup_is_never_escaped_twice_nor_text_left_raw():
+    inner = element("b", "a < b")
+    assert inner == "<b>a &lt; b</b>"
+    assert element("p", inner, " & c") == "<p><b>a &lt; b</b> &amp; c</p>"
+    assert element("td", title='"', class_=None, hidden=True) == '<td title="&quot;" hidden></td>'
+    assert isinstance(joined(inner), Markup)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(12345.6, "12346"), (0.0123456, "0.01235"), (1234.4, "1234"), (math.inf, "unknown"),
+     (math.nan, "n/a"), (0.0, "0")],
+)  # fmt: skip
+def test_numbers_read_plainly(value, text):
+    assert number(value).text == text

@@ -1,0 +1,74 @@
+"""Rules in words are the model's own coefficients at the middle of the words' sets."""
+
+import pytest
+import torch
+
+from nfriction import LFM, NFLFM
+from nfriction.report import rules_in_words
+from tests.report.runs import neuro_fuzzy
+
+
+def test_a_rule_says_what_the_model_gives_where_its_words_hold():
+    model = neuro_fuzzy()
+    for j, of in enumerate(rules_in_words(model, ["one", "two"])):
+        assert len(of.rules) == 25
+        velocity = {t.name: t.centre for t in of.velocity}
+        acceleration = {t.name: t.centre for t in of.acceleration}
+        for rule in of.rules:
+            qd = torch.full((2,), velocity[rule.velocity], dtype=torch.float64)
+            qdd = torch.full((2,), acceleration[rule.acceleration], dtype=torch.float64)
+            if qd[j] == 0:  # acceleration along the motion has no meaning at rest
+                continue
+            said = torch.tensor(rule.values, dtype=torch.float64)
+            # tanh of the direction is 1 to rounding at these speeds.
+            torch.testing.assert_close(
+                said, model.coefficients(qd, qdd)[j].detach(), rtol=1e-9, atol=0
+            )
+
+
+def test_an_untrained_model_says_its_constant_law_in_every_rule():
+    (of,) = rules_in_words(NFLFM(1, [2e-3, 1e-2]))
+    assert all(rule.values == pytest.approx((2e-3, 1e-2), rel=1e-9) for rule in of.rules)
+    sentence = of.rules[12].sentence([("B", "N m s/rad"), ("C", "N m")])
+    assert sentence == (
+        "IF velocity is medium AND acceleration is about zero "
+        "THEN B = 0.002 N m s/rad AND C = 0.01 N m"
+    )
+
+
+@pytest.mark.parametrize("terms", [(1, 1), (2, 3), (4, 2), (7, 9)])
+def test_words_are_unique_and_in_order(terms):
+    model = NFLFM(1, terms=terms)
+    (of,) = rules_in_words(model)
+    for words, count in ((of.velocity, terms[0]), (of.acceleration, terms[1])):
+        assert len({t.name for t in words}) == len(words) == count
+        assert [t.centre for t in words] == sorted(t.centre for t in words)
+
+
+def test_zero_lies_where_it_is_not_in_the_middle():
+    model = NFLFM(1)
+    model.schedule.set_range(10.0, [-100.0, 20.0])
+    (of,) = rules_in_words(model)
+    nearest = min(of.acceleration, key=lambda t: abs(t.centre))
+    assert nearest.name == "about zero"
+    below = [t.name for t in of.acceleration if t.centre < nearest.centre]
+    assert all("braking" in name for name in below)
+    signed = NFLFM(1, acceleration="signed")
+    assert {t.name.split()[-1] for t in rules_in_words(signed)[0].acceleration} == {
+        "negative", "zero", "positive",
+    }  # fmt: skip
+
+
+def test_sets_that_changed_places_change_words():
+    model = NFLFM(1)
+    with torch.no_grad():
+        centres = model.schedule.network.anfis.partition.centres
+        centres[0, :5] = centres[0, :5].flip(0)
+    (of,) = rules_in_words(model)
+    assert [t.name for t in of.velocity] == ["very fast", "fast", "medium", "slow", "very slow"]
+
+
+def test_models_without_rules_have_none_and_names_must_fit():
+    assert rules_in_words(LFM(2)) == []
+    with pytest.raises(ValueError, match="2 names"):
+        rules_in_words(NFLFM(2), ["one"])
