@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -58,7 +59,8 @@ class Score:
 
     Attributes:
         recording: name of the recording.
-        free_run: error of one simulation over the whole recording from its initial state.
+        free_run: error of one simulation over the whole recording from its initial state; behind
+            a gap in time it starts anew from the smoothed motion.
         windows: error of simulations restarted from the recording, by horizon [s].
         floor: error of the free run when every initial position is off by one encoder count:
             below it, differences between models mean nothing. None where the count is unknown.
@@ -115,12 +117,19 @@ def score(
     if initial_state is not None:
         q0 = convention.position_to_joint(np.asarray(initial_state[0]), first_link)
         qd0 = convention.rate_to_joint(np.asarray(initial_state[1]), first_link)
-    tau = None if joint.tau is None else joint.tau[:-1]
-    step = np.diff(joint.time)
-    substeps = _substeps(plant, friction, float(step.max()), recording.name)
+    substeps = _substeps(plant, friction, recording.longest_step, recording.name)
     quantum = getattr(plant, "position_quantum", None)
-    starts = [q0] if quantum is None else [q0, *(q0 + quantum * e for e in np.eye(len(q0)))]
-    run, diverged_at = _simulate(plant, friction, (np.stack(starts), qd0), tau, step, substeps)
+    off = np.zeros((1, len(q0))) if quantum is None else np.eye(len(q0) + 1, len(q0), -1) * quantum
+    run = np.broadcast_to(motion.q, (len(off), *motion.q.shape)).copy()
+    diverged_at = np.inf
+    for first, last in recording.spans:
+        if first > 0:
+            q0, qd0 = motion.q[first], motion.qd[first]
+        tau = None if joint.tau is None else joint.tau[first:last]
+        step = np.diff(joint.time[first : last + 1])
+        piece, lost = _simulate(plant, friction, (q0 + off, qd0), tau, step, substeps)
+        run[:, first : last + 1] = piece
+        diverged_at = min(diverged_at, joint.time[first] - joint.time[0] + float(lost[0]))
     simulated = convention.position_from_joint(run, first_link)
     floor = None
     if quantum is not None:
@@ -133,7 +142,7 @@ def score(
         floor=floor,
         time=recording.time,
         simulated=simulated[0],
-        diverged_at=float(diverged_at[0]),
+        diverged_at=float(diverged_at),
     )
 
 
@@ -200,12 +209,9 @@ def _windows(
     if friction is not None and friction.state_size:
         known = friction.schedule.states(torch.tensor(motion.qd), torch.tensor(motion.qdd))
     for horizon in horizons:
-        # A recording a few samples short of a whole number of windows still gives that number.
-        count = int(time[-1] / horizon + 0.02)
-        width = min(horizon, time[-1] / max(count, 1))
-        edges = [int(np.searchsorted(time, k * width - 1e-9)) for k in range(count + 1)]
-        length = min(np.diff(edges), default=0)
-        starts = edges[:count]
+        edges = [_edges(time, span, horizon) for span in recording.spans]
+        length = min((b - a for e in edges for a, b in pairwise(e)), default=0)
+        starts = [a for e in edges for a in e[:-1]]
         if length < 1:
             continue
         index = np.array(starts)[:, None] + np.arange(length)
@@ -217,6 +223,17 @@ def _windows(
         measured = recording.q[np.array(starts)[:, None] + np.arange(length + 1)]
         found[f"{horizon:g}"] = Rmse.of(simulated - measured)
     return found
+
+
+def _edges(time: Array, span: tuple[int, int], horizon: float) -> list[int]:
+    """Samples between which windows of a stretch without gaps lie."""
+    first, last = span
+    duration = time[last] - time[first]
+    # A stretch a few samples short of a whole number of windows still gives that number.
+    count = int(duration / horizon + 0.02)
+    width = min(horizon, duration / max(count, 1))
+    stamps = time[first : last + 1] - time[first]
+    return [first + int(np.searchsorted(stamps, k * width - 1e-9)) for k in range(count + 1)]
 
 
 def rmse_table(scores: Mapping[str, Sequence[Score]], horizon: str | None = None) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nfriction import NCFM, PendulumChain, Recording, results
-from nfriction.cli.report import error_tables
+from nfriction.cli.tables import error_tables
 from nfriction.comparison import Comparison
 from nfriction.export import ExportError
 from nfriction.fitting import fit

@@ -36,6 +36,18 @@ def test_the_true_model_is_as_good_as_the_encoder(convention):
     assert found.diverged_at == np.inf
 
 
+@pytest.mark.filterwarnings("ignore:.*has gaps")
+def test_simulations_start_anew_behind_a_gap():
+    """The true model stays as good as the encoder, however long the recording paused."""
+    whole = swing(plant(), MODEL, **SETTINGS)
+    keep = (whole.time < 1.5) | (whole.time > 1.9)
+    gapped = replace(whole, time=whole.time[keep], q=whole.q[keep])
+    found = score(plant(), MODEL, gapped, horizons=(0.5, 1.0))
+    assert found.free_run.all < 20 * QUANTUM
+    assert all(w.all < 20 * QUANTUM for w in found.windows.values())
+    assert len(found.simulated) == len(gapped.time)
+
+
 def test_angles_are_written_as_the_plant_says_unless_the_recording_says_otherwise():
     """An encoder log that says nothing, on a rig that writes absolute angles from hanging."""
     hanging = pendulum(convention=("absolute", "hanging"), position_quantum=QUANTUM)

@@ -11,12 +11,12 @@ import shlex
 import sys
 from collections.abc import Sequence
 
-from nfriction.cli import compare, demo, export, fit, info, pages, reproduce, verify
+from nfriction.cli import compare, demo, export, fit, info, report, reproduce, verify
 from nfriction.cli.console import Parser, UsageError, interruptible, message_of, one_line_warnings
 from nfriction.version import __version__
 
 # In the order in which the help lists them.
-COMMANDS = (fit, compare, demo, pages.report, info, export, verify, reproduce)
+COMMANDS = (fit, compare, demo, report, info, export, verify, reproduce)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -73,12 +73,12 @@ def run_comparison(
     settings: dict[str, Any],
 ) -> int:
     """Fit, score, write and print."""
-    from nfriction.cli import report
+    from nfriction.cli import tables
     from nfriction.comparison import compare
     from nfriction.results import write_results
     from nfriction.selection import select
 
-    states = _initial_states(arguments.initial_states, plant, [*train, *held_out])
+    states = _initial_states(arguments, plant, [*train, *held_out])
     check_writable(arguments.out)
     selection = None
     with Progress() as progress:
@@ -96,16 +96,16 @@ def run_comparison(
             comparison, train, held_out, arguments.out,
             command=arguments.command_line, figures=not arguments.no_figures,
         )  # fmt: skip
-    print(f"\n{report.error_tables(comparison)}\n")
+    print(f"\n{tables.error_tables(comparison)}\n")
     for name, fit in comparison.fits.items():
-        print(report.fit_lines(name, fit))
+        print(tables.fit_lines(name, fit))
     if selection is not None:
-        print(f"\n{report.choice(selection)}")
-    print(f"\n{report.verdict(comparison)}")
+        print(f"\n{tables.choice(selection)}")
+    print(f"\n{tables.verdict(comparison)}")
     best = comparison.fits.get(comparison.best() or "")
     if best is not None:
-        print(report.coefficient_table(best.model, plant.joint_names, plant.unit))
-        if intervals := report.interval_table(best):
+        print(tables.coefficient_table(best.model, plant.joint_names, plant.unit))
+        if intervals := tables.interval_table(best):
             print(intervals)
         print(f"its model file: {arguments.out / 'models' / f'{comparison.best()}.json'}")
     what = "results and models" if arguments.no_figures else "results, models and figures"
@@ -114,14 +114,17 @@ def run_comparison(
 
 
 def _initial_states(
-    path: Path | None, plant: PendulumChain | LinearAxis, recordings: Sequence[Recording]
+    arguments: argparse.Namespace,
+    plant: PendulumChain | LinearAxis,
+    recordings: Sequence[Recording],
 ) -> InitialStates | None:
     """States of these recordings; says which have none and so start from their smoothed motion."""
     from nfriction.recording import read_initial_states
 
+    path = arguments.initial_states
     if path is None:
         return None
-    states = read_initial_states(path)
+    states = read_initial_states(path, degrees=arguments.degrees)
     of = [recording.name for recording in recordings]
     for name in of:
         if name in states and len(states[name][0]) != plant.joints:

@@ -26,7 +26,7 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
     parser.add_argument("--seconds", type=seconds, default=DURATION,
                         help="length of each recording [s]")  # fmt: skip
     add_comparison_options(parser)
-    parser.set_defaults(run=run, out=Path("runs/demo"))
+    parser.set_defaults(run=run, out=Path("runs/demo"), degrees=False)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -28,7 +28,7 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Fit, write, say how it went."""
-    from nfriction.cli.report import coefficient_table, fit_lines, interval_table
+    from nfriction.cli.tables import coefficient_table, fit_lines, interval_table
     from nfriction.fitting import fit
     from nfriction.friction import model_by_name
     from nfriction.modelfile import save

@@ -28,7 +28,7 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Load and print."""
-    from nfriction.cli.report import coefficient_table
+    from nfriction.cli.tables import coefficient_table
     from nfriction.modelfile import info_of, load
 
     model, info = load(arguments.model), info_of(arguments.model)

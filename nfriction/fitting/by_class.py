@@ -113,7 +113,7 @@ def refine_adaptive(
     schedule.set_parameter_vector(taken * vector)
     schedule.adaptive.set_sample_time(sample_time)
     if taken == 0:
-        schedule.clear()
+        schedule.set_parameter_vector(torch.zeros_like(vector))
         note = "The correction serves no better on windows held back: the adaptive model is kept."
         return replace(adaptive, model=model, status=f"{adaptive.status} {note}")
     found = trajectory_outcome(seen, result, seen.errors(result.x), motions)

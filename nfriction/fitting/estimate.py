@@ -39,6 +39,9 @@ WINDOWS = (0.5, 2.0, 5.0)
 LOOSE = 1e-4
 # Errors that count for less would be rounding [rad or m].
 LEAST_NOISE = 1e-9
+# How much worse than its constant law a network may do on windows held back: that law has seen
+# them, and where a recording is short few windows judge.
+HEAD_START = 1.1
 # Samples counted within the time that errors last, and the most that are passed over: a network
 # leaves errors that last less long than its constant law's.
 CORRELATED, MOST_STRIDE = 8, 20
@@ -185,11 +188,13 @@ def _refine_network(
     stride = int(min(max(correlation_time(start._residuals) / CORRELATED, 1), MOST_STRIDE))
     seen, held_back = judged_windows(search, motions, length)
     part = search.problem(seen, noise, vector, stride)
-    stage = search.search(part, vector, LOOSE, "a third held back")
+    # The constant law's own cost, in which the gain of a step is judged.
+    tolerance = _flat(float(0.5 * (start._residuals / noise).square().sum()))
+    stage = search.search(part, vector, tolerance, "a third held back")
     if stage.result.status == "stopped":
         return trajectory_outcome(stage.problem, stage.result, stage.residuals, motions)
     ratio = gain_on(held_back, stage, vector)
-    if ratio > 1:
+    if ratio > HEAD_START:
         settle_on(search.model, start)
         note = (
             f"The network predicts windows held back {100 * (ratio - 1):.3g} % worse than its "
@@ -200,7 +205,7 @@ def _refine_network(
             warnings=(*start.warnings, note),
         )  # fmt: skip
     whole = search.problem(cut_windows(search.joint, motions, length), noise, vector, stride)
-    stage = search.search(whole, stage.vector, LOOSE, f"{length:g} s windows")
+    stage = search.search(whole, stage.vector, tolerance, f"{length:g} s windows")
     return trajectory_outcome(stage.problem, stage.result, stage.residuals, motions)
 
 

@@ -110,7 +110,7 @@ def mixing_of(plant: Plant, convention: AngleConvention) -> Tensor:
 
 def substeps_of(plant: Plant, model: FrictionModel, joint: Sequence[Recording]) -> int:
     """Integration steps to a sample."""
-    step = max(float(np.diff(r.time).max()) for r in joint)
+    step = max(r.longest_step for r in joint)
     needed = required_substeps(plant, model, step)
     if needed > MOST_SUBSTEPS:
         logger.warning("friction needs %d substeps at rest, %d are used", needed, MOST_SUBSTEPS)

@@ -52,7 +52,7 @@ class Windows:
 def cut_windows(
     recordings: Sequence[Recording], motions: Sequence[Motion], length: float
 ) -> Windows:
-    """Cut recordings into windows of about `length` seconds that cover them.
+    """Cut recordings into windows of about `length` seconds that cover all but their gaps.
 
     Args:
         recordings: in joint coordinates; a recording shorter than `length` is one window.
@@ -66,15 +66,16 @@ def cut_windows(
         raise ValueError(f"`length` must be positive [s], got {length}.")
     pieces = []
     for place, (recording, motion) in enumerate(zip(recordings, motions, strict=True)):
-        span = recording.time[-1] - recording.time[0]
-        count = max(1, int(span / length + 0.5))
-        if count >= len(recording.time):
-            raise ValueError(
-                f"{recording.name or 'a recording'} has {len(recording.time)} samples in {span:g} "
-                f"s, too few for windows of {length:g} s; use longer windows."
-            )
-        edges = np.linspace(0, len(recording.time) - 1, count + 1).astype(int)
-        pieces += [(place, recording, motion, int(a), int(b)) for a, b in pairwise(edges)]
+        for first, last in recording.spans:
+            span = recording.time[last] - recording.time[first]
+            count = max(1, int(span / length + 0.5))
+            if count > last - first:
+                raise ValueError(
+                    f"{recording.name or 'a recording'} has {last - first + 1} samples in "
+                    f"{span:g} s, too few for windows of {length:g} s; use longer windows."
+                )
+            edges = np.linspace(first, last, count + 1).astype(int)
+            pieces += [(place, recording, motion, int(a), int(b)) for a, b in pairwise(edges)]
     steps = max(b - a for *_, a, b in pieces)
     joints = recordings[0].q.shape[1]
     q = np.zeros((len(pieces), steps + 1, joints))

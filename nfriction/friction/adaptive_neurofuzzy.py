@@ -1,7 +1,7 @@
 """Coefficients by class of acceleration, corrected by a neuro-fuzzy function of the motion."""
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from nfriction.friction.neurofuzzy import (
     NeuroFuzzy,
     soft_positive_inverse,
 )
-from nfriction.friction.schedules import SMALLEST, FactoredSensitivity, Schedule
+from nfriction.friction.schedules import FactoredSensitivity, Schedule
 
 
 class AdaptiveNeuroFuzzy(Schedule):
@@ -40,7 +40,8 @@ class AdaptiveNeuroFuzzy(Schedule):
     """
 
     state_size: int = 2
-    least: Tensor
+    # Final, so that TorchScript takes it for a constant.
+    least_ratio: Final[float] = LEAST_RATIO
 
     def __init__(
         self,
@@ -57,8 +58,6 @@ class AdaptiveNeuroFuzzy(Schedule):
         super().__init__(law, joints)
         self._law = law
         self.adaptive = Adaptive(law, joints, initial)
-        # As in the network's own reference, see `LEAST_RATIO`.
-        self.register_buffer("least", self.adaptive.raw.detach().new_tensor(LEAST_RATIO))
         self.deviation = NeuroFuzzy(
             law, joints, self.adaptive.values.mean(1), terms=terms, head_units=head_units,
             acceleration=acceleration, interpretable=interpretable, prior_sd=prior_sd,
@@ -86,13 +85,6 @@ class AdaptiveNeuroFuzzy(Schedule):
             adaptive.values.mean(1), largest if scale is None else torch.maximum(largest, scale)
         )
         self.set_parameter_vector(torch.zeros_like(self.parameter_vector()))
-        self.least.fill_(LEAST_RATIO)
-
-    @torch.no_grad()
-    def clear(self) -> None:
-        """Take the network back: exactly the adaptive schedule, coefficients of zero included."""
-        self.set_parameter_vector(torch.zeros_like(self.parameter_vector()))
-        self.least.fill_(SMALLEST)
 
     def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
         return self.coefficients_from(qd, qdd, self.initial_state(qd, qdd))
@@ -104,12 +96,18 @@ class AdaptiveNeuroFuzzy(Schedule):
         return self.adaptive.advance(qd, qdd, state)
 
     def coefficients_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
-        return self.deviation.deviating(self._reference(qd, qdd, state), qd, qdd)
+        base = self.adaptive.coefficients_from(qd, qdd, state)
+        reference = self._lifted(base)
+        # As a difference, so that a network of zeros leaves the adaptive schedule to the last bit.
+        moved = self.deviation.deviating(reference, qd, qdd)
+        corrected = base + (moved - self.deviation.at_reference(reference))
+        return torch.where(self.positive, corrected.clamp_min(0.0), corrected)
 
-    def _reference(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
-        """The class's coefficients in the network's units."""
-        ratio = self.adaptive.coefficients_from(qd, qdd, state) / self.deviation.scale
-        lifted = soft_positive_inverse(torch.maximum(ratio, self.least), self.deviation.roundness)
+    def _lifted(self, base: Tensor) -> Tensor:
+        """The class's coefficients in the network's units, those of zero free to rise."""
+        ratio = base / self.deviation.scale
+        least = torch.full_like(ratio, self.least_ratio)
+        lifted = soft_positive_inverse(torch.maximum(ratio, least), self.deviation.roundness)
         return torch.where(self.positive, lifted, ratio)
 
     def states(self, qd: Tensor, qdd: Tensor) -> Tensor:
@@ -144,7 +142,7 @@ class AdaptiveNeuroFuzzy(Schedule):
         return self.sensitivities_from(qd, qdd, self.initial_state(qd, qdd))
 
     def sensitivities_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> FactoredSensitivity:
-        reference = self._reference(qd, qdd, state).detach()
+        reference = self._lifted(self.adaptive.coefficients_from(qd, qdd, state)).detach()
         return self.deviation.deviating_sensitivities(reference, qd, qdd)
 
     def options(self) -> dict[str, Any]:

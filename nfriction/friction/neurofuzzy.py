@@ -113,6 +113,10 @@ class NeuroFuzzy(Schedule):
         """Coefficients where the network deviates from a reference in its own units."""
         return self._coefficients(reference + self.network(self.inputs(qd, qdd)))
 
+    def at_reference(self, reference: Tensor) -> Tensor:
+        """Coefficients at a reference in the network's own units, without the network."""
+        return self._coefficients(reference)
+
     def _coefficients(self, u: Tensor) -> Tensor:
         return self.scale * torch.where(self.positive, soft_positive(u, self.roundness), u)
 

@@ -18,6 +18,7 @@ from nfriction.recording.validation import (
     check_content,
     check_shapes,
     frozen,
+    gaps_in,
     is_uniform,
     warn_of_gaps,
     warn_of_units,
@@ -98,6 +99,19 @@ class Recording:
     def sample_time(self) -> float:
         """Median step between samples [s]."""
         return float(np.median(np.diff(self.time)))
+
+    @property
+    def spans(self) -> list[tuple[int, int]]:
+        """First and last sample of each stretch without a gap in time, two samples at least."""
+        gaps = gaps_in(self.time)
+        first, last = [0, *(gaps + 1).tolist()], [*gaps.tolist(), len(self.time) - 1]
+        return [(a, b) for a, b in zip(first, last, strict=True) if a < b]
+
+    @property
+    def longest_step(self) -> float:
+        """Longest step between samples, gaps aside [s]."""
+        step = np.diff(self.time)
+        return float(np.delete(step, gaps_in(self.time)).max())
 
     @property
     def is_uniform(self) -> bool:

@@ -95,17 +95,23 @@ def check_content(recording: Recording) -> None:
         )
 
 
-def warn_of_gaps(recording: Recording) -> None:
-    step = np.diff(recording.time)
+def gaps_in(time: Array) -> NDArray[np.intp]:
+    """Samples after which the recording pauses."""
+    step = np.diff(time)
     # Logs from computers without a real-time system jitter by up to three steps.
-    gaps = np.flatnonzero(step > 5 * np.median(step))
+    return np.flatnonzero(step > 5 * np.median(step))
+
+
+def warn_of_gaps(recording: Recording) -> None:
+    gaps = gaps_in(recording.time)
     if len(gaps):
-        k = gaps[np.argmax(step[gaps])]
+        step = np.diff(recording.time)[gaps]
+        k = int(np.argmax(step))
         _warn(
             recording,
             f"`time` has gaps ({len(gaps)}), the longest of {step[k]:.4g} s at "
-            f"{recording.time[k]:.6g} s, which a simulation crosses in one step",
-            "cut it there, as by `window`",
+            f"{recording.time[gaps[k]]:.6g} s",
+            "no simulation crosses them; each starts anew behind one",
         )
 
 

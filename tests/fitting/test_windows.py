@@ -69,3 +69,14 @@ def test_windows_too_short_for_a_step_are_refused():
         cut_windows([recording], [motion], 1e-3)
     with pytest.raises(ValueError, match="positive"):
         cut_windows([recording], [motion], 0.0)
+
+
+@pytest.mark.filterwarnings("ignore:.*has gaps")
+@pytest.mark.parametrize("length", [0.3, 1.0, 100.0])
+def test_no_window_reaches_over_a_gap(length):
+    recording, motion = made(301)
+    time = recording.time + 2.0 * (np.arange(301) > 120)
+    w = cut_windows([Recording(time, recording.q)], [motion], length)
+    assert float(w.step.max()) < 0.1
+    assert int((w.weight.sum(1) - 1).sum()) == 299
+    assert [span for span in w.spans if span[1] <= 120 < span[2]] == []
