@@ -7,7 +7,7 @@ BIN := .venv/bin
 .PHONY: demo test lint clean
 
 demo: .venv/installed
-	$(BIN)/nfriction demo --out runs/demo
+	$(BIN)/nfriction reproduce --quick --out runs/papers
 
 test: .venv/installed
 	$(BIN)/python -m pytest -n auto -m "not slow"

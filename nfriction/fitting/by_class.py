@@ -48,8 +48,8 @@ def refine_adaptive(
     """Fit a network that corrects an adaptive model's coefficients.
 
     It learns from two windows of three. The third ones decide how much of the correction is
-    taken: all, a half or a quarter of it, as much as simulates them no worse on any joint, or
-    nothing, and the model is the adaptive one.
+    taken: all of it, and then it learns from these too; a half or a quarter, as much as simulates
+    them no worse on any joint; or nothing, and the model is the adaptive one.
 
     Args:
         model: its schedule an `AdaptiveNeuroFuzzy`; changed in place.
@@ -111,14 +111,21 @@ def refine_adaptive(
             taken = share
             break
     schedule.set_parameter_vector(taken * vector)
+    fitted = seen
+    if taken == 1:
+        # What has proved itself may learn from all windows.
+        fitted = problem(cut)
+        result = solve_trajectory(
+            fitted, fitted.start(), max_steps=max_steps, cost_tolerance=LOOSE, callback=told
+        )
     schedule.adaptive.set_sample_time(sample_time)
     if taken == 0:
-        schedule.set_parameter_vector(torch.zeros_like(vector))
         note = "The correction serves no better on windows held back: the adaptive model is kept."
         return replace(adaptive, model=model, status=f"{adaptive.status} {note}")
-    found = trajectory_outcome(seen, result, seen.errors(result.x), motions)
+    if taken < 1:
+        result.x[: len(vector)] *= taken
+    found = trajectory_outcome(fitted, result, fitted.errors(result.x), motions)
     part = "" if taken == 1 else f" {taken:g} of the correction is taken."
-    schedule.set_parameter_vector(taken * vector)
     return replace(found, status=found.status + part, plant_terms=adaptive.plant_terms)
 
 
@@ -126,7 +133,7 @@ def _set_range(schedule: AdaptiveNeuroFuzzy, qd: Tensor, qdd: Tensor) -> None:
     """The range of the motion for the network's inputs, wild accelerations aside."""
     along = qdd * qd.sign() if schedule.deviation.along_motion else qdd
     low, high = np.quantile(along.numpy(), [0.001, 0.999], axis=0)
-    schedule.deviation.set_range(
+    schedule.set_range(
         qd.abs().amax(0), torch.stack([torch.as_tensor(low), torch.as_tensor(high)], -1)
     )
 

@@ -15,6 +15,11 @@ from nfriction.friction.neurofuzzy import (
     soft_positive_inverse,
 )
 from nfriction.friction.schedules import FactoredSensitivity, Schedule
+from nfriction.fuzzy.membership import HALF_WIDTH_OF_GAUSSIAN
+from nfriction.fuzzy.placement import crossing_half_widths
+
+# Powers of an even spacing from zero by which sets of velocity and acceleration are placed.
+VELOCITY_POWER, ACCELERATION_POWER = 3, 2
 
 
 class AdaptiveNeuroFuzzy(Schedule):
@@ -85,6 +90,29 @@ class AdaptiveNeuroFuzzy(Schedule):
             adaptive.values.mean(1), largest if scale is None else torch.maximum(largest, scale)
         )
         self.set_parameter_vector(torch.zeros_like(self.parameter_vector()))
+
+    @torch.no_grad()
+    def set_range(self, velocity: Tensor, acceleration: Tensor) -> None:
+        """Set the network's trained range, its sets the denser the slower the motion.
+
+        Friction changes most where a joint hardly moves, and there a swing spends most of its
+        time; evenly spaced sets would see a single one in all of it.
+
+        Args:
+            velocity, acceleration: see `NeuroFuzzy.set_range`.
+        """
+        network = self.deviation
+        network.set_range(velocity, acceleration)
+        fast, lively = (torch.linspace(0.0, 1.0, n, dtype=velocity.dtype) for n in network.terms)
+        centred = 2.0 * lively - 1.0
+        share = centred.sign() * centred.abs() ** ACCELERATION_POWER
+        low, high = (network.acceleration_lower[:, None], network.acceleration_upper[:, None])
+        # In the network's inputs, where zero acceleration lies wherever its range leaves it.
+        accelerations = (torch.where(share < 0, -share * low, share * high) - low) / (high - low)
+        centres = [(fast**VELOCITY_POWER).expand(self.joints, -1), accelerations]
+        half_widths = crossing_half_widths(centres, torch.ones(self.joints, 2).to(velocity))
+        widths = [half / HALF_WIDTH_OF_GAUSSIAN for half in half_widths]
+        network.network.anfis.init_from_sets(centres, widths, lower=0.0, upper=1.0)
 
     def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
         return self.coefficients_from(qd, qdd, self.initial_state(qd, qdd))

@@ -23,8 +23,8 @@ def positions(
 ) -> Figure:
     """Measured against simulated position, a pair of panels a joint: position, error below.
 
-    A panel spans what was measured, and errors of up to half of that of what did not diverge; what
-    lies beyond is cut off.
+    A panel spans what was measured, and the errors of models that did not diverge, up to half of
+    that; what lies beyond, such as a simulation without friction, is cut off.
 
     Args:
         recording: what was measured, in its own convention and unit.
@@ -47,8 +47,9 @@ def positions(
         2 * joints, 1, width, 0.4 + 1.7 * joints, sharex=True, height_ratios=[1.5, 1] * joints
     )
     looks = style.looks(scores)
-    # A diverging error would leave nothing to see of the others.
+    # Errors that diverge or know of no friction would leave nothing to see of the others.
     whole = {n for n, s in scores.items() if not np.isfinite(s.diverged_at)} or set(scores)
+    whole = whole - {NO_FRICTION} or whole
     for joint, name in enumerate(recording.names):
         measured = recording.q[:, joint]
         span = float(np.ptp(measured)) or 1.0

@@ -55,10 +55,10 @@ QUICK = Settings(
     tlrip_seconds=10.0,
     rtip_seconds=10.0,
     max_steps=5,
-    network_steps=3,
+    network_steps=2,
     terms=(3, 3),
     head_units=5,
     controller_samples=2000,
-    search_evaluations=300,
+    search_evaluations=200,
 )
 """A look at everything within two minutes; the figures are then not the papers'."""

@@ -30,7 +30,7 @@ class Order:
 
     Attributes:
         broken: where not, in words.
-        best: the best of the nine by joint.
+        best: the best of the nine by joint, those that tie joined by an equals sign.
     """
 
     broken: tuple[str, ...]
@@ -151,7 +151,11 @@ def order_of(table: pd.DataFrame) -> Order:
         # What diverged is no number, and not in order.
         if not e <= limit or np.isinf(e)
     ]
-    best = {joint: min(error, key=lambda m: error[m][k]) for k, joint in enumerate(joints)}
+    # Models that share the least error, as one that was left at the other's coefficients, tie.
+    best = {
+        joint: " = ".join(m for m, e in error.items() if e[k] == min(x[k] for x in error.values()))
+        for k, joint in enumerate(joints)
+    }
     return Order(tuple(broken), best)
 
 
