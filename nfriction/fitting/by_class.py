@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nfriction.fitting.holdback import FOLDS, HEAD_START
 from nfriction.fitting.outcome import Fit, trajectory_outcome
 from nfriction.fitting.preparation import (
     in_joint_coordinates,
@@ -14,7 +15,7 @@ from nfriction.fitting.preparation import (
     substeps_of,
     told_of,
 )
-from nfriction.fitting.residuals import correlation_time, effective_noise
+from nfriction.fitting.residuals import effective_noise, stride_of
 from nfriction.fitting.sensitivity import StepJacobian
 from nfriction.fitting.torque import fit_torque, natural_scale
 from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
@@ -24,16 +25,12 @@ from nfriction.friction.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
 from nfriction.recording import Recording
 from nfriction.solve.levenberg import LevenbergMarquardt, Step
 
-# Every so many-th window is held back, so that all sizes of the motion are judged.
-FOLDS = 3
 # Relative fall of the cost that ends the search: only its neighbourhood matters to a correction.
 LOOSE = 1e-3
 # How much of a correction is tried, until one serves.
 SHARES = (1.0, 0.5, 0.25)
 # Of the search for the starts of windows held back.
 START_STEPS = 4
-# Samples counted within the time that errors last, and the most that are passed over.
-CORRELATED, MOST_STRIDE = 8, 20
 
 
 def refine_adaptive(
@@ -49,7 +46,7 @@ def refine_adaptive(
 
     It learns from two windows of three. The third ones decide how much of the correction is
     taken: all of it, and then it learns from these too; a half or a quarter, as much as simulates
-    them no worse on any joint; or nothing, and the model is the adaptive one.
+    them not clearly worse on any joint; or nothing, and the model is the adaptive one.
 
     Args:
         model: its schedule an `AdaptiveNeuroFuzzy`; changed in place.
@@ -86,7 +83,7 @@ def refine_adaptive(
     cut = cut_windows(joint, motions, length)
     back = torch.arange(len(cut)) % FOLDS == FOLDS - 1
     substeps = substeps_of(plant, model, joint)
-    stride = int(min(max(correlation_time(adaptive._residuals) / CORRELATED, 1), MOST_STRIDE))
+    stride = stride_of(adaptive._residuals)
 
     def problem(windows: Windows) -> TrajectoryProblem:
         return TrajectoryProblem(
@@ -104,7 +101,7 @@ def refine_adaptive(
         seen, seen.start(), max_steps=max_steps, cost_tolerance=LOOSE, callback=told
     )
     vector = seen.split(result.x)[0].clone()
-    limit = _by_joint(judged, torch.zeros_like(vector))
+    limit = HEAD_START**2 * _by_joint(judged, torch.zeros_like(vector))
     taken = 0.0
     for share in SHARES:
         if bool((_by_joint(judged, share * vector) <= limit).all()):

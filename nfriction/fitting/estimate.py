@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.eccentricity import may_be_eccentric, richer_by_evidence
-from nfriction.fitting.holdback import gain_on, judged_windows
+from nfriction.fitting.holdback import HEAD_START, gain_on, judged_windows
 from nfriction.fitting.neurofuzzy_start import is_constant_fit, settle_on, start_at
 from nfriction.fitting.outcome import Fit, Plant, torque_outcome, trajectory_outcome
 from nfriction.fitting.preparation import (
@@ -19,7 +19,7 @@ from nfriction.fitting.preparation import (
     in_joint_coordinates,
     mixing_of,
 )
-from nfriction.fitting.residuals import correlation_time, effective_noise
+from nfriction.fitting.residuals import effective_noise, stride_of
 from nfriction.fitting.stages import Callback, Refinement, Stage
 from nfriction.fitting.torque import fit_torque
 from nfriction.fitting.windows import cut_windows
@@ -39,12 +39,6 @@ WINDOWS = (0.5, 2.0, 5.0)
 LOOSE = 1e-4
 # Errors that count for less would be rounding [rad or m].
 LEAST_NOISE = 1e-9
-# How much worse than its constant law a network may do on windows held back: that law has seen
-# them, and where a recording is short few windows judge.
-HEAD_START = 1.1
-# Samples counted within the time that errors last, and the most that are passed over: a network
-# leaves errors that last less long than its constant law's.
-CORRELATED, MOST_STRIDE = 8, 20
 
 
 def fit(
@@ -185,7 +179,7 @@ def _refine_network(
     # What the constant law left over, at the same window length, is the noise that the prior is
     # weighed against.
     noise = effective_noise(start._residuals)
-    stride = int(min(max(correlation_time(start._residuals) / CORRELATED, 1), MOST_STRIDE))
+    stride = stride_of(start._residuals)
     seen, held_back = judged_windows(search, motions, length)
     part = search.problem(seen, noise, vector, stride)
     # The constant law's own cost, in which the gain of a step is judged.

@@ -3,6 +3,10 @@
 import torch
 from torch import Tensor
 
+# Samples counted within the time that errors last, and the most that are passed over: a network
+# leaves errors that last less long than its constant law's.
+CORRELATED, MOST_STRIDE = 8, 20
+
 
 def correlation_time(residuals: Tensor) -> float:
     """Integrated autocorrelation time of residuals in samples, 1 or more.
@@ -30,3 +34,12 @@ def effective_noise(residuals: Tensor) -> float:
         residuals: [rad or m], shape (window, sample, joint).
     """
     return float(residuals.square().mean().sqrt()) * correlation_time(residuals) ** 0.5
+
+
+def stride_of(residuals: Tensor) -> int:
+    """Of how many samples one is enough, where errors last as long as these.
+
+    Args:
+        residuals: [rad or m], shape (window, sample, joint).
+    """
+    return int(min(max(correlation_time(residuals) / CORRELATED, 1), MOST_STRIDE))
