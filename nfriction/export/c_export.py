@@ -51,8 +51,8 @@ def c(
         torque_limit, cutoff_hz: see `controller_of`.
 
     Returns:
-        What was written: `<name>.c` and `<name>.h`; `<name>.json` with the metadata and test
-        vectors; `<prefix>_selftest.c`, a program that returns 0 where these agree; `<prefix>.hpp`
+        What was written: `<name>.c` and `<name>.h`; `<name>.contract.json` with the metadata
+        and test vectors; `<prefix>_selftest.c`, a program that returns 0 where these agree; `<prefix>.hpp`
         for C++; `<name>_sfun.c` for Simulink and `<name>.ino` for Arduino.
 
     Raises:
@@ -79,7 +79,7 @@ def c(
     files = {
         f"{name}.c": source.code,
         f"{name}.h": source.header,
-        f"{name}.json": contract.to_json() + "\n",
+        f"{name}.contract.json": contract.to_json() + "\n",
         f"{prefix}_selftest.c": _filled("selftest.c", {**words, **_vectors(contract, real)}),
         f"{prefix}.hpp": _filled("wrapper.hpp", words),
         f"{name}_sfun.c": _filled("simulink.c", words),

@@ -66,6 +66,11 @@ void nf_rows(long rows, const double *const *in, double *tau, double *coefficien
 """
 
 
+def beside(source: str | Path) -> Path:
+    """Where the contract of an exported C file lies: apart from a model file of the same name."""
+    return Path(source).with_suffix(".contract.json")
+
+
 def c_contract(source: str | Path) -> Contract:
     """The contract that lies beside an exported C file.
 
@@ -73,14 +78,14 @@ def c_contract(source: str | Path) -> Contract:
         ContractError: if it is damaged.
         OSError: if it cannot be read.
     """
-    return Contract.from_json(Path(source).with_suffix(".json").read_text("utf-8"))
+    return Contract.from_json(beside(source).read_text("utf-8"))
 
 
 def c_runner(source: str | Path, flags: Sequence[str] = FLAGS) -> Callable[..., tuple[Any, ...]]:
     """Compile an exported C file and hand back a function for `verify` and `compare`.
 
     Args:
-        source: the `.c` file; its `.h` and `.json` lie beside it.
+        source: the `.c` file; its `.h` and `.contract.json` lie beside it.
         flags: of the compiler.
 
     Returns:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nfriction.export.c_run import c_contract, c_runner
+from nfriction.export.c_run import beside, c_contract, c_runner
 from nfriction.export.contract import (
     Contract,
     ContractError,
@@ -41,15 +41,15 @@ def open_c(path: str | Path) -> tuple[Contract, Runner]:
         ContractError: if the metadata are absent or damaged.
     """
     path = Path(path)
-    beside = path.with_suffix(".json")
-    if not beside.is_file():
-        raise ContractError(f"{path}: its metadata, {beside.name}, do not lie beside it.")
-    if max(path.stat().st_size, beside.stat().st_size) > LARGEST_FILE:
+    metadata = beside(path)
+    if not metadata.is_file():
+        raise ContractError(f"{path}: its metadata, {metadata.name}, do not lie beside it.")
+    if max(path.stat().st_size, metadata.stat().st_size) > LARGEST_FILE:
         raise ExportError(f"{path}: too large for a controller of nfriction.")
     contract = c_contract(path)
     prefix = contract.description.get("prefix")
     if not isinstance(prefix, str) or not prefix.isidentifier():
-        raise ContractError(f"{beside}: lacks the prefix of the functions.")
+        raise ContractError(f"{metadata}: lacks the prefix of the functions.")
     return contract, c_runner(path)
 
 
@@ -97,7 +97,7 @@ def verify_artefact(
     that you trust.
 
     Args:
-        path: `.pt`, `.pt2`, `.onnx`, or `.c` with its `.json` beside it.
+        path: `.pt`, `.pt2`, `.onnx`, or `.c` with its `.contract.json` beside it.
         model: the model, as loaded from its file.
         info: what the model file says besides the parameters.
         points: how many to draw; at most 2,000 where the controller has a state.

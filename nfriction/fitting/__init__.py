@@ -1,6 +1,7 @@
 """Estimation of friction and plant terms from recordings."""
 
 from nfriction.fitting.adaptive import fit_adaptive, fit_by_search
+from nfriction.fitting.by_class import refine_adaptive
 from nfriction.fitting.classes import AccelerationClasses, find_classes
 from nfriction.fitting.estimate import fit
 from nfriction.fitting.neurofuzzy import NetworkFit, train_network, train_on_controller
@@ -17,6 +18,7 @@ __all__ = [
     "fit_adaptive",
     "fit_by_search",
     "nearest_fit",
+    "refine_adaptive",
     "train_network",
     "train_on_controller",
 ]

@@ -1,6 +1,7 @@
 """Friction models: laws times schedules."""
 
 from nfriction.friction.adaptive import CLASSES, Adaptive
+from nfriction.friction.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
 from nfriction.friction.controller_schedule import RadialBasis
 from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.models import (
@@ -34,6 +35,7 @@ __all__ = [
     "NFNLFM",
     "NLFM",
     "Adaptive",
+    "AdaptiveNeuroFuzzy",
     "Coefficient",
     "Constant",
     "FrictionModel",

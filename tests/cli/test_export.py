@@ -54,6 +54,13 @@ def test_to_controllers_and_back(
     assert "lfm.pt IS NOT other.json" in said
 
 
+def test_artefacts_beside_a_model_leave_it_whole(model: Path) -> None:
+    before = model.read_bytes()
+    targets = "torchscript,c,pt2,onnx"
+    assert cli.main(["export", str(model), "--to", targets, "--out", str(model.parent)]) == 0
+    assert model.read_bytes() == before
+
+
 def test_to_simulators(model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     time = 1e-3 * np.arange(2000)
     phase = 5 * time[:, None] + np.arange(RIG.joints)
@@ -89,5 +96,5 @@ def test_what_cannot_be_done_is_said(
 def test_the_filter_goes_in(model: Path, tmp_path: Path) -> None:
     words = ["--with-filter", "--cutoff", "30", "--to", "c", "--out", str(tmp_path / "out")]
     assert cli.main(["export", str(model), *words]) == 0
-    told = json.loads((tmp_path / "out" / "lfm.json").read_text())
+    told = json.loads((tmp_path / "out" / "lfm.contract.json").read_text())
     assert told["filter"]["cutoff_hz"] == 30.0

@@ -58,7 +58,7 @@ def test_doctored_c_is_found_out(tmp_path: Path) -> None:
     source.write_text("no C at all")
     with pytest.raises(ExportError, match="failed"):
         verify_artefact(source, MODELS["LFM"], INFO)
-    beside = tmp_path / "m.json"
+    beside = tmp_path / "m.contract.json"
     beside.write_text(beside.read_text()[:-100])
     with pytest.raises(ContractError, match="cut short"):
         verify_artefact(source, MODELS["LFM"], INFO)
@@ -79,7 +79,7 @@ def test_huge_files_are_refused_before_they_are_read(tmp_path: Path) -> None:
     for name in ("m.pt", "m.c"):
         with (tmp_path / name).open("wb") as file:
             file.truncate(2**29)  # sparse
-    (tmp_path / "m.json").write_text(a_contract().to_json())
+    (tmp_path / "m.contract.json").write_text(a_contract().to_json())
     for name in ("m.pt", "m.c"):
         with pytest.raises(ExportError, match="too large"):
             verify_artefact(tmp_path / name, LFM(2))
