@@ -52,8 +52,8 @@ def c(
 
     Returns:
         What was written: `<name>.c` and `<name>.h`; `<name>.contract.json` with the metadata
-        and test vectors; `<prefix>_selftest.c`, a program that returns 0 where these agree; `<prefix>.hpp`
-        for C++; `<name>_sfun.c` for Simulink and `<name>.ino` for Arduino.
+        and test vectors; `<prefix>_selftest.c`, a program that returns 0 where these agree;
+        `<prefix>.hpp` for C++; `<name>_sfun.c` for Simulink and `<name>.ino` for Arduino.
 
     Raises:
         ExportError: if the law or schedule uses an operation that has no C form.
