@@ -129,9 +129,7 @@ def warnings_of(
     if not converged:
         found.append("The search did not end at a minimum; intervals may be too narrow.")
     if at_bounds:
-        found.append(
-            f"At a bound: {', '.join(at_bounds)}; the data ask for less than the model allows."
-        )
+        found.append(f"At a bound: {', '.join(at_bounds)}; the data ask for values beyond it.")
     if lost:
         found.append(f"The data cannot tell: {'; '.join(lost)}.")
     rounding = None if quantum is None else quantum / 12**0.5
