@@ -23,11 +23,11 @@ from nfriction.fitting.windows import Windows, cut_windows
 from nfriction.friction import Adaptive, FrictionModel
 from nfriction.friction.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
 from nfriction.recording import Recording
-from nfriction.solve.levenberg import LeastSquaresResult, LevenbergMarquardt, Step
+from nfriction.solve.levenberg import LevenbergMarquardt, Step
 
 # Relative fall of the cost that ends the search: only its neighbourhood matters to a correction.
 LOOSE = 1e-3
-# Of the network's prior standard deviation, tried until one serves.
+# How much of a correction is tried, until one serves.
 SHARES = (1.0, 0.5, 0.25)
 # Of the search for the starts of windows held back.
 START_STEPS = 4
@@ -44,9 +44,9 @@ def refine_adaptive(
 ) -> Fit:
     """Fit a network that corrects an adaptive model's coefficients.
 
-    It learns from two windows of three. The third ones decide how freely it may deviate: as its
-    prior says, or a half or a quarter as far, the first that simulates them not clearly worse on
-    any joint; it then learns from all windows. Where none does, the model is the adaptive one.
+    It learns from two windows of three. The third ones decide how much of the correction is
+    taken: all of it, and then it learns from these too; a half or a quarter, as much as simulates
+    them not clearly worse on any joint; or nothing, and the model is the adaptive one.
 
     Args:
         model: its schedule an `AdaptiveNeuroFuzzy`; changed in place.
@@ -94,35 +94,35 @@ def refine_adaptive(
 
     seen, judged = problem(cut.subset(~back)), problem(cut.subset(back))
     told = told_of(callback, f"{length:g} s windows, correction by class")
-
-    def learned(of: TrajectoryProblem, start: Tensor) -> LeastSquaresResult:
-        schedule.set_parameter_vector(start)
-        return solve_trajectory(
-            of, of.start(), max_steps=max_steps, cost_tolerance=LOOSE, callback=told
-        )
-
     # The memory advances with every step of the integration while the search lasts.
     sample_time = schedule.adaptive.sample_time
     schedule.adaptive.set_sample_time(sample_time / substeps)
-    nothing = torch.zeros_like(schedule.parameter_vector())
-    limit = HEAD_START**2 * _by_joint(judged, nothing)
-    given, whole = schedule.deviation.prior_sd, problem(cut)
-    result = None
+    result = solve_trajectory(
+        seen, seen.start(), max_steps=max_steps, cost_tolerance=LOOSE, callback=told
+    )
+    vector = seen.split(result.x)[0].clone()
+    limit = HEAD_START**2 * _by_joint(judged, torch.zeros_like(vector))
+    taken = 0.0
     for share in SHARES:
-        schedule.deviation.prior_sd = share * given
-        vector = seen.split(learned(seen, nothing).x)[0].clone()
-        if bool((_by_joint(judged, vector) <= limit).all()):
-            # What has proved itself may learn from all windows.
-            result = learned(whole, vector)
+        if bool((_by_joint(judged, share * vector) <= limit).all()):
+            taken = share
             break
+    schedule.set_parameter_vector(taken * vector)
+    fitted = seen
+    if taken == 1:
+        # What has proved itself may learn from all windows.
+        fitted = problem(cut)
+        result = solve_trajectory(
+            fitted, fitted.start(), max_steps=max_steps, cost_tolerance=LOOSE, callback=told
+        )
     schedule.adaptive.set_sample_time(sample_time)
-    if result is None:
-        schedule.deviation.prior_sd = given
-        schedule.set_parameter_vector(nothing)
+    if taken == 0:
         note = "The correction serves no better on windows held back: the adaptive model is kept."
         return replace(adaptive, model=model, status=f"{adaptive.status} {note}")
-    found = trajectory_outcome(whole, result, whole.errors(result.x), motions)
-    part = "" if share == 1 else f" The network's prior is {share:g} of what was given."
+    if taken < 1:
+        result.x[: len(vector)] *= taken
+    found = trajectory_outcome(fitted, result, fitted.errors(result.x), motions)
+    part = "" if taken == 1 else f" {taken:g} of the correction is taken."
     return replace(found, status=found.status + part, plant_terms=adaptive.plant_terms)
 
 
