@@ -1,0 +1,113 @@
+"""Real recordings left out one at a time, and simulated by what the others taught."""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from nfriction import Recording, rigs
+from nfriction.fitting import Fit, fit, nearest_fit
+from nfriction.friction import model_by_name
+from nfriction.plant import LinearAxis, PendulumChain
+from nfriction.scoring import score
+
+
+class Set(NamedTuple):
+    """Recordings of one mechanism: folder, files, plant, what is aimed at, unit in the table.
+
+    `target` is the free run's error and that of 5 s windows; of recordings kept apart, which the
+    folder does not hold.
+    """
+
+    folder: str
+    names: tuple[str, ...]
+    plant: Callable[[], PendulumChain | LinearAxis]
+    target: tuple[float, float] = (math.nan, math.nan)
+    unit: str = "mrad"
+
+
+SETS = {
+    "single": Set("multiarm_pendulum", ("single_b0", "single_b2", "single_b4"),
+                  rigs.multiarm_single, (8.0, math.nan)),
+    "double": Set("multiarm_pendulum", ("double_b0", "double_b2", "double_b4", "double_b6"),
+                  rigs.multiarm_double, (6.0, 2.8)),
+    "triple": Set("multiarm_pendulum", ("triple_b0", "triple_b2"), rigs.multiarm_triple,
+                  (2.0, 1.2)),
+    "C1": Set("dfki_double_pendulum", ("C1_143339", "C1_143601", "C1_143747", "C1_144003"),
+              lambda: rigs.dfki("C1"), (54.0, math.nan)),
+    "C0": Set("dfki_double_pendulum", ("C0_00", "C0_02", "C0_04", "C0_06"),
+              lambda: rigs.dfki("C0"), (40.0, math.nan)),
+    "A0": Set("dfki_double_pendulum", ("A0_00", "A0_02", "A0_12"), lambda: rigs.dfki("A0"),
+              (85.0, math.nan)),
+    "emps": Set("emps", ("emps_first",), rigs.emps, (4.0, math.nan), "mm"),
+    "xl330": Set("xl330_servo_pendulum", ("drop_kp100", "drop_kp400"), rigs.xl330,
+                 (18.0, math.nan)),
+}  # fmt: skip
+
+
+def read(data: Path, of: Set) -> list[Recording]:
+    """The recordings of a set; a lone one is halved in time."""
+    found = []
+    for name in of.names:
+        (path,) = (p for p in (data / of.folder).glob(f"{name}.csv*"))
+        recording = Recording.read(path, unit="m" if of.unit == "mm" else "rad", name=name)
+        found.append(recording)
+    if len(found) == 1:
+        half = len(found[0]) // 2
+        found = [found[0][: half + 1], found[0][half:]]
+    return found
+
+
+def first_state(data: Path, of: Set, recording: Recording) -> tuple[np.ndarray, np.ndarray] | None:
+    """Initial state of a whole recording as its card gives it."""
+    table = pd.read_csv(data / of.folder / "recordings.csv").set_index("id")
+    if len(of.names) == 1 or recording.name not in table.index:
+        return None
+    row = table.loc[recording.name]
+    q, qd = (
+        np.array([row[f"{key}_{k + 1}"] for k in range(recording.joints)], dtype=float)
+        for key in ("q0", "qd0")
+    )
+    return q, qd
+
+
+def real(data: Path, only: Sequence[str], models: Sequence[str]) -> None:
+    """Print the error of every model on recordings left out, one at a time."""
+    print("set      model     free run   5 s   left out one by one (free run)        processor [s]")
+    print("                   RMSE; beside each set what is aimed at on recordings kept apart")
+    for name in only:
+        of = SETS[name]
+        aim = "  ".join(f"{t:g}" for t in of.target if math.isfinite(t))
+        plant, recordings = of.plant(), read(data, of)
+        free: dict[str, list[float]] = {m: [] for m in models}
+        short: dict[str, list[float]] = {m: [] for m in models}
+        spent = dict.fromkeys(models, 0.0)
+        for k, left in enumerate(recordings):
+            fits: list[Fit] = []
+            for m in models:
+                start = time.process_time()
+                model = model_by_name(m)(plant.joints)
+                before = nearest_fit(fits, model)
+                others = [*recordings[:k], *recordings[k + 1 :]]
+                fits.append(fit(model, plant, others, start=before,
+                                motions=before.motions if before else None))  # fmt: skip
+                spent[m] += time.process_time() - start
+                state = first_state(data, of, left)
+                told = score(fits[-1].plant, fits[-1].model, left, initial_state=state)
+                free[m].append(1e3 * told.free_run.all)
+                short[m].append(1e3 * told.windows["5"].all if "5" in told.windows else math.nan)
+        for m in models:
+            rows = "  ".join(f"{e:.3g}" for e in free[m])
+            print(
+                f"{name:8} {m:8} {root_mean_square(free[m]):9.2f} {root_mean_square(short[m]):6.2f}"
+                f"   {rows:36} {spent[m]:10.0f}   {of.unit}, aim {aim}",
+                flush=True,
+            )
+
+
+def root_mean_square(values: Sequence[float]) -> float:
+    return math.sqrt(sum(v * v for v in values) / len(values))
