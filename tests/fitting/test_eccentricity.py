@@ -14,13 +14,13 @@ def model(initial=None):
     return LFM(2, initial, v_smooth=V_SMOOTH)
 
 
-def recorded(size):
+def recorded(size, seconds=3.0):
     truth = model([[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]])
     turned = pendulum().replace(
         encoder_cosine=torch.tensor([size, -size], dtype=F64),
         encoder_sine=torch.tensor([-size, size / 2], dtype=F64),
     )
-    return swing(turned, truth, seconds=3.0)
+    return swing(turned, truth, seconds=seconds)
 
 
 def encoder_terms(found):
@@ -53,7 +53,7 @@ def test_encoders_that_are_centred_stay_so():
 
 
 def test_it_is_fitted_or_not_as_asked():
-    recording = recorded(0.0)
+    recording = recorded(0.0, seconds=1.0)
     quick = {"windows": (0.5,), "max_steps": 1}
     assert len(encoder_terms(fit(model(), pendulum(), recording, eccentricity=True, **quick))) == 4
     assert not encoder_terms(fit(model(), pendulum(), recording, eccentricity=False, **quick))
