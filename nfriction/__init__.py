@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from nfriction import export, plots
     from nfriction.angles import AngleConvention
     from nfriction.comparison import Comparison, compare
+    from nfriction.estimators import FrictionEstimator
     from nfriction.fitting import Fit, fit, fit_adaptive, fit_by_search
     from nfriction.friction import (
         ALFM,
@@ -30,11 +31,13 @@ if TYPE_CHECKING:
     from nfriction.plant import LinearAxis, PendulumChain, rigs
     from nfriction.recording import Recording
     from nfriction.scoring import Score, score
+    from nfriction.selection import Selection, select
     from nfriction.simulation import Rollout, rollout
 
 _HOME = {
     "angles": ("AngleConvention",),
     "comparison": ("Comparison", "compare"),
+    "estimators": ("FrictionEstimator",),
     "fitting": ("Fit", "fit", "fit_adaptive", "fit_by_search"),
     "friction": (
         "ALFM",
@@ -53,6 +56,7 @@ _HOME = {
     "plant": ("LinearAxis", "PendulumChain", "rigs"),
     "recording": ("Recording",),
     "scoring": ("Score", "score"),
+    "selection": ("Selection", "select"),
     "simulation": ("Rollout", "rollout"),
 }
 _MODULE = {name: module for module, names in _HOME.items() for name in names}
@@ -70,6 +74,7 @@ __all__ = [
     "AngleConvention",
     "Comparison",
     "Fit",
+    "FrictionEstimator",
     "FrictionModel",
     "LinearAxis",
     "ModelInfo",
@@ -77,6 +82,7 @@ __all__ = [
     "Recording",
     "Rollout",
     "Score",
+    "Selection",
     "Stribeck",
     "__version__",
     "compare",
@@ -92,6 +98,7 @@ __all__ = [
     "rollout",
     "save",
     "score",
+    "select",
 ]
 
 

@@ -1,17 +1,18 @@
 """Compare friction models: fit each on training recordings, score it on those held out."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from torch import Tensor
 
-from nfriction.fitting import Fit, fit, nearest_fit
-from nfriction.friction import Constant, FrictionModel, NeuroFuzzy, model_by_name
+from nfriction.fitting import Fit
+from nfriction.friction import Constant, FrictionModel, NeuroFuzzy
 from nfriction.friction.adaptive import CLASSES, Adaptive
 from nfriction.friction.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
+from nfriction.many import Data, fit_models
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.recording import Recording
 from nfriction.scoring import HORIZONS, Score, improvement_table, rmse_table, score
@@ -24,7 +25,7 @@ TIE = 1e-3
 InitialStates = Mapping[str, tuple[np.ndarray, np.ndarray]]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Comparison:
     """Fits and scores of several models on the same recordings.
 
@@ -34,6 +35,7 @@ class Comparison:
         unit: of the errors, `"rad"` or `"m"`.
         joint_names: columns of the tables.
         horizons_asked: window lengths that were to be scored [s].
+        failed: why a model was not fitted, by its name.
     """
 
     fits: dict[str, Fit]
@@ -42,6 +44,18 @@ class Comparison:
     unit: str
     joint_names: tuple[str, ...]
     horizons_asked: tuple[float, ...] = ()
+    failed: dict[str, str] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        """Which model predicts best, and the free-run errors by model and joint."""
+        held_out = bool(self.held_out)
+        kind = "held-out" if held_out else "training"
+        table = 1e3 * self.table(held_out=held_out)
+        table.index.name = f"[m{self.unit}]"
+        lines = [f"Comparison by free-run RMSE over {kind} recordings, best: {self.best()}"]
+        lines += table.to_string(float_format=lambda x: f"{x:.4g}").splitlines()
+        lines += [f"not fitted: {name}: {why}" for name, why in self.failed.items()]
+        return "\n".join(lines)
 
     def scores(self, *, held_out: bool = True) -> dict[str, list[Score]]:
         """Scores of a kind by model name.
@@ -88,6 +102,21 @@ class Comparison:
         }
         return {horizon: short for horizon, short in found.items() if short}
 
+    def to_frame(self) -> pd.DataFrame:
+        """Every error as one row: model, recording, kind, horizon, joint, rmse with its unit."""
+        rows = [
+            (model, s.recording, kind, horizon, joint, value)
+            for kind, scores in (("train", self.train), ("held out", self.held_out))
+            for model, of_model in scores.items()
+            for s in of_model
+            for horizon, rmse in (("free run", s.free_run), *s.windows.items())
+            for joint, value in zip(
+                (*self.joint_names, "all"), (*rmse.joints, rmse.all), strict=True
+            )
+        ]
+        keys = ["model", "recording", "kind", "horizon", "joint"]
+        return pd.DataFrame(rows, columns=[*keys, f"rmse [{self.unit}]"])
+
     def best(self) -> str | None:
         """What predicts the held-out recordings best, `"no friction"` included.
 
@@ -122,8 +151,10 @@ class Comparison:
                     "fit": found.to_dict(),
                 }
         best = self.best()
+        failed = {"failed": dict(self.failed)} if self.failed else {}
         return {
             "models": models,
+            **failed,
             "best": None if best is None else {"model": best, "by": JUDGED_BY},
             "units": self.unit,
             "joints": list(self.joint_names),
@@ -132,56 +163,60 @@ class Comparison:
 
 def compare(
     plant: PendulumChain | LinearAxis,
-    models: Sequence[str],
-    train: Sequence[Recording],
-    held_out: Sequence[Recording] = (),
+    models: str | Sequence[str],
+    train: Recording | Sequence[Recording],
+    held_out: Recording | Sequence[Recording] = (),
     *,
     initial_states: InitialStates | None = None,
     horizons: Sequence[float] = HORIZONS,
     on_stage: Callable[[str], None] | None = None,
     on_step: Callable[[str], None] | None = None,
+    jobs: int = 1,
     **fit_settings: Any,
 ) -> Comparison:
-    """Fit models one after the other and score each on every recording.
+    """Fit models and score each on every recording.
 
     No friction is scored on the plant as given, so it does not depend on any model's fit; each
     model is scored on the plant that was fitted with it.
 
     Args:
         plant: the mechanism as given.
-        models: names of models, simple ones first: a later model starts from the plant terms of
-            the one before, a neuro-fuzzy one from the constant fit of its law.
-        train: recordings to fit.
-        held_out: recordings to judge by; never seen by a fit.
+        models: names of models, the simplest first: constant laws start from its plant terms,
+            an adaptive or neuro-fuzzy model from the constant fit of its law.
+        train: recordings to fit, or one.
+        held_out: recordings to judge by, or one; never seen by a fit.
         initial_states: q0 and qd0 by recording name, in the recording's convention.
         horizons: window lengths of the scores [s].
-        on_stage, on_step: told what is being done, for a progress display.
+        on_stage, on_step: told what is being done, for a progress display; steps only of
+            searches in this process.
+        jobs: fits at the same time, each in a process of its own; -1 for one to each core. The
+            result does not depend on it. Above 1 it takes joblib, whose `parallel_config`
+            chooses another backend, such as a Dask cluster.
         fit_settings: see `fit`.
 
     Raises:
         ValueError: if a recording is both trained on and held out, or names are not unique.
+        ImportError: if `jobs` needs joblib and it is not installed.
+        ValueError, ArithmeticError, RuntimeError: if no model could be fitted; where only some
+            could not, `failed` tells why.
     """
+    models = [models] if isinstance(models, str) else models
+    train, held_out = (
+        [given] if isinstance(given, Recording) else list(given) for given in (train, held_out)
+    )
     names = [r.name for r in (*train, *held_out)]
     if not models or not train:
         raise ValueError("at least one model and one training recording are needed.")
     repeated = sorted({n for n in names if names.count(n) > 1})
     if repeated:
         raise ValueError(f"recordings must have different names, {', '.join(repeated)} repeats.")
+    # Smoothed once, for all fits and scores.
+    moved = [[_motion(plant, r) for r in kind] for kind in (train, held_out)]
+    fits, failed = fit_models(
+        plant, models, {"fit": Data(train, moved[0])}, jobs=jobs, on_stage=on_stage,
+        on_step=on_step, **fit_settings,
+    )["fit"]  # fmt: skip
     say = on_stage or (lambda _: None)
-    fits: dict[str, Fit] = {}
-    for name in dict.fromkeys(models):
-        model = model_by_name(name)(plant.joints)
-        start = nearest_fit(fits.values(), model)
-        say(f"fit {name}")
-        fits[name] = fit(
-            model, plant, list(train), start=start,
-            motions=None if start is None else start.motions,
-            callback=None if on_step is None else lambda stage, _: on_step(stage),
-            **fit_settings,
-        )  # fmt: skip
-    # Smoothed once: the fits have done so for the recordings that they saw.
-    seen = next(iter(fits.values())).motions
-    moved = (seen, [_motion(plant, r) for r in held_out])
     scored: tuple[dict[str, list[Score]], dict[str, list[Score]]] = ({}, {})
     states = initial_states or {}
     for name in (NO_FRICTION, *fits):
@@ -202,7 +237,7 @@ def compare(
                 ]
     return Comparison(
         fits, *scored, unit=plant.unit, joint_names=tuple(plant.joint_names),
-        horizons_asked=tuple(horizons),
+        horizons_asked=tuple(horizons), failed=failed,
     )  # fmt: skip
 
 

@@ -2,13 +2,12 @@
 
 import json
 import logging
+import re
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from nfriction.atomic import write_atomically
 from nfriction.comparison import Comparison
@@ -16,8 +15,13 @@ from nfriction.export import ExportError, torchscript
 from nfriction.fitting import Fit
 from nfriction.modelfile import ModelInfo, save
 from nfriction.recording import Recording
+from nfriction.selection import Selection
 
 logger = logging.getLogger(__name__)
+
+RESULTS, TABLE = "results.json", "table.csv"
+# What a run may have written, and a later one remove: in its own folders, no way out of them.
+OURS = re.compile(r"table\.csv|models/\w+\.(json|pt)|figures/\w[\w.-]*\.png")
 
 
 def digests(recordings: Sequence[Recording]) -> dict[str, str]:
@@ -53,15 +57,20 @@ def write_results(
     held_out: Sequence[Recording],
     folder: str | Path,
     *,
+    selection: Selection | None = None,
     command: str = "",
     figures: bool = True,
 ) -> list[Path]:
     """Write `table.csv`, `results.json`, the models with their TorchScript, and figures.
 
+    `results.json` lists the files. Those that an earlier run listed there are removed, so that
+    what is in the folder afterwards is of this run, or the user's own.
+
     Args:
         comparison: fits and scores.
         train, held_out: the recordings behind them.
-        folder: made where it is not there; files of an earlier run are replaced.
+        folder: made where it is not there.
+        selection: what the training recordings alone would choose, if that was asked.
         command: what would make the same results again.
         figures: draw them.
 
@@ -69,54 +78,60 @@ def write_results(
         What was written.
     """
     folder = Path(folder)
-    written = [
-        write_atomically(folder / "table.csv", long_table(comparison).to_csv(index=False).encode())
-    ]
     results = comparison.to_dict() | {
+        "selection": None if selection is None else selection.to_dict(),
         "command": command,
-        "recordings": {
-            "train": digests(train),
-            "held_out": digests(held_out),
-        },
+        "recordings": {"train": digests(train), "held_out": digests(held_out)},
     }
-    text = json.dumps(results, indent=1, allow_nan=False)
-    written.append(write_atomically(folder / "results.json", text.encode()))
-    for name, fit in comparison.fits.items():
-        info = model_info(fit, train)
-        written.append(save(fit.model, folder / "models" / f"{name}.json", info))
-        script = folder / "models" / f"{name}.pt"
-        try:
-            written.append(torchscript(fit.model, script, info))
-        except ExportError as error:
-            script.unlink(missing_ok=True)  # an earlier run's would pass for this one's
-            logger.warning("%s was not exported: %s", name, " ".join(str(error).split()))
+
+    def tell(files: Iterable[Path]) -> Path:
+        own = {"files": sorted({path.relative_to(folder).as_posix() for path in files})}
+        text = json.dumps(results | own, indent=1, allow_nan=False)
+        return write_atomically(folder / RESULTS, text.encode())
+
+    earlier = files_of(folder)
+    models = {name: folder / "models" / f"{name}.json" for name in comparison.fits}
+    table = write_atomically(folder / TABLE, comparison.to_frame().to_csv(index=False).encode())
+    # Told before they are there: what an interrupt leaves, the next run knows for ours.
+    tell([*earlier, table, *models.values(), *(m.with_suffix(".pt") for m in models.values())])
+    written = [table]
+    for name, path in models.items():
+        written += _write_model(comparison.fits[name], path, train)
+    for path in set(earlier) - set(written):
+        path.unlink(missing_ok=True)
+    told = tell(written)
     if figures:
         from nfriction import plots  # matplotlib takes half a second that other commands save
 
         (folder / "figures").mkdir(exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".") as unfinished:
-            for drawn in plots.save_all(comparison, [*train, *held_out], unfinished):
-                written.append(drawn.replace(folder / "figures" / drawn.name))
+            drawn = plots.save_all(comparison, [*train, *held_out], unfinished)
+            places = [folder / "figures" / path.name for path in drawn]
+            tell([*written, *places])
+            written += [path.replace(to) for path, to in zip(drawn, places, strict=True)]
+    return [told, *written]
+
+
+def files_of(folder: Path) -> list[Path]:
+    """What an earlier run wrote into a folder besides its `results.json`, as far as that tells.
+
+    Only such names as a run writes are taken from it: it may be anybody's file.
+    """
+    try:
+        content = json.loads((folder / RESULTS).read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError, ValueError, RecursionError):
+        return []
+    listed = content.get("files") if isinstance(content, dict) else None
+    names = listed if isinstance(listed, list) else []
+    return [folder / name for name in names if isinstance(name, str) and OURS.fullmatch(name)]
+
+
+def _write_model(fit: Fit, path: Path, recordings: Sequence[Recording]) -> list[Path]:
+    """The model file and its TorchScript, where it has one."""
+    info = model_info(fit, recordings)
+    written = [save(fit.model, path, info)]
+    try:
+        written.append(torchscript(fit.model, path.with_suffix(".pt"), info))
+    except ExportError as error:
+        logger.warning("%s was not exported: %s", path.stem, " ".join(str(error).split()))
     return written
-
-
-def long_table(comparison: Comparison) -> pd.DataFrame:
-    """Every error as one row: model, recording, kind, horizon, joint, rmse."""
-    rows: list[dict[str, Any]] = []
-    for kind, scores in (("train", comparison.train), ("held out", comparison.held_out)):
-        for model, of_model in scores.items():
-            for s in of_model:
-                for horizon, rmse in (("free run", s.free_run), *s.windows.items()):
-                    joints = zip(comparison.joint_names, rmse.joints, strict=True)
-                    for joint, value in (*joints, ("all", rmse.all)):
-                        rows.append(
-                            {
-                                "model": model,
-                                "recording": s.recording,
-                                "kind": kind,
-                                "horizon": horizon,
-                                "joint": joint,
-                                f"rmse [{comparison.unit}]": value,
-                            }
-                        )
-    return pd.DataFrame(rows)

@@ -1,14 +1,16 @@
 """Choice of a law on training data alone, by cross-validation over blocks of time."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
-from nfriction.fitting import Fit, fit, nearest_fit
+from nfriction.fitting import Fit
 from nfriction.friction import model_by_name
+from nfriction.many import Data, Fits, fit_models
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.recording import Recording
 from nfriction.scoring import score
@@ -25,7 +27,7 @@ class Candidate:
     Attributes:
         name: of the model.
         errors: root mean square position error of each block [rad or m], infinite where the model
-            diverged; blocks in the same order for all candidates.
+            diverged or could not be fitted; blocks in the same order for all candidates.
         parameters: how many numbers a fit varies in the friction model.
         converged: whether every fold's fit converged.
     """
@@ -41,7 +43,7 @@ class Candidate:
         return math.sqrt(sum(e * e for e in self.errors) / len(self.errors))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Selection:
     """Models compared by cross-validation, and the one to take.
 
@@ -58,6 +60,16 @@ class Selection:
     candidates: tuple[Candidate, ...]
     horizon: float
     unit: str
+
+    def __repr__(self) -> str:
+        """What is chosen and why, and how all candidates fared."""
+        return f"Selection of {self.chosen}: {self.reason}\n{self.to_frame().to_string()}"
+
+    def to_frame(self) -> pd.DataFrame:
+        """Candidates as rows: error over all blocks with its unit, parameters, converged."""
+        rows = {c.name: (c.error, c.parameters, c.converged) for c in self.candidates}
+        columns = [f"error [{self.unit}]", "parameters", "converged"]
+        return pd.DataFrame.from_dict(rows, orient="index", columns=columns)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON; a diverged block has no number."""
@@ -94,6 +106,8 @@ def select(
     horizon: float = 5.0,
     tolerance: float = 0.02,
     on_stage: Callable[[str], None] | None = None,
+    on_step: Callable[[str], None] | None = None,
+    jobs: int = 1,
     **fit_settings: Any,
 ) -> Selection:
     """Choose a friction model from training recordings alone.
@@ -110,7 +124,8 @@ def select(
         folds: at least 2.
         horizon: length of the simulations [s]; a block where that is shorter.
         tolerance: relative difference of errors that counts as none.
-        on_stage: told what is being done, for a progress display.
+        on_stage, on_step, jobs: as in `compare`; fits of different folds never wait for each
+            other.
         fit_settings: see `fit`.
 
     Returns:
@@ -128,29 +143,45 @@ def select(
     names = list(dict.fromkeys(models))
     blocks = [cut_blocks(plant, recording, folds) for recording in recordings]
     horizon = min(horizon, *(b.recording.duration for row in blocks for b in row))
-    errors: dict[str, list[float]] = {name: [] for name in names}
-    converged = dict.fromkeys(names, True)
-    parameters: dict[str, int] = {}
+    seen, unseen = _folds(blocks, folds)
+    fits = fit_models(
+        plant, names, seen, jobs=jobs, on_stage=on_stage, on_step=on_step, **fit_settings
+    )
+    candidates = tuple(_candidate(plant, name, fits, unseen, horizon) for name in names)
+    return Selection(*choose(candidates, tolerance), candidates, horizon, plant.unit)
+
+
+def _folds(
+    blocks: Sequence[list[Block]], folds: int
+) -> tuple[dict[str, Data], dict[str, list[Block]]]:
+    """What each fold's fits see, and what they do not."""
+    seen, unseen = {}, {}
     for fold in range(folds):
+        label = f"fold {fold + 1} of {folds}: fit"
         # Staggered, so that no fold lacks the same stretch of every recording.
         out = [(fold + i) % folds for i in range(len(blocks))]
-        unseen = [row[k] for row, k in zip(blocks, out, strict=True)]
-        seen = [b for row, k in zip(blocks, out, strict=True) for b in (*row[:k], *row[k + 1 :])]
-        fits: list[Fit] = []
-        for name in names:
-            if on_stage is not None:
-                on_stage(f"fold {fold + 1} of {folds}: {name}")
-            model = model_by_name(name)(plant.joints)
-            found = fit(
-                model, plant, [b.recording for b in seen], motions=[b.motion for b in seen],
-                start=nearest_fit(fits, model), **fit_settings,
-            )  # fmt: skip
-            fits.append(found)
-            errors[name] += [block_error(found, b, horizon) for b in unseen]
-            converged[name] &= found.converged
-            parameters[name] = model.schedule.parameter_vector().numel()
-    candidates = tuple(Candidate(n, tuple(errors[n]), parameters[n], converged[n]) for n in names)
-    return Selection(*choose(candidates, tolerance), candidates, horizon, plant.unit)
+        unseen[label] = [row[k] for row, k in zip(blocks, out, strict=True)]
+        left = [b for row, k in zip(blocks, out, strict=True) for b in (*row[:k], *row[k + 1 :])]
+        seen[label] = Data([b.recording for b in left], [b.motion for b in left])
+    return seen, unseen
+
+
+def _candidate(
+    plant: PendulumChain | LinearAxis,
+    name: str,
+    fits: Mapping[str, Fits],
+    unseen: Mapping[str, list[Block]],
+    horizon: float,
+) -> Candidate:
+    """A model judged on the blocks that its fits have not seen."""
+    errors: list[float] = []
+    converged = True
+    for label, blocks in unseen.items():
+        found = fits[label].found.get(name)
+        converged &= found is not None and found.converged
+        errors += [block_error(found, b, horizon) if found else math.inf for b in blocks]
+    parameters = model_by_name(name)(plant.joints).schedule.parameter_vector().numel()
+    return Candidate(name, tuple(errors), parameters, converged)
 
 
 def choose(candidates: Sequence[Candidate], tolerance: float = 0.02) -> tuple[str, str]:

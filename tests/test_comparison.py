@@ -41,6 +41,45 @@ def test_tables_have_a_row_a_model_and_a_column_a_joint(comparison):
     assert stages[:2] == ["fit NCFM", "fit LFM"]
 
 
+def test_it_tells_in_a_few_lines_who_is_best(comparison):
+    found, _ = comparison
+    head, *rows = repr(found).splitlines()
+    assert head.endswith("held-out recordings, best: LFM")
+    table = found.table()
+    assert rows[0].split()[-1] == "all"
+    for row, (name, errors) in zip(rows[2:], table.iterrows(), strict=True):
+        assert row.startswith(name)
+        assert float(row.split()[-1]) == pytest.approx(1e3 * errors["all"], rel=1e-3)
+    told = repr(dataclasses.replace(found, failed={"ALFM": "no classes"}, held_out={}))
+    assert "training recordings, best: None" in told
+    assert told.endswith("not fitted: ALFM: no classes")
+
+
+def test_one_name_and_one_recording_need_no_list():
+    settings = {"horizons": (0.5,), "windows": (0.5,), "max_steps": 1}
+    one = compare(pendulum(), "NCFM", A, B, **settings)
+    many = compare(pendulum(), ["NCFM"], [A], [B], **settings)
+    assert one.to_dict() == many.to_dict()
+
+
+def test_what_could_not_be_fitted_is_kept_with_its_reason(comparison):
+    found, _ = comparison
+    assert "failed" not in found.to_dict()
+    assert dataclasses.replace(found, failed={"ALFM": "x"}).to_dict()["failed"] == {"ALFM": "x"}
+
+
+def test_its_frame_has_every_error_once(comparison):
+    found, _ = comparison
+    table = found.to_frame()
+    keys = ["model", "recording", "kind", "horizon", "joint"]
+    assert list(table.columns) == [*keys, "rmse [rad]"]
+    assert not table.duplicated(keys).any()
+    # models × kinds × (free run and two horizons) × (joints and all)
+    assert len(table) == 3 * 2 * 3 * 3
+    metres = dataclasses.replace(found, unit="m").to_frame()
+    assert "rmse [m]" in metres.columns
+
+
 def test_results_are_plain_json_with_the_names_others_rely_on(comparison):
     found, _ = comparison
     data = json.loads(json.dumps(found.to_dict(), allow_nan=False))

@@ -14,6 +14,7 @@ from nfriction.comparison import Comparison
 from nfriction.export import ExportError
 from nfriction.fitting import fit
 from nfriction.scoring import Rmse, Score
+from nfriction.selection import Candidate, Selection
 
 TIME = 2e-3 * np.arange(200)
 
@@ -63,17 +64,6 @@ def test_no_digest_is_lost_where_names_repeat_or_lack(recording: Recording) -> N
     assert set(results.digests([recording])) == {"r"}
 
 
-def test_long_table_has_every_error_once(comparison: Comparison) -> None:
-    table = results.long_table(comparison)
-    keys = ["model", "recording", "kind", "horizon", "joint"]
-    assert not table.duplicated(keys).any()
-    # models × horizons × (joint and all)
-    assert len(table) == 3 * 2 * 2
-    assert list(table.columns) == [*keys, "rmse [rad]"]
-    metres = results.long_table(dataclasses.replace(comparison, unit="m"))
-    assert "rmse [m]" in metres.columns
-
-
 def test_input_ranges_are_those_of_the_motion(comparison: Comparison, recording: Recording) -> None:
     info = results.model_info(comparison.fits["good"], [recording])
     (motion,) = comparison.fits["good"].motions
@@ -99,6 +89,63 @@ def test_a_failed_export_is_told_and_leaves_no_older_script(
         results.write_results(comparison, [recording], [], tmp_path, figures=False)
     assert caplog.messages[0] == "good was not exported: it does not script"
     assert not list(tmp_path.rglob("*.pt"))
+
+
+def test_a_later_run_leaves_its_own_files_and_the_users(
+    comparison: Comparison, recording: Recording, tmp_path: Path
+) -> None:
+    def files() -> set[str]:
+        return {p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*.*")}
+
+    first = results.write_results(comparison, [recording], [], tmp_path)
+    own = {p.relative_to(tmp_path).as_posix() for p in first}
+    assert files() == own
+    assert {"models/wild.pt", "figures/rmse_train.png"} < own
+    listed = json.loads((tmp_path / "results.json").read_text())["files"]
+    assert {*listed, "results.json"} == own
+    foreign = {"notes.md", "models/mine.json", "figures/rmse_mine.png"}
+    for name in foreign:
+        (tmp_path / name).write_text("mine")
+    fewer = dataclasses.replace(
+        comparison,
+        fits={"good": comparison.fits["good"]},
+        train={n: s for n, s in comparison.train.items() if n != "wild"},
+    )
+    second = results.write_results(fewer, [recording], [], tmp_path, figures=False)
+    left = {"results.json", "table.csv", "models/good.json", "models/good.pt"}
+    assert {p.relative_to(tmp_path).as_posix() for p in second} == left
+    assert files() == left | foreign
+
+
+def test_no_list_of_files_leads_out_of_the_folder(
+    comparison: Comparison, recording: Recording, tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    (folder / "models").mkdir(parents=True)
+    victims = [tmp_path / "a.json", folder / "models" / "deep" / "a.json", folder / "notes.txt"]
+    for victim in victims:
+        victim.parent.mkdir(exist_ok=True)
+        victim.write_text("keep")
+    listed = ["../a.json", "models/../../a.json", str(tmp_path / "a.json"), "models/deep/a.json",
+              "notes.txt", "models/\n.json", ".", "", None, {}, ["x"]]  # fmt: skip
+    for content in ({"files": listed}, {"files": "models/a.json"}, [], "[", {"files": None}):
+        text = content if isinstance(content, str) else json.dumps(content)
+        (folder / "results.json").write_text(text)
+        assert results.files_of(folder) == []
+        results.write_results(comparison, [recording], [], folder, figures=False)
+    assert all(victim.read_text() == "keep" for victim in victims)
+
+
+def test_a_choice_is_kept_with_the_results(
+    comparison: Comparison, recording: Recording, tmp_path: Path
+) -> None:
+    chosen = Selection("LFM", "so", (Candidate("LFM", (1e-3, np.inf), 2, True),), 1.0, "rad")
+    for selection in (chosen, None):
+        results.write_results(
+            comparison, [recording], [], tmp_path, selection=selection, figures=False
+        )
+        found = json.loads((tmp_path / "results.json").read_text(), parse_constant=pytest.fail)
+        assert found["selection"] == (None if selection is None else selection.to_dict())
 
 
 def test_figures_that_fail_leave_nothing_half_drawn(

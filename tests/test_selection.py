@@ -5,8 +5,8 @@ from itertools import pairwise
 
 import pytest
 
-from nfriction import LFM, NCFM
-from nfriction.selection import Candidate, choose, cut_blocks, select
+from nfriction import LFM, NCFM, fit
+from nfriction.selection import Candidate, Selection, choose, cut_blocks, select
 from tests.fitting.recordings import pendulum, swing
 
 
@@ -39,6 +39,32 @@ def test_what_diverges_is_not_chosen():
     lost, fine = candidate("A", (math.inf, 1.0), 1), candidate("B", (5.0, 5.0), 9)
     assert choose([lost, fine])[0] == "B"
     assert choose([lost])[0] == "A"
+
+
+def test_it_tells_the_choice_and_every_candidate():
+    candidates = (candidate("A", (3e-3, 4e-3), 1), candidate("B", (math.inf,), 9))
+    found = Selection("A", "so it is.", candidates, 2.0, "rad")
+    head, _, *rows = repr(found).splitlines()
+    assert head == "Selection of A: so it is."
+    assert [row.split()[0] for row in rows] == ["A", "B"]
+    table = found.to_frame()
+    assert table.loc["A", "error [rad]"] == pytest.approx(math.sqrt(12.5) * 1e-3)
+    assert list(table.loc["B"]) == [math.inf, 9, True]
+
+
+def test_a_model_that_fails_in_a_fold_counts_as_diverged(monkeypatch):
+    def fragile(model, plant, recordings, *, motions, start, **_):
+        if isinstance(model, LFM) and motions[0].time[0] > 0:
+            raise ValueError("nothing to be learnt")
+        return fit(model, plant, recordings, motions=motions, method="torque")
+
+    monkeypatch.setattr("nfriction.many.fit", fragile)
+    recording = swing(pendulum(), NCFM(2, [[2e-3], [1e-3]]), seconds=1.0)
+    found = select(pendulum(), ["NCFM", "LFM"], [recording], folds=2)
+    assert found.chosen == "NCFM"
+    failed = found.candidates[1]
+    assert sum(map(math.isinf, failed.errors)) == 1
+    assert not failed.converged
 
 
 def test_blocks_cover_a_recording_and_share_their_ends():

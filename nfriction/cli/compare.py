@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,6 +51,24 @@ def add_comparison_options(parser: argparse.ArgumentParser) -> None:
                         help="also say which model the training recordings alone would choose, "
                         "by simulating blocks of them left out of the fits")  # fmt: skip
     parser.add_argument("--no-figures", action="store_true", help="draw no figures")
+    parser.add_argument("--jobs", type=jobs, default=1, metavar="N",
+                        help="fits at the same time, each in a process of its own; -1 for one to "
+                        "each core (takes joblib; the results are the same)")  # fmt: skip
+    parser.add_argument("--log-file", type=Path, metavar="FILE",
+                        help="append what is done, when and with what result")  # fmt: skip
+
+
+def jobs(text: str) -> int:
+    """A number of processes from 1, or -1, for argparse."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
+    if value < 1 and value != -1:
+        raise argparse.ArgumentTypeError(
+            f"must be a whole number from 1, or -1 for one to each core, got {text!r}"
+        )
+    return value
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -72,33 +92,45 @@ def run_comparison(
     arguments: argparse.Namespace,
     settings: dict[str, Any],
 ) -> int:
-    """Fit, score, write and print."""
+    """Fit, score, write and print.
+
+    Returns:
+        The exit status: 1 where a model could not be fitted.
+    """
     from nfriction.cli import tables
     from nfriction.comparison import compare
+    from nfriction.parallel import check_jobs
     from nfriction.results import write_results
     from nfriction.selection import select
 
     states = _initial_states(arguments, plant, [*train, *held_out])
     check_writable(arguments.out)
+    check_jobs(arguments.jobs)
     selection = None
-    with Progress() as progress:
+    with _log(arguments.log_file) as logger, Progress() as progress:
+
+        def stage(what: str) -> None:
+            logger.info(what)
+            progress.stage(what)
+
+        settings = settings | {"on_stage": stage, "on_step": progress.step, "jobs": arguments.jobs}
+        logger.info(arguments.command_line)
         if arguments.select:
-            selection = select(
-                plant, arguments.models, train, on_stage=progress.stage,
-                callback=lambda stage, _: progress.step(stage), **settings,
-            )  # fmt: skip
+            selection = select(plant, arguments.models, train, **settings)
         comparison = compare(
-            plant, arguments.models, train, held_out, initial_states=states,
-            on_stage=progress.stage, on_step=progress.step, **settings,
-        )  # fmt: skip
-        progress.stage("write results and figures")
+            plant, arguments.models, train, held_out, initial_states=states, **settings
+        )
+        stage("write results and figures")
         write_results(
-            comparison, train, held_out, arguments.out,
+            comparison, train, held_out, arguments.out, selection=selection,
             command=arguments.command_line, figures=not arguments.no_figures,
         )  # fmt: skip
+        logger.info(tables.verdict(comparison))
     print(f"\n{tables.error_tables(comparison)}\n")
     for name, fit in comparison.fits.items():
         print(tables.fit_lines(name, fit))
+    for name, why in comparison.failed.items():
+        print(f"{name}: not fitted: {why}")
     if selection is not None:
         print(f"\n{tables.choice(selection)}")
     print(f"\n{tables.verdict(comparison)}")
@@ -110,7 +142,32 @@ def run_comparison(
         print(f"its model file: {arguments.out / 'models' / f'{comparison.best()}.json'}")
     what = "results and models" if arguments.no_figures else "results, models and figures"
     print(f"\n{what} are in {arguments.out}")
-    return 0
+    return 1 if comparison.failed else 0
+
+
+@contextmanager
+def _log(path: Path | None) -> Iterator[logging.Logger]:
+    """The command's logger, which with all others of the package writes into a file."""
+    package = logging.getLogger("nfriction")
+    if path is None:
+        yield package
+        return
+    handler = logging.FileHandler(path, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    console = {shown: shown.level for shown in logging.getLogger().handlers}
+    before = package.level
+    package.addHandler(handler)
+    package.setLevel(logging.INFO)
+    for shown, level in console.items():
+        shown.setLevel(max(level, logging.WARNING))  # the console is told no more than else
+    try:
+        yield package
+    finally:
+        for shown, level in console.items():
+            shown.setLevel(level)
+        package.setLevel(before)
+        package.removeHandler(handler)
+        handler.close()
 
 
 def _initial_states(

@@ -1,9 +1,11 @@
 """`compare` and `demo` as a user meets them: what they write and print, how they stop."""
 
+import logging
 import re
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -72,7 +74,8 @@ def test_equal_input_gives_equal_bytes(bench: Path, compared: Path) -> None:
     assert compare(bench, bench / "again", "--no-figures", models="NCFM,LFM") == 0
     assert not (bench / "again" / "figures").exists()
     assert (bench / "again/table.csv").read_bytes() == (compared / "table.csv").read_bytes()
-    assert results(bench / "again") | {"command": ""} == results(compared) | {"command": ""}
+    own = {"command": "", "files": []}
+    assert results(bench / "again") | own == results(compared) | own
 
 
 def test_verdict_names_the_winner_and_its_file(
@@ -136,6 +139,7 @@ def test_the_choice_on_training_data_is_told_with_its_reason(
     told = capsys.readouterr().out.partition("training data alone would choose ")[2]
     chosen, reason = told.split("\n")[0].split(": ")
     assert chosen in ("NCFM", "LFM")
+    assert results(bench / "chosen")["selection"]["chosen"] == chosen
     assert "error on blocks left out" in reason
     # A third of a second was left out each time.
     assert re.search(r"0\.33\d* s simulations", told)
@@ -188,10 +192,53 @@ def test_interrupt_outside_a_solver(
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("nfriction.comparison.fit", stop)
+    monkeypatch.setattr("nfriction.many.fit", stop)
     assert compare(bench, bench / "stopped") == 130
     assert capsys.readouterr().err.count("\n") == 1
     assert not list((bench / "stopped").iterdir())
+
+
+def test_processes_change_nothing_and_are_checked(
+    bench: Path, compared: Path, failing: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ["compare", bench / "a.csv.gz", "--rig", bench / "bench.json", "--jobs"]
+    for wrong in ("0", "-2", "two"):
+        assert "from 1, or -1" in failing(*words, wrong)
+    with monkeypatch.context() as absent:
+        absent.setitem(sys.modules, "joblib", None)
+        assert "pip install nfriction[parallel]" in failing(*words, "2", "--out", bench / "none")
+    pytest.importorskip("joblib")
+    out = bench / "jobs"
+    assert compare(bench, out, "--no-figures", "--jobs", "2", models="NCFM,LFM") == 0
+    assert (out / "table.csv").read_bytes() == (compared / "table.csv").read_bytes()
+
+
+def test_the_log_tells_what_was_done_and_the_console_no_more(
+    bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "night.log"
+    for _ in range(2):
+        assert compare(bench, tmp_path / "out", "--no-figures", "--log-file", str(log)) == 0
+    lines = log.read_text().splitlines()
+    # The second run is told below the first.
+    assert sum("nfriction compare" in line for line in lines) == 2
+    for told in ("fit NCFM", "fit NCFM: ", "score NCFM", "best on held-out recordings: NCFM"):
+        assert sum(line.split("INFO ")[1].startswith(told) for line in lines) >= 2
+    assert all(re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} (INFO|WARNING) ", x) for x in lines)
+    assert "INFO" not in capsys.readouterr().err
+    assert not logging.getLogger("nfriction").handlers
+
+
+def test_a_model_that_cannot_be_fitted_is_told_beside_the_others(
+    bench: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A second of swinging has one class of acceleration, which is too few for an adaptive one."""
+    out = bench / "partly"
+    assert compare(bench, out, "--no-figures", models="NCFM,ANCFM") == 1
+    assert "ANCFM: not fitted: the acceleration hardly varies" in capsys.readouterr().out
+    found = results(out)
+    assert "hardly varies" in found["failed"]["ANCFM"]
+    assert list(found["models"]) == ["no friction", "NCFM"]
 
 
 @pytest.mark.slow

@@ -56,7 +56,9 @@ def test_commands_parse(
 
 @pytest.mark.parametrize(("page", "block"), list(blocks("python")))
 def test_code_compiles_and_imports_what_there_is(page: str, block: str) -> None:
-    for snippet in re.findall(r'^--8<-- "(.*)"$', block, re.MULTILINE):
+    snippets = re.findall(r'^--8<-- "(.*)"$', block, re.MULTILINE)
+    assert len(snippets) == block.count("--8")
+    for snippet in snippets:
         assert (ROOT / snippet).is_file()
     code = re.sub(r"^--8<--.*$", "", block, flags=re.MULTILINE)
     compile(code, page, "exec")

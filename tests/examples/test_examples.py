@@ -17,18 +17,31 @@ SAID = {
     "export_to_c": "selftest",
     "fit_a_recording": "best: ",
     "fuzzy_rules": "in % of range",
+    "many_fits_on_dask": "fitted on 2 workers",
     "neuro_fuzzy": "THEN C_p = ",
     "own_law": "true 0.0004",
     "own_rig": "fitted B, C:",
 }
 
 
-def test_there_are_six() -> None:
+# What some need beyond the package.
+NEEDS = {"many_fits_on_dask": ("dask", "distributed", "joblib")}
+
+
+def test_every_example_is_known() -> None:
     assert {path.stem for path in EXAMPLES} == set(SAID)
 
 
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+# A cluster's processes load the whole package first.
+SLOW = {"many_fits_on_dask"}
+RUNS = [pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem in SLOW))
+        for path in EXAMPLES]  # fmt: skip
+
+
+@pytest.mark.parametrize("path", RUNS)
 def test_runs_quickly(path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for library in NEEDS.get(path.stem, ()):
+        pytest.importorskip(library, reason="`pip install nfriction[dask]` to run this")
     torch.set_num_threads(1)
     main = runpy.run_path(str(path))["main"]
     assert main(["--quick", "--out", str(tmp_path / "out")]) == 0

@@ -1,0 +1,71 @@
+"""Many fits on a Dask cluster: one a recording, and a comparison of models.
+
+Needs `pip install nfriction[dask]`, on the workers too. Without --scheduler the cluster is this
+machine.
+"""
+
+import argparse
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+import joblib
+import pandas as pd
+import torch
+from dask.distributed import Client, LocalCluster
+
+from nfriction import LFM, LinearAxis, PendulumChain, Recording, compare, fit, twin
+
+QUICK = {"fit_plant": False, "windows": (0.5,), "max_steps": 1}
+
+
+def coefficients(
+    rig: PendulumChain | LinearAxis, recording: Recording, settings: dict
+) -> dict[str, float]:
+    """Intervals' middles of one recording's own fit, done on some worker."""
+    torch.set_num_threads(1)  # a worker has one, and small tensors want no more
+    found = fit(LFM(rig.joints), rig, recording, **settings)
+    return {"converged": found.converged} | {i.name: i.value for i in found.intervals}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="a second instead of ten")
+    parser.add_argument("--out", type=Path, default=Path("runs/many_fits_on_dask"))
+    parser.add_argument("--scheduler", help="address of a cluster, tcp://HOST:8786")
+    arguments = parser.parse_args(argv)
+    settings = QUICK if arguments.quick else {"fit_plant": False}
+    simulated = twin.make("tlrip", duration=1.0 if arguments.quick else 10.0)
+    rig, train, held_out = simulated.plant, simulated.part("train"), simulated.part("held_out")
+    if arguments.quick:
+        train, held_out = train[:2], held_out[:1]
+    arguments.out.mkdir(parents=True, exist_ok=True)
+
+    with ExitStack() as stack:
+        cluster = arguments.scheduler
+        if cluster is None:
+            # One thread a worker: fits share nothing, and compiled code has its own.
+            cluster = stack.enter_context(
+                LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
+            )
+        client = stack.enter_context(Client(cluster))
+        # All that joblib does in here is done by the cluster, also what nfriction asks of it.
+        stack.enter_context(joblib.parallel_config(backend="dask"))
+
+        fits = joblib.Parallel()(
+            joblib.delayed(coefficients)(rig, recording, settings) for recording in train
+        )
+        table = pd.DataFrame(fits, index=[recording.name for recording in train])
+        table.to_csv(arguments.out / "coefficients.csv")
+        print(f"LFM fitted to each recording alone\n{table.T}\n")
+
+        models = ["NCFM", "LFM"] if arguments.quick else ["NCFM", "LFM", "NLFM", "NFLFM"]
+        comparison = compare(rig, models, train, held_out, jobs=-1, **settings)
+        comparison.to_frame().to_csv(arguments.out / "comparison.csv", index=False)
+        print(comparison)
+        print(f"fitted on {len(client.scheduler_info()['workers'])} workers")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
