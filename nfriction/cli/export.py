@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nfriction.cli import names
+from nfriction.cli import estimation, names
 from nfriction.cli.console import Parser, UsageError, check_writable, seconds
 
 if TYPE_CHECKING:
@@ -49,7 +49,13 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
                        help="rig file or name (default: the one in the model file)")  # fmt: skip
     group.add_argument("--into", type=names.file, metavar="ROBOT",
                        help="robot description whose joints of these names get them")  # fmt: skip
-    group.add_argument("--angles", metavar="HOW,ZERO", help="of the recordings; see fit")
+    group.add_argument("--angles", metavar="HOW,ZERO",
+                       help="how the recordings write angles, e.g. absolute,hanging "
+                       "(default: as file or rig say)")  # fmt: skip
+    group.add_argument("--degrees", action="store_true", help="the recordings are in degrees")
+    group.add_argument("--columns", type=estimation._columns, metavar="OURS=THEIRS,...",
+                       help="the recordings' names of time, q1, ..., tau1, ... where they differ, "
+                       "e.g. time=t,q1=enc_1,q2=enc_2")  # fmt: skip
     parser.set_defaults(run=run)
 
 
@@ -102,7 +108,6 @@ def _write_simulator(
 ) -> None:
     """Write joint parameters, and tell what they cost."""
     from nfriction import export
-    from nfriction.cli import estimation
     from nfriction.plant import rigfile
     from nfriction.signals import kalman_smoother
 
@@ -112,7 +117,6 @@ def _write_simulator(
         plant = rigfile.from_dict(info.rig)
     else:
         raise UsageError("the model file tells no rig; give --rig, whose loads friction needs.")
-    arguments.columns, arguments.degrees = None, False
     recordings = estimation.read_recordings(arguments.recording, plant, arguments)
     moved = (recording.joint_coordinates(plant) for recording in recordings)
     motions = [kalman_smoother(recording.time, recording.q) for recording in moved]

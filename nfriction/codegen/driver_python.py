@@ -23,10 +23,12 @@ def python_source(parts: Pieces) -> str:
     def spread(arguments: list[str]) -> list[str]:
         return [a for name in arguments for a in _spread(name, parts)]
 
-    functions = [
-        lanes_python.function("nf_step", spread(STEP), parts.step, scalars(below), into="step"),
-        lanes_python.function("nf_stage", spread(STAGE), parts.stage, scalars(known)),
-    ]
+    functions = [lanes_python.function("nf_stage", spread(STAGE), parts.stage, scalars(known))]
+    if parts.step:
+        step = lanes_python.function(
+            "nf_step", spread(STEP), parts.step, scalars(below), into="step"
+        )
+        functions.append(step)
     if parts.advance:
         functions += [
             python_function("nf_begin", spread(BEGIN), parts.begin, scalars(parts.inputs)),
@@ -64,33 +66,36 @@ def _python_names(parts: Pieces) -> dict[str, object]:
         return ("\n" + " " * indent).join(pattern.replace("#", str(i)) for i in n)
 
     held, memory = _names("qd_held", count) + _names("qdd_held", count), _spread("memory", parts)
+    acting = [*_names("tau", count), *held, *memory]
     return {
         "N": count,
+        "ARITHMETIC": lanes_python.ARITHMETIC,
         "NM": max(1, len(parts.advance)),
         "NS": max(1, len(parts.step)),
-        "held": ", ".join([*_names("tau", count), *held, *memory]),
+        "held": ", ".join(acting),
+        "prepare": f"nf_step(p, once, {', '.join(acting)}, step)" if parts.step else "",
         "q": each("q_#"),
         "qd": each("qd_#"),
         "q_args": ", ".join(_names("q", count)),
         "qd_args": ", ".join(_names("qd", count)),
-        "initial": lines("q_# = q0[#]; qd_# = qd0[#]; q_out[#] = q_#; qd_out[#] = qd_#", 4),
-        "first_qdd": lines("prev_# = start[#]; qdd_out[#] = prev_#", 4),
-        "seed": lines("qd_held_# = qdd_held_# = 0.0", 4),
-        "memory_seed": "\n    ".join(f"{name} = 0.0" for name in memory),
-        "take": lines("tau_# = torque[k * torque_step + #]", 8),
-        "hold": lines("qd_held_# = qd_#; qdd_held_# = prev_#", 12),
+        "initial": lines("q_# = q0[#]; qd_# = qd0[#]; q_out[#] = q_#; qd_out[#] = qd_#", 8),
+        "first_qdd": lines("prev_# = start[#]; qdd_out[#] = prev_#", 8),
+        "seed": lines("qd_held_# = qdd_held_# = 0.0", 8),
+        "memory_seed": "\n        ".join(f"{name} = 0.0" for name in memory),
+        "take": lines("tau_# = torque[k * torque_step + #]", 12),
+        "hold": lines("qd_held_# = qd_#; qdd_held_# = prev_#", 16),
         "remember": _remember(", ".join(held), ", ".join(memory)) if memory else "",
         "drive": lines(
             "qd_held_# = qd_drive[k * drive_step + #]; qdd_held_# = qdd_drive[k * drive_step + #]",
-            16,
+            20,
         ),
         "a1": each("a1_#"),
         "a2": each("a2_#"),
         "a3": each("a3_#"),
         "a4": each("a4_#"),
-        "to2": lines("x_# = q_# + half * qd_#; v2_# = qd_# + half * a1_#", 8),
-        "to3": lines("x_# = q_# + half * v2_#; v3_# = qd_# + half * a2_#", 8),
-        "to4": lines("x_# = q_# + dt * v3_#; v4_# = qd_# + dt * a3_#", 8),
+        "to2": lines("x_# = q_# + half * qd_#; v2_# = qd_# + half * a1_#", 12),
+        "to3": lines("x_# = q_# + half * v2_#; v3_# = qd_# + half * a2_#", 12),
+        "to4": lines("x_# = q_# + dt * v3_#; v4_# = qd_# + dt * a3_#", 12),
         "x": ", ".join(_names("x", count)),
         "v2": ", ".join(_names("v2", count)),
         "v3": ", ".join(_names("v3", count)),
@@ -98,85 +103,82 @@ def _python_names(parts: Pieces) -> dict[str, object]:
         "advance": lines(
             "q_# += sixth * (qd_# + 2.0 * (v2_# + v3_#) + v4_#); "
             "qd_# += sixth * (a1_# + 2.0 * (a2_# + a3_#) + a4_#); prev_# = a1_#",
-            8,
+            12,
         ),
         "within": " and ".join(f"abs(qd_{i}) <= limit and q_{i} - q_{i} == 0.0" for i in n),
-        "record": lines("q_out[at + #] = q_#; qd_out[at + #] = qd_#; qdd_out[at + #] = prev_#", 12),
+        "record": lines("q_out[at + #] = q_#; qd_out[at + #] = qd_#; qdd_out[at + #] = prev_#", 16),
     }
 
 
 def _remember(held: str, memory: str) -> str:
-    given = f"{memory}, = " + ", ".join(f"first[{i}]" for i in range(memory.count(",") + 1))
+    given = f"{memory}, = " + ", ".join(f"first_memory[{i}]" for i in range(memory.count(",") + 1))
     return f"""
-            if k > 0:
-                {memory}, = nf_advance(p, {held}, {memory})
-            elif remembered:
-                {given},
-            else:
-                {memory}, = nf_begin(p, {held})"""
+                if k > 0:
+                    {memory}, = nf_advance(p, {held}, {memory})
+                elif remembered:
+                    {given},
+                else:
+                    {memory}, = nf_begin(p, {held})"""
 
 
 _PYTHON_DRIVER = Template("""\
-@njit(error_model="numpy", fastmath={"contract"})
-def nf_candidate(
-    once, start, steps, every, hold, limit, p, q0, qd0, h, h_step, torque, torque_step,
-    qd_drive, qdd_drive, drive_step, first, remembered, q_out, qd_out, qdd_out,
-):
-    step = np.empty($NS)
-    $initial
-    $seed
-    $first_qdd
-    at = $N
-    next = every
-    renew = 0
-    $memory_seed
-    for k in range(steps):
-        dt = h[k * h_step]
-        half = 0.5 * dt
-        sixth = dt / 6.0
-        $take
-        if k == renew:
-            renew += hold
-            $hold
-            if drive_step:
-                $drive$remember
-        nf_step(p, once, $held, step)
-        $a1 = nf_stage(p, once, step, $held, $q_args, $qd_args)
-        $to2
-        $a2 = nf_stage(p, once, step, $held, $x, $v2)
-        $to3
-        $a3 = nf_stage(p, once, step, $held, $x, $v3)
-        $to4
-        $a4 = nf_stage(p, once, step, $held, $x, $v4)
-        $advance
-        if not ($within):
-            q_out[at:] = math.nan
-            qd_out[at:] = math.nan
-            qdd_out[at:] = math.nan
-            return k + 1
-        if k + 1 == next:
-            $record
-            at += $N
-            next += every
-    return -1
-
-
-@njit(error_model="numpy", nogil=True, cache=True)
+@njit($ARITHMETIC, nogil=True, cache=True)
 def nf_rollout(
-    once, once_row, start, first, last, steps, every, hold, limit, p, p_row,
-    q0, qd0, h, h_row, h_step, torque, torque_row, torque_step,
-    qd_drive, qdd_drive, drive_row, drive_step, memory, remembered,
-    q_out, qd_out, qdd_out, diverged,
+    all_once, once_row, all_start, first, last, steps, every, hold, limit, all_p, p_row,
+    all_q0, all_qd0, all_h, h_row, h_step, all_torque, torque_row, torque_step,
+    all_qd_drive, all_qdd_drive, drive_row, drive_step, memory, remembered,
+    all_q_out, all_qd_out, all_qdd_out, diverged,
 ):
     records = (steps // every + 1) * $N
+    step = np.empty($NS)
     for c in range(first, last):
-        diverged[c] = nf_candidate(
-            once[(c - first) * once_row :], start[(c - first) * $N :],
-            steps, every, hold, limit, p[c * p_row :], q0[c * $N :], qd0[c * $N :],
-            h[c * h_row :], h_step, torque[c * torque_row :], torque_step,
-            qd_drive[c * drive_row :], qdd_drive[c * drive_row :], drive_step,
-            memory[c * $NM * remembered :], remembered,
-            q_out[c * records : (c + 1) * records], qd_out[c * records : (c + 1) * records],
-            qdd_out[c * records : (c + 1) * records],
-        )
+        once = all_once[(c - first) * once_row :]
+        start = all_start[(c - first) * $N :]
+        p = all_p[c * p_row :]
+        q0 = all_q0[c * $N :]
+        qd0 = all_qd0[c * $N :]
+        h = all_h[c * h_row :]
+        torque = all_torque[c * torque_row :]
+        qd_drive = all_qd_drive[c * drive_row :]
+        qdd_drive = all_qdd_drive[c * drive_row :]
+        first_memory = memory[c * $NM * remembered :]
+        q_out = all_q_out[c * records : (c + 1) * records]
+        qd_out = all_qd_out[c * records : (c + 1) * records]
+        qdd_out = all_qdd_out[c * records : (c + 1) * records]
+        diverged[c] = -1
+        $initial
+        $seed
+        $first_qdd
+        at = $N
+        next = every
+        renew = 0
+        $memory_seed
+        for k in range(steps):
+            dt = h[k * h_step]
+            half = 0.5 * dt
+            sixth = dt / 6.0
+            $take
+            if k == renew:
+                renew += hold
+                $hold
+                if drive_step:
+                    $drive$remember
+            $prepare
+            $a1 = nf_stage(p, once, step, $held, $q_args, $qd_args)
+            $to2
+            $a2 = nf_stage(p, once, step, $held, $x, $v2)
+            $to3
+            $a3 = nf_stage(p, once, step, $held, $x, $v3)
+            $to4
+            $a4 = nf_stage(p, once, step, $held, $x, $v4)
+            $advance
+            if not ($within):
+                for i in range(at, records):
+                    q_out[i] = qd_out[i] = qdd_out[i] = math.nan
+                diverged[c] = k + 1
+                break
+            if k + 1 == next:
+                $record
+                at += $N
+                next += every
 """)

@@ -11,7 +11,7 @@ from nfriction.codegen.scalar import Node, reachable
 Bounds = tuple[float, float]
 
 _ANY: Bounds = (-math.inf, math.inf)
-_MONOTONE = {"exp": np.exp, "tanh": np.tanh, "sqrt": np.sqrt}
+_MONOTONE = {"exp": np.exp, "expm1": np.expm1, "tanh": np.tanh, "sqrt": np.sqrt}
 
 
 def bounds_of(one: Template, nodes: Sequence[Node]) -> dict[int, Bounds]:

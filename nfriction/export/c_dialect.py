@@ -53,10 +53,10 @@ class ControllerC(C):
         self.used.add(name)
         return f"{name}({', '.join(args)})"
 
-    def array_exp(self) -> str:
-        """The name of `c_exp.exponential`."""
+    def array_exp(self, less: float) -> str:
+        """A call of `c_exp.exponential` on `{array}` of `{count}`."""
         self.used.add("array_exp")
-        return f"{self.prefix}_exp"
+        return f"{self.prefix}_exp({{array}}, {{count}}, {self.literal(less)});"
 
     def functions(self) -> str:
         """Prototypes that C89 lacks, and the maximum and minimum where they are used."""

@@ -4,11 +4,19 @@ The exponential of `math.h` is a call for every number. This one is a loop over 
 branches or tables: x = k ln 2 + r, a polynomial in r, and 2^k by the bits of a float.
 """
 
+from collections.abc import Sequence
+
 from nfriction.codegen.emit import C, Real
+from nfriction.codegen.finite import rebuilt
+from nfriction.codegen.scalar import Graph, Node
 
 # Arguments it takes. Below -87.3 the result is 0; further down k would not fit its integer, and
 # above zero it would be rounded to the wrong side, which a rounding may come to.
 LEAST, LARGEST = -1e9, 0.1
+# What it takes off, by operation.
+LESS = {"exp": 0.0, "expm1": 1.0}
+# Beyond half of this exp(x) - 1 is -1 and tanh is 1, in double and in single precision.
+_SATURATED = -40.0
 
 # Of (exp(r) - 1) / r for |r| <= ln(2) / 2, minimax; relative errors of exp(r) are below 4e-18 and
 # 2e-9, beside the roundings of what is computed with them.
@@ -27,9 +35,10 @@ _LN2: dict[Real, tuple[float, float]] = {
 
 
 def exponential(prefix: str, real: Real) -> str:
-    """`{prefix}_exp(x, count)`, which replaces numbers of LEAST to LARGEST by their exponential.
+    """`{prefix}_exp(x, count, less)`: exp(x) - less in place, for numbers of LEAST to LARGEST.
 
-    NaN stays NaN. It needs `{prefix}_word` of `c_dialect.bits`.
+    With less = 1 small numbers keep their digits. NaN stays NaN. It needs `{prefix}_word` of
+    `c_dialect.bits`.
     """
     dialect = C(real)
     high, low = map(dialect.literal, _LN2[real])
@@ -46,8 +55,8 @@ typedef int {prefix}_whole;
 typedef long {prefix}_whole;
 #endif
 {check}
-/* The exponential of numbers <= 0, in place; without branches, so that compilers vectorise it. */
-static void {prefix}_exp({real} *x, int count)
+/* exp(x) - less of numbers <= 0, in place; without branches, so that compilers vectorise it. */
+static void {prefix}_exp({real} *x, int count, {real} less)
 {{
     int i;
     for (i = 0; i < count; ++i) {{
@@ -62,7 +71,7 @@ static void {prefix}_exp({real} *x, int count)
         memcpy(&power, &word, sizeof power);
         {{
             const {real} scale = ({real})power;
-            x[i] = scale + scale * (r * p);
+            x[i] = scale * (r * p) + (scale - less);
         }}
     }}
 }}
@@ -79,3 +88,23 @@ def _pairs(literals: list[str]) -> str:
     for pair in reversed(pairs[:-1]):
         text = f"{pair} + s * ({text})" if " " in text else f"{pair} + s * {text}"
     return text
+
+
+def by_exponentials(graph: Graph, nodes: Sequence[Node]) -> list[Node]:
+    """`nodes` with every tanh by this exponential: -e / (e + 2) with e = exp(-2 |x|) - 1.
+
+    The tanh of `math.h` takes another branch for another size of its argument, which costs where
+    that is not foreseen.
+    """
+
+    def rule(node: Node, args: tuple[Node, ...]) -> Node | None:
+        if node.op != "tanh":
+            return None
+        (x,) = args
+        size = graph.apply("mul", graph.constant(-2.0), graph.apply("abs", x))
+        e = graph.apply("expm1", graph.apply("max", graph.constant(_SATURATED), size))
+        ratio = graph.apply("div", e, graph.apply("add", e, graph.constant(2.0)))
+        negative = graph.apply("lt", x, graph.constant(0.0))
+        return graph.apply("where", negative, ratio, graph.apply("neg", ratio))
+
+    return rebuilt(graph, nodes, rule)

@@ -1,37 +1,35 @@
-"""One traced function as C: a static function for a joint, called for every joint."""
+"""One traced function as C: a static function for a joint, called for every joint, or one for all.
 
-import math
+Where a model has exponentials in plenty, all joints are computed side by side: their exponentials
+go through one loop, and compilers make vector instructions of the rest. Elsewhere, one joint after
+the other is as quick and shorter.
+"""
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from torch import Tensor
 
 from nfriction.codegen import finite
 from nfriction.codegen.function import fold
-from nfriction.codegen.joints import TABLE, Template, template
-from nfriction.codegen.loops import Names, body
-from nfriction.codegen.packs import Pack, Packing, pack
+from nfriction.codegen.joints import TABLE, template
+from nfriction.codegen.packing import pack
+from nfriction.codegen.packs import Packing
+from nfriction.codegen.places import LANE, at
 from nfriction.codegen.scalar import Node, reachable
 from nfriction.codegen.squares import completed
-from nfriction.export.c_bounds import bounds_of
+from nfriction.export.c_blocks import (
+    View,
+    alike,
+    branches,
+    choice,
+    indented,
+)
 from nfriction.export.c_dialect import ControllerC, array, table
-from nfriction.export.c_exp import LARGEST, LEAST
-from nfriction.export.c_whole import whole, whole_leaves
-
-
-@dataclass(frozen=True)
-class Output:
-    """An output array of a C function.
-
-    Attributes:
-        name: of the argument.
-        kind: "real", or "int" for what is a whole number by construction.
-    """
-
-    name: str
-    kind: Literal["real", "int"] = "real"
+from nfriction.export.c_exp import by_exponentials
+from nfriction.export.c_parts import Output, Parts
 
 
 @dataclass(frozen=True)
@@ -39,7 +37,7 @@ class Emitted:
     """A function as text.
 
     Attributes:
-        source: its tables and the static function of one joint.
+        source: its tables and the static function.
         call: statements that call it for all joints.
         counts: whether they count the joints with `j`.
     """
@@ -74,225 +72,113 @@ def emit(
     return _Function(name, one, outputs, dialect).emitted(arrays or {})
 
 
-class _Function:
-    def __init__(
-        self, name: str, one: Template, outputs: Sequence[Output], dialect: ControllerC
-    ) -> None:
-        self.name, self.one, self.outputs, self.dialect = name, one, outputs, dialect
-        self.names = Names(f"{name}_c")
-        pairs = zip(outputs, one.outputs, strict=True)
-        self.targets = [(output, i) for output, group in pairs for i in range(len(group))]
-
+class _Function(Parts):
     def emitted(self, arrays: Mapping[str, str]) -> Emitted:
         graph = self.one.graph
         nodes = [node for group in self.one.outputs for node in group]
-        nodes = finite.rebuilt(graph, finite.by_bits(graph, nodes), self._left_range)
+        nodes = finite.rebuilt(graph, finite.by_bits(graph, nodes), self.left_range)
         test = finite.border(nodes)
         usual = nodes if test is None else finite.decided(graph, nodes, test, True)
-        packing = pack(self._wanted(usual))
-        main = self._body(usual, packing)
+        rare = None if test is None else finite.decided(graph, nodes, test, False)
+        packing = pack(self.wanted(usual))
+        in_place = self.in_place(usual)
+        if any(in_place(made) for made, _ in packing.home.values()):
+            several = self.one.joints > 1
+            if several or self.dialect.real == "double":  # on a microcontroller it costs flash
+                usual = by_exponentials(graph, usual)
+                packing = pack(self.wanted(usual), calls=("expm1",))
+            if several:
+                return self._side_by_side(test, usual, rare, packing, arrays)
+        return self._one_by_one(test, usual, rare, packing, arrays)
+
+    def _one_by_one(
+        self, test: Node | None, usual: list[Node], rare: list[Node] | None, packing: Packing,
+        arrays: Mapping[str, str],
+    ) -> Emitted:  # fmt: skip
+        """A function of one joint's numbers, called in a loop."""
+        view = View(self.sizes)
+        main = self.block(usual, packing, view)
         lines = [*main.declarations, *(f"(void){key};" for key in self.one.inputs)]
-        if test is None:
+        if test is None or rare is None:
             lines += main.lines()
         else:
-            rare = finite.decided(graph, nodes, test, False)
-            other = self._body(rare, Packing({}, packing.columns, packing.column))
-            lines += _branches(self._tests(test), main, other)
-        return Emitted(
-            "\n".join([*self._tables(packing), self._function(lines, packing)]),
-            self._call(packing, arrays),
-            self.one.joints > 1,
-        )
+            other = self.block(rare, _unpacked(packing), view)
+            lines += branches(self.tests(test, view), main, other)
+        parts = [*self._arrays(), self._function(lines, bool(packing.columns))]
+        columns = self._columns(packing)
+        if columns:
+            rows = table(f"{self.name}_table", self.dialect.real, np.stack(columns, -1),
+                         self.dialect)  # fmt: skip
+            parts.insert(0, rows)
+        single = self.one.joints == 1
+        given = [f"{self.name}_table[{0 if single else LANE}]"] if columns else []
+        for key, size in self.sizes.items():
+            step = "" if single else f" + {size} * {LANE}" if size > 1 else f" + {LANE}"
+            given.append(arrays.get(key, key) + step)
+        call = f"{self.name}({', '.join(given)});"
+        head = f"for ({LANE} = 0; {LANE} < {self.one.joints}; ++{LANE})"
+        return Emitted("\n".join(parts), (call,) if single else (head, f"    {call}"), not single)
 
-    def _function(self, lines: Sequence[str], packing: Packing) -> str:
+    def _side_by_side(
+        self, test: Node | None, usual: list[Node], rare: list[Node] | None, packing: Packing,
+        arrays: Mapping[str, str],
+    ) -> Emitted:  # fmt: skip
+        """A function of all joints' numbers; inputs that are not finite count as zero at first."""
+        lanes, real = self.one.joints, self.dialect.real
+        name = f"{self.name}_table"
+        view = View(self.sizes, name, every=True, lanes=lanes)
+        read = {n.value[0] for n in reachable(self.wanted(usual)) if n.op == "input"}
+        own = {key: f"{key}_now" for key in self.one.inputs if key in read}
+        main = self.block(usual, packing, view, own)
+        lines = [*main.declarations]
+        lines += [f"{real} {copy}[{lanes * self.sizes[key]}];" for key, copy in own.items()]
+        reads = self._reads(view, own, "" if rare is None else f"sound[{LANE}]")
+        stores = [line for store in main.stores for line in store.lines()]
+        if test is not None and rare is not None:
+            lines.append(f"int sound[{lanes}];")
+            reads.insert(0, f"sound[{LANE}] = {self.tests(test, view)};")
+            other = self.block(rare, _unpacked(packing), view)
+            if alike(main, other):
+                both = f"sound[{LANE}] && {main.stores[0].test}"
+                stores = choice(both, main.stores[0].sound, other.lines())
+            else:
+                stores = choice(f"sound[{LANE}]", stores, [*other.declarations, *other.lines()])
+        head = f"for ({LANE} = 0; {LANE} < {lanes}; ++{LANE}) {{"
+        lines += [f"(void){key};" for key in self.one.inputs]
+        lines += [head, *indented(reads), "}", *main.statements, head, *indented(stores), "}"]
+        numbers = [self.dialect.literal(float(x)) for c in self._columns(packing) for x in c]
+        columns = [array(name, real, numbers)] if numbers else []
+        parts = [*columns, *self._arrays(), self._function(lines, False)]
+        call = f"{self.name}({', '.join(arrays.get(key, key) for key in self.sizes)});"
+        return Emitted("\n".join(parts), (call,), False)
+
+    def _reads(self, view: View, own: Mapping[str, str], test: str) -> list[str]:
+        """Copies of the inputs, joints side by side; zero where a test fails."""
+        zero = self.dialect.literal(0.0)
+        lines = []
+        for key, copy in own.items():
+            for i in range(self.sizes[key]):
+                given = view.number(key, i)
+                value = f"{test} ? {given} : {zero}" if test else given
+                lines.append(f"{copy}[{at(i, view.lanes)}] = {value};")
+        return lines
+
+    def _function(self, lines: Sequence[str], with_table: bool) -> str:
         real = self.dialect.real
-        arguments = [f"const {real} *{TABLE}"] if packing.columns else []
+        arguments = [f"const {real} *{TABLE}"] if with_table else []
         arguments += [f"const {real} *{key}" for key in self.one.inputs]
         arguments += [f"{'int' if o.kind == 'int' else real} *{o.name}" for o in self.outputs]
         head = ",\n    ".join(arguments)
         inside = "\n    ".join(lines)
         return f"static void {self.name}(\n    {head})\n{{\n    {inside}\n}}\n"
 
-    def _tables(self, packing: Packing) -> list[str]:
-        real = self.dialect.real
-        columns = [self._values(node) for node in packing.columns]
-        arrays = [array(key, *value) for key, value in self.names.arrays.items()]
-        if not columns:
-            return arrays
-        return [table(f"{self.name}_table", real, np.stack(columns, -1), self.dialect), *arrays]
+    def _arrays(self) -> list[str]:
+        return [array(key, *value) for key, value in self.names.arrays.items()]
 
-    def _call(self, packing: Packing, arrays: Mapping[str, str]) -> tuple[str, ...]:
-        sizes = dict(self.one.inputs)
-        pairs = zip(self.outputs, self.one.outputs, strict=True)
-        sizes |= {output.name: len(group) for output, group in pairs}
-        single = self.one.joints == 1
-        given = [f"{self.name}_table[{0 if single else 'j'}]"] if packing.columns else []
-        for key, size in sizes.items():
-            step = "" if single else f" + {size} * j" if size > 1 else " + j"
-            given.append(arrays.get(key, key) + step)
-        call = f"{self.name}({', '.join(given)});"
-        if single:
-            return (call,)
-        return (f"for (j = 0; j < {self.one.joints}; ++j)", f"    {call}")
-
-    def _left_range(self, node: Node, args: tuple[Node, ...]) -> Node | None:
-        """`x != clamp(x, low, high)` as `x < low or high < x`, which is shorter."""
-        if node.op != "ne":
-            return None
-        for x, clamped in (args, args[::-1]):
-            for high, raised in _sides("min", clamped):
-                for low, own in _sides("max", raised):
-                    if own is x and (self._values(low) <= self._values(high)).all():
-                        g = self.one.graph
-                        return g.apply("or", g.apply("lt", x, low), g.apply("lt", high, x))
-        return None
-
-    def _values(self, node: Node) -> np.ndarray:
-        """Known number of each joint, NaN for what is not known."""
-        if node.op == "constant":
-            return np.full(self.one.joints, node.value)
-        if node.op == "input" and node.value[0] == TABLE:
-            return self.one.table[:, node.value[1]]
-        return np.full(self.one.joints, np.nan)
-
-    def _wanted(self, nodes: Sequence[Node]) -> list[Node]:
-        """What has to be computed: tests, values, and what whole numbers rest on."""
-        wanted: list[Node] = []
-        for (output, _), node in zip(self.targets, nodes, strict=True):
-            if output.kind == "int":
-                wanted += whole_leaves(node)
-            else:
-                wanted += [part for part in _guarded(node) if part is not None]
-        return list({node.number: node for node in wanted}.values())
-
-    def _body(self, nodes: Sequence[Node], packing: Packing) -> "_Block":
-        """All that computes and stores the outputs."""
-
-        def bound(node: Node) -> str:
-            name, index = node.value
-            return f"{name}[{packing.place(node) if name == TABLE else index}]"
-
-        wanted = self._wanted(nodes)
-        tests = [n for n in reachable(wanted) if n.op == "finite"]
-        named = [*tests, *(n.args[0] for n in tests)]
-        limits = bounds_of(self.one, wanted)
-
-        def in_place(made: Pack) -> str | None:
-            if made.op != "exp":
-                return None
-            within = (limits[n.args[0].number] for n in made.nodes)
-            if not all(low >= LEAST and high <= LARGEST for low, high in within):
-                return None
-            return self.dialect.array_exp()
-
-        made = body(wanted, packing, self.dialect, bound, named, self.names, in_place)
-        texts = dict(zip((n.number for n in wanted), made.texts, strict=True))
-        return _Block(made.declarations, made.statements, self._stores(nodes, texts))
-
-    def _stores(self, nodes: Sequence[Node], texts: Mapping[int, str]) -> list["_Stores"]:
-        """Stores to the outputs, by the test that decides whether they are NaN.
-
-        NaN is stored as bits, whatever the compiler assumes of numbers.
-        """
-        tests = {test.number for test, _ in map(_guarded, nodes) if test is not None}
-        found: dict[str, tuple[list[str], list[str], list[tuple[str, int]]]] = {}
-        for (output, i), node in zip(self.targets, nodes, strict=True):
-            target = f"{output.name}[{i}]"
-            if output.kind == "int":
-                guarded = node.op == "where" and node.args[0].number in tests
-                test = node.args[0] if guarded else None
-                sides = node.args[1:] if guarded else (node,)
-                lines = [f"{target} = {whole(x, texts, self.dialect)};" for x in sides]
-            else:
-                test, value = _guarded(node)
-                lines = [] if value is None else [f"{target} = {texts[value.number]};"]
-            sound, broken, nans = found.setdefault(
-                "" if test is None else texts[test.number], ([], [], [])
-            )
-            sound += lines[:1]
-            broken += lines[1:]
-            if output.kind == "real" and (value is None or test is not None):
-                nans.append((output.name, i))
-        return [_Stores(k, s, [*b, *self._fills(n)]) for k, (s, b, n) in found.items()]
-
-    def _fills(self, places: Sequence[tuple[str, int]]) -> list[str]:
-        """Calls that fill with NaN, one a run of neighbours."""
-        runs: list[tuple[str, int, int]] = []
-        for name, i in places:
-            if runs and runs[-1][0] == name and runs[-1][1] + runs[-1][2] == i:
-                runs[-1] = name, runs[-1][1], runs[-1][2] + 1
-            else:
-                runs.append((name, i, 1))
-        fill = f"{self.dialect.prefix}_fill_nan"
-        return [f"{fill}({name}{f' + {i}' if i else ''}, {n});" for name, i, n in runs]
-
-    def _tests(self, test: Node) -> str:
-        if test.op == "and":
-            return " && ".join(self._tests(part) for part in test.args)
-        name, index = test.args[0].value
-        return self.dialect.call("finite", [f"{name}[{index}]"])
+    def _columns(self, packing: Packing) -> list[np.ndarray]:
+        return [self.values(node) for node in packing.columns]
 
 
-@dataclass(frozen=True)
-class _Stores:
-    """Stores where a test holds, and where it fails; an empty test holds, yet both are stored."""
-
-    test: str
-    sound: list[str]
-    broken: list[str]
-
-    def lines(self) -> list[str]:
-        if not self.test:
-            return [*self.sound, *self.broken]
-        return [f"if ({self.test}) {{", *_indented(self.sound), "} else {",
-                *_indented(self.broken), "}"]  # fmt: skip
-
-
-@dataclass(frozen=True)
-class _Block:
-    """Declarations, statements, and the stores to the outputs."""
-
-    declarations: list[str]
-    statements: list[str]
-    stores: list[_Stores]
-
-    def lines(self) -> list[str]:
-        return [*self.statements, *(line for store in self.stores for line in store.lines())]
-
-
-def _branches(tests: str, usual: _Block, rare: _Block) -> list[str]:
-    """The usual case where inputs pass their tests, the rare one otherwise."""
-    bare = rare.lines()
-    if len(usual.stores) == 1 and usual.stores[0].test and usual.stores[0].broken == bare:
-        # Both kinds of failure end alike: one way out for both.
-        last = [f"if ({usual.stores[0].test}) {{", *_indented(usual.stores[0].sound),
-                "    return;", "}"]  # fmt: skip
-        return [f"if ({tests}) {{", *_indented([*usual.statements, *last]), "}", *bare]
-    return [
-        f"if (!({tests})) {{",
-        *_indented([*rare.declarations, *bare, "return;"]),
-        "}",
-        *usual.lines(),
-    ]
-
-
-def _indented(lines: Sequence[str]) -> list[str]:
-    return [f"    {line}" for line in lines]
-
-
-def _sides(op: str, node: Node) -> list[tuple[Node, Node]]:
-    """Both ways to read the arguments of a maximum or minimum."""
-    return [(*node.args,), (*node.args[::-1],)] if node.op == op else []  # type: ignore[list-item]
-
-
-def _is_nan(node: Node) -> bool:
-    return node.op == "constant" and isinstance(node.value, float) and math.isnan(node.value)
-
-
-def _guarded(node: Node) -> tuple[Node | None, Node | None]:
-    """The test without which an output is NaN, and its value; no value where it always is."""
-    if _is_nan(node):
-        return None, None
-    if node.op == "where" and _is_nan(node.args[2]):
-        return node.args[0], node.args[1]
-    return None, node
+def _unpacked(packing: Packing) -> Packing:
+    """No loops, with the same table."""
+    return Packing({}, packing.columns, packing.column)

@@ -98,11 +98,10 @@ class _Contracted(nn.Module):
         """The torque alone, by the same contract; a memory is that after a first sample."""
         qd_seen, qdd_seen, _ = self._seen(qd, qdd)
         tau_f = self.model.torque(qd, load, self.model.schedule(qd_seen, qdd_seen))
-        # Nothing times zero is NaN where it is not finite: half the operations of a comparison.
-        seen = qd + qdd + load + tau_f
-        if self.limited:
-            tau_f = torch.clamp(tau_f, -self.torque_limit, self.torque_limit)
-        return torch.add(tau_f, seen, alpha=0.0)
+        held = torch.clamp(tau_f, -self.torque_limit, self.torque_limit) if self.limited else tau_f
+        # Zero times what is not finite is NaN: a third of the operations of comparisons.
+        held = torch.addcmul(held, qd, qdd, value=0.0)
+        return torch.addcmul(held, load, tau_f, value=0.0)
 
 
 def masked(

@@ -128,12 +128,7 @@ def mjcf(
         OSError: if a file cannot be read or written.
     """
     found = collapse(model, motions, load=load, info=info)
-    if into is None:
-        text = mjcf_snippet(found.joint_names, found.damping, found.frictionloss, str(found))
-    else:
-        text = patched(into, "mujoco", found.joint_names, found.damping, found.frictionloss)
-    write_atomically(path, text)
-    return found
+    return _written(found, path, "mujoco", mjcf_snippet, into)
 
 
 def urdf(
@@ -151,10 +146,19 @@ def urdf(
         be copied into a robot.
     """
     found = collapse(model, motions, load=load, info=info)
-    if into is None:
-        text = urdf_snippet(found.joint_names, found.damping, found.frictionloss, str(found))
-    else:
-        text = patched(into, "robot", found.joint_names, found.damping, found.frictionloss)
+    return _written(found, path, "robot", urdf_snippet, into)
+
+
+def _written(
+    found: Collapse,
+    path: str | Path,
+    root: str,
+    snippet: Callable[..., bytes],
+    into: str | Path | None,
+) -> Collapse:
+    """Write the numbers as a snippet of its own, or into a robot of that root element."""
+    numbers = found.joint_names, found.damping, found.frictionloss
+    text = snippet(*numbers, str(found)) if into is None else patched(into, root, *numbers)
     write_atomically(path, text)
     return found
 

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +73,30 @@ def test_to_simulators(model: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     assert said.count("RMS") == 2 * RIG.joints
     for name in ("lfm.xml", "lfm.urdf"):
         assert RIG.joint_names[0] in (tmp_path / name).read_text()
+
+
+def test_a_recording_in_degrees_with_names_of_its_own_gives_the_same(
+    model: Path, tmp_path: Path
+) -> None:
+    time = 1e-3 * np.arange(2000)
+    q = np.sin(5 * time[:, None] + np.arange(RIG.joints))
+    ours = ["time", *(f"q{j + 1}" for j in range(RIG.joints))]
+    theirs = ["t", *(f"enc_{j + 1}" for j in range(RIG.joints))]
+    pairs = ",".join(f"{a}={b}" for a, b in zip(ours, theirs, strict=True))
+    found = []
+    for columns, angles, words in (
+        (ours, q, []),
+        (theirs, np.rad2deg(q), ["--degrees", "--columns", pairs]),
+    ):
+        path = tmp_path / f"{columns[0]}.csv"
+        rows = np.column_stack([time, angles])
+        np.savetxt(path, rows, "%.15g", ",", header=",".join(columns), comments="")
+        words = ["--to", "urdf", "--angles", "relative,upright", "--recording", str(path), *words]
+        assert cli.main(["export", str(model), *words, "--out", str(tmp_path / columns[0])]) == 0
+        text = (tmp_path / columns[0] / "lfm.urdf").read_text()
+        found.append([float(x) for x in re.findall(r'(?:damping|friction)="([^"]+)"', text)])
+    assert len(found[0]) == 2 * RIG.joints
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -11,11 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nfriction.codegen import finite
+from nfriction.codegen.elements import Names
 from nfriction.codegen.emit import C_PRELUDE, C
 from nfriction.codegen.function import fold
 from nfriction.codegen.joints import TABLE, Template, template
-from nfriction.codegen.loops import Names, _index, body
-from nfriction.codegen.packs import pack
+from nfriction.codegen.loops import body
+from nfriction.codegen.packing import pack
+from nfriction.codegen.places import at, place
 from nfriction.codegen.scalar import Graph, evaluate, reachable
 from nfriction.codegen.squares import completed
 
@@ -67,9 +69,9 @@ def expanded(x):
     return torch.exp((q * (x * x)).sum(-1) + (-2.0 * q * m * x).sum(-1) + (q * m * m).sum(-1))
 
 
-def compiled(one, tmp_path):
+def compiled(one, tmp_path, calls=()):
     """One row of a template of one input and one output, as C."""
-    packing = pack(one.outputs[0])
+    packing = pack(one.outputs[0], calls)
     names = Names("c")
 
     def bound(node):
@@ -125,6 +127,56 @@ def test_loops_equal_the_module(tmp_path, units):
     assert len(source) < 4000
 
 
+@pytest.mark.skipif(CC is None, reason="needs a C compiler")
+@pytest.mark.parametrize("units", [4, 6, 25])
+def test_lanes_give_every_joint_what_its_row_gives(tmp_path, units):
+    """The same body over arrays with the joints side by side, all of them in one call."""
+    network = Network(units)
+    one = templated(network, (4,))
+    packing, names = pack(one.outputs[0]), Names("c")
+
+    def bound(node):
+        name, index = node.value
+        return f"{name}[{at(packing.place(node) if name == TABLE else index, JOINTS)}]"
+
+    made = body(one.outputs[0], packing, C(), bound, (), names, lanes=JOINTS)
+    count = len(made.texts)
+    stores = "".join(f"out[{count} * j + {i}] = {text};" for i, text in enumerate(made.texts))
+    stores = f"for (j = 0; j < {JOINTS}; ++j) {{ {stores} }}"
+    constants = [
+        f"static const {kind} {name}[] = {{{', '.join(values)}}};"
+        for name, (kind, values) in names.arrays.items()
+    ]
+    inside = "\n".join([*made.declarations, *made.statements, stores])
+    head = f"void f(const double *{TABLE}, const double *x0, double *out)"
+    (tmp_path / "f.c").write_text("\n".join([C_PRELUDE, *constants, f"{head} {{\n{inside}\n}}"]))
+    command = [CC, "-std=c89", "-O3", "-shared", "-fPIC", "-o", str(tmp_path / "f.so")]
+    subprocess.run([*command, str(tmp_path / "f.c"), "-lm"], check=True)
+    x = torch.randn(JOINTS, 4, dtype=F64)
+    columns = [one.table[:, n.value[1]] for n in packing.columns]
+    out = np.empty(JOINTS * count)
+    arrays = np.concatenate(columns), np.ascontiguousarray(x.mT.numpy()), out
+    function = ctypes.CDLL(str(tmp_path / "f.so")).f
+    function(*(ctypes.c_void_p(a.ctypes.data) for a in arrays))
+    np.testing.assert_allclose(out, network(x).detach().reshape(-1), rtol=1e-13)
+
+
+@pytest.mark.skipif(CC is None, reason="needs a C compiler")
+def test_calls_are_packed_however_few(tmp_path):
+    """Those that wait for another come in a pack of their own."""
+
+    def nested(x):
+        first = torch.expm1(x[:, 0]) + torch.expm1(2.0 * x[:, 1])
+        return torch.expm1(first) * x[:, 0]
+
+    one = templated(nested, (2,))
+    packs = {id(made): made for made, _ in pack(one.outputs[0], ("expm1",)).home.values()}
+    assert sorted(len(made.nodes) for made in packs.values() if made.op == "expm1") == [1, 2]
+    run, _ = compiled(one, tmp_path, ("expm1",))
+    x = 0.3 * torch.randn(JOINTS, 2, dtype=F64)
+    np.testing.assert_allclose(run(x.numpy()), nested(x), rtol=1e-13)
+
+
 def test_joints_that_look_at_each_other_are_one_row():
     def coupled(x):
         return x * x.sum()
@@ -174,9 +226,13 @@ def test_a_test_for_infinity_asks_every_input():
 @settings(max_examples=200)
 def test_an_index_says_where_each_round_reads(count, start, step, divisor, turn):
     index = [start + step * (i // divisor) + turn % 3 * (i % divisor) for i in range(count)]
-    text = _index(index, [("i", count)])
+    text = place(index, [("i", count)])
     if count % divisor == 0:
         assert text is not None
+    if text is not None and count > 1:
+        lanes = place(index, [("i", count)], 3)
+        found = [eval(lanes.replace("/", "//"), {"i": i, "j": 2}) for i in range(count)]
+        assert found == [3 * n + 2 for n in index]
     if text is not None:
         assert [eval(text.replace("/", "//"), {"i": i}) for i in range(count)] == index
 

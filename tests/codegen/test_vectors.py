@@ -10,6 +10,9 @@ from nfriction.codegen.scalar import Graph, evaluate
 
 pytest.importorskip("numba")
 
+# Inner functions have no entry of their own for Python.
+ENTRY = "\n@njit\ndef entry(*arguments):\n    return f(*arguments)\n"
+
 
 @pytest.fixture(scope="module")
 def four(tmp_path_factory):
@@ -21,7 +24,7 @@ def four(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("NFRICTION_CACHE", str(tmp_path_factory.mktemp("vectors")))
         text = function("f", ["x"], nodes, bound, into="y")
-        f = build.build_numba("\n".join([PYTHON_PRELUDE + prelude(), text])).f
+        f = build.build_numba("\n".join([PYTHON_PRELUDE + prelude(), text, ENTRY])).entry
 
     def run(op, x):
         rows, out = np.asarray(x, dtype=float).reshape(-1, 4), np.empty(16)
@@ -75,6 +78,7 @@ def test_phases_that_wait_for_each_other_keep_every_value():
     outputs = [outer, g.apply("add", g.total(products), outer), inner, waves[3]]
     text = function("f", ["x"], outputs, bound)
     values = np.linspace(-1, 1, 5)
-    got = build.build_numba("\n".join([PYTHON_PRELUDE + prelude(), text])).f(values)
+    compiled = build.build_numba("\n".join([PYTHON_PRELUDE + prelude(), text, ENTRY]))
+    got = compiled.entry(values)
     expected = evaluate(outputs, {"x": values})
     np.testing.assert_allclose(got, [float(e) for e in expected], rtol=1e-14)

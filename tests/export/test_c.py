@@ -36,6 +36,7 @@ TOLERANCE = {"float64": 1e-14, "float32": 5e-7}
 # Constants of the size that the papers' rigs have.
 INITIAL = {
     "viscous": [0.02],
+    "coulomb_viscous": [0.05, 0.02],
     "linear": [0.02, 0.05],
     "nonlinear": [0.005, 0.05, 0.02, 0.02, 2.0],
     "stribeck": [0.05, 0.02, 0.02, 0.3, 1.5],
@@ -343,6 +344,44 @@ def test_a_law_and_schedule_of_ones_own_export(tmp_path, schedule, dtype):
     run = c_runner(tmp_path / "nfriction.c")
     parity = compare(run_through(controller, inputs), run(*inputs), TOLERANCE[dtype])
     assert parity.passed, parity
+
+
+class Fading(Constant):
+    """A memory of past motion among exponentials in plenty; more than its last sample counts."""
+
+    state_size = 2
+
+    def initial_state(self, qd, qdd):
+        return torch.stack([qd, qdd], -1)
+
+    def advance(self, qd, qdd, state):
+        return 0.9 * state + 0.1 * torch.stack([qd, qdd], -1)
+
+    def coefficients_from(self, qd, qdd, state):
+        centres = torch.linspace(-8.0, 8.0, 12, dtype=qd.dtype)
+        near = torch.exp(-0.1 * (state[..., :1] - centres).clamp(-20.0, 20.0).square()).sum(-1)
+        return super().forward(qd, qdd) * (1.0 + near + torch.tanh(0.1 * qdd)).unsqueeze(-1)
+
+    def forward(self, qd, qdd):
+        return self.coefficients_from(qd, qdd, self.initial_state(qd, qdd))
+
+
+@cases
+@pytest.mark.parametrize("flags", [("-O3",), ("-O3", "-ffast-math")])
+def test_a_memory_goes_side_by_side_too(tmp_path, dtype, flags):
+    """Where the load alone is not finite, the memory goes on."""
+    model = FrictionModel(DRAG, Fading(DRAG, 3, [[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]]))
+    c(model, tmp_path, INFO, dtype=dtype)
+    assert "qd_now" in (tmp_path / "nfriction.c").read_text()
+    build([*C89, "-c", "nfriction.c", "-o", "n.o"], tmp_path)
+    controller = controller_of(model, INFO)
+    inputs = [x.clone() for x in points(controller, dtype, 300)]
+    for which, joint in ((0, 0), (1, 1), (2, 2)):
+        inputs[which][20 + which :: 40, joint] = (torch.nan, torch.inf, -torch.inf)[which]
+    found = c_runner(tmp_path / "nfriction.c", flags)(*inputs)
+    parity = compare(run_through(controller, inputs), found, TOLERANCE[dtype])
+    assert parity.passed, parity
+    self_test(tmp_path, *flags)
 
 
 def test_an_operation_without_c_form_is_named(tmp_path):

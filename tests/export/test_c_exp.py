@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from nfriction.codegen.function import fold
 from nfriction.codegen.joints import template
-from nfriction.codegen.scalar import evaluate
+from nfriction.codegen.scalar import evaluate, reachable
 from nfriction.export.c_bounds import bounds_of
 from nfriction.export.c_dialect import bits
-from nfriction.export.c_exp import LARGEST, LEAST, exponential
+from nfriction.export.c_exp import LARGEST, LEAST, by_exponentials, exponential
 
 GCC = shutil.which("gcc")
 F64 = torch.float64
@@ -31,7 +31,10 @@ def library(request, tmp_path_factory):
     texts = ["#include <limits.h>\n#include <string.h>"]
     for real in ("double", "float"):
         texts += [bits(real, real), exponential(real, real)]
-        texts.append(f"void run_{real}({real} *x, int n) {{ {real}_exp(x, n); }}")
+        for name, less in (("run", 0), ("less", 1)):
+            texts.append(
+                f"void {name}_{real}({real} *x, int n) {{ {real}_exp(x, n, ({real}){less}); }}"
+            )
     (folder / "e.c").write_text("\n".join(texts))
     # Linked apart: with -ffast-math that would take subnormal numbers from this very process.
     for command in (["-std=c99", *request.param.split(), "-fPIC", "-c", "e.c"],
@@ -42,9 +45,9 @@ def library(request, tmp_path_factory):
     return loaded
 
 
-def run(library, real: str, x: np.ndarray) -> np.ndarray:
+def run(library, real: str, x: np.ndarray, name: str = "run") -> np.ndarray:
     found = np.ascontiguousarray(x, dtype={"double": np.float64, "float": np.float32}[real]).copy()
-    getattr(library, f"run_{real}")(ctypes.c_void_p(found.ctypes.data), ctypes.c_int(len(found)))
+    getattr(library, f"{name}_{real}")(ctypes.c_void_p(found.ctypes.data), ctypes.c_int(len(found)))
     return found
 
 
@@ -57,6 +60,19 @@ def test_it_is_accurate_to_one_and_a_half_units_in_the_last_place(library, real)
     # -ffast-math may join both parts of ln 2: half a unit of it k times, k = |x| / ln 2.
     allowed = 1.5 + 0.75 * np.abs(x.astype(np.float64)) * library.joins_terms
     error = np.abs(run(library, real, x) - exact) / np.spacing(exact.astype(kind))
+    assert (error <= allowed).all()
+
+
+@pytest.mark.parametrize("real", ["double", "float"])
+def test_less_one_small_numbers_keep_their_digits(library, real):
+    kind = np.float64 if real == "double" else np.float32
+    random = np.random.default_rng(0)
+    x = np.concatenate([-(10.0 ** random.uniform(-20, 1.6, 100_001)), [0.0]]).astype(kind)
+    exact = np.expm1(x.astype(np.longdouble))
+    error = np.abs(run(library, real, x, "less") - exact)
+    # -ffast-math may join both parts of ln 2, which moves the argument by |x| / ln 2 half units.
+    joined = 0.75 * np.abs(x.astype(np.float64)) * np.exp(x) * library.joins_terms
+    allowed = 2.5 * np.spacing(np.abs(exact).astype(kind)) + joined * np.spacing(kind(1.0))
     assert (error <= allowed).all()
 
 
@@ -112,3 +128,20 @@ def test_distances_to_a_maximum_are_known_to_have_a_sign():
     for node in one.outputs[0][:3]:
         low, high = limits[node.number]
         assert LEAST < low <= high <= LARGEST
+
+
+@given(st.lists(st.floats(-1e3, 1e3), min_size=6, max_size=6))
+@settings(max_examples=60, deadline=None)
+def test_tanh_by_exponentials_is_tanh_and_in_their_range(values):
+    one = traced(lambda x: torch.tanh(3.0 * x))
+    nodes = by_exponentials(one.graph, one.outputs[0])
+    calls = [n for n in reachable(nodes) if n.op in ("tanh", "expm1")]
+    assert {n.op for n in calls} == {"expm1"}
+    limits = bounds_of(one, nodes)
+    assert all(limits[n.args[0].number][0] >= LEAST for n in calls)
+    assert all(limits[n.args[0].number][1] <= LARGEST for n in calls)
+    x = np.array(values).reshape(2, 3)
+    for row in x:
+        found = np.array(evaluate(nodes, {"x0": row}))
+        # Relative to the result: around zero nothing cancels.
+        np.testing.assert_allclose(found, np.tanh(3.0 * row), rtol=1e-15, atol=0.0)

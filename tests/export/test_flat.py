@@ -4,13 +4,15 @@ import pytest
 import torch
 
 from nfriction.export.controller import controller_of
-from nfriction.export.flat import FlatNeuroFuzzy, _deepest, flattened, shortened
+from nfriction.export.flat import flattened, shortened
+from nfriction.export.flat_numbers import NumberByNumber, _deepest
+from nfriction.export.flat_tensors import TensorByTensor
 from nfriction.friction import NFLFM, NFNCFM, NFNLFM, FrictionModel, NeuroFuzzy
 from nfriction.friction.laws import NONLINEAR
 from tests.friction.samples import randomise
 
 JOINTS = 3
-ways = pytest.mark.parametrize("number_by_number", [False, True])
+ways = pytest.mark.parametrize("way", [TensorByTensor, NumberByNumber])
 
 
 def trained(model: FrictionModel, spread: float = 0.2) -> FrictionModel:
@@ -27,7 +29,7 @@ def samples(count: int = 400):
     return torch.cat([8.0 * draw[0], still]), torch.cat([60.0 * draw[1], still])
 
 
-def assert_alike(schedule: NeuroFuzzy, single: FlatNeuroFuzzy) -> None:
+def assert_alike(schedule: NeuroFuzzy, single: torch.nn.Module) -> None:
     qd, qdd = samples()
     with torch.no_grad():
         expected = schedule(qd, qdd)
@@ -40,34 +42,34 @@ def assert_alike(schedule: NeuroFuzzy, single: FlatNeuroFuzzy) -> None:
 @ways
 @pytest.mark.parametrize("kind", [NFNCFM, NFLFM, NFNLFM])
 @pytest.mark.parametrize("interpretable", [False, True])
-def test_it_gives_the_coefficients_of_the_schedule(kind, interpretable, number_by_number):
+def test_it_gives_the_coefficients_of_the_schedule(kind, interpretable, way):
     model = trained(kind(JOINTS, interpretable=interpretable))
-    assert_alike(model.schedule, FlatNeuroFuzzy(model.schedule, number_by_number))
+    assert_alike(model.schedule, way(model.schedule))
 
 
 @ways
 @pytest.mark.parametrize("acceleration", ["along_motion", "signed"])
-def test_either_sense_of_acceleration_and_signs_of_coefficients(acceleration, number_by_number):
+def test_either_sense_of_acceleration_and_signs_of_coefficients(acceleration, way):
     model = trained(NFNLFM(JOINTS, acceleration=acceleration))
     # Exponents and slopes of the nonlinear law may be of any sign or must not: take both.
     schedule = model.schedule
     schedule.positive[:] = torch.tensor([i % 2 == 0 for i in range(len(NONLINEAR.names))])
-    assert_alike(schedule, FlatNeuroFuzzy(schedule, number_by_number))
+    assert_alike(schedule, way(schedule))
 
 
 @ways
-def test_narrow_sets_do_not_underflow(number_by_number):
+def test_narrow_sets_do_not_underflow(way):
     """Between sets a tenth as wide every strength is below 1e-20: only their ratios count."""
     schedule = trained(NFLFM(JOINTS), 0.05).schedule
     with torch.no_grad():
         schedule.network.anfis.partition.log_widths.sub_(2.7)
-    single = FlatNeuroFuzzy(schedule, number_by_number)
-    assert not single.shallow
+    single = way(schedule)
+    assert not getattr(single, "shallow", False)
     assert_alike(schedule, single)
 
 
 def test_sets_of_usual_width_need_no_maximum():
-    assert FlatNeuroFuzzy(trained(NFLFM(JOINTS)).schedule, True).shallow
+    assert NumberByNumber(trained(NFLFM(JOINTS)).schedule).shallow
 
 
 def test_depth_is_the_largest_over_the_range():
