@@ -44,7 +44,7 @@ class NeuroFuzzy(Schedule):
             alike; `"signed"` takes qdd as the papers do.
         interpretable: keep the sets ordered, in range and overlapping.
         prior_sd: standard deviation of the network's parameters around zero, in units of the
-            coefficients' scale.
+            coefficients' scale; a fit also tries a third of it.
 
     References:
         TLRIP paper, neuro-fuzzy friction estimation (5 x 5 sets, 25 rules, 10 radial basis units).
@@ -99,12 +99,14 @@ class NeuroFuzzy(Schedule):
 
     def inputs(self, qd: Tensor, qdd: Tensor) -> Tensor:
         """Scaled inputs of the network in [0, 1], shape (*batch, joint, 2)."""
+        return self._scaled(qd, qdd).clamp(0.0, 1.0)
+
+    def _scaled(self, qd: Tensor, qdd: Tensor) -> Tensor:
         velocity = qd / self.velocity_range
         if self.along_motion:
             qdd = qdd * torch.tanh(velocity / self.turn)
         span = self.acceleration_upper - self.acceleration_lower
-        scaled = torch.stack([velocity.abs(), (qdd - self.acceleration_lower) / span], -1)
-        return scaled.clamp(0.0, 1.0)
+        return torch.stack([velocity.abs(), (qdd - self.acceleration_lower) / span], -1)
 
     def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
         return self.deviating(self.reference, qd, qdd)
@@ -227,26 +229,63 @@ class NeuroFuzzy(Schedule):
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> FactoredSensitivity:
         return self.deviating_sensitivities(self.reference, qd, qdd)
 
-    @torch.enable_grad()
+    @torch.no_grad()
+    def slopes(self, qd: Tensor, qdd: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+        """Derivatives of the coefficients by the joint's own velocity and acceleration.
+
+        With u the reference plus the network's outputs, x its scaled inputs, v = qd / v_max and
+        t = tanh(v / turn), which stands for 1 where acceleration is signed:
+
+            dc/dqd  = dc/du (du/dx_1 sgn(v) / v_max + du/dx_2 qdd dt/dqd / span),
+            dc/dqdd = dc/du du/dx_2 t / span.
+
+        Inputs beyond their range do not count. The positive map s(u) with roundness r has the
+        slope s^2 / (s^2 + r^2), which its value tells.
+
+        Args:
+            qd, qdd: shape (*batch, joint).
+            coefficients: there, (*batch, joint, coefficient).
+        Returns:
+            Each (*batch, joint, coefficient).
+        """
+        scaled = self._scaled(qd, qdd)
+        inside = ((scaled >= 0.0) & (scaled <= 1.0)).to(scaled.dtype)
+        x = scaled.clamp(0.0, 1.0).reshape(-1, self.joints, 2)
+        by_x = self.network.input_jacobian(x).permute(3, 0, 1, 2).reshape(*coefficients.shape, 2)
+        s = coefficients / self.scale
+        rounded = s * s / (s * s + self.roundness**2)
+        by_u = self.scale * torch.where(self.positive, rounded, 1.0)
+        velocity, span = self.velocity_range, self.acceleration_upper - self.acceleration_lower
+        by_speed, by_acceleration = (by_x * by_u[..., None] * inside[..., None, :]).unbind(-1)
+        by_acceleration = by_acceleration / span[:, None]
+        by_qd = by_speed * (qd.sign() / velocity)[..., None]
+        if not self.along_motion:
+            return by_qd, by_acceleration
+        turned = torch.tanh(qd / velocity / self.turn)
+        turning = qdd * (1.0 - turned * turned) / (velocity * self.turn)
+        return by_qd + by_acceleration * turning[..., None], by_acceleration * turned[..., None]
+
+    @torch.no_grad()
     def deviating_sensitivities(
         self, reference: Tensor, qd: Tensor, qdd: Tensor
     ) -> FactoredSensitivity:
         """Derivatives of what `deviating` gives, the reference held."""
         anfis, head = self.network.anfis, self.network.head
-        x = self.inputs(qd, qdd).detach()
-        y = anfis(x).detach()
+        x = self.inputs(qd, qdd)
+        y = anfis(x)
         both = torch.cat([x, y], -1)
-        u = (reference + y + head(both)).detach().requires_grad_()
-        (by_u,) = torch.autograd.grad(self._coefficients(u).sum(), u)
+        with torch.enable_grad():
+            u = (reference + y + head(both)).detach().requires_grad_()
+            coefficients = self._coefficients(u)
+            (by_u,) = torch.autograd.grad(coefficients.sum(), u)
         own = torch.eye(y.shape[-1], dtype=y.dtype, device=y.device)
         # The head sees the rules' outputs too.
         by_y = head.input_jacobian(both)[:, :, x.shape[-1] :].permute(3, 0, 1, 2)
-        qd, qdd = qd.detach().requires_grad_(), qdd.detach().requires_grad_()
-        by_qd, by_qdd = _slopes(self.deviating(reference, qd, qdd), (qd, qdd))
+        by_qd, by_qdd = self.slopes(qd, qdd, coefficients)
         return FactoredSensitivity(
             (
-                (by_u[..., None] * (own + by_y), anfis.regressors(x).detach()),
-                (by_u[..., None] * own, head.activations(both).detach()),
+                (by_u[..., None] * (own + by_y), anfis.regressors(x)),
+                (by_u[..., None] * own, head.activations(both)),
             ),
             by_qd,
             by_qdd,
@@ -263,12 +302,3 @@ class NeuroFuzzy(Schedule):
 
     def extra_repr(self) -> str:
         return ", ".join(f"{name}={value!r}" for name, value in self.options().items())
-
-
-def _slopes(outputs: Tensor, inputs: tuple[Tensor, ...]) -> list[Tensor]:
-    """Derivatives of outputs (sample, joint, k) by inputs (sample, joint) of their own joint."""
-    rows = [
-        torch.autograd.grad(outputs[..., k].sum(), inputs, retain_graph=True)
-        for k in range(outputs.shape[-1])
-    ]
-    return [torch.stack(columns, -1) for columns in zip(*rows, strict=True)]

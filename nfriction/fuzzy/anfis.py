@@ -189,6 +189,16 @@ class Anfis(nn.Module):
         """
         return dense_jacobian(self.jacobian_columns(x), self.jacobian_maps(), self.outputs)
 
+    def input_jacobian(self, x: Tensor) -> Tensor:
+        """Derivative of every output by the inputs of its group.
+
+        Args:
+            x: inputs, shape (samples, groups, inputs).
+        Returns:
+            Shape (groups, outputs, inputs, samples).
+        """
+        return anfis_jacobian.input_jacobian(self, x)
+
     def regressor_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
         """`regressors` with the samples last, (groups, regressors, samples), written to `out`."""
         return anfis_jacobian.regressor_columns(self, x, out)

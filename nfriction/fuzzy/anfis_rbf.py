@@ -74,6 +74,22 @@ class AnfisRBF(nn.Module):
         head = self.head.jacobian(seen).permute(1, 2, 0)
         return torch.cat([J.flatten(0, 1), head], 1).permute(2, 0, 1)
 
+    @torch.no_grad()
+    def input_jacobian(self, x: Tensor) -> Tensor:
+        """Derivative of every output by the inputs of its group.
+
+        Args:
+            x: inputs, shape (samples, groups, inputs).
+        Returns:
+            Shape (groups, outputs, inputs, samples).
+        """
+        said = self.anfis.input_jacobian(x)
+        through = self.head.input_jacobian(torch.cat([x, self.anfis(x)], -1))
+        found = said + through[:, :, : self.inputs]
+        for j in range(self.outputs):
+            found.addcmul_(through[:, :, self.inputs + j].unsqueeze(2), said[:, j].unsqueeze(1))
+        return found
+
     def init_grid(self, lower: float | Tensor, upper: float | Tensor, seed: int = 0) -> None:
         """Even sets over the inputs' range, the head's centres drawn from it (outputs: ±1).
 

@@ -100,14 +100,14 @@ class RBFNetwork(nn.Module):
             Shape (groups, outputs, inputs, samples).
         """
         phi, precision = self._activations(x), torch.exp(-2.0 * self.log_widths)
-        by_input = []
-        for i in range(self.inputs):
-            # phi (c - x) / s^2, split so that each part is one product of matrices.
-            pull, weight = self.centres[:, :, i] * precision[:, :, i], self.output_weight
-            part = torch.bmm(weight * pull.unsqueeze(1), phi)
-            part -= torch.bmm(weight * precision[:, None, :, i], phi) * x[..., i].T.unsqueeze(1)
-            by_input.append(part)
-        return torch.stack(by_input, 2)
+
+        def weighted(factor: Tensor) -> Tensor:
+            rows = (self.output_weight.unsqueeze(2) * factor.mT.unsqueeze(1)).flatten(1, 2)
+            return torch.bmm(rows, phi).unflatten(1, (self.outputs, self.inputs))
+
+        # phi (c - x) / s^2, split so that each part is one product of matrices.
+        moved = weighted(precision).mul_(to_columns(x).unsqueeze(1))
+        return weighted(self.centres * precision).sub_(moved)
 
     @torch.no_grad()
     def regressor_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:

@@ -106,8 +106,10 @@ class _Linear:
         rate: acceleration at the four stages with its graph, (stage, step, *batch, joint).
         slopes: of each stage's acceleration by q, qd and the coefficients, (stage, step, *batch,
             joint, 2 joint + joint coefficient).
-        drive: of the coefficients by qd and qdd, (step, *batch, joint coefficient, 2 joint); None
-            where the motion does not drive them.
+        drive: of the coefficients by qd and qdd: (step, *batch, joint, coefficient, 2) where each
+            joint's own motion drives them, else (step, *batch, joint coefficient, 2 joint); None
+            where no motion does.
+        local: which of these `drive` is.
         step: [s], (step, *batch, 1).
     """
 
@@ -115,6 +117,7 @@ class _Linear:
     rate: Tensor
     slopes: Tensor
     drive: Tensor | None
+    local: bool
     step: Tensor
 
 
@@ -208,19 +211,19 @@ class _Backward:
     def _linearised(self, part: slice, states: Sequence[Tensor]) -> tuple[list[_Linear], Tensor]:
         """Each substep of these samples, and the torque that they were linearised with."""
         q, qd, qdd = states
-        h = self.step[part]
+        h, mechanism = self.step[part], self.chain.mechanism
         tau = self.tau[part].detach().requires_grad_(bool(self.by_tau.numel()))
         pieces = []
         for _ in range(self.chain.substeps):
-            driven = [x[part] for x in self.measured] or [
-                x.detach().requires_grad_() for x in (qd, qdd)
-            ]
+            driven = [x[part] for x in self.measured] or [qd.detach(), qdd.detach()]
+            if not (self.measured or mechanism.has_slopes()):
+                driven = [x.requires_grad_() for x in driven]
             held = self.call(lambda _, friction, *x: friction.coefficients(*x), *driven)
             held = held.expand(*q.shape, held.shape[-1])
             drive = None if self.measured else self._drive(held, driven)
             points, after = self._stages(q, qd, tau, held.detach(), h)
             rate, slopes = self._slopes(points, tau, held.detach())
-            pieces.append(_Linear(held, rate, slopes, drive, h))
+            pieces.append(_Linear(held, rate, slopes, drive, mechanism.is_local(), h))
             q, qd, qdd = after
         return pieces, tau
 
@@ -270,16 +273,17 @@ class _Backward:
 
     def _drive(self, held: Tensor, driven: Sequence[Tensor]) -> Tensor | None:
         """Derivatives of the coefficients by what drives them; see `_Linear`."""
+        mechanism = self.chain.mechanism
+        if mechanism.has_slopes():
+            given = (*driven, held.detach())
+            found = self.call(lambda _, friction, *x: friction.schedule.slopes(*x), *given)
+            return torch.stack(found, -1)
         if held.grad_fn is None:
             return None
-        if self.chain.mechanism.is_local():
+        if mechanism.is_local():
             # Each joint's coefficient by its own motion, all joints in one pass.
             columns = [_grad([held[..., k]], driven, retain=True) for k in range(held.shape[-1])]
-            blocks = [
-                torch.diag_embed(torch.stack(own, -2)).transpose(-3, -2)
-                for own in zip(*columns, strict=True)
-            ]
-            return torch.cat(blocks, -1).flatten(-3, -2)
+            return torch.stack([torch.stack(own, -1) for own in columns], -2)
         rows = [_grad([y], driven, retain=True) for y in held.flatten(-2).unbind(-1)]
         return torch.stack([torch.cat(row, -1) for row in rows], -2)
 
@@ -313,9 +317,13 @@ def _step_back(piece: _Linear, k: int, after: States, by_held: Tensor, by_rate: 
     before[..., joints:] += h * (by_state[..., :joints] + x4 + 0.5 * (x2 + x3))
     if piece.drive is None:
         return before, torch.zeros_like(by_qdd)
-    driven = (found[..., None, 2 * joints :] @ piece.drive[k]).squeeze(-2)
-    before[..., joints:] += driven[..., :joints]
-    return before, driven[..., joints:]
+    if piece.local:
+        by_qd, by_qdd = (by_held.unsqueeze(-1) * piece.drive[k]).sum(-2).unbind(-1)
+    else:
+        driven = found[..., None, 2 * joints :] @ piece.drive[k]
+        by_qd, by_qdd = driven.squeeze(-2).chunk(2, -1)
+    before[..., joints:] += by_qd
+    return before, by_qdd
 
 
 def _grad(

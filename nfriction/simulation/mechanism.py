@@ -32,6 +32,10 @@ class Mechanism(nn.Module):
         """Whether a joint's coefficients follow that joint's motion alone, as schedules promise."""
         return isinstance(getattr(self.friction, "schedule", None), Schedule)
 
+    def has_slopes(self) -> bool:
+        """Whether such a schedule tells its coefficients' derivatives by the motion itself."""
+        return self.is_local() and hasattr(self.friction.schedule, "slopes")
+
     def is_closed(self, q: Tensor, qd: Tensor, tau: Tensor) -> bool:
         """Whether gradients can flow to nothing but the states and this module's own tensors."""
         own = {n: t.detach().requires_grad_(t.requires_grad) for n, t in self.tensors().items()}

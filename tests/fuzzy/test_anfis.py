@@ -261,3 +261,19 @@ def test_unsound_options_and_samples_are_refused() -> None:
         layer.solve_consequents(x[:0], x[:0])
     with pytest.raises(ValueError, match="centres"):
         layer.init_from_sets([x[:, 0, 0]], [x[:, 0, 0]])
+
+
+@pytest.mark.parametrize("options", VARIANTS)
+@pytest.mark.parametrize("terms", [(5,), (4, 3), (2, 3, 2)])
+def test_the_input_jacobian_is_the_automatic_one(options: dict, terms: tuple[int, ...]) -> None:
+    layer = random_layer(terms=terms, **options)
+    x = samples(20, 3, len(terms)).requires_grad_()
+    y = layer(x)
+    found = layer.input_jacobian(x)
+    assert found.shape == (3, 2, len(terms), 20)
+    for k in range(2):
+        (expected,) = torch.autograd.grad(y[..., k].sum(), x, retain_graph=True)
+        # Sums of the same numbers in another order.
+        torch.testing.assert_close(
+            found[:, k].permute(2, 0, 1), expected, rtol=1e-10, atol=1e-12 * float(expected.std())
+        )

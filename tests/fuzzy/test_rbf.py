@@ -90,6 +90,18 @@ def test_output_layer_is_stationary(prior_precision: float) -> None:
         assert gradient.abs().max() < 1e-9 * y.square().sum()
 
 
+@pytest.mark.parametrize("kind", ["network", "combined"])
+def test_the_input_jacobian_is_the_automatic_one(kind: str) -> None:
+    network = shaken(RBFNetwork(3) if kind == "network" else AnfisRBF(3, 2, (4, 3), 2))
+    x = samples(20, 3, 2).requires_grad_()
+    y = network(x)
+    found = network.input_jacobian(x)
+    for k in range(2):
+        (expected,) = torch.autograd.grad(y[..., k].sum(), x, retain_graph=True)
+        # Sums of the same numbers in another order.
+        torch.testing.assert_close(found[:, k].permute(2, 0, 1), expected, rtol=1e-10, atol=1e-12)
+
+
 def test_kmeans_is_repeatable_and_finds_clusters() -> None:
     middles = torch.tensor([[0.0, 0.0], [5.0, 0.0], [0.0, 5.0]], dtype=FLOAT64)
     x = (middles.repeat(50, 1) + 0.05 * samples(150, 2)).unsqueeze(1)
