@@ -335,11 +335,12 @@ def test_save_all_writes_every_figure_and_leaves_matplotlib_alone(tmp_path):
     before = rc_params()
     comparison = Comparison(fits, train, held, "m", plant.joint_names)
     files = plots.save_all(comparison, [recording, held_out], tmp_path / "figures")
-    assert {f.name for f in files} == {
-        "rmse_train.png", "horizons_train.png", "positions_train_push_1_µ.png",
-        "rmse_held_out.png", "horizons_held_out.png", "positions_held_out_held.png",
-        "torque_over_velocity.png", "coefficients_NFNCFM.png", "memberships_NFNCFM.png",
+    expected = {
+        "rmse_train", "horizons_train", "positions_train_push_1_µ", "rmse_held_out",
+        "horizons_held_out", "positions_held_out_held", "torque_over_velocity",
+        "over_time_viscous", "coefficients_NFNCFM", "sections_NFNCFM", "memberships_NFNCFM",
     }  # fmt: skip
+    assert {f.name for f in files} == {f"{n}{of}.png" for n in expected for of in ("", ".dark")}
     assert all(f.read_bytes().startswith(b"\x89PNG") for f in files)
     assert rc_params() == before
     only_train = plots.save_all(replace(comparison, fits={}, held_out={}), [], tmp_path)

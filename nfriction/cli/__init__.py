@@ -12,7 +12,14 @@ import sys
 from collections.abc import Sequence
 
 from nfriction.cli import compare, demo, export, fit, info, report, reproduce, verify
-from nfriction.cli.console import Parser, UsageError, interruptible, message_of, one_line_warnings
+from nfriction.cli.console import (
+    Parser,
+    UsageError,
+    drop_output,
+    interruptible,
+    message_of,
+    one_line_warnings,
+)
 from nfriction.version import __version__
 
 # In the order in which the help lists them.
@@ -22,9 +29,21 @@ COMMANDS = (fit, compare, demo, report, info, export, verify, reproduce)
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command.
 
-    Errors are one line on standard error and exit status 2, an interrupt gives status 130.
+    Errors are one line on standard error and exit status 2, an interrupt gives status 130, and
+    141 says that whoever read the output had enough of it.
     """
     words = list(sys.argv[1:] if argv is None else argv)
+    try:
+        try:
+            return _answer(words)
+        finally:
+            sys.stdout.flush()  # what is still held back would fail too late to be caught
+    except BrokenPipeError:
+        return drop_output()
+
+
+def _answer(words: list[str]) -> int:
+    """Parse and run, and tell errors."""
     parser = make_parser()
     arguments = argparse.Namespace(debug="--debug" in words)
     try:
@@ -37,6 +56,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as interrupt:
         print(f"nfriction: interrupted {interrupt}".rstrip(), file=sys.stderr)
         return 130
+    except BrokenPipeError:
+        raise
     except (UsageError, ValueError, OSError, ImportError) as error:
         if arguments.debug:
             raise

@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import os
 import re
 import signal
 import sys
@@ -92,6 +93,17 @@ def message_of(error: Exception) -> str:
 def warn(message: str) -> None:
     """Tell the user what may be wrong, on standard error."""
     print(f"nfriction: warning: {message}", file=sys.stderr)
+
+
+def drop_output() -> int:
+    """End quietly where the reader of the output is gone (`nfriction info FILE | head -1`).
+
+    Returns:
+        The status of a program that the closed pipe ended.
+    """
+    # Python flushes once more on its way out.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 128 + 13  # SIGPIPE, which not every system has
 
 
 @contextmanager

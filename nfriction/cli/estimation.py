@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of `fit` and `compare`."""
     parser.add_argument("--rig", required=True, type=names.rig,
-                        help=f"a rig file (.json), or one of {', '.join(names.RIGS)}")  # fmt: skip
+                        help="a rig file (.json, .toml), a robot description (.urdf, MuJoCo's "
+                        f".xml), or one of {', '.join(names.RIGS)}")  # fmt: skip
     parser.add_argument("--angles", metavar="HOW,ZERO",
                         help="how the files write angles, relative or absolute and from upright or "
                         "hanging, e.g. absolute,hanging (default: as file or rig say)")  # fmt: skip

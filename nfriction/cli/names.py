@@ -7,12 +7,14 @@ import argparse
 from pathlib import Path
 
 MODELS = (
-    "NCFM", "LFM", "NLFM", "Stribeck", "ANCFM", "ALFM", "ANLFM", "NFNCFM", "NFLFM", "NFNLFM",
+    "NCFM", "LFM", "NLFM", "CVFM", "Stribeck", "ANCFM", "ALFM", "ANLFM", "ACVFM",
+    "NFNCFM", "NFLFM", "NFNLFM", "NFCVFM",
 )  # fmt: skip
 RIGS = (
     "tlrip", "rtip", "multiarm-single", "multiarm-double", "multiarm-triple",
     "dfki-A0", "dfki-C0", "dfki-C1", "emps", "xl330",
 )  # fmt: skip
+RIG_FILES = (".json", ".toml", ".urdf", ".xml", ".mjcf")
 DEFAULT_MODELS = "NCFM,LFM,NLFM,NFLFM"
 
 
@@ -37,9 +39,10 @@ def rig(text: str) -> str:
     """A named rig or a rig file, for argparse."""
     if text in RIGS:
         return text
-    if Path(text).suffix.lower() not in (".json", ".toml"):
+    if Path(text).suffix.lower() not in RIG_FILES:
         raise argparse.ArgumentTypeError(
-            f"no rig is called {text!r}; give a .json file or one of {', '.join(RIGS)}"
+            f"no rig is called {text!r}; give a file ({', '.join(RIG_FILES)}) or one of "
+            f"{', '.join(RIGS)}"
         )
     return str(file(text))
 

@@ -8,16 +8,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nfriction.fitting.residuals import effective_noise
+from nfriction.fitting.residuals import effective_noise, local_noise
 from nfriction.fitting.torque import TorqueFit
 from nfriction.fitting.trajectory import TrajectoryProblem
+from nfriction.fitting.uncertainty import CoefficientUncertainty
 from nfriction.fitting.verdict import (
-    Evidence,
     Interval,
+    covariance_root,
     evidence,
     intervals,
     lost_directions,
-    standard_deviations,
+    open_values,
     warnings_of,
 )
 from nfriction.friction import Constant, FrictionModel
@@ -48,6 +49,7 @@ class Fit:
             that last in time count for as few as they are worth. None for a torque fit.
         lost: what the data cannot tell, parameters or combinations of them, in words.
         warnings: what to be wary of, a sentence each.
+        uncertainty: standard deviation of the coefficients at any motion; None for a torque fit.
     """
 
     model: FrictionModel
@@ -63,6 +65,7 @@ class Fit:
     intervals: tuple[Interval, ...] = ()
     lost: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    uncertainty: CoefficientUncertainty | None = None
 
     @property
     def residual_unit(self) -> str:
@@ -136,7 +139,7 @@ def trajectory_outcome(
     hit = (result.at_lower | result.at_upper)[:count] & fitted
     at_bounds = tuple(names[i] for i in hit.nonzero().flatten().tolist())
     noise = effective_noise(residuals)
-    told, lost = _told_by_data(problem, result, names, fitted, noise)
+    told, lost, uncertainty = _told_by_data(problem, result, names, fitted, residuals)
     residual = float(residuals.square().mean().sqrt())
     return Fit(
         model=problem.friction.requires_grad_(False),
@@ -157,6 +160,7 @@ def trajectory_outcome(
             converged=result.converged, at_bounds=at_bounds, lost=lost, residual=residual,
             effective_sd=noise, quantum=plant.position_quantum, unit=plant.unit,
         ),
+        uncertainty=uncertainty,
     )  # fmt: skip
 
 
@@ -165,14 +169,18 @@ def _told_by_data(
     result: LeastSquaresResult,
     names: Sequence[str],
     fitted: Tensor,
-    noise: float,
-) -> tuple[tuple[Interval, ...], tuple[str, ...]]:
-    """Intervals, and what the data cannot tell; of a network, only of the plant's terms."""
-    count = problem.shared_count
+    residuals: Tensor,
+) -> tuple[tuple[Interval, ...], tuple[str, ...], CoefficientUncertainty | None]:
+    """Intervals, and what the data cannot tell; of a network, only of the plant's terms.
+
+    What they leave open of the coefficients comes last.
+    """
+    count, noise = problem.shared_count, effective_noise(residuals)
     if not torch.isfinite(result.hessian).all() or not noise > 0:
-        return (), ()
+        return (), (), None
     precision, _ = problem.prior()
-    known = evidence(result.hessian, precision, count, problem.noise_sd, noise)
+    score = problem.score_covariance(result.x, local_noise(residuals))
+    known = evidence(result.hessian, precision, count, problem.noise_sd, problem.noise_sd, score)
     constant = isinstance(problem.friction.schedule, Constant)
     shown = fitted.clone()
     if not constant:
@@ -181,8 +189,18 @@ def _told_by_data(
     lower, upper = (bound[index] for bound in problem.bounds())
     chosen = [names[i] for i in index.tolist()]
     fixed = fitted.nonzero().flatten()
-    part = Evidence(known.data[fixed][:, fixed], known.prior[fixed])
-    sd = torch.zeros(count, dtype=torch.float64)
-    sd[fixed] = standard_deviations(part)
-    lost = lost_directions([names[i] for i in fixed.tolist()], part) if constant else ()
-    return intervals(chosen, result.x[index], sd[index], lower, upper), lost
+    part = known.subset(fixed)
+    root = torch.zeros(count, len(fixed), dtype=torch.float64)
+    root[fixed] = covariance_root(part)
+    sd = root.norm(dim=1)
+    lost: tuple[str, ...] = ()
+    if constant:
+        friction = fixed[fixed < problem.friction_count]
+        coefficients = [names[i] for i in friction.tolist()]
+        lost = lost_directions([names[i] for i in fixed.tolist()], part)
+        open_ = open_values(coefficients, result.x[friction], part)
+        lost += tuple(name for name in open_ if not any(name in told for told in lost))
+    uncertainty = CoefficientUncertainty(
+        problem.friction.schedule, root[: problem.friction_count].clone()
+    )
+    return intervals(chosen, result.x[index], sd[index], lower, upper), lost, uncertainty

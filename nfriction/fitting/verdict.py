@@ -14,6 +14,9 @@ from torch import Tensor
 NORMAL_95 = 1.959964
 # A direction is lost where it is worse determined than its parameters alone by this factor.
 LOST = 1e3
+# A value that its interval leaves wholly open is lost where it would be known that much better
+# with the others given; where it would not, it is but small.
+TRADED = 30.0
 # Below this share of its parameter's largest entry, a direction's entry is not worth naming.
 NAMED = 0.3
 # Left over beyond this many times the encoder's rounding is the model's own error.
@@ -43,14 +46,26 @@ class Evidence:
     Attributes:
         data: curvature by the data, in units of one independent residual, (p, p).
         prior: prior precision, (p,).
+        score: covariance of the data's gradient; None where residuals are alike, and it is `data`.
     """
 
     data: Tensor
     prior: Tensor
+    score: Tensor | None = None
+
+    def subset(self, index: Tensor) -> "Evidence":
+        """What is known of some of the parameters while the others are held."""
+        score = None if self.score is None else self.score[index][:, index]
+        return Evidence(self.data[index][:, index], self.prior[index], score)
 
 
 def evidence(
-    hessian: Tensor, precision: Tensor, shared: int, noise_sd: float, effective_sd: float
+    hessian: Tensor,
+    precision: Tensor,
+    shared: int,
+    noise_sd: float,
+    effective_sd: float,
+    score: Tensor | None = None,
 ) -> Evidence:
     """Curvature over the shared parameters with every window's state eliminated.
 
@@ -60,23 +75,49 @@ def evidence(
         shared: number of friction and plant parameters.
         noise_sd: what the residuals were counted in.
         effective_sd: of a residual, enlarged for its correlation in time.
+        score: covariance of that cost's gradient by the data, (n, n), where it is not the
+            curvature: residuals differ in size, or in how long they last.
     """
     data = (hessian - torch.diag(precision)) * (noise_sd / effective_sd) ** 2
     own = data[shared:, shared:] + torch.diag(precision[shared:])
     across = data[:shared, shared:]
-    eliminated = data[:shared, :shared] - across @ torch.linalg.solve(own, across.T)
-    return Evidence(0.5 * (eliminated + eliminated.T), precision[:shared])
+    pull = torch.linalg.solve(own, across.T).T
+    eliminated = _symmetric(data[:shared, :shared] - pull @ across.T)
+    if score is None:
+        return Evidence(eliminated, precision[:shared])
+    score = score * (noise_sd / effective_sd) ** 4
+    passed = torch.cat([torch.eye(shared, dtype=data.dtype), -pull], 1)
+    known = passed @ score @ passed.T + (pull * precision[shared:]) @ pull.T
+    return Evidence(eliminated, precision[:shared], _symmetric(known))
+
+
+def covariance_root(known: Evidence) -> Tensor:
+    """R of the posterior covariance R R^T, (p, p); rows are infinite where nothing is known.
+
+    Where residuals are not alike it is the sandwich covariance H^-1 (score + prior) H^-1.
+
+    References:
+        H. White, Econometrica 50 (1982), 1-25.
+    """
+    scale, values, vectors = _spectrum(known.data + torch.diag(known.prior))
+    floor = torch.finfo(values.dtype).eps * len(values)
+    least = values.clamp(min=floor)
+    root = scale[:, None] * vectors * least.rsqrt()
+    if known.score is not None:
+        pulled = root.T @ (known.score + torch.diag(known.prior)) @ root
+        # What of the score lies where the curvature all but vanishes is rounding.
+        weak = values <= torch.finfo(values.dtype).eps ** 0.5
+        pulled = torch.where(weak | weak[:, None], torch.diag(weak.to(pulled)), pulled)
+        sizes, turn = torch.linalg.eigh(_symmetric(pulled))
+        root = root @ (turn * sizes.clamp(min=0).sqrt())
+    # Where the huge variance of a lost direction rules, no number means anything.
+    lost = (vectors.square() * (values <= 10 * floor)).sum(1) > 1e-12
+    return torch.where(lost[:, None], torch.inf, root)
 
 
 def standard_deviations(known: Evidence) -> Tensor:
     """Posterior standard deviation of each parameter, infinite where nothing is known, (p,)."""
-    scale, values, vectors = _spectrum(known.data + torch.diag(known.prior))
-    floor = torch.finfo(values.dtype).eps * len(values)
-    roots = vectors * values.clamp(min=floor).rsqrt()
-    sd = scale * roots.norm(dim=1)
-    # Where the huge variance of a lost direction rules, no number means anything.
-    lost = (vectors.square() * (values <= 10 * floor)).sum(1) > 1e-12
-    return torch.where(lost, torch.inf, sd)
+    return covariance_root(known).norm(dim=1)
 
 
 def intervals(
@@ -114,6 +155,20 @@ def lost_directions(names: Sequence[str], known: Evidence) -> tuple[str, ...]:
     return tuple(found)
 
 
+def open_values(names: Sequence[str], values: Tensor, known: Evidence) -> tuple[str, ...]:
+    """Parameters whose very size is open, because others make up for them.
+
+    Args:
+        names: of some parameters.
+        values: theirs.
+        known: what is known of these, and of others behind them.
+    """
+    sd = standard_deviations(known)[: len(names)]
+    alone = known.data.diagonal()[: len(names)].clamp_min(1e-300).rsqrt()
+    found = (NORMAL_95 * sd >= values.abs()) & (sd > TRADED * alone)
+    return tuple(names[i] for i in found.nonzero().flatten().tolist())
+
+
 def warnings_of(
     *,
     converged: bool,
@@ -141,6 +196,10 @@ def warnings_of(
             "allow for its size, not for what is missing in the model."
         )
     return tuple(found)
+
+
+def _symmetric(matrix: Tensor) -> Tensor:
+    return 0.5 * (matrix + matrix.T)
 
 
 def _spectrum(matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:

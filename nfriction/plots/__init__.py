@@ -4,11 +4,13 @@ from nfriction.plots.coefficients import coefficient_intervals, coefficients_ove
 from nfriction.plots.dark import for_dark_screen
 from nfriction.plots.errors import horizon_curve, positions, rmse_bars
 from nfriction.plots.fits import convergence, torque_over_velocity
-from nfriction.plots.fuzzy import coefficient_surfaces, controller_surface, memberships
+from nfriction.plots.fuzzy import controller_surface, memberships
 from nfriction.plots.saving import save_all
+from nfriction.plots.surfaces import coefficient_sections, coefficient_surfaces
 
 __all__ = [
     "coefficient_intervals",
+    "coefficient_sections",
     "coefficient_surfaces",
     "coefficients_over_time",
     "controller_surface",

@@ -126,9 +126,7 @@ def _along(model: FrictionModel, motion: Motion) -> NDArray[np.float64]:
     qd, qdd = torch.tensor(motion.qd), torch.tensor(motion.qdd)
     with torch.no_grad():
         if model.state_size:
-            after = model.schedule.states(qd, qdd)
-            before = torch.cat([after[:1], after[:-1]])
-            found = model.coefficients_from(qd, qdd, before)[0]
+            found = model.coefficients_from(qd, qdd, model.schedule.states(qd, qdd))
         else:
             found = model.coefficients(qd, qdd)
     return found.expand(len(qd), -1, -1).numpy()

@@ -1,4 +1,4 @@
-"""Figures of fuzzy models: memberships, coefficient maps, and a controller's surface."""
+"""Figures of fuzzy models: memberships, and a controller's surface."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,79 +10,17 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, gaussian_filter
 
 from nfriction.friction import FrictionModel, NeuroFuzzy
 from nfriction.fuzzy import MamdaniController
 from nfriction.plots import style
-from nfriction.signals import Motion
 
 Array = NDArray[np.float64]
 Edges = tuple[Array, Array]
 
-CELLS = 60
-"""Cells of a map along each axis."""
-NEAR = 3
-"""Cells that a sample vouches for around its own: a twentieth of the range."""
 _BEFORE: dict[str, Any] = {"linestyle": (0, (3, 1.5)), "linewidth": 0.8}
 _AFTER: dict[str, Any] = {"linestyle": "-", "linewidth": 1.3}
 _POINTS = 400  # of a membership's line
-
-
-def coefficient_surfaces(
-    model: FrictionModel,
-    motions: Sequence[Motion] | None = None,
-    *,
-    joint_names: Sequence[str] | None = None,
-    unit: str = "rad",
-    width: float | None = None,
-) -> Figure:
-    """Coefficients of a neuro-fuzzy model as maps over |velocity| and acceleration.
-
-    Args:
-        model: a neuro-fuzzy model.
-        motions: smoothed motions in joint coordinates. White lines hold 50 % and 90 % of their
-            samples; where they never came near, the map is hatched.
-        joint_names: for the titles.
-        unit: of a position, `"rad"` or `"m"`.
-        width: of the figure [in].
-
-    Returns:
-        A map a coefficient and joint.
-
-    Raises:
-        ValueError: if the model's coefficients do not follow a neuro-fuzzy schedule.
-    """
-    schedule = neuro_fuzzy(model)
-    names = style.joint_labels(joint_names, model.joints)
-    coefficients = model.law.coefficients
-    # The fewer of the two stand side by side: the maps with their bars need the room.
-    across = model.joints <= len(coefficients)
-    rows, columns = sorted((model.joints, len(coefficients)), reverse=True)
-    share = "col" if across else "row"
-    figure, axes = style.panels(
-        rows, columns, width or (style.COLUMN if columns == 1 else style.PAGE), 0.7 + 1.5 * rows,
-        sharex=share, sharey=share,
-    )  # fmt: skip
-    along = " along motion" if schedule.along_motion else ""
-    for j, maps in enumerate(axes.T if across else axes):
-        edges = _edges(schedule, j)
-        values = _surface(schedule, j, edges)
-        counts = None if motions is None else _visits(schedule, motions, j, edges)
-        seen = None if counts is None else binary_dilation(counts > 0, iterations=NEAR)
-        for ax, value, coefficient in zip(
-            maps, np.moveaxis(values, -1, 0), coefficients, strict=True
-        ):
-            label = style.sliding(coefficient.unit, unit)
-            _map(figure, ax, edges, value, seen, coefficient.name, label)
-            if counts is not None:
-                _density_lines(ax, edges, counts)
-            style.title(ax, names[j])
-            # Ranges differ between joints, so every map says its own.
-            ax.tick_params(labelbottom=True, labelleft=True)
-    figure.supxlabel(f"|velocity| [{unit}/s]", fontsize=style.LABEL, color=style.INK)
-    figure.supylabel(f"acceleration{along} [{unit}/s²]", fontsize=style.LABEL, color=style.INK)
-    return figure
 
 
 def memberships(
@@ -118,7 +56,7 @@ def memberships(
     labels = (f"|velocity| [{unit}/s]", f"acceleration{along} [{unit}/s²]")
     for j, row in enumerate(axes):
         for i, ax in enumerate(row):
-            low, high = _range(schedule, j, i)
+            low, high = range_of(schedule, j, i)
             x = np.linspace(low, high, _POINTS)
             ax.set_prop_cycle(color=style.COLOURS[: schedule.terms[i]])
             if start is not None:
@@ -158,7 +96,7 @@ def controller_surface(
         values = controller.infer(inputs / controller.si_factor).numpy()
     figure, axes = style.panels(1, controller.outputs, width, 2.5, sharey=True)
     for k, (ax, output) in enumerate(zip(axes[0], rules.outputs, strict=True)):
-        _map(figure, ax, (x, y), values[..., k], None, output.name, output.unit)
+        draw_map(figure, ax, (x, y), values[..., k], None, output.name, output.unit)
         ax.set_xlabel(_input_label(rules.inputs[0].name, rules.inputs[0].unit))
     axes[0, 0].set_ylabel(_input_label(rules.inputs[1].name, rules.inputs[1].unit))
     return figure
@@ -174,7 +112,7 @@ def neuro_fuzzy(model: FrictionModel) -> NeuroFuzzy:
     return model.schedule
 
 
-def _range(schedule: NeuroFuzzy, joint: int, variable: int) -> tuple[float, float]:
+def range_of(schedule: NeuroFuzzy, joint: int, variable: int) -> tuple[float, float]:
     """Trained range of velocity (0) or acceleration (1)."""
     if variable == 0:
         return 0.0, float(schedule.get_buffer("velocity_range")[joint])
@@ -182,54 +120,16 @@ def _range(schedule: NeuroFuzzy, joint: int, variable: int) -> tuple[float, floa
     return float(lower[joint]), float(upper[joint])
 
 
-def _edges(schedule: NeuroFuzzy, joint: int) -> Edges:
-    velocity, acceleration = (np.linspace(*_range(schedule, joint, i), CELLS + 1) for i in range(2))
-    return velocity, acceleration
-
-
-def _surface(schedule: NeuroFuzzy, joint: int, edges: Edges) -> Array:
-    """Coefficients at the cells' middles, (acceleration, velocity, coefficient)."""
-    grid = np.meshgrid(*(0.5 * (e[1:] + e[:-1]) for e in edges))
-    qd, qdd = (torch.as_tensor(g)[..., None].expand(*g.shape, schedule.joints) for g in grid)
-    with torch.no_grad():
-        return schedule(qd, qdd)[:, :, joint].numpy()
-
-
-def _visits(schedule: NeuroFuzzy, motions: Sequence[Motion], joint: int, edges: Edges) -> Array:
-    """Samples in each cell, (acceleration, velocity); those outside the range in the edge's."""
-    qd = np.concatenate([m.qd[:, joint] for m in motions])
-    qdd = np.concatenate([m.qdd[:, joint] for m in motions])
-    if schedule.along_motion:
-        qdd = qdd * np.sign(qd)
-    inside = [np.clip(v, e[0], e[-1]) for v, e in zip((np.abs(qd), qdd), edges, strict=True)]
-    return np.histogram2d(inside[1], inside[0], [edges[1], edges[0]])[0]
-
-
-def _density_lines(ax: Axes, edges: Edges, counts: Array) -> None:
-    """Lines around the densest cells that hold half and nine tenths of the samples."""
-    smooth = gaussian_filter(counts, 2.5)
-    falling = np.sort(smooth.ravel())[::-1]
-    held = np.cumsum(falling) / falling.sum()
-    levels = sorted({float(falling[np.searchsorted(held, share)]) for share in (0.5, 0.9)})
-    if levels[0] <= 0 or levels[-1] >= falling[0]:
-        return  # all in one cell: nothing to draw a line around
-    middles = [0.5 * (e[1:] + e[:-1]) for e in edges]
-    dashes = ["--", "-"][-len(levels) :]
-    # Dark below, so that the lines stand out on light and dark parts of the map alike.
-    for colour, width in ((style.INK, 1.4), ("white", 0.7)):
-        ax.contour(*middles, smooth, levels, colors=colour, linewidths=width, linestyles=dashes)
-
-
 def _sets(schedule: NeuroFuzzy, x: Array, joint: int, variable: int) -> Array:
     """Memberships (point, term) of one input of a joint, over its values in SI."""
-    low, high = _range(schedule, joint, variable)
+    low, high = range_of(schedule, joint, variable)
     scaled = torch.as_tensor(np.clip((x - low) / (high - low), 0.0, 1.0))
     inputs = scaled[:, None, None].expand(-1, schedule.joints, 2)
     with torch.no_grad():
         return schedule.network.anfis.memberships(inputs)[variable][:, joint].numpy()
 
 
-def _map(
+def draw_map(
     figure: Figure,
     ax: Axes,
     axes: Edges,
@@ -237,8 +137,9 @@ def _map(
     seen: NDArray[np.bool_] | None,
     name: str,
     unit: str,
+    opacity: Array | None = None,
 ) -> None:
-    """One map with its colour bar; cells not seen show a hatched ground."""
+    """One map with its colour bar; cells not seen show a hatched ground, others as it says."""
     shown = values if seen is None else np.ma.masked_where(~seen, values)
     low, high = (float(shown.min()), float(shown.max())) if np.ma.count(shown) else (0.0, 1.0)
     if high - low < 1e-6 * max(abs(low), abs(high)):
@@ -251,6 +152,8 @@ def _map(
         shading="flat" if len(axes[0]) > values.shape[1] else "gouraud", rasterized=True,
     )  # fmt: skip
     bar = figure.colorbar(mesh, ax=ax, pad=0.02, aspect=14)
+    if opacity is not None:
+        mesh.set(alpha=opacity)  # of the map, not of its bar
     bar.outline.set(linewidth=0.6, edgecolor=style.INK)
     bar.ax.tick_params(colors=style.INK, labelsize=style.SMALL, width=0.6, length=2.0)
     bar.ax.yaxis.set_major_locator(MaxNLocator(5))

@@ -1,18 +1,23 @@
 """Write the figures that a comparison yields."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
 
 from nfriction.comparison import Comparison
-from nfriction.friction import NeuroFuzzy
+from nfriction.friction import Constant, FrictionModel, NeuroFuzzy
+from nfriction.plots.coefficients import coefficients_over_time
+from nfriction.plots.dark import GROUND, for_dark_screen
 from nfriction.plots.errors import horizon_curve, positions, rmse_bars
 from nfriction.plots.fits import torque_over_velocity
-from nfriction.plots.fuzzy import coefficient_surfaces, memberships
+from nfriction.plots.fuzzy import memberships
+from nfriction.plots.surfaces import coefficient_sections, coefficient_surfaces
 from nfriction.recording import Recording
 from nfriction.scoring import Score
+from nfriction.signals import Motion
 
 DPI = 150
 
@@ -20,11 +25,11 @@ DPI = 150
 def save_all(
     comparison: Comparison, recordings: Sequence[Recording], folder: str | Path
 ) -> list[Path]:
-    """Write every figure of a comparison as PNG.
+    """Write every figure of a comparison as PNG, and as `NAME.dark.png` for a dark screen.
 
     `rmse_*` and `horizons_*` for training and held-out recordings, `positions_*` for each
-    recording given, `torque_over_velocity`, and for each neuro-fuzzy model `coefficients_*` and
-    `memberships_*`.
+    recording given, `torque_over_velocity`, `over_time_*` for each law of which a model follows the
+    motion, and for each neuro-fuzzy model `coefficients_*`, `sections_*` and `memberships_*`.
 
     Args:
         comparison: fits and scores.
@@ -48,15 +53,17 @@ def save_all(
     folder.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
     for name, figure in _figures(comparison, recordings):
-        stem = re.sub(r"[^\w.-]+", "_", name)
+        stem = re.sub(r"[^\w-]+", "_", name)
         path = folder / f"{stem}.png"
         for count in range(2, 2 + len(written)):
             if path not in written:
                 break
             path = folder / f"{stem}_{count}.png"
         figure.savefig(path, dpi=DPI)
+        shade = path.with_suffix(".dark.png")
+        for_dark_screen(figure, ground=GROUND).savefig(shade, dpi=DPI)
         figure.clear()
-        written.append(path)
+        written += [path, shade]
     return written
 
 
@@ -88,13 +95,26 @@ def _figures(
     if given:
         motions = [trained[r.name] for r in given]
         yield "torque_over_velocity", torque_over_velocity(last.plant, models, given, motions)
+    yield from _over_time(models, last.motions[0], joints, comparison.unit)
+    for name, found in comparison.fits.items():
+        if isinstance(found.model.schedule, NeuroFuzzy):
+            labels: dict[str, Any] = {"joint_names": joints, "unit": comparison.unit}
+            known = labels | {"motions": last.motions, "uncertainty": found.uncertainty}
+            yield f"coefficients_{name}", coefficient_surfaces(found.model, **known)
+            yield f"sections_{name}", coefficient_sections(found.model, **known)
+            yield f"memberships_{name}", memberships(found.model, **labels)
+
+
+def _over_time(
+    models: Mapping[str, FrictionModel], motion: Motion, joints: Sequence[str], unit: str
+) -> Iterator[tuple[str, Figure]]:
+    """Coefficients of each law of which a model follows the motion, beside its constant ones."""
+    by_law: dict[str, dict[str, FrictionModel]] = {}
     for name, model in models.items():
-        if isinstance(model.schedule, NeuroFuzzy):
+        by_law.setdefault(model.law.name, {})[name] = model
+    for law, of in by_law.items():
+        if not all(isinstance(model.schedule, Constant) for model in of.values()):
             yield (
-                f"coefficients_{name}",
-                coefficient_surfaces(model, last.motions, joint_names=joints, unit=comparison.unit),
-            )
-            yield (
-                f"memberships_{name}",
-                memberships(model, joint_names=joints, unit=comparison.unit),
+                f"over_time_{law}",
+                coefficients_over_time(of, motion, joint_names=joints, unit=unit),
             )

@@ -9,7 +9,7 @@ class Markup(str):
     __slots__ = ()
 
 
-VOID = frozenset({"meta", "img", "br"})
+VOID = frozenset({"meta", "img", "br", "source"})
 
 
 def element(name: str, *content: str, **attributes: str | bool | None) -> Markup:

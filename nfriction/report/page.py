@@ -3,7 +3,7 @@
 import base64
 import hashlib
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib import resources
 
 from nfriction.comparison import NO_FRICTION
@@ -23,13 +23,24 @@ _CAPTIONS = {
     "torque_over_velocity": "Friction torque over velocity: the models' laws over what the "
     "recorded motion implies",
 }
-_ORDER = ("rmse_held", "horizons_held", "rmse", "horizons", "positions_held", "positions", "torque")
+_ORDER = (
+    "rmse_held", "horizons_held", "rmse", "horizons", "positions_held", "positions", "torque",
+    "over_time", "coefficients", "sections", "memberships",
+)  # fmt: skip
 _PREFIXES = {
     "positions_held_out_": "Measured and simulated position with the error below, held out: ",
     "positions_train_": "Measured and simulated position with the error below, trained on: ",
-    "coefficients_": "Coefficients over velocity and acceleration (hatched: no data) of ",
+    "coefficients_": "Coefficients over velocity and acceleration (hatched: no data; faded: the "
+    "fit leaves much of the value open; lines hold 50 % and 90 % of the samples) of ",
+    "sections_": "Coefficients over velocity at three accelerations, with 95 % intervals (faint: "
+    "no data) of ",
     "memberships_": "Fuzzy sets of velocity and acceleration of ",
+    "over_time_": "Coefficients along the first recording trained on, models of the law: ",
 }
+# A figure's twin for a dark screen.
+_DARK = ".dark"
+WIDE = 700
+"""Pixels beyond which half a page is too narrow for a figure."""
 
 
 def to_html(run: Run) -> str:
@@ -127,12 +138,19 @@ def _sections(run: Run) -> Iterator[tuple[str, str, Markup]]:
         "is than with no friction. The least error of each column is marked.",
     )
     yield "errors", "Errors", joined(legend, *errors, _folded(tables.recording_table(run)))
+    if run.selection is not None:
+        told = element(
+            "p", "From the training recordings alone one would take ",
+            element("strong", run.selection.chosen), f": {run.selection.reason}",
+        )  # fmt: skip
+        table = _table(tables.selection_table(run.selection))
+        yield "choice", "Choice by training data alone", joined(told, table)
     if run.figures:
-        ordered = sorted(run.figures, key=lambda figure: _rank(figure.name))
-        yield "figures", "Figures", element("div", *map(_figure, ordered), class_="figures")
+        yield "figures", "Figures", element("div", *_figures(run.figures), class_="figures")
     yield "data", "What was fitted on which file", joined(*_data(run))
-    if run.fits:
-        yield "fits", "Fits", joined(*(_fit(run, name) for name in run.fits))
+    failed = [_failure(name, why) for name, why in run.comparison.failed.items()]
+    if run.fits or failed:
+        yield "fits", "Fits", joined(*(_fit(run, name) for name in run.fits), *failed)
     rules = [piece for name in run.models for piece in _rules(run, name)]
     if rules:
         yield "rules", "Rules in words", joined(*rules)
@@ -165,9 +183,10 @@ def _fit(run: Run, name: str) -> Markup:
     if fit.residual == fit.residual:
         said.append(f" Left over: {1e3 * fit.residual:.4g} m{fit.residual_unit}.")
     wary = [*fit.warnings]
-    if fit.at_bounds:
-        wary.append(f"At a bound: {', '.join(fit.at_bounds)}.")
-    wary += [f"The data cannot tell: {what}." for what in fit.lost]
+    for what, of in (("At a bound", fit.at_bounds), ("The data cannot tell", fit.lost)):
+        # Most fits say so themselves, and say more.
+        if of and not any(warning.startswith(what) for warning in wary):
+            wary.append(f"{what}: {'; '.join(of)}.")
     parts = [
         element("h3", name),
         element("p", *said, class_="good" if fit.converged else "bad"),
@@ -181,6 +200,12 @@ def _fit(run: Run, name: str) -> Markup:
     if intervals is not None:
         parts.append(_table(intervals))
     return element("article", *parts)
+
+
+def _failure(name: str, why: str) -> Markup:
+    """A model that was asked for and could not be fitted."""
+    said = element("p", element("strong", "Not fitted. "), why, class_="bad")
+    return element("article", element("h3", name), said)
 
 
 def _rules(run: Run, name: str) -> Iterator[Markup]:
@@ -272,16 +297,36 @@ def _folded(table: Table) -> Markup:
     return element("details", element("summary", table.caption), _table(table))
 
 
-def _figure(figure: Figure) -> Markup:
+def _figures(figures: Sequence[Figure]) -> Iterator[Markup]:
+    """Every figure, in a useful order, with its twin for a dark screen where there is one."""
+    by_name = {figure.name: figure for figure in figures}
+    for figure in sorted(figures, key=lambda figure: _rank(figure.name)):
+        if figure.name.removesuffix(_DARK) in by_name.keys() - {figure.name}:
+            continue  # shown with the other
+        yield _figure(figure, by_name.get(figure.name + _DARK))
+
+
+def _figure(figure: Figure, dark: Figure | None) -> Markup:
     caption = caption_of(figure.name)
-    source = "data:image/png;base64," + base64.b64encode(figure.png).decode()
     picture = element(
-        "img", src=source, alt=caption, width=str(figure.width), height=str(figure.height),
+        "img", src=_source(figure), alt=caption, width=str(figure.width),
+        height=str(figure.height),
     )  # fmt: skip
+    if dark is not None:
+        picture = element(
+            "picture",
+            element("source", media="(prefers-color-scheme: dark)", srcset=_source(dark)),
+            picture,
+        )
     button = element(
         "button", picture, type="button", class_="zoom", aria_label=f"Enlarge: {caption}"
     )
-    return element("figure", button, element("figcaption", caption))
+    wide = "wide" if figure.width > WIDE else None
+    return element("figure", button, element("figcaption", caption), class_=wide)
+
+
+def _source(figure: Figure) -> str:
+    return "data:image/png;base64," + base64.b64encode(figure.png).decode()
 
 
 def _rank(name: str) -> int:

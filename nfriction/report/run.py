@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,9 +13,11 @@ from nfriction.comparison import Comparison
 from nfriction.friction import MODELS, FrictionModel
 from nfriction.modelfile import ModelFileError, ModelInfo, info_of, load
 from nfriction.scoring import Rmse, Score
+from nfriction.selection import Candidate, Selection
 
 # Far beyond any run of ours; what is larger is no results file or figure.
 LARGEST_RESULTS, LARGEST_FIGURE, MOST_FIGURES = 64 * 2**20, 16 * 2**20, 100
+LARGEST_NUMBER = 10**100
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 T = TypeVar("T")
@@ -72,6 +74,7 @@ class Run:
         models: models and what their files say; those that could be read.
         figures: in the order of their names.
         notes: what could not be read, a sentence each.
+        selection: what the training recordings alone would choose, where that was asked.
     """
 
     folder: Path
@@ -85,6 +88,7 @@ class Run:
     models: dict[str, tuple[FrictionModel, ModelInfo]]
     figures: tuple[Figure, ...]
     notes: tuple[str, ...]
+    selection: Selection | None = None
 
 
 def read_run(folder: str | Path) -> Run:
@@ -144,11 +148,18 @@ def _run(folder: Path, content: Mapping[str, Any]) -> Run:
     models, notes = _models(folder, fits, len(joints))
     figures, unread = _figures(folder / "figures")
     best = _mapping(content.get("best") or {}, "`best`")
-    if best and best.get("model") not in entries:
+    if best and _text(best.get("model"), "`best`") not in entries:
         raise _UnfitError("its best model is none of its models")
     return Run(
         folder=folder,
-        comparison=Comparison({}, train, held_out, unit, joints),
+        comparison=Comparison(
+            {},
+            train,
+            held_out,
+            unit,
+            joints,
+            failed=_mapped(content.get("failed", {}), "`failed`", _text),
+        ),
         fits=fits,
         coefficients={
             n: _coefficients(e["coefficients"], n, len(joints))
@@ -165,6 +176,7 @@ def _run(folder: Path, content: Mapping[str, Any]) -> Run:
         models=models,
         figures=figures,
         notes=(*notes, *unread),
+        selection=_selection(content.get("selection"), unit),
     )
 
 
@@ -186,6 +198,32 @@ def _scores(value: object, where: str, joints: int) -> list[Score]:
             )
         )  # fmt: skip
     return found
+
+
+def _selection(value: object, unit: str) -> Selection | None:
+    if value is None:
+        return None
+    where = "`selection`"
+    entry = _mapping(value, where)
+    candidates = _mapped(entry.get("candidates"), where, _candidate)
+    chosen = _text(entry.get("chosen"), where)
+    if chosen not in candidates:
+        raise _UnfitError(f"{where} chose none of its candidates")
+    return Selection(
+        chosen, _text(entry.get("reason", ""), where),
+        tuple(replace(c, name=name) for name, c in candidates.items()),
+        _number(entry.get("horizon"), where), unit,
+    )  # fmt: skip
+
+
+def _candidate(value: object, where: str) -> Candidate:
+    entry = _mapping(value, where)
+    blocks = entry.get("blocks")
+    if not isinstance(blocks, list) or not blocks:
+        raise _UnfitError(f"{where} needs the error of each block")
+    errors = tuple(math.inf if e is None else _number(e, where) for e in blocks)
+    parameters = int(_number(entry.get("parameters"), where))
+    return Candidate("", errors, parameters, entry.get("converged") is True)
 
 
 def _rmse(value: object, where: str, joints: int) -> Rmse:
@@ -301,10 +339,10 @@ def _texts(value: object, where: str) -> tuple[str, ...]:
 def _number(value: object, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise _UnfitError(f"{where} must be a number")
-    try:
-        return float(value)
-    except OverflowError:
-        raise _UnfitError(f"{where} is too large a number") from None
+    # Squares of what is shown stay finite; an int may be too large for a comparison with floats.
+    if abs(value) > LARGEST_NUMBER:
+        raise _UnfitError(f"{where} is too large a number")
+    return float(value)
 
 
 def _seconds(text: str, where: str) -> float:

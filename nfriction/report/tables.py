@@ -8,7 +8,10 @@ from nfriction.comparison import NO_FRICTION
 from nfriction.modelfile import ModelInfo, describe
 from nfriction.report.rules import JointRules
 from nfriction.report.run import Run
+from nfriction.selection import Selection
 
+# A positive coefficient at zero is given for 1e-12 of its unit.
+NOTHING = 1.001e-12
 KINDS = {"held_out": "held-out recordings", "train": "recordings trained on"}
 
 
@@ -32,6 +35,8 @@ class Table:
 
 def number(value: float, digits: int = 4) -> Cell:
     """A cell of a number; infinite says that nothing is known."""
+    if abs(value) <= NOTHING:
+        return Cell("0", value)
     if math.isnan(value):
         return Cell("n/a", math.inf)
     if math.isinf(value):
@@ -97,6 +102,23 @@ def recording_table(run: Run) -> Table:
          "diverged"),
         tuple(rows),
     )  # fmt: skip
+
+
+def selection_table(selection: Selection) -> Table:
+    """How each model fared on blocks of the training recordings left out of its fits."""
+    least = min(c.error for c in selection.candidates)
+    rows = []
+    for c in selection.candidates:
+        judged = error(c.error)
+        marked = Cell(judged.text, judged.value, best=math.isfinite(least) and c.error == least)
+        converged = Cell("yes" if c.converged else "no")
+        rows.append((Cell(c.name), marked, number(float(c.parameters)), converged))
+    return Table(
+        f"Position RMSE [m{selection.unit}] of {selection.horizon:.3g} s simulations over blocks "
+        "left out",
+        ("model", "error", "parameters", "all fits converged"),
+        tuple(rows),
+    )
 
 
 def data_table(run: Run) -> Table:

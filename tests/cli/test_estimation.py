@@ -131,3 +131,20 @@ def test_stamps_in_milliseconds_are_told(bench: Path, capsys, monkeypatch) -> No
     first, _ = capsys.readouterr().err.splitlines()
     assert "slow" in first
     assert "milliseconds" in first
+
+
+def test_a_robot_description_is_as_good_as_a_rig_file(bench: Path, compared: Path) -> None:
+    (bench / "bench.urdf").write_text(
+        '<robot name="bench"><link name="wall"/><link name="rod"><inertial>'
+        '<origin xyz="0 0 -0.15"/><mass value="0.15"/><inertia ixx="1e-4" iyy="1e-4" '
+        'izz="1e-6" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        '<joint name="joint1" type="continuous"><parent link="wall"/><child link="rod"/>'
+        '<axis xyz="0 1 0"/></joint></robot>'
+    )
+    rig = ["--rig", str(bench / "bench.urdf"), "--angles", "relative,hanging"]
+    assert compare(bench, bench / "robot", *rig, models="NCFM,LFM") == 0
+    ours, theirs = (results(out)["models"] for out in (bench / "robot", compared))
+    for model in ("NCFM", "LFM"):
+        mine, other = (m[model]["held_out"]["b"]["free_run"]["all"] for m in (ours, theirs))
+        # The rig file knows the encoder's noise besides, which the fit does not ask for.
+        assert mine == pytest.approx(other, rel=1e-6)

@@ -11,7 +11,9 @@ import pytest
 
 from nfriction import cli, rigs, twin
 from nfriction.cli import demo, names
-from nfriction.friction import MODELS
+from nfriction.friction import MODELS, NCFM
+from nfriction.modelfile import save
+from nfriction.plant import robotfile
 from nfriction.version import __version__
 
 
@@ -30,6 +32,7 @@ def test_names_are_those_of_the_library() -> None:
     assert list(MODELS) == list(names.MODELS)
     assert rigs.names() == list(names.RIGS)
     assert names.models(names.DEFAULT_MODELS)
+    assert (".json", ".toml", *robotfile.ENDINGS) == names.RIG_FILES
     assert demo.DURATION == twin.QUICK_DURATION
 
 
@@ -149,3 +152,22 @@ def test_export_info_and_demo_say_what_they_cannot(bench: Path, compared: Path, 
     assert "positive seconds" in failing("demo", "--seconds", "nan")
     assert "whole number" in failing("demo", "--seed", "-1")
     assert "NCFM, LFM" in failing("demo", "--models", "FOO")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pipes end otherwise there")
+@pytest.mark.parametrize(
+    ("words", "unbuffered"), [(["--version"], ""), (["--version"], "1"), (["info"], "")]
+)
+def test_a_closed_pipe_ends_quietly(words: list[str], unbuffered: str, tmp_path: Path) -> None:
+    if words == ["info"]:
+        save(NCFM(2), tmp_path / "NCFM.json")
+        words = ["info", str(tmp_path / "NCFM.json")]
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "nfriction", *words]
+    env = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, timeout=60, env=env)
+    os.close(writer)
+    assert done.stderr == b""
+    # argparse drops its own failure to write.
+    assert done.returncode == (0 if unbuffered and "--version" in words else 141)

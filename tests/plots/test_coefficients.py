@@ -33,12 +33,19 @@ def test_lines_are_the_coefficients_along_the_motion(motion):
     figure.draw_without_rendering()
 
 
-def test_an_adaptive_model_shows_only_its_classes(motion):
+def test_an_adaptive_model_switches_as_a_controller_does(motion):
     values = [[1e-3, 1e-2], [2e-3, 2e-2], [3e-3, 3e-2]]
-    figure = plots.coefficients_over_time({"ALFM": ALFM(2, [values, values])}, motion)
-    shown = {round(float(x), 6) for ax in figure.axes[:2] for x in ax.lines[0].get_ydata()}
-    assert shown <= {1.0, 2.0, 3.0}  # mN m s/rad
-    assert shown
+    model = ALFM(2, [values, values])
+    qd, qdd = torch.tensor(motion.qd), torch.tensor(motion.qdd)
+    model.schedule.thresholds[:] = torch.tensor([2.0, 6.0])  # the motion begins with none
+    figure = plots.coefficients_over_time({"ALFM": model}, motion)
+    memory, expected = model.schedule.initial_state(qd[0], qdd[0]), []
+    for k, (v, a) in enumerate(zip(qd, qdd, strict=True)):
+        memory = memory if k == 0 else model.schedule.advance(v, a, memory)
+        expected.append(model.coefficients_from(v, a, memory)[:, 0].detach())
+    shown = np.stack([ax.lines[0].get_ydata() for ax in figure.axes[:2]], -1)
+    np.testing.assert_allclose(1e-3 * shown, torch.stack(expected), rtol=1e-12)
+    assert all(len(np.unique(shown[:, j])) > 1 for j in range(2))
 
 
 def test_intervals_are_those_of_the_fit():

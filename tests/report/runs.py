@@ -78,7 +78,7 @@ def neuro_fuzzy() -> NFLFM:
 
 
 def write(folder: Path, content: dict[str, Any] | None = None) -> Path:
-    """A run's folder with two model files and two figures."""
+    """A run's folder with two model files and two figures, one with its twin for the dark."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "results.json").write_text(json.dumps(results() if content is None else content))
     ranges = {"qd": [[-10.0, 10.0], [-5, 5]], "qdd": [[-60.0, 60], [-30, 30]]}
@@ -86,8 +86,9 @@ def write(folder: Path, content: dict[str, Any] | None = None) -> Path:
     save(LFM(2, [2e-3, 1e-2]), folder / "models" / "LFM.json", info)
     save(neuro_fuzzy(), folder / "models" / "NFLFM.json", info)
     (folder / "figures").mkdir(exist_ok=True)
-    for name in ("rmse_held_out", "positions_train_calm"):
-        figure = Figure(figsize=(4, 2))
+    for name, size in (("rmse_held_out", (4, 2)), ("rmse_held_out.dark", (4, 2)),
+                       ("positions_train_calm", (8, 2))):  # fmt: skip
+        figure = Figure(figsize=size, facecolor="black" if "dark" in name else "white")
         figure.subplots().plot([0, 1])
         figure.savefig(folder / "figures" / f"{name}.png")
     return folder

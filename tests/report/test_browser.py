@@ -59,6 +59,22 @@ addEventListener("load", async () => {
 });
 """
 
+# What a figure looks like once it is enlarged.
+DARK = """
+addEventListener("load", async () => {
+  const page = document.querySelector("iframe").contentDocument;
+  page.querySelector(".zoom").click();
+  const large = page.querySelector("dialog img");
+  await large.decode();
+  const canvas = document.createElement("canvas").getContext("2d");
+  canvas.drawImage(large, 0, 0);
+  const corner = [...canvas.getImageData(0, 0, 1, 1).data].slice(0, 3);
+  const ground = page.defaultView.getComputedStyle(page.body).backgroundColor;
+  document.body.innerHTML = "<pre></pre>";
+  document.querySelector("pre").textContent = JSON.stringify({corner, ground});
+});
+"""
+
 
 @pytest.fixture(scope="module")
 def looks(tmp_path_factory: pytest.TempPathFactory) -> list[dict]:
@@ -74,11 +90,12 @@ def looks(tmp_path_factory: pytest.TempPathFactory) -> list[dict]:
     return json.loads(seen_by_browser(outer, folder / "profile"))
 
 
-def seen_by_browser(page: Path, profile: Path) -> str:
+def seen_by_browser(page: Path, profile: Path, *options: str) -> str:
     command = [
         str(BROWSER), "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run",
         "--disable-background-networking", "--disable-component-update", "--disable-sync",
-        f"--user-data-dir={profile}", "--virtual-time-budget=10000", "--dump-dom", page.as_uri(),
+        f"--user-data-dir={profile}", "--virtual-time-budget=10000", *options, "--dump-dom",
+        page.as_uri(),
     ]  # fmt: skip
     run = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
     return unescape(run.stdout.split("<pre>")[1].split("</pre>")[0])
@@ -115,3 +132,17 @@ def test_figures_open_grow_and_close(looks):
 
 def test_what_is_pressed_is_large_enough_for_a_finger(looks):
     assert all(look["narrow"] == 0 for look in looks)
+
+
+def test_a_dark_screen_shows_dark_figures_small_and_large(tmp_path):
+    page = escape(to_html(read_run(write(tmp_path / "run"))))
+    outer = tmp_path / "outer.html"
+    outer.write_text(
+        f'<!DOCTYPE html><body><iframe srcdoc="{page}" style="width:900px;height:900px"></iframe>'
+        f"<script>{DARK}</script>",
+        encoding="utf-8",
+    )
+    option = "--blink-settings=preferredColorScheme=0"
+    look = json.loads(seen_by_browser(outer, tmp_path / "profile", option))
+    assert look["ground"] == "rgb(20, 23, 27)"
+    assert look["corner"] == [0, 0, 0]  # of the twin for the dark; the other's is white

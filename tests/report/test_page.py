@@ -26,7 +26,7 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         self.tags.append((tag, dict(attrs)))
-        if tag not in ("meta", "img"):
+        if tag not in ("meta", "img", "source"):
             self._open.append(tag)
 
     def handle_endtag(self, tag):
@@ -51,7 +51,7 @@ def page(html):
 
 def test_nothing_comes_from_outside(html, page):
     for tag, attributes in page.tags:
-        for key in ("src", "href", "action", "poster", "data"):
+        for key in ("src", "srcset", "href", "action", "poster", "data"):
             reference = attributes.get(key)
             assert reference is None or reference.startswith(("data:image/png;base64,", "#")), tag
         assert not any(key.startswith("on") or key == "style" for key in attributes)
@@ -71,6 +71,19 @@ def test_the_policy_lets_only_the_pages_own_script_run(page):
     (policy,) = (m["content"] for m in page.all("meta") if "http-equiv" in m)
     assert policy.startswith("default-src 'none'")
     assert "unsafe" not in policy
+
+
+def test_a_dark_screen_gets_the_dark_twin(page, tmp_path):
+    (dark,) = page.all("source")
+    assert dark["media"] == "(prefers-color-scheme: dark)"
+    assert dark["srcset"] not in {image.get("src") for image in page.all("img")}
+    assert len(page.all("figure")) == 2  # the twin is no figure of its own
+    assert [figure.get("class") for figure in page.all("figure")] == [None, "wide"]
+    folder = write(tmp_path)
+    (folder / "figures" / "rmse_held_out.png").unlink()
+    alone = Page(to_html(read_run(folder)))
+    assert len(alone.all("figure")) == 2
+    assert not alone.all("source")
 
 
 def test_what_a_reader_of_the_screen_needs(page):
@@ -100,6 +113,7 @@ def test_verdicts_warnings_and_rules_are_told(page):
         "trained on",
     ):
         assert said in text
+    assert text.count("At a bound") == 1
 
 
 def test_the_least_error_of_a_column_is_marked_and_a_diverged_one_never(tmp_path):
@@ -123,7 +137,7 @@ def test_markup_is_never_escaped_twice_nor_text_left_raw():
 @pytest.mark.parametrize(
     ("value", "text"),
     [(12345.6, "12346"), (0.0123456, "0.01235"), (1234.4, "1234"), (math.inf, "unknown"),
-     (math.nan, "n/a"), (0.0, "0")],
+     (math.nan, "n/a"), (0.0, "0"), (1e-12, "0"), (2e-6, "2e-06")],
 )  # fmt: skip
 def test_numbers_read_plainly(value, text):
     assert number(value).text == text

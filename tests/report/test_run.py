@@ -24,8 +24,9 @@ def test_a_run_is_what_its_files_say(folder):
     assert set(run.models) == {"LFM", "NFLFM"}
     assert run.comparison.table()["all"]["LFM"] == pytest.approx(0.1)
     assert run.comparison.scores()["NLFM"][0].diverged_at == 0.5
-    assert [f.name for f in run.figures] == ["positions_train_calm", "rmse_held_out"]
-    assert (run.figures[0].width, run.figures[0].height) == (400, 200)
+    assert {f.name for f in run.figures} == {
+        "positions_train_calm", "rmse_held_out", "rmse_held_out.dark"}  # fmt: skip
+    assert (run.figures[0].width, run.figures[0].height) == (800, 200)
     assert any("NLFM" in note for note in run.notes)  # its model file is not there
 
 

@@ -58,7 +58,7 @@ for (const button of document.querySelectorAll(".zoom")) {
   button.addEventListener("click", async () => {
     const small = button.querySelector("img");
     picture.alt = small.alt;
-    picture.src = small.src;
+    picture.src = small.currentSrc; // the one for this screen
     dialog.setAttribute("aria-label", small.alt);
     dialog.showModal();
     await picture.decode();

@@ -1,0 +1,91 @@
+"""What is left open of coefficients is what their parameters leave open."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from nfriction import LFM, NFLFM, Recording, fit, rigs, rollout
+from nfriction.fitting.uncertainty import PIECE, CoefficientUncertainty
+
+F64 = torch.float64
+
+
+@pytest.fixture(scope="module")
+def swings():
+    """Two swings of a pendulum with known friction, as an encoder reads them."""
+    plant, made = rigs.multiarm_single(), []
+    truth = LFM(1, [4e-4, 2e-3]).requires_grad_(False)
+    for k, start in enumerate((2.0, 1.2)):
+        q0, qd0 = torch.tensor([np.pi + start]), torch.zeros(1)
+        run = rollout(plant, truth, q0.double(), qd0.double(), sample_time=4e-3, steps=500)
+        counts = np.round(run.q.numpy() / plant.position_quantum) * plant.position_quantum
+        time = 4e-3 * np.arange(len(counts))
+        made.append(Recording(time, counts, convention="relative,upright", name=f"swing{k}"))
+    return plant, made
+
+
+@pytest.fixture(scope="module")
+def fits(swings):
+    options = {"windows": (1.0,), "fit_plant": False, "drag": False}
+    law = fit(LFM(1), *swings, **options)
+    return law, fit(NFLFM(1), *swings, start=law, **options)
+
+
+def test_moved_parameters_move_the_coefficients_so_far():
+    torch.manual_seed(0)
+    schedule = NFLFM(2, [2e-3, 1e-2]).schedule
+    vector = schedule.parameter_vector()
+    root = 1e-3 * torch.randn(len(vector), 5, dtype=F64)
+    qd, qdd = 5 * torch.randn(2, 3, 2, dtype=F64), 50 * torch.randn(2, 3, 2, dtype=F64)
+    told = CoefficientUncertainty(schedule, root).sd(qd, qdd)
+
+    def at(moved):
+        schedule.set_parameter_vector(vector + moved)
+        return schedule(qd, qdd).detach()
+
+    # Central differences, right to the square of the step.
+    slopes = torch.stack([(at(0.01 * r) - at(-0.01 * r)) / 0.02 for r in root.T])
+    torch.testing.assert_close(slopes.norm(dim=0), told, rtol=1e-6, atol=0)
+
+
+def test_pieces_make_no_difference_and_unknown_parameters_are_told():
+    torch.manual_seed(1)
+    schedule = NFLFM(1).schedule
+    root = torch.randn(len(schedule.parameter_vector()), 3, dtype=F64)
+    qd = torch.linspace(-9, 9, PIECE + 7, dtype=F64)[:, None]
+    whole = CoefficientUncertainty(schedule, root).sd(qd, 3 * qd)
+    one_by_one = [CoefficientUncertainty(schedule, root).sd(v, 3 * v) for v in qd[-3:]]
+    torch.testing.assert_close(whole[-3:], torch.stack(one_by_one))
+    constant = LFM(2).schedule
+    root = torch.eye(4, dtype=F64)
+    root[3] = torch.inf
+    sd = CoefficientUncertainty(constant, root).sd(qd.expand(-1, 2), qd.expand(-1, 2))
+    assert sd[0].tolist() == [[1.0, 1.0], [1.0, torch.inf]]
+
+
+def test_of_constants_it_says_what_the_intervals_say(fits):
+    law, _ = fits
+    rest = torch.zeros(1, dtype=F64)
+    sd = law.uncertainty.sd(rest, rest)[0]
+    for interval, value in zip(law.intervals, sd.tolist(), strict=False):
+        assert interval.high - interval.value == pytest.approx(1.959964 * value)
+
+
+def test_known_friction_lies_within_and_unvisited_motion_is_less_known(fits):
+    _, found = fits
+    (motion, _) = found.motions
+    there = [torch.tensor(x[30::30]) for x in (motion.qd, motion.qdd)]
+    sd = found.uncertainty.sd(*there)
+    error = found.model.schedule(*there).detach() - torch.tensor([4e-4, 2e-3], dtype=F64)
+    assert (error.abs() <= 4 * sd).all()
+    never = torch.full((1, 1), 1e3, dtype=F64)  # taken for the corner of the range
+    assert (found.uncertainty.sd(never, never)[0, 0] > 1.5 * sd.median(0).values).all()
+
+
+def test_a_network_that_is_not_kept_is_as_sure_as_its_law(fits):
+    law, found = fits
+    kept = replace(law, model=found.model)  # as a fit does where the network predicts worse
+    rest = torch.zeros(3, 1, dtype=F64)
+    torch.testing.assert_close(kept.uncertainty.sd(rest, rest), law.uncertainty.sd(rest, rest))

@@ -1,0 +1,97 @@
+"""Maps and sections show what the fit leaves open, and tell where nothing was seen."""
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.collections import LineCollection, QuadMesh
+
+from nfriction import LFM, NFLFM, plots
+from nfriction.fitting.uncertainty import CoefficientUncertainty
+from nfriction.signals import Motion
+
+F64 = torch.float64
+
+
+@pytest.fixture
+def known():
+    """A model of two joints whose parameters are known to a random covariance."""
+    torch.manual_seed(0)
+    model = NFLFM(2, [2e-3, 1e-2])
+    root = 0.02 * torch.randn(len(model.schedule.parameter_vector()), 6, dtype=F64)
+    return model, CoefficientUncertainty(model.schedule, root)
+
+
+def slow_motion() -> Motion:
+    """Both joints up to 3 rad/s only, a seventh of the range, without acceleration."""
+    qd = np.linspace(0.0, 3.0, 400)[:, None].repeat(2, 1)
+    return Motion(qd[:, 0], qd, qd, 0 * qd)
+
+
+def mesh_of(ax) -> QuadMesh:
+    (mesh,) = (c for c in ax.collections if isinstance(c, QuadMesh))
+    return mesh
+
+
+def test_maps_fade_as_they_become_uncertain(known):
+    model, uncertainty = known
+    figure = plots.coefficient_surfaces(model, uncertainty=uncertainty)
+    maps = [ax for ax in figure.axes if ax.get_label() != "<colorbar>"]
+    for j, k in np.ndindex(2, 2):
+        mesh = mesh_of(maps[k * 2 + j])
+        grid = mesh.get_coordinates()
+        middle = torch.as_tensor(0.5 * (grid[1:, 1:] + grid[:-1, :-1]))[..., None, :]
+        qd, qdd = middle.expand(-1, -1, 2, -1).unbind(-1)
+        sd = uncertainty.sd(qd, qdd)[..., j, k].ravel()
+        order = np.argsort(sd.numpy())
+        assert (np.diff(mesh.get_alpha().ravel()[order]) <= 1e-12).all()
+    sure = CoefficientUncertainty(model.schedule, torch.zeros_like(uncertainty.root))
+    plain = plots.coefficient_surfaces(model, uncertainty=sure)
+    assert (mesh_of(plain.axes[0]).get_alpha() == 1.0).all()
+    figure.draw_without_rendering()
+
+
+def test_what_is_wholly_unknown_can_be_drawn(known):
+    model, uncertainty = known
+    lost = CoefficientUncertainty(model.schedule, torch.full_like(uncertainty.root, torch.inf))
+    for draw in (plots.coefficient_surfaces, plots.coefficient_sections):
+        draw(model, [slow_motion()], uncertainty=lost).draw_without_rendering()
+
+
+def test_sections_are_the_coefficients_with_their_intervals(known):
+    model, uncertainty = known
+    figure = plots.coefficient_sections(model, uncertainty=uncertainty, joint_names=["a", "b"])
+    for j, k in np.ndindex(2, 2):
+        ax = figure.axes[2 * j + k]
+        factor = 1e3 if "[m" in ax.get_ylabel() else 1.0
+        lines = [line for line in ax.lines if len(line.get_xdata()) == 60]
+        for line, acceleration in zip(lines, (-100.0, 0.0, 100.0), strict=True):
+            qd = torch.tensor(line.get_xdata())[:, None].expand(-1, 2)
+            value = model.schedule(qd, torch.full_like(qd, acceleration)).detach()[:, j, k]
+            np.testing.assert_allclose(line.get_ydata() / factor, value, rtol=1e-9)
+        bars = [c for c in ax.collections if isinstance(c, LineCollection)]
+        for bar, acceleration in zip(bars, (-100.0, 0.0, 100.0), strict=True):
+            ends = np.array(bar.get_segments())
+            qd = torch.tensor(ends[:, 0, 0])[:, None].expand(-1, 2)
+            sd = uncertainty.sd(qd, torch.full_like(qd, acceleration))[:, j, k]
+            half = 0.5 * (ends[:, 1, 1] - ends[:, 0, 1]) / factor
+            np.testing.assert_allclose(half, 1.959964 * sd, rtol=1e-6)
+    assert figure.axes[0].get_title() == "a, at −100, 0, 100 rad/s²"
+    assert [t.get_text() for t in figure.legends[0].get_texts()] == [
+        "braking", "steady", "speeding up"]  # fmt: skip
+    figure.draw_without_rendering()
+
+
+def test_sections_are_faint_where_nothing_was_seen(known):
+    model, _ = known
+    ax = plots.coefficient_sections(model, [slow_motion()]).axes[0]
+    steady = [line for line in ax.lines if line.get_color() == ax.lines[2].get_color()]
+    solid = next(line for line in steady if np.isfinite(line.get_ydata()).any())
+    shown = solid.get_xdata()[np.isfinite(solid.get_ydata())]
+    assert 2.5 < shown.max() < 5.0  # no data beyond a twentieth of the range
+    braking = ax.lines[0]
+    assert not np.isfinite(braking.get_ydata()).any()
+
+
+def test_only_neuro_fuzzy_models_have_sections():
+    with pytest.raises(ValueError, match="neuro-fuzzy"):
+        plots.coefficient_sections(LFM(2))

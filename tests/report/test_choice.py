@@ -1,0 +1,65 @@
+"""What the training data alone would choose, and what could not be fitted, on the page."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from nfriction.report.page import to_html
+from nfriction.report.run import RunError, read_run
+from nfriction.selection import Candidate, Selection
+from tests.report.runs import EVIL, results
+
+CHOICE = Selection(
+    "LFM", f"because {EVIL}",
+    (Candidate("LFM", (1e-3, 2e-3), 4, True), Candidate(EVIL, (1e-3, math.inf), 90, False)),
+    2.0, "rad",
+)  # fmt: skip
+
+
+def folder(path: Path, **changes: object) -> Path:
+    (path / "results.json").write_text(json.dumps(results() | changes))
+    return path
+
+
+def test_the_choice_is_read_back_and_shown(tmp_path: Path) -> None:
+    run = read_run(folder(tmp_path, selection=CHOICE.to_dict()))
+    assert run.selection == CHOICE
+    page = to_html(run)
+    assert "Choice by training data alone" in page
+    assert "2 s simulations" in page
+    assert EVIL not in page
+
+
+def test_without_a_choice_there_is_no_section(tmp_path: Path) -> None:
+    for k, none in enumerate(({}, {"selection": None})):
+        (tmp_path / str(k)).mkdir()
+        run = read_run(folder(tmp_path / str(k), **none))
+        assert run.selection is None
+        assert "Choice by training data alone" not in to_html(run)
+
+
+def test_a_model_that_failed_is_told(tmp_path: Path) -> None:
+    page = to_html(read_run(folder(tmp_path, failed={"ALFM": f"no classes {EVIL}"})))
+    assert "Not fitted. " in page
+    assert "no classes" in page
+    assert EVIL not in page
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"chosen": "NFLFM"},
+        {"candidates": {}},
+        {"candidates": {"LFM": {"blocks": [], "parameters": 1}}},
+        {"candidates": {"LFM": {"blocks": ["a"], "parameters": 1}}},
+        {"horizon": None},
+        {"reason": 3},
+    ],
+)
+def test_a_damaged_choice_is_refused(tmp_path: Path, damage: dict[str, object]) -> None:
+    with pytest.raises(RunError, match="selection"):
+        read_run(folder(tmp_path, selection=CHOICE.to_dict() | damage))
+    with pytest.raises(RunError, match="failed"):
+        read_run(folder(tmp_path, failed=[1]))
