@@ -1,13 +1,16 @@
 """Identification put to the test: friction that is known, and recordings that were left out.
 
-    python benchmarks/identification.py recovery [--seconds 10 20 40] [--seeds 1]
+    python benchmarks/identification.py recovery [--seconds 10 20 40] [--seeds 1] [--peer mujoco]
     python benchmarks/identification.py real DATA [--only triple ...] [--models NCFM LFM NFLFM]
 
 Run from the repository's root, on one thread. `recovery` simulates the papers' three links with
 viscous and Coulomb friction, reads them with encoders of 8192 counts at 1 kHz and fits friction
 and plant with everything else unknown too. It prints the largest error of the six coefficients,
-the share of 95 % intervals that hold the truth, the seconds of processor time, and what the fit
-says cannot be told. The model starts at three times the true friction.
+the share of 95 % intervals that hold the truth, their median half-width, seconds to a fit, and
+what the fit says of itself. The model starts at three times the true friction (a fit of ours then
+takes its own start from the torques). With `--peer mujoco` the toolbox of `mujoco[sysid]` gets
+the same recordings and starts, and the true plant; it simulates them whole, or in short windows
+from smoothed states.
 
 `real` leaves one recording out at a time, fits the others and simulates the one left out from its
 first state. DATA holds a folder to each set, with a `recordings.csv` of initial states.
@@ -19,7 +22,7 @@ from pathlib import Path
 
 import torch
 from left_out import SETS, real
-from recovery import recovery
+from recovery import RELEASES, recovery
 
 
 def main() -> int:
@@ -28,6 +31,8 @@ def main() -> int:
     known = commands.add_parser("recovery", help="simulated friction found again")
     known.add_argument("--seconds", type=float, nargs="+", default=[10.0, 20.0, 40.0])
     known.add_argument("--seeds", type=int, default=1)
+    known.add_argument("--releases", nargs="+", default=list(RELEASES), choices=list(RELEASES))
+    known.add_argument("--peer", choices=["mujoco"])
     given = commands.add_parser("real", help="recordings left out one by one")
     given.add_argument("data", type=Path)
     given.add_argument("--only", nargs="+", default=list(SETS), choices=list(SETS))
@@ -35,7 +40,7 @@ def main() -> int:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     if arguments.command == "recovery":
-        recovery(arguments.seconds, arguments.seeds)
+        recovery(arguments.seconds, arguments.seeds, arguments.releases, arguments.peer)
     else:
         real(arguments.data, arguments.only, arguments.models)
     return 0

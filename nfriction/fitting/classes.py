@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter1d
 from torch import Tensor
 
 from nfriction.friction import CLASSES, Adaptive
@@ -187,6 +186,8 @@ def _sample_time(recordings: Sequence[Recording]) -> float:
 def _searched(
     qdd: Sequence[Tensor], step: float, window: float, joints: Sequence[str], notes: list[str]
 ) -> list[tuple[float, float]]:
+    from scipy.ndimage import maximum_filter1d  # slow to import
+
     width = max(1, round(window / step))
     peaks = np.concatenate([maximum_filter1d(np.abs(a.numpy()), width, axis=0) for a in qdd])
     highest = np.maximum(peaks.max(0), STILL)

@@ -21,7 +21,7 @@ from nfriction.fitting.preparation import (
 )
 from nfriction.fitting.residuals import effective_noise, stride_of
 from nfriction.fitting.stages import Callback, Refinement, Stage
-from nfriction.fitting.torque import fit_torque
+from nfriction.fitting.torque import fit_torque, prior_sd
 from nfriction.fitting.windows import cut_windows
 from nfriction.friction import Adaptive, Constant, FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
@@ -37,6 +37,8 @@ FIRST_NOISE = 1e-3
 WINDOWS = (0.5, 2.0, 5.0)
 # Relative fall of the cost that ends a search of which only the neighbourhood matters.
 LOOSE = 1e-4
+# Priors of a network that are tried, over its own: windows held back choose among them.
+PRIOR_SHARES = (1.0, 1 / 3)
 # Errors that count for less would be rounding [rad or m].
 LEAST_NOISE = 1e-9
 
@@ -60,7 +62,8 @@ def fit(
 
     The friction torque that the smoothed motion implies gives constant coefficients; simulated
     windows of growing length then refine them, and what the data tell of the plant. A
-    neuro-fuzzy model starts at the constant fit of its own law and is pulled toward it. So
+    neuro-fuzzy model starts at the constant fit of its own law and is pulled toward it, by its
+    own prior or a tighter one that serves windows held back better. So
     does every class of an adaptive model; `fit_adaptive` has its further settings.
 
     Args:
@@ -121,7 +124,9 @@ def fit(
         torque = fit_torque(
             model.law, start.plant if start else plant, joint, moved, model.v_smooth
         )
-        constant_schedule(model).set_coefficients(torque.coefficients)
+        schedule = constant_schedule(model)
+        schedule.set_coefficients(torque.coefficients)
+        schedule.set_prior_sd(prior_sd(model.law, torque))
         if method == "torque":
             return torque_outcome(model, start, plant, moved, torque)
     if not windows:
@@ -156,8 +161,11 @@ def _through_windows(
     noise, traced = FIRST_NOISE, motions
     for length in windows:
         problem = search.problem(cut_windows(search.joint, traced, length), noise)
-        last = length == windows[-1]
-        tolerance = _flat(float(problem.cost(problem.start(vector)))) if last else LOOSE
+        tolerance = LOOSE
+        if length == windows[-1]:
+            # Of a start far away the cost says nothing; the last stage's minimum is as high.
+            near = reached and _least(reached.residuals, noise)
+            tolerance = _flat(near or float(problem.cost(problem.start(vector))))
         stage = search.search(problem, vector, tolerance, f"{length:g} s windows")
         if reached is not None and stage.lost_since(reached):
             logger.warning("%g s windows are too long for this motion; left out", length)
@@ -183,11 +191,21 @@ def _refine_network(
     seen, held_back = judged_windows(search, motions, length)
     part = search.problem(seen, noise, vector, stride)
     # The constant law's own cost, in which the gain of a step is judged.
-    tolerance = _flat(float(0.5 * (start._residuals / noise).square().sum()))
-    stage = search.search(part, vector, tolerance, "a third held back")
-    if stage.result.status == "stopped":
-        return trajectory_outcome(stage.problem, stage.result, stage.residuals, motions)
-    ratio = gain_on(held_back, stage, vector)
+    tolerance = _flat(_least(start._residuals, noise))
+    schedule = search.model.schedule
+    assert isinstance(schedule, NeuroFuzzy)
+    widest, trials = schedule.prior_sd, []
+    for share in PRIOR_SHARES:
+        # From nothing: on from another prior's end a search stays near it, and judges that.
+        schedule.set_parameter_vector(torch.zeros_like(schedule.parameter_vector()))
+        schedule.prior_sd = share * widest
+        stage = search.search(part, vector, tolerance, "a third held back")
+        if stage.result.status == "stopped":
+            return trajectory_outcome(stage.problem, stage.result, stage.residuals, motions)
+        ratio = gain_on(held_back, stage, vector)
+        trials.append((ratio, schedule.prior_sd, schedule.parameter_vector(), stage))
+    ratio, schedule.prior_sd, network, stage = min(trials, key=lambda trial: trial[0])
+    schedule.set_parameter_vector(network)
     if ratio > HEAD_START:
         settle_on(search.model, start)
         note = (
@@ -201,6 +219,11 @@ def _refine_network(
     whole = search.problem(cut_windows(search.joint, motions, length), noise, vector, stride)
     stage = search.search(whole, stage.vector, tolerance, f"{length:g} s windows")
     return trajectory_outcome(stage.problem, stage.result, stage.residuals, motions)
+
+
+def _least(residuals: Tensor, noise: float) -> float:
+    """Cost of residuals counted in what they turned out to be."""
+    return float(0.5 * (residuals / noise).square().sum())
 
 
 def _flat(cost: float) -> float:

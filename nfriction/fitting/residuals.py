@@ -6,6 +6,9 @@ from torch import Tensor
 # Samples counted within the time that errors last, and the most that are passed over: a network
 # leaves errors that last less long than its constant law's.
 CORRELATED, MOST_STRIDE = 8, 20
+# Stretches over which errors are taken as alike, in times that they last, and at least so many
+# samples: shorter ones tell too little of how long errors last in them.
+ALIKE, LEAST_ALIKE = 20, 500
 
 
 def correlation_time(residuals: Tensor) -> float:
@@ -17,14 +20,7 @@ def correlation_time(residuals: Tensor) -> float:
         residuals: [rad or m], shape (window, sample, joint).
     """
     centred = residuals - residuals.mean(1, keepdim=True)
-    n = centred.shape[1]
-    spectrum = torch.fft.rfft(centred, n=2 * n, dim=1).abs().square()
-    correlation = torch.fft.irfft(spectrum, dim=1)[:, :n].sum((0, 2))
-    correlation = correlation / correlation[0].clamp_min(1e-300)
-    # Summed up to its first zero, beyond which the estimate is noise.
-    negative = (correlation < 0).nonzero()
-    end = int(negative[0]) if len(negative) else n
-    return max(1.0, 1.0 + 2.0 * float(correlation[1:end].sum()))
+    return float(_integrated(_autocovariance(centred).sum((0, 2))[None, :, None]))
 
 
 def effective_noise(residuals: Tensor) -> float:
@@ -36,6 +32,30 @@ def effective_noise(residuals: Tensor) -> float:
     return float(residuals.square().mean().sqrt()) * correlation_time(residuals) ** 0.5
 
 
+def local_noise(residuals: Tensor) -> Tensor:
+    """Standard deviation that each residual counts with, by how long errors last around it.
+
+    Rounding by an encoder is as good as white while a joint is fast; once it hardly moves, one and
+    the same error stays for a second. A sum of residuals times a sensitivity that changes slowly
+    has the variance of independent ones of this size.
+
+    Args:
+        residuals: [rad or m], shape (window, sample, joint).
+
+    Returns:
+        Of the same shape.
+    """
+    samples = residuals.shape[1]
+    length = max(ALIKE * correlation_time(residuals), LEAST_ALIKE)
+    stretches = residuals.tensor_split(max(1, int(samples / length)), 1)
+    size = torch.stack([part.square().mean(1) for part in stretches])
+    # A stretch without error owes that to its window's free start, which is off by as much.
+    size = torch.maximum(size, size.flatten(0, 1).median(0).values)
+    lasting = torch.stack([_integrated(_autocovariance(part)) for part in stretches])
+    counted = [part.shape[1] for part in stretches]
+    return (size * lasting).sqrt().transpose(0, 1).repeat_interleave(torch.tensor(counted), 1)
+
+
 def stride_of(residuals: Tensor) -> int:
     """Of how many samples one is enough, where errors last as long as these.
 
@@ -43,3 +63,19 @@ def stride_of(residuals: Tensor) -> int:
         residuals: [rad or m], shape (window, sample, joint).
     """
     return int(min(max(correlation_time(residuals) / CORRELATED, 1), MOST_STRIDE))
+
+
+def _autocovariance(residuals: Tensor) -> Tensor:
+    """Sum of the products of residuals so many samples apart, shape (window, lag, joint)."""
+    n = residuals.shape[1]
+    spectrum = torch.fft.rfft(residuals, n=2 * n, dim=1).abs().square()
+    return torch.fft.irfft(spectrum, n=2 * n, dim=1)[:, :n]
+
+
+def _integrated(covariance: Tensor) -> Tensor:
+    """Integrated autocorrelation time in samples, 1 or more, (window, joint)."""
+    none = covariance[:, :1] <= 0
+    correlation = torch.where(none, 1.0, covariance / covariance[:, :1].clamp_min(1e-300))
+    # Summed up to its first zero, beyond which the estimate is noise.
+    kept = (correlation >= 0).to(correlation).cumprod(1)
+    return (2 * (correlation * kept).sum(1) - 1).clamp_min(1.0)

@@ -13,7 +13,6 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
-from scipy.optimize import minimize
 from torch import Tensor
 
 from nfriction.solve.pattern import PatternSearch, PatternState
@@ -198,6 +197,8 @@ def _sqp(
     progress: bool,
 ) -> SearchResult:
     """SciPy's SLSQP with forward differences, every gradient one batch of candidates."""
+    from scipy.optimize import minimize  # slow to import
+
     free = box.free
     log, scale = box.logarithmic[free], box.scale[free]
 

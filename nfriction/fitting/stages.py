@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
+import torch
 from torch import Tensor
 
 from nfriction.fitting.outcome import Plant
@@ -12,9 +13,10 @@ from nfriction.fitting.residuals import effective_noise
 from nfriction.fitting.sensitivity import StepJacobian
 from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
 from nfriction.fitting.windows import Windows
-from nfriction.friction import FrictionModel
+from nfriction.friction import Constant, FrictionModel
 from nfriction.recording import Recording
-from nfriction.solve.levenberg import LeastSquaresResult, Step
+from nfriction.solve.least_squares import Status
+from nfriction.solve.levenberg import FULL, LeastSquaresResult, Step
 
 Callback = Callable[[str, Step], bool | None]
 
@@ -23,6 +25,10 @@ LOST_TRACK = 10.0
 # Dry friction puts kinks into the cost, along which a search may creep: so many steps in a row
 # that together lower it by no more than their tolerance end it.
 PATIENCE = 3
+# Windows that diverge from their neighbourhood's motion lower the cost long after what they share
+# has settled: so many steps in a row that each move it by no more than this share of its standard
+# deviation end a search, too.
+SETTLED = 0.05
 
 
 @dataclass(frozen=True)
@@ -104,28 +110,51 @@ class Refinement:
             tolerance: relative fall of the cost that counts as none.
             name: of the stage, for the callback.
         """
-        watch = _Watch(name, tolerance, self.callback)
+        watch = _Watch(name, tolerance, self.callback, problem)
         result = solve_trajectory(
             problem, problem.start(vector), max_steps=self.max_steps, callback=watch,
             cost_tolerance=tolerance,
         )  # fmt: skip
-        if watch.creeps and result.status == "stopped":
-            result = replace(result, status="stalled")
+        if result.status == "stopped" and (watch.settles or watch.creeps):
+            status: Status = "converged_step" if watch.settles else "stalled"
+            result = replace(result, status=status)
         return Stage(problem, result, problem.errors(result.x))
 
 
 class _Watch:
-    """Tells the caller every step, and ends a search that creeps."""
+    """Tells the caller every step, and ends a search that creeps or has settled."""
 
-    def __init__(self, name: str, tolerance: float, callback: Callback | None) -> None:
-        self.name, self.tolerance, self.callback = name, tolerance, callback
+    def __init__(
+        self,
+        name: str,
+        tolerance: float,
+        callback: Callback | None,
+        problem: TrajectoryProblem | None = None,
+    ) -> None:
+        self.name, self.tolerance, self.callback, self.problem = name, tolerance, callback, problem
         self.costs: list[float] = []
-        self.creeps = False
+        self.before: Tensor | None = None
+        self.still = 0
+        self.creeps = self.settles = False
 
-    def __call__(self, _: Tensor, step: Step) -> bool:
-        asked = self.callback is not None and self.callback(self.name, step)
+    def __call__(self, x: Tensor, step: Step) -> bool:
+        if self.callback is not None and self.callback(self.name, step):
+            return True
         self.costs.append(step.cost)
-        if not asked and len(self.costs) > PATIENCE:
+        if len(self.costs) > PATIENCE:
             before = self.costs[-1 - PATIENCE]
             self.creeps = before - step.cost <= PATIENCE * self.tolerance * before
-        return bool(asked) or self.creeps
+        self.still = self.still + 1 if self._moved(x, step) <= SETTLED else 0
+        self.settles = self.still >= PATIENCE
+        return self.creeps or self.settles
+
+    def _moved(self, x: Tensor, step: Step) -> float:
+        """By how many standard deviations a full step moved a shared parameter at most."""
+        problem = self.problem
+        if problem is None or not isinstance(problem.friction.schedule, Constant):
+            return torch.inf
+        shared, self.before, before = x[: problem.shared_count], x, self.before
+        # A step that damping cut short is no sign of rest.
+        if before is None or step.damping > FULL:
+            return torch.inf
+        return float(((shared - before[: problem.shared_count]) / problem.spread()).abs().max())

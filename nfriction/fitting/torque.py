@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.optimize import lsq_linear
 from torch import Tensor
 
 from nfriction.friction import Law
@@ -17,6 +16,11 @@ from nfriction.signals import Motion
 
 # Smoothers know less at the ends of a record; that much of each end is left out [s].
 EDGE = 0.02
+# Precision of each coefficient around zero over that of the data: nothing where they tell, and
+# where they do not (an offset and a sign that never turns, say) no runaway.
+RIDGE = 1e-6
+# Share of a torque that is taken for friction even where no law explains any of it.
+LEAST_TOLD = 0.01
 
 
 @dataclass(frozen=True)
@@ -116,6 +120,23 @@ def natural_scale(law: Law, torque: TorqueFit, qd: Tensor) -> Tensor:
     return torch.stack(columns, -1)
 
 
+def prior_sd(law: Law, torque: TorqueFit) -> Tensor:
+    """What a fit expects of each coefficient, as its law says: sd around zero, in SI.
+
+    Args:
+        law: whose coefficients they are.
+        torque: its fit to the motion.
+
+    Returns:
+        (joint, coefficient); infinite where the law expects nothing.
+    """
+    shares = torque.torque.new_tensor([c.share for c in law.coefficients])
+    # Of a light mechanism's torque most is what inertia terms and smoothing leave over.
+    left = torque.torque.square() - torque.residual.square()
+    told = torch.maximum(left.clamp_min(0.0).sqrt(), LEAST_TOLD * torque.torque).clamp_min(1e-9)
+    return told[:, None] * shares
+
+
 def _linear_fit(
     law: Law,
     qd: Tensor,
@@ -125,6 +146,8 @@ def _linear_fit(
     fixed: dict[int, float],
 ) -> tuple[Tensor, Tensor]:
     """Coefficients (joint, coefficient) and residual (joint,) with the nonlinear ones given."""
+    from scipy.optimize import lsq_linear  # slow to import
+
     columns = []
     linear = [i for i, c in enumerate(law.coefficients) if c.linear]
     for i in linear:
@@ -144,7 +167,9 @@ def _linear_fit(
         # Columns of unit length: coefficients differ by orders of magnitude.
         scale = np.linalg.norm(a, axis=0)
         scale[scale == 0] = 1.0
-        solution = lsq_linear(a / scale, y, bounds=(lower, np.inf), tol=1e-12).x / scale
+        rows = np.concatenate([a / scale, RIDGE * np.eye(len(linear))])
+        aim = np.concatenate([y, np.zeros(len(linear))])
+        solution = lsq_linear(rows, aim, bounds=(lower, np.inf), tol=1e-12).x / scale
         coefficients[joint, linear] = torch.as_tensor(solution)
         residual[joint] = float(np.sqrt(np.mean((a @ solution - y) ** 2)))
     return coefficients, residual

@@ -9,11 +9,13 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from nfriction.fitting.plant_parameters import adjusted_buffers
-from nfriction.fitting.sensitivity import StepJacobian, start_slope, step_maps
+from nfriction.fitting.sensitivity import StepJacobian, StepMaps, start_slope, step_maps
+from nfriction.fitting.verdict import evidence, standard_deviations
 from nfriction.fitting.windows import Windows
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.signals import Motion
@@ -27,6 +29,8 @@ logger = logging.getLogger(__name__)
 PIECE = 2000
 # Smoothed start states are off by far less; the prior only keeps a window from running away.
 START_Q_SD, START_QD_SD = 0.01, 0.3
+# Starts are good and a trial costs but a simulation: a search first tries nearly full steps.
+DAMPING = 1e-6
 
 
 @dataclass
@@ -71,6 +75,7 @@ class TrajectoryProblem:
         self.step = w.step.repeat_interleave(self.substeps, 1) / self.substeps
         self.tau = w.tau.repeat_interleave(self.substeps, 1)
         self._simulated: tuple[Tensor, Rollout] | None = None
+        self._hessian = torch.zeros(0, 0, dtype=torch.float64)
 
     def start(self, plant_vector: Tensor | None = None) -> Tensor:
         """Unknowns at the model's present parameters and the smoothed window states."""
@@ -134,7 +139,14 @@ class TrajectoryProblem:
         precision, mean = self.prior()
         gradient, hessian = self._normal_equations(x, r)
         hessian.diagonal().add_(precision)
+        self._hessian = hessian
         return Quadratic(self.cost(x), gradient + precision * (x - mean), hessian)
+
+    def spread(self) -> Tensor:
+        """Standard deviation of every shared parameter by the last quadratic model."""
+        precision, _ = self.prior()
+        known = evidence(self._hessian, precision, self.shared_count, 1.0, 1.0)
+        return standard_deviations(known)
 
     def _simulate(self, x: Tensor) -> Rollout:
         """Motion at `x`; the last one is kept, as a step's cost and model ask for the same."""
@@ -175,15 +187,28 @@ class TrajectoryProblem:
         sd = torch.cat([sd, spread.reshape(-1)])
         return sd.square().reciprocal(), torch.cat([mean, start.reshape(-1)])
 
-    def _normal_equations(self, x: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
-        """J^T r and J^T J of all unknowns."""
+    def score_covariance(self, x: Tensor, sd: Tensor) -> Tensor:
+        """Covariance of J^T r where the errors have their own sizes.
+
+        Args:
+            x: unknowns.
+            sd: of each error, enlarged for its correlation in time, (window, step + 1, joint).
+        """
+        r = torch.zeros_like(sd)
+        return self._normal_equations(x, r, self._scale * sd / self.noise_sd)[1]
+
+    def _normal_equations(
+        self, x: Tensor, r: Tensor, scale: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """J^T r and J^T J of all unknowns; errors count over the noise, or as `scale` says."""
+        scale = self._scale if scale is None else scale
         shared, windows, joints = self.shared_count, *self.windows.q0.shape
         gradient = torch.zeros_like(x)
         hessian = torch.zeros(len(x), len(x), dtype=torch.float64)
         of_state = torch.zeros(windows, 2 * joints, 2 * joints, dtype=torch.float64)
         mixed = torch.zeros(windows, 2 * joints, shared, dtype=torch.float64)
         for part, rows in self._sensitivities(x):
-            scaled = (self.mixing @ rows) * self._scale[:, part, :, None]
+            scaled = (self.mixing @ rows) * scale[:, part, :, None]
             common, own = scaled.flatten(1, 2).split([shared, 2 * joints], -1)
             left = r[:, part].flatten(1)
             gradient[:shared] += left.flatten() @ common.flatten(0, 1)
@@ -220,16 +245,36 @@ class TrajectoryProblem:
             self.jacobian, motion, self.tau, self.step, plant_vector, run, block,
             self._states(motion),
         ):  # fmt: skip
-            rows = []
-            for k in range(len(maps.state)):
-                rows.append(carried[:, :joints])
-                carried = maps.state[k] @ carried
-                carried[..., :n] += maps.parameters[k]
-                carried[..., n:shared] += maps.plant[k]
-            end = sample + self.stride * len(rows)
-            yield slice(sample, end, self.stride), torch.stack(rows, 1)
+            rows, carried = _carried(maps, carried, joints)
+            end = sample + self.stride * rows.shape[1]
+            yield slice(sample, end, self.stride), rows
             sample = end
         yield slice(sample, sample + 1), carried[:, None, :joints]
+
+
+def _carried(maps: StepMaps, start: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Carry the derivatives of a state through a run of maps.
+
+    Args:
+        maps: of the run, one after another.
+        start: derivatives before it, (window, row, column); what is shared comes first.
+        count: leading rows that are kept.
+
+    Returns:
+        The kept rows before every map, (window, map, count, column), and all rows after the last.
+    """
+    # Thousands of products of small matrices: NumPy's cost a fifth of torch's.
+    state = maps.state.numpy()
+    shared = torch.cat([maps.parameters, maps.plant], -1).numpy()
+    before = start.numpy().copy()
+    after = np.empty_like(before)
+    rows = np.empty((len(state), len(before), count, before.shape[-1]))
+    for k in range(len(state)):
+        rows[k] = before[:, :count]
+        np.matmul(state[k], before, out=after)
+        after[..., : shared.shape[-1]] += shared[k]
+        before, after = after, before
+    return torch.from_numpy(rows).transpose(0, 1), torch.from_numpy(before)
 
 
 def solve_trajectory(
@@ -247,6 +292,7 @@ def solve_trajectory(
         gradient_tolerance=1e-6,
         cost_tolerance=cost_tolerance,
         step_tolerance=1e-8,
+        initial_damping=DAMPING,
     )
     result = solver.minimise(
         problem.quadratic, x0, cost=problem.cost, lower=lower, upper=upper, callback=callback

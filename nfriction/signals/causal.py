@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.signal import lfilter
 
 from nfriction.signals.encoder import frequency_counting, quantise
 from nfriction.signals.motion import Motion, checked
@@ -74,6 +73,8 @@ class SecondOrderLowPass:
         """Filter a whole array (time, ...), at rest at its first sample unless `state` is given."""
         values = np.asarray(values, dtype=np.float64)
         state = self.init(values[0]) if state is None else state
+        from scipy.signal import lfilter  # slow to import
+
         filtered, _ = lfilter(*self.coefficients, values, axis=0, zi=state)
         return np.asarray(filtered)
 

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.signal import savgol_filter
 
 from nfriction.recording import is_uniform
 from nfriction.signals.motion import Motion, checked
@@ -46,6 +45,8 @@ def savitzky_golay(time: ArrayLike, q: ArrayLike, window_s: float = 0.06, order:
             f"and at most the record's {len(time)}. Change `window_s`."
         )
     if is_uniform(time):
+        from scipy.signal import savgol_filter  # slow to import
+
         q, qd, qdd = (
             savgol_filter(q, window, order, deriv=k, delta=step, axis=0, mode="interp")
             for k in range(3)

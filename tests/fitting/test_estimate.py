@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction import LFM, NCFM, NFLFM, LinearAxis, Recording, fit
+from nfriction import LFM, NCFM, NFLFM, LinearAxis, Recording, fit, rollout
 from nfriction.fitting.residuals import effective_noise
 from tests.fitting.recordings import F64, driven_axis, pendulum, swing
 
@@ -63,6 +63,42 @@ def test_a_driven_axis_gives_mass_and_offset():
     assert float(found.plant.torque_offset) == pytest.approx(0.3, abs=0.03)
     values = found.model.schedule.values[0].tolist()
     assert values == pytest.approx([3.0, 1.0], rel=0.05)
+
+
+def test_viscous_and_coulomb_friction_at_one_speed_are_named_as_lost():
+    """Only their sum shows; either alone may be anything, and the verdict says so."""
+    axis, truth = LinearAxis(2.0), LFM(1, [3.0, 1.0], v_smooth=V_SMOOTH)
+    # Not a whole number of micrometres to a sample.
+    speed = torch.full((1,), 0.5123, dtype=F64)
+    force = torch.full((1000, 1), 3.0 * 0.5123 + 1.0, dtype=F64)
+    out = rollout(axis, truth, 0 * speed, speed, force, sample_time=2e-3, substeps=2,
+                  gradients=False)  # fmt: skip
+    tau = np.append(force.numpy(), force.numpy()[-1:], axis=0)
+    q = 1e-6 * np.rint(out.q.numpy() / 1e-6)
+    recording = Recording(out.time.numpy(), q, tau=tau, unit="m", name="steady")
+    found = fit(LFM(1, v_smooth=V_SMOOTH), axis, recording, windows=(0.5, 1.0), fit_plant=False)
+    (lost,) = found.lost
+    assert set(lost.split(" with ")) == {"B of joint1", "C of joint1"}
+    assert any("cannot tell" in warning for warning in found.warnings)
+    assert all(i.high - i.low > i.value for i in found.intervals)
+    viscous, coulomb = found.model.schedule.values[0].tolist()
+    assert 0.5123 * viscous + coulomb == pytest.approx(3.0 * 0.5123 + 1.0, rel=0.01)
+
+
+def test_a_joint_that_hardly_moves_is_named_as_lost():
+    """It creeps in the smooth sign's passage, where viscous and Coulomb friction look alike."""
+    truth = LFM(2, [[1.5e-3, 2.5e-3], [8e-4, 0.1]], v_smooth=V_SMOOTH)
+    recording = swing(pendulum(), truth, start=(np.pi - 0.5, 0.0), seconds=3.0)
+    assert np.ptp(recording.q[:, 1]) < 0.01
+    found = fit(
+        LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5, 1.0), fit_plant=False
+    )
+    assert {"B of joint2", "C of joint2"} <= set(" with ".join(found.lost).split(" with "))
+    told = {i.name: i for i in found.intervals}
+    assert told["C of joint2"].high - told["C of joint2"].low > 0.1
+    for name, true in (("B of joint1", 1.5e-3), ("C of joint1", 2.5e-3)):
+        assert name not in found.lost
+        assert told[name].value == pytest.approx(true, rel=0.05)
 
 
 def test_an_asymmetric_axis_is_told_from_its_offset():

@@ -1,10 +1,11 @@
 """A stage tells its steps, ends where it creeps, and says so."""
 
+import pytest
 import torch
 
 from nfriction import LFM
 from nfriction.fitting.preparation import mixing_of
-from nfriction.fitting.stages import PATIENCE, Refinement, _Watch
+from nfriction.fitting.stages import PATIENCE, SETTLED, Refinement, _Watch
 from nfriction.fitting.windows import cut_windows
 from nfriction.signals import kalman_smoother
 from nfriction.solve.levenberg import Step
@@ -41,15 +42,49 @@ def test_the_caller_hears_every_step_and_may_stop():
     assert not watch.creeps
 
 
-def test_a_search_that_creeps_does_not_claim_convergence():
-    """With a tolerance that every step falls short of, it ends after as many as patience has."""
+def short_search():
+    """A search of one short swing, and its problem."""
     plant, model = pendulum(), LFM(2, [[1e-3, 1e-3]] * 2, v_smooth=0.05)
     recording = swing(plant, LFM(2, [[2e-3, 3e-3]] * 2, v_smooth=0.05), seconds=1.0)
     motion = kalman_smoother(recording.time, recording.q)
     mixing = mixing_of(plant, recording.convention_on(plant))
     search = Refinement(plant, model, [recording], mixing, [], max_steps=20)
-    problem = search.problem(cut_windows([recording], [motion], 0.5), 1e-3)
+    return search, search.problem(cut_windows([recording], [motion], 0.5), 1e-3)
+
+
+@pytest.mark.parametrize(("why", "status"), [("creeps", "stalled"), ("settles", "converged_step")])
+def test_only_a_search_that_settled_claims_convergence(monkeypatch, why, status):
+    def end(self, x, step):
+        setattr(self, why, True)
+        return True
+
+    monkeypatch.setattr(_Watch, "__call__", end)
+    search, problem = short_search()
     ended = search.search(problem, torch.zeros(0, dtype=F64), 1e-9, "")
-    assert ended.result.status in ("stalled", "converged_cost", "converged_step")
-    assert (ended.result.status == "stalled") != ended.result.converged
+    assert ended.result.status == status
+    assert ended.result.converged == (why == "settles")
     assert ended.vector.shape == (0,)
+
+
+def test_what_is_shared_has_settled_once_it_moves_no_more():
+    """Window states may go on; a step that damping cut short is no rest."""
+    _, problem = short_search()
+    x = problem.start()
+    problem.quadratic(x)
+    spread, count = problem.spread(), problem.shared_count
+    far, near, states = x.clone(), x.clone(), x.clone()
+    far[:count] += spread
+    near[:count] += 0.5 * SETTLED * spread
+    states[count:] += 1.0
+
+    def settles(points, damping=0.0):
+        watch = _Watch("stage", 0.0, None, problem)
+        for k, point in enumerate(points):
+            watch(point, Step(0.5**k, damping, 1.0))
+        return watch.settles
+
+    assert settles([x, near, x, near])
+    assert settles([x, states, x, states])
+    assert not settles([x, far, x, far])
+    assert not settles([x, near, far, near])
+    assert not settles([x, near, x, near], damping=10.0)

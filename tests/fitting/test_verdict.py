@@ -8,6 +8,7 @@ from nfriction.fitting.verdict import (
     evidence,
     intervals,
     lost_directions,
+    open_values,
     standard_deviations,
     warnings_of,
 )
@@ -46,6 +47,46 @@ def test_eliminating_window_states_is_marginalising_them():
     torch.testing.assert_close(found, whole.diagonal()[:3].sqrt())
 
 
+def test_a_score_as_large_as_the_curvature_changes_nothing():
+    design, _ = regression(parameters=5)
+    precision = torch.tensor([0.0, 2.0, 0.0, 1.0, 3.0], dtype=F64)
+    data = design.T @ design / 0.25
+    hessian = data + torch.diag(precision)
+    plain = evidence(hessian, precision, 3, 0.5, 0.5)
+    same = evidence(hessian, precision, 3, 0.5, 0.5, data)
+    torch.testing.assert_close(standard_deviations(same), standard_deviations(plain))
+    # Errors twice as large make intervals as wide, be that said of the score or of all residuals.
+    wide = evidence(design.T @ design / 0.25, 0 * precision, 3, 0.5, 1.0)
+    score = evidence(design.T @ design / 0.25, 0 * precision, 3, 0.5, 0.5, 4 * data)
+    torch.testing.assert_close(standard_deviations(score), standard_deviations(wide))
+
+
+def test_intervals_cover_where_residuals_are_not_alike():
+    """Half the samples err ten times as much, and tell more: their share alone must widen."""
+    design, g = regression()
+    design[:100] *= 3
+    sizes = torch.cat([torch.full((100,), 1.0), torch.full((100,), 0.1)]).to(F64)
+    hessian, zero = design.T @ design, torch.zeros(3, dtype=F64)
+    score = design.T @ (sizes[:, None] ** 2 * design)
+    alike = float(sizes.square().mean().sqrt())
+    free = torch.full((3,), torch.inf, dtype=F64)
+    hits: dict[str, list[bool]] = {"sandwich": [], "alike": []}
+    sd = {
+        "sandwich": standard_deviations(evidence(hessian, zero, 3, 1.0, 1.0, score)),
+        "alike": standard_deviations(evidence(hessian, zero, 3, 1.0, alike)),
+    }
+    for _ in range(400):
+        y = sizes * torch.randn(len(design), generator=g, dtype=F64)
+        found = torch.linalg.lstsq(design, y[:, None]).solution[:, 0]
+        for name, spread in sd.items():
+            told = intervals(NAMES, found, spread, -free, free)
+            hits[name] += [i.low <= 0 <= i.high for i in told]
+    covered = {name: sum(hit) / len(hit) for name, hit in hits.items()}
+    # 1200 trials of 95 %: a standard deviation is 0.6 %.
+    assert covered["sandwich"] == pytest.approx(0.95, abs=0.02)
+    assert covered["alike"] < 0.9
+
+
 def test_units_do_not_matter():
     design, _ = regression()
     units = torch.tensor([1e-6, 1.0, 1e5], dtype=F64)
@@ -64,10 +105,27 @@ def test_a_singular_direction_and_a_blind_parameter_are_named():
     assert set(direction.split(" with ")) == {"a", "b"}
     assert torch.isinf(standard_deviations(known)).tolist() == [True, True, False]
     design[:, 1] = 0.0
+    # Nor does a score of rounding in that direction make it known.
+    nearly = known.data + 1e-12 * torch.eye(3, dtype=F64)
+    for score in (None, 4 * known.data, torch.zeros(3, 3, dtype=F64)):
+        sd = standard_deviations(Evidence(nearly, known.prior, score))
+        assert sd[:2].min() > 1e4
     blind = Evidence(design.T @ design, torch.tensor([0.0, 1.0, 0.0], dtype=F64))
     assert lost_directions(NAMES, blind) == ("b",)
     # Its prior still says what it says.
     assert float(standard_deviations(blind)[1]) == pytest.approx(1.0)
+
+
+def test_a_value_is_open_only_where_others_make_up_for_it():
+    design, _ = regression()
+    design[:, 1] = design[:, 0] + 0.01 * design[:, 1]
+    known = Evidence(design.T @ design, torch.zeros(3, dtype=F64))
+    assert lost_directions(NAMES, known) == ()
+    sd = standard_deviations(known)
+    assert open_values(NAMES, 1.5 * sd, known) == ("a", "b")
+    assert open_values(NAMES[:2], 3.0 * sd[:2], known) == ()
+    # One that is told by itself is but small.
+    assert open_values(NAMES, torch.tensor([1e3, 1e3, 0.0], dtype=F64), known) == ()
 
 
 def test_nothing_is_lost_where_all_is_told():

@@ -1,0 +1,59 @@
+"""How long errors last, all over and in each stretch of a window."""
+
+import pytest
+import torch
+
+from nfriction.fitting.residuals import LEAST_ALIKE, correlation_time, local_noise
+
+F64 = torch.float64
+
+
+def lasting(phi: float, samples: int = 4000, windows: int = 20, seed: int = 0) -> torch.Tensor:
+    """Errors of unit size that forget a share 1 - phi of themselves from sample to sample."""
+    g = torch.Generator().manual_seed(seed)
+    noise = torch.randn(windows, samples, 1, generator=g, dtype=F64)
+    rows = [noise[:, 0]]
+    for k in range(1, samples):
+        rows.append(phi * rows[-1] + (1 - phi**2) ** 0.5 * noise[:, k])
+    return torch.stack(rows, 1)
+
+
+def time_of(phi: float) -> float:
+    return (1 + phi) / (1 - phi)
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.8])
+def test_errors_that_are_alike_count_alike(phi):
+    """Rough in each stretch, on the safe side in all: no time is below one sample."""
+    found = local_noise(0.3 * lasting(phi))
+    assert found.shape == (20, 4000, 1)
+    assert 1.0 <= float(found.square().mean()) / (0.3**2 * time_of(phi)) < 1.25
+
+
+def test_a_stretch_where_errors_last_does_not_spoil_the_others():
+    fast, slow = lasting(0.0), lasting(0.95, seed=1)
+    residuals = torch.cat([fast[:, :3000], slow[:, :1000]], 1)
+    # All over, errors seem to last for longer than they do in most of the window.
+    assert correlation_time(residuals) > 5
+    found = local_noise(residuals).square()
+    assert 1.0 <= float(found[:, : 3000 - LEAST_ALIKE].mean()) < 1.25
+    assert float(found[:, 3000 + LEAST_ALIKE :].mean()) == pytest.approx(time_of(0.95), rel=0.4)
+
+
+def test_joints_are_told_apart():
+    residuals = torch.cat([lasting(0.0), 3 * lasting(0.0, seed=1)], -1)
+    one, three = local_noise(residuals).square().mean((0, 1)).tolist()
+    assert three / one == pytest.approx(9.0, rel=0.05)
+
+
+def test_no_error_at_all_is_as_uncertain_as_errors_elsewhere():
+    """A free start takes over the one error of a joint at rest; it stays as uncertain."""
+    residuals = torch.cat([lasting(0.0, 3000), torch.zeros(20, 1000, 1, dtype=F64)], 1)
+    assert float(local_noise(residuals)[:, -1].min()) > 0.8 * LEAST_ALIKE**0.5
+    assert not torch.isnan(local_noise(torch.zeros(2, 300, 1, dtype=F64))).any()
+
+
+def test_units_do_not_matter_and_windows_may_be_short():
+    residuals = lasting(0.5, 1000, 3)
+    torch.testing.assert_close(local_noise(7 * residuals), 7 * local_noise(residuals))
+    assert local_noise(residuals[:, :50]).shape == (3, 50, 1)
