@@ -15,11 +15,14 @@ if TYPE_CHECKING:
     from nfriction.estimators import FrictionEstimator
     from nfriction.fitting import Fit, fit, fit_adaptive, fit_by_search
     from nfriction.friction import (
+        ACVFM,
         ALFM,
         ANCFM,
         ANLFM,
+        CVFM,
         LFM,
         NCFM,
+        NFCVFM,
         NFLFM,
         NFNCFM,
         NFNLFM,
@@ -40,11 +43,14 @@ _HOME = {
     "estimators": ("FrictionEstimator",),
     "fitting": ("Fit", "fit", "fit_adaptive", "fit_by_search"),
     "friction": (
+        "ACVFM",
         "ALFM",
         "ANCFM",
         "ANLFM",
+        "CVFM",
         "LFM",
         "NCFM",
+        "NFCVFM",
         "NFLFM",
         "NFNCFM",
         "NFNLFM",
@@ -62,11 +68,14 @@ _HOME = {
 _MODULE = {name: module for module, names in _HOME.items() for name in names}
 
 __all__ = [
+    "ACVFM",
     "ALFM",
     "ANCFM",
     "ANLFM",
+    "CVFM",
     "LFM",
     "NCFM",
+    "NFCVFM",
     "NFLFM",
     "NFNCFM",
     "NFNLFM",

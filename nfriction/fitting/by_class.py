@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.fitting.holdback import FOLDS, HEAD_START
+from nfriction.fitting.holdback import FOLDS, cut_for_folds, shares_by_joint
 from nfriction.fitting.outcome import Fit, trajectory_outcome
 from nfriction.fitting.preparation import (
     in_joint_coordinates,
@@ -19,18 +19,13 @@ from nfriction.fitting.residuals import effective_noise, stride_of
 from nfriction.fitting.sensitivity import StepJacobian
 from nfriction.fitting.torque import fit_torque, natural_scale
 from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
-from nfriction.fitting.windows import Windows, cut_windows
 from nfriction.friction import Adaptive, FrictionModel
 from nfriction.friction.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
 from nfriction.recording import Recording
-from nfriction.solve.levenberg import LevenbergMarquardt, Step
+from nfriction.solve.levenberg import Step
 
 # Relative fall of the cost that ends the search: only its neighbourhood matters to a correction.
 LOOSE = 1e-3
-# How much of a correction is tried, until one serves.
-SHARES = (1.0, 0.5, 0.25)
-# Of the search for the starts of windows held back.
-START_STEPS = 4
 
 
 def refine_adaptive(
@@ -44,16 +39,17 @@ def refine_adaptive(
 ) -> Fit:
     """Fit a network that corrects an adaptive model's coefficients.
 
-    It learns from two windows of three. The third ones decide how much of the correction is
-    taken: all of it, and then it learns from these too; a half or a quarter, as much as simulates
-    them not clearly worse on any joint; or nothing, and the model is the adaptive one.
+    Three corrections are learned, each from two windows of three, and the windows that each has
+    not seen decide which share of it every joint takes. The model takes these shares of one that
+    is learned from all windows, begun at the mean of the three; where no share serves, it is the
+    adaptive one.
 
     Args:
         model: its schedule an `AdaptiveNeuroFuzzy`; changed in place.
         adaptive: fit of the same law by class of acceleration; the plant stays as it left it.
         recordings: those fitted there.
         length: of the windows [s].
-        max_steps: of the search.
+        max_steps: of each search.
         callback: called with a stage name after every step; True stops.
 
     Raises:
@@ -61,93 +57,112 @@ def refine_adaptive(
 
     References:
         TLRIP paper, neuro-fuzzy friction estimation (NFFEM), which starts from AFEM's models.
+        L. Breiman, Machine Learning 24 (1996) 49, on shares from data held back (stacking).
     """
-    schedule, reference = model.schedule, adaptive.model.schedule
-    fits = isinstance(reference, Adaptive) and adaptive.model.law is model.law
-    if not (isinstance(schedule, AdaptiveNeuroFuzzy) and fits):
+    schedule = _schedule_of(model, adaptive)
+    plant, motions = adaptive.plant, adaptive.motions
+    joint = in_joint_coordinates(plant, model, list(recordings))
+    _start_at(model, adaptive, joint)
+    known = [schedule.states(torch.as_tensor(m.qd), torch.as_tensor(m.qdd)) for m in motions]
+    substeps = substeps_of(plant, model, joint)
+    cut = cut_for_folds(joint, motions, length)
+    whole = TrajectoryProblem(
+        StepJacobian(plant, model, []), cut, effective_noise(adaptive._residuals),
+        mixing_of(plant, recordings[0].convention_on(plant)), substeps,
+        stride=stride_of(adaptive._residuals),
+        memory=torch.stack([known[place][first] for place, first, _ in cut.spans]),
+    )  # fmt: skip
+    # The memory advances with every step of the integration while the search lasts.
+    sample_time = schedule.adaptive.sample_time
+    schedule.adaptive.set_sample_time(sample_time / substeps)
+    told = told_of(callback, f"{length:g} s windows, correction by class")
+    begun, shares = _cross_fitted(whole, max_steps, told)
+    if not shares.any():
+        schedule.set_parameter_vector(torch.zeros_like(begun))
+        schedule.adaptive.set_sample_time(sample_time)
+        note = "The correction serves no better on windows held back: the adaptive model is kept."
+        return replace(adaptive, model=model, status=f"{adaptive.status} {note}")
+    schedule.set_parameter_vector(begun)
+    result = solve_trajectory(
+        whole, whole.start(), max_steps=max_steps, cost_tolerance=LOOSE, callback=told
+    )
+    result.x[: len(begun)] *= shares[schedule.joint_of_parameters()]
+    found = trajectory_outcome(whole, result, whole.errors(result.x), motions)
+    schedule.adaptive.set_sample_time(sample_time)
+    parts = zip(shares.tolist(), plant.joint_names, strict=True)
+    taken = ", ".join(f"{share:g} of {name}'s" for share, name in parts)
+    status = f"{found.status} Taken of the correction: {taken}."
+    return replace(found, status=status, plant_terms=adaptive.plant_terms)
+
+
+def _schedule_of(model: FrictionModel, adaptive: Fit) -> AdaptiveNeuroFuzzy:
+    """The model's schedule, which must be able to start from the fit."""
+    fits = isinstance(adaptive.model.schedule, Adaptive) and adaptive.model.law == model.law
+    if not (isinstance(model.schedule, AdaptiveNeuroFuzzy) and fits):
         raise ValueError(
             f"an adaptive fit of the model's law, {model.law.name!r}, and a model made with "
             f'network="by_class" are needed, got {type(adaptive.model).__name__} and '
             f"{type(model).__name__}."
         )
+    return model.schedule
+
+
+def _start_at(model: FrictionModel, adaptive: Fit, joint: Sequence[Recording]) -> None:
+    """Set the model to the adaptive one, and its network's inputs to the range of the motion."""
+    schedule, reference = model.schedule, adaptive.model.schedule
+    assert isinstance(schedule, AdaptiveNeuroFuzzy)
     assert isinstance(reference, Adaptive)
-    plant, motions = adaptive.plant, adaptive.motions
-    joint = in_joint_coordinates(plant, model, list(recordings))
-    qd = [torch.as_tensor(m.qd) for m in motions]
-    qdd = [torch.as_tensor(m.qdd) for m in motions]
-    torque = fit_torque(model.law, plant, joint, motions, model.v_smooth)
-    schedule.set_adaptive(reference, natural_scale(model.law, torque, torch.cat(qd)))
-    _set_range(schedule, torch.cat(qd), torch.cat(qdd))
-    model.requires_grad_(False)
-    known = [schedule.states(v, a) for v, a in zip(qd, qdd, strict=True)]
-    cut = cut_windows(joint, motions, length)
-    back = torch.arange(len(cut)) % FOLDS == FOLDS - 1
-    substeps = substeps_of(plant, model, joint)
-    stride = stride_of(adaptive._residuals)
-
-    def problem(windows: Windows) -> TrajectoryProblem:
-        return TrajectoryProblem(
-            StepJacobian(plant, model, []), windows, effective_noise(adaptive._residuals),
-            mixing_of(plant, recordings[0].convention_on(plant)), substeps, stride=stride,
-            memory=torch.stack([known[place][first] for place, first, _ in windows.spans]),
-        )  # fmt: skip
-
-    seen, judged = problem(cut.subset(~back)), problem(cut.subset(back))
-    told = told_of(callback, f"{length:g} s windows, correction by class")
-    # The memory advances with every step of the integration while the search lasts.
-    sample_time = schedule.adaptive.sample_time
-    schedule.adaptive.set_sample_time(sample_time / substeps)
-    result = solve_trajectory(
-        seen, seen.start(), max_steps=max_steps, cost_tolerance=LOOSE, callback=told
+    qd, qdd = (
+        torch.cat([torch.as_tensor(getattr(m, name)) for m in adaptive.motions])
+        for name in ("qd", "qdd")
     )
-    vector = seen.split(result.x)[0].clone()
-    limit = HEAD_START**2 * _by_joint(judged, torch.zeros_like(vector))
-    taken = 0.0
-    for share in SHARES:
-        if bool((_by_joint(judged, share * vector) <= limit).all()):
-            taken = share
-            break
-    schedule.set_parameter_vector(taken * vector)
-    fitted = seen
-    if taken == 1:
-        # What has proved itself may learn from all windows.
-        fitted = problem(cut)
-        result = solve_trajectory(
-            fitted, fitted.start(), max_steps=max_steps, cost_tolerance=LOOSE, callback=told
-        )
-    schedule.adaptive.set_sample_time(sample_time)
-    if taken == 0:
-        note = "The correction serves no better on windows held back: the adaptive model is kept."
-        return replace(adaptive, model=model, status=f"{adaptive.status} {note}")
-    if taken < 1:
-        result.x[: len(vector)] *= taken
-    found = trajectory_outcome(fitted, result, fitted.errors(result.x), motions)
-    part = "" if taken == 1 else f" {taken:g} of the correction is taken."
-    return replace(found, status=found.status + part, plant_terms=adaptive.plant_terms)
-
-
-def _set_range(schedule: AdaptiveNeuroFuzzy, qd: Tensor, qdd: Tensor) -> None:
-    """The range of the motion for the network's inputs, wild accelerations aside."""
+    torque = fit_torque(model.law, adaptive.plant, joint, adaptive.motions, model.v_smooth)
+    schedule.set_adaptive(reference, natural_scale(model.law, torque, qd))
     along = qdd * qd.sign() if schedule.deviation.along_motion else qdd
+    # Wild accelerations aside.
     low, high = np.quantile(along.numpy(), [0.001, 0.999], axis=0)
     schedule.set_range(
         qd.abs().amax(0), torch.stack([torch.as_tensor(low), torch.as_tensor(high)], -1)
     )
+    model.requires_grad_(False)
 
 
-def _by_joint(problem: TrajectoryProblem, vector: Tensor) -> Tensor:
-    """Mean square error of windows by joint, the network's parameters given.
+def _cross_fitted(
+    whole: TrajectoryProblem,
+    max_steps: int,
+    told: Callable[[Tensor, Step], bool | None] | None,
+) -> tuple[Tensor, Tensor]:
+    """The mean of corrections learned from parts, and what share of them each joint is to take."""
+    schedule, windows, memory = whole.friction.schedule, whole.windows, whole.memory
+    assert isinstance(schedule, AdaptiveNeuroFuzzy)
+    assert memory is not None
+    zero = torch.zeros_like(schedule.parameter_vector())
+    fold = torch.arange(len(windows)) % FOLDS
+    learned, unseen = [], []
+    for k in range(FOLDS):
+        seen, rest = (
+            replace(whole, windows=windows.subset(chosen), memory=memory[chosen])
+            for chosen in (fold != k, fold == k)
+        )
+        schedule.set_parameter_vector(zero)
+        result = solve_trajectory(
+            seen, seen.start(), max_steps=max_steps, cost_tolerance=LOOSE, callback=told
+        )
+        learned.append(seen.split(result.x)[0].clone())
+        unseen.append(rest)
+        if result.status == "stopped":
+            break
+    of_joint = schedule.joint_of_parameters()
 
-    Each window's start is fitted: off by what an encoder does not tell, it would soon matter more
-    than friction.
-    """
+    def errors(shares: Tensor) -> Tensor:
+        parts = [_errors(p, shares[of_joint] * v) for p, v in zip(unseen, learned, strict=True)]
+        return torch.cat(parts)
+
+    shares = shares_by_joint(errors, schedule.joints)
+    return torch.stack(learned).mean(0), shares
+
+
+def _errors(problem: TrajectoryProblem, vector: Tensor) -> Tensor:
+    """Root mean square error of windows from their smoothed starts, (window, joint)."""
     problem.friction.schedule.set_parameter_vector(vector)
-    start = problem.start()
-    lower, upper = problem.bounds()
-    shared = problem.shared_count
-    fixed = [torch.cat([start[:shared], ends[shared:]]) for ends in (lower, upper)]
-    solver = LevenbergMarquardt(max_steps=START_STEPS, cost_tolerance=LOOSE)
-    found = solver.minimise(
-        problem.quadratic, start, cost=problem.cost, lower=fixed[0], upper=fixed[1]
-    )
-    return problem.errors(found.x).square().mean((0, 1)).nan_to_num(torch.inf)
+    return problem.errors(problem.start()).square().mean(1).sqrt()

@@ -1,13 +1,16 @@
 """Whether a network earns its place: trained on part of the windows, judged on the rest."""
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 
 import torch
 from torch import Tensor
 
 from nfriction.fitting.stages import Refinement, Stage
 from nfriction.fitting.windows import Windows, cut_windows
+from nfriction.recording import Recording
 from nfriction.signals import Motion
 
 # Every so many-th window is held back, so that all sizes of the motion are judged.
@@ -15,18 +18,67 @@ FOLDS = 3
 # How much worse a network may do on windows held back than the law that it corrects: that law has
 # seen them, and where a recording is short few windows judge.
 HEAD_START = 1.1
+# What may be taken of a correction; of what serves alike, the least.
+SHARES = (0.0, 0.25, 0.5, 1.0)
+# Below any error that an encoder can tell, in rad or m.
+LEAST_ERROR = 1e-9
+
+
+def cut_for_folds(joint: Sequence[Recording], motions: Sequence[Motion], length: float) -> Windows:
+    """Windows of which some can be held back: shorter ones where the recordings are short."""
+    cut = cut_windows(joint, motions, length)
+    if len(cut) >= FOLDS:
+        return cut
+    longest = max(float(r.time[-1] - r.time[0]) for r in joint)
+    return cut_windows(joint, motions, longest / FOLDS)
 
 
 def judged_windows(
     refinement: Refinement, motions: tuple[Motion, ...], length: float
 ) -> tuple[Windows, Windows]:
     """Windows to train on and windows held back; shorter where the recordings are short."""
-    cut = cut_windows(refinement.joint, motions, length)
-    if len(cut) < FOLDS:
-        longest = max(float(r.time[-1] - r.time[0]) for r in refinement.joint)
-        cut = cut_windows(refinement.joint, motions, longest / FOLDS)
+    cut = cut_for_folds(refinement.joint, motions, length)
     back = torch.arange(len(cut)) % FOLDS == FOLDS - 1
     return cut.subset(~back), cut.subset(back)
+
+
+def shares_by_joint(errors: Callable[[Tensor], Tensor], joints: int) -> Tensor:
+    """How much of a correction to take of each joint's, by windows that it has not seen.
+
+    A window is judged by the ratio of its errors to those without the correction, and windows by
+    their geometric mean: a single one of a motion that blows up all errors must not outvote the
+    others. The share sought makes no joint worse and lowers the mean over joints most, which
+    counts as it is at worst within its standard error; a gain as small as that is none. First the
+    same share is tried for all joints, then each joint's own until none changes.
+
+    Args:
+        errors: root mean square errors at given shares (joint,), shape (window, joint).
+        joints: their number.
+
+    Returns:
+        Shares between 0 and 1, (joint,).
+    """
+
+    def logarithm(shares: tuple[float, ...]) -> Tensor:
+        found = errors(torch.tensor(shares, dtype=torch.float64))
+        return found.clamp_min(LEAST_ERROR).log().nan_to_num(torch.inf, torch.inf)
+
+    without = logarithm((0.0,) * joints)
+
+    @cache
+    def change(shares: tuple[float, ...]) -> float:
+        ratio = logarithm(shares) - without
+        own = ratio.mean(1)
+        found = own.mean() + own.std() / len(own) ** 0.5
+        return float(found) if bool((ratio.mean(0) <= 0).all()) else math.inf
+
+    best = min(((share,) * joints for share in SHARES), key=change)
+    before = None
+    while best != before:
+        before = best
+        for j in range(joints):
+            best = min(((*best[:j], share, *best[j + 1 :]) for share in SHARES), key=change)
+    return torch.tensor(best, dtype=torch.float64)
 
 
 def gain_on(held_back: Windows, trained: Stage, mean: Tensor) -> float:

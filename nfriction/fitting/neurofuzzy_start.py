@@ -21,7 +21,7 @@ def is_constant_fit(start: Fit | None, model: FrictionModel) -> bool:
     """Whether a fit is one of the model's law with constant coefficients, by trajectories."""
     return (
         start is not None
-        and start.model.law is model.law
+        and start.model.law == model.law
         and isinstance(start.model.schedule, Constant)
         and start._residuals.numel() > 0
     )

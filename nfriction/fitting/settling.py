@@ -36,7 +36,7 @@ def constant_start(
     """The fit of the model's law with constant coefficients."""
     if (
         start is not None
-        and start.model.law is model.law
+        and start.model.law == model.law
         and isinstance(start.model.schedule, Constant)
         and start._residuals.numel()
     ):

@@ -5,12 +5,15 @@ from nfriction.friction.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
 from nfriction.friction.controller_schedule import RadialBasis
 from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.models import (
+    ACVFM,
     ALFM,
     ANCFM,
     ANLFM,
+    CVFM,
     LFM,
     MODELS,
     NCFM,
+    NFCVFM,
     NFLFM,
     NFNCFM,
     NFNLFM,
@@ -23,13 +26,16 @@ from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.friction.schedules import Constant, Schedule
 
 __all__ = [
+    "ACVFM",
     "ALFM",
     "ANCFM",
     "ANLFM",
     "CLASSES",
+    "CVFM",
     "LFM",
     "MODELS",
     "NCFM",
+    "NFCVFM",
     "NFLFM",
     "NFNCFM",
     "NFNLFM",

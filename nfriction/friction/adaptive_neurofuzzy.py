@@ -158,6 +158,12 @@ class AdaptiveNeuroFuzzy(Schedule):
     def parameter_names(self, joint_names: Sequence[str]) -> list[str]:
         return self.deviation.parameter_names(joint_names)
 
+    def joint_of_parameters(self) -> Tensor:
+        """The joint whose coefficients each entry of the parameter vector moves, (parameter,)."""
+        joints = torch.arange(self.joints)
+        trained = self.deviation.trained()
+        return torch.cat([joints.repeat_interleave(p[0].numel()) for p in trained])
+
     def bounds(self) -> tuple[Tensor, Tensor]:
         return self.deviation.bounds()
 

@@ -146,6 +146,16 @@ class LFM(ConstantModel):
     definition = laws.LINEAR
 
 
+class CVFM(ConstantModel):
+    """Coulomb plus viscous friction with constants F_c and F_v, whatever the load.
+
+    The usual law of geared drives, whose dry friction is that of the gear and not of the joint's
+    own bearing.
+    """
+
+    definition = laws.COULOMB_VISCOUS
+
+
 class NLFM(ConstantModel):
     """Five constants f_o, f_c, f_v, f_a, f_b a joint (second paper, Table III)."""
 
@@ -196,6 +206,12 @@ class ANCFM(AdaptiveModel):
     """Viscous friction, its constant one for each class of acceleration (TLRIP paper)."""
 
     definition = laws.VISCOUS
+
+
+class ACVFM(AdaptiveModel):
+    """Coulomb plus viscous friction, F_c and F_v for each class of acceleration."""
+
+    definition = laws.COULOMB_VISCOUS
 
 
 class ALFM(AdaptiveModel):
@@ -270,6 +286,12 @@ class NFNCFM(NeuroFuzzyModel):
     definition = laws.VISCOUS
 
 
+class NFCVFM(NeuroFuzzyModel):
+    """Coulomb plus viscous friction with neuro-fuzzy F_c and F_v."""
+
+    definition = laws.COULOMB_VISCOUS
+
+
 class NFLFM(NeuroFuzzyModel):
     """Viscous plus load-dependent Coulomb friction with neuro-fuzzy B and C (TLRIP paper)."""
 
@@ -286,8 +308,10 @@ NamedModel = type[ConstantModel] | type[AdaptiveModel] | type[NeuroFuzzyModel]
 
 MODELS: dict[str, NamedModel] = {
     model.__name__: model
-    for model in (NCFM, LFM, NLFM, Stribeck, ANCFM, ALFM, ANLFM, NFNCFM, NFLFM, NFNLFM)
-}
+    for model in (
+        NCFM, LFM, NLFM, CVFM, Stribeck, ANCFM, ALFM, ANLFM, ACVFM, NFNCFM, NFLFM, NFNLFM, NFCVFM,
+    )
+}  # fmt: skip
 
 
 def model_by_name(name: str) -> NamedModel:

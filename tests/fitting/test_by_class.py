@@ -51,7 +51,7 @@ def case():
 
 def test_what_classes_cannot_say_is_learned(case):
     plant, train, held, by_class = case
-    found = refine_adaptive(network(), by_class, train, length=1.0)
+    found = refine_adaptive(network(), by_class, train, length=1.0, max_steps=8)
     assert "kept" not in found.status
     assert found.residual < 0.7 * by_class.residual
     ours, before = (score(plant, m, held) for m in (found.model, by_class.model))
@@ -62,12 +62,32 @@ def test_a_correction_that_does_not_serve_is_left(case, monkeypatch):
     plant, train, held, by_class = case
     # However little is taken, the windows held back come out worse.
     monkeypatch.setattr(
-        "nfriction.fitting.by_class._by_joint", lambda _, vector: 1.0 + vector.any()
+        "nfriction.fitting.by_class._errors",
+        lambda p, vector: (1.0 + vector.any()) * torch.ones(len(p.windows), 2, dtype=F64),
     )
-    found = refine_adaptive(network(), by_class, train, length=1.0, max_steps=2)
+    found = refine_adaptive(network(), by_class, train, length=1.0, max_steps=1)
     assert "kept" in found.status
     ours, before = (score(plant, m, held) for m in (found.model, by_class.model))
     assert ours.free_run.joints == pytest.approx(before.free_run.joints, rel=1e-6)
+
+
+def test_a_joint_s_part_that_does_not_serve_is_left(case, monkeypatch):
+    plant, train, _, by_class = case
+    model = network()
+    of_joint = model.schedule.joint_of_parameters()
+
+    def errors(problem, vector):
+        # The first joint's part halves its error, the second's doubles it.
+        moved = torch.stack([vector[of_joint == j].any() for j in range(2)])
+        factor = torch.where(moved, torch.tensor([0.5, 2.0]), torch.ones(2))
+        return factor.to(F64).expand(len(problem.windows), 2)
+
+    monkeypatch.setattr("nfriction.fitting.by_class._errors", errors)
+    found = refine_adaptive(model, by_class, train, length=1.0, max_steps=1)
+    taken = found.model.schedule.parameter_vector()
+    assert taken[of_joint == 0].any()
+    assert not taken[of_joint == 1].any()
+    assert f"0 of {plant.joint_names[1]}'s" in found.status
 
 
 def test_it_needs_an_adaptive_fit_and_a_network_by_class(case):

@@ -5,15 +5,16 @@ import pytest
 import torch
 
 from nfriction import Recording
-from nfriction.fitting.torque import EDGE, fit_torque, friction_torque
+from nfriction.fitting.torque import EDGE, TorqueFit, fit_torque, friction_torque, prior_sd
 from nfriction.friction import MODELS
-from nfriction.friction.laws import LINEAR
+from nfriction.friction.laws import LINEAR, NONLINEAR
 from nfriction.signals import Motion
 from tests.fitting.recordings import pendulum
 
 V_SMOOTH = 0.05
 TRUTH = {
     "NCFM": [[2e-3], [1e-3]],
+    "CVFM": [[3e-3, 2e-3], [5e-4, 1e-3]],
     "LFM": [[2e-3, 3e-3], [1e-3, 5e-4]],
     "NLFM": [[1e-3, 2e-3, 3e-3, 4e-3, 3.0], [-1e-3, 1e-3, 2e-3, 1e-3, 0.3]],
     "Stribeck": [[2e-3, 3e-3, 1e-3, 0.3, 2.0], [1e-3, 2e-3, 2e-3, 1.0, 2.0]],
@@ -80,3 +81,15 @@ def test_what_is_positive_by_physics_stays_so():
     assert (found.coefficients >= 0).all()
     signed = fit_torque(model.law, plant, [recording], [motion], V_SMOOTH)
     assert (signed.coefficients[:, 0] < 0).all()
+
+
+@pytest.mark.parametrize(("law", "shy"), [(NONLINEAR, "f_o"), (LINEAR, None)])
+def test_what_joints_have_little_of_is_expected_near_zero_in_units_of_the_friction(law, shy):
+    size = torch.tensor([2e-3, 0.5], dtype=torch.float64)
+    nothing = torch.zeros(2, len(law.names), dtype=torch.float64)
+    sd = prior_sd(law, TorqueFit(nothing, 0.6 * size, size))
+    for k, coefficient in enumerate(law.coefficients):
+        assert torch.isfinite(sd[:, k]).all() == (coefficient.name == shy)
+        # 0.6 left over and 0.8 explained add in the square.
+        torch.testing.assert_close(sd[:, k], coefficient.share * 0.8 * size)
+    assert (prior_sd(law, TorqueFit(nothing, size, size)) > 0).all()

@@ -101,6 +101,7 @@ def test_sensitivities_are_derivatives_at_a_given_memory() -> None:
             ends.append(made.coefficients_from(*moved, states).detach())
         torch.testing.assert_close(got, (ends[0] - ends[1]) / (2 * width), rtol=0, atol=1e-8)
     assert not isinstance(found, Sensitivity)
+    assert torch.equal(made.joint_of_parameters(), found.joint)
 
 
 def test_every_class_may_hold_at_rest() -> None:

@@ -9,7 +9,14 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from nfriction.friction import Coefficient, Law
-from nfriction.friction.laws import STRIBECK, linear, nonlinear, smooth_sign, stribeck
+from nfriction.friction.laws import (
+    STRIBECK,
+    coulomb_viscous,
+    linear,
+    nonlinear,
+    smooth_sign,
+    stribeck,
+)
 from tests.friction.samples import LAWS, QUADRATIC, motion, normal
 
 V_SMOOTH = 3e-3
@@ -98,6 +105,22 @@ def test_coulomb_friction_grows_with_the_load_alone() -> None:
     torch.testing.assert_close(linear(qd, load, coefficients, V_SMOOTH), expected)
 
 
+def test_the_laws_of_dry_friction_are_nested() -> None:
+    qd, _, load = motion(50, 2)
+    ones = torch.ones_like(load)
+    f_c, f_v = torch.tensor([0.7, 0.02], dtype=torch.float64)
+    plain = coulomb_viscous(qd, load, torch.stack([f_c, f_v]), V_SMOOTH)
+    assert torch.equal(plain, coulomb_viscous(qd, 2 * load, torch.stack([f_c, f_v]), V_SMOOTH))
+    without_drop = torch.tensor([0.7, 0.0, 0.02, 0.3, 2.0], dtype=torch.float64)
+    without_arctangent = torch.tensor([0.0, 0.7, 0.02, 0.0, 1.0], dtype=torch.float64)
+    for other in (
+        linear(qd, ones, torch.stack([f_v, f_c]), V_SMOOTH),
+        stribeck(qd, load, without_drop, V_SMOOTH),
+        nonlinear(qd, load, without_arctangent, V_SMOOTH),
+    ):
+        torch.testing.assert_close(other, plain, rtol=1e-14, atol=1e-15)
+
+
 def test_stribeck_falls_from_breakaway_to_coulomb_friction() -> None:
     f_c, f_d, v_s = 1.0, 0.5, 0.1
     load = torch.ones((), dtype=torch.float64)
@@ -125,6 +148,10 @@ def test_the_exponent_of_stribeck_is_kept_by_default() -> None:
 def test_a_law_is_refused_that_could_not_be_fitted_or_told() -> None:
     with pytest.raises(ValueError, match="search"):
         Coefficient("v_s", "rad/s", linear=False)
+    with pytest.raises(ValueError, match="`share` of 'v_s' must be positive, and is for"):
+        Coefficient("v_s", "rad/s", linear=False, search=(1.0,), share=0.1)
+    with pytest.raises(ValueError, match="`share`"):
+        Coefficient("f_o", "N m", share=0.0)
     with pytest.raises(ValueError, match="names of their own"):
         Law("twice", (Coefficient("B", "N m"), Coefficient("B", "N m")), linear)
     with pytest.raises(ValueError, match="names of their own"):

@@ -1,0 +1,88 @@
+"""Geared mechanisms that torques drive, read at irregular times, and what a law expects of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from nfriction import LFM, NLFM, PendulumChain, Recording, fit, rollout
+from nfriction.friction import CVFM, Constant, FrictionModel
+from nfriction.signals import quantise
+from tests.fitting.recordings import F64, pendulum, swing
+
+V_SMOOTH = 0.05
+DRY = [[0.20, 0.010], [0.15, 0.005]]
+
+
+def geared() -> PendulumChain:
+    """A double pendulum as heavy, and with rotors as large, as quasi-direct drives have."""
+    return PendulumChain(
+        [0.5, 0.6], [0.2, 0.3], inertia=[8e-3, 9e-3], armature=[3e-3, 3e-3],
+        convention=("relative", "hanging"),
+    )  # fmt: skip
+
+
+def driven(plant: PendulumChain, model: FrictionModel, seed: int, seconds: float = 3.0):
+    """Sums of sines in torque from rest, stamped as a host's clock does: late now and then."""
+    random = np.random.default_rng(seed)
+    step = np.abs(2e-3 + 1e-4 * random.standard_normal(round(seconds / 2e-3)))
+    step[random.integers(0, len(step), 5)] = 5e-3
+    time = np.concatenate([[0.0], np.cumsum(step)])
+    rate = random.uniform(3.0, 12.0, (3, 2))
+    tau = 0.35 * np.sin(rate * time[:, None, None] + random.uniform(0, 6, (3, 2))).sum(1)
+    rest = torch.tensor([np.pi, 0.0], dtype=F64)
+    out = rollout(
+        plant, model, rest, torch.zeros_like(rest), torch.as_tensor(tau[:-1]),
+        sample_time=torch.as_tensor(step), substeps=4, gradients=False,
+    )  # fmt: skip
+    q = quantise(out.q.numpy() - [np.pi, 0.0], 16384)
+    return Recording(time, q, tau=tau, convention="relative,hanging", name=f"driven {seed}")
+
+
+def test_friction_and_masses_of_a_driven_mechanism_are_recovered_from_irregular_stamps():
+    plant = geared()
+    recordings = [driven(plant, CVFM(2, DRY, v_smooth=V_SMOOTH), seed) for seed in (0, 1)]
+    given = plant.replace(armature=plant.armature * 0.9, gravity_moment=1.05 * plant.gravity_moment)
+    found = fit(CVFM(2, v_smooth=V_SMOOTH), given, recordings, windows=(1.0,))
+    assert found.converged, found.status
+    truth = torch.tensor(DRY, dtype=F64)
+    # An encoder of 16384 counts leaves some thousandths open.
+    torch.testing.assert_close(found.model.schedule.values, truth, rtol=0.01, atol=1e-4)
+    # The first rotor turns with the first link, so only their sum can be told.
+    pose = torch.tensor([[0.0, 0.0], [1.0, 2.0]], dtype=F64)
+    for term in ("mass_matrix", "gravity"):
+        torch.testing.assert_close(
+            getattr(found.plant, term)(pose), getattr(plant, term)(pose), rtol=0.01, atol=1e-3
+        )
+
+
+def test_load_dependent_friction_leaves_more_of_a_geared_mechanism_unexplained():
+    plant = geared()
+    recording = driven(plant, CVFM(2, DRY, v_smooth=V_SMOOTH), 0)
+    plain, loaded = (
+        fit(make(2, v_smooth=V_SMOOTH), plant, recording, fit_plant=False, windows=(0.5,))
+        for make in (CVFM, LFM)
+    )
+    assert plain.residual < 0.1 * loaded.residual
+
+
+def test_an_offset_that_the_law_does_not_expect_is_found_where_the_recording_tells_it():
+    plant, offset = pendulum(), 4e-4
+    truth = NLFM(2, [[offset, 2e-3, 1e-3, 0.0, 1.0]] * 2, v_smooth=V_SMOOTH)
+    recording = swing(plant, truth, seconds=1.5)
+    told, denied = (fitted_offset(plant, truth, recording, share) for share in (None, 1e-6))
+    # A recording counts for many times what the law expects, unless that is next to certainty.
+    assert (told - offset).abs().max() < 0.05 * offset
+    assert denied.abs().max() < 0.05 * offset
+
+
+def fitted_offset(plant, truth, recording, share):
+    """The offset of a fit, expected to be within a share of the friction."""
+    law = truth.law
+    if share is not None:
+        expected = tuple(replace(c, share=share) if c.name == "f_o" else c
+                         for c in law.coefficients)  # fmt: skip
+        law = replace(law, coefficients=expected)
+    model = FrictionModel(law, Constant(law, 2), V_SMOOTH)
+    fit(model, plant, recording, fit_plant=False, windows=(1.0,))
+    return model.schedule.values[:, 0]

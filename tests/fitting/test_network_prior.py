@@ -1,0 +1,36 @@
+"""How far a network may deviate from its constant law is for windows held back to say."""
+
+import pytest
+
+from nfriction import LFM, NFLFM, fit
+from nfriction.fitting.estimate import PRIOR_SHARES
+from tests.fitting.recordings import pendulum, swing
+
+V_SMOOTH = 0.05
+SMALL = {"terms": (2, 2), "head_units": 2}
+
+
+@pytest.fixture(scope="module")
+def constant():
+    truth = LFM(2, [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]], v_smooth=V_SMOOTH)
+    recording = swing(pendulum(), truth, seconds=2.0)
+    model = LFM(2, v_smooth=V_SMOOTH)
+    return recording, fit(model, pendulum(), recording, windows=(0.5,), fit_plant=False)
+
+
+@pytest.mark.parametrize("best", range(len(PRIOR_SHARES)))
+def test_the_prior_is_the_one_whose_network_predicts_best(constant, monkeypatch, best):
+    recording, found = constant
+    gains = [0.9 - 0.2 * (k == best) for k in range(len(PRIOR_SHARES))]
+    seen = []
+
+    def gain(held_back, trained, mean):
+        seen.append(trained.problem.friction.schedule.prior_sd)
+        return gains[len(seen) - 1]
+
+    monkeypatch.setattr("nfriction.fitting.estimate.gain_on", gain)
+    model = NFLFM(2, v_smooth=V_SMOOTH, prior_sd=0.6, **SMALL)
+    fit(model, pendulum(), recording, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
+    assert seen == pytest.approx([0.6 * share for share in PRIOR_SHARES])
+    # It travels with the model as what it was fitted with.
+    assert model.options()["prior_sd"] == pytest.approx(0.6 * PRIOR_SHARES[best])
