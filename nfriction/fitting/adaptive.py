@@ -13,6 +13,7 @@ from nfriction.fitting.outcome import Fit, Plant, trajectory_outcome
 from nfriction.fitting.preparation import (
     adjustable_terms,
     in_joint_coordinates,
+    listed,
     mixing_of,
     substeps_of,
     told_of,
@@ -76,13 +77,13 @@ def fit_adaptive(
     References:
         TLRIP paper, AFEM.
     """
+    given = listed(model, plant, recordings)
     if method not in get_args(AdaptiveMethod):
         raise ValueError(f"`method` must be one of {get_args(AdaptiveMethod)}, got {method!r}.")
     if not isinstance(model.schedule, Adaptive):
         raise ValueError(f"{type(model).__name__} is no adaptive model; use `fit`.")
     if not prior_sd > 0:
         raise ValueError(f"`prior_sd` must be positive, got {prior_sd}.")
-    given = [recordings] if isinstance(recordings, Recording) else list(recordings)
     joint = in_joint_coordinates(plant, model, given)
     moved = tuple(motions or (kalman_smoother(r.time, r.q) for r in joint))
     constant = constant_start(

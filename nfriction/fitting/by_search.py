@@ -14,6 +14,7 @@ from nfriction.fitting.position_error import PositionError
 from nfriction.fitting.preparation import (
     constant_schedule,
     in_joint_coordinates,
+    listed,
     mixing_of,
     substeps_of,
 )
@@ -89,7 +90,7 @@ def fit_by_search(
         raise ValueError(
             f"a search fits constant or adaptive coefficients, not {type(schedule).__name__}."
         )
-    given = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    given = listed(model, plant, recordings)
     joint = in_joint_coordinates(plant, model, given)
     moved = tuple(motions or (kalman_smoother(r.time, r.q) for r in joint))
     if isinstance(schedule, Adaptive):

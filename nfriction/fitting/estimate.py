@@ -17,6 +17,7 @@ from nfriction.fitting.preparation import (
     constant_schedule,
     has_encoder_terms,
     in_joint_coordinates,
+    listed,
     mixing_of,
 )
 from nfriction.fitting.residuals import effective_noise, stride_of
@@ -90,11 +91,12 @@ def fit(
         The fit; read `converged` and `status`.
 
     Raises:
+        TypeError: if model, plant or recordings are something else.
         ValueError: if recordings and plant do not match, or there is no such method.
     """
     if method not in get_args(Method):
         raise ValueError(f"`method` must be one of {get_args(Method)}, got {method!r}.")
-    given = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    given = listed(model, plant, recordings)
     joint = in_joint_coordinates(plant, model, given)
     if eccentricity and not may_be_eccentric(plant):
         raise ValueError(f"{plant.name or 'the axis'} has no encoders that turn with its joints.")

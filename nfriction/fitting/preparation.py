@@ -1,6 +1,7 @@
 """What every fit needs before it searches: joint coordinates, adjustable terms, substeps."""
 
 import logging
+import textwrap
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
@@ -11,7 +12,7 @@ from nfriction.angles import AngleConvention
 from nfriction.fitting.outcome import Plant
 from nfriction.fitting.plant_parameters import PlantParameter, plant_parameters
 from nfriction.friction import Constant, FrictionModel
-from nfriction.plant import PendulumChain
+from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.recording import Recording
 from nfriction.simulation import required_substeps
 from nfriction.solve.levenberg import Step
@@ -27,6 +28,27 @@ def told_of(
 ) -> Callable[[Tensor, Step], bool | None] | None:
     """A solver's callback that tells a fit's callback the stage."""
     return None if callback is None else lambda _, step: callback(stage, step)
+
+
+def listed(
+    model: FrictionModel, plant: Plant, recordings: Recording | Iterable[Recording]
+) -> list[Recording]:
+    """The recordings of a fit as a list.
+
+    Raises:
+        TypeError: if model, plant or recordings are something else.
+    """
+    many = [recordings] if isinstance(recordings, Recording) else recordings
+    given = list(many) if isinstance(many, Iterable) and not isinstance(many, str) else [many]
+    wanted: list[tuple[str, object, tuple[type, ...], str]] = [
+        ("model", model, (FrictionModel,), "a friction model such as LFM(joints=3)"),
+        ("plant", plant, (PendulumChain, LinearAxis), "a PendulumChain or LinearAxis"),
+        *(("recordings", r, (Recording,), "one Recording or a list of them") for r in given),
+    ]
+    for name, value, kinds, what in wanted:
+        if not isinstance(value, kinds):
+            raise TypeError(f"`{name}` must be {what}, got {textwrap.shorten(repr(value), 60)}.")
+    return given
 
 
 def in_joint_coordinates(

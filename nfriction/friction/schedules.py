@@ -129,8 +129,8 @@ class Schedule(nn.Module, ABC):
 
     def __init__(self, law: Law, joints: int) -> None:
         super().__init__()
-        if joints < 1:
-            raise ValueError(f"`joints` must be at least 1, got {joints}.")
+        if not isinstance(joints, int) or joints < 1:
+            raise ValueError(f"`joints` must be a whole number of at least 1, got {joints!r}.")
         self.joints = joints
         self.coefficient_names = list(law.names)
         self.fitted_mask = [c.fitted for c in law.coefficients]

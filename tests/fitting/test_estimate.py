@@ -282,3 +282,19 @@ def test_a_method_that_is_none_is_named():
     recording = swing(pendulum(), true_model(), seconds=0.5)
     with pytest.raises(ValueError, match=r"one of \('trajectory', 'torque'\), got 'torqe'"):
         fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, method="torqe")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (lambda m, p, r: ("LFM", p, r), "`model` must be a friction model .*'LFM'"),
+        (lambda m, p, r: (m, "tlrip", r), "`plant` must be a PendulumChain .*'tlrip'"),
+        (lambda m, p, r: (m, r, p), "`plant` must be"),
+        (lambda m, p, r: (m, p, "run.csv"), "`recordings` must be one Recording .*'run.csv'"),
+        (lambda m, p, r: (m, p, r.q), "`recordings` must be"),
+    ],
+)
+def test_what_is_something_else_is_told(arguments, told):
+    recording = swing(pendulum(), LFM(2, v_smooth=0.05), seconds=0.2)
+    with pytest.raises(TypeError, match=told):
+        fit(*arguments(LFM(2), pendulum(), recording))
