@@ -32,7 +32,7 @@ ALLOWED: dict[str, set[str]] = {
     | {"plant", "fuzzy", "friction", "codegen", "simulation", "compiled", "solve"},
     "scoring": FOUNDATIONS | {"plant", "friction", "simulation"},
     "modelfile": {"version", "atomic", "plant", "friction"},
-    "export": {"version", "atomic", "friction", "codegen", "modelfile", "signals"},
+    "export": {"version", "atomic", "plant", "friction", "codegen", "modelfile", "signals"},
 }
 # Only command lines talk to a person: the program's, and the one that scripts share.
 MAY_PRINT = ("cli/", "twin/command.py")

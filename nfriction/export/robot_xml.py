@@ -5,7 +5,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 from xml.sax.saxutils import quoteattr
 
-LARGEST_FILE = 64 * 2**20
+from nfriction.plant.robotfile import parse_xml
 
 
 def mjcf_snippet(
@@ -55,7 +55,10 @@ def patched(
             there twice.
         OSError: if it cannot be read.
     """
-    tree = _parse(Path(path))
+    try:
+        tree = parse_xml(Path(path), comments=True)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
     if tree.tag != root:
         raise ValueError(f"{path}: the root element is <{tree.tag[:40]}>, not <{root}>.")
     # In MJCF other things refer to joints by elements of that name too.
@@ -81,24 +84,6 @@ def patched(
             dynamics.set("friction", repr(f))
     text = ElementTree.tostring(tree, encoding="unicode")
     return f'<?xml version="1.0" encoding="utf-8"?>\n{text}\n'.encode()
-
-
-def _parse(path: Path) -> ElementTree.Element:
-    """The root of an XML file that declares nothing of its own."""
-    if path.stat().st_size > LARGEST_FILE:
-        raise ValueError(f"{path}: too large for a robot description.")
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: must be UTF-8 ({error.reason}).") from error
-    # Entities can be made to grow without bound, or to read other files; no robot needs them.
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise ValueError(f"{path}: declares a document type or entities, which is refused.")
-    builder = ElementTree.TreeBuilder(insert_comments=True)
-    try:
-        return ElementTree.fromstring(text, ElementTree.XMLParser(target=builder))
-    except ElementTree.ParseError as error:
-        raise ValueError(f"{path}: no XML, or cut short ({error}).") from error
 
 
 def _number(value: float) -> str:

@@ -28,7 +28,9 @@ def read_robot(path: str | Path) -> PendulumChain:
         ImportError: for an MJCF where MuJoCo is not installed.
     """
     path = Path(path)
-    root = _parse(path)
+    root = parse_xml(path)
+    if any("xacro" in element.tag for element in root.iter()):
+        raise ValueError("holds macros; write it out first: xacro robot.xacro > robot.urdf")
     if root.tag == "robot":
         return pendulum_chain(urdf_links(root), GRAVITY, root.get("name", ""))
     if root.tag == "mujoco":
@@ -36,8 +38,16 @@ def read_robot(path: str | Path) -> PendulumChain:
     raise ValueError(f"the root element is <{root.tag[:40]}>, neither <robot> nor <mujoco>.")
 
 
-def _parse(path: Path) -> ElementTree.Element:
-    """The root of an XML file that declares nothing of its own."""
+def parse_xml(path: Path, *, comments: bool = False) -> ElementTree.Element:
+    """The root of an XML file that declares nothing of its own.
+
+    Args:
+        path: of the file.
+        comments: keep them as elements.
+
+    Raises:
+        ValueError: if it is too large, not UTF-8, no XML, or declares a document type.
+    """
     size = path.stat().st_size
     if size > LARGEST_FILE:
         raise ValueError(f"{size} bytes are too large for a robot description.")
@@ -48,10 +58,8 @@ def _parse(path: Path) -> ElementTree.Element:
     # Entities can be made to grow without bound, or to read other files; no robot needs them.
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError("declares a document type or entities, which is refused.")
+    builder = ElementTree.TreeBuilder(insert_comments=comments)
     try:
-        root = ElementTree.fromstring(text)
+        return ElementTree.fromstring(text, ElementTree.XMLParser(target=builder))
     except ElementTree.ParseError as error:
         raise ValueError(f"no XML, or cut short ({error}).") from error
-    if any("xacro" in element.tag for element in root.iter()):
-        raise ValueError("holds macros; write it out first: xacro robot.xacro > robot.urdf")
-    return root
