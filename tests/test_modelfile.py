@@ -334,11 +334,11 @@ FORGED: dict[str, tuple[Callable[[dict], Any], str]] = {
         "unexpected keyword argument 'terms'",
     ),
     "smoothing": (lambda c: c.update(v_smooth=-1.0), "`v_smooth` must be positive"),
-    "infinite smoothing": (lambda c: c.update(v_smooth=float("inf")), "must be positive"),
+    "infinite smoothing": (lambda c: c.update(v_smooth=float("inf")), "beyond all numbers"),
     "wrong shape": (lambda c: c["state"].update({"schedule.raw": [[1.0, 2.0]]}), r"got shape \(1"),
     "infinite": (
         lambda c: c["state"].update({"schedule.raw": [[1.0, float("inf")], [1.0, 1.0]]}),
-        "must be finite",
+        "beyond all numbers",
     ),
     "ragged": (lambda c: c["state"].update({"schedule.raw": [[1.0], [1.0, 2.0]]}), "no array"),
     "text": (lambda c: c["state"].update({"schedule.raw": "abc"}), "no array of numbers"),

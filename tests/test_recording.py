@@ -171,7 +171,7 @@ def test_absent_and_empty_and_unknown_files(tmp_path: Path) -> None:
 
 def test_pickled_objects_are_never_loaded(tmp_path: Path) -> None:
     np.savez(tmp_path / "run.npz", time=np.array([{"a": 1}], dtype=object))
-    with pytest.raises(ValueError, match="allow_pickle=False"):
+    with pytest.raises(ValueError, match="none of numbers or text"):
         Recording.read(tmp_path / "run.npz")
 
 
@@ -205,13 +205,13 @@ def test_parquet_without_pyarrow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         Recording.read(tmp_path / "run.parquet")
 
 
-def test_an_array_that_claims_more_than_memory_is_refused(tmp_path: Path) -> None:
+def test_an_array_that_claims_more_than_it_has_is_refused(tmp_path: Path) -> None:
     header = io.BytesIO()
     claim = {"descr": "<f8", "fortran_order": False, "shape": (10**15,)}
     np.lib.format.write_array_header_1_0(header, claim)  # type: ignore[arg-type]
     with zipfile.ZipFile(tmp_path / "run.npz", "w") as archive:
         archive.writestr("q1.npy", header.getvalue() + bytes(80))
-    with pytest.raises(ValueError, match=r"run\.npz.*array q1 is larger than memory"):
+    with pytest.raises(ValueError, match=r"run\.npz.*80 bytes, which do not fit its shape"):
         Recording.read(tmp_path / "run.npz")
 
 
@@ -475,7 +475,7 @@ def test_initial_states_of_the_real_sets(data_dir: Path) -> None:
 def test_initial_states_name_their_faults(tmp_path: Path) -> None:
     path = tmp_path / "recordings.csv"
     path.write_text("id,q0_1\na,0.5\n")
-    with pytest.raises(ValueError, match=r"lacks columns \['qd0_1'\]"):
+    with pytest.raises(ValueError, match=r"lacks columns qd0_1;"):
         read_initial_states(path)
     path.write_text("id,q0_1,qd0_1,q0_2,qd0_2\na,0.5,0,1,\n")
     with pytest.raises(ValueError, match="finite q0 and qd0 of the same joints"):

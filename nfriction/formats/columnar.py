@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import io
+import math
+import re
+import struct
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from nfriction.formats.limits import refuse_size
+from nfriction.formats.limits import MOST_COLUMNS, refuse_bomb
 from nfriction.formats.text import ATTRIBUTES
+
+_HEADER = re.compile(
+    rb"\{'descr': '([<>|][fiu][1248]|\|b1|[<>]U\d{1,6})', 'fortran_order': (True|False), "
+    rb"'shape': \((\d{0,19}(?:, ?\d{1,19})*),?\), \}\s*"
+)
 
 
 def read_parquet(path: Path, _: object = ()) -> pd.DataFrame:
@@ -20,11 +28,16 @@ def read_parquet(path: Path, _: object = ()) -> pd.DataFrame:
     content = io.BytesIO(path.read_bytes())
     # Equal numbers pack to almost nothing, so the file's size tells little.
     metadata = ParquetFile(content).metadata
-    refuse_size(8 * metadata.num_rows * metadata.num_columns)
+    if metadata.num_columns > MOST_COLUMNS:
+        raise ValueError(f"it has more than {MOST_COLUMNS} columns")
+    refuse_bomb(8 * metadata.num_rows * metadata.num_columns, path.stat().st_size)
     try:
-        return pd.read_parquet(content, engine="pyarrow")
+        table = pd.read_parquet(content, engine="pyarrow")
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"what it says of its columns is damaged: {error!r}") from error
+    # What else a stranger wrote there pandas would copy at every step.
+    table.attrs = {k: table.attrs[k] for k in ATTRIBUTES if isinstance(table.attrs.get(k), str)}
+    return table
 
 
 def write_parquet(table: pd.DataFrame) -> bytes:
@@ -46,25 +59,47 @@ def _need_pyarrow() -> None:
 def read_npz(path: Path, _: object = ()) -> pd.DataFrame:
     columns: dict[str, np.ndarray] = {}
     attributes = {}
-    content = io.BytesIO(path.read_bytes())
-    with zipfile.ZipFile(content) as archive:
-        refuse_size(sum(entry.file_size for entry in archive.infolist()), "unpacked bytes")
-    with np.load(content, allow_pickle=False) as arrays:
-        for key in arrays.files:
-            try:
-                values = arrays[key]
-            except MemoryError as error:
-                # An array's header may claim any size.
-                raise ValueError(f"array {key} is larger than memory") from error
-            if key in ATTRIBUTES:
-                attributes[key] = str(values)
-            elif values.ndim == 2:
-                columns |= {f"{key}{k + 1}": column for k, column in enumerate(values.T)}
-            else:
-                columns[key] = np.atleast_1d(values)
+    with zipfile.ZipFile(path) as archive:
+        entries = archive.infolist()
+        refuse_bomb(sum(entry.file_size for entry in entries), path.stat().st_size)
+        arrays = {e.filename.removesuffix(".npy"): _array(archive.read(e)) for e in entries}
+    for key, values in arrays.items():
+        if key in ATTRIBUTES:
+            attributes[key] = str(values)
+        elif values.ndim == 2:
+            if values.shape[1] > MOST_COLUMNS:
+                raise ValueError(f"array {key[:40]} has more than {MOST_COLUMNS} columns")
+            columns |= {f"{key}{k + 1}": column for k, column in enumerate(values.T)}
+        else:
+            columns[key] = np.atleast_1d(values)
     table = pd.DataFrame(columns)
     table.attrs.update(attributes)
     return table
+
+
+def _array(content: bytes) -> np.ndarray:
+    """A vector, a matrix or a text of a `.npy` file.
+
+    NumPy's reader takes the header for Python, objects and records for data, and makes room for
+    what the header claims; here the header has one form, and what it claims must be there.
+    """
+    if content[:6] != b"\x93NUMPY" or len(content) < 12:
+        raise ValueError("it holds something that is no array")
+    wide = content[6] > 1
+    size, begin = struct.unpack_from("<I" if wide else "<H", content, 8)[0], 12 if wide else 10
+    header = _HEADER.fullmatch(content[begin : begin + size])
+    if header is None:
+        raise ValueError("an array in it is none of numbers or text, or its header is damaged")
+    kind, columns_first, lengths = header.groups()
+    shape = [int(length) for length in lengths.replace(b",", b" ").split()]
+    form, data = np.dtype(kind.decode()), memoryview(content)[begin + size :]
+    if len(shape) > 2 or math.prod(shape) * form.itemsize != len(data):
+        raise ValueError(f"an array in it has {len(data)} bytes, which do not fit its shape")
+    if form.kind == "U":
+        # NumPy makes strings of code points that are none, which end the interpreter later on.
+        order = "be" if form.byteorder == ">" else "le"
+        return np.array(bytes(data).decode(f"utf-32-{order}").rstrip("\0"))
+    return np.frombuffer(data, form).reshape(shape, order="F" if columns_first == b"True" else "C")
 
 
 def write_npz(table: pd.DataFrame) -> bytes:

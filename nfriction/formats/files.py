@@ -62,8 +62,10 @@ def read_table(path: str | os.PathLike[str], sources: Sequence[str] = ()) -> pd.
     try:
         return reader(path, sources)
     except _BROKEN as error:
+        told = str(error)
+        told = told if len(told) <= 500 else f"{told[:497]}..."  # it may cite what is in the file
         raise ValueError(
-            f"'{path}' is truncated, ragged or not what its ending says ({error}); "
+            f"'{path}' is truncated, ragged or not what its ending says ({told}); "
             f"mend or fetch it again."
         ) from error
 

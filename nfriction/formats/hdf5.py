@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from nfriction.formats.limits import refuse_size
+from nfriction.formats.limits import refuse_bomb
 from nfriction.formats.nested import DEEPEST, MOST, nested_table
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -31,7 +31,7 @@ def read_hdf5(path: Path, sources: Sequence[str] = ()) -> pd.DataFrame:
         ) from error
     try:
         with h5py.File(path, "r") as file:
-            content = _Reader(file).group(file, 0)
+            content = _Reader(file, path.stat().st_size).group(file, 0)
     except (OSError, RuntimeError, KeyError, TypeError, MemoryError) as error:
         raise ValueError(f"h5py cannot read it: {error}") from error
     return nested_table(content, sources, slashes=True)
@@ -40,8 +40,9 @@ def read_hdf5(path: Path, sources: Sequence[str] = ()) -> pd.DataFrame:
 class _Reader:
     """Plain dicts, lists and arrays from an open file."""
 
-    def __init__(self, file: Any) -> None:
+    def __init__(self, file: Any, size: int) -> None:
         self.file = file
+        self.size = size
         self.count = 0
         self.bytes = 0
 
@@ -63,7 +64,7 @@ class _Reader:
             content = self.group(item, depth) if hasattr(item, "keys") else {}
             return _struct_array(content)
         self.bytes += int(item.size or 0) * item.dtype.itemsize
-        refuse_size(self.bytes)
+        refuse_bomb(self.bytes, self.size)
         if item.dtype.kind == "O":
             return self._referred(item, depth)
         if item.dtype.kind not in "fiub" or item.shape is None:

@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 
 from nfriction.formats.hdf5 import SIGNATURE, read_hdf5
-from nfriction.formats.limits import LARGEST, refuse_size
+from nfriction.formats.limits import most_unpacked, refuse_bomb, refuse_size
 from nfriction.formats.nested import DEEPEST, MOST, nested_table
 
 _HEADER = 128
@@ -71,8 +71,9 @@ def read_version_5(content: bytes) -> dict[str, Any]:
     state, unpacked = _State(order), 0
     for kind, data in _elements(memoryview(content)[_HEADER:], order):
         if kind == _COMPRESSED:
-            plain = _unpacked(data, LARGEST - unpacked)
+            plain = _unpacked(data, most_unpacked(len(content)) - unpacked)
             unpacked += len(plain)
+            refuse_bomb(unpacked, len(content))
             kind, data = next(_elements(memoryview(plain), order))
         if kind == _MATRIX:
             name, value = _matrix(data, state, 0)
@@ -83,7 +84,6 @@ def read_version_5(content: bytes) -> dict[str, Any]:
 def _unpacked(data: memoryview, limit: int) -> bytes:
     stream = zlib.decompressobj()
     plain = stream.decompress(data, limit + 1)
-    refuse_size(LARGEST + len(plain) - limit, "unpacked bytes")
     if len(plain) < 8:
         raise ValueError("a variable in it is cut short")
     return plain

@@ -151,7 +151,9 @@ def _column(table: pd.DataFrame, kind: str, source: Source) -> Array:
 
 def _missing(table: pd.DataFrame, columns: dict[str, str], missing: list[str]) -> str:
     found = [str(name) for name in table.attrs.get("found", table.columns)]
-    shown = ", ".join(found[:30]) + (f" … ({len(found)} in all)" if len(found) > 30 else "")
+    shown = ", ".join(name[:60] for name in found[:30]) + (
+        f" … ({len(found)} in all)" if len(found) > 30 else ""
+    )
     first = columns.get(missing[0], missing[0])
     stem, _, unit = first.rpartition(":")
     note = f" {unit!r} is no unit known." if stem in found and not is_unit(unit) else ""

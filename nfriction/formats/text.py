@@ -11,11 +11,12 @@ import csv
 import gzip
 import io
 import re
+from collections import Counter
 from pathlib import Path
 
 import pandas as pd
 
-from nfriction.formats.limits import LARGEST, refuse_size
+from nfriction.formats.limits import MOST_COLUMNS, most_unpacked, refuse_bomb, refuse_size
 from nfriction.formats.units import is_unit
 
 ATTRIBUTES = ("convention", "unit", "names")
@@ -33,8 +34,8 @@ def read_csv(path: Path, _: object = ()) -> pd.DataFrame:
 
 def read_csv_gz(path: Path, _: object = ()) -> pd.DataFrame:
     with gzip.open(path) as file:
-        content = file.read(LARGEST + 1)
-    refuse_size(len(content), "unpacked bytes")
+        content = file.read(most_unpacked(path.stat().st_size) + 1)
+    refuse_bomb(len(content), path.stat().st_size)
     return parse_csv(_decoded(content))
 
 
@@ -60,6 +61,10 @@ def parse_csv(text: str) -> pd.DataFrame:
         raise ValueError("it has no header")
     lines = content[:3]
     separator = _separator(lines[0].rstrip("\r\n"), lines[1:])
+    header = next(csv.reader([lines[0]], delimiter=separator, skipinitialspace=True))
+    most = max(len(line.split(None if separator == " " else separator)) for line in lines)
+    if most > MOST_COLUMNS:
+        raise ValueError(f"it has {most} columns, more than {MOST_COLUMNS} are read")
     table = pd.read_csv(
         io.StringIO("".join(content)),
         sep=r"\s+" if separator == " " else separator,
@@ -72,7 +77,6 @@ def parse_csv(text: str) -> pd.DataFrame:
             "its rows have more cells than its header; with decimal commas, cells must be "
             "separated by semicolons or tabs"
         )
-    header = next(csv.reader([lines[0]], delimiter=separator, skipinitialspace=True))
     names = [cell.strip() for cell in header]
     table.columns = table.columns.astype(str).str.strip()
     # An ending separator makes a last column without name or content.
@@ -89,7 +93,7 @@ def parse_csv(text: str) -> pd.DataFrame:
             units.setdefault(column, told[2])
             if told[1] not in table.columns and told[1] not in aliases:
                 aliases[told[1]] = column
-    repeated = sorted({name for name in names if name and names.count(name) > 1})
+    repeated = sorted(n for n, count in Counter(names).items() if n and count > 1)
     table.attrs.update(_comments(text), units=units, aliases=aliases, repeated=repeated)
     return table
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from nfriction.fuzzy.membership import FuzzySet
 from nfriction.fuzzy.rulebase import ANY, Rule, RuleBase, Variable
-from nfriction.fuzzy.rulefile import MAX_BYTES
+from nfriction.fuzzy.rulefile import MAX_BYTES, shortened
 
 _METHODS = {"AndMethod": "min", "ImpMethod": "min", "AggMethod": "max", "DefuzzMethod": "centroid"}
 
@@ -57,7 +57,7 @@ def load_fis(path: str | Path, units: Sequence[str] = ("deg/s", "deg/s^2")) -> R
     try:
         return parse_fis(path.read_text(encoding="utf-8"), units)
     except ValueError as error:
-        raise ValueError(f"{path.name}: {error}") from error
+        raise ValueError(f"{path.name}: {shortened(error)}") from error
 
 
 def parse_fis(text: str, units: Sequence[str] = ("deg/s", "deg/s^2")) -> RuleBase:

@@ -63,8 +63,10 @@ def parse_rules(text: str, source: str = "rules") -> RuleBase:
     try:
         document = json.loads(text, object_pairs_hook=_unique, parse_constant=_refuse_constant)
         return _rule_base(document)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{source}: {error}") from error
+    except RecursionError:
+        raise ValueError(f"{source}: nested too deeply for a rule base.") from None
+    except ValueError as error:
+        raise ValueError(f"{source}: {shortened(error)}") from error
 
 
 def format_rules(rules: RuleBase) -> str:
@@ -251,6 +253,12 @@ def _terms(value: Any, where: str) -> tuple[str, ...]:
     if not isinstance(value, list):
         raise ValueError(f"{where}: expected a list of terms, got {_brief(value)}.")
     return tuple(_text(term, where) for term in value)
+
+
+def shortened(error: ValueError) -> str:
+    """What an error says, though it may cite a name of any length."""
+    text = str(error)
+    return text if len(text) <= 500 else text[:497] + "..."
 
 
 def _brief(value: Any) -> str:

@@ -11,7 +11,7 @@ from nfriction.modelfile.description import FORMAT, SCHEMA
 
 # A neuro-fuzzy model of ten joints takes less than a megabyte.
 LARGEST_FILE = 64 * 2**20
-MOST_JOINTS = 1000
+MOST_JOINTS, DEEPEST = 1000, 32
 
 
 class ModelFileError(ValueError):
@@ -62,6 +62,8 @@ def read_model_file(path: str | Path) -> dict[str, Any]:
     if content.pop("checksum") != checksum_of(content):
         raise ModelFileError(f"{path}: the checksum does not match; damaged or edited.")
     _check_sizes(path, content, size)
+    _check_names(path, content)
+    _check_depth(path, [v for k, v in content.items() if k != "state"])
     return content
 
 
@@ -80,6 +82,13 @@ def _refuse_constant(name: str) -> float:
     raise ValueError(f"{name} is not JSON")
 
 
+def _finite(text: str) -> float:
+    value = float(text)
+    if math.isinf(value):
+        raise ValueError(f"{text[:40]} is beyond all numbers")
+    return value
+
+
 def _read_json(path: Path) -> tuple[int, Any]:
     """Size and content of a JSON file."""
     try:
@@ -88,7 +97,8 @@ def _read_json(path: Path) -> tuple[int, Any]:
         size = path.stat().st_size
         if size > LARGEST_FILE:
             raise ModelFileError(f"{path}: {size} bytes are too many for a model file.")
-        return size, json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
+        text = path.read_text(encoding="utf-8")
+        return size, json.loads(text, parse_constant=_refuse_constant, parse_float=_finite)
     except FileNotFoundError:
         raise ModelFileError(f"{path}: no such file.") from None
     except OSError as error:
@@ -99,6 +109,30 @@ def _read_json(path: Path) -> tuple[int, Any]:
         raise
     except ValueError as error:
         raise ModelFileError(f"{path}: not a model file, or cut short ({error}).") from error
+
+
+def _check_names(path: Path, content: Mapping[str, Any]) -> None:
+    """Refuse what would pass for names of joints and recordings, and is none."""
+    names, digests, step = (content[k] for k in ("joint_names", "training_data", "sample_time"))
+    if not all(isinstance(n, str) for n in names) or len(names) not in (0, content["joints"]):
+        raise ModelFileError(f"{path}: `joint_names` must be {content['joints']} texts, or none.")
+    if not all(isinstance(digest, str) for digest in digests.values()):
+        raise ModelFileError(f"{path}: `training_data` must map names to digests.")
+    if step is not None and not 0 < step < 1e6:
+        raise ModelFileError(f"{path}: `sample_time` must be positive seconds, got {short(step)}.")
+
+
+def _check_depth(path: Path, content: list[Any]) -> None:
+    """Refuse what is nested beyond what copying and writing it again can take."""
+    for _ in range(DEEPEST):
+        parts = [v.values() if isinstance(v, dict) else v for v in content if _holds(v)]
+        content = [value for part in parts for value in part]
+    if content:
+        raise ModelFileError(f"{path}: nested too deeply for a model file.")
+
+
+def _holds(value: object) -> bool:
+    return isinstance(value, (dict, list))
 
 
 def _check_sizes(path: Path, content: Mapping[str, Any], size: int) -> None:

@@ -74,9 +74,9 @@ def load(path: str | Path, into: FrictionModel | None = None) -> FrictionModel:
     if given.keys() != expected.keys():
         odd = sorted(given.keys() ^ expected.keys())
         raise ModelFileError(f"{path}: parameters are missing or not the model's: {short(odd)}.")
-    model.load_state_dict(
-        {name: _parameter(path, name, given[name], value) for name, value in expected.items()}
-    )
+    state = {name: _parameter(path, name, given[name], value) for name, value in expected.items()}
+    _check_finite(path, model, state)
+    model.load_state_dict(state)
     return model.requires_grad_(False) if into is None else model
 
 
@@ -149,6 +149,16 @@ def _check_same_model(path: str | Path, content: Mapping[str, Any], model: Frict
             raise ModelFileError(
                 f"{path}: `{key}` is {short(ours)} in the file, {short(theirs)} in the model."
             )
+
+
+def _check_finite(path: str | Path, model: FrictionModel, state: Mapping[str, Tensor]) -> None:
+    """Refuse parameters that are finite and yet, through an exponential, make no finite torque."""
+    qd, qdd, load = torch.tensor([[0.0, 0.5], [0.0, 0.0], [1.0, 1.0]], dtype=torch.float64)
+    inputs = tuple(x[:, None].expand(-1, model.joints) for x in (qd, qdd, load))
+    with torch.no_grad():
+        torque = torch.func.functional_call(model, dict(state), inputs)
+    if not torque.isfinite().all():
+        raise ModelFileError(f"{path}: with its parameters the model gives no finite torque.")
 
 
 def _parameter(path: str | Path, name: str, given: Any, expected: Tensor) -> Tensor:

@@ -6,14 +6,13 @@ import hashlib
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
+from nfriction import formats
 from nfriction.angles import AngleConvention, ConventionLike, Mechanism
-from nfriction.formats import read_table, stem, table_arrays, write_table
 from nfriction.recording.validation import (
     check_content,
     check_shapes,
@@ -23,6 +22,9 @@ from nfriction.recording.validation import (
     warn_of_gaps,
     warn_of_units,
 )
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Array = NDArray[np.float64]
 Unit = Literal["rad", "m"]
@@ -208,6 +210,8 @@ class Recording:
 
     def to_pandas(self) -> pd.DataFrame:
         """Table with columns time, q1 …, qd1 …, tau1 …; `attrs` tell unit, names and convention."""
+        import pandas as pd  # slow to import
+
         columns = {"time": self.time}
         for key in ("q", "qd", "tau"):
             values = getattr(self, key)
@@ -250,7 +254,7 @@ class Recording:
         """
         attributes = table.attrs
         said = attributes.get("convention") if convention is None else convention
-        arrays, slides = table_arrays(table, columns, degrees=degrees)
+        arrays, slides = formats.table_arrays(table, columns, degrees=degrees)
         told: Unit | None = None if slides is None else "m" if slides else "rad"
         written = attributes.get("unit")
         if degrees and written == "deg":
@@ -305,7 +309,7 @@ class Recording:
         """
         if convention is not None:
             convention = AngleConvention.of(convention)
-        table = read_table(path, list((columns or {}).values()))
+        table = formats.read_table(path, list((columns or {}).values()))
         try:
             return cls.from_pandas(
                 table,
@@ -313,11 +317,11 @@ class Recording:
                 degrees=degrees,
                 convention=convention,
                 unit=unit,
-                name=stem(path) if name is None else name,
+                name=formats.stem(path) if name is None else name,
             )
         except ValueError as error:
             raise ValueError(f"'{path}': {error}") from error
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write to .csv, .csv.gz, .parquet or .npz, whole or not at all; `read` gives it back."""
-        write_table(self.to_pandas(), path)
+        formats.write_table(self.to_pandas(), path)

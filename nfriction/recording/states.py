@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nfriction.formats import column_numbers, read_table
+from nfriction import formats
 
 Array = NDArray[np.float64]
 
@@ -28,16 +29,21 @@ def read_initial_states(
     Raises:
         ValueError: missing columns, or a state that is incomplete or comes twice.
     """
-    table = read_table(path)
+    table = formats.read_table(path)
     joints = sorted((c[3:] for c in table.columns if re.fullmatch(r"q0_\d+", c)), key=int)
     wanted = ["id", *(f"{key}_{k}" for key in ("q0", "qd0") for k in joints or ["1"])]
     missing = [c for c in wanted if c not in table.columns]
     if missing:
-        raise ValueError(f"'{path}' lacks columns {missing}; found {list(table.columns)}.")
-    q0, qd0 = (
-        np.stack([column_numbers(table, f"{key}_{k}") for k in joints], axis=1)
-        for key in ("q0", "qd0")
-    )
+        raise ValueError(
+            f"'{path}' lacks columns {_listed(missing)}; found {_listed(table.columns)}."
+        )
+    try:
+        q0, qd0 = (
+            np.stack([formats.column_numbers(table, f"{key}_{k}") for k in joints], axis=1)
+            for key in ("q0", "qd0")
+        )
+    except ValueError as error:
+        raise ValueError(f"'{path}': {error}") from error
     if degrees:
         q0, qd0 = np.deg2rad(q0), np.deg2rad(qd0)
     states: dict[str, tuple[Array, Array]] = {}
@@ -47,7 +53,13 @@ def read_initial_states(
         sound = np.array_equal(present, ~np.isnan(state[1])) and not np.isinf(state).any()
         if label in states or not present.any() or not sound:
             raise ValueError(
-                f"'{path}': {label!r} must come once, with finite q0 and qd0 of the same joints."
+                f"'{path}': {label[:60]!r} must come once, with finite q0 and qd0 of the same "
+                f"joints."
             )
         states[label] = (state[0, present], state[1, present])
     return states
+
+
+def _listed(names: Iterable[str]) -> str:
+    """Names that come from a file, so of any number and length."""
+    return ", ".join(str(name)[:60] for name in list(names)[:30])

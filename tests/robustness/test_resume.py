@@ -1,0 +1,150 @@
+"""Runs that are killed or interrupted at any moment: what is resumed ends as if nobody had."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from nfriction.fitting import SearchState
+
+ROOT = Path(__file__).resolve().parents[2]
+SEARCH = ["train_constant.py", "--twin", "rtip", "--seconds", "1", "--model", "LFM",
+          "--method", "pattern", "--horizon", "0.5", "--max-evaluations", "300"]  # fmt: skip
+STAGES = ["train_neurofuzzy.py", "--seconds", "1", "--windows", "0.5", "--max-steps", "2",
+          "--model", "NFNCFM"]  # fmt: skip
+REPRODUCE = """
+import sys
+from nfriction.reproduction import Settings, reproduce
+if __name__ == "__main__":
+    reproduce(sys.argv[1], Settings(
+        tlrip_seconds=1.0, rtip_seconds=1.0, windows=(0.5,), max_steps=1, network_steps=1,
+        controller_samples=50, search_horizon=0.5, search_evaluations=20, torchscript=False,
+    ), jobs=1)
+"""
+ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1"}
+Told = Callable[[Path], None]
+
+
+def begin(words: list[str]) -> "subprocess.Popen[str]":
+    return subprocess.Popen(
+        [sys.executable, *words], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+        env=ENVIRONMENT, cwd=ROOT, start_new_session=True,
+        # Who runs the tests in the background has a shell that lets children ignore Ctrl-C.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
+
+
+def end(process: "subprocess.Popen[str]", how: int) -> str:
+    """What it said on standard error; its children end with it."""
+    if how == signal.SIGKILL:
+        os.killpg(process.pid, how)
+        return process.communicate()[1]
+    # A library's import may swallow a Ctrl-C; who pressed it presses again.
+    for _ in range(10):
+        process.send_signal(how)
+        with suppress(subprocess.TimeoutExpired):
+            return process.communicate(timeout=20)[1]
+    os.killpg(process.pid, signal.SIGKILL)
+    raise AssertionError("it does not end on Ctrl-C")
+
+
+def broken_off(
+    words: list[str], folder: Path, started: Path, seed: int, kills: int, check: Told
+) -> None:
+    """Run to the end, ended `kills` times on the way at moments drawn from the seed.
+
+    Args:
+        started: a file that is there as soon as the work has begun.
+        check: what must hold of the folder after each end.
+    """
+    rng = Random(seed)
+    for kill in range(kills):
+        how = signal.SIGKILL if kill % 2 == 0 else signal.SIGINT
+        process = begin(words)
+        deadline = time.monotonic() + 200
+        while not started.exists() and process.poll() is None:
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        # Importing takes most of the first seconds of every run but the first.
+        time.sleep(rng.uniform(0.0, 1.5) + (0.0 if kill == 0 else rng.uniform(1.0, 4.0)))
+        if process.poll() is None:
+            end(process, how)
+        check(folder)
+    process = begin(words)
+    told = process.communicate(timeout=500)[1]
+    assert process.returncode == 0, told
+
+
+def whole(words: list[str]) -> None:
+    subprocess.run([sys.executable, *words], env=ENVIRONMENT, cwd=ROOT, check=True,
+                   stdout=subprocess.DEVNULL, timeout=500)  # fmt: skip
+
+
+class Kept:
+    """Files that were finished stay as they are; a search never goes back."""
+
+    def __init__(self) -> None:
+        self.finished: dict[Path, bytes] = {}
+        self.evaluations = 0
+
+    def __call__(self, folder: Path) -> None:
+        files = [p for p in folder.rglob("*") if p.is_file() and not p.name.startswith(".")]
+        for path, content in self.finished.items():
+            assert path in files, f"{path.name} was lost"
+            assert path.read_bytes() == content, f"{path.name} was made anew"
+        for path in files:
+            if path.suffix == ".json":
+                json.loads(path.read_text())  # none is half of one
+            if path.name == "search-state.json":
+                state = SearchState.from_dict(json.loads(path.read_text()))
+                assert state.evaluations >= self.evaluations
+                self.evaluations = state.evaluations
+            # The result is written anew by a run that only reads its stages.
+            elif path.parent.name in ("checkpoints", "stages"):
+                model = path.with_suffix(".json")
+                if model.exists():  # which is written last
+                    self.finished[path] = path.read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("options", "seed"), [(SEARCH, 0), (SEARCH, 1), (STAGES, 2), (STAGES, 3)])
+def test_a_trainer_that_is_ended_again_and_again(
+    tmp_path: Path, options: list[str], seed: int
+) -> None:
+    words = [str(ROOT / "trainers" / options[0]), *options[1:], "--out"]
+    whole([*words, str(tmp_path / "whole")])
+    folder = tmp_path / "ended"
+    broken_off(
+        [*words, str(folder), "--resume"], folder, folder / "checkpoints" / "options.json",
+        seed, 4, Kept(),
+    )  # fmt: skip
+    model = f"{options[options.index('--model') + 1]}.json"
+    assert (folder / model).read_bytes() == (tmp_path / "whole" / model).read_bytes()
+
+
+@pytest.mark.slow
+def test_a_reproduction_that_is_ended_again_and_again(tmp_path: Path) -> None:
+    script = tmp_path / "run.py"
+    script.write_text(REPRODUCE)
+    whole([str(script), str(tmp_path / "whole")])
+    folder = tmp_path / "ended"
+    broken_off([str(script), str(folder)], folder, folder / "twin", 5, 5, Kept())
+    expected, found = (
+        {p.relative_to(f): p.read_bytes() for p in (f / "models").glob("*.json")}
+        for f in (tmp_path / "whole", folder)
+    )
+    assert expected == found
+    for path in (tmp_path / "whole" / "stages").glob("*.json"):
+        ours = json.loads((folder / "stages" / path.name).read_text())
+        theirs = json.loads(path.read_text())
+        for content in (ours, theirs):
+            content.get("result", {}).pop("seconds", None)
+        assert ours == theirs, path.name
