@@ -3,6 +3,8 @@ PYTHON ?= python3
 # A torch that is installed as it is here; any from pyproject.toml's range serves.
 TORCH ?= torch==2.13.0
 BIN := .venv/bin
+# As many tests at a time as this process has cores.
+WORKERS ?= $(shell nproc 2>/dev/null || echo auto)
 
 .PHONY: demo test lint clean
 
@@ -10,7 +12,7 @@ demo: .venv/installed
 	$(BIN)/nfriction reproduce --quick --out runs/papers
 
 test: .venv/installed
-	$(BIN)/python -m pytest -n auto -m "not slow"
+	$(BIN)/python -m pytest -n $(WORKERS) -m "not slow"
 
 lint: .venv/installed
 	$(BIN)/ruff check .
