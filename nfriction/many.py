@@ -146,9 +146,6 @@ def _fit(
     """A fit, or why there is none; and how long it took [s]."""
     begun = time.perf_counter()
     model = model_by_name(name)(plant.joints)
-    if start is not None and start.model.law == model.law:
-        # On its way to this process it became a copy, and fits know a law by its identity.
-        start.model.law = model.law
     result: Fit | Exception
     try:
         result = fit(model, plant, data.recordings, motions=data.motions, start=start, **settings)

@@ -148,7 +148,7 @@ def select(
         plant, names, seen, jobs=jobs, on_stage=on_stage, on_step=on_step, **fit_settings
     )
     candidates = tuple(_candidate(plant, name, fits, unseen, horizon) for name in names)
-    return Selection(*choose(candidates, tolerance), candidates, horizon, plant.unit)
+    return Selection(*choose(candidates, tolerance, plant.unit), candidates, horizon, plant.unit)
 
 
 def _folds(
@@ -184,16 +184,23 @@ def _candidate(
     return Candidate(name, tuple(errors), parameters, converged)
 
 
-def choose(candidates: Sequence[Candidate], tolerance: float = 0.02) -> tuple[str, str]:
+def choose(
+    candidates: Sequence[Candidate], tolerance: float = 0.02, unit: str = "rad"
+) -> tuple[str, str]:
     """The model with the fewest parameters whose error cannot be told from the least.
 
     Args:
         candidates: with errors of the same blocks.
         tolerance: relative difference of errors that counts as none.
+        unit: of the errors.
 
     Returns:
         Its name, and why, in a sentence.
     """
+
+    def told(candidate: Candidate) -> str:
+        return f"{1e3 * candidate.error:.3g} m{unit}"
+
     best = min(candidates, key=lambda c: c.error)
     if not math.isfinite(best.error):
         simplest = min(candidates, key=lambda c: c.parameters)
@@ -202,16 +209,16 @@ def choose(candidates: Sequence[Candidate], tolerance: float = 0.02) -> tuple[st
     chosen = min(alike, key=lambda c: (c.parameters, c.error))
     if chosen is not best:
         return chosen.name, (
-            f"its error on blocks left out, {chosen.error:.3g}, cannot be told from the least, "
-            f"{best.error:.3g} of {best.name}, and it has fewer parameters "
+            f"its error on blocks left out, {told(chosen)}, cannot be told from the least, "
+            f"{told(best)} of {best.name}, and it has fewer parameters "
             f"({chosen.parameters} against {best.parameters})."
         )
     others = sorted((c for c in candidates if c is not best), key=lambda c: c.error)
     if not others:
         return best.name, "it is the only model."
     return best.name, (
-        f"its error on blocks left out, {best.error:.3g}, is the least; {others[0].name} follows "
-        f"with {others[0].error:.3g}."
+        f"its error on blocks left out, {told(best)}, is the least; {others[0].name} follows "
+        f"with {told(others[0])}."
     )
 
 
