@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,10 @@ def read_mdf(path: Path, sources: Sequence[str] = ()) -> pd.DataFrame:
     try:
         with MDF(path) as file:
             return _table(file, sources)
-    except (MdfException, OSError, KeyError, IndexError, TypeError, AttributeError) as error:
+    except (
+        MdfException, OSError, LookupError, TypeError, AttributeError, struct.error, MemoryError,
+        RuntimeError,
+    ) as error:  # fmt: skip
         raise ValueError(f"asammdf cannot read it: {error}") from error
 
 

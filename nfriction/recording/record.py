@@ -320,7 +320,9 @@ class Recording:
                 name=formats.stem(path) if name is None else name,
             )
         except ValueError as error:
-            raise ValueError(f"'{path}': {error}") from error
+            told = str(error)
+            told = told if len(told) <= 2000 else f"{told[:1997]}..."  # it may cite the file
+            raise ValueError(f"'{path}': {told}") from error
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write to .csv, .csv.gz, .parquet or .npz, whole or not at all; `read` gives it back."""

@@ -49,6 +49,7 @@ def case():
     return plant, train, held, by_class
 
 
+@pytest.mark.slow
 def test_what_classes_cannot_say_is_learned(case):
     plant, train, held, by_class = case
     found = refine_adaptive(network(), by_class, train, length=1.0, max_steps=8)

@@ -178,7 +178,7 @@ def test_what_unpacks_to_far_more_is_refused(
 # Damaged numbers may well look like degrees or milliseconds.
 pytestmark = pytest.mark.filterwarnings("ignore::nfriction.recording.RecordingWarning")
 fuzzing = settings(
-    max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 
 

@@ -299,7 +299,7 @@ def test_without_mujoco_it_says_what_to_do(tmp_path, monkeypatch):
     assert rigs.read(path).joint_names == ("top", "elbow")
 
 
-@settings(IN_A_FOLDER, max_examples=200)
+@settings(IN_A_FOLDER, max_examples=60)
 @given(st.data())
 def test_a_spoilt_file_is_a_plant_or_an_error(tmp_path, data):
     start = data.draw(st.integers(0, len(PENDULUM) - 1))

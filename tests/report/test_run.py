@@ -109,7 +109,7 @@ JUNK = st.sampled_from([None, True, "x", -1, 1e400, 10**400, [], {}, [[]], {"joi
 
 
 @settings(
-    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(place=st.sampled_from(paths(results())[1:]), junk=JUNK)
 def test_junk_anywhere_is_read_or_refused_and_nothing_else(folder, tmp_path, place, junk):

@@ -272,9 +272,9 @@ def test_a_memory_advances_once_a_sample(backend):
             return super().advance(qd, qdd, state)
 
     model = named_model("ALFM")
-    fine = run(model, *MOVING, sample_time=5e-4, steps=300, substeps=4, backend=backend)
+    fine = run(model, *MOVING, sample_time=5e-4, steps=300, substeps=2, backend=backend)
     model.schedule.__class__ = Watched
-    watched = run(model, *MOVING, sample_time=5e-4, steps=300, substeps=4, backend="torch")
+    watched = run(model, *MOVING, sample_time=5e-4, steps=300, substeps=2, backend="torch")
     assert len(seen) == 299
     torch.testing.assert_close(watched.q, fine.q, rtol=0, atol=1e-12)
     known = model.schedule.classes(fine.qd, fine.qdd)
