@@ -31,3 +31,14 @@ def reference_dir(request: pytest.FixtureRequest) -> Path:
     if not folder.is_dir():
         pytest.skip(f"no reference states at {folder}; set NFRICTION_REFERENCE to run these tests")
     return folder
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Leave one law's turn of the long tests over all models to the slow run.
+
+    Viscous and Coulomb friction is a part of NLFM's, whose turn is kept.
+    """
+    for item in items:
+        if "CVFM" in item.name and item.path.parent.name in ("export", "simulation"):
+            item.add_marker(pytest.mark.slow)

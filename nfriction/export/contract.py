@@ -20,7 +20,7 @@ from nfriction.export.controller import (
     MemoryController,
     controller_of,
 )
-from nfriction.export.errors import ContractError
+from nfriction.export.errors import ContractError, first_line
 from nfriction.export.parity import COEFFICIENT_SLACK, Parity, compare
 from nfriction.export.points import draw, trials
 from nfriction.friction import FrictionModel
@@ -98,7 +98,7 @@ class Contract:
             ContractError: if it is not of this form.
         """
         try:
-            content = json.loads(text)
+            content = json.loads(text, parse_constant=_refuse, parse_float=_finite)
         except (ValueError, RecursionError) as error:
             raise ContractError(f"the metadata are no JSON, or cut short ({error}).") from error
         if not isinstance(content, dict) or content.get("format") != FORMAT:
@@ -115,8 +115,11 @@ class Contract:
                 {str(name): _tensor(name, x) for name, x in vectors[side].items()}
                 for side in ("inputs", "outputs")
             )
-        except (KeyError, TypeError, AttributeError, ValueError, RuntimeError) as error:
-            raise ContractError(f"the test vectors are missing or damaged ({error}).") from error
+        except (
+            KeyError, TypeError, AttributeError, ValueError, RuntimeError, OverflowError,
+        ) as error:  # fmt: skip
+            told = first_line(error)
+            raise ContractError(f"the test vectors are missing or damaged ({told}).") from error
         _check_vectors(inputs, outputs, tolerance)
         _check_interface(content, list(inputs))
         outputs["status"] = outputs["status"].to(torch.int32)
@@ -277,6 +280,17 @@ def _tensor(name: str, given: Any) -> Tensor:
 _SPELLINGS = ("nan", "inf", "-inf")
 
 
+def _refuse(name: str) -> float:
+    raise ValueError(f"{name} is not JSON")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if math.isinf(value):
+        raise ValueError(f"{text[:40]} is beyond all numbers")
+    return value
+
+
 def _check_interface(content: Mapping[str, Any], names: list[str]) -> None:
     """Raise `ContractError` where what a host relies on is not there."""
     size, dtype = content.get("state_size"), content.get("dtype")
@@ -284,6 +298,7 @@ def _check_interface(content: Mapping[str, Any], names: list[str]) -> None:
         not isinstance(size, int)
         or isinstance(size, bool)
         or not 0 <= size <= MOST_STATES
+        or not isinstance(dtype, str)
         or dtype not in TOLERANCE
         or content.get("inputs") != names
     ):

@@ -101,7 +101,14 @@ def open_pt2(path: str | Path) -> tuple[Contract, Runner]:
     try:
         with silent(), Path(path).open("rb") as file:
             module = torch.export.load(file, extra_files=files).module()
-    except (RuntimeError, AttributeError, AssertionError, KeyError, TypeError) as error:
+    except (
+        RuntimeError,
+        AttributeError,
+        AssertionError,
+        LookupError,
+        TypeError,
+        ValueError,
+    ) as error:
         raise ExportError(f"{path}: no program of nfriction ({first_line(error)}).") from error
     contract = Contract.from_json(files[METADATA])
     size = contract.state_size

@@ -111,7 +111,7 @@ def open_torchscript(path: str | Path) -> tuple[Contract, Runner]:
     with _silent():
         try:
             module = torch.jit.load(str(path), map_location="cpu", _extra_files=files)
-        except (RuntimeError, ValueError) as error:
+        except (RuntimeError, ValueError, LookupError) as error:
             raise ExportError(f"{path}: no TorchScript ({first_line(error)}).") from error
     contract = Contract.from_json(files[METADATA])
     if not hasattr(module, "step"):

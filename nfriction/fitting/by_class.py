@@ -77,16 +77,18 @@ def refine_adaptive(
     schedule.adaptive.set_sample_time(sample_time / substeps)
     told = told_of(callback, f"{length:g} s windows, correction by class")
     begun, shares = _cross_fitted(whole, max_steps, told)
-    if not shares.any():
+    part = shares[schedule.joint_of_parameters()]
+    if part.any():
+        schedule.set_parameter_vector(begun)
+        result = solve_trajectory(
+            whole, whole.start(), max_steps=max_steps, cost_tolerance=LOOSE, callback=told
+        )
+        result.x[: len(begun)] *= part
+    if not part.any() or not _serves(whole, result.x[: len(begun)]):
         schedule.set_parameter_vector(torch.zeros_like(begun))
         schedule.adaptive.set_sample_time(sample_time)
         note = "The correction serves no better on windows held back: the adaptive model is kept."
         return replace(adaptive, model=model, status=f"{adaptive.status} {note}")
-    schedule.set_parameter_vector(begun)
-    result = solve_trajectory(
-        whole, whole.start(), max_steps=max_steps, cost_tolerance=LOOSE, callback=told
-    )
-    result.x[: len(begun)] *= shares[schedule.joint_of_parameters()]
     found = trajectory_outcome(whole, result, whole.errors(result.x), motions)
     schedule.adaptive.set_sample_time(sample_time)
     parts = zip(shares.tolist(), plant.joint_names, strict=True)
@@ -160,6 +162,15 @@ def _cross_fitted(
 
     shares = shares_by_joint(errors, schedule.joints)
     return torch.stack(learned).mean(0), shares
+
+
+def _serves(whole: TrajectoryProblem, vector: Tensor) -> bool:
+    """Whether a correction is no worse on any joint over the very windows it learned from.
+
+    What shares of the parts' corrections do, the same shares of another need not do.
+    """
+    ratio = _errors(whole, vector) / _errors(whole, torch.zeros_like(vector))
+    return bool((ratio.log().mean(0) <= 0).all())
 
 
 def _errors(problem: TrajectoryProblem, vector: Tensor) -> Tensor:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import os
-import uuid
 import zipfile
 import zlib
 from collections.abc import Callable, Sequence
@@ -12,6 +11,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from nfriction.atomic import write_atomically
 from nfriction.formats import columnar, hdf5, matlab, mdf, text
 
 _Reader = Callable[[Path, Sequence[str]], pd.DataFrame]
@@ -80,15 +80,7 @@ def write_table(table: pd.DataFrame, path: str | os.PathLike[str]) -> None:
         OSError: the file cannot be written.
     """
     path = Path(path)
-    content = _WRITERS[_ending(path, _WRITERS, "written")](table)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
-    try:
-        with open(unfinished, "xb") as file:
-            file.write(content)
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    write_atomically(path, _WRITERS[_ending(path, _WRITERS, "written")](table))
 
 
 def stem(path: str | os.PathLike[str]) -> str:

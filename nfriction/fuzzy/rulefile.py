@@ -35,6 +35,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from nfriction.atomic import write_atomically
 from nfriction.fuzzy.membership import FuzzySet, sets_from_ranges
 from nfriction.fuzzy.rulebase import ANY, Rule, RuleBase, Variable
 
@@ -82,8 +83,8 @@ def format_rules(rules: RuleBase) -> str:
 
 
 def save_rules(rules: RuleBase, path: str | Path) -> None:
-    """Write a rule base as a JSON file."""
-    Path(path).write_text(format_rules(rules), encoding="utf-8")
+    """Write a rule base as a JSON file, whole or not at all."""
+    write_atomically(path, format_rules(rules).encode())
 
 
 def _rule_base(document: Any) -> RuleBase:

@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from nfriction.atomic import write_atomically
 from nfriction.plant import robotfile
 from nfriction.plant.axis import LinearAxis
 from nfriction.plant.chain import PendulumChain
@@ -81,15 +82,16 @@ def read(path: str | Path) -> PendulumChain | LinearAxis:
 
 
 def write(plant: PendulumChain | LinearAxis, path: str | Path) -> None:
-    """Write a plant, fitted buffers included, as JSON that `read` takes.
+    """Write a plant, fitted buffers included, as JSON that `read` takes; whole or not at all.
 
     Raises:
         ValueError: for an ending other than .json.
+        OSError: if the file cannot be written.
     """
     path = Path(path)
     if path.suffix.lower() != ".json":
         raise ValueError(f"a rig is written as .json, got {path.name!r}.")
-    path.write_text(json.dumps(plant.to_dict(), indent=2) + "\n", encoding="utf-8")
+    write_atomically(path, (json.dumps(plant.to_dict(), indent=2) + "\n").encode())
 
 
 def _check_entry(key: str, value: Any) -> None:

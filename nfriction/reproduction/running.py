@@ -51,6 +51,7 @@ def reproduce(
 
 def _run_all(workspace: Workspace, waiting: dict[str, Stage], jobs: int, bar: "tqdm[Any]") -> None:
     running: dict[Future[None], str] = {}
+    finished = False
     pool = ProcessPoolExecutor(
         jobs, mp_context=get_context("spawn"), initializer=_end_when_interrupted
     )
@@ -69,10 +70,13 @@ def _run_all(workspace: Workspace, waiting: dict[str, Stage], jobs: int, bar: "t
                 future.result()
                 bar.update()
             bar.refresh()
+        finished = True
     finally:
-        # After an error or an interrupt; that reaches workers only where the keyboard sent it.
-        for worker in (pool._processes or {}).values() if running else ():
-            worker.terminate()
+        if not finished:
+            # An error or an interrupt; that reaches workers only where the keyboard sent it, and
+            # may have come while one was started, before it is among those running.
+            for worker in list((pool._processes or {}).values()):
+                worker.terminate()
         pool.shutdown(cancel_futures=True)
 
 

@@ -29,6 +29,8 @@ from nfriction.signals import Motion, kalman_smoother
 
 # What does not change the result.
 _IRRELEVANT = ("out", "resume")
+# What shells expect of a program that a Ctrl-C ended.
+INTERRUPTED = 130
 Tell = Callable[..., None]
 
 
@@ -101,7 +103,7 @@ class Training:
                 f"{mark}: made with other options; repeat them, or start anew without --resume."
             )
         write_atomically(mark, text.encode())
-        _end_when_interrupted()
+        _end_when_interrupted(self.folder)
 
     def data(self) -> Data:
         """The recordings given, or the twin's."""
@@ -197,10 +199,11 @@ def _errors(found: Score, unit: str) -> str:
     return f"position RMSE of the free run by joint {joints} m{unit}"
 
 
-def _end_when_interrupted() -> None:
+def _end_when_interrupted(folder: Path) -> None:
     # Solvers keep their best point on a KeyboardInterrupt, which would pass for a finished stage.
     def end(_signal: int, _frame: FrameType | None) -> None:
-        sys.exit("interrupted; go on with --resume")
+        sys.stderr.write(f"\ninterrupted; what was reached is in {folder}, go on with --resume\n")
+        sys.exit(INTERRUPTED)
 
     signal.signal(signal.SIGINT, end)
 
@@ -211,5 +214,7 @@ def run(train: Callable[[Sequence[str] | None], str], argv: Sequence[str] | None
     torch.set_num_threads(1)
     try:
         return train(argv)
+    except KeyboardInterrupt:  # before there is a folder
+        sys.exit(INTERRUPTED)
     except (ValueError, OSError) as error:
         sys.exit(f"error: {error}")

@@ -72,6 +72,22 @@ def test_a_correction_that_does_not_serve_is_left(case, monkeypatch):
     assert ours.free_run.joints == pytest.approx(before.free_run.joints, rel=1e-6)
 
 
+def test_a_correction_worse_where_it_was_learned_is_left(case, monkeypatch):
+    """Though its parts fared well on windows held back."""
+    plant, train, _, by_class = case
+    monkeypatch.setattr(
+        "nfriction.fitting.by_class._cross_fitted",
+        lambda whole, *_: (whole.friction.schedule.parameter_vector(), torch.ones(2, dtype=F64)),
+    )
+    monkeypatch.setattr(
+        "nfriction.fitting.by_class._errors",
+        lambda p, vector: (1.0 + vector.any()) * torch.ones(len(p.windows), 2, dtype=F64),
+    )
+    found = refine_adaptive(network(), by_class, train, length=1.0, max_steps=1)
+    assert "kept" in found.status
+    assert not found.model.schedule.parameter_vector().any()
+
+
 def test_a_joint_s_part_that_does_not_serve_is_left(case, monkeypatch):
     plant, train, _, by_class = case
     model = network()

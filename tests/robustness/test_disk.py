@@ -17,6 +17,8 @@ from nfriction import LFM, ModelInfo, save
 from nfriction.angles import AngleConvention
 from nfriction.atomic import replacing, write_atomically
 from nfriction.export import torchscript
+from nfriction.fuzzy import paper_controller, save_rules
+from nfriction.plant import rigs
 from nfriction.recording import Recording
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -37,6 +39,8 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "run.csv.gz": lambda path: recording().write(path),
     "run.npz": lambda path: recording().write(path),
     "run.parquet": lambda path: recording().write(path),
+    "rig.json": lambda path: rigs.write(rigs.tlrip(), path),
+    "rules.json": lambda path: save_rules(paper_controller(2).rule_base, path),
     "rest.bin": lambda path: write_atomically(path, bytes(10_000)),
 }
 
@@ -90,7 +94,7 @@ def tiny_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", str(folder)], check=True)
 
 
-@pytest.mark.parametrize("name", ["model.json", "model.pt"])
+@pytest.mark.parametrize("name", ["model.json", "model.pt", "run.csv", "run.npz"])
 def test_a_disk_that_is_really_full(name: str, tiny_disk: Path) -> None:
     (tiny_disk / "ballast").write_bytes(bytes(64 * 1024))
     with pytest.raises(OSError, match=r"No space left.*make room in") as refusal:
@@ -117,7 +121,7 @@ def read_only_disk(tiny_disk: Path) -> Path:
     return tiny_disk
 
 
-@pytest.mark.parametrize("name", ["model.json", "model.pt"])
+@pytest.mark.parametrize("name", ["model.json", "model.pt", "run.csv"])
 def test_a_disk_that_is_read_only(name: str, read_only_disk: Path) -> None:
     with pytest.raises(OSError, match=r"Read-only.*allow writing to") as refusal:
         WRITERS[name](read_only_disk / name)

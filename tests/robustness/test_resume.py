@@ -76,7 +76,9 @@ def broken_off(
         # Importing takes most of the first seconds of every run but the first.
         time.sleep(rng.uniform(0.0, 1.5) + (0.0 if kill == 0 else rng.uniform(1.0, 4.0)))
         if process.poll() is None:
-            end(process, how)
+            told = end(process, how)
+            if how == signal.SIGINT and process.returncode:
+                assert process.returncode in (130, -signal.SIGINT), told
         check(folder)
     process = begin(words)
     told = process.communicate(timeout=500)[1]
@@ -148,3 +150,19 @@ def test_a_reproduction_that_is_ended_again_and_again(tmp_path: Path) -> None:
         for content in (ours, theirs):
             content.get("result", {}).pop("seconds", None)
         assert ours == theirs, path.name
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_with_what_was_reached_and_says_where(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    process = begin([str(ROOT / "trainers" / SEARCH[0]), *SEARCH[1:], "--out", str(folder)])
+    state = folder / "checkpoints" / "search-state.json"
+    deadline = time.monotonic() + 200
+    while not state.exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    told = end(process, signal.SIGINT)
+    assert process.returncode == 130, told
+    assert f"what was reached is in {folder}" in told
+    assert "Traceback" not in told
+    assert state.exists()
+    assert not [p for p in folder.rglob("*") if p.suffix == ".part"]
