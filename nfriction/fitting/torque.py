@@ -80,6 +80,9 @@ def fit_torque(
 
     Returns:
         Coefficients with what they leave unexplained.
+
+    Raises:
+        ValueError: if the law's torque is not finite along the motion.
     """
     parts = [friction_torque(plant, r, m) for r, m in zip(recordings, motions, strict=True)]
     qd, load, torque = (torch.cat(x) for x in zip(*parts, strict=True))
@@ -157,6 +160,13 @@ def _linear_fit(
             unit[..., k] = value
         columns.append(law.torque(qd, load, unit, v_smooth))
     design = torch.stack(columns, -1)
+    for sample, joint, k in (~torch.isfinite(design)).nonzero()[:1].tolist():
+        raise ValueError(
+            f"law {law.name!r} gives {float(design[sample, joint, k]):g} where "
+            f"{law.coefficients[linear[k]].name} is 1, at joint {joint + 1}, velocity "
+            f"{float(qd[sample, joint]):g} and load {float(load[sample, joint]):g}; its torque "
+            "must be a finite number."
+        )
     lower = [0.0 if law.coefficients[i].positive else -np.inf for i in linear]
     coefficients = torch.zeros(qd.shape[1], len(law.coefficients), dtype=qd.dtype)
     for k, value in fixed.items():

@@ -7,7 +7,7 @@ import torch
 from nfriction import Recording
 from nfriction.fitting.torque import EDGE, TorqueFit, fit_torque, friction_torque, prior_sd
 from nfriction.friction import MODELS
-from nfriction.friction.laws import LINEAR, NONLINEAR
+from nfriction.friction.laws import LINEAR, NONLINEAR, Coefficient, Law
 from nfriction.signals import Motion
 from tests.fitting.recordings import pendulum
 
@@ -93,3 +93,14 @@ def test_what_joints_have_little_of_is_expected_near_zero_in_units_of_the_fricti
         # 0.6 left over and 0.8 explained add in the square.
         torch.testing.assert_close(sd[:, k], coefficient.share * 0.8 * size)
     assert (prior_sd(law, TorqueFit(nothing, size, size)) > 0).all()
+
+
+def test_a_law_that_gives_no_number_is_named_with_joint_and_velocity():
+    def root(qd, load, coefficients, v_smooth):
+        return coefficients[..., 0] * qd.sqrt()  # NaN where the joint turns back
+
+    plant = pendulum()
+    recording, motion, _ = moved(MODELS["NCFM"](2, TRUTH["NCFM"]), plant)
+    law = Law("root", (Coefficient("R", "N m"),), root)
+    with pytest.raises(ValueError, match=r"law 'root' gives nan where R is 1, at joint \d, vel"):
+        fit_torque(law, plant, [recording], [motion], V_SMOOTH)
