@@ -74,7 +74,7 @@ def test_a_correction_that_does_not_serve_is_left(case, monkeypatch):
 
 def test_a_correction_worse_where_it_was_learned_is_left(case, monkeypatch):
     """Though its parts fared well on windows held back."""
-    plant, train, _, by_class = case
+    _, train, _, by_class = case
     monkeypatch.setattr(
         "nfriction.fitting.by_class._cross_fitted",
         lambda whole, *_: (whole.friction.schedule.parameter_vector(), torch.ones(2, dtype=F64)),
