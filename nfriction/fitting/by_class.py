@@ -87,7 +87,7 @@ def refine_adaptive(
     if not part.any() or not _serves(whole, result.x[: len(begun)]):
         schedule.set_parameter_vector(torch.zeros_like(begun))
         schedule.adaptive.set_sample_time(sample_time)
-        note = "The correction serves no better on windows held back: the adaptive model is kept."
+        note = "The correction serves no better: the adaptive model is kept."
         return replace(adaptive, model=model, status=f"{adaptive.status} {note}")
     found = trajectory_outcome(whole, result, whole.errors(result.x), motions)
     schedule.adaptive.set_sample_time(sample_time)
