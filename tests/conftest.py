@@ -33,12 +33,15 @@ def reference_dir(request: pytest.FixtureRequest) -> Path:
     return folder
 
 
+# Of the long tests over all models the short run takes those of the richest laws alone.
+LEFT_TO_THE_SLOW_RUN = ("CVFM", "ANCFM", "NFNCFM")
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Leave one law's turn of the long tests over all models to the slow run.
-
-    Viscous and Coulomb friction is a part of NLFM's, whose turn is kept.
-    """
+    """Mark what only repeats, with a law that is part of another, what another test does."""
     for item in items:
-        if "CVFM" in item.name and item.path.parent.name in ("export", "simulation"):
+        if item.path.parent.name in ("export", "simulation", "codegen") and any(
+            name in item.name for name in LEFT_TO_THE_SLOW_RUN
+        ):
             item.add_marker(pytest.mark.slow)

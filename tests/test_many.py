@@ -54,7 +54,7 @@ def same(one: Fit, other: Fit) -> bool:
 
 # A network's law must be known again in another process: laws are told by identity.
 CASES = [
-    (["NCFM", "LFM"], {"method": "torque"}),
+    pytest.param(["NCFM", "LFM"], {"method": "torque"}, marks=pytest.mark.slow),
     pytest.param(["LFM", "NFLFM"], QUICK, marks=pytest.mark.slow),
 ]
 

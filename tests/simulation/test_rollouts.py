@@ -261,7 +261,7 @@ def test_the_simulated_motion_as_measured_one_gives_itself():
     assert not torch.allclose(other.q, free.q, atol=1e-8)
 
 
-@pytest.mark.parametrize("backend", ["torch", "c"])
+@pytest.mark.parametrize("backend", [pytest.param("torch", marks=pytest.mark.slow), "c"])
 def test_a_memory_advances_once_a_sample(backend):
     """Substeps refine the integration; the class changes at samples only, as in a controller."""
     seen = []
@@ -281,7 +281,7 @@ def test_a_memory_advances_once_a_sample(backend):
     assert len(known.unique()) > 1
 
 
-@pytest.mark.parametrize("backend", ["torch", "c"])
+@pytest.mark.parametrize("backend", [pytest.param("torch", marks=pytest.mark.slow), "c"])
 def test_a_motion_goes_on_with_what_it_remembers(backend):
     """Cut in two with the memory handed over, a run is the uncut one."""
     model = named_model("ALFM")
@@ -300,7 +300,7 @@ def test_a_motion_goes_on_with_what_it_remembers(backend):
     torch.testing.assert_close(both.q, torch.stack([rest.q, lost.q]), rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("backend", ["torch", "c"])
+@pytest.mark.parametrize("backend", [pytest.param("torch", marks=pytest.mark.slow), "c"])
 def test_a_measured_motion_drives_the_memory_too(backend):
     model = named_model("ALFM")
     settings = {"sample_time": 5e-4, "steps": 300, "backend": backend}

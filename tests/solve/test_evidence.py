@@ -40,6 +40,7 @@ def test_identities_hold_at_convergence() -> None:
     assert math.isclose(fit.beta, unexplained / (2 * fit.error_squares), rel_tol=2e-7)
 
 
+@pytest.mark.slow
 def test_effective_parameters_saturate_as_units_are_added() -> None:
     # Foresee and Hagan's first example: gamma stays near 8.7 from four units on, while the
     # parameters grow from 13 to 31. The noise of a data set moves it by about one.
