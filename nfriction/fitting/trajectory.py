@@ -29,8 +29,6 @@ logger = logging.getLogger(__name__)
 PIECE = 2000
 # Smoothed start states are off by far less; the prior only keeps a window from running away.
 START_Q_SD, START_QD_SD = 0.01, 0.3
-# Starts are good and a trial costs but a simulation: a search first tries nearly full steps.
-DAMPING = 1e-6
 
 
 @dataclass
@@ -292,7 +290,6 @@ def solve_trajectory(
         gradient_tolerance=1e-6,
         cost_tolerance=cost_tolerance,
         step_tolerance=1e-8,
-        initial_damping=DAMPING,
     )
     result = solver.minimise(
         problem.quadratic, x0, cost=problem.cost, lower=lower, upper=upper, callback=callback
