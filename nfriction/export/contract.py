@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from nfriction import strict_json
 from nfriction.export.controller import (
     CLAMPED,
     NOT_FINITE,
@@ -98,7 +99,7 @@ class Contract:
             ContractError: if it is not of this form.
         """
         try:
-            content = json.loads(text, parse_constant=_refuse, parse_float=_finite)
+            content = strict_json.parse(text)
         except (ValueError, RecursionError) as error:
             raise ContractError(f"the metadata are no JSON, or cut short ({error}).") from error
         if not isinstance(content, dict) or content.get("format") != FORMAT:
@@ -278,17 +279,6 @@ def _tensor(name: str, given: Any) -> Tensor:
 
 
 _SPELLINGS = ("nan", "inf", "-inf")
-
-
-def _refuse(name: str) -> float:
-    raise ValueError(f"{name} is not JSON")
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    if math.isinf(value):
-        raise ValueError(f"{text[:40]} is beyond all numbers")
-    return value
 
 
 def _check_interface(content: Mapping[str, Any], names: list[str]) -> None:

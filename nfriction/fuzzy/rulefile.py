@@ -35,6 +35,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from nfriction import strict_json
 from nfriction.atomic import write_atomically
 from nfriction.fuzzy.membership import FuzzySet, sets_from_ranges
 from nfriction.fuzzy.rulebase import ANY, Rule, RuleBase, Variable
@@ -62,7 +63,7 @@ def load_rules(path: str | Path) -> RuleBase:
 def parse_rules(text: str, source: str = "rules") -> RuleBase:
     """Rule base from JSON text; `source` names it in errors."""
     try:
-        document = json.loads(text, object_pairs_hook=_unique, parse_constant=_refuse_constant)
+        document = strict_json.parse(text, _unique)
         return _rule_base(document)
     except RecursionError:
         raise ValueError(f"{source}: nested too deeply for a rule base.") from None
@@ -211,10 +212,6 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
             raise ValueError(f"{name!r} comes twice in the same place; every name once.")
         entries[name] = value
     return entries
-
-
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"numbers must be finite, got {name}.")
 
 
 def _check_keys(where: str, entry: Any, needed: set[str], allowed: set[str]) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from nfriction import strict_json
 from nfriction.modelfile.description import FORMAT, SCHEMA
 
 # A neuro-fuzzy model of ten joints takes less than a megabyte.
@@ -78,17 +79,6 @@ def short(value: object) -> str:
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"{name} is not JSON")
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    if math.isinf(value):
-        raise ValueError(f"{text[:40]} is beyond all numbers")
-    return value
-
-
 def _read_json(path: Path) -> tuple[int, Any]:
     """Size and content of a JSON file."""
     try:
@@ -98,7 +88,7 @@ def _read_json(path: Path) -> tuple[int, Any]:
         if size > LARGEST_FILE:
             raise ModelFileError(f"{path}: {size} bytes are too many for a model file.")
         text = path.read_text(encoding="utf-8")
-        return size, json.loads(text, parse_constant=_refuse_constant, parse_float=_finite)
+        return size, strict_json.parse(text)
     except FileNotFoundError:
         raise ModelFileError(f"{path}: no such file.") from None
     except OSError as error:

@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from nfriction import strict_json
 from nfriction.atomic import write_atomically
 from nfriction.plant import robotfile
 from nfriction.plant.axis import LinearAxis
@@ -129,13 +130,9 @@ def _short(value: object) -> str:
     return text if len(text) <= 300 else f"{text[:297]}..."
 
 
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"numbers must be finite, got {name}.")
-
-
 def _parse(text: str, suffix: str) -> Any:
     if suffix == ".json":
-        return json.loads(text, parse_constant=_refuse_constant)
+        return strict_json.parse(text)
     if suffix != ".toml":
         raise ValueError(f"a rig file ends in .json or .toml, .urdf or .xml, not {suffix!r}.")
     if sys.version_info < (3, 11):

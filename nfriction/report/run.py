@@ -1,6 +1,5 @@
 """Read what a comparison left in its folder, trusting none of it."""
 
-import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -9,6 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from nfriction import strict_json
 from nfriction.comparison import Comparison
 from nfriction.friction import MODELS, FrictionModel
 from nfriction.modelfile import ModelFileError, ModelInfo, info_of, load
@@ -108,7 +108,7 @@ def read_run(folder: str | Path) -> Run:
     if path.stat().st_size > LARGEST_RESULTS:
         raise RunError(f"{path}: is too large for results of a comparison.")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
+        content = strict_json.parse(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise RunError(f"{path}: is no JSON, or cut short ({error}).") from error
     try:
@@ -350,7 +350,3 @@ def _seconds(text: str, where: str) -> float:
         return float(text)
     except ValueError:
         raise _UnfitError(f"{where} has windows of {text!r} seconds") from None
-
-
-def _refuse(name: str) -> float:
-    raise ValueError(f"{name} is not JSON")
