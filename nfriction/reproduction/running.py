@@ -1,9 +1,11 @@
 """Runs the stages of a reproduction, several at a time, and goes on where an earlier run ended."""
 
+import os
 import signal
+import threading
 from collections.abc import Iterable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +55,7 @@ def _run_all(workspace: Workspace, waiting: dict[str, Stage], jobs: int, bar: "t
     running: dict[Future[None], str] = {}
     finished = False
     pool = ProcessPoolExecutor(
-        jobs, mp_context=get_context("spawn"), initializer=_end_when_interrupted
+        jobs, mp_context=get_context("spawn"), initializer=_end_with_the_caller
     )
     try:
         while waiting or running:
@@ -86,6 +88,15 @@ def _ready(waiting: Mapping[str, Stage], running: Iterable[str]) -> list[str]:
     return [name for name, stage in waiting.items() if not blocked & set(stage.needs)]
 
 
-def _end_when_interrupted() -> None:
+def _end_with_the_caller() -> None:
     # A solver keeps its best point on Ctrl-C; such a fit would pass for a finished one.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    # A caller that is killed cannot end its workers, which would wait for work for ever.
+    threading.Thread(target=_watch_the_caller, daemon=True).start()
+
+
+def _watch_the_caller() -> None:
+    caller = parent_process()
+    assert caller is not None
+    caller.join()
+    os._exit(1)

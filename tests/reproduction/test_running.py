@@ -63,6 +63,29 @@ def test_a_constant_model_is_fitted_judged_and_kept(tmp_path: Path) -> None:
     assert workspace.model("NCFM").exists()
 
 
+def test_workers_end_with_a_killed_caller(tmp_path: Path) -> None:
+    script = tmp_path / "run.py"
+    script.write_text(
+        "import os, signal, sys\n"
+        "from concurrent.futures import ProcessPoolExecutor\n"
+        "from multiprocessing import get_context\n"
+        "from nfriction.reproduction.running import _end_with_the_caller\n"
+        "if __name__ == '__main__':\n"
+        "    pool = ProcessPoolExecutor(\n"
+        "        1, mp_context=get_context('spawn'), initializer=_end_with_the_caller\n"
+        "    )\n"
+        "    print(pool.submit(os.getpid).result(), flush=True)\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    ended = subprocess.run([sys.executable, str(script)], capture_output=True, text=True)
+    assert ended.returncode == -signal.SIGKILL, ended.stderr
+    worker = Path("/proc") / ended.stdout.strip()
+    deadline = time.monotonic() + 60
+    while worker.exists() and "Z (zombie)" not in (worker / "status").read_text():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
 @pytest.mark.slow
 def test_a_run_that_is_killed_goes_on_where_it_was(tmp_path: Path) -> None:
     script = tmp_path / "run.py"
