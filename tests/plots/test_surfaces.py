@@ -54,7 +54,13 @@ def test_what_is_wholly_unknown_can_be_drawn(known):
     model, uncertainty = known
     lost = CoefficientUncertainty(model.schedule, torch.full_like(uncertainty.root, torch.inf))
     for draw in (plots.coefficient_surfaces, plots.coefficient_sections):
-        draw(model, [slow_motion()], uncertainty=lost).draw_without_rendering()
+        figure = draw(model, [slow_motion()], uncertainty=lost)
+        figure.draw_without_rendering()
+        meshes = [c for ax in figure.axes for c in ax.collections if isinstance(c, QuadMesh)]
+        # Nothing is shown as if it were known; a colour bar is a mesh without transparency.
+        shown = [mesh.get_alpha() for mesh in meshes if mesh.get_alpha() is not None]
+        assert len(shown) == (4 if draw is plots.coefficient_surfaces else 0)
+        assert all(np.max(alpha) < 0.5 for alpha in shown)
 
 
 def test_sections_are_the_coefficients_with_their_intervals(known):
