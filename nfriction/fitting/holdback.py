@@ -20,6 +20,8 @@ FOLDS = 3
 HEAD_START = 1.1
 # What may be taken of a correction; of what serves alike, the least.
 SHARES = (0.0, 0.25, 0.5, 1.0)
+# Standard errors by which a gain must show: 95 % of a normal distribution.
+SURE = 2.0
 # Below any error that an encoder can tell, in rad or m.
 LEAST_ERROR = 1e-9
 
@@ -48,7 +50,7 @@ def shares_by_joint(errors: Callable[[Tensor], Tensor], joints: int) -> Tensor:
     A window is judged by the ratio of its errors to those without the correction, and windows by
     their geometric mean: a single one of a motion that blows up all errors must not outvote the
     others. The share sought makes no joint worse and lowers the mean over joints most, which
-    counts as it is at worst within its standard error; a gain as small as that is none. First the
+    counts as it is at worst within twice its standard error; a smaller gain is none. First the
     same share is tried for all joints, then each joint's own until none changes.
 
     Args:
@@ -69,7 +71,7 @@ def shares_by_joint(errors: Callable[[Tensor], Tensor], joints: int) -> Tensor:
     def change(shares: tuple[float, ...]) -> float:
         ratio = logarithm(shares) - without
         own = ratio.mean(1)
-        found = own.mean() + own.std() / len(own) ** 0.5
+        found = own.mean() + SURE * own.std() / len(own) ** 0.5
         return float(found) if bool((ratio.mean(0) <= 0).all()) else math.inf
 
     best = min(((share,) * joints for share in SHARES), key=change)
