@@ -477,6 +477,9 @@ def test_initial_states_name_their_faults(tmp_path: Path) -> None:
     path.write_text("id,q0_1\na,0.5\n")
     with pytest.raises(ValueError, match=r"lacks columns qd0_1;"):
         read_initial_states(path)
+    path.write_text("id,q0_1,qd0_1\n,0.5,0\n")
+    with pytest.raises(ValueError, match="row 1 has no id"):
+        read_initial_states(path)
     path.write_text("id,q0_1,qd0_1,q0_2,qd0_2\na,0.5,0,1,\n")
     with pytest.raises(ValueError, match="finite q0 and qd0 of the same joints"):
         read_initial_states(path)

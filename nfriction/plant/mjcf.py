@@ -1,5 +1,6 @@
 """Links of an MJCF, as MuJoCo's own compiler understands it (default classes, geoms, meshes)."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -7,7 +8,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
-from nfriction.plant.reduction import HingedLink, RigidBody
+from nfriction.plant.reduction import LARGEST_NUMBER, HingedLink, RigidBody
 
 # What makes many bodies of a line, or reads other files as descriptions.
 _NO_CHAIN = ("replicate", "composite", "flexcomp", "attach", "plugin", "extension", "include")
@@ -38,11 +39,7 @@ def mjcf_links(path: Path, root: Element) -> tuple[list[HingedLink], NDArray[np.
             "reading an MJCF takes MuJoCo, whose compiler knows its default classes and "
             "geometries: pip install mujoco; or give a URDF or a rig file."
         ) from error
-    model = mujoco.MjModel.from_xml_path(str(path))
-    _refuse_more_than_hinges(model, mujoco)
-    data = mujoco.MjData(model)
-    data.qpos[:] = model.qpos0
-    mujoco.mj_kinematics(model, data)
+    model, data = _at_reference(path, mujoco)
     links: list[HingedLink] = []
     mover: list[int | None] = [None]  # of the world
     for body in range(1, model.nbody):
@@ -68,6 +65,28 @@ def mjcf_links(path: Path, root: Element) -> tuple[list[HingedLink], NDArray[np.
                 RigidBody(float(model.body_mass[body]), data.xipos[body].copy(), inertia)
             )
     return links, np.array(model.opt.gravity), root.get("model", "")
+
+
+def _at_reference(path: Path, mujoco: Any) -> tuple[Any, Any]:
+    """The compiled model, and its data at the reference pose."""
+    said: list[str] = []
+    handler = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(said.append)  # else MuJoCo writes a file where the user stands
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+        _refuse_more_than_hinges(model, mujoco)
+        data = mujoco.MjData(model)
+        data.qpos[:] = model.qpos0
+        mujoco.mj_kinematics(model, data)
+    finally:
+        mujoco.set_mju_user_warning(handler)
+    numbers = (model.body_mass, model.body_inertia, model.dof_armature, model.qpos0,
+               model.opt.gravity, data.xipos, data.ximat, data.xanchor, data.xaxis)  # fmt: skip
+    if not all((np.abs(x) <= LARGEST_NUMBER).all() for x in numbers):  # false of NaN
+        raise ValueError(f"its bodies and joints need numbers of at most {LARGEST_NUMBER:g}.")
+    for words in dict.fromkeys(said):
+        warnings.warn(f"{path}: MuJoCo says: {words}", stacklevel=2)
+    return model, data
 
 
 def _refuse_more_than_hinges(model: Any, mujoco: Any) -> None:

@@ -21,6 +21,8 @@ from nfriction.plant.inertia import inertia_tensors
 Array = NDArray[np.float64]
 
 MOST_JOINTS = 50
+# Of metres, kilograms and kg m^2: far beyond any mechanism, and squares of it can be added up.
+LARGEST_NUMBER = 1e9
 # A right angle written as 1.57 is off by less than this [rad]; beyond, it is meant.
 TILT = 1e-3
 # Of a link's length: how far its mass centre may lie off the line through its joints.

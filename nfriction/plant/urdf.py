@@ -6,13 +6,14 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
-from nfriction.plant.reduction import HingedLink, RigidBody
+from nfriction.plant.reduction import LARGEST_NUMBER, HingedLink, RigidBody
 
 Array = NDArray[np.float64]
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 """URDF has none; its world has z up (REP 103) [m/s^2]."""
 
+LONGEST_NAME = 200
 _HINGES = ("revolute", "continuous")
 
 
@@ -66,7 +67,8 @@ def _hinge(joint: Element, frame: Array, origin: Array, parent: int | None) -> H
     name = str(joint.get("name"))
     if joint.get("type") not in _HINGES:
         raise ValueError(
-            f"joint {name!r} is {joint.get('type')!r}; a pendulum's are revolute or continuous."
+            f"joint {name!r} is {joint.get('type', '')[:80]!r}; a pendulum's are revolute or "
+            "continuous."
         )
     if joint.find("mimic") is not None:
         raise ValueError(f"joint {name!r} mimics another; every joint must be free.")
@@ -121,8 +123,12 @@ def _numbers(
         values = np.array([float(word) for word in (text or "").split()])
     except ValueError:
         values = np.zeros(0)
-    if len(values) != count or not np.isfinite(values).all():
-        raise ValueError(f"{what}: `{key}` must be {count} finite numbers, got {text!r}.")
+    # False of NaN.
+    if len(values) != count or not (np.abs(values) <= LARGEST_NUMBER).all():
+        raise ValueError(
+            f"{what}: `{key}` must be {count} numbers of at most {LARGEST_NUMBER:g}, "
+            f"got {(text or '')[:80]!r}."
+        )
     return values
 
 
@@ -130,8 +136,12 @@ def _named(robot: Element, tag: str) -> dict[str, Element]:
     found: dict[str, Element] = {}
     for element in robot.findall(tag):
         name = element.get("name", "")
+        if len(name) > LONGEST_NAME:
+            raise ValueError(f"{tag} {name[:80]!r}... has a name of {len(name)} characters.")
         if not name or name in found:
-            raise ValueError(f"every {tag} needs a name of its own, got {name!r} again or empty.")
+            raise ValueError(
+                f"every {tag} needs a name of its own, got {name[:80]!r} again or empty."
+            )
         found[name] = element
     return found
 
@@ -140,5 +150,5 @@ def _link(joint: Element, end: str, name: str, links: dict[str, Element]) -> str
     given = joint.find(end)
     link = "" if given is None else given.get("link", "")
     if link not in links:
-        raise ValueError(f"joint {name!r} has a {end} that is no link: {link!r}.")
+        raise ValueError(f"joint {name!r} has a {end} that is no link: {link[:80]!r}.")
     return link

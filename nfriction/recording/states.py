@@ -47,7 +47,9 @@ def read_initial_states(
     if degrees:
         q0, qd0 = np.deg2rad(q0), np.deg2rad(qd0)
     states: dict[str, tuple[Array, Array]] = {}
-    for row, label in enumerate(table["id"].astype(str)):
+    for row, label in enumerate(table["id"].fillna("").astype(str)):
+        if not label:
+            raise ValueError(f"'{path}': row {row + 1} has no id.")
         state = np.stack([q0[row], qd0[row]])
         present = ~np.isnan(state[0])
         sound = np.array_equal(present, ~np.isnan(state[1])) and not np.isinf(state).any()

@@ -24,10 +24,11 @@ import torch
 
 from nfriction import LFM, NFLFM, NLFM, ModelInfo, save
 from nfriction.angles import AngleConvention
-from nfriction.export import pt2, torchscript
-from nfriction.export.contract import Contract, ContractError, contract_of
+from nfriction.export import onnx, pt2, torchscript
+from nfriction.export.contract import Contract, ContractError, contract_of, verify
 from nfriction.export.controller import controller_of
 from nfriction.export.errors import ExportError
+from nfriction.export.onnx_file import open_onnx
 from nfriction.export.program import open_pt2
 from nfriction.export.script import open_torchscript
 from nfriction.fuzzy import MamdaniController, load_fis, load_rules
@@ -303,6 +304,24 @@ convention = ["absolute", "hanging"]
 [buffers]
 drag_quadratic = [0.01, 0.01]
 """
+_URDF = b"""<robot name="bench"><link name="ground"/>
+<joint name="j1" type="continuous"><parent link="ground"/><child link="a"/>
+<origin xyz="0 0 1" rpy="0 0.1 0"/><axis xyz="0 1 0"/></joint>
+<link name="a"><inertial><origin xyz="0 0 -0.1"/><mass value="0.26"/>
+<inertia ixx="1e-3" iyy="1e-3" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="j2" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0 0 -0.2"/>
+<axis xyz="0 1 0"/><limit lower="-3" upper="3" effort="1" velocity="9"/></joint>
+<link name="b"><inertial><origin xyz="0 0 -0.15"/><mass value="0.12"/>
+<inertia ixx="1e-3" iyy="1e-3" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="grip" type="fixed"><parent link="b"/><child link="c"/><origin xyz="0 0 -0.3"/></joint>
+<link name="c"><inertial><mass value="0.02"/>
+<inertia ixx="1e-6" iyy="1e-6" izz="1e-6" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
+_MJCF = b"""<mujoco model="bench"><option gravity="0 0 -9.7"/><compiler angle="degree"/>
+<default><joint type="hinge" armature="0.002" damping="0.1"/><geom density="2700"/></default>
+<worldbody><body name="a" pos="0 0 1"><joint name="j1" axis="0 1 0"/>
+<geom type="capsule" size="0.01" fromto="0 0 0 0 0 -0.2"/>
+<body name="b" pos="0 0 -0.2" euler="0 5 0"><joint name="j2" axis="0 1 0" ref="20"/>
+<geom type="box" size="0.01 0.01 0.1" pos="0 0 -0.1"/></body></body></worldbody></mujoco>"""
 
 
 def _read_rig(path: Path) -> None:
@@ -455,6 +474,11 @@ def _read_torchscript(path: Path) -> None:
     open_torchscript(path)
 
 
+def _read_onnx(path: Path) -> None:
+    contract, run = open_onnx(path)
+    verify(run, contract)
+
+
 # Folders of results.
 
 
@@ -515,6 +539,8 @@ LOADERS: dict[str, Loader] = {
         Loader("initial_states", ".csv", lambda _: [_STATES], _read_states, damage_text),
         Loader("rig_json", ".json", _json_samples(*_RIGS), _read_rig, damage_json),
         Loader("rig_toml", ".toml", lambda _: [_TOML], _read_rig, damage_text, needs="tomllib"),
+        Loader("urdf", ".urdf", lambda _: [_URDF], _read_rig, damage_text),
+        Loader("mjcf", ".xml", lambda _: [_MJCF], _read_rig, damage_text, needs="mujoco"),
         Loader("rules", ".json", _rule_samples, lambda p: _check_rules(load_rules(p)),
                damage_json),
         Loader("fis", ".fis", lambda _: [_FIS], lambda p: _check_rules(load_fis(p)), damage_text),
@@ -526,6 +552,8 @@ LOADERS: dict[str, Loader] = {
         Loader("figure", ".png", _figure_samples, _read_figure, damage_bytes, names_file=False),
         Loader("pt2", ".pt2", _artefact(pt2), _read_pt2, _damage_artefact, _ARTEFACT,
                names_file=False),
+        Loader("onnx", ".onnx", _artefact(onnx), _read_onnx, damage_bytes, _ARTEFACT,
+               names_file=False, needs="onnx"),
         Loader("torchscript", ".pt", _artefact(torchscript), _read_torchscript, _damage_artefact,
                _ARTEFACT, names_file=False),
     )

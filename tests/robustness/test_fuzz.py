@@ -20,7 +20,7 @@ from tests.robustness.fuzz import fuzz
 from tests.robustness.loaders import LOADERS, Loader
 
 # Programs of torch take a second a case.
-QUICK = [name for name in LOADERS if name not in ("pt2", "torchscript")]
+QUICK = [name for name in LOADERS if name not in ("onnx", "pt2", "torchscript")]
 
 
 def needed(name: str) -> Loader:
