@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from nfriction import NFLFM, FrictionModel, PendulumChain, rigs
+from nfriction.friction.constant import Constant
 from nfriction.friction.laws import Coefficient, Law, smooth_sign
 from nfriction.friction.neurofuzzy import NeuroFuzzy
-from nfriction.friction.schedules import Constant
 
 STEPS, DT = 40_000, 1e-3
 # Strong enough that the release below stays regular: states of all contestants can be compared at

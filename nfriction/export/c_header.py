@@ -5,16 +5,9 @@ from typing import Any
 
 from nfriction.codegen.emit import Real
 from nfriction.export.c_dialect import comment
-from nfriction.export.controller import (
-    CLAMPED,
-    FILTER_STATE,
-    NOT_FINITE,
-    SATURATED,
-    AnyController,
-    Controller,
-    FilteredController,
-    MemoryController,
-)
+from nfriction.export.controller import AnyController
+from nfriction.export.filtered import FILTER_STATE, FilteredController
+from nfriction.export.unfiltered import CLAMPED, NOT_FINITE, SATURATED, Controller, MemoryController
 
 
 def header_of(

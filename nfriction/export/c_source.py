@@ -20,15 +20,11 @@ from nfriction.export.c_header import (
     init_signature,
     step_signature,
 )
-from nfriction.export.controller import (
-    FILTER_STATE,
-    AnyController,
-    Controller,
-    FilteredController,
-    MemoryController,
-)
+from nfriction.export.controller import AnyController
 from nfriction.export.errors import ExportError
+from nfriction.export.filtered import FILTER_STATE, FilteredController
 from nfriction.export.flat import shortened
+from nfriction.export.unfiltered import Controller, MemoryController
 
 
 @dataclass(frozen=True)

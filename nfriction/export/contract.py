@@ -11,19 +11,12 @@ import torch
 from torch import Tensor
 
 from nfriction import strict_json
-from nfriction.export.controller import (
-    CLAMPED,
-    NOT_FINITE,
-    SATURATED,
-    AnyController,
-    Controller,
-    FilteredController,
-    MemoryController,
-    controller_of,
-)
+from nfriction.export.controller import AnyController, controller_of
 from nfriction.export.errors import ContractError, first_line
+from nfriction.export.filtered import FilteredController
 from nfriction.export.parity import COEFFICIENT_SLACK, Parity, compare
 from nfriction.export.points import draw, trials
+from nfriction.export.unfiltered import CLAMPED, NOT_FINITE, SATURATED, Controller, MemoryController
 from nfriction.friction import FrictionModel
 from nfriction.modelfile import ModelInfo, describe
 

@@ -11,7 +11,7 @@ from typing import TypeVar
 
 from torch import Tensor, nn
 
-from nfriction.export.controller import FilteredController
+from nfriction.export.filtered import FilteredController
 from nfriction.export.flat_numbers import NumberByNumber
 from nfriction.export.flat_tensors import TensorByTensor
 from nfriction.friction import FrictionModel, NeuroFuzzy

@@ -10,10 +10,11 @@ import torch
 
 from nfriction.atomic import replacing
 from nfriction.export.contract import OUTPUTS, Contract, Runner, contract_of, verify
-from nfriction.export.controller import Controller, controller_of
+from nfriction.export.controller import controller_of
 from nfriction.export.errors import ExportError, first_line
 from nfriction.export.onnx_graph import OnnxGraph
 from nfriction.export.program import METADATA, exported, run_stateful, silent
+from nfriction.export.unfiltered import Controller
 from nfriction.friction import FrictionModel
 from nfriction.modelfile import ModelInfo
 

@@ -5,7 +5,9 @@ import math
 import torch
 from torch import Tensor
 
-from nfriction.export.controller import UNBOUNDED, AnyController, Controller, FilteredController
+from nfriction.export.controller import AnyController
+from nfriction.export.filtered import FilteredController
+from nfriction.export.unfiltered import UNBOUNDED, Controller
 
 Series = tuple[Tensor, ...]
 

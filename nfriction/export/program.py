@@ -16,15 +16,11 @@ from torch import Tensor, nn
 
 from nfriction.atomic import replacing
 from nfriction.export.contract import Contract, Runner, contract_of, verify
-from nfriction.export.controller import (
-    AnyController,
-    Controller,
-    FilteredController,
-    MemoryController,
-    controller_of,
-)
+from nfriction.export.controller import AnyController, controller_of
 from nfriction.export.errors import ExportError, first_line
+from nfriction.export.filtered import FilteredController
 from nfriction.export.points import draw
+from nfriction.export.unfiltered import Controller, MemoryController
 from nfriction.friction import FrictionModel
 from nfriction.modelfile import ModelInfo
 

@@ -14,8 +14,8 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from nfriction.atomic import write_atomically
-from nfriction.export.controller import memory_of
 from nfriction.export.robot_xml import mjcf_snippet, patched, urdf_snippet
+from nfriction.export.unfiltered import memory_of
 from nfriction.friction import FrictionModel
 from nfriction.modelfile import ModelInfo
 from nfriction.signals import Motion

@@ -15,18 +15,14 @@ from nfriction.export.contract import (
     run_through,
     verify,
 )
-from nfriction.export.controller import (
-    AnyController,
-    Controller,
-    FilteredController,
-    MemoryController,
-    controller_of,
-)
+from nfriction.export.controller import AnyController, controller_of
 from nfriction.export.errors import ExportError
+from nfriction.export.filtered import FilteredController
 from nfriction.export.onnx_file import open_onnx
 from nfriction.export.points import draw
 from nfriction.export.program import open_pt2
 from nfriction.export.script import open_torchscript
+from nfriction.export.unfiltered import Controller, MemoryController
 from nfriction.friction import FrictionModel
 from nfriction.modelfile import ModelInfo, parameter_hash
 

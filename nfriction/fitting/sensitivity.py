@@ -18,7 +18,7 @@ from torch import Tensor
 from nfriction import codegen
 from nfriction.fitting.plant_parameters import PlantParameter, adjusted_buffers
 from nfriction.friction import FrictionModel
-from nfriction.friction.schedules import FactoredSensitivity, Sensitivity
+from nfriction.friction.sensitivity import FactoredSensitivity, Sensitivity
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.simulation import Rollout, rk4_step
 

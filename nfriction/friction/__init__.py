@@ -2,6 +2,7 @@
 
 from nfriction.friction.adaptive import CLASSES, Adaptive
 from nfriction.friction.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
+from nfriction.friction.constant import Constant
 from nfriction.friction.controller_schedule import RadialBasis
 from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.models import (
@@ -23,7 +24,7 @@ from nfriction.friction.models import (
     model_by_name,
 )
 from nfriction.friction.neurofuzzy import NeuroFuzzy
-from nfriction.friction.schedules import Constant, Schedule
+from nfriction.friction.schedules import Schedule
 
 __all__ = [
     "ACVFM",

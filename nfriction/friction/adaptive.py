@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from nfriction.friction.laws import Law
-from nfriction.friction.schedules import Sensitivity, Tabulated
+from nfriction.friction.schedules import Tabulated
+from nfriction.friction.sensitivity import Sensitivity
 
 CLASSES = ("low", "medium", "high")
 

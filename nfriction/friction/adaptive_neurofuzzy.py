@@ -14,7 +14,8 @@ from nfriction.friction.neurofuzzy import (
     NeuroFuzzy,
     soft_positive_inverse,
 )
-from nfriction.friction.schedules import FactoredSensitivity, Schedule
+from nfriction.friction.schedules import Schedule
+from nfriction.friction.sensitivity import FactoredSensitivity
 from nfriction.fuzzy.membership import HALF_WIDTH_OF_GAUSSIAN
 from nfriction.fuzzy.placement import crossing_half_widths
 

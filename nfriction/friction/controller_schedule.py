@@ -6,8 +6,10 @@ from typing import Any, Final, Literal
 import torch
 from torch import Tensor, nn
 
+from nfriction.friction.constant import Constant
 from nfriction.friction.laws import Law
-from nfriction.friction.schedules import Constant, Schedule, Sensitivity
+from nfriction.friction.schedules import Schedule
+from nfriction.friction.sensitivity import Sensitivity
 from nfriction.fuzzy import RBFNetwork
 
 

@@ -10,10 +10,11 @@ from torch import Tensor, nn
 from nfriction.friction import laws
 from nfriction.friction.adaptive import Adaptive
 from nfriction.friction.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
+from nfriction.friction.constant import Constant
 from nfriction.friction.controller_schedule import RadialBasis
 from nfriction.friction.laws import Law
 from nfriction.friction.neurofuzzy import PRIOR_SD, NeuroFuzzy
-from nfriction.friction.schedules import Constant, Schedule
+from nfriction.friction.schedules import Schedule
 
 # Velocity over which the sign turns [rad/s]; larger values creep, smaller ones make RK4 unstable.
 V_SMOOTH = 3e-3

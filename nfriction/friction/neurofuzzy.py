@@ -6,8 +6,10 @@ from typing import Any, Final, Literal
 import torch
 from torch import Tensor, nn
 
+from nfriction.friction.constant import Constant
 from nfriction.friction.laws import Law
-from nfriction.friction.schedules import Constant, FactoredSensitivity, Schedule
+from nfriction.friction.schedules import Schedule
+from nfriction.friction.sensitivity import FactoredSensitivity
 from nfriction.fuzzy import AnfisRBF
 
 # Below a thousandth of its scale a coefficient is as good as zero, and must be able to rise.

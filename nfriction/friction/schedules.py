@@ -8,99 +8,16 @@ shape (*batch, joint) -> (*batch, joint, coefficient). Fits see it through `para
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from nfriction.friction.laws import Coefficient, Law
+from nfriction.friction.sensitivity import FactoredSensitivity, Sensitivity
 
 # Smallest value a positive coefficient takes: far below any torque that a sensor can tell.
 SMALLEST = 1e-12
-
-
-@dataclass(frozen=True)
-class Sensitivity:
-    """Derivatives of the coefficients at given motions.
-
-    A parameter acts on one joint's coefficients only, which `joint` names, so the derivative with
-    respect to the parameters needs no joint axis.
-
-    Attributes:
-        parameters: with respect to the parameter vector, (sample, coefficient, parameter).
-        joint: the joint that each parameter acts on, (parameter,).
-        qd: with respect to the joint's own velocity, (sample, joint, coefficient).
-        qdd: with respect to the joint's own acceleration, (sample, joint, coefficient).
-    """
-
-    parameters: Tensor
-    joint: Tensor
-    qd: Tensor
-    qdd: Tensor
-
-    def pulled(self, held: Tensor) -> Tensor:
-        """Derivatives by the parameters of what depends on the coefficients at many samples.
-
-        Args:
-            held: derivatives by the coefficients, (block, row, sample, joint, coefficient); the
-                blocks' samples are those of this sensitivity, one block after the other.
-
-        Returns:
-            Shape (block, row, parameter).
-        """
-        blocks, rows, samples, joints, k = held.shape
-        by_parameter = self.parameters.reshape(blocks, samples * k, -1)
-        found = held.new_empty(blocks, rows, len(self.joint))
-        for joint in range(joints):
-            own = (self.joint == joint).nonzero().squeeze(-1)
-            found[..., own] = held[..., joint, :].flatten(2) @ by_parameter[..., own]
-        return found
-
-
-@dataclass(frozen=True)
-class FactoredSensitivity:
-    """The same of a schedule whose outputs share features, which are then never multiplied out.
-
-    Parameters come in groups, each laid out as (joint, output, feature).
-
-    Attributes:
-        factors: of each group, the coefficients' derivatives by the outputs, (sample, joint,
-            coefficient, output), and the outputs' by their parameters, (sample, joint, feature).
-        qd, qdd: as in `Sensitivity`.
-    """
-
-    factors: tuple[tuple[Tensor, Tensor], ...]
-    qd: Tensor
-    qdd: Tensor
-
-    @property
-    def parameters(self) -> Tensor:
-        """Multiplied out, as in `Sensitivity`."""
-        whole = [torch.einsum("sjko,sjf->skjof", *factor).flatten(2) for factor in self.factors]
-        return torch.cat(whole, -1)
-
-    @property
-    def joint(self) -> Tensor:
-        """As in `Sensitivity`."""
-        rows = []
-        for mix, features in self.factors:
-            joints = torch.arange(mix.shape[1], device=mix.device)
-            rows.append(joints.repeat_interleave(mix.shape[-1] * features.shape[-1]))
-        return torch.cat(rows)
-
-    def pulled(self, held: Tensor) -> Tensor:
-        """As in `Sensitivity`."""
-        blocks, rows, samples = held.shape[:3]
-        by_sample = held.permute(0, 2, 3, 1, 4)
-        found = []
-        for mix, features in self.factors:
-            mixed = by_sample @ mix.unflatten(0, (blocks, samples))
-            # (block, joint, row and output, sample) by (block, joint, sample, feature).
-            left = mixed.permute(0, 2, 3, 4, 1).flatten(2, 3)
-            both = left @ features.unflatten(0, (blocks, samples)).transpose(1, 2)
-            found.append(both.unflatten(2, (rows, -1)).transpose(1, 2).flatten(2))
-        return torch.cat(found, -1)
 
 
 class Schedule(nn.Module, ABC):
@@ -330,47 +247,3 @@ class Tabulated(Schedule):
             torch.where(fitted, lower, values).reshape(-1),
             torch.where(fitted, upper, values).reshape(-1),
         )
-
-
-class Constant(Tabulated):
-    """Coefficients that do not depend on the motion.
-
-    Args:
-        law: the law whose coefficients these are.
-        joints: number of joints.
-        initial: start values in SI, shape (joint, coefficient) or (coefficient,); default as in
-            `Tabulated`.
-    """
-
-    def __init__(self, law: Law, joints: int, initial: Tensor | Sequence | None = None) -> None:
-        super().__init__(law, joints, initial)
-        # Of the fit under way, and no part of the model.
-        self._prior_sd: list[list[float]] = [[math.inf] * len(law.names)] * joints
-
-    def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
-        return self.table()
-
-    def prior(self) -> tuple[Tensor, Tensor]:
-        vector = self.parameter_vector()
-        return torch.zeros_like(vector), vector.new_tensor(self._prior_sd).reshape(-1)
-
-    def set_prior_sd(self, sd: Tensor) -> None:
-        """Set the standard deviation around zero that a fit expects of each coefficient.
-
-        Args:
-            sd: in SI, (joint, coefficient); infinite where nothing is known.
-        """
-        self._prior_sd = sd.tolist()
-
-    def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
-        joints, k = self.raw.shape
-        samples = qd.shape[0]
-        identity = torch.eye(k, dtype=self.raw.dtype, device=self.raw.device).repeat(1, joints)
-        zero = self.raw.new_zeros(()).expand(samples, joints, k)
-        joint = torch.arange(joints, device=self.raw.device).repeat_interleave(k)
-        return Sensitivity(identity.expand(samples, -1, -1), joint, zero, zero)
-
-    def extra_repr(self) -> str:
-        columns = [f"{v:.4g}" for v in self.values.mean(0)]
-        mean = ", ".join(f"{n}={v}" for n, v in zip(self.coefficient_names, columns, strict=True))
-        return f"joints={self.joints}, mean {mean}"

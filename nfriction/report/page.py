@@ -3,44 +3,17 @@
 import base64
 import hashlib
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from importlib import resources
 
 from nfriction.comparison import NO_FRICTION
 from nfriction.report import tables
+from nfriction.report.figures import enlarged, shown
 from nfriction.report.markup import Markup, element, joined
 from nfriction.report.rules import rules_in_words
-from nfriction.report.run import Figure, Run
+from nfriction.report.run import Run
 from nfriction.report.tables import Cell, Table
 from nfriction.version import __version__
-
-_CAPTIONS = {
-    "rmse_held_out": "Position error by model and joint, held-out recordings",
-    "rmse_train": "Position error by model and joint, recordings trained on",
-    "horizons_held_out": "Position error over the length of the simulation, held-out recordings; "
-    "the band is what one encoder count at the start does",
-    "horizons_train": "Position error over the length of the simulation, recordings trained on",
-    "torque_over_velocity": "Friction torque over velocity: the models' laws over what the "
-    "recorded motion implies",
-}
-_ORDER = (
-    "rmse_held", "horizons_held", "rmse", "horizons", "positions_held", "positions", "torque",
-    "over_time", "coefficients", "sections", "memberships",
-)  # fmt: skip
-_PREFIXES = {
-    "positions_held_out_": "Measured and simulated position with the error below, held out: ",
-    "positions_train_": "Measured and simulated position with the error below, trained on: ",
-    "coefficients_": "Coefficients over velocity and acceleration (hatched: no data; faded: the "
-    "fit leaves much of the value open; lines hold 50 % and 90 % of the samples) of ",
-    "sections_": "Coefficients over velocity at three accelerations, with 95 % intervals (faint: "
-    "no data) of ",
-    "memberships_": "Fuzzy sets of velocity and acceleration of ",
-    "over_time_": "Coefficients along the first recording trained on, models of the law: ",
-}
-# A figure's twin for a dark screen.
-_DARK = ".dark"
-WIDE = 700
-"""Pixels beyond which half a page is too narrow for a figure."""
 
 
 def to_html(run: Run) -> str:
@@ -71,7 +44,7 @@ def to_html(run: Run) -> str:
             for anchor, heading, content in sections
         )),
         element("footer", element("p", f"Written by nfriction {__version__}.")),
-        _dialog(),
+        enlarged(),
         element("script", Markup(script)),
     ]  # fmt: skip
     head = element(
@@ -146,7 +119,7 @@ def _sections(run: Run) -> Iterator[tuple[str, str, Markup]]:
         table = _table(tables.selection_table(run.selection))
         yield "choice", "Choice by training data alone", joined(told, table)
     if run.figures:
-        yield "figures", "Figures", element("div", *_figures(run.figures), class_="figures")
+        yield "figures", "Figures", element("div", *shown(run.figures), class_="figures")
     yield "data", "What was fitted on which file", joined(*_data(run))
     failed = [_failure(name, why) for name, why in run.comparison.failed.items()]
     if run.fits or failed:
@@ -295,67 +268,3 @@ def _value(cell: Cell) -> str | None:
 
 def _folded(table: Table) -> Markup:
     return element("details", element("summary", table.caption), _table(table))
-
-
-def _figures(figures: Sequence[Figure]) -> Iterator[Markup]:
-    """Every figure, in a useful order, with its twin for a dark screen where there is one."""
-    by_name = {figure.name: figure for figure in figures}
-    for figure in sorted(figures, key=lambda figure: _rank(figure.name)):
-        if figure.name.removesuffix(_DARK) in by_name.keys() - {figure.name}:
-            continue  # shown with the other
-        yield _figure(figure, by_name.get(figure.name + _DARK))
-
-
-def _figure(figure: Figure, dark: Figure | None) -> Markup:
-    caption = caption_of(figure.name)
-    picture = element(
-        "img", src=_source(figure), alt=caption, width=str(figure.width),
-        height=str(figure.height),
-    )  # fmt: skip
-    if dark is not None:
-        picture = element(
-            "picture",
-            element("source", media="(prefers-color-scheme: dark)", srcset=_source(dark)),
-            picture,
-        )
-    button = element(
-        "button", picture, type="button", class_="zoom", aria_label=f"Enlarge: {caption}"
-    )
-    wide = "wide" if figure.width > WIDE else None
-    return element("figure", button, element("figcaption", caption), class_=wide)
-
-
-def _source(figure: Figure) -> str:
-    return "data:image/png;base64," + base64.b64encode(figure.png).decode()
-
-
-def _rank(name: str) -> int:
-    """Errors first, then motions, then what is inside the models."""
-    ranks = (k for k, prefix in enumerate(_ORDER) if name.startswith(prefix))
-    return next(ranks, len(_ORDER))
-
-
-def caption_of(name: str) -> str:
-    """What a figure of that name shows."""
-    if name in _CAPTIONS:
-        return _CAPTIONS[name]
-    for prefix, words in _PREFIXES.items():
-        if name.startswith(prefix):
-            return words + name.removeprefix(prefix)
-    return name.replace("_", " ")
-
-
-def _dialog() -> Markup:
-    """Where a figure is looked at closely."""
-    keys = [("out", "−", "Smaller"), ("fit", "Fit", "Fit to the window"), ("in", "+", "Larger"),
-            ("close", "Close", "Close")]  # fmt: skip
-    buttons = (
-        element("button", sign, type="button", data_do=do, aria_label=word)
-        for do, sign, word in keys
-    )
-    return element(
-        "dialog",
-        element("div", *buttons, class_="tools"),
-        element("div", element("img", alt=""), class_="view", tabindex="0"),
-        aria_label="Figure",
-    )

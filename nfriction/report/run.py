@@ -1,10 +1,10 @@
 """Read what a comparison left in its folder, trusting none of it."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -12,15 +12,13 @@ from nfriction import strict_json
 from nfriction.comparison import Comparison
 from nfriction.friction import MODELS, FrictionModel
 from nfriction.modelfile import ModelFileError, ModelInfo, info_of, load
+from nfriction.report.entries import UnfitError, mapped, mapping, number, seconds, text, texts
+from nfriction.report.png import Figure, read_figures
 from nfriction.scoring import Rmse, Score
 from nfriction.selection import Candidate, Selection
 
-# Far beyond any run of ours; what is larger is no results file or figure.
-LARGEST_RESULTS, LARGEST_FIGURE, MOST_FIGURES = 64 * 2**20, 16 * 2**20, 100
-LARGEST_NUMBER = 10**100
-_PNG = b"\x89PNG\r\n\x1a\n"
-
-T = TypeVar("T")
+# Far beyond any run of ours; what is larger is no results file.
+LARGEST_RESULTS = 64 * 2**20
 
 
 class RunError(ValueError):
@@ -45,16 +43,6 @@ class FitRecord:
     lost: tuple[str, ...]
     plant: dict[str, float]
     intervals: dict[str, tuple[float, float]]
-
-
-@dataclass(frozen=True)
-class Figure:
-    """A PNG file with its size in pixels."""
-
-    name: str
-    png: bytes
-    width: int
-    height: int
 
 
 @dataclass(frozen=True)
@@ -112,23 +100,19 @@ def read_run(folder: str | Path) -> Run:
     except (ValueError, RecursionError) as error:
         raise RunError(f"{path}: is no JSON, or cut short ({error}).") from error
     try:
-        return _run(folder, _mapping(content, "the file"))
-    except _UnfitError as error:
+        return _run(folder, mapping(content, "the file"))
+    except UnfitError as error:
         raise RunError(f"{path}: not results of a comparison: {error}.") from error
 
 
-class _UnfitError(ValueError):
-    """What is wrong with an entry."""
-
-
 def _run(folder: Path, content: Mapping[str, Any]) -> Run:
-    joints = _texts(content.get("joints"), "`joints`")
+    joints = texts(content.get("joints"), "`joints`")
     unit = content.get("units")
     if unit not in ("rad", "m"):
-        raise _UnfitError('`units` must be "rad" or "m"')
-    entries = _mapped(content.get("models"), "`models`", _mapping)
+        raise UnfitError('`units` must be "rad" or "m"')
+    entries = mapped(content.get("models"), "`models`", mapping)
     if not joints or not entries:
-        raise _UnfitError("it has no joints or no models")
+        raise UnfitError("it has no joints or no models")
     scores = {
         kind: {
             name: _scores(entry.get(kind, {}), f"{name}, {kind}", len(joints))
@@ -140,16 +124,16 @@ def _run(folder: Path, content: Mapping[str, Any]) -> Run:
         # Tables pool the recordings of a model, so all must have been scored on the same.
         forms = {tuple((s.recording, *s.windows) for s in many) for many in of.values()}
         if len(forms) > 1:
-            raise _UnfitError(f"its models were scored on different recordings ({kind})")
+            raise UnfitError(f"its models were scored on different recordings ({kind})")
     fits = {n: _fit(e["fit"], n) for n, e in entries.items() if "fit" in e}
     train, held_out = ({n: s for n, s in of.items() if s} for of in scores.values())
     if not train and not held_out:
-        raise _UnfitError("it has no scores")
+        raise UnfitError("it has no scores")
     models, notes = _models(folder, fits, len(joints))
-    figures, unread = _figures(folder / "figures")
-    best = _mapping(content.get("best") or {}, "`best`")
-    if best and _text(best.get("model"), "`best`") not in entries:
-        raise _UnfitError("its best model is none of its models")
+    figures, unread = read_figures(folder / "figures")
+    best = mapping(content.get("best") or {}, "`best`")
+    if best and text(best.get("model"), "`best`") not in entries:
+        raise UnfitError("its best model is none of its models")
     return Run(
         folder=folder,
         comparison=Comparison(
@@ -158,7 +142,7 @@ def _run(folder: Path, content: Mapping[str, Any]) -> Run:
             held_out,
             unit,
             joints,
-            failed=_mapped(content.get("failed", {}), "`failed`", _text),
+            failed=mapped(content.get("failed", {}), "`failed`", text),
         ),
         fits=fits,
         coefficients={
@@ -167,11 +151,11 @@ def _run(folder: Path, content: Mapping[str, Any]) -> Run:
             if "coefficients" in e
         },
         best=best.get("model"),
-        judged_by=_text(best.get("by", ""), "`best`"),
-        command=_text(content.get("command", ""), "`command`"),
+        judged_by=text(best.get("by", ""), "`best`"),
+        command=text(content.get("command", ""), "`command`"),
         recordings={
-            kind: _mapped(digests, "`recordings`", _text)
-            for kind, digests in _mapping(content.get("recordings", {}), "`recordings`").items()
+            kind: mapped(digests, "`recordings`", text)
+            for kind, digests in mapping(content.get("recordings", {}), "`recordings`").items()
         },
         models=models,
         figures=figures,
@@ -183,18 +167,18 @@ def _run(folder: Path, content: Mapping[str, Any]) -> Run:
 def _scores(value: object, where: str, joints: int) -> list[Score]:
     nothing = np.zeros(0)
     found = []
-    for recording, entry in _mapped(value, where, _mapping).items():
+    for recording, entry in mapped(value, where, mapping).items():
         at = f"{where}, {recording}"
-        windows = _mapped(entry.get("windows", {}), at, lambda v, w: _rmse(v, w, joints))
+        windows = mapped(entry.get("windows", {}), at, lambda v, w: _rmse(v, w, joints))
         for horizon in windows:
-            _seconds(horizon, at)
+            seconds(horizon, at)
         floor = entry.get("floor")
         diverged_at = entry.get("diverged_at")
         found.append(
             Score(
                 recording, _rmse(entry.get("free_run"), at, joints), windows,
                 None if floor is None else _rmse(floor, at, joints), nothing, nothing,
-                math.inf if diverged_at is None else _number(diverged_at, at),
+                math.inf if diverged_at is None else number(diverged_at, at),
             )
         )  # fmt: skip
     return found
@@ -204,76 +188,76 @@ def _selection(value: object, unit: str) -> Selection | None:
     if value is None:
         return None
     where = "`selection`"
-    entry = _mapping(value, where)
-    candidates = _mapped(entry.get("candidates"), where, _candidate)
-    chosen = _text(entry.get("chosen"), where)
+    entry = mapping(value, where)
+    candidates = mapped(entry.get("candidates"), where, _candidate)
+    chosen = text(entry.get("chosen"), where)
     if chosen not in candidates:
-        raise _UnfitError(f"{where} chose none of its candidates")
+        raise UnfitError(f"{where} chose none of its candidates")
     return Selection(
-        chosen, _text(entry.get("reason", ""), where),
+        chosen, text(entry.get("reason", ""), where),
         tuple(replace(c, name=name) for name, c in candidates.items()),
-        _number(entry.get("horizon"), where), unit,
+        number(entry.get("horizon"), where), unit,
     )  # fmt: skip
 
 
 def _candidate(value: object, where: str) -> Candidate:
-    entry = _mapping(value, where)
+    entry = mapping(value, where)
     blocks = entry.get("blocks")
     if not isinstance(blocks, list) or not blocks:
-        raise _UnfitError(f"{where} needs the error of each block")
-    errors = tuple(math.inf if e is None else _number(e, where) for e in blocks)
-    parameters = int(_number(entry.get("parameters"), where))
+        raise UnfitError(f"{where} needs the error of each block")
+    errors = tuple(math.inf if e is None else number(e, where) for e in blocks)
+    parameters = int(number(entry.get("parameters"), where))
     return Candidate("", errors, parameters, entry.get("converged") is True)
 
 
 def _rmse(value: object, where: str, joints: int) -> Rmse:
     """Errors of a simulation; one that diverged has null for a number."""
-    entry = _mapping(value, where)
+    entry = mapping(value, where)
     of_joints = entry.get("joints")
     if not isinstance(of_joints, list) or len(of_joints) != joints:
-        raise _UnfitError(f"{where} needs an error for each of {joints} joints")
-    errors = [math.inf if e is None else _number(e, where) for e in (*of_joints, entry.get("all"))]
+        raise UnfitError(f"{where} needs an error for each of {joints} joints")
+    errors = [math.inf if e is None else number(e, where) for e in (*of_joints, entry.get("all"))]
     if min(errors) < 0:
-        raise _UnfitError(f"{where} has a negative error")
+        raise UnfitError(f"{where} has a negative error")
     return Rmse(tuple(errors[:-1]), errors[-1])
 
 
 def _fit(value: object, name: str) -> FitRecord:
-    entry, where = _mapping(value, f"fit of {name}"), f"fit of {name}"
+    entry, where = mapping(value, f"fit of {name}"), f"fit of {name}"
     return FitRecord(
-        status=_text(entry.get("status", "unknown"), where),
+        status=text(entry.get("status", "unknown"), where),
         converged=entry.get("converged") is True,
-        residual=_number(entry.get("residual", math.nan), where),
-        residual_unit=_text(entry.get("residual_unit", ""), where),
-        at_bounds=_texts(entry.get("at_bounds", []), where),
-        warnings=_texts(entry.get("warnings", []), where),
-        lost=_texts(entry.get("lost", []), where),
-        plant=_mapped(entry.get("plant", {}), where, _number),
-        intervals=_mapped(entry.get("intervals", {}), where, _interval),
+        residual=number(entry.get("residual", math.nan), where),
+        residual_unit=text(entry.get("residual_unit", ""), where),
+        at_bounds=texts(entry.get("at_bounds", []), where),
+        warnings=texts(entry.get("warnings", []), where),
+        lost=texts(entry.get("lost", []), where),
+        plant=mapped(entry.get("plant", {}), where, number),
+        intervals=mapped(entry.get("intervals", {}), where, _interval),
     )
 
 
 def _interval(value: object, where: str) -> tuple[float, float]:
     if not isinstance(value, list) or len(value) != 2:
-        raise _UnfitError(f"an interval of {where} needs two ends")
+        raise UnfitError(f"an interval of {where} needs two ends")
     low, high = value
     return (
-        -math.inf if low is None else _number(low, where),
-        math.inf if high is None else _number(high, where),
+        -math.inf if low is None else number(low, where),
+        math.inf if high is None else number(high, where),
     )
 
 
 def _coefficients(value: object, name: str, joints: int) -> dict[str, dict[str, tuple[float, ...]]]:
     where = f"coefficients of {name}"
-    entry = _mapping(value, where)
+    entry = mapping(value, where)
     sets = entry if all(isinstance(v, dict) for v in entry.values()) else {"always": entry}
 
     def values(given: object, at: str) -> tuple[float, ...]:
         if not isinstance(given, list) or len(given) != joints:
-            raise _UnfitError(f"{at} need a value for each of {joints} joints")
-        return tuple(_number(x, at) for x in given)
+            raise UnfitError(f"{at} need a value for each of {joints} joints")
+        return tuple(number(x, at) for x in given)
 
-    return {label: _mapped(of, where, values) for label, of in sets.items()}
+    return {label: mapped(of, where, values) for label, of in sets.items()}
 
 
 def _models(
@@ -296,57 +280,3 @@ def _models(
             continue
         found[name] = (model, info)
     return found, notes
-
-
-def _figures(folder: Path) -> tuple[tuple[Figure, ...], list[str]]:
-    found: list[Figure] = []
-    notes = []
-    for path in sorted(folder.glob("*.png"))[:MOST_FIGURES]:
-        if not path.is_file() or path.stat().st_size > LARGEST_FIGURE:
-            notes.append(f"figure {path.name}: no file, or too large")
-            continue
-        png = path.read_bytes()
-        if not png.startswith(_PNG) or len(png) < 24:
-            notes.append(f"figure {path.name}: not a PNG file")
-            continue
-        width, height = (int.from_bytes(png[k : k + 4], "big") for k in (16, 20))
-        found.append(Figure(path.stem, png, width, height))
-    return tuple(found), notes
-
-
-def _mapping(value: object, where: str) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise _UnfitError(f"{where} must be an object")
-    return value
-
-
-def _mapped(value: object, where: str, of: Callable[[Any, str], T]) -> dict[str, T]:
-    return {key: of(entry, f"{where}, {key}") for key, entry in _mapping(value, where).items()}
-
-
-def _text(value: object, where: str) -> str:
-    if not isinstance(value, str):
-        raise _UnfitError(f"{where} must be text")
-    return value
-
-
-def _texts(value: object, where: str) -> tuple[str, ...]:
-    if not isinstance(value, list):
-        raise _UnfitError(f"{where} must be a list of texts")
-    return tuple(_text(v, where) for v in value)
-
-
-def _number(value: object, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise _UnfitError(f"{where} must be a number")
-    # Squares of what is shown stay finite; an int may be too large for a comparison with floats.
-    if abs(value) > LARGEST_NUMBER:
-        raise _UnfitError(f"{where} is too large a number")
-    return float(value)
-
-
-def _seconds(text: str, where: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise _UnfitError(f"{where} has windows of {text!r} seconds") from None

@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from nfriction.simulation.linearised import Linearised, step_back
 from nfriction.simulation.mechanism import Mechanism
 from nfriction.simulation.steps import acceleration
 
@@ -97,30 +98,6 @@ def _by_time(x: Tensor, like: Tensor) -> Tensor:
     return x.expand(*like.shape[:-2], *x.shape[-2:]).movedim(-2, 0)
 
 
-@dataclass(frozen=True)
-class _Linear:
-    """Some steps, linearised; time is the first axis.
-
-    Attributes:
-        held: coefficients of the law with their graph, (step, *batch, joint, coefficient).
-        rate: acceleration at the four stages with its graph, (stage, step, *batch, joint).
-        slopes: of each stage's acceleration by q, qd and the coefficients, (stage, step, *batch,
-            joint, 2 joint + joint coefficient).
-        drive: of the coefficients by qd and qdd: (step, *batch, joint, coefficient, 2) where each
-            joint's own motion drives them, else (step, *batch, joint coefficient, 2 joint); None
-            where no motion does.
-        local: which of these `drive` is.
-        step: [s], (step, *batch, 1).
-    """
-
-    held: Tensor
-    rate: Tensor
-    slopes: Tensor
-    drive: Tensor | None
-    local: bool
-    step: Tensor
-
-
 class _Backward:
     """One walk back through the chain; gradients gather in `by_tau` and `by_tensor`."""
 
@@ -197,7 +174,7 @@ class _Backward:
         by_rate = [torch.empty_like(p.rate) for p in pieces]
         for k in reversed(range(part.stop - part.start)):
             for piece, held, rate in zip(pieces[::-1], by_held[::-1], by_rate[::-1], strict=True):
-                carried = _step_back(piece, k, carried, held[k], rate[:, k])
+                carried = step_back(piece, k, carried, held[k], rate[:, k])
             carried = tuple(c + x[part.start + k] for c, x in zip(carried, cotangents, strict=True))
         inputs = [*([tau] if tau.requires_grad else []), *self._asked()]
         for piece, held, rate in zip(pieces, by_held, by_rate, strict=True):
@@ -208,7 +185,7 @@ class _Backward:
         return carried
 
     @torch.enable_grad()
-    def _linearised(self, part: slice, states: Sequence[Tensor]) -> tuple[list[_Linear], Tensor]:
+    def _linearised(self, part: slice, states: Sequence[Tensor]) -> tuple[list[Linearised], Tensor]:
         """Each substep of these samples, and the torque that they were linearised with."""
         q, qd, qdd = states
         h, mechanism = self.step[part], self.chain.mechanism
@@ -223,7 +200,7 @@ class _Backward:
             drive = None if self.measured else self._drive(held, driven)
             points, after = self._stages(q, qd, tau, held.detach(), h)
             rate, slopes = self._slopes(points, tau, held.detach())
-            pieces.append(_Linear(held, rate, slopes, drive, mechanism.is_local(), h))
+            pieces.append(Linearised(held, rate, slopes, drive, mechanism.is_local(), h))
             q, qd, qdd = after
         return pieces, tau
 
@@ -258,7 +235,7 @@ class _Backward:
     def _slopes(
         self, points: tuple[Tensor, Tensor], tau: Tensor, held: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Acceleration at the stages and its derivatives; see `_Linear`."""
+        """Acceleration at the stages and its derivatives; see `Linearised`."""
         q, qd = (x.requires_grad_() for x in points)
         c = held.expand(4, *held.shape).contiguous().requires_grad_()
         rate = self.call(acceleration, q, qd, tau, c)
@@ -272,7 +249,7 @@ class _Backward:
         return rate, slopes
 
     def _drive(self, held: Tensor, driven: Sequence[Tensor]) -> Tensor | None:
-        """Derivatives of the coefficients by what drives them; see `_Linear`."""
+        """Derivatives of the coefficients by what drives them; see `Linearised`."""
         mechanism = self.chain.mechanism
         if mechanism.has_slopes():
             given = (*driven, held.detach())
@@ -286,44 +263,6 @@ class _Backward:
             return torch.stack([torch.stack(own, -1) for own in columns], -2)
         rows = [_grad([y], driven, retain=True) for y in held.flatten(-2).unbind(-1)]
         return torch.stack([torch.cat(row, -1) for row in rows], -2)
-
-
-def _step_back(piece: _Linear, k: int, after: States, by_held: Tensor, by_rate: Tensor) -> States:
-    """Carry the cotangents of (q, qd) and of qdd after step `k` to those before it.
-
-    What reaches the coefficients and the stages' accelerations is written to `by_held` and
-    `by_rate`.
-    """
-    by_state, by_qdd = after
-    h, joints = piece.step[k], by_qdd.shape[-1]
-    half, own = 0.5 * h, slice(joints, 2 * joints)
-    once_q, once_qd = (h / 6.0 * by_state).chunk(2, -1)
-    twice_q, twice_qd = 2.0 * once_q, 2.0 * once_qd
-
-    def pulled(stage: int, cotangent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """By all that a stage's acceleration hangs on, and by its q and qd."""
-        by_rate[stage] = cotangent
-        found = (cotangent.unsqueeze(-2) @ piece.slopes[stage, k]).squeeze(-2)
-        return found, found[..., :joints], found[..., own]
-
-    p4, x4, v4 = pulled(3, once_qd)
-    p3, x3, v3 = pulled(2, torch.addcmul(twice_qd, h, v4 + once_q))
-    p2, x2, v2 = pulled(1, torch.addcmul(twice_qd, half, v3 + twice_q + h * x4))
-    p1, _, _ = pulled(0, torch.addcmul(once_qd, half, v2 + twice_q + half * x3) + by_qdd)
-    found = p1 + p2 + p3 + p4
-    by_held.copy_(found[..., 2 * joints :].unflatten(-1, by_held.shape[-2:]))
-    before = by_state + found[..., : 2 * joints]
-    # The stages' positions hang on the velocity before the step as well.
-    before[..., joints:] += h * (by_state[..., :joints] + x4 + 0.5 * (x2 + x3))
-    if piece.drive is None:
-        return before, torch.zeros_like(by_qdd)
-    if piece.local:
-        by_qd, by_qdd = (by_held.unsqueeze(-1) * piece.drive[k]).sum(-2).unbind(-1)
-    else:
-        driven = found[..., None, 2 * joints :] @ piece.drive[k]
-        by_qd, by_qdd = driven.squeeze(-2).chunk(2, -1)
-    before[..., joints:] += by_qd
-    return before, by_qdd
 
 
 def _grad(

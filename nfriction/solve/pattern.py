@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from nfriction.solve.space import Space
+
 Status = Literal["mesh_tolerance", "max_evaluations", "not_finite", "stopped"]
 
 MESSAGES: dict[str, str] = {
@@ -183,7 +185,7 @@ class PatternSearch:
         Raises:
             ValueError: if shapes, bounds or scales do not fit, or the objective's shape is wrong.
         """
-        space = _Space.build(x0, lower, upper, scale, logarithmic)
+        space = Space.build(x0, lower, upper, scale, logarithmic)
         if state is None:
             start = space.to_unit(x0.clamp(space.lower, space.upper))
             state = PatternState(start.tolist(), math.inf, self.initial_mesh, [0.0] * len(x0))
@@ -203,7 +205,7 @@ class PatternSearch:
     def _run(
         self,
         objective: Objective,
-        space: _Space,
+        space: Space,
         state: PatternState,
         callback: Callable[[PatternState], bool | None] | None,
         bar: tqdm[Any],
@@ -223,7 +225,7 @@ class PatternSearch:
                 return "stopped"
         return "mesh_tolerance" if math.isfinite(state.value) else "not_finite"
 
-    def _iterate(self, objective: Objective, space: _Space, state: PatternState) -> None:
+    def _iterate(self, objective: Objective, space: Space, state: PatternState) -> None:
         x, last = space.tensor(state.x), space.tensor(state.last_step)
         steps = state.mesh * self._directions(len(x), state.iterations).to(x)
         # The last success comes first: "first" and ties then keep going the same way.
@@ -260,79 +262,7 @@ class PatternSearch:
         return torch.cat([axes, back])
 
 
-@dataclass(frozen=True, eq=False)
-class _Space:
-    """Between the caller's variables and those of the search, of order 1."""
-
-    lower: Tensor
-    upper: Tensor
-    scale: Tensor
-    logarithmic: Tensor
-
-    @classmethod
-    def build(
-        cls,
-        x0: Tensor,
-        lower: Tensor | float | None,
-        upper: Tensor | float | None,
-        scale: Tensor | float | None,
-        logarithmic: Sequence[bool] | bool,
-    ) -> _Space:
-        if x0.ndim != 1 or len(x0) == 0 or not x0.is_floating_point():
-            raise ValueError(
-                f"`x0` must be a vector of floats, got {x0.dtype} of shape {tuple(x0.shape)}."
-            )
-        x0 = x0.detach()
-
-        def vector(name: str, value: Any, dtype: torch.dtype = x0.dtype) -> Tensor:
-            given = torch.as_tensor(value, dtype=dtype, device=x0.device)
-            if given.shape not in ((), x0.shape):
-                raise ValueError(
-                    f"`{name}` must be one value or {len(x0)}, got shape {tuple(given.shape)}."
-                )
-            return given.expand_as(x0)
-
-        low = vector("lower", -math.inf if lower is None else lower)
-        high = vector("upper", math.inf if upper is None else upper)
-        log = vector("logarithmic", logarithmic, torch.bool)
-        if not (low <= high).all():
-            raise ValueError("`lower` must not exceed `upper`, and neither may be NaN.")
-        start = x0.clamp(low, high)
-        if not torch.isfinite(start).all() or (log & (start <= 0)).any():
-            raise ValueError(
-                f"`x0` must be finite, and positive where logarithmic, got {x0.tolist()}."
-            )
-        # A lower bound of zero is no bound to a logarithm.
-        inner = torch.where(log & (low <= 0), -math.inf, low)
-        unit = cls(inner, high, torch.ones_like(x0), log)
-        width = unit.to_unit(high) - unit.to_unit(torch.where(log & (low <= 0), torch.nan, low))
-        default = torch.where(log | (start == 0), 1.0, start.abs())
-        usable = torch.isfinite(width) & (width > 0)
-        chosen = torch.where(usable, width, default) if scale is None else vector("scale", scale)
-        if not (torch.isfinite(chosen) & (chosen > 0)).all():
-            raise ValueError(f"`scale` must be positive and finite, got {chosen.tolist()}.")
-        return cls(inner, high, chosen, log)
-
-    def to_unit(self, x: Tensor) -> Tensor:
-        return torch.where(self.logarithmic, x.log10(), x) / self.scale
-
-    def from_unit(self, u: Tensor) -> Tensor:
-        x = u * self.scale
-        x = torch.where(self.logarithmic, 10.0**x, x).clamp(self.lower, self.upper)
-        # On a bound means on it to the last bit, whatever the logarithm rounds to.
-        x = torch.where(u <= self.to_unit(self.lower), self.lower, x)
-        return torch.where(u >= self.to_unit(self.upper), self.upper, x)
-
-    def project(self, u: Tensor) -> Tensor:
-        """Onto the bounds, in search variables."""
-        low = torch.where(self.lower == -math.inf, -math.inf, self.to_unit(self.lower))
-        return u.clamp(low, self.to_unit(self.upper))
-
-    def tensor(self, values: list[float]) -> Tensor:
-        return torch.tensor(values, dtype=self.scale.dtype, device=self.scale.device)
-
-
-def _evaluate(objective: Objective, space: _Space, candidates: Tensor) -> Tensor:
+def _evaluate(objective: Objective, space: Space, candidates: Tensor) -> Tensor:
     values = torch.as_tensor(objective(space.from_unit(candidates))).detach()
     if values.shape != candidates.shape[:1]:
         raise ValueError(
@@ -343,7 +273,7 @@ def _evaluate(objective: Objective, space: _Space, candidates: Tensor) -> Tensor
     return torch.where(torch.isfinite(values), values, math.inf)
 
 
-def _result(space: _Space, state: PatternState, status: Status) -> PatternResult:
+def _result(space: Space, state: PatternState, status: Status) -> PatternResult:
     x = space.from_unit(space.tensor(state.x))
     return PatternResult(
         x=x,

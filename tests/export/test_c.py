@@ -17,11 +17,12 @@ from nfriction.export.c_dialect import comment
 from nfriction.export.c_export import c
 from nfriction.export.c_run import c_contract, c_runner
 from nfriction.export.contract import compare, run_through, verify
-from nfriction.export.controller import CLAMPED, NOT_FINITE, SATURATED, controller_of
+from nfriction.export.controller import controller_of
 from nfriction.export.errors import ExportError
 from nfriction.export.points import draw
+from nfriction.export.unfiltered import CLAMPED, NOT_FINITE, SATURATED
 from nfriction.friction import MODELS, Coefficient, FrictionModel, Law
-from nfriction.friction.schedules import Constant
+from nfriction.friction.constant import Constant
 from nfriction.modelfile import ModelInfo
 
 STUBS = Path(__file__).parent / "stubs"

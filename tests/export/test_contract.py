@@ -16,7 +16,8 @@ from nfriction.export.contract import (
     run_through,
     verify,
 )
-from nfriction.export.controller import NOT_FINITE, controller_of
+from nfriction.export.controller import controller_of
+from nfriction.export.unfiltered import NOT_FINITE
 from nfriction.friction import LFM
 from nfriction.modelfile import ModelInfo
 from tests.export.artefacts import INFO

@@ -6,16 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction.export.controller import (
-    CLAMPED,
-    NOT_FINITE,
-    SATURATED,
-    Controller,
-    FilteredController,
-    MemoryController,
-    controller_of,
-)
+from nfriction.export.controller import controller_of
+from nfriction.export.filtered import FilteredController
 from nfriction.export.points import draw
+from nfriction.export.unfiltered import CLAMPED, NOT_FINITE, SATURATED, Controller, MemoryController
 from nfriction.friction import LFM, NFLFM
 from nfriction.modelfile import ModelInfo
 from nfriction.signals import SecondOrderLowPass

@@ -7,7 +7,7 @@ from nfriction import NFLFM, rollout
 from nfriction.friction import Adaptive
 from nfriction.friction.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
 from nfriction.friction.laws import LINEAR, NONLINEAR
-from nfriction.friction.schedules import Sensitivity
+from nfriction.friction.sensitivity import Sensitivity
 from tests.fitting.recordings import pendulum
 from tests.friction.samples import motion
 

@@ -15,7 +15,7 @@ from nfriction.friction import (
     model_by_name,
 )
 from nfriction.friction.laws import LINEAR, VISCOUS
-from nfriction.friction.schedules import Sensitivity
+from nfriction.friction.sensitivity import Sensitivity
 from tests.friction.samples import QUADRATIC, motion, named_models, normal, quadratic
 
 every_model = pytest.mark.parametrize("name", named_models())

@@ -12,7 +12,7 @@ from torch.func import functional_call, jacrev
 from nfriction.friction import Constant, FrictionModel, NeuroFuzzy
 from nfriction.friction.laws import LINEAR, NONLINEAR, STRIBECK, VISCOUS
 from nfriction.friction.neurofuzzy import LEAST_RATIO, soft_positive, soft_positive_inverse
-from nfriction.friction.schedules import Sensitivity
+from nfriction.friction.sensitivity import Sensitivity
 from tests.friction.samples import LAWS, QUADRATIC, motion, normal, randomise
 
 every_law = pytest.mark.parametrize("law", [*LAWS, QUADRATIC], ids=lambda law: law.name)
