@@ -33,6 +33,9 @@ from nfriction.plant.planar import (
 )
 from nfriction.plant.poses import refuse_indefinite, turning_poses
 
+# Of gravity [m/s^2]: loads are told in weights.
+WEIGHTLESS = 1e-6
+
 
 class _Geometry(NamedTuple):
     pose: Pose
@@ -121,6 +124,8 @@ class PendulumChain(Plant):
     ) -> None:
         m = vector("mass", mass, None, positive=True)
         gravity = number("gravity", gravity, positive=True)
+        if gravity < WEIGHTLESS:
+            raise ValueError(f"`gravity` must be at least {WEIGHTLESS:g} m/s^2, got {gravity:g}.")
         links = len(m)
         first = 1 if arm else 0
         super().__init__(

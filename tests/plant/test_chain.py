@@ -270,6 +270,7 @@ def test_chain_formula_of_the_multiarm_bench() -> None:
         ({"inertia": [1.0, 1.0, 1.0]}, "`inertia` must be None"),
         ({"inertia": [0.0, -0.5]}, "positive definite"),
         ({"gravity": 0.0}, "`gravity` must be positive"),
+        ({"gravity": 5e-324}, "`gravity` must be at least 1e-06"),
         ({"armature": [0.0, -1.0]}, "`armature` must not be negative"),
         ({"convention": ("absolute", "down")}, "`convention` must be"),
         ({"joint_names": ["a", "a"]}, "different names"),
