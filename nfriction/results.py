@@ -20,6 +20,8 @@ from nfriction.selection import Selection
 logger = logging.getLogger(__name__)
 
 RESULTS, TABLE = "results.json", "table.csv"
+# Sample times that differ by host clocks, and not by what was set.
+ALIKE = 1.05
 # What a run may have written, and a later one remove: in its own folders, no way out of them.
 OURS = re.compile(r"table\.csv|models/\w+\.(json|pt)|figures/\w[\w.-]*\.png")
 
@@ -40,7 +42,7 @@ def model_info(fit: Fit, recordings: Sequence[Recording]) -> ModelInfo:
     return ModelInfo(
         joint_names=tuple(fit.plant.joint_names),
         unit=fit.plant.unit,
-        sample_time=float(recordings[0].sample_time),
+        sample_time=_common_sample_time(recordings),
         input_ranges={
             "qd": np.stack([qd.min(0), qd.max(0)], -1).tolist(),
             "qdd": np.stack([qdd.min(0), qdd.max(0)], -1).tolist(),
@@ -49,6 +51,12 @@ def model_info(fit: Fit, recordings: Sequence[Recording]) -> ModelInfo:
         rig=fit.plant.to_dict(),
         fit=fit.to_dict(),
     )
+
+
+def _common_sample_time(recordings: Sequence[Recording]) -> float | None:
+    """The middle one where all are much the same; of several, a controller's is not known."""
+    times = sorted(float(r.sample_time) for r in recordings)
+    return times[len(times) // 2] if times[-1] <= ALIKE * times[0] else None
 
 
 def write_results(

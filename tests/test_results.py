@@ -72,6 +72,14 @@ def test_input_ranges_are_those_of_the_motion(comparison: Comparison, recording:
     assert info.training_data == {"r": recording.digest()}
 
 
+@pytest.mark.parametrize(("factors", "told"), [((1.0, 1.01, 0.99), 2e-3), ((1.0, 2.0), None)])
+def test_one_sample_time_is_told_where_recordings_share_it(
+    comparison: Comparison, recording: Recording, factors: tuple[float, ...], told: float | None
+) -> None:
+    several = [dataclasses.replace(recording, time=f * recording.time) for f in factors]
+    assert results.model_info(comparison.fits["good"], several).sample_time == pytest.approx(told)
+
+
 def test_a_failed_export_is_told_and_leaves_no_older_script(
     comparison: Comparison,
     recording: Recording,

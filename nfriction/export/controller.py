@@ -37,5 +37,8 @@ def controller_of(
         return inner
     sample_time = (info or ModelInfo()).sample_time
     if sample_time is None:
-        raise ValueError("a filter needs `ModelInfo.sample_time` [s], got None.")
+        raise ValueError(
+            "a filter needs `ModelInfo.sample_time` [s], got None: none was given, or the model "
+            "was fitted to recordings of different ones."
+        )
     return FilteredController(inner, SecondOrderLowPass(cutoff_hz, float(sample_time)))

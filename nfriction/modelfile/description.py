@@ -21,7 +21,7 @@ class ModelInfo:
     Attributes:
         joint_names: in the order of the last axis; empty where joints have no names.
         unit: of a joint's position, `"rad"` or `"m"`.
-        sample_time: of the recordings it was trained on [s].
+        sample_time: of the recordings it was trained on [s]; None where they differ.
         input_ranges: smallest and largest trained value of each input by joint,
             `{"qd": [[low, high], ...], "qdd": ...}`.
         training_data: digest of each recording, by name.
