@@ -1,71 +1,74 @@
-"""ASAM MDF measurement files (.mf4) through asammdf."""
+"""ASAM MDF measurement files (.mf4) through asammdf, read in a process of its own.
+
+A damaged file can end the process that reads it, keep it busy for ever, or spoil its memory.
+"""
 
 from __future__ import annotations
 
-import struct
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from nfriction.formats.limits import refuse_size
 from nfriction.formats.nested import signals_table
-from nfriction.formats.selection import OURS, parse_source
+
+# Processor time of the reader [s]: to import what it needs, and to read a byte; then how much
+# longer a busy machine may take.
+STARTING, BY_BYTE, BUSY = 20.0, 1e-6, 10.0
+_READER = "import sys; from nfriction.formats.mdf_reader import main; main(sys.argv[1:])"
 
 
 def read_mdf(path: Path, sources: Sequence[str] = ()) -> pd.DataFrame:
     """Table of the channels asked for, with their units; `time` is their common time.
 
-    asammdf may end the process on a damaged file, so read only files whose origin you know.
-
     Raises:
         ImportError: asammdf is not installed.
-        ValueError: no MDF file, or channels that were not sampled together.
+        ValueError: no MDF file, one that asammdf cannot bear, or channels that were not sampled
+            together.
     """
-    try:
-        from asammdf import MDF
-        from asammdf.blocks.utils import MdfException
-    except ImportError as error:
+    if find_spec("asammdf") is None:
         raise ImportError(
             "MDF files need asammdf: pip install nfriction[mdf]; or export them as .csv or .mat."
-        ) from error
-    refuse_size(path.stat().st_size)
-    try:
-        with MDF(path) as file:
-            return _table(file, sources)
-    except (
-        MdfException, OSError, LookupError, TypeError, AttributeError, struct.error, MemoryError,
-        RuntimeError,
-    ) as error:  # fmt: skip
-        raise ValueError(f"asammdf cannot read it: {error}") from error
+        )
+    size = path.stat().st_size
+    refuse_size(size)
+    seconds = STARTING + BY_BYTE * size
+    with tempfile.TemporaryDirectory() as folder:
+        table, refusal = Path(folder) / "table.npz", Path(folder) / "refusal.txt"
+        command = [sys.executable, "-c", _READER, str(path), folder, str(seconds), *sources]
+        # What this process imports from, the other does, too.
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+        try:
+            ended = subprocess.run(
+                command, stdin=subprocess.DEVNULL, capture_output=True, env=environment,
+                timeout=BUSY * seconds, check=False,
+            )  # fmt: skip
+        except subprocess.TimeoutExpired:
+            raise ValueError("asammdf does not come to an end with it") from None
+        if refusal.exists():
+            raise ValueError(refusal.read_text(encoding="utf-8", errors="replace"))
+        if ended.returncode != 0 or not table.exists():
+            raise ValueError(f"asammdf cannot read it ({_end_of(ended)})")
+        with np.load(table, allow_pickle=False) as held:
+            told = json.loads(str(held["told"]))
+            columns = {name: held[f"c{k}"] for k, name in enumerate(told["names"])}
+    found = signals_table(columns, told["channels"])
+    found.attrs["units"] = told["units"]
+    return found
 
 
-def _table(file: Any, sources: Sequence[str]) -> pd.DataFrame:
-    places = dict(file.channels_db)
-    names = set(places)
-    wanted = {s.column for spec in sources if (s := parse_source(spec, names))}
-    wanted |= {name for name in names if OURS.fullmatch(name) and name != "time"}
-    repeated = [name for name in sorted(wanted) if len(places[name]) > 1]
-    if repeated:
-        raise ValueError(f"channel {repeated[0]} is there more than once")
-    columns: dict[str, np.ndarray] = {}
-    units: dict[str, str] = {}
-    time: np.ndarray | None = None
-    for name in sorted(wanted):
-        signal = file.get(name)
-        if time is not None and not np.array_equal(time, signal.timestamps):
-            raise ValueError(
-                f"channel {name} was not sampled together with {next(iter(columns))}; export the "
-                "measurement on one raster, such as by asammdf's `MDF.resample`"
-            )
-        time = np.asarray(signal.timestamps)
-        columns[name] = np.asarray(signal.samples)
-        if signal.unit:
-            units[name] = str(signal.unit)
-    if time is not None:
-        columns.setdefault("time", time)
-    table = signals_table(columns, sorted(names))
-    table.attrs["units"] = units
-    return table
+def _end_of(ended: subprocess.CompletedProcess[bytes]) -> str:
+    """How a process ended: the signal, or its last words."""
+    if ended.returncode < 0:
+        return signal.Signals(-ended.returncode).name
+    words = ended.stderr.decode(errors="replace").strip().splitlines()
+    return words[-1][:200] if words else f"exit status {ended.returncode}"

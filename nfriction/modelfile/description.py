@@ -42,7 +42,7 @@ class ModelInfo:
 
     def __post_init__(self) -> None:
         if self.unit not in ("rad", "m"):
-            raise ValueError(f'`unit` must be "rad" or "m", got {self.unit!r}.')
+            raise ValueError(f'`unit` must be "rad" or "m", got {str(self.unit)[:80]!r}.')
 
 
 def parameter_hash(state: Mapping[str, Tensor]) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from nfriction.formats import mdf
 from nfriction.recording import Recording
 
 TIME = np.arange(40) / 1000
@@ -67,3 +68,22 @@ def test_a_file_cut_short_is_refused(asammdf: Any, tmp_path: Path) -> None:
         path.write_bytes(content[:length])
         with pytest.raises(ValueError, match=r"run\.mf4"):
             Recording.read(path)
+
+
+@pytest.mark.parametrize(
+    ("reader", "said"),
+    [
+        ("import os; os.abort()", "cannot read it .SIGABRT"),
+        ("raise SystemExit('no more')", "cannot read it .no more"),
+        ("while True: pass", "does not come to an end"),
+    ],
+)
+def test_a_reader_that_ends_or_hangs_is_told(
+    reader: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mdf, "find_spec", lambda _: True)
+    monkeypatch.setattr(mdf, "_READER", reader)
+    monkeypatch.setattr(mdf, "STARTING", 0.5)
+    (tmp_path / "run.mf4").write_bytes(b"MDF     ")
+    with pytest.raises(ValueError, match=rf"run\.mf4.*{said}"):
+        Recording.read(tmp_path / "run.mf4")

@@ -31,6 +31,7 @@ from nfriction.export.errors import ExportError
 from nfriction.export.onnx_file import open_onnx
 from nfriction.export.program import open_pt2
 from nfriction.export.script import open_torchscript
+from nfriction.formats import mdf
 from nfriction.fuzzy import MamdaniController, load_fis, load_rules
 from nfriction.fuzzy.rulefile import format_rules, parse_rules
 from nfriction.modelfile import ModelFileError, info_of, load, parameter_hash, plant_of
@@ -287,6 +288,11 @@ def _mdf_samples(folder: Path) -> list[bytes]:
     return [path.read_bytes()]
 
 
+def _read_mdf(path: Path) -> None:
+    mdf.STARTING = 5.0  # of processor time, for files that keep asammdf busy for ever
+    _read_recording(path)
+
+
 # Rigs, rules, states.
 
 _RIGS: list[dict[str, Any]] = [
@@ -535,7 +541,7 @@ LOADERS: dict[str, Loader] = {
                needs="pyarrow"),
         Loader("mat", ".mat", _matlab_samples, _read_recording, _damage_matlab),
         Loader("hdf5", ".h5", _hdf5_samples, _read_recording, _damage_hdf5, needs="h5py"),
-        Loader("mdf", ".mf4", _mdf_samples, _read_recording, damage_bytes, needs="asammdf"),
+        Loader("mdf", ".mf4", _mdf_samples, _read_mdf, damage_bytes, needs="asammdf"),
         Loader("initial_states", ".csv", lambda _: [_STATES], _read_states, damage_text),
         Loader("rig_json", ".json", _json_samples(*_RIGS), _read_rig, damage_json),
         Loader("rig_toml", ".toml", lambda _: [_TOML], _read_rig, damage_text, needs="tomllib"),
