@@ -6,6 +6,7 @@ A damaged file can end the process that reads it, keep it busy for ever, or spoi
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -13,6 +14,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from importlib.util import find_spec
+from multiprocessing.spawn import get_executable
 from pathlib import Path
 
 import numpy as np
@@ -23,8 +25,15 @@ from nfriction.formats.nested import signals_table
 
 # Processor time of the reader [s]: to import what it needs, and to read a byte; then how much
 # longer a busy machine may take.
-STARTING, BY_BYTE, BUSY = 20.0, 1e-6, 10.0
-_READER = "import sys; from nfriction.formats.mdf_reader import main; main(sys.argv[1:])"
+STARTING, BY_BYTE, BUSY = 20.0, 1e-7, 10.0
+# Python puts the folder where the user stands first in the path; what lies there is no module.
+_READER = """import sys
+sys.path[:] = [place for place in sys.path if place]
+from nfriction.formats.mdf_reader import main
+main()
+"""
+_ENDLESS = "asammdf does not come to an end with it"
+_OUT_OF_TIME = getattr(signal, "SIGXCPU", 0) or math.nan
 
 
 def read_mdf(path: Path, sources: Sequence[str] = ()) -> pd.DataFrame:
@@ -44,16 +53,20 @@ def read_mdf(path: Path, sources: Sequence[str] = ()) -> pd.DataFrame:
     seconds = STARTING + BY_BYTE * size
     with tempfile.TemporaryDirectory() as folder:
         table, refusal = Path(folder) / "table.npz", Path(folder) / "refusal.txt"
-        command = [sys.executable, "-c", _READER, str(path), folder, str(seconds), *sources]
+        asked = {"path": str(path.absolute()), "folder": folder, "seconds": seconds,
+                 "sources": list(sources)}  # fmt: skip
         # What this process imports from, the other does, too.
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+        places = os.pathsep.join(place or os.getcwd() for place in sys.path)
         try:
             ended = subprocess.run(
-                command, stdin=subprocess.DEVNULL, capture_output=True, env=environment,
+                [get_executable(), "-c", _READER], input=json.dumps(asked).encode(),
+                capture_output=True, env=os.environ | {"PYTHONPATH": places},
                 timeout=BUSY * seconds, check=False,
             )  # fmt: skip
         except subprocess.TimeoutExpired:
-            raise ValueError("asammdf does not come to an end with it") from None
+            raise ValueError(_ENDLESS) from None
+        if ended.returncode == -_OUT_OF_TIME:
+            raise ValueError(_ENDLESS)
         if refusal.exists():
             raise ValueError(refusal.read_text(encoding="utf-8", errors="replace"))
         if ended.returncode != 0 or not table.exists():

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
+import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,27 +21,26 @@ from nfriction.formats.selection import OURS, parse_source
 ROOM = 16
 
 
-def main(arguments: Sequence[str]) -> None:
+def main() -> None:
     """Write the channels asked for, or why they make no recording, into a folder.
 
-    What asammdf stumbles over ends this process, and its last words tell of it.
-
-    Args:
-        arguments: path of the file, the folder, seconds of processor time, sources of columns.
+    Standard input says of which file, where to, and within how much processor time. What asammdf
+    stumbles over ends this process, and its last words tell of it.
     """
-    path, folder, seconds, *sources = arguments
-    try:
-        from asammdf import MDF
+    asked = json.load(sys.stdin)
+    folder = Path(asked["folder"])
+    from asammdf import MDF
 
-        _limit(float(seconds))
-        with MDF(path) as file:
-            columns, told = _channels(file, sources)
+    _limit(asked["seconds"])
+    try:
+        with MDF(Path(asked["path"])) as file:
+            columns, told = _channels(file, asked["sources"])
     except _UnfitError as error:
         why = str(error)[:1000]
-        (Path(folder) / "refusal.txt").write_text(why, encoding="utf-8", errors="replace")
+        (folder / "refusal.txt").write_text(why, encoding="utf-8", errors="replace")
     else:
         arrays: dict[str, Any] = {f"c{k}": values for k, values in enumerate(columns.values())}
-        np.savez(Path(folder) / "table.npz", told=np.array(json.dumps(told)), **arrays)
+        np.savez(folder / "table.npz", told=np.array(json.dumps(told)), **arrays)
 
 
 class _UnfitError(ValueError):
@@ -46,15 +48,21 @@ class _UnfitError(ValueError):
 
 
 def _limit(seconds: float) -> None:
-    """Bound processor time and memory, where the system can."""
-    with contextlib.suppress(ImportError, ValueError, OSError):
+    """Bound processor time and memory, where the system can; what is bounded closer stays so."""
+    try:
         import resource
-
-        resource.setrlimit(resource.RLIMIT_CPU, (int(seconds) + 1,) * 2)
-        _, hard = resource.getrlimit(resource.RLIMIT_AS)
-        room = ROOM * LARGEST
-        if hard == resource.RLIM_INFINITY or hard > room:
-            resource.setrlimit(resource.RLIMIT_AS, (room, hard))
+    except ImportError:
+        return
+    bounds = {
+        resource.RLIMIT_CPU: math.ceil(time.process_time() + seconds),
+        resource.RLIMIT_AS: ROOM * LARGEST,
+        resource.RLIMIT_CORE: 0,
+    }
+    for what, bound in bounds.items():
+        soft, hard = resource.getrlimit(what)
+        known = [x for x in (soft, hard) if x != resource.RLIM_INFINITY]
+        with contextlib.suppress(ValueError, OSError):
+            resource.setrlimit(what, (min([bound, *known]), hard))
 
 
 def _channels(file: Any, sources: Sequence[str]) -> tuple[dict[str, NDArray], dict[str, Any]]:
@@ -71,20 +79,20 @@ def _channels(file: Any, sources: Sequence[str]) -> tuple[dict[str, NDArray], di
         raise _UnfitError(f"channel {repeated[0]} is there more than once")
     columns: dict[str, NDArray] = {}
     units: dict[str, str] = {}
-    time: NDArray | None = None
+    stamps: NDArray | None = None
     for name in sorted(wanted):
         signal = file.get(name)
-        if time is not None and not np.array_equal(time, signal.timestamps):
+        if stamps is not None and not np.array_equal(stamps, signal.timestamps):
             raise _UnfitError(
                 f"channel {name} was not sampled together with {next(iter(columns))}; export the "
                 "measurement on one raster, such as by asammdf's `MDF.resample`"
             )
-        time = _plain(signal.timestamps)
+        stamps = _plain(signal.timestamps)
         columns[name] = _plain(signal.samples)
         if signal.unit:
             units[name] = str(signal.unit)
-    if time is not None:
-        columns.setdefault("time", time)
+    if stamps is not None:
+        columns.setdefault("time", stamps)
     told = {"names": list(columns), "channels": sorted(names), "units": units}
     return columns, told
 
@@ -94,4 +102,6 @@ def _plain(samples: Any) -> NDArray:
     found = np.asarray(samples)
     if found.dtype.kind in "biu":
         return found
+    if found.dtype.kind == "S":
+        return np.char.decode(found, "utf-8", "replace")
     return found.astype(np.float64 if found.dtype.kind == "f" else str)

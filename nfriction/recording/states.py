@@ -47,8 +47,9 @@ def read_initial_states(
     if degrees:
         q0, qd0 = np.deg2rad(q0), np.deg2rad(qd0)
     states: dict[str, tuple[Array, Array]] = {}
-    for row, label in enumerate(table["id"].fillna("").astype(str)):
-        if not label:
+    ids = table["id"]
+    for row, (label, lost) in enumerate(zip(ids.astype(str), ids.isna(), strict=True)):
+        if lost or not label:
             raise ValueError(f"'{path}': row {row + 1} has no id.")
         state = np.stack([q0[row], qd0[row]])
         present = ~np.isnan(state[0])
