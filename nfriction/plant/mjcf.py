@@ -8,7 +8,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
-from nfriction.plant.reduction import LARGEST_NUMBER, HingedLink, RigidBody
+from nfriction.plant.reduction import LARGEST_NUMBER, LONGEST_NAME, HingedLink, RigidBody
 
 # What makes many bodies of a line, or reads other files as descriptions.
 _NO_CHAIN = ("replicate", "composite", "flexcomp", "attach", "plugin", "extension", "include")
@@ -30,6 +30,9 @@ def mjcf_links(path: Path, root: Element) -> tuple[list[HingedLink], NDArray[np.
         ImportError: where MuJoCo is not installed.
     """
     for element in root.iter():
+        name = element.get("name", "")
+        if len(name) > LONGEST_NAME:
+            raise ValueError(f"{name[:80]!r}... is a name of {len(name)} characters.")
         if element.tag in _NO_CHAIN:
             raise ValueError(f"<{element.tag}> is not read; write the chain out in one file.")
     try:
@@ -83,7 +86,8 @@ def _at_reference(path: Path, mujoco: Any) -> tuple[Any, Any]:
     numbers = (model.body_mass, model.body_inertia, model.dof_armature, model.qpos0,
                model.opt.gravity, data.xipos, data.ximat, data.xanchor, data.xaxis)  # fmt: skip
     if not all((np.abs(x) <= LARGEST_NUMBER).all() for x in numbers):  # false of NaN
-        raise ValueError(f"its bodies and joints need numbers of at most {LARGEST_NUMBER:g}.")
+        hint = f" (MuJoCo says: {'; '.join(dict.fromkeys(said))[:300]})" if said else ""
+        raise ValueError(f"its bodies and joints need numbers of at most {LARGEST_NUMBER:g}{hint}.")
     for words in dict.fromkeys(said):
         warnings.warn(f"{path}: MuJoCo says: {words}", stacklevel=2)
     return model, data

@@ -20,7 +20,7 @@ from nfriction.plant.inertia import inertia_tensors
 
 Array = NDArray[np.float64]
 
-MOST_JOINTS = 50
+MOST_JOINTS, LONGEST_NAME = 50, 200
 # Of metres, kilograms and kg m^2: far beyond any mechanism, and squares of it can be added up.
 LARGEST_NUMBER = 1e9
 # A right angle written as 1.57 is off by less than this [rad]; beyond, it is meant.

@@ -6,14 +6,13 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
-from nfriction.plant.reduction import LARGEST_NUMBER, HingedLink, RigidBody
+from nfriction.plant.reduction import LARGEST_NUMBER, LONGEST_NAME, HingedLink, RigidBody
 
 Array = NDArray[np.float64]
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 """URDF has none; its world has z up (REP 103) [m/s^2]."""
 
-LONGEST_NAME = 200
 _HINGES = ("revolute", "continuous")
 
 
@@ -126,7 +125,7 @@ def _numbers(
     # False of NaN.
     if len(values) != count or not (np.abs(values) <= LARGEST_NUMBER).all():
         raise ValueError(
-            f"{what}: `{key}` must be {count} numbers of at most {LARGEST_NUMBER:g}, "
+            f"{what}: `{key}` must be {count} finite numbers up to {LARGEST_NUMBER:g}, "
             f"got {(text or '')[:80]!r}."
         )
     return values

@@ -1,6 +1,7 @@
 """Robot descriptions: the chain moves as MuJoCo says of the same file; what is none is refused."""
 
 import math
+import re
 import sys
 from dataclasses import dataclass
 
@@ -170,6 +171,16 @@ def test_mjcf_is_read_as_compiled(tmp_path, sign):
     assert_moves_alike(plant, model)
 
 
+def test_what_mujoco_warns_of_is_told_and_leaves_no_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "bench.xml"
+    path.write_text(MJCF.format(sign=1).replace('pos="0.2 0.01 0"', 'pos="NaN 0.01 0"'))
+    with pytest.warns(UserWarning, match=r"bench\.xml: MuJoCo says: .*NaN"):
+        rigs.read(path)
+    assert mujoco.get_mju_user_warning() is None
+    assert [entry.name for entry in tmp_path.iterdir()] == ["bench.xml"]
+
+
 def test_a_file_of_a_known_rig_is_that_rig(tmp_path):
     rig = rigs.multiarm_triple()
     given, place, bodies = rig.to_dict(), np.zeros(3), []
@@ -213,6 +224,18 @@ PENDULUM = """<robot name="p"><link name="base"/><link name="rod"><inertial>
 </joint>
 <joint name="elbow" type="continuous"><parent link="rod"/><child link="bob"/>
 <axis xyz="0 1 0"/><origin xyz="0 0 -0.4"/></joint></robot>"""
+
+
+@pytest.mark.parametrize("suffix", ["urdf", "xml"])
+def test_endless_names_are_refused_in_few_words(tmp_path, suffix):
+    path = tmp_path / f"bench.{suffix}"
+    written = PENDULUM if suffix == "urdf" else MJCF.format(sign=1)
+    path.write_text(re.sub(r'(<joint name=)"[^"]*"', r'\1"' + "j" * 1000 + '"', written, count=1))
+    with pytest.raises(ValueError, match="name of 1000 characters") as raised:
+        rigs.read(path)
+    assert len(str(raised.value)) < 300
+
+
 ELBOW = '<axis xyz="0 1 0"/><origin xyz="0 0 -0.4"/>'
 
 
@@ -233,8 +256,8 @@ ELBOW = '<axis xyz="0 1 0"/><origin xyz="0 0 -0.4"/>'
         ('<mass value="0.5"/>', '<mass value="-1"/>', "link 'bob': mass and moments"),
         ('<mass value="0.5"/>', "", "link 'bob': an inertial needs"),
         ('<mass value="0.5"/>', '<mass value="heavy"/>', "mass of link 'bob'.*'heavy'"),
-        ('<mass value="0.5"/>', '<mass value="nan"/>', "1 finite numbers, got 'nan'"),
-        ('xyz="0 0 -0.1"', 'xyz="0 0"', "3 finite numbers, got '0 0'"),
+        ('<mass value="0.5"/>', '<mass value="nan"/>', r"1 finite numbers up to 1e\+09, got 'nan'"),
+        ('xyz="0 0 -0.1"', 'xyz="0 0"', r"3 finite numbers up to 1e\+09, got '0 0'"),
         ('<child link="bob"/>', '<child link="rod"/>', "'rod' hangs on two joints"),
         ('<child link="bob"/>', '<child link="base"/>', "links go round in a circle"),
         ('<link name="base"/>', '<link name="base"/><link name="b2"/>', "one link that no joint"),
