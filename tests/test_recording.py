@@ -477,6 +477,8 @@ def test_initial_states_name_their_faults(tmp_path: Path) -> None:
     path.write_text("id,q0_1\na,0.5\n")
     with pytest.raises(ValueError, match=r"lacks columns qd0_1;"):
         read_initial_states(path)
+    path.write_text(f"id,q0_1,qd0_1,q0_{'1' * 5000}\na,0.5,0,1\n")
+    assert list(read_initial_states(path)) == ["a"]
     path.write_text("id,q0_1,qd0_1\n,0.5,0\n")
     with pytest.raises(ValueError, match="row 1 has no id"):
         read_initial_states(path)

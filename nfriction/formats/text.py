@@ -12,6 +12,7 @@ import gzip
 import io
 import re
 from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 
 import pandas as pd
@@ -78,7 +79,7 @@ def parse_csv(text: str) -> pd.DataFrame:
             "separated by semicolons or tabs"
         )
     names = [cell.strip() for cell in header]
-    table.columns = table.columns.astype(str).str.strip()
+    table.columns = _told_apart(str(column).strip() for column in table.columns)
     # An ending separator makes a last column without name or content.
     unnamed = [c for c in table.columns if c.startswith("Unnamed: ") and table[c].isna().all()]
     table = table.drop(columns=unnamed)
@@ -158,6 +159,17 @@ def _with_decimal_points(table: pd.DataFrame) -> pd.DataFrame:
         )
     changed = {c: table[c].str.replace(",", ".", regex=False) for c in commas}
     return table.assign(**changed)
+
+
+def _told_apart(names: Iterable[str]) -> list[str]:
+    """Names of which none is there twice, as pandas makes them before blanks are stripped."""
+    found: dict[str, None] = {}
+    for name in names:
+        own, k = name, 0
+        while own in found:
+            own, k = f"{name}.{k + 1}", k + 1
+        found[own] = None
+    return list(found)
 
 
 def _all_numbers_with(cells: pd.Series, form: re.Pattern[str], sign: str) -> bool:

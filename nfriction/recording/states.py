@@ -30,7 +30,7 @@ def read_initial_states(
         ValueError: missing columns, or a state that is incomplete or comes twice.
     """
     table = formats.read_table(path)
-    joints = sorted((c[3:] for c in table.columns if re.fullmatch(r"q0_\d+", c)), key=int)
+    joints = sorted((c[3:] for c in table.columns if re.fullmatch(r"q0_[0-9]{1,4}", c)), key=int)
     wanted = ["id", *(f"{key}_{k}" for key in ("q0", "qd0") for k in joints or ["1"])]
     missing = [c for c in wanted if c not in table.columns]
     if missing:

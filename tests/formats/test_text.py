@@ -126,6 +126,7 @@ def test_an_ending_separator_is_no_column(tmp_path: Path) -> None:
         ("time;q1\n0,1;1,5\n0,2;1.6\n", "must be a number, got '1,5'|decimal commas"),
         ("time;q1\n0;1.234,5\n1;1.235,5\n", r"column q1, row 0 .* got '1\.234,5'"),
         ("time;q1;q1\n0;1;2\n1;2;3\n", "q1 is there more than once"),
+        ("time;q1;q1 \n0;1;2\n1;2;3\n", "q1 is there more than once"),
         ("time;q1\n[s];[bar]\n0;1\n1;2\n", r"column q1: '\[bar\]' is no unit of q"),
         ("time;q1\n[s];[ms]\n0;1\n1;2\n", r"'\[ms\]' is no unit of q"),
         ("time;q1\nx;y\n0;1\n", "row 0 .* must be a number, got 'x'"),
