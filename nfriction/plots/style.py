@@ -68,10 +68,14 @@ def legend(figure: Figure, handles: Iterable[Artist], labels: Sequence[str]) -> 
     longest = max(len(label) for label in labels)
     columns = min(len(labels), max(1, int(figure.get_figwidth() / (0.5 + 0.05 * longest))))
     rows = -(-len(labels) // columns)
+    columns = -(-len(labels) // rows)
+    # Filled column by column, read row by row.
+    order = [k for column in range(columns) for k in range(column, len(labels), columns)]
+    artists = list(handles)
     figure.set_figheight(figure.get_figheight() + 0.05 + 0.15 * rows)
     figure.legend(
-        list(handles),
-        list(labels),
+        [artists[k] for k in order],
+        [labels[k] for k in order],
         loc="outside upper center",
         ncols=columns,
         frameon=False,
