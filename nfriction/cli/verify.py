@@ -16,7 +16,7 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
         "verify", parents=[common], help="prove that an artefact is its model", epilog=EXAMPLE,
         description="Run an artefact (.pt, .pt2, .onnx, or .c with its .contract.json beside it) "
         "over its test vectors and over many points beside the model. Exit status 1 if they "
-        "differ. An artefact is a program: verify files from hands that you trust.",
+        "differ. C is compiled and run as it is: verify it from hands that you trust.",
     )  # fmt: skip
     parser.add_argument("artefact", type=Path, metavar="ARTEFACT", help="what export wrote")
     parser.add_argument("model", type=names.file, metavar="MODEL", help="model file")

@@ -9,11 +9,12 @@ import numpy as np
 import torch
 
 from nfriction.atomic import replacing
+from nfriction.export.archive import METADATA
 from nfriction.export.contract import OUTPUTS, Contract, Runner, contract_of, verify
 from nfriction.export.controller import controller_of
 from nfriction.export.errors import ExportError, first_line
 from nfriction.export.onnx_graph import OnnxGraph
-from nfriction.export.program import METADATA, exported, run_stateful, silent
+from nfriction.export.program import exported, run_stateful, silent
 from nfriction.export.unfiltered import Controller
 from nfriction.friction import FrictionModel
 from nfriction.modelfile import ModelInfo

@@ -1,12 +1,10 @@
 """torch.export: a `.pt2` program for runtimes that take one, with the metadata inside."""
 
 import io
-import json
 import math
 import re
 import warnings
-import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,19 +12,19 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from nfriction import strict_json
 from nfriction.atomic import replacing
+from nfriction.export.archive import METADATA, contents, repacked
 from nfriction.export.contract import Contract, Runner, contract_of, verify
 from nfriction.export.controller import AnyController, controller_of
 from nfriction.export.errors import ExportError, first_line
 from nfriction.export.filtered import FilteredController
+from nfriction.export.harmless import refuse_harmful_program
 from nfriction.export.points import draw
 from nfriction.export.unfiltered import Controller, MemoryController
 from nfriction.friction import FrictionModel
 from nfriction.modelfile import ModelInfo
 
-# Name under which the metadata lie in the archive.
-METADATA = "nfriction.json"
-LARGEST_ARCHIVE = 256 * 2**20
 # All that an archive of ours holds.
 _OURS = re.compile(
     r"data/weights/(weight_\d+|model_weights_config\.json)"
@@ -73,6 +71,8 @@ def pt2(
     contract = contract_of(model, controller, info)
     program = exported(controller)
     program.example_inputs = None  # torch would pickle them
+    for node in program.graph.nodes:  # the stack tells of this machine's folders
+        node.meta = {key: value for key, value in node.meta.items() if key == "val"}
     buffer = io.BytesIO()  # into memory, so that the temporary file's name is not kept inside
     with silent():
         torch.export.save(program, buffer, extra_files={METADATA: contract.to_json()})
@@ -89,14 +89,17 @@ def open_pt2(path: str | Path) -> tuple[Contract, Runner]:
     """Load an artefact: what it says of itself, and how to run it.
 
     Raises:
-        ExportError: if it is no program of `torch.export`, or holds what is not ours.
+        ExportError: if it is no program of `torch.export`, or holds more than arithmetic of
+            tensors.
         ContractError: if its metadata are absent or damaged.
+        OSError: if it cannot be read.
     """
-    _refuse_foreign_objects(path)
-    files = {METADATA: ""}
+    files = contents(path, _OURS, "program")
+    _refuse_foreign_objects(path, files)
+    contract = Contract.from_json(files.get(f"extra/{METADATA}", b""))
     try:
-        with silent(), Path(path).open("rb") as file:
-            module = torch.export.load(file, extra_files=files).module()
+        with silent():
+            module = torch.export.load(repacked(files)).module()
     except (
         RuntimeError,
         AttributeError,
@@ -106,7 +109,6 @@ def open_pt2(path: str | Path) -> tuple[Contract, Runner]:
         ValueError,
     ) as error:
         raise ExportError(f"{path}: no program of nfriction ({first_line(error)}).") from error
-    contract = Contract.from_json(files[METADATA])
     size = contract.state_size
 
     @torch.no_grad()
@@ -116,29 +118,20 @@ def open_pt2(path: str | Path) -> tuple[Contract, Runner]:
     return contract, run
 
 
-def _refuse_foreign_objects(path: str | Path) -> None:
+def _refuse_foreign_objects(path: str | Path, files: Mapping[str, bytes]) -> None:
     """Refuse an archive that holds more than tensors and JSON: torch would unpickle it."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            entries = archive.infolist()
-            if sum(entry.file_size for entry in entries) > LARGEST_ARCHIVE:
-                raise ExportError(f"{path}: too large for a program of nfriction.")
-            for entry in entries:
-                inner = entry.filename.partition("/")[2]
-                if not _OURS.fullmatch(inner):
-                    raise ExportError(f"{path}: holds {entry.filename[:80]!r}, which is not ours.")
-                content = archive.read(entry)
-                if inner.endswith("_config.json"):
-                    config = json.loads(content)["config"]
-                    if any(entry["use_pickle"] for entry in config.values()):
-                        raise ExportError(f"{path}: holds pickled objects, which are refused.")
-                if inner.endswith(".pt") and content:
-                    raise ExportError(f"{path}: holds pickled inputs, which are refused.")
-    except zipfile.BadZipFile as error:
-        raise ExportError(f"{path}: no program of nfriction ({first_line(error)}).") from error
-    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
-        if isinstance(error, ExportError):
-            raise
+        refuse_harmful_program(strict_json.parse(files["models/model.json"]))
+        for name, content in files.items():
+            if name.endswith("_config.json"):
+                config = strict_json.parse(content)["config"]
+                if any(entry["use_pickle"] for entry in config.values()):
+                    raise ExportError("it holds pickled objects, which are refused.")
+            if name.endswith(".pt") and content:
+                raise ExportError("it holds pickled inputs, which are refused.")
+    except ExportError as error:
+        raise ExportError(f"{path}: {error}") from None
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise ExportError(f"{path}: damaged ({first_line(error)}).") from error
 
 

@@ -1,6 +1,7 @@
 """TorchScript: a frozen module that runs with torch alone, in Python or LibTorch."""
 
 import io
+import re
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -11,20 +12,24 @@ import torch
 from torch import Tensor, nn
 
 from nfriction.atomic import replacing
+from nfriction.export.archive import METADATA, contents, repacked
 from nfriction.export.contract import Contract, Runner, contract_of, verify
 from nfriction.export.controller import AnyController, controller_of
 from nfriction.export.errors import ExportError, first_line
 from nfriction.export.filtered import FilteredController
 from nfriction.export.flat import shortened
+from nfriction.export.harmless import refuse_harmful_script
 from nfriction.export.unfiltered import Controller, MemoryController
 from nfriction.friction import FrictionModel
 from nfriction.modelfile import ModelInfo
 
-# Name under which the metadata lie in the archive.
-METADATA = "nfriction.json"
 # Largest difference from the model over the largest torque: sums may be taken in another order.
 TOLERANCE = 1e-12
-LARGEST_FILE = 256 * 2**20
+# All that an archive of ours holds.
+_OURS = re.compile(
+    r"data\.pkl|code/__torch__/[\w./]+\.py(\.debug_pkl)?|constants/\d+|constants\.pkl|version"
+    r"|byteorder|\.data/(serialization_id|version)|extra/nfriction\.json"
+)
 
 
 def torchscript(
@@ -97,21 +102,31 @@ def run_torchscript(module: Any, inputs: Sequence[Tensor], state_size: int) -> t
 def open_torchscript(path: str | Path) -> tuple[Contract, Runner]:
     """Load an artefact: what it says of itself, and how to run it.
 
+    A damaged file can end the process in `torch.jit.load`; see `verify_artefact`.
+
     Raises:
-        ExportError: if it is no TorchScript, or lacks the methods of ours.
+        ExportError: if it is no TorchScript, lacks the methods of ours, or holds more than
+            arithmetic of tensors.
         ContractError: if its metadata are absent or damaged.
+        OSError: if it cannot be read.
     """
-    if Path(path).stat().st_size > LARGEST_FILE:
-        raise ExportError(f"{path}: too large for a TorchScript of nfriction.")
-    files = {METADATA: ""}
+    files = contents(path, _OURS, "TorchScript")
+    if any(b"__setstate__" in content for content in files.values()):
+        raise ExportError(f"{path}: runs as it is loaded, which is refused.")
+    contract = Contract.from_json(files.get(f"extra/{METADATA}", b""))
     with _silent():
         try:
-            module = torch.jit.load(str(path), map_location="cpu", _extra_files=files)
-        except (RuntimeError, ValueError, LookupError) as error:
+            module = torch.jit.load(repacked(files), map_location="cpu")
+            graphs = [getattr(module, name).inlined_graph for name in _methods(module)]
+        except (RuntimeError, ValueError, LookupError, AttributeError) as error:
             raise ExportError(f"{path}: no TorchScript ({first_line(error)}).") from error
-    contract = Contract.from_json(files[METADATA])
     if not hasattr(module, "step"):
         raise ExportError(f"{path}: a TorchScript, but none of nfriction: it has no `step`.")
+    try:
+        for graph in graphs:
+            refuse_harmful_script(graph)
+    except ExportError as error:
+        raise ExportError(f"{path}: {error}") from None
     size = contract.state_size
 
     @torch.no_grad()
@@ -220,13 +235,18 @@ def _compile(controller: AnyController) -> Any:
             f"torch operations and annotated arguments:\n{error}"
         ) from error
     module = _wrapped(shortened(controller)).eval()
-    methods = [name for name in ("step", "initial_state") if hasattr(module, name)]
+    methods = [name for name in _methods(module) if name != "forward"]
     for name in methods:
         torch.jit.export(getattr(type(module), name))
     try:
         return torch.jit.freeze(torch.jit.script(module), preserved_attrs=methods)
     except refusals as error:
         raise ExportError(f"the model does not script:\n{error}") from error
+
+
+def _methods(module: Any) -> list[str]:
+    """What a host may call."""
+    return [name for name in ("forward", "step", "initial_state") if hasattr(module, name)]
 
 
 def _model(controller: AnyController) -> FrictionModel:

@@ -1,6 +1,6 @@
 """Prove an artefact equal to a model file: by its own vectors, and at many points besides."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,15 +13,13 @@ from nfriction.export.contract import (
     Runner,
     compare,
     run_through,
-    verify,
 )
 from nfriction.export.controller import AnyController, controller_of
 from nfriction.export.errors import ExportError
 from nfriction.export.filtered import FilteredController
 from nfriction.export.onnx_file import open_onnx
 from nfriction.export.points import draw
-from nfriction.export.program import open_pt2
-from nfriction.export.script import open_torchscript
+from nfriction.export.runner import open_apart
 from nfriction.export.unfiltered import Controller, MemoryController
 from nfriction.friction import FrictionModel
 from nfriction.modelfile import ModelInfo, parameter_hash
@@ -49,11 +47,25 @@ def open_c(path: str | Path) -> tuple[Contract, Runner]:
     return contract, c_runner(path)
 
 
-OPENERS: dict[str, Callable[[str | Path], tuple[Contract, Runner]]] = {
-    ".c": open_c,
-    ".pt": open_torchscript,
-    ".pt2": open_pt2,
-    ".onnx": open_onnx,
+Batches = Callable[..., Sequence[Sequence[Any]]]
+"""Runs several batches of samples, each a sequence of inputs, through an artefact."""
+
+
+def _here(opener: Callable[[str | Path], tuple[Contract, Runner]]) -> Callable[..., Any]:
+    """An opener of artefacts that are run in this process."""
+
+    def opened(path: str | Path) -> tuple[Contract, Batches]:
+        contract, run = opener(path)
+        return contract, lambda *batches: [run(*batch) for batch in batches]
+
+    return opened
+
+
+OPENERS: dict[str, Callable[[str | Path], tuple[Contract, Batches]]] = {
+    ".c": _here(open_c),
+    ".pt": open_apart,
+    ".pt2": open_apart,
+    ".onnx": _here(open_onnx),
 }
 # A controller with a state goes through its points one by one.
 MOST_SUCCESSIVE = 2000
@@ -89,8 +101,9 @@ def verify_artefact(
 ) -> Verdict:
     """Compare an artefact with the model that it should be.
 
-    An artefact is a program, and running it is how it is verified: do so with files from hands
-    that you trust.
+    An artefact is a program, and running it is how it is verified. Those of torch run in a process
+    of their own and only if they are arithmetic of tensors alone; C is compiled and run as it is,
+    so verify it from hands that you trust.
 
     Args:
         path: `.pt`, `.pt2`, `.onnx`, or `.c` with its `.contract.json` beside it.
@@ -118,8 +131,9 @@ def verify_artefact(
     if contract.description["dtype"] == "float32":
         inputs = tuple(x.float().double() for x in inputs)
     try:
-        at_vectors = verify(run, contract)
-        at_points = compare(run_through(controller, inputs), run(*inputs), contract.tolerance)
+        vectors, drawn = run(tuple(contract.inputs.values()), inputs)
+        at_vectors = compare(tuple(contract.outputs.values()), vectors, contract.tolerance)
+        at_points = compare(run_through(controller, inputs), drawn, contract.tolerance)
     except (RuntimeError, TypeError, AttributeError, IndexError) as error:
         if isinstance(error, ExportError):
             raise

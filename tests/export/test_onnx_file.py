@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from nfriction.export import ExportError, onnx
+from nfriction.export.archive import METADATA
 from nfriction.export.contract import ContractError, compare, run_through, verify
 from nfriction.export.controller import controller_of
-from nfriction.export.onnx_file import METADATA, open_onnx
+from nfriction.export.onnx_file import open_onnx
 from nfriction.export.points import draw
 from nfriction.friction import LFM, Coefficient, Constant, FrictionModel, Law
 from tests.export.artefacts import INFO, rising

@@ -8,10 +8,11 @@ import pytest
 import torch
 
 from nfriction.export import ExportError, pt2
+from nfriction.export.archive import METADATA
 from nfriction.export.contract import ContractError, compare, run_through, verify
 from nfriction.export.controller import controller_of
 from nfriction.export.points import draw
-from nfriction.export.program import METADATA, open_pt2
+from nfriction.export.program import open_pt2
 from nfriction.friction import FrictionModel
 from tests.export.artefacts import INFO, rising
 from tests.friction.samples import motion, named_models

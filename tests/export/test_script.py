@@ -11,10 +11,11 @@ import torch
 from torch import Tensor
 
 from nfriction.export import ExportError, torchscript
-from nfriction.export.contract import ContractError, compare, run_through, verify
+from nfriction.export.archive import METADATA
+from nfriction.export.contract import compare, run_through, verify
 from nfriction.export.controller import controller_of
 from nfriction.export.points import draw
-from nfriction.export.script import METADATA, open_torchscript, sample_inputs
+from nfriction.export.script import open_torchscript, sample_inputs
 from nfriction.friction import LFM, NFLFM, Coefficient, Constant, FrictionModel, Law, NeuroFuzzy
 from nfriction.friction.laws import TorqueFunction
 from nfriction.modelfile import ModelInfo, parameter_hash
@@ -180,7 +181,7 @@ def test_what_is_no_artefact_is_refused(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         torch.jit.save(torch.jit.script(torch.nn.Linear(2, 2)), str(bad))
-    with pytest.raises(ContractError, match="no JSON"):
+    with pytest.raises(ExportError, match="not ours"):
         open_torchscript(bad)
 
 

@@ -70,32 +70,11 @@ def test_a_file_cut_short_is_refused(asammdf: Any, tmp_path: Path) -> None:
             Recording.read(path)
 
 
-@pytest.mark.parametrize(
-    ("reader", "said", "starting"),
-    [
-        ("import os; os.abort()", "cannot read it .SIGABRT", 20.0),
-        ("raise SystemExit('no more')", "cannot read it .no more", 20.0),
-        ("while True: pass", "does not come to an end", 0.2),
-    ],
-)
-def test_a_reader_that_ends_or_hangs_is_told(
-    reader: str, said: str, starting: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_reader_that_perishes_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mdf, "find_spec", lambda _: True)
-    monkeypatch.setattr(mdf, "_READER", reader)
-    monkeypatch.setattr(mdf, "STARTING", starting)
+    monkeypatch.setattr(mdf, "_READER", "there.is_none")
     (tmp_path / "run.mf4").write_bytes(b"MDF     ")
-    with pytest.raises(ValueError, match=rf"run\.mf4.*{said}"):
-        Recording.read(tmp_path / "run.mf4")
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="processor time is bounded on POSIX")
-def test_processor_time_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mdf, "find_spec", lambda _: True)
-    limited = "from nfriction.formats.mdf_reader import _limit; _limit(1.0)\nwhile True: pass"
-    monkeypatch.setattr(mdf, "_READER", limited)
-    (tmp_path / "run.mf4").write_bytes(b"MDF     ")
-    with pytest.raises(ValueError, match="does not come to an end"):
+    with pytest.raises(ValueError, match=r"run\.mf4.*cannot read it .ModuleNotFoundError"):
         Recording.read(tmp_path / "run.mf4")
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import faulthandler
 import json
 import math
 import mmap
@@ -24,6 +25,7 @@ import tempfile
 import time
 import traceback
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -36,6 +38,7 @@ from tests.robustness.loaders import LOADERS, Loader
 SECONDS, MEMORY = 5.0, 2 * 2**30
 _STUCK = 600.0  # wall time without progress [s]; a busy machine may well take a minute
 _HARNESS = 77  # exit status of a child that failed outside a case
+_PERISHED = 78  # and of one whose case took too much memory
 _MEMORY_DISK = "/dev/shm" if Path("/dev/shm").is_dir() else None
 _COUNTS = struct.Struct("qqq")  # the case at work, how many were loaded, how many refused
 
@@ -50,6 +53,7 @@ class Outcome:
 
     Attributes:
         loaded, refused: how many gave something valid, and a documented error.
+        perished: of what the refused ones had ended or hung a process of their own.
         faults: by kind, where all else came from: number of cases, and the first of them with its
             traceback.
     """
@@ -58,6 +62,7 @@ class Outcome:
     loaded: int = 0
     refused: int = 0
     seconds: float = 0.0
+    perished: Counter[str] = field(default_factory=Counter)
     faults: dict[str, tuple[int, int, str]] = field(default_factory=dict)
 
     def add_fault(self, kind: str, case: int, told: str) -> None:
@@ -70,6 +75,7 @@ class Outcome:
             f"{self.refused} refused, {sum(n for n, _, _ in self.faults.values())} faults "
             f"({self.seconds:.0f} s)"
         ]
+        lines += [f"  apart, {kind}: {count} cases" for kind, count in self.perished.items()]
         for kind, (count, first, told) in self.faults.items():
             lines.append(f"  {kind}: {count} cases, first {first}\n{told}")
         return "\n".join(lines)
@@ -99,7 +105,9 @@ def fuzz(
     work = _Work(LOADERS[name], first + cases, seconds, memory, begin + budget, keep)
     at = first
     while at < work.end and time.monotonic() < work.deadline:
-        at = _run_child(work, at, outcome) + 1
+        # Made here, as a child that is ended leaves its files behind.
+        with tempfile.TemporaryDirectory(dir=_MEMORY_DISK) as folder:
+            at = _run_child(work, at, outcome, Path(folder)) + 1
     outcome.seconds = time.monotonic() - begin
     return outcome
 
@@ -116,7 +124,7 @@ class _Work:
     keep: Path | None
 
 
-def _run_child(work: _Work, first: int, outcome: Outcome) -> int:
+def _run_child(work: _Work, first: int, outcome: Outcome, folder: Path) -> int:
     """Cases from `first` on until all are done or one ends the child; the last case tried."""
     shared = mmap.mmap(-1, _COUNTS.size)
     shared[:] = _COUNTS.pack(first, 0, 0)
@@ -124,7 +132,7 @@ def _run_child(work: _Work, first: int, outcome: Outcome) -> int:
     child = os.fork()
     if child == 0:
         os.close(reader)
-        _child(work, first, shared, writer)
+        _child(work, first, shared, writer, folder)
     os.close(writer)
     told = b""
     last, since, hung = first, time.monotonic(), False
@@ -153,8 +161,11 @@ def _run_child(work: _Work, first: int, outcome: Outcome) -> int:
         raise RuntimeError(f"{work.loader.name}: the harness itself failed, see above.")
     if status:
         ended = "hang in a library" if hung else f"the process ended ({_told(status)})"
-        outcome.add_fault(ended, case, "")
-        return int(case)
+        if work.loader.apart:
+            outcome.perished[ended] += 1
+            outcome.refused += 1
+        else:
+            outcome.add_fault(ended, case, "")
     return int(case)
 
 
@@ -164,30 +175,29 @@ def _told(status: int) -> str:
     return f"status {os.waitstatus_to_exitcode(status)}"
 
 
-def _child(work: _Work, first: int, shared: mmap.mmap, writer: int) -> NoReturn:
+def _child(work: _Work, first: int, shared: mmap.mmap, writer: int, folder: Path) -> NoReturn:
     """Never returns; tells faults as lines of JSON."""
     loader = work.loader
     status = _HARNESS
     try:
-        with (
-            _quiet(),
-            tempfile.TemporaryDirectory(dir=_MEMORY_DISK) as folder,
-            os.fdopen(writer, "w") as pipe,
-        ):
-            samples = loader.samples(Path(folder))
-            warm = Path(folder) / f"warm{loader.suffix}"
+        tempfile.tempdir = str(folder)
+        faulthandler.disable()  # what ends it is told by the parent
+        with _quiet(), os.fdopen(writer, "w") as pipe:
+            samples = loader.samples(folder)
+            warm = folder / f"warm{loader.suffix}"
             for sample in samples:  # libraries are imported before memory is limited
                 warm.write_bytes(sample)
                 loader.load(warm)
             # What an address space already holds is no loader's.
             held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
             resource.setrlimit(resource.RLIMIT_AS, (held + work.memory,) * 2)
-            signal.signal(signal.SIGPROF, _too_long)
+            # A process of its own may be ended, where Python cannot interrupt it as well.
+            signal.signal(signal.SIGPROF, signal.SIG_DFL if loader.apart else _too_long)
             counts = [0, 0]
             case = first
             for case in range(first, work.end):
                 shared[:] = _COUNTS.pack(case, *counts)
-                fault = _try(work, case, samples, Path(folder), counts)
+                fault = _try(work, case, samples, folder, counts)
                 if fault is not None:
                     pipe.write(json.dumps(fault) + "\n")
                     pipe.flush()
@@ -227,6 +237,8 @@ def _try(
         counts[1] += 1
         return None
     except (Exception, Hang) as error:
+        if loader.apart and isinstance(error, MemoryError):
+            os._exit(_PERISHED)
         frames = [
             f for f in traceback.extract_tb(error.__traceback__) if "/nfriction/" in f.filename
         ]

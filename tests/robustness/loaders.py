@@ -25,13 +25,13 @@ import torch
 from nfriction import LFM, NFLFM, NLFM, ModelInfo, save
 from nfriction.angles import AngleConvention
 from nfriction.export import onnx, pt2, torchscript
-from nfriction.export.contract import Contract, ContractError, contract_of, verify
+from nfriction.export.contract import Contract, ContractError, Runner, contract_of, verify
 from nfriction.export.controller import controller_of
 from nfriction.export.errors import ExportError
 from nfriction.export.onnx_file import open_onnx
 from nfriction.export.program import open_pt2
 from nfriction.export.script import open_torchscript
-from nfriction.formats import mdf
+from nfriction.formats import mdf, mdf_reader
 from nfriction.fuzzy import MamdaniController, load_fis, load_rules
 from nfriction.fuzzy.rulefile import format_rules, parse_rules
 from nfriction.modelfile import ModelFileError, info_of, load, parameter_hash, plant_of
@@ -66,6 +66,7 @@ class Loader:
         refusals: what it may raise.
         names_file: whether every refusal names the file.
         needs: package without which it does not run.
+        apart: what ends or hangs the process is a refusal: the library runs it in one of its own.
     """
 
     name: str
@@ -76,6 +77,7 @@ class Loader:
     refusals: Refusals = (ValueError, OSError)
     names_file: bool = True
     needs: str | None = None
+    apart: bool = False
 
     @property
     def available(self) -> bool:
@@ -289,8 +291,14 @@ def _mdf_samples(folder: Path) -> list[bytes]:
 
 
 def _read_mdf(path: Path) -> None:
-    mdf.STARTING = 5.0  # of processor time, for files that keep asammdf busy for ever
-    _read_recording(path)
+    """What the process for it does; what asammdf raises ends that process."""
+    folder = path.parent / "read"
+    folder.mkdir(exist_ok=True)
+    try:
+        mdf_reader.read({"path": str(path), "sources": []}, folder)
+    except Exception as error:
+        raise ValueError(f"{path}: {error}") from error
+    mdf.table_of(folder)
 
 
 # Rigs, rules, states.
@@ -469,15 +477,29 @@ def _artefact(write: Callable[..., Path]) -> Callable[[Path], list[bytes]]:
 
 
 def _damage_artefact(rng: Random, content: bytes) -> bytes:
-    return damage_zip(rng, content, lambda r, data: damage_bytes(r, data))
+    return damage_zip(rng, content, _damage_part)
+
+
+def _damage_part(rng: Random, content: bytes) -> bytes:
+    """One file of an archive, mostly so that it is still JSON if it was."""
+    whole = content[:1] == b"{" and rng.random() < 0.8
+    return (damage_json if whole else damage_bytes)(rng, content)
 
 
 def _read_pt2(path: Path) -> None:
-    open_pt2(path)
+    _run_artefact(*open_pt2(path))
 
 
 def _read_torchscript(path: Path) -> None:
-    open_torchscript(path)
+    _run_artefact(*open_torchscript(path))
+
+
+def _run_artefact(contract: Contract, run: Runner) -> None:
+    """As `verify_artefact` does; a program that does not run is refused there."""
+    try:
+        verify(run, contract)
+    except (RuntimeError, TypeError, AttributeError, LookupError, ValueError) as error:
+        raise ExportError(str(error)[:1000]) from error
 
 
 def _read_onnx(path: Path) -> None:
@@ -541,7 +563,8 @@ LOADERS: dict[str, Loader] = {
                needs="pyarrow"),
         Loader("mat", ".mat", _matlab_samples, _read_recording, _damage_matlab),
         Loader("hdf5", ".h5", _hdf5_samples, _read_recording, _damage_hdf5, needs="h5py"),
-        Loader("mdf", ".mf4", _mdf_samples, _read_mdf, damage_bytes, needs="asammdf"),
+        Loader("mdf", ".mf4", _mdf_samples, _read_mdf, damage_bytes, needs="asammdf",
+               apart=True),
         Loader("initial_states", ".csv", lambda _: [_STATES], _read_states, damage_text),
         Loader("rig_json", ".json", _json_samples(*_RIGS), _read_rig, damage_json),
         Loader("rig_toml", ".toml", lambda _: [_TOML], _read_rig, damage_text, needs="tomllib"),
@@ -561,6 +584,6 @@ LOADERS: dict[str, Loader] = {
         Loader("onnx", ".onnx", _artefact(onnx), _read_onnx, damage_bytes, _ARTEFACT,
                names_file=False, needs="onnx"),
         Loader("torchscript", ".pt", _artefact(torchscript), _read_torchscript, _damage_artefact,
-               _ARTEFACT, names_file=False),
+               _ARTEFACT, names_file=False, apart=True),
     )
 }  # fmt: skip

@@ -76,6 +76,30 @@ def test_the_harness_sees_what_it_looks_for(monkeypatch: pytest.MonkeyPatch) -> 
     assert outcome.loaded + outcome.refused + sum(n for n, *_ in outcome.faults.values()) == 40
 
 
+def test_what_perishes_in_a_process_of_its_own_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    def load(path: Path) -> None:
+        content = path.read_bytes()
+        if content == b"crash":
+            os.abort()
+        while content == b"hang":
+            pass
+        if content == b"hoard":
+            bytearray(2**30)
+
+    kinds = [b"hang", b"hoard", b"crash", b"sound"]
+    broken = Loader(
+        "broken", ".x", lambda _: [b"sound"], load,
+        lambda rng, _: kinds[rng.randrange(len(kinds))], apart=True,
+    )  # fmt: skip
+    monkeypatch.setitem(LOADERS, "broken", broken)
+    outcome = fuzz("broken", 20, seconds=0.05, memory=2**28)
+    assert not outcome.faults
+    assert outcome.loaded + outcome.refused == 20
+    assert outcome.refused == sum(outcome.perished.values()) > 0
+    for kind in ("SIGPROF", "SIGABRT", "status"):
+        assert kind in str(outcome)
+
+
 @pytest.mark.parametrize(
     "text",
     [

@@ -1,0 +1,155 @@
+"""Programs of torch from strangers are arithmetic of tensors, or are refused before they run."""
+
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from nfriction.export import ExportError, pt2, runner, torchscript, verify_artefact
+from nfriction.export.archive import METADATA
+from nfriction.export.harmless import refuse_harmful_program
+from nfriction.export.program import open_pt2
+from nfriction.export.script import open_torchscript
+from nfriction.friction import LFM
+from tests.export.artefacts import INFO
+from tests.export.test_program import rewritten
+
+MODEL = LFM(3, [1e-3, 2e-3])
+ATTACK = "__import__('pathlib').Path('attacked').touch()"
+IMPORT = '[1, {"type": "builtins.tuple", "context": {"__enum__": 1, "fqn": "antigravity:x"}}]'
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return pt2(MODEL, tmp_path_factory.mktemp("pt2") / "model.pt2", INFO)
+
+
+def changed(value: Any, key: str, to: Any) -> Any:
+    """Nested JSON with every value of a key replaced."""
+    if isinstance(value, dict):
+        return {k: to if k == key else changed(v, key, to) for k, v in value.items()}
+    return [changed(v, key, to) for v in value] if isinstance(value, list) else value
+
+
+@pytest.mark.parametrize(
+    ("key", "to"),
+    [
+        ("expr_str", ATTACK),
+        ("expr_str", "Integer(9)**Integer(9)**Integer(9)"),
+        ("guards_code", [ATTACK]),
+        ("guards_code", [f"L['qd'].size()[0] == 1 and {ATTACK}"]),
+        ("target", "torch.hub.load"),
+        ("target", "torch.ops.aten.from_file.default"),
+        ("target", "math.factorial"),
+        ("in_spec", IMPORT),
+        ("out_spec", IMPORT),
+        ("name", f"x, y={ATTACK}"),
+        ("metadata", {"source_fn_stack": f"x,{ATTACK}"}),
+        ("arg", {"as_custom_obj": {"name": "x", "class_fqn": "y"}}),
+        ("dtype", {f"os.system({ATTACK})": 1}),
+    ],
+)
+def test_a_program_that_torch_would_run_as_python_is_refused(
+    program: Path, key: str, to: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with zipfile.ZipFile(program) as archive:
+        name = next(n for n in archive.namelist() if n.endswith("models/model.json"))
+        document = json.loads(archive.read(name))
+    refuse_harmful_program(document)
+    evil = changed(document, key, to)
+    assert evil != document
+    bad = rewritten(program, tmp_path / "bad.pt2", {"models/model.json": json.dumps(evil).encode()})
+    with pytest.raises(ExportError, match=r"bad\.pt2: it holds .* no part of a controller"):
+        open_pt2(bad)
+    assert [x.name for x in tmp_path.iterdir()] == ["bad.pt2"]
+
+
+def test_artefacts_say_nothing_of_the_machine_that_wrote_them(program: Path) -> None:
+    with zipfile.ZipFile(program) as archive:
+        told = b"".join(archive.read(name) for name in archive.namelist())
+    assert str(Path(__file__).parents[2]).encode() not in told
+
+
+def test_files_of_the_same_name_are_refused(program: Path, tmp_path: Path) -> None:
+    bad = rewritten(program, tmp_path / "bad.pt2", {})
+    with zipfile.ZipFile(bad, "a") as archive, pytest.warns(UserWarning, match="Duplicate"):
+        archive.writestr(zipfile.ZipFile(program).namelist()[0], b"other")
+    with pytest.raises(ExportError, match="not ours"):
+        open_pt2(bad)
+
+
+class Saving(nn.Module):
+    def forward(self, qd: Tensor, qdd: Tensor, load: Tensor) -> Tensor:
+        return qd
+
+    @torch.jit.export
+    def step(self, qd: Tensor, qdd: Tensor, load: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        torch.save(qd, "attacked")
+        return qd, qdd, load
+
+
+class Reading(Saving):
+    @torch.jit.export
+    def step(self, qd: Tensor, qdd: Tensor, load: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        if qd.numel() > 0:
+            qd = torch.from_file("/etc/passwd", False, 8)
+        return qd, qdd, load
+
+
+class Endless(Saving):
+    @torch.jit.export
+    def step(self, qd: Tensor, qdd: Tensor, load: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        while qd.numel() >= 0:
+            qd = qd.neg()
+        return qd, qdd, load
+
+
+class Waking(Saving):
+    """Runs as it is loaded."""
+
+    @torch.jit.export
+    def __getstate__(self) -> int:
+        return 0
+
+    @torch.jit.export
+    def __setstate__(self, state: int) -> None:
+        self.training = False
+
+
+def scripted(module: nn.Module, path: Path) -> Path:
+    """With the metadata of a sound artefact."""
+    with zipfile.ZipFile(torchscript(MODEL, path, INFO)) as archive:
+        metadata = archive.read(f"{archive.namelist()[0].partition('/')[0]}/extra/{METADATA}")
+    with pytest.warns(DeprecationWarning, match=r"torch\.jit"):
+        torch.jit.save(torch.jit.script(module), str(path), _extra_files={METADATA: metadata})
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"), [(Saving, "aten::save"), (Reading, "from_file"), (Waking, "as it is loaded")]
+)
+def test_a_script_that_does_more_than_arithmetic_is_refused(
+    kind: type[nn.Module], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = scripted(kind(), tmp_path / "bad.pt")
+    with pytest.raises(ExportError, match=rf"bad\.pt.*{said}"):
+        open_torchscript(path)
+    assert [x.name for x in tmp_path.iterdir()] == ["bad.pt"]
+
+
+def test_a_script_without_an_end_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runner, "STARTING", 8.0)
+    monkeypatch.setattr(runner, "BY_SAMPLE", 0.0)
+    with pytest.raises(ExportError, match="does not come to an end"):
+        verify_artefact(scripted(Endless(), tmp_path / "bad.pt"), MODEL, INFO)
+
+
+def test_what_verification_refuses_is_told_across_the_process(tmp_path: Path) -> None:
+    with pytest.raises(ExportError, match="aten::save"):
+        verify_artefact(scripted(Saving(), tmp_path / "bad.pt"), MODEL, INFO)
