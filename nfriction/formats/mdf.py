@@ -42,9 +42,9 @@ def read_mdf(path: Path, sources: Sequence[str] = ()) -> pd.DataFrame:
     with tempfile.TemporaryDirectory() as folder:
         try:
             apart.run(_READER, asked, Path(folder), seconds=STARTING + BY_BYTE * size)
-        except apart.PerishedError as error:
+            return table_of(Path(folder))
+        except (apart.PerishedError, OSError, EOFError, LookupError, TypeError) as error:
             raise ValueError(f"asammdf cannot read it ({error})") from None
-        return table_of(Path(folder))
 
 
 def table_of(folder: Path) -> pd.DataFrame:

@@ -38,7 +38,7 @@ from tests.robustness.loaders import LOADERS, Loader
 SECONDS, MEMORY = 5.0, 2 * 2**30
 _STUCK = 600.0  # wall time without progress [s]; a busy machine may well take a minute
 _HARNESS = 77  # exit status of a child that failed outside a case
-_PERISHED = 78  # and of one whose case took too much memory
+_PERISHED = 78  # and of one that an error of a library ends, as it ends a process of its own
 _MEMORY_DISK = "/dev/shm" if Path("/dev/shm").is_dir() else None
 _COUNTS = struct.Struct("qqq")  # the case at work, how many were loaded, how many refused
 
@@ -172,6 +172,8 @@ def _run_child(work: _Work, first: int, outcome: Outcome, folder: Path) -> int:
 def _told(status: int) -> str:
     if os.WIFSIGNALED(status):
         return signal.Signals(os.WTERMSIG(status)).name
+    if os.waitstatus_to_exitcode(status) == _PERISHED:
+        return "an error"
     return f"status {os.waitstatus_to_exitcode(status)}"
 
 
@@ -237,8 +239,8 @@ def _try(
         counts[1] += 1
         return None
     except (Exception, Hang) as error:
-        if loader.apart and isinstance(error, MemoryError):
-            os._exit(_PERISHED)
+        if loader.apart and not isinstance(error, AssertionError):
+            os._exit(_PERISHED)  # as it would end there; it may have spoilt this process, too
         frames = [
             f for f in traceback.extract_tb(error.__traceback__) if "/nfriction/" in f.filename
         ]

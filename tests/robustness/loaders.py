@@ -66,7 +66,7 @@ class Loader:
         refusals: what it may raise.
         names_file: whether every refusal names the file.
         needs: package without which it does not run.
-        apart: what ends or hangs the process is a refusal: the library runs it in one of its own.
+        apart: the library runs it in a process of its own; what ends or hangs that is a refusal.
     """
 
     name: str

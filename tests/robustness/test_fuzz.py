@@ -96,7 +96,7 @@ def test_what_perishes_in_a_process_of_its_own_is_refused(monkeypatch: pytest.Mo
     assert not outcome.faults
     assert outcome.loaded + outcome.refused == 20
     assert outcome.refused == sum(outcome.perished.values()) > 0
-    for kind in ("SIGPROF", "SIGABRT", "status"):
+    for kind in ("SIGPROF", "SIGABRT", "an error"):
         assert kind in str(outcome)
 
 
