@@ -7,6 +7,7 @@ through our own writer. A loader may refuse by its documented errors alone.
 from __future__ import annotations
 
 import gzip
+import contextlib
 import hashlib
 import io
 import json
@@ -482,8 +483,10 @@ def _damage_artefact(rng: Random, content: bytes) -> bytes:
 
 def _damage_part(rng: Random, content: bytes) -> bytes:
     """One file of an archive, mostly so that it is still JSON if it was."""
-    whole = content[:1] == b"{" and rng.random() < 0.8
-    return (damage_json if whole else damage_bytes)(rng, content)
+    if content[:1] == b"{" and rng.random() < 0.8:
+        with contextlib.suppress(ValueError, RecursionError):  # damaged before
+            return damage_json(rng, content)
+    return damage_bytes(rng, content)
 
 
 def _read_pt2(path: Path) -> None:
