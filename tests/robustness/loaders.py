@@ -6,8 +6,8 @@ through our own writer. A loader may refuse by its documented errors alone.
 
 from __future__ import annotations
 
-import gzip
 import contextlib
+import gzip
 import hashlib
 import io
 import json
