@@ -16,10 +16,10 @@ import stat
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
+from importlib import metadata
 from pathlib import Path
-from types import ModuleType
 from typing import Literal
 
 from nfriction.codegen.errors import CompilerError, NoBackend
@@ -31,6 +31,7 @@ Backend = Literal["auto", "c", "numba"]
 FLAGS = ("-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast")
 _NATIVE = "-march=native"
 _SHARED = ("-shared", "-fPIC")
+_IMAGE = ".image"
 
 
 def cache_folder() -> Path:
@@ -109,35 +110,53 @@ def build_c(source: str, level: str = "-O3") -> ctypes.CDLL:
     folder = cache_folder()
     recipe = (source, *compiler, _version(tuple(compiler)), level, *FLAGS, _processor())
     key = hashlib.sha256("\0".join(recipe).encode()).hexdigest()[:32]
-    library = _intact(folder, key) or _compile([*compiler, level], source, folder, key)
+    library = _intact(folder, key, _suffix()) or _compile([*compiler, level], source, folder, key)
     return ctypes.CDLL(str(library))
 
 
-def build_numba(source: str) -> ModuleType:
-    """Import Python source from the cache, where numba keeps its machine code beside it."""
-    digest = hashlib.sha256(source.encode()).hexdigest()
-    path = cache_folder() / f"nf_{digest[:32]}.py"
-    if not path.exists() or path.read_text(encoding="utf-8") != source:
-        with _scratch(path.parent) as scratch:
-            draft = scratch / "draft.py"
-            draft.write_text(source, encoding="utf-8")
-            os.replace(draft, path)
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    if spec is None or spec.loader is None:
-        raise ImportError(f"{path} cannot be imported")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[path.stem] = module  # numba finds what it cached by the module's name
-    spec.loader.exec_module(module)
-    return module
+def build_numba(source: str, name: str, arguments: Sequence[type]) -> Callable[..., None]:
+    """Compile a function of emitted Python with numba, or take it from the cache.
+
+    Args:
+        source: the module.
+        name: of the function, which has a signature.
+        arguments: types of its arguments for ctypes.
+    """
+    from nfriction.codegen import machine  # brings LLVM, which C does without
+
+    folder = cache_folder()
+    versions = (sys.platform, metadata.version("numba"), metadata.version("llvmlite"))
+    recipe = (source, name, *versions, _processor())
+    key = hashlib.sha256("\0".join(recipe).encode()).hexdigest()[:32]
+    kept = _intact(folder, key, _IMAGE)
+    if kept:
+        return machine.load(kept.read_bytes(), arguments)
+    image, alone = machine.compile_python(source, name)
+    if alone:
+        with _scratch(folder) as scratch:
+            draft = scratch / "image"
+            draft.write_bytes(image)
+            _keep(draft, folder, key, _IMAGE)
+    return machine.load(image, arguments)
 
 
-def _intact(folder: Path, key: str) -> Path | None:
-    """A cached library whose contents still have the digest that its name tells."""
-    for path in sorted(folder.glob(f"{key}-*{_suffix()}")):
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()[:32]
-        if path.name == f"{key}-{digest}{_suffix()}":
+def _intact(folder: Path, key: str, suffix: str) -> Path | None:
+    """A cached artefact whose contents still have the digest that its name tells."""
+    for path in sorted(folder.glob(f"{key}-*{suffix}")):
+        if path.name == f"{key}-{_digest(path)}{suffix}":
             return path
     return None
+
+
+def _keep(made: Path, folder: Path, key: str, suffix: str) -> Path:
+    """Move an artefact into the cache. The rename is atomic: others see the whole or nothing."""
+    target = folder / f"{key}-{_digest(made)}{suffix}"
+    os.replace(made, target)
+    return target
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:32]
 
 
 def _compile(compiler: list[str], source: str, folder: Path, key: str) -> Path:
@@ -152,11 +171,7 @@ def _compile(compiler: list[str], source: str, folder: Path, key: str) -> Path:
                 break
         else:
             raise CompilerError(f"{shlex.join(command)} failed:\n{result.stderr[-4000:]}")
-        digest = hashlib.sha256(library.read_bytes()).hexdigest()[:32]
-        # The rename is atomic: another process sees the whole library or none.
-        target = folder / f"{key}-{digest}{_suffix()}"
-        os.replace(library, target)
-        return target
+        return _keep(library, folder, key, _suffix())
 
 
 @contextlib.contextmanager

@@ -4,7 +4,7 @@ from string import Template
 
 from nfriction.codegen import lanes_python
 from nfriction.codegen.driver import ADVANCE, BEGIN, LEVELS, STAGE, STEP, Pieces
-from nfriction.codegen.emit import PYTHON_PRELUDE, python_function
+from nfriction.codegen.emit import INNER, PYTHON_PRELUDE, python_function
 
 
 def python_source(parts: Pieces) -> str:
@@ -25,8 +25,9 @@ def python_source(parts: Pieces) -> str:
 
     functions = [lanes_python.function("nf_stage", spread(STAGE), parts.stage, scalars(known))]
     if parts.step:
+        into = [f"step[{i}]" for i in range(len(parts.step))]
         step = lanes_python.function(
-            "nf_step", spread(STEP), parts.step, scalars(below), into="step"
+            "nf_step", [*spread(STEP), "step"], parts.step, scalars(below), into=into
         )
         functions.append(step)
     if parts.advance:
@@ -69,10 +70,8 @@ def _python_names(parts: Pieces) -> dict[str, object]:
     acting = [*_names("tau", count), *held, *memory]
     return {
         "N": count,
-        "ARITHMETIC": lanes_python.ARITHMETIC,
-        "NM": max(1, len(parts.advance)),
-        "NS": max(1, len(parts.step)),
-        "held": ", ".join(acting),
+        "INNER": INNER,
+        "stage": ", ".join(["p", "once", "step", *acting]),
         "prepare": f"nf_step(p, once, {', '.join(acting)}, step)" if parts.step else "",
         "q": each("q_#"),
         "qd": each("qd_#"),
@@ -82,13 +81,10 @@ def _python_names(parts: Pieces) -> dict[str, object]:
         "first_qdd": lines("prev_# = start[#]; qdd_out[#] = prev_#", 8),
         "seed": lines("qd_held_# = qdd_held_# = 0.0", 8),
         "memory_seed": "\n        ".join(f"{name} = 0.0" for name in memory),
-        "take": lines("tau_# = torque[k * torque_step + #]", 12),
+        "take": lines("tau_# = torque[#]", 12),
         "hold": lines("qd_held_# = qd_#; qdd_held_# = prev_#", 16),
         "remember": _remember(", ".join(held), ", ".join(memory)) if memory else "",
-        "drive": lines(
-            "qd_held_# = qd_drive[k * drive_step + #]; qdd_held_# = qdd_drive[k * drive_step + #]",
-            20,
-        ),
+        "drive": lines("qd_held_# = qd_drive[#]; qdd_held_# = qdd_drive[#]", 20),
         "a1": each("a1_#"),
         "a2": each("a2_#"),
         "a3": each("a3_#"),
@@ -106,50 +102,56 @@ def _python_names(parts: Pieces) -> dict[str, object]:
             12,
         ),
         "within": " and ".join(f"abs(qd_{i}) <= limit and q_{i} - q_{i} == 0.0" for i in n),
-        "record": lines("q_out[at + #] = q_#; qd_out[at + #] = qd_#; qdd_out[at + #] = prev_#", 16),
+        "record": lines("q_out[#] = q_#; qd_out[#] = qd_#; qdd_out[#] = prev_#", 16),
     }
 
 
 def _remember(held: str, memory: str) -> str:
-    given = f"{memory}, = " + ", ".join(f"first_memory[{i}]" for i in range(memory.count(",") + 1))
+    count = memory.count(",") + 1
+    given = f"{memory}, = " + ", ".join(f"given[{i}]" for i in range(count))
     return f"""
                 if k > 0:
                     {memory}, = nf_advance(p, {held}, {memory})
                 elif remembered:
+                    given = moved(memory, c * {count})
                     {given},
                 else:
                     {memory}, = nf_begin(p, {held})"""
 
 
 _PYTHON_DRIVER = Template("""\
-@njit($ARITHMETIC, nogil=True, cache=True)
+@njit(
+    void(
+        REALS, REALS, COUNT, REALS, COUNT, COUNT, COUNT, COUNT, COUNT, REAL, REALS, COUNT,
+        REALS, REALS, REALS, COUNT, COUNT, REALS, COUNT, COUNT,
+        REALS, REALS, COUNT, COUNT, REALS, COUNT, REALS, REALS, REALS, COUNTS,
+    ),
+    $INNER,
+)
 def nf_rollout(
-    all_once, once_row, all_start, first, last, steps, every, hold, limit, all_p, p_row,
+    step, all_once, once_row, all_start, first, last, steps, every, hold, limit, all_p, p_row,
     all_q0, all_qd0, all_h, h_row, h_step, all_torque, torque_row, torque_step,
     all_qd_drive, all_qdd_drive, drive_row, drive_step, memory, remembered,
     all_q_out, all_qd_out, all_qdd_out, diverged,
 ):
     records = (steps // every + 1) * $N
-    step = np.empty($NS)
     for c in range(first, last):
-        once = all_once[(c - first) * once_row :]
-        start = all_start[(c - first) * $N :]
-        p = all_p[c * p_row :]
-        q0 = all_q0[c * $N :]
-        qd0 = all_qd0[c * $N :]
-        h = all_h[c * h_row :]
-        torque = all_torque[c * torque_row :]
-        qd_drive = all_qd_drive[c * drive_row :]
-        qdd_drive = all_qdd_drive[c * drive_row :]
-        first_memory = memory[c * $NM * remembered :]
-        q_out = all_q_out[c * records : (c + 1) * records]
-        qd_out = all_qd_out[c * records : (c + 1) * records]
-        qdd_out = all_qdd_out[c * records : (c + 1) * records]
+        once = moved(all_once, (c - first) * once_row)
+        start = moved(all_start, (c - first) * $N)
+        p = moved(all_p, c * p_row)
+        q0 = moved(all_q0, c * $N)
+        qd0 = moved(all_qd0, c * $N)
+        h = moved(all_h, c * h_row)
+        torque = moved(all_torque, c * torque_row)
+        qd_drive = moved(all_qd_drive, c * drive_row)
+        qdd_drive = moved(all_qdd_drive, c * drive_row)
+        q_out = moved(all_q_out, c * records)
+        qd_out = moved(all_qd_out, c * records)
+        qdd_out = moved(all_qdd_out, c * records)
         diverged[c] = -1
         $initial
         $seed
         $first_qdd
-        at = $N
         next = every
         renew = 0
         $memory_seed
@@ -164,21 +166,26 @@ def nf_rollout(
                 if drive_step:
                     $drive$remember
             $prepare
-            $a1 = nf_stage(p, once, step, $held, $q_args, $qd_args)
+            $a1 = nf_stage($stage, $q_args, $qd_args)
             $to2
-            $a2 = nf_stage(p, once, step, $held, $x, $v2)
+            $a2 = nf_stage($stage, $x, $v2)
             $to3
-            $a3 = nf_stage(p, once, step, $held, $x, $v3)
+            $a3 = nf_stage($stage, $x, $v3)
             $to4
-            $a4 = nf_stage(p, once, step, $held, $x, $v4)
+            $a4 = nf_stage($stage, $x, $v4)
             $advance
+            torque = moved(torque, torque_step)
+            qd_drive = moved(qd_drive, drive_step)
+            qdd_drive = moved(qdd_drive, drive_step)
             if not ($within):
-                for i in range(at, records):
+                for i in range($N, records - k // every * $N):
                     q_out[i] = qd_out[i] = qdd_out[i] = math.nan
                 diverged[c] = k + 1
                 break
             if k + 1 == next:
+                q_out = moved(q_out, $N)
+                qd_out = moved(qd_out, $N)
+                qdd_out = moved(qdd_out, $N)
                 $record
-                at += $N
                 next += every
 """)

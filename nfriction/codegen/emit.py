@@ -38,19 +38,27 @@ _PYTHON_NAMES = {
     **{op: f"np.{op}" for op in ("floor", "ceil", "trunc", "fmod")},
 }
 
-PYTHON_PRELUDE = """\
+# No entries for C and Python, and no rewriting of array expressions, of which there are none: with
+# those, the functions take half as long again to compile.
+INNER = (
+    'error_model="numpy", fastmath={"contract"}, no_cfunc_wrapper=True, no_cpython_wrapper=True, '
+    "no_rewrites=True"
+)
+
+PYTHON_PRELUDE = f"""\
 import math
 
 import numpy as np
-from numba import njit
+from numba import njit, void
+from nfriction.codegen.pointers import COUNT, COUNTS, REAL, REALS, moved
 
 
-@njit(error_model="numpy")
+@njit({INNER})
 def _max(a, b):
     return a if a > b or a != a else b
 
 
-@njit(error_model="numpy")
+@njit({INNER})
 def _min(a, b):
     return a if a < b or a != a else b
 """
@@ -253,17 +261,23 @@ def python_function(
     arguments: Sequence[str],
     outputs: Sequence[Node],
     bound: Mapping[int, str],
-    into: str | None = None,
+    into: Sequence[str] = (),
 ) -> str:
-    """A numba function that returns `outputs` as a tuple, or fills the array named `into`."""
-    lines, texts = statements(outputs, bound, Python())
-    if into is None:
-        lines.append(f"return ({', '.join(texts)},)")
+    """A numba function that returns `outputs` as a tuple, or assigns them to elements `into`."""
+    return python_text(name, arguments, *statements(outputs, bound, Python()), into)
+
+
+def python_text(
+    name: str,
+    arguments: Sequence[str],
+    lines: Sequence[str],
+    texts: Sequence[str],
+    into: Sequence[str] = (),
+) -> str:
+    """A numba function of statements and of expressions, which it returns or assigns."""
+    if into:
+        last = [f"{target} = {text}" for target, text in zip(into, texts, strict=True)]
     else:
-        lines += [f"{into}[{i}] = {text}" for i, text in enumerate(texts)] or ["pass"]
-        arguments = [*arguments, into]
-    body = "\n    ".join(lines)
-    return (
-        f'@njit(error_model="numpy", fastmath={{"contract"}})\n'
-        f"def {name}({', '.join(arguments)}):\n    {body}\n"
-    )
+        last = [f"return ({', '.join(texts)},)" if texts else "pass"]
+    body = "\n    ".join([*lines, *last])
+    return f"@njit({INNER})\ndef {name}({', '.join(arguments)}):\n    {body}\n"

@@ -1,6 +1,5 @@
 """Compile single functions, and fold what their parameters decide."""
 
-import ctypes
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.codegen import arguments, build
+from nfriction.codegen import arguments, build, kernels
 from nfriction.codegen.derivative import with_jacobian
 from nfriction.codegen.errors import SelfCheckFailed
 from nfriction.codegen.function_source import c_source, python_source
@@ -80,12 +79,13 @@ class CompiledFunction:
         split, groups = _split(program)
         emit = c_source if backend == "c" else python_source
         self.source = emit(program, split, groups, self._inputs)
+        arrays = [kernels.ARRAY] * (1 + len(self._inputs) + len(self._outputs))
         if backend == "c":
             # A Jacobian is long straight code, whose optimisation takes minutes and gains little.
             level = "-O1" if jacobian else "-O3"
-            self._kernel = _c_kernel(self.source, level, 1 + len(self._inputs) + len(self._outputs))
+            self._kernel = _c_kernel(self.source, level, arrays)
         else:
-            self._kernel = build.build_numba(self.source).nf_function
+            self._kernel = _numba_kernel(self.source, len(split.hoisted[Level.PARAMETER]), arrays)
 
     def __call__(self, *inputs: Any) -> Any:
         """Evaluate row by row.
@@ -225,12 +225,13 @@ def _port_values(program: Program, lifted: Lifted) -> dict[str, Array]:
     return {f"p{i}": value for i, value in enumerate(flat)}
 
 
-def _c_kernel(source: str, level: str, arrays: int) -> Callable[..., None]:
+def _c_kernel(source: str, level: str, arrays: Sequence[type]) -> Callable[..., None]:
     function = build.build_c(source, level).nf_function
-    function.argtypes = [ctypes.c_ssize_t, *[ctypes.c_void_p] * arrays]
-    function.restype = None
+    function.restype, function.argtypes = None, [kernels.COUNT, *arrays]
+    return kernels.of_arrays(function)
 
-    def call(rows: int, *given: Array) -> None:
-        function(rows, *(a.ctypes.data for a in given))
 
-    return call
+def _numba_kernel(source: str, once: int, arrays: Sequence[type]) -> Callable[..., None]:
+    types = [kernels.ARRAY, kernels.COUNT, *arrays]
+    function = kernels.of_arrays(build.build_numba(source, "nf_function", types))
+    return lambda rows, *given: function(np.empty(once), rows, *given)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from nfriction.codegen.emit import C_PRELUDE, PYTHON_PRELUDE, c_function, python_function
+from nfriction.codegen.emit import C_PRELUDE, INNER, PYTHON_PRELUDE, c_function, python_function
 from nfriction.codegen.graph import Program
 from nfriction.codegen.partition import Partition
 from nfriction.codegen.scalar import Level, Node
@@ -63,24 +63,21 @@ def python_source(
 ) -> str:
     inputs, known = _bound(program, split)
     once = split.hoisted[Level.PARAMETER]
-    given, taken = _sizes("x", shapes), _sizes("y", [(len(g),) for g in groups])
+    sizes = _sizes("x", shapes) | _sizes("y", [(len(g),) for g in groups])
     flat = [node for group in groups for node in group]
-    rows = [f"{x}[r * {size} : (r + 1) * {size}]" for x, size in given.items()]
-    names = [f"{y}[r * {size} + {i}]" for y, size in taken.items() for i in range(size)]
+    targets = [f"y{i}[{j}]" for i, group in enumerate(groups) for j in range(len(group))]
+    slots = [f"once[{i}]" for i in range(len(once))]
+    rows = ", ".join(f"moved({a}, r * {size})" for a, size in sizes.items())
     return "\n".join(
         [
             PYTHON_PRELUDE,
-            python_function("nf_once", ["p"], once, inputs, into="once"),
-            python_function("nf_row", ["p", "once", *given], flat, known, into="out"),
-            '@njit(error_model="numpy", nogil=True, cache=True)',
-            f"def nf_function(rows, p, {', '.join([*given, *taken])}):",
-            f"    once = np.empty({max(1, len(once))})",
-            f"    out = np.empty({len(flat)})",
+            python_function("nf_once", ["p", "once"], once, inputs, into=slots),
+            python_function("nf_row", ["p", "once", *sizes], flat, known, into=targets),
+            f"@njit(void(REALS, COUNT, REALS{', REALS' * len(sizes)}), {INNER})",
+            f"def nf_function(once, rows, p, {', '.join(sizes)}):",
             "    nf_once(p, once)",
             "    for r in range(rows):",
-            f"        nf_row(p, once, {', '.join([*rows, 'out'])})",
-            *(f"        {target} = out[{i}]" for i, target in enumerate(names)),
-            "",
+            f"        nf_row(p, once, {rows})\n",
         ]
     )
 

@@ -10,17 +10,16 @@ from nfriction.codegen import build, driver
 
 Array = np.ndarray
 
+COUNT, REAL, ARRAY = ctypes.c_ssize_t, ctypes.c_double, ctypes.c_void_p
+_ARGUMENTS: list[type] = [
+    *(COUNT, COUNT, COUNT, COUNT, COUNT, REAL, ARRAY, COUNT, ARRAY, ARRAY, ARRAY, COUNT, COUNT),
+    *(ARRAY, COUNT, COUNT, ARRAY, ARRAY, COUNT, COUNT, ARRAY, COUNT),
+    *(ARRAY, ARRAY, ARRAY, ARRAY),
+]
 
-def c_kernel(source: str) -> Callable[..., None]:
-    """The entry point of a rollout in C; it lets go of the GIL."""
-    function = build.build_c(source).nf_rollout
-    size, real, array = ctypes.c_ssize_t, ctypes.c_double, ctypes.c_void_p
-    function.restype = None
-    function.argtypes = [
-        *(size, size, size, size, size, real, array, size, array, array, array, size, size),
-        *(array, size, size, array, array, size, size, array, size),
-        *(array, array, array, array),
-    ]
+
+def of_arrays(function: Callable[..., None]) -> Callable[..., None]:
+    """A function of addresses as one of arrays."""
 
     def call(*args: Any) -> None:
         function(*(a.ctypes.data if isinstance(a, np.ndarray) else a for a in args))
@@ -28,9 +27,17 @@ def c_kernel(source: str) -> Callable[..., None]:
     return call
 
 
+def c_kernel(source: str) -> Callable[..., None]:
+    """The entry point of a rollout in C; it lets go of the GIL."""
+    function = build.build_c(source).nf_rollout
+    function.restype, function.argtypes = None, _ARGUMENTS
+    return of_arrays(function)
+
+
 def numba_kernel(source: str, parts: driver.Pieces) -> Callable[..., None]:
     """The entry point of a rollout for numba, with what C computes once a candidate done here."""
-    function = build.build_numba(source).nf_rollout
+    more: list[type] = [ARRAY, ARRAY, COUNT, ARRAY]
+    function = of_arrays(build.build_numba(source, "nf_rollout", [*more, *_ARGUMENTS]))
 
     def call(first: int, last: int, *args: Any) -> None:
         p, p_row, q0, qd0 = args[4:8]
@@ -46,6 +53,7 @@ def numba_kernel(source: str, parts: driver.Pieces) -> Callable[..., None]:
         given |= {"q": rows(q0, n, n), "qd": rows(qd0, n, n)}
         once = parts.evaluate(parts.once, given, count if p_row else 1)
         start = parts.evaluate(parts.start, given, count)
-        function(once, len(parts.once) if p_row else 0, start, first, last, *args)
+        step = np.empty(len(parts.step))
+        function(step, once, len(parts.once) if p_row else 0, start, first, last, *args)
 
     return call

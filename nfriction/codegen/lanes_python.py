@@ -7,13 +7,9 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from nfriction.codegen.emit import Python, statements
+from nfriction.codegen.emit import Python, python_text, statements
 from nfriction.codegen.lanes import FAMILY, WIDTH, phases
 from nfriction.codegen.scalar import Node, reachable
-
-# No entry for C, which nobody uses, and no rewriting of array expressions, of which there are none:
-# with the inner functions' entries for Python these take half of the time to compile.
-ARITHMETIC = 'error_model="numpy", fastmath={"contract"}, no_cfunc_wrapper=True, no_rewrites=True'
 
 
 def prelude() -> str:
@@ -22,7 +18,7 @@ def prelude() -> str:
     numba keeps machine code as long as the text stays the same, so their text counts with it.
     """
     digest = hashlib.sha256()
-    for name in ("vectors.py", "lanes.py"):
+    for name in ("vectors.py", "lanes.py", "pointers.py"):
         digest.update(Path(__file__).with_name(name).read_bytes())
     return (
         f"from nfriction.codegen.vectors import exp4, sincos4, tanh4  # {digest.hexdigest()[:16]}\n"
@@ -34,20 +30,10 @@ def function(
     arguments: Sequence[str],
     outputs: Sequence[Node],
     bound: Mapping[int, str],
-    into: str | None = None,
+    into: Sequence[str] = (),
 ) -> str:
-    """A numba function that returns `outputs` as a tuple, or fills the array named `into`."""
-    lines, texts = _body(outputs, dict(bound))
-    if into is None:
-        lines.append(f"return ({', '.join(texts)},)")
-    else:
-        lines += [f"{into}[{i}] = {text}" for i, text in enumerate(texts)] or ["pass"]
-        arguments = [*arguments, into]
-    body = "\n    ".join(lines)
-    return (
-        f"@njit({ARITHMETIC}, no_cpython_wrapper=True)\n"
-        f"def {name}({', '.join(arguments)}):\n    {body}\n"
-    )
+    """A numba function that returns `outputs` as a tuple, or assigns them to elements `into`."""
+    return python_text(name, arguments, *_body(outputs, dict(bound)), into)
 
 
 def _body(outputs: Sequence[Node], bound: dict[int, str]) -> tuple[list[str], list[str]]:

@@ -4,18 +4,18 @@ The same formulas, accuracy and limits as the C of `lanes`, written as LLVM inst
 of four: numba calls the functions of `math` one by one. Imported by emitted code alone.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from llvmlite import ir  # type: ignore[import-untyped]
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
 
 from nfriction.codegen.lanes import COS, EXP, SIN, WIDTH
 
 _REAL = ir.VectorType(ir.DoubleType(), WIDTH)
 _BITS = ir.VectorType(ir.IntType(64), WIDTH)
+_LANES = [ir.Constant(ir.IntType(32), i) for i in range(WIDTH)]
 _ROUND = 6755399441055744.0  # adding it rounds to an integer, which stands in the lowest bits
 
 
@@ -82,7 +82,7 @@ def _tanh(v: _Vectors, x: Any) -> list[Any]:
     return [v.real(v.builder.xor(v.bits(ratio), sign))]
 
 
-def _sincos(v: _Vectors, x: Any) -> list[Any]:
+def _near(v: _Vectors, x: Any) -> list[Any]:
     b = v.builder
     t = v.add(v.mul(x, 0.6366197723675814), _ROUND)
     n = v.sub(t, _ROUND)
@@ -106,6 +106,35 @@ def _sincos(v: _Vectors, x: Any) -> list[Any]:
     return [turned(sine, turns), turned(cosine, b.add(turns, v.bits(1)))]
 
 
+def _far(v: _Vectors, x: Any) -> list[Any]:
+    """The C library's, one by one."""
+    real, results = ir.DoubleType(), []
+    for name in ("llvm.sin", "llvm.cos"):
+        function = v.builder.module.declare_intrinsic(name, [real])
+        results.append(x)
+        for i in _LANES:
+            one = v.builder.call(function, [v.builder.extract_element(x, i)])
+            results[-1] = v.builder.insert_element(results[-1], one, i)
+    return results
+
+
+def _sincos(v: _Vectors, x: Any) -> list[Any]:
+    b = v.builder
+    size = v.real(b.and_(v.bits(x), v.bits(2**63 - 1)))
+    every = ir.IntType(WIDTH)
+    near = b.bitcast(b.fcmp_ordered("<", size, v.of(1e5)), every)
+    found = []
+    with b.if_else(b.icmp_unsigned("==", near, every(2**WIDTH - 1))) as branches:
+        for branch, function in zip(branches, (_near, _far), strict=True):
+            with branch:
+                found.append((function(v, x), b.block))
+    merged = [b.phi(_REAL), b.phi(_REAL)]
+    for values, block in found:
+        for phi, value in zip(merged, values, strict=True):
+            phi.add_incoming(value, block)
+    return merged
+
+
 def _four(function: Callable[[_Vectors, Any], list[Any]], results: int) -> Callable[..., Any]:
     """A function of four numbers that numba compiled code may call."""
     returned = types.UniTuple(types.float64, WIDTH * results)
@@ -113,12 +142,11 @@ def _four(function: Callable[[_Vectors, Any], list[Any]], results: int) -> Calla
     @intrinsic
     def call(typing: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
         def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            lane = [ir.Constant(ir.IntType(32), i) for i in range(WIDTH)]
             x = ir.Constant(_REAL, ir.Undefined)
-            for i, argument in zip(lane, arguments, strict=True):
+            for i, argument in zip(_LANES, arguments, strict=True):
                 x = builder.insert_element(x, argument, i)
             values = function(_Vectors(builder), x)
-            numbers = [builder.extract_element(y, i) for y in values for i in lane]
+            numbers = [builder.extract_element(y, i) for y in values for i in _LANES]
             return context.make_tuple(builder, returned, numbers)
 
         return returned(*[types.float64] * WIDTH), code
@@ -128,15 +156,4 @@ def _four(function: Callable[[_Vectors, Any], list[Any]], results: int) -> Calla
 
 exp4 = _four(_exp, 1)
 tanh4 = _four(_tanh, 1)
-_near4 = _four(_sincos, 2)
-
-
-@njit(error_model="numpy")
-def sincos4(a: float, b: float, c: float, d: float) -> Any:
-    """Four sines and four cosines."""
-    if max(abs(a), abs(b), abs(c), abs(d)) < 1e5:
-        return _near4(a, b, c, d)
-    return (
-        math.sin(a), math.sin(b), math.sin(c), math.sin(d),
-        math.cos(a), math.cos(b), math.cos(c), math.cos(d),
-    )  # fmt: skip
+sincos4 = _four(_sincos, 2)

@@ -5,13 +5,19 @@ import pytest
 
 from nfriction.codegen import build
 from nfriction.codegen.emit import PYTHON_PRELUDE
+from nfriction.codegen.kernels import ARRAY, of_arrays
 from nfriction.codegen.lanes_python import function, prelude
 from nfriction.codegen.scalar import Graph, evaluate
 
 pytest.importorskip("numba")
 
-# Inner functions have no entry of their own for Python.
-ENTRY = "\n@njit\ndef entry(*arguments):\n    return f(*arguments)\n"
+
+def build_f(outputs, bound):
+    """A function of two arrays, `x` and what becomes of it."""
+    into = [f"y[{i}]" for i in range(len(outputs))]
+    text = function("f", ["x", "y"], outputs, bound, into=into)
+    signed = text.replace("@njit(", "@njit(void(REALS, REALS), ")
+    return of_arrays(build.build_numba(PYTHON_PRELUDE + prelude() + signed, "f", [ARRAY, ARRAY]))
 
 
 @pytest.fixture(scope="module")
@@ -23,8 +29,7 @@ def four(tmp_path_factory):
     nodes = [g.apply(op, a) for op in ("sin", "cos", "exp", "tanh") for a in x]
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("NFRICTION_CACHE", str(tmp_path_factory.mktemp("vectors")))
-        text = function("f", ["x"], nodes, bound, into="y")
-        f = build.build_numba("\n".join([PYTHON_PRELUDE + prelude(), text, ENTRY])).entry
+        f = build_f(nodes, bound)
 
     def run(op, x):
         rows, out = np.asarray(x, dtype=float).reshape(-1, 4), np.empty(16)
@@ -76,9 +81,7 @@ def test_phases_that_wait_for_each_other_keep_every_value():
     # A sum of both phases, and an argument that is itself kept.
     outer = g.apply("exp", g.apply("sub", inner, products[0]))
     outputs = [outer, g.apply("add", g.total(products), outer), inner, waves[3]]
-    text = function("f", ["x"], outputs, bound)
-    values = np.linspace(-1, 1, 5)
-    compiled = build.build_numba("\n".join([PYTHON_PRELUDE + prelude(), text, ENTRY]))
-    got = compiled.entry(values)
+    values, got = np.linspace(-1, 1, 5), np.empty(len(outputs))
+    build_f(outputs, bound)(values, got)
     expected = evaluate(outputs, {"x": values})
     np.testing.assert_allclose(got, [float(e) for e in expected], rtol=1e-14)
