@@ -4,7 +4,7 @@ from string import Template
 
 from nfriction.codegen import lanes_python
 from nfriction.codegen.driver import ADVANCE, BEGIN, LEVELS, STAGE, STEP, Pieces
-from nfriction.codegen.emit import INNER, PYTHON_PRELUDE, python_function
+from nfriction.codegen.emit import COMPILED, PYTHON_PRELUDE, python_function
 
 
 def python_source(parts: Pieces) -> str:
@@ -70,7 +70,7 @@ def _python_names(parts: Pieces) -> dict[str, object]:
     acting = [*_names("tau", count), *held, *memory]
     return {
         "N": count,
-        "INNER": INNER,
+        "COMPILED": COMPILED,
         "stage": ", ".join(["p", "once", "step", *acting]),
         "prepare": f"nf_step(p, once, {', '.join(acting)}, step)" if parts.step else "",
         "q": each("q_#"),
@@ -126,7 +126,7 @@ _PYTHON_DRIVER = Template("""\
         REALS, REALS, REALS, COUNT, COUNT, REALS, COUNT, COUNT,
         REALS, REALS, COUNT, COUNT, REALS, COUNT, REALS, REALS, REALS, COUNTS,
     ),
-    $INNER,
+    $COMPILED,
 )
 def nf_rollout(
     step, all_once, once_row, all_start, first, last, steps, every, hold, limit, all_p, p_row,

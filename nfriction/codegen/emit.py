@@ -30,39 +30,21 @@ _INFIX = {
     "ne": ("!=", _COMPARE),
 }
 _C_NAMES = {"abs": "fabs"}
-_PYTHON_NAMES = {
-    "abs": "abs",
-    "max": "_max",
-    "min": "_min",
-    # math.floor and its like give integers, which know neither infinity nor NaN.
-    **{op: f"np.{op}" for op in ("floor", "ceil", "trunc", "fmod")},
-}
 
-# No entries for C and Python, and no rewriting of array expressions, of which there are none: with
-# those, the functions take half as long again to compile.
-INNER = (
+PYTHON_PRELUDE = """\
+import math
+
+from numba import njit, void
+
+from nfriction.codegen.straight import COUNT, COUNTS, REAL, REALS, moved, op, straight
+"""
+
+# No entries for C and Python, of which the loader needs none, and no rewriting of array
+# expressions, of which there are none.
+COMPILED = (
     'error_model="numpy", fastmath={"contract"}, no_cfunc_wrapper=True, no_cpython_wrapper=True, '
     "no_rewrites=True"
 )
-
-PYTHON_PRELUDE = f"""\
-import math
-
-import numpy as np
-from numba import njit, void
-from nfriction.codegen.pointers import COUNT, COUNTS, REAL, REALS, moved
-
-
-@njit({INNER})
-def _max(a, b):
-    return a if a > b or a != a else b
-
-
-@njit({INNER})
-def _min(a, b):
-    return a if a < b or a != a else b
-"""
-
 
 # The two functions that the emitted C relies on both propagate NaN.
 C_PRELUDE = """\
@@ -111,7 +93,7 @@ class C:
 
 @dataclass(frozen=True)
 class Python:
-    """Python for numba."""
+    """Straight-line Python, see `straight`."""
 
     def literal(self, value: float | bool) -> str:
         if isinstance(value, bool):
@@ -123,13 +105,13 @@ class Python:
         return f"({value!r})" if repr(value).startswith("-") else repr(value)
 
     def call(self, op: str, args: Sequence[str]) -> str:
-        return f"{_PYTHON_NAMES.get(op, f'math.{op}')}({', '.join(args)})"
+        return f"op.{op}({', '.join(args)})"
 
     def logical(self, op: str) -> str:
-        return {"and": "and", "or": "or", "not": "not "}[op]
+        return {"and": "&", "or": "|", "not": "~"}[op]
 
     def where(self, condition: str, a: str, b: str) -> str:
-        return f"({a} if {condition} else {b})"
+        return f"op.where({condition}, {a}, {b})"
 
     def define(self, name: str, text: str, predicate: bool) -> str:
         return f"{name} = {text}"
@@ -263,7 +245,7 @@ def python_function(
     bound: Mapping[int, str],
     into: Sequence[str] = (),
 ) -> str:
-    """A numba function that returns `outputs` as a tuple, or assigns them to elements `into`."""
+    """A function that returns `outputs` as a tuple, or assigns them to elements `into`."""
     return python_text(name, arguments, *statements(outputs, bound, Python()), into)
 
 
@@ -274,10 +256,11 @@ def python_text(
     texts: Sequence[str],
     into: Sequence[str] = (),
 ) -> str:
-    """A numba function of statements and of expressions, which it returns or assigns."""
+    """A function of statements and of expressions, which it returns or assigns."""
     if into:
         last = [f"{target} = {text}" for target, text in zip(into, texts, strict=True)]
     else:
         last = [f"return ({', '.join(texts)},)" if texts else "pass"]
     body = "\n    ".join([*lines, *last])
-    return f"@njit({INNER})\ndef {name}({', '.join(arguments)}):\n    {body}\n"
+    count = 0 if into else len(texts)
+    return f"@straight({count})\ndef {name}({', '.join(arguments)}):\n    {body}\n"

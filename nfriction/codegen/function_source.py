@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from nfriction.codegen.emit import C_PRELUDE, INNER, PYTHON_PRELUDE, c_function, python_function
+from nfriction.codegen.emit import C_PRELUDE, COMPILED, PYTHON_PRELUDE, c_function, python_function
 from nfriction.codegen.graph import Program
 from nfriction.codegen.partition import Partition
 from nfriction.codegen.scalar import Level, Node
@@ -73,7 +73,7 @@ def python_source(
             PYTHON_PRELUDE,
             python_function("nf_once", ["p", "once"], once, inputs, into=slots),
             python_function("nf_row", ["p", "once", *sizes], flat, known, into=targets),
-            f"@njit(void(REALS, COUNT, REALS{', REALS' * len(sizes)}), {INNER})",
+            f"@njit(void(REALS, COUNT, REALS{', REALS' * len(sizes)}), {COMPILED})",
             f"def nf_function(once, rows, p, {', '.join(sizes)}):",
             "    nf_once(p, once)",
             "    for r in range(rows):",

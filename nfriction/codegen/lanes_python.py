@@ -18,7 +18,7 @@ def prelude() -> str:
     numba keeps machine code as long as the text stays the same, so their text counts with it.
     """
     digest = hashlib.sha256()
-    for name in ("vectors.py", "lanes.py", "pointers.py"):
+    for name in ("vectors.py", "lanes.py", "straight.py"):
         digest.update(Path(__file__).with_name(name).read_bytes())
     return (
         f"from nfriction.codegen.vectors import exp4, sincos4, tanh4  # {digest.hexdigest()[:16]}\n"
@@ -32,7 +32,7 @@ def function(
     bound: Mapping[int, str],
     into: Sequence[str] = (),
 ) -> str:
-    """A numba function that returns `outputs` as a tuple, or assigns them to elements `into`."""
+    """A function that returns `outputs` as a tuple, or assigns them to elements `into`."""
     return python_text(name, arguments, *_body(outputs, dict(bound)), into)
 
 

@@ -8,10 +8,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from llvmlite import ir  # type: ignore[import-untyped]
-from numba import types
-from numba.extending import intrinsic
 
 from nfriction.codegen.lanes import COS, EXP, SIN, WIDTH
+from nfriction.codegen.straight import Value, builder_of, code_of
 
 _REAL = ir.VectorType(ir.DoubleType(), WIDTH)
 _BITS = ir.VectorType(ir.IntType(64), WIDTH)
@@ -135,25 +134,18 @@ def _sincos(v: _Vectors, x: Any) -> list[Any]:
     return merged
 
 
-def _four(function: Callable[[_Vectors, Any], list[Any]], results: int) -> Callable[..., Any]:
-    """A function of four numbers that numba compiled code may call."""
-    returned = types.UniTuple(types.float64, WIDTH * results)
+def _four(function: Callable[[_Vectors, Any], list[Any]]) -> Callable[..., tuple[Value, ...]]:
+    """A function of four recorded numbers."""
 
-    @intrinsic
-    def call(typing: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
-        def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            x = ir.Constant(_REAL, ir.Undefined)
-            for i, argument in zip(_LANES, arguments, strict=True):
-                x = builder.insert_element(x, argument, i)
-            values = function(_Vectors(builder), x)
-            numbers = [builder.extract_element(y, i) for y in values for i in _LANES]
-            return context.make_tuple(builder, returned, numbers)
-
-        return returned(*[types.float64] * WIDTH), code
+    def call(*given: Any) -> tuple[Value, ...]:
+        builder = builder_of(given)
+        x = ir.Constant(_REAL, ir.Undefined)
+        for i, one in zip(_LANES, given, strict=True):
+            x = builder.insert_element(x, code_of(one), i)
+        values = function(_Vectors(builder), x)
+        return tuple(Value(builder, builder.extract_element(y, i)) for y in values for i in _LANES)
 
     return call
 
 
-exp4 = _four(_exp, 1)
-tanh4 = _four(_tanh, 1)
-sincos4 = _four(_sincos, 2)
+exp4, tanh4, sincos4 = map(_four, (_exp, _tanh, _sincos))

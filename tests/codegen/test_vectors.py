@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nfriction.codegen import build
-from nfriction.codegen.emit import PYTHON_PRELUDE
+from nfriction.codegen.emit import COMPILED, PYTHON_PRELUDE
 from nfriction.codegen.kernels import ARRAY, of_arrays
 from nfriction.codegen.lanes_python import function, prelude
 from nfriction.codegen.scalar import Graph, evaluate
@@ -12,12 +12,18 @@ from nfriction.codegen.scalar import Graph, evaluate
 pytest.importorskip("numba")
 
 
+ENTRY = f"""
+@njit(void(REALS, REALS), {COMPILED})
+def entry(x, y):
+    f(x, y)
+"""
+
+
 def build_f(outputs, bound):
     """A function of two arrays, `x` and what becomes of it."""
     into = [f"y[{i}]" for i in range(len(outputs))]
-    text = function("f", ["x", "y"], outputs, bound, into=into)
-    signed = text.replace("@njit(", "@njit(void(REALS, REALS), ")
-    return of_arrays(build.build_numba(PYTHON_PRELUDE + prelude() + signed, "f", [ARRAY, ARRAY]))
+    text = PYTHON_PRELUDE + prelude() + function("f", ["x", "y"], outputs, bound, into) + ENTRY
+    return of_arrays(build.build_numba(text, "entry", [ARRAY, ARRAY]))
 
 
 @pytest.fixture(scope="module")
