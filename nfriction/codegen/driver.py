@@ -2,17 +2,14 @@
 
 `driver_c` and `driver_python` put the same RK4 driver around them. Both give it the same entry
 point `nf_rollout` with the same arguments: candidates `first` to `last`, flat arrays and strides.
-Python's also takes what C computes once a candidate.
+Python's also takes room for what C keeps on its stack.
 """
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-
-import numpy as np
 
 from nfriction.codegen.graph import Program
 from nfriction.codegen.partition import partition
-from nfriction.codegen.scalar import Level, Node, evaluate
+from nfriction.codegen.scalar import Level, Node
 
 LEVELS = {
     "qd_held": Level.STEP,
@@ -31,7 +28,6 @@ class Pieces:
 
     Attributes:
         joints: number of joints.
-        parameters: number of scalar parameters.
         once: values computed once a rollout.
         step: values computed once a step.
         stage: acceleration with friction.
@@ -39,11 +35,9 @@ class Pieces:
         begin: memory of the coefficients after the first sample; empty where they have none.
         advance: memory after a sample, from that before.
         inputs: text of the input nodes by number, elements of arrays.
-        offsets: where each parameter begins in the array `p`.
     """
 
     joints: int
-    parameters: int
     once: tuple[Node, ...]
     step: tuple[Node, ...]
     stage: tuple[Node, ...]
@@ -51,24 +45,6 @@ class Pieces:
     begin: tuple[Node, ...]
     advance: tuple[Node, ...]
     inputs: dict[int, str]
-    offsets: dict[str, int]
-
-    def evaluate(
-        self, outputs: Sequence[Node], given: Mapping[str, np.ndarray], rows: int
-    ) -> np.ndarray:
-        """Values of some of these nodes in NumPy, all candidates at once, flat.
-
-        Args:
-            outputs: what to compute.
-            given: arrays by the names that `inputs` uses, (rows or 1, size).
-            rows: number of candidates.
-        """
-        inputs = {name: given["p"][:, offset:] for name, offset in self.offsets.items()}
-        columns = evaluate(outputs, {**inputs, **given})
-        table = np.empty((rows, len(outputs)))
-        for i, column in enumerate(columns):
-            table[:, i] = column
-        return table.reshape(-1)
 
     @property
     def hoisted(self) -> dict[int, str]:
@@ -89,18 +65,15 @@ def pieces(program: Program) -> Pieces:
     joints = len(stage.nodes)
     split = partition(program.graph, stage.nodes)
     inputs: dict[int, str] = {}
-    offsets: dict[str, int] = {}
     offset = 0
     for port in program.inputs:
         held = port.name in LEVELS
         for i, node in enumerate(port.nodes):
             inputs[node.number] = f"{port.name}[{i}]" if held else f"p[{offset + i}]"
         if not held:
-            offsets[port.name] = offset
             offset += len(port.nodes)
     return Pieces(
         joints,
-        offset,
         split.hoisted[Level.PARAMETER],
         split.hoisted[Level.STEP],
         split.outputs,
@@ -108,7 +81,6 @@ def pieces(program: Program) -> Pieces:
         begin,
         advance,
         inputs,
-        offsets,
     )
 
 

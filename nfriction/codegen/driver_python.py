@@ -3,16 +3,12 @@
 from string import Template
 
 from nfriction.codegen import lanes_python
-from nfriction.codegen.driver import ADVANCE, BEGIN, LEVELS, STAGE, STEP, Pieces
+from nfriction.codegen.driver import ADVANCE, BEGIN, LEVELS, ONCE, STAGE, START, STEP, Pieces
 from nfriction.codegen.emit import COMPILED, PYTHON_PRELUDE, python_function
 
 
 def python_source(parts: Pieces) -> str:
-    """The Python module of a rollout, for numba.
-
-    What is computed once a rollout comes as an argument: long functions that run once would take
-    most of the time to compile.
-    """
+    """The Python module of a rollout, for numba."""
     known = parts.inputs | parts.hoisted
     below = {node.number: known[node.number] for node in parts.once} | parts.inputs
 
@@ -23,7 +19,12 @@ def python_source(parts: Pieces) -> str:
     def spread(arguments: list[str]) -> list[str]:
         return [a for name in arguments for a in _spread(name, parts)]
 
-    functions = [lanes_python.function("nf_stage", spread(STAGE), parts.stage, scalars(known))]
+    once = [f"once[{i}]" for i in range(len(parts.once))]
+    functions = [
+        python_function("nf_once", [*ONCE, "once"], parts.once, parts.inputs, once),
+        python_function("nf_start", spread(START), parts.start, scalars(parts.inputs)),
+        lanes_python.function("nf_stage", spread(STAGE), parts.stage, scalars(known)),
+    ]
     if parts.step:
         into = [f"step[{i}]" for i in range(len(parts.step))]
         step = lanes_python.function(
@@ -73,14 +74,15 @@ def _python_names(parts: Pieces) -> dict[str, object]:
         "COMPILED": COMPILED,
         "stage": ", ".join(["p", "once", "step", *acting]),
         "prepare": f"nf_step(p, once, {', '.join(acting)}, step)" if parts.step else "",
-        "q": each("q_#"),
-        "qd": each("qd_#"),
+        "prev": each("prev_#"),
+        "tau": ", ".join(_names("tau", count)),
         "q_args": ", ".join(_names("q", count)),
         "qd_args": ", ".join(_names("qd", count)),
         "initial": lines("q_# = q0[#]; qd_# = qd0[#]; q_out[#] = q_#; qd_out[#] = qd_#", 8),
-        "first_qdd": lines("prev_# = start[#]; qdd_out[#] = prev_#", 8),
+        "first_qdd": lines("qdd_out[#] = prev_#", 8),
         "seed": lines("qd_held_# = qdd_held_# = 0.0", 8),
         "memory_seed": "\n        ".join(f"{name} = 0.0" for name in memory),
+        "first_tau": lines("tau_# = torque[#]", 8),
         "take": lines("tau_# = torque[#]", 12),
         "hold": lines("qd_held_# = qd_#; qdd_held_# = prev_#", 16),
         "remember": _remember(", ".join(held), ", ".join(memory)) if memory else "",
@@ -122,22 +124,20 @@ def _remember(held: str, memory: str) -> str:
 _PYTHON_DRIVER = Template("""\
 @njit(
     void(
-        REALS, REALS, COUNT, REALS, COUNT, COUNT, COUNT, COUNT, COUNT, REAL, REALS, COUNT,
+        REALS, REALS, COUNT, COUNT, COUNT, COUNT, COUNT, REAL, REALS, COUNT,
         REALS, REALS, REALS, COUNT, COUNT, REALS, COUNT, COUNT,
         REALS, REALS, COUNT, COUNT, REALS, COUNT, REALS, REALS, REALS, COUNTS,
     ),
     $COMPILED,
 )
 def nf_rollout(
-    step, all_once, once_row, all_start, first, last, steps, every, hold, limit, all_p, p_row,
+    once, step, first, last, steps, every, hold, limit, all_p, p_row,
     all_q0, all_qd0, all_h, h_row, h_step, all_torque, torque_row, torque_step,
     all_qd_drive, all_qdd_drive, drive_row, drive_step, memory, remembered,
     all_q_out, all_qd_out, all_qdd_out, diverged,
 ):
     records = (steps // every + 1) * $N
     for c in range(first, last):
-        once = moved(all_once, (c - first) * once_row)
-        start = moved(all_start, (c - first) * $N)
         p = moved(all_p, c * p_row)
         q0 = moved(all_q0, c * $N)
         qd0 = moved(all_qd0, c * $N)
@@ -151,6 +151,9 @@ def nf_rollout(
         diverged[c] = -1
         $initial
         $seed
+        $first_tau
+        nf_once(p, once)
+        $prev = nf_start(p, $tau, $q_args, $qd_args)
         $first_qdd
         next = every
         renew = 0
