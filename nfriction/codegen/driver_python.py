@@ -71,9 +71,12 @@ def _python_names(parts: Pieces) -> dict[str, object]:
     acting = [*_names("tau", count), *held, *memory]
     return {
         "N": count,
+        "N3": 3 * count,
         "COMPILED": COMPILED,
         "stage": ", ".join(["p", "once", "step", *acting]),
         "prepare": f"nf_step(p, once, {', '.join(acting)}, step)" if parts.step else "",
+        "q": each("q_#"),
+        "qd": each("qd_#"),
         "prev": each("prev_#"),
         "tau": ", ".join(_names("tau", count)),
         "q_args": ", ".join(_names("q", count)),
@@ -91,18 +94,15 @@ def _python_names(parts: Pieces) -> dict[str, object]:
         "a2": each("a2_#"),
         "a3": each("a3_#"),
         "a4": each("a4_#"),
-        "to2": lines("x_# = q_# + half * qd_#; v2_# = qd_# + half * a1_#", 12),
-        "to3": lines("x_# = q_# + half * v2_#; v3_# = qd_# + half * a2_#", 12),
-        "to4": lines("x_# = q_# + dt * v3_#; v4_# = qd_# + dt * a3_#", 12),
+        "to2": lines("x_# = q_# + half * qd_#; v2_# = qd_# + half * a1_#", 4),
+        "to3": lines("x_# = q_# + half * v2_#; v3_# = qd_# + half * a2_#", 4),
+        "to4": lines("x_# = q_# + dt * v3_#; v4_# = qd_# + dt * a3_#", 4),
         "x": ", ".join(_names("x", count)),
         "v2": ", ".join(_names("v2", count)),
         "v3": ", ".join(_names("v3", count)),
         "v4": ", ".join(_names("v4", count)),
-        "advance": lines(
-            "q_# += sixth * (qd_# + 2.0 * (v2_# + v3_#) + v4_#); "
-            "qd_# += sixth * (a1_# + 2.0 * (a2_# + a3_#) + a4_#); prev_# = a1_#",
-            12,
-        ),
+        "q_next": each("q_# + sixth * (qd_# + 2.0 * (v2_# + v3_#) + v4_#)"),
+        "qd_next": each("qd_# + sixth * (a1_# + 2.0 * (a2_# + a3_#) + a4_#)"),
         "within": " and ".join(f"abs(qd_{i}) <= limit and q_{i} - q_{i} == 0.0" for i in n),
         "record": lines("q_out[#] = q_#; qd_out[#] = qd_#; qdd_out[#] = prev_#", 16),
     }
@@ -122,6 +122,20 @@ def _remember(held: str, memory: str) -> str:
 
 
 _PYTHON_DRIVER = Template("""\
+@straight($N3)
+def nf_rk4(dt, $stage, $q_args, $qd_args):
+    half = 0.5 * dt
+    sixth = dt / 6.0
+    $a1 = nf_stage.within($stage, $q_args, $qd_args)
+    $to2
+    $a2 = nf_stage.within($stage, $x, $v2)
+    $to3
+    $a3 = nf_stage.within($stage, $x, $v3)
+    $to4
+    $a4 = nf_stage.within($stage, $x, $v4)
+    return ($q_next $qd_next $a1)
+
+
 @njit(
     void(
         REALS, REALS, COUNT, COUNT, COUNT, COUNT, COUNT, REAL, REALS, COUNT,
@@ -159,9 +173,6 @@ def nf_rollout(
         renew = 0
         $memory_seed
         for k in range(steps):
-            dt = h[k * h_step]
-            half = 0.5 * dt
-            sixth = dt / 6.0
             $take
             if k == renew:
                 renew += hold
@@ -169,14 +180,7 @@ def nf_rollout(
                 if drive_step:
                     $drive$remember
             $prepare
-            $a1 = nf_stage($stage, $q_args, $qd_args)
-            $to2
-            $a2 = nf_stage($stage, $x, $v2)
-            $to3
-            $a3 = nf_stage($stage, $x, $v3)
-            $to4
-            $a4 = nf_stage($stage, $x, $v4)
-            $advance
+            $q $qd $prev = nf_rk4(h[k * h_step], $stage, $q_args, $qd_args)
             torque = moved(torque, torque_step)
             qd_drive = moved(qd_drive, drive_step)
             qdd_drive = moved(qdd_drive, drive_step)

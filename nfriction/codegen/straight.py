@@ -35,7 +35,7 @@ def moved(typing: Any, pointer: Any, count: Any) -> Any:
 
 def code_of(x: Any) -> Any:
     """LLVM's value of a recorded one or a literal."""
-    if isinstance(x, Value):
+    if isinstance(x, (Value, _Array)):
         return x.code
     return ir.Constant(_TRUTH if isinstance(x, bool) else _REAL, x)
 
@@ -154,22 +154,33 @@ op = SimpleNamespace(
 
 
 def straight(results: int) -> Callable[..., Any]:
-    """Decorate a function of numbers and pointers that returns so many numbers, or None."""
+    """Decorate a function of numbers and pointers that returns so many numbers, or None.
+
+    Compiled code calls it by its name, other recorded functions through its attribute `within`.
+    """
     returned = types.UniTuple(REAL, results) if results else types.none
     kind = ir.ArrayType(_REAL, results) if results else ir.VoidType()
 
     def decorate(function: Callable[..., Any]) -> Any:
+        def invoke(builder: Any, arguments: Sequence[Any]) -> Any:
+            name, known = function.__name__, builder.module.globals
+            made = known[name] if name in known else _record(function, builder, arguments, kind)
+            return builder.call(made, arguments)
+
         @intrinsic
         def call(typing: Any, *given: Any) -> Any:
             def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-                arguments = cgutils.unpack_tuple(builder, arguments[0])
-                name, known = function.__name__, builder.module.globals
-                made = known[name] if name in known else _record(function, builder, arguments, kind)
-                found = builder.call(made, arguments)
+                found = invoke(builder, cgutils.unpack_tuple(builder, arguments[0]))
                 return found if results else context.get_dummy_value()
 
             return returned(types.StarArgTuple(given)), code
 
+        def within(*given: Any) -> tuple[Value, ...]:
+            builder = builder_of(given)
+            found = invoke(builder, [code_of(x) for x in given])
+            return tuple(Value(builder, builder.extract_value(found, i)) for i in range(results))
+
+        call.within = within  # type: ignore[attr-defined]
         return call
 
     return decorate

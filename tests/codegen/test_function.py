@@ -40,7 +40,7 @@ def everything(x, y):
     ])  # fmt: skip
 
 
-@pytest.mark.parametrize("backend", ["c", pytest.param("numba", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("backend", ["c", "numba"])
 def test_every_operation_agrees_in_every_language(backend):
     rng = np.random.default_rng(0)
     x, y = rng.normal(size=(2, 50, 3))
