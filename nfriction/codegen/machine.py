@@ -6,6 +6,7 @@ later process LLVM's loader is enough.
 
 import ctypes
 import math
+import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -23,7 +24,10 @@ def compile_python(source: str, name: str) -> tuple[bytes, bool]:
     (result,) = scope[name].overloads.values()
     _, _, (code, bitcode) = result.library.serialize_using_object_code()
     called = [f.name for f in llvm.parse_bitcode(bitcode).functions if f.is_declaration]
-    alone = all(n.startswith("llvm.") or hasattr(math, n) for n in called)
+    # On Windows numba brings functions of the C library that LLVM does not find by itself, and
+    # what it does not find ends the process.
+    alone = sys.platform != "win32"
+    alone = alone and all(n.startswith("llvm.") or hasattr(math, n) for n in called)
     return result.fndesc.llvm_func_name.encode() + b"\n" + code, alone
 
 

@@ -70,7 +70,12 @@ def pt2(
     )
     contract = contract_of(model, controller, info)
     program = exported(controller)
-    program.example_inputs = None  # torch would pickle them
+    try:
+        program.example_inputs = None  # torch would pickle them
+    except ValueError as error:
+        raise ExportError(
+            f"torch {torch.__version__} writes pickled objects into a .pt2; use a newer one for it."
+        ) from error
     for node in program.graph.nodes:  # the stack tells of this machine's folders
         node.meta = {key: value for key, value in node.meta.items() if key == "val"}
     buffer = io.BytesIO()  # into memory, so that the temporary file's name is not kept inside
