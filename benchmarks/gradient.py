@@ -152,25 +152,27 @@ def one_width_a_unit():
         @torch.no_grad()
         def jacobian_columns(self, x, out=None):
             shared, moving = self.units + 1, self.units * self.inputs
-            u, inverse = x.movedim(0, -1).unsqueeze(1), torch.exp(-self.log_widths)
             F = x.new_empty(1, shared + moving + self.units, len(x)) if out is None else out
-            phi = self.regressor_columns(x, F[:, :shared])[:, :-1]
-            z = F[:, shared : shared + moving].unflatten(1, (self.units, self.inputs))
-            torch.sub(u, self.centres.unsqueeze(-1), out=z)
-            z.mul_(inverse.unsqueeze(-1))
-            torch.mul(z[:, :, 0], z[:, :, 0], out=F[:, -self.units :])
-            F[:, -self.units :].addcmul_(z[:, :, 1], z[:, :, 1]).mul_(phi)
-            z.mul_(phi.unsqueeze(2))
+            d = F[:, shared : shared + moving].unflatten(1, (self.units, self.inputs))
+            torch.sub(x.movedim(0, -1).unsqueeze(1), self.centres.unsqueeze(-1), out=d)
+            squares = torch.mul(d[:, :, 0], d[:, :, 0], out=F[:, -self.units :])
+            squares.addcmul_(d[:, :, 1], d[:, :, 1])
+            phi = F[:, : self.units]
+            torch.mul(squares, -0.5 * torch.exp(-2.0 * self.log_widths), out=phi)
+            phi.clamp_(min=self.least_exponent).exp_()
+            F[:, self.units] = 1.0
+            squares.mul_(phi)
+            d.mul_(phi.unsqueeze(2))
             return F
 
         @torch.no_grad()
         def jacobian_maps(self):
             inputs, units, weight = self.inputs, self.units, self.output_weight.detach()
-            slope = (weight * torch.exp(-self.log_widths).mT).repeat_interleave(inputs, 2)
+            slope = weight * torch.exp(-2.0 * self.log_widths).mT
             own, one = (torch.eye(n).to(weight) for n in (self.outputs, units))
             blocks = (
+                torch.diag_embed(slope.repeat_interleave(inputs, 2)),
                 torch.diag_embed(slope),
-                torch.diag_embed(weight),
                 torch.einsum("ab,uv->aubv", own, one).flatten(2),
                 own.unsqueeze(1),
             )

@@ -112,18 +112,19 @@ class RBFNetwork(nn.Module):
     @torch.no_grad()
     def regressor_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
         """`regressors` with the samples last, (groups, units + 1, samples), written to `out`."""
-        exponents = self._exponents(x)
+        constant, quadratic, powers = self._expanded(x)
         if out is None:
-            out = exponents.new_empty(len(exponents), self.units + 1, exponents.shape[2])
-        torch.exp(exponents, out=out[:, :-1])
+            out = powers.new_empty(len(powers), self.units + 1, powers.shape[2])
+        phi = torch.baddbmm(constant, quadratic, powers, out=out[:, :-1])
+        phi.clamp_(min=self.least_exponent).exp_()
         out[:, -1] = 1.0
         return out
 
     @torch.no_grad()
     def jacobian_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
-        """What the derivatives of all outputs combine: the regressors, phi z and phi z^2.
+        """What the derivatives of all outputs combine: the regressors, phi d and phi d^2.
 
-        Here z = (x - c)/s. `jacobian_maps` says how they combine.
+        Here d = x - c. `jacobian_maps` says how they combine.
 
         Args:
             x: inputs, shape (samples, groups, inputs).
@@ -131,18 +132,20 @@ class RBFNetwork(nn.Module):
         Returns:
             Shape (groups, units + 1 + 2 units inputs, samples).
         """
-        columns = to_columns(x)
-        size = (self.units, self.inputs)
-        shared, moving = self.units + 1, self.units * self.inputs
-        shape = (len(columns), shared + 2 * moving, columns.shape[-1])
+        columns, shared = to_columns(x), self.units + 1
+        shape = (len(columns), shared + 2 * self.units * self.inputs, columns.shape[-1])
         F = columns.new_empty(shape) if out is None else out
-        phi = self.regressor_columns(x, F[:, :shared])[:, :-1]
-        by_centre = F[:, shared : shared + moving].unflatten(1, size)
-        by_width = F[:, shared + moving :].unflatten(1, size)
-        z = torch.sub(columns.unsqueeze(1), self.centres.unsqueeze(-1), out=by_width)
-        z.mul_(torch.exp(-self.log_widths).unsqueeze(-1))
-        torch.mul(z, phi.unsqueeze(2), out=by_centre)
-        by_width.mul_(by_centre)
+        moving = F[:, shared:].unflatten(1, (2, self.units, self.inputs))
+        d = torch.sub(columns.unsqueeze(1), self.centres.unsqueeze(-1), out=moving[:, 0])
+        squares = torch.mul(d, d, out=moving[:, 1])
+        # The differences are asked for anyway, so that the exponents take nothing else.
+        factor = -0.5 * torch.exp(-2.0 * self.log_widths).unsqueeze(-1)
+        phi = torch.mul(squares[:, :, 0], factor[:, :, 0], out=F[:, : self.units])
+        for i in range(1, self.inputs):
+            phi.addcmul_(squares[:, :, i], factor[:, :, i])
+        phi.clamp_(min=self.least_exponent).exp_()
+        F[:, self.units] = 1.0
+        moving.mul_(phi[:, None, :, None])
         return F
 
     def readout(self) -> Tensor:
@@ -153,7 +156,7 @@ class RBFNetwork(nn.Module):
     def jacobian_maps(self) -> dict[str, Tensor]:
         """How `jacobian_columns` combine to the derivatives by each trained parameter.
 
-        d y_k = sum_u w_ku (phi z / s dc + phi z^2 dlog s) + phi_u dw_ku + db_k.
+        d y_k = sum_u w_ku (phi d / s^2 dc + phi d^2 / s^2 dlog s) + phi_u dw_ku + db_k.
 
         Returns:
             For each trained parameter (groups, outputs, columns, entries of a group).
@@ -161,11 +164,11 @@ class RBFNetwork(nn.Module):
         groups, units, inputs = self.centres.shape
         moving, columns = units * inputs, (2 * inputs + 1) * units + 1
         weight = self.output_weight.detach().repeat_interleave(inputs, 2)
-        slope = weight * torch.exp(-self.log_widths).flatten(1).unsqueeze(1)
+        slope = torch.diag_embed(weight * torch.exp(-2.0 * self.log_widths).flatten(1).unsqueeze(1))
         own, one = (torch.eye(n).to(weight) for n in (self.outputs, units))
         blocks = {
-            "centres": (units + 1, torch.diag_embed(slope)),
-            "log_widths": (units + 1 + moving, torch.diag_embed(weight)),
+            "centres": (units + 1, slope),
+            "log_widths": (units + 1 + moving, slope),
             "output_weight": (0, torch.einsum("ab,uv->aubv", own, one).flatten(2)),
             "output_bias": (units, own.unsqueeze(1)),
         }
@@ -181,11 +184,19 @@ class RBFNetwork(nn.Module):
         return torch.exp(self._exponents(x))
 
     def _exponents(self, x: Tensor) -> Tensor:
-        """Logarithms of the units' outputs, shape (groups, units, samples).
+        """Logarithms of the units' outputs, shape (groups, units, samples)."""
+        constant, quadratic, powers = self._expanded(x)
+        return torch.baddbmm(constant, quadratic, powers).clamp(min=self.least_exponent)
+
+    def _expanded(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Constants, coefficients and powers of the inputs whose product the exponents are.
 
         The square is expanded into a product of matrices, 12 times faster on 40,000 samples than
         differences of every sample and centre. Taken about the mean centre it costs digits only by
         (range/width)^2, never by where the inputs lie.
+
+        Returns:
+            Shapes (groups, units, 1), (groups, units, 2 inputs) and (groups, 2 inputs, samples).
         """
         columns = to_columns(x)
         middle = self.centres.mean(1)
@@ -195,8 +206,7 @@ class RBFNetwork(nn.Module):
         linear = precision * offset
         constant = -0.5 * (linear * offset).sum(2)
         quadratic = torch.cat([-0.5 * precision.expand_as(linear), linear], 2)
-        exponent = torch.baddbmm(constant.unsqueeze(-1), quadratic, torch.cat([v * v, v], 1))
-        return exponent.clamp(min=self.least_exponent)
+        return constant.unsqueeze(-1), quadratic, torch.cat([v * v, v], 1)
 
     @torch.no_grad()
     def init_range(self, lower: float | Tensor, upper: float | Tensor, seed: int = 0) -> None:

@@ -72,6 +72,8 @@ def bayesian_regularisation(
     used = used[used > 0]
     # Errors within the rounding of the targets are no information about anything.
     rounding = torch.finfo(y.dtype).eps * float(y.square().mean().sqrt())
+    # Samples last in memory, as layers take them: kernels are vectorised over samples.
+    x, y = (part.movedim(0, -1).contiguous().movedim(-1, 0) for part in (x, y))
 
     def equations(w: Tensor) -> NormalEquations:
         return jac.normal_equations(model, jac.unflatten(w, parameters), x, y, weights, chunk)

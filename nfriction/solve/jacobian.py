@@ -20,6 +20,9 @@ Function: TypeAlias = Callable[[Mapping[str, Tensor], Tensor], Tensor]
 # 4 MiB of Jacobian at a time: below, the calls cost more than the arithmetic; above, the backward
 # pass falls out of the cache, and its some ten intermediates of that size out of 100 MB.
 CHUNK_ENTRIES = 2**19
+# Where only outputs are asked for: their intermediates stay in the cache, and need no memory that
+# the system hands out anew, whose first touch costs more than the arithmetic.
+CHUNK_SAMPLES = 2**14
 
 
 class NormalEquations(NamedTuple):
@@ -158,11 +161,15 @@ def sum_of_squares(
     weights: Tensor | None = None,
 ) -> Tensor:
     """Weighted sum of squared errors alone: the cheap trial of a step."""
+    function, total = _function(model), inputs.new_zeros(())
     with torch.no_grad():
-        errors = _errors(_function(model)(parameters, inputs), targets).square()
-        if weights is not None:
-            errors = errors * weights.reshape(len(errors), -1)
-        return errors.sum()
+        for start in range(0, len(inputs), CHUNK_SAMPLES):
+            rows = slice(start, start + CHUNK_SAMPLES)
+            errors = _errors(function(parameters, inputs[rows]), targets[rows]).square()
+            if weights is not None:
+                errors = errors * weights[rows].reshape(len(errors), -1)
+            total += errors.sum()
+    return total
 
 
 def check_samples(inputs: Tensor, targets: Tensor, weights: Tensor | None) -> None:

@@ -20,8 +20,9 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-# 8 MiB of columns at a time: fewer samples cost more calls, more fall out of the cache.
-CHUNK_ENTRIES = 2**20
+# 4 MiB of columns at a time: fewer samples cost more calls, more fall out of the cache and into
+# memory that the system has to hand out anew for every call.
+CHUNK_ENTRIES = 2**19
 
 
 class SharedColumns(Protocol):
@@ -108,7 +109,7 @@ class _Grams(nn.Module):
             F = buffer[:, :, : wanted.shape[-1]]
             model.jacobian_columns(inputs[part], F[:, :columns])
             torch.bmm(readout, F[:, :used], out=F[:, columns:])
-            F[:, columns:] -= wanted
+            F[:, columns:].sub_(wanted)
             if roots is None:
                 grams[:, 0].baddbmm_(F, F.mT)
                 continue
