@@ -171,11 +171,17 @@ class Anfis(nn.Module):
         On a full grid the softmax of the summed log memberships is the product of one softmax for
         each input: the same numbers with sum(terms) exponentials instead of prod(terms).
         """
-        logs = self._log_memberships(columns)
-        strengths = torch.softmax(logs[0], 1)
-        for log in logs[1:]:
-            shares = torch.softmax(log, 1)
-            strengths = (strengths.unsqueeze(2) * shares.unsqueeze(1)).flatten(1, 2)
+        return self.strengths_of(self.set_shares(columns))
+
+    def set_shares(self, columns: Tensor) -> list[Tensor]:
+        """Memberships over their sum, one tensor (groups, terms, samples) for each input."""
+        return [torch.softmax(log, 1) for log in self._log_memberships(columns)]
+
+    def strengths_of(self, shares: list[Tensor]) -> Tensor:
+        """Product of one share of each input for every rule, shape (groups, rules, samples)."""
+        strengths = shares[0]
+        for own in shares[1:]:
+            strengths = (strengths.unsqueeze(2) * own.unsqueeze(1)).flatten(1, 2)
         return strengths
 
     def jacobian(self, x: Tensor) -> Tensor:
@@ -197,7 +203,7 @@ class Anfis(nn.Module):
         Returns:
             Shape (groups, outputs, inputs, samples).
         """
-        return anfis_jacobian.input_jacobian(self, x)
+        return anfis_jacobian.input_jacobian(self, x)[1]
 
     def regressor_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
         """`regressors` with the samples last, (groups, regressors, samples), written to `out`."""

@@ -10,7 +10,6 @@ and the log memberships with z = (x - c)/a: by -h, where h = z for Gaussians.
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 import torch
@@ -73,36 +72,40 @@ def jacobian_columns(anfis: Anfis, x: Tensor, out: Tensor | None = None) -> Tens
 
 
 @torch.no_grad()
-def input_jacobian(anfis: Anfis, x: Tensor) -> Tensor:
-    """Derivative of every output by the inputs of its group, (groups, outputs, inputs, samples).
+def input_jacobian(anfis: Anfis, x: Tensor) -> tuple[Tensor, Tensor]:
+    """Outputs and their derivatives by the inputs of their group.
 
-    An input x_i moves the rules' planes f_kr = a_kr . x + b_kr, and their strengths through the log
-    memberships l of its sets, of which the normalisation takes the mean off:
+    An input x_i moves the rules' planes f_kr = a_kr . x + b_kr, and the shares p of its sets in the
+    strengths s_r = prod_i p_i[t_i(r)], each softmax of log memberships l:
 
-        d y_k / d x_i = sum_r s_r a_kri + sum_r s_r (l'_i[t_i(r)] - sum_q s_q l'_i[t_i(q)]) f_kr.
+        d y_k / d x_i = sum_r s_r a_kri + sum_r s_r p'_i[t_i(r)] / p_i[t_i(r)] f_kr,
+        p' = p (l' - sum p l').
 
     Args:
         x: inputs, shape (samples, groups, inputs).
+    Returns:
+        Shapes (groups, outputs, samples) and (groups, outputs, inputs, samples).
     """
-    u = to_columns(x)
-    strengths, terms = anfis.strength_columns(u), _terms(anfis, u)
+    u = to_columns(x).contiguous()
+    terms, shares = _terms(anfis, u), anfis.set_shares(u)
     planes = anfis.consequents.transpose(2, 3).flatten(1, 2)
-    # A row of ones sums what is blended: the mean comes along with the planes.
-    rows = torch.cat([planes, torch.ones_like(planes[:, :1])], 1)
-    blended = torch.bmm(planes, strengths)
+
+    def blended(factors: list[Tensor]) -> Tensor:
+        found = torch.bmm(planes, anfis.strengths_of(factors))
+        return found.unflatten(1, (anfis.outputs, terms.shape[1]))
+
+    def evaluated(blend: Tensor) -> Tensor:
+        return (blend * terms.unsqueeze(1)).sum(2)
+
+    own = blended(shares)
     by_log = _premises(anfis, u)[1] / -anfis.sets()[1].unsqueeze(-1)
-    shape = (anfis.outputs, terms.shape[1])
-    moved, by_input = torch.empty_like(strengths), []
-    for i, own in enumerate(by_log.split(anfis.terms, 1)):
-        after = math.prod(anfis.terms[i + 1 :])
-        by_set = (-1, anfis.terms[i], after)
-        factors = strengths.unflatten(1, by_set), own[:, None, :, None]
-        torch.mul(*factors, out=moved.unflatten(1, by_set))
-        found = torch.bmm(rows, moved)
-        found = torch.addcmul(found[:, :-1], blended, found[:, -1:], value=-1.0)
-        by_input.append((found.unflatten(1, shape) * terms.unsqueeze(1)).sum(2))
-    direct = blended.unflatten(1, shape)[:, :, :-1]
-    return torch.stack(by_input, 2) + (direct if anfis.order == 1 else 0.0)
+    by_input = []
+    for i, slope in enumerate(by_log.split(anfis.terms, 1)):
+        mean = (shares[i] * slope).sum(1, keepdim=True)
+        moved = [*shares[:i], shares[i] * (slope - mean), *shares[i + 1 :]]
+        by_input.append(evaluated(blended(moved)))
+    found = torch.stack(by_input, 2)
+    return evaluated(own), found + own[:, :, :-1] if anfis.order == 1 else found
 
 
 @torch.no_grad()

@@ -5,7 +5,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from nfriction.fuzzy import anfis_jacobian
 from nfriction.fuzzy.anfis import Anfis
+from nfriction.fuzzy.layout import to_columns
 from nfriction.fuzzy.rbf import RBFHead
 
 
@@ -83,8 +85,8 @@ class AnfisRBF(nn.Module):
         Returns:
             Shape (groups, outputs, inputs, samples).
         """
-        said = self.anfis.input_jacobian(x)
-        through = self.head.input_jacobian(torch.cat([x, self.anfis(x)], -1))
+        y, said = anfis_jacobian.input_jacobian(self.anfis, x)
+        through = self.head.input_jacobian(torch.cat([to_columns(x), y], 1).movedim(-1, 0))
         found = said + through[:, :, : self.inputs]
         for j in range(self.outputs):
             found.addcmul_(through[:, :, self.inputs + j].unsqueeze(2), said[:, j].unsqueeze(1))
