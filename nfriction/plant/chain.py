@@ -32,6 +32,7 @@ from nfriction.plant.planar import (
     static_moment,
 )
 from nfriction.plant.poses import refuse_indefinite, turning_poses
+from nfriction.plant.slopes import PlantSlopes, planar_slopes
 
 # Of gravity [m/s^2]: loads are told in weights.
 WEIGHTLESS = 1e-6
@@ -288,6 +289,18 @@ class PendulumChain(Plant):
         rate = qd[..., self.first_link :]
         load = (self.load_lever * rate * rate - angle.cos()).abs()
         return torch.cat([torch.ones_like(load[..., :1]), load], -1) if self.first_link else load
+
+    def has_slopes(self) -> bool:
+        """Whether `slopes` knows all terms of this chain."""
+        return not (self.first_link or self.has_drag or self.has_eccentricity)
+
+    @torch.no_grad()
+    def slopes(self, q: Tensor, qd: Tensor, qdd: Tensor) -> PlantSlopes:
+        """Derivatives of `inverse_dynamics` and `load` at a motion (*batch, joint)."""
+        geometry = self._geometry(q)
+        moment, lever = self.gravity_moment.unbind(-1), self.load_lever.unbind(-1)
+        mass = self._mass(geometry)
+        return planar_slopes(geometry.pose, geometry.coupling, mass, moment, lever, qd, qdd)
 
     @torch.no_grad()
     def mobility(self) -> Tensor:

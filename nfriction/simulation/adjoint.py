@@ -18,13 +18,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nfriction.simulation.linearised import Linearised, step_back
+from nfriction.simulation.linearised import Linearised, combined_slopes, gradients, step_back
 from nfriction.simulation.mechanism import Mechanism
 from nfriction.simulation.steps import acceleration
 
 # Samples linearised together, by device: enough that the calls cost little, few enough for the
 # cache or (at some 20 KB each) the memory.
-CHUNK = {"cpu": 2**14, "cuda": 2**18}
+CHUNK = {"cpu": 2**13, "cuda": 2**18}
 
 States = tuple[Tensor, ...]
 
@@ -86,11 +86,15 @@ class _Rollout(torch.autograd.Function):
             t.detach().requires_grad_(asked) for t, asked in zip(tensors, wanted[1:], strict=True)
         ]
         walk = _Backward(ctx.chain, leaves, q, step, tau, wanted[0])
-        given = [x.movedim(-2, 0) for x in (q, qd, qdd)]
-        found = walk.run(given, [x.movedim(-2, 0) for x in cotangents])
+        found = walk.run(*([_joints_first(x) for x in part] for part in ((q, qd, qdd), cotangents)))
         by_tau = walk.by_tau.movedim(0, -2).sum_to_size(tau.shape) if wanted[0] else None
-        by_start = [x.sum_to_size(q0.shape) for x in found]
+        by_start = [x.movedim(0, -1).sum_to_size(q0.shape) for x in found]
         return None, None, None, *by_start, by_tau, *walk.by_tensor
+
+
+def _joints_first(x: Tensor) -> Tensor:
+    """A series (*batch, step, joint) as (joint, step, *batch), also in memory."""
+    return x.movedim((-1, -2), (0, 1)).contiguous()
 
 
 def _by_time(x: Tensor, like: Tensor) -> Tensor:
@@ -125,32 +129,35 @@ class _Backward:
         """Gradients by the initial position and velocity.
 
         Args:
-            states: q, qd, qdd, each (step + 1, *batch, joint).
+            states: q, qd, qdd, each (joint, step + 1, *batch).
             cotangents: of these.
+        Returns:
+            Each (joint, *batch).
         """
         # A step that diverges passes nothing back, but its numbers would turn zeros into NaN.
-        alive = torch.stack([torch.isfinite(x[1:]).all(-1, keepdim=True) for x in states]).all(0)
-        before = [torch.where(alive, x[:-1], 0.0) for x in states]
+        alive = torch.stack([torch.isfinite(x[:, 1:]) for x in states]).all(0).all(0)
+        before = [torch.where(alive, x[:, :-1], 0.0) for x in states]
         # Position and velocity as one: half as many operations.
-        cotangents = [torch.cat(list(cotangents[:2]), -1), cotangents[2]]
-        carried: States = tuple(x[-1] for x in cotangents)
-        steps, batch = len(self.step), states[0][0, ..., 0].numel()
+        cotangents = [torch.cat(list(cotangents[:2])), cotangents[2]]
+        carried: States = tuple(x[:, -1] for x in cotangents)
+        steps, batch = len(self.step), states[0][0, 0].numel()
         length = max(1, CHUNK.get(self.tau.device.type, CHUNK["cpu"]) // max(1, batch))
         for start in reversed(range(0, steps, length)):
             part = slice(start, min(start + length, steps))
             carried = self._chunk(part, before, cotangents, carried)
         by_state, by_qdd = carried
-        by_q, by_qd = by_state.chunk(2, -1)
+        by_q, by_qd = by_state.chunk(2)
         with torch.enable_grad():
             # The first acceleration is that without friction.
-            given = [x[0].detach().requires_grad_() for x in (*states[:2], self.tau)]
+            first = (*(x[:, 0].movedim(0, -1) for x in states[:2]), self.tau[0])
+            given = [x.detach().requires_grad_() for x in first]
             start_rate = self.call(lambda plant, _, *x: plant.forward_dynamics(*x), *given)
         inputs = [*given, *self._asked()]
-        more_q, more_qd, more_tau, *own = _grad([start_rate], inputs, [by_qdd])
+        more_q, more_qd, more_tau, *own = gradients([start_rate], inputs, [by_qdd.movedim(0, -1)])
         self._gather(own)
         if self.by_tau.numel():
             self.by_tau[0] += more_tau
-        return by_q + more_q, by_qd + more_qd
+        return by_q + more_q.movedim(-1, 0), by_qd + more_qd.movedim(-1, 0)
 
     def _asked(self) -> list[Tensor]:
         return [t for t in self.leaves if t.requires_grad]
@@ -169,16 +176,19 @@ class _Backward:
         carried: States,
     ) -> States:
         """Carry the cotangent of the state after these steps to that before them."""
-        pieces, tau = self._linearised(part, [x[part] for x in states])
-        by_held = [torch.empty_like(p.held) for p in pieces]
-        by_rate = [torch.empty_like(p.rate) for p in pieces]
+        pieces, tau = self._linearised(part, [x[:, part].movedim(0, -1) for x in states])
+        # Written step by step, (joint, coefficient, step, *batch) and (stage, joint, step, *batch).
+        by_held = [p.held.new_empty(p.held.movedim((-2, -1), (0, 1)).shape) for p in pieces]
+        by_rate = [p.rate.new_empty(p.rate.movedim(-1, 1).shape) for p in pieces]
         for k in reversed(range(part.stop - part.start)):
             for piece, held, rate in zip(pieces[::-1], by_held[::-1], by_rate[::-1], strict=True):
-                carried = step_back(piece, k, carried, held[k], rate[:, k])
-            carried = tuple(c + x[part.start + k] for c, x in zip(carried, cotangents, strict=True))
+                carried = step_back(piece, k, carried, held[:, :, k], rate[:, :, k])
+            at = part.start + k
+            carried = tuple(c + x[:, at] for c, x in zip(carried, cotangents, strict=True))
         inputs = [*([tau] if tau.requires_grad else []), *self._asked()]
         for piece, held, rate in zip(pieces, by_held, by_rate, strict=True):
-            found = _grad([piece.held, piece.rate], inputs, [held, rate])
+            pulls = [held.movedim((0, 1), (-2, -1)), rate.movedim(1, -1)]
+            found = gradients([piece.held, piece.rate], inputs, pulls)
             if tau.requires_grad:
                 self.by_tau[part] += found.pop(0)
             self._gather(found)
@@ -199,16 +209,17 @@ class _Backward:
             held = held.expand(*q.shape, held.shape[-1])
             drive = None if self.measured else self._drive(held, driven)
             points, after = self._stages(q, qd, tau, held.detach(), h)
-            rate, slopes = self._slopes(points, tau, held.detach())
-            pieces.append(Linearised(held, rate, slopes, drive, mechanism.is_local(), h))
+            linearise = self._slopes if mechanism.has_plant_slopes() else self._automatic_slopes
+            found = linearise(points, tau, held.detach())
+            pieces.append(Linearised(held, *found, drive, mechanism.is_local(), h[..., 0]))
             q, qd, qdd = after
         return pieces, tau
 
     @torch.no_grad()
     def _stages(
         self, q: Tensor, qd: Tensor, tau: Tensor, held: Tensor, h: Tensor
-    ) -> tuple[tuple[Tensor, Tensor], States]:
-        """States at the four stages, (stage, step, *batch, joint), and after the step."""
+    ) -> tuple[States, States]:
+        """q, qd and qdd at the four stages, (stage, step, *batch, joint), and after the step."""
 
         def rate(q: Tensor, qd: Tensor) -> Tensor:
             found: Tensor = self.call(acceleration, q, qd, tau, held)
@@ -221,10 +232,12 @@ class _Backward:
         v3, x3 = qd + half * a2, q + half * v2
         a3 = rate(x3, v3)
         v4, x4 = qd + h * a3, q + h * v3
-        points = torch.stack([q, x2, x3, x4]), torch.stack([qd, v2, v3, v4])
-        if self.chain.substeps == 1:
-            return points, (q, qd, a1)  # what follows the step is not asked for
         a4, sixth = rate(x4, v4), h / 6.0
+        # Joints first in memory, as these states come.
+        points = tuple(
+            torch.stack([x.movedim(-1, 0) for x in part], 1).movedim(0, -1)
+            for part in ((q, x2, x3, x4), (qd, v2, v3, v4), (a1, a2, a3, a4))
+        )
         after = (
             q + sixth * (qd + 2.0 * (v2 + v3) + v4),
             qd + sixth * (a1 + 2.0 * (a2 + a3) + a4),
@@ -232,21 +245,31 @@ class _Backward:
         )
         return points, after
 
-    def _slopes(
-        self, points: tuple[Tensor, Tensor], tau: Tensor, held: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Acceleration at the stages and its derivatives; see `Linearised`."""
-        q, qd = (x.requires_grad_() for x in points)
+    def _slopes(self, points: States, tau: Tensor, held: Tensor) -> tuple[Tensor, Tensor]:
+        """Acceleration at the stages and its derivatives, the plant's in closed form."""
+        q, qd, qdd = points
+        plant = self.call(lambda plant, _, *x: plant.slopes(*x), q, qd, qdd)
+        load = self.call(lambda plant, _, *x: plant.load(*x).detach(), q, qd)
+        inputs = [x.requires_grad_() for x in (qd.detach(), load, held.expand(4, *held.shape))]
+        # A law is elementwise, so the sum's gradient is each joint's own slope.
+        torque = self.call(lambda _, friction, *x: friction.torque(*x), *inputs)
+        by_qd, by_load, by_c = gradients([torque], inputs)
+        law = by_qd.movedim(-1, 0), by_load.movedim(-1, 0), by_c.movedim((-2, -1), (0, 1))
+        slopes = combined_slopes(plant, *law)
+        if tau.requires_grad or self.chain.mechanism.plant_asks(self.own):
+            qdd = self.call(acceleration, q, qd, tau, held)
+        return qdd, slopes
+
+    def _automatic_slopes(self, points: States, tau: Tensor, held: Tensor) -> tuple[Tensor, Tensor]:
+        """Acceleration at the stages and its derivatives, of any plant and friction."""
+        q, qd = (x.requires_grad_() for x in points[:2])
         c = held.expand(4, *held.shape).contiguous().requires_grad_()
         rate = self.call(acceleration, q, qd, tau, c)
-        joints, count = held.shape[-2:]
-        slopes = rate.new_empty(*rate.shape, joints * (2 + count))
-        for j, y in enumerate(rate.unbind(-1)):
-            by_q, by_qd, by_c = _grad([y], [q, qd, c], retain=True)
-            row = slopes[..., j, :]
-            row[..., :joints], row[..., joints : 2 * joints] = by_q, by_qd
-            row[..., 2 * joints :] = by_c.flatten(-2)
-        return rate, slopes
+        rows = []
+        for y in rate.unbind(-1):
+            by_q, by_qd, by_c = gradients([y], [q, qd, c], retain=True)
+            rows.append(torch.cat([by_q, by_qd, by_c.flatten(-2)], -1).movedim(-1, 0))
+        return rate, torch.stack(rows)
 
     def _drive(self, held: Tensor, driven: Sequence[Tensor]) -> Tensor | None:
         """Derivatives of the coefficients by what drives them; see `Linearised`."""
@@ -254,31 +277,15 @@ class _Backward:
         if mechanism.has_slopes():
             given = (*driven, held.detach())
             found = self.call(lambda _, friction, *x: friction.schedule.slopes(*x), *given)
-            return torch.stack(found, -1)
+            return torch.stack([x.movedim((-2, -1), (0, 1)) for x in found], 2)
         if held.grad_fn is None:
             return None
         if mechanism.is_local():
             # Each joint's coefficient by its own motion, all joints in one pass.
-            columns = [_grad([held[..., k]], driven, retain=True) for k in range(held.shape[-1])]
-            return torch.stack([torch.stack(own, -1) for own in columns], -2)
-        rows = [_grad([y], driven, retain=True) for y in held.flatten(-2).unbind(-1)]
-        return torch.stack([torch.cat(row, -1) for row in rows], -2)
-
-
-def _grad(
-    outputs: Sequence[Tensor],
-    inputs: Sequence[Tensor],
-    cotangents: Sequence[Tensor] | None = None,
-    retain: bool = False,
-) -> list[Tensor]:
-    """Gradients by `inputs`, zero where an output does not depend on one; ones pull by default."""
-    pulls = cotangents or [torch.ones_like(y) for y in outputs]
-    pairs = [(y, pull) for y, pull in zip(outputs, pulls, strict=True) if y.requires_grad]
-    if not pairs or not inputs:
-        return [torch.zeros_like(x) for x in inputs]
-    alive, pulls = zip(*pairs, strict=True)
-    return list(
-        torch.autograd.grad(
-            alive, inputs, pulls, retain_graph=retain, allow_unused=True, materialize_grads=True
-        )
-    )
+            columns = [
+                gradients([held[..., k]], driven, retain=True) for k in range(held.shape[-1])
+            ]
+            own = [torch.stack([x.movedim(-1, 0) for x in column], 1) for column in columns]
+            return torch.stack(own, 1)
+        rows = [gradients([y], driven, retain=True) for y in held.flatten(-2).unbind(-1)]
+        return torch.stack([torch.cat([x.movedim(-1, 0) for x in row]) for row in rows])

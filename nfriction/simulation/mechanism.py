@@ -1,13 +1,13 @@
 """Plant and friction as one module, and whether all that moves it can be seen."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
 from nfriction.compiled import NoFriction
-from nfriction.friction import Schedule
+from nfriction.friction import FrictionModel, Schedule
 from nfriction.simulation.protocols import remembering
 from nfriction.simulation.steps import acceleration
 
@@ -35,6 +35,16 @@ class Mechanism(nn.Module):
     def has_slopes(self) -> bool:
         """Whether such a schedule tells its coefficients' derivatives by the motion itself."""
         return self.is_local() and hasattr(self.friction.schedule, "slopes")
+
+    def has_plant_slopes(self) -> bool:
+        """Whether the plant tells its own derivatives, and the friction is a law's, elementwise."""
+        told = getattr(self.plant, "has_slopes", None)
+        lawful = getattr(type(self.friction), "torque", None) is FrictionModel.torque
+        return lawful and self.is_local() and told is not None and told()
+
+    def plant_asks(self, tensors: Mapping[str, Tensor]) -> bool:
+        """Whether the plant's own tensors are differentiated by, of these in place of them."""
+        return any(t.requires_grad for name, t in tensors.items() if name.startswith("plant."))
 
     def is_closed(self, q: Tensor, qd: Tensor, tau: Tensor) -> bool:
         """Whether gradients can flow to nothing but the states and this module's own tensors."""

@@ -77,6 +77,12 @@ def test_every_model(name):
     assert_equal_gradients(CHAIN, model)
 
 
+def test_a_single_link():
+    model = NFLFM(1, [2e-3, 1e-3], v_smooth=0.5, terms=(3, 2), head_units=3)
+    plant = PendulumChain([0.3], [0.2])
+    assert_equal_gradients(plant, model, q0=Q0[:, :1], qd0=QD0[:, :1])
+
+
 @pytest.mark.parametrize("chunk", [1, 15, 10_000])
 def test_any_division_into_chunks(chunk, monkeypatch):
     monkeypatch.setitem(adjoint.CHUNK, "cpu", chunk)

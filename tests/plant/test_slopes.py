@@ -1,0 +1,52 @@
+"""Closed derivatives of a chain are those that automatic differentiation finds."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from nfriction.plant import Arm, PendulumChain, rigs
+
+F64 = torch.float64
+CHAINS = {
+    "one link": PendulumChain([0.3], [0.2]),
+    "two with rotors": PendulumChain([0.3, 0.2], [0.2, 0.15], armature=[1e-3, 2e-3]),
+    "three, offset": rigs.tlrip(arm="fixed").replace(
+        angle_offset=torch.tensor([0.1, -0.2, 0.3], dtype=F64)
+    ),
+}
+
+
+def derivative(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
+    """(*batch, joint) -> (*batch, joint), as (joint, joint, *batch)."""
+    x = x.clone().requires_grad_()
+    # What does not depend on the motion still has a derivative: zero.
+    rows = (function(x) + 0.0 * x).unbind(-1)
+    found = [torch.autograd.grad(y.sum(), x, retain_graph=True)[0] for y in rows]
+    return torch.stack(found).movedim(-1, 1)
+
+
+@pytest.mark.parametrize("name", CHAINS)
+def test_slopes_are_the_automatic_ones(name):
+    plant = CHAINS[name]
+    random = torch.Generator().manual_seed(0)
+    q, qd, qdd = torch.randn(3, 5, 4, plant.joints, generator=random, dtype=F64) * 5.0
+    found = plant.slopes(q, qd, qdd)
+    load_by_qd = derivative(lambda x: plant.load(q, x), qd)
+    for a, b in (
+        (found.by_q, derivative(lambda x: plant.inverse_dynamics(x, qd, qdd), q)),
+        (found.by_qd, derivative(lambda x: plant.inverse_dynamics(q, x, qdd), qd)),
+        (found.inverse_mass, torch.linalg.inv(plant.mass_matrix(q)).movedim((-2, -1), (0, 1))),
+        (found.load_by_q, derivative(lambda x: plant.load(x, qd), q)),
+        (torch.diag_embed(found.load_by_qd.movedim(0, -1)), load_by_qd.movedim((0, 1), (-2, -1))),
+    ):
+        torch.testing.assert_close(a.expand(b.shape), b, rtol=1e-10, atol=1e-12)
+
+
+def test_a_chain_with_other_terms_has_none():
+    fixed, free = rigs.tlrip(arm="fixed"), PendulumChain([0.3], [0.2], arm=Arm(0.1, 0.2))
+    some = torch.full((3,), 1e-3, dtype=F64)
+    assert fixed.has_slopes()
+    for plant in (free, fixed.replace(drag_linear=some), fixed.replace(encoder_sine=some)):
+        assert not plant.has_slopes()
