@@ -11,6 +11,7 @@ import pandas as pd
 
 from nfriction import Recording, rigs
 from nfriction.fitting import Fit, fit, nearest_fit
+from nfriction.fitting.estimate import Zeroed
 from nfriction.friction import model_by_name
 from nfriction.friction.models import V_SMOOTH
 from nfriction.plant import LinearAxis, PendulumChain
@@ -23,7 +24,8 @@ class Set(NamedTuple):
     `target` is the free run's error and that of 5 s windows; of recordings kept apart, which the
     folder does not hold. `v_smooth` is where the sign of friction turns: geared drives with dry
     friction of half their torque and encoders that resolve 0.2 rad/s in a sample need no sharper
-    one than that, and it saves seven integration steps of eight.
+    one than that, and it saves seven integration steps of eight. `zeroed` is when the encoders
+    were: recordings that all begin at rest at 0 were zeroed anew.
     """
 
     folder: str
@@ -32,6 +34,7 @@ class Set(NamedTuple):
     target: tuple[float, float] = (math.nan, math.nan)
     unit: str = "mrad"
     v_smooth: float = V_SMOOTH
+    zeroed: Zeroed = "once"
 
 
 SETS = {
@@ -42,11 +45,11 @@ SETS = {
     "triple": Set("multiarm_pendulum", ("triple_b0", "triple_b2"), rigs.multiarm_triple,
                   (2.0, 1.2)),
     "C1": Set("dfki_double_pendulum", ("C1_143339", "C1_143601", "C1_143747", "C1_144003"),
-              lambda: rigs.dfki("C1"), (54.0, math.nan), v_smooth=0.04),
+              lambda: rigs.dfki("C1"), (54.0, math.nan), v_smooth=0.04, zeroed="each"),
     "C0": Set("dfki_double_pendulum", ("C0_00", "C0_02", "C0_04", "C0_06"),
-              lambda: rigs.dfki("C0"), (40.0, math.nan), v_smooth=0.04),
+              lambda: rigs.dfki("C0"), (40.0, math.nan), v_smooth=0.04, zeroed="each"),
     "A0": Set("dfki_double_pendulum", ("A0_00", "A0_02", "A0_12"), lambda: rigs.dfki("A0"),
-              (85.0, math.nan), v_smooth=0.04),
+              (85.0, math.nan), v_smooth=0.04, zeroed="each"),
     "emps": Set("emps", ("emps_first",), rigs.emps, (4.0, math.nan), "mm"),
     "xl330": Set("xl330_servo_pendulum", ("drop_kp100", "drop_kp400"), rigs.xl330,
                  (18.0, math.nan)),
@@ -95,7 +98,7 @@ def real(data: Path, only: Sequence[str], models: Sequence[str]) -> None:
                 model = model_by_name(m)(plant.joints, v_smooth=of.v_smooth)
                 before = nearest_fit(fits, model)
                 others = [*recordings[:k], *recordings[k + 1 :]]
-                fits.append(fit(model, plant, others, start=before,
+                fits.append(fit(model, plant, others, start=before, zeroed=of.zeroed,
                                 motions=before.motions if before else None))  # fmt: skip
                 spent[m] += time.process_time() - start
                 state = first_state(data, of, left)

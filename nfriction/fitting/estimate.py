@@ -32,6 +32,10 @@ from nfriction.signals import Motion, kalman_smoother
 logger = logging.getLogger(__name__)
 
 Method = Literal["trajectory", "torque"]
+# How encoders were zeroed: once for all recordings, or anew at the start of each.
+Zeroed = Literal["once", "each"]
+# Dry friction of a tenth of a link's largest gravity moment lets it rest up to 0.1 rad off [rad].
+ZERO_SD = 0.05
 # First guess of what a model of a bench leaves unexplained, before a fit tells [rad or m].
 FIRST_NOISE = 1e-3
 # Short windows converge from far away, long ones tell small friction and small drag apart [s].
@@ -54,6 +58,7 @@ def fit(
     fit_plant: bool = True,
     drag: bool | None = None,
     eccentricity: bool | None = False,
+    zeroed: Zeroed = "once",
     start: Fit | None = None,
     motions: Sequence[Motion] | None = None,
     max_steps: int = 30,
@@ -81,6 +86,11 @@ def fit(
             model. None asks the evidence, or takes what `start` found. Off by default: the
             evidence trusts the law, and where that is wrong a sine of the angle takes over part of
             it that other amplitudes do not have.
+        zeroed: when incremental encoders were set to zero. `"once"`: before all recordings, so
+            that an angle offset is part of the plant. `"each"`: at the start of each recording,
+            wherever dry friction held the links then; how far that was off is found for each
+            recording and left out of the plant, whose offset stays as given, as that of a further
+            recording cannot be known. Not with an adaptive model.
         start: an earlier fit to start from: of the same law for a neuro-fuzzy model, of any model
             for the plant's terms.
         motions: smoothed motions in joint coordinates, to save smoothing again.
@@ -92,16 +102,20 @@ def fit(
 
     Raises:
         TypeError: if model, plant or recordings are something else.
-        ValueError: if recordings and plant do not match, or there is no such method.
+        ValueError: if recordings and plant do not match, or there is no such method or zero.
     """
     if method not in get_args(Method):
         raise ValueError(f"`method` must be one of {get_args(Method)}, got {method!r}.")
+    if zeroed not in get_args(Zeroed):
+        raise ValueError(f"`zeroed` must be one of {get_args(Zeroed)}, got {zeroed!r}.")
     given = listed(model, plant, recordings)
     joint = in_joint_coordinates(plant, model, given)
     if eccentricity and not may_be_eccentric(plant):
         raise ValueError(f"{plant.name or 'the axis'} has no encoders that turn with its joints.")
     moved = tuple(motions or (kalman_smoother(r.time, r.q) for r in joint))
     if isinstance(model.schedule, Adaptive):
+        if zeroed == "each":
+            raise ValueError('`zeroed="each"` is not for an adaptive model; fit its constant law.')
         if method == "torque":
             raise ValueError("an adaptive model is fitted to trajectories, not to torques.")
         # It fits the constant law first, so it stands above this module.
@@ -118,8 +132,8 @@ def fit(
             constant = FrictionModel(model.law, Constant(model.law, model.joints), model.v_smooth)
             start = fit(
                 constant, plant, given, windows=windows, fit_plant=fit_plant, drag=drag,
-                eccentricity=eccentricity, start=start, motions=moved, max_steps=max_steps,
-                callback=callback,
+                eccentricity=eccentricity, zeroed=zeroed, start=start, motions=moved,
+                max_steps=max_steps, callback=callback,
             )  # fmt: skip
         start_at(model, start, joint, moved)
     else:
@@ -140,7 +154,11 @@ def fit(
 
     def refinement(eccentric: bool) -> Refinement:
         terms = adjustable_terms(plant, joint, fit_plant, drag, eccentric)
-        return Refinement(plant, model, joint, mixing, terms, max_steps, callback)
+        # A shared offset beside them is no more than their mean.
+        zero_sd = ZERO_SD if zeroed == "each" and fit_plant else 0.0
+        if zero_sd:
+            terms = [t for t in terms if t.buffer != "angle_offset"]
+        return Refinement(plant, model, joint, mixing, terms, max_steps, callback, zero_sd)
 
     search = refinement(bool(eccentric))
     vector = torch.tensor([known.get(t.name, 0.0) for t in search.terms], dtype=torch.float64)
@@ -160,6 +178,7 @@ def _through_windows(
 ) -> Stage:
     """Stages of growing length, each from the states and weighed by the errors of the last."""
     reached: Stage | None = None
+    zeros: Tensor | None = None
     noise, traced = FIRST_NOISE, motions
     for length in windows:
         problem = search.problem(cut_windows(search.joint, traced, length), noise)
@@ -168,13 +187,14 @@ def _through_windows(
             # Of a start far away the cost says nothing; the last stage's minimum is as high.
             near = reached and _least(reached.residuals, noise)
             tolerance = _flat(near or float(problem.cost(problem.start(vector))))
-        stage = search.search(problem, vector, tolerance, f"{length:g} s windows")
+        stage = search.search(problem, vector, tolerance, f"{length:g} s windows", zeros)
         if reached is not None and stage.lost_since(reached):
             logger.warning("%g s windows are too long for this motion; left out", length)
             schedule = search.model.schedule
             schedule.set_parameter_vector(reached.problem.split(reached.result.x)[0])
             break
         reached, vector, noise = stage, stage.vector, max(stage.noise, LEAST_NOISE)
+        zeros = stage.zeros
         if stage.result.status == "stopped":
             break
         traced = problem.traced(stage.result.x, traced)

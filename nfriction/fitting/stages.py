@@ -51,6 +51,11 @@ class Stage:
         return self.problem.split(self.result.x)[1].clone()
 
     @property
+    def zeros(self) -> Tensor:
+        """Zeros of each recording, as the problem takes them to start from."""
+        return self.problem.split_zeros(self.result.x).clone()
+
+    @property
     def noise(self) -> float:
         """Standard deviation that a residual counts with."""
         return effective_noise(self.residuals)
@@ -74,6 +79,7 @@ class Refinement:
         terms: adjustable terms of the plant.
         max_steps: limit to each stage.
         callback: told every step with its stage; True stops.
+        zero_sd: see `TrajectoryProblem`.
     """
 
     plant: Plant
@@ -83,6 +89,7 @@ class Refinement:
     terms: list[PlantParameter]
     max_steps: int = 30
     callback: Callback | None = None
+    zero_sd: float = 0.0
     jacobian: StepJacobian = field(init=False)
 
     def __post_init__(self) -> None:
@@ -96,11 +103,16 @@ class Refinement:
         return TrajectoryProblem(
             self.jacobian, windows, noise, self.mixing,
             substeps=substeps_of(self.plant, self.model, self.joint), plant_mean=mean,
-            stride=stride,
+            stride=stride, zero_sd=self.zero_sd,
         )  # fmt: skip
 
     def search(
-        self, problem: TrajectoryProblem, vector: Tensor, tolerance: float, name: str
+        self,
+        problem: TrajectoryProblem,
+        vector: Tensor,
+        tolerance: float,
+        name: str,
+        zeros: Tensor | None = None,
     ) -> Stage:
         """Minimise from the model's present parameters and plant terms at `vector`.
 
@@ -109,10 +121,11 @@ class Refinement:
             vector: plant terms to start from.
             tolerance: relative fall of the cost that counts as none.
             name: of the stage, for the callback.
+            zeros: of each recording, to start from; 0 by default.
         """
         watch = _Watch(name, tolerance, self.callback, problem)
         result = solve_trajectory(
-            problem, problem.start(vector), max_steps=self.max_steps, callback=watch,
+            problem, problem.start(vector, zeros), max_steps=self.max_steps, callback=watch,
             cost_tolerance=tolerance,
         )  # fmt: skip
         if result.status == "stopped" and (watch.settles or watch.creeps):

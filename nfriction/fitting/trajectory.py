@@ -35,7 +35,8 @@ START_Q_SD, START_QD_SD = 0.01, 0.3
 class TrajectoryProblem:
     """Sum of squares of the position error over windows, and its quadratic model.
 
-    The vector of unknowns is [friction parameters, plant parameters, q0 and qd0 of each window].
+    The vector of unknowns is [friction parameters, plant parameters, q0 and qd0 of each window,
+    zeros of each recording], where a zero is what its encoders fall short of the true angles.
 
     Args:
         jacobian: derivatives of a step, with the mechanism, the friction model whose schedule is
@@ -48,6 +49,7 @@ class TrajectoryProblem:
         plant_mean: where the prior of the plant's terms is centred; default the plant as given.
         stride: only every so many-th sample counts, for as many: errors of a model last far
             longer than a sample, and the sums over many parameters are what a step costs.
+        zero_sd: what is expected of the zeros of each recording [rad]; 0 holds them at 0.
         memory: of the coefficients at the start of each window, (window, joint, state_size), of a
             schedule that has one. It advances with every step of the integration.
     """
@@ -60,6 +62,7 @@ class TrajectoryProblem:
     plant_mean: Tensor | None = None
     stride: int = 1
     memory: Tensor | None = None
+    zero_sd: float = 0.0
 
     def __post_init__(self) -> None:
         w = self.windows
@@ -72,19 +75,29 @@ class TrajectoryProblem:
         self.shared_count = self.friction_count + len(self.plant_terms)
         self.step = w.step.repeat_interleave(self.substeps, 1) / self.substeps
         self.tau = w.tau.repeat_interleave(self.substeps, 1)
+        places = [place for place, *_ in w.spans] if self.zero_sd > 0 else []
+        known = sorted(set(places))
+        self.zero_count = len(known) * w.q0.shape[-1]
+        # Which recording a window is of, (window, recording).
+        self._of_recording = torch.zeros(len(w), len(known), dtype=torch.float64)
+        for i, place in enumerate(places):
+            self._of_recording[i, known.index(place)] = 1.0
         self._simulated: tuple[Tensor, Rollout] | None = None
         self._hessian = torch.zeros(0, 0, dtype=torch.float64)
 
-    def start(self, plant_vector: Tensor | None = None) -> Tensor:
+    def start(self, plant_vector: Tensor | None = None, zeros: Tensor | None = None) -> Tensor:
         """Unknowns at the model's present parameters and the smoothed window states."""
         if plant_vector is None:
             plant_vector = torch.zeros(len(self.plant_terms), dtype=torch.float64)
         state = torch.cat([self.windows.q0, self.windows.qd0], -1).reshape(-1)
-        return torch.cat([self.friction.schedule.parameter_vector(), plant_vector, state])
+        if zeros is None:
+            zeros = torch.zeros(self.zero_count, dtype=torch.float64)
+        return torch.cat([self.friction.schedule.parameter_vector(), plant_vector, state, zeros])
 
     def bounds(self) -> tuple[Tensor, Tensor]:
         lower, upper = self.friction.schedule.bounds()
-        free = torch.full((2 * self.windows.q0.numel(),), torch.inf, dtype=torch.float64)
+        own = 2 * self.windows.q0.numel() + self.zero_count
+        free = torch.full((own,), torch.inf, dtype=torch.float64)
         terms = self.plant_terms
         low = torch.tensor([t.lower for t in terms], dtype=torch.float64)
         high = torch.tensor([t.upper for t in terms], dtype=torch.float64)
@@ -92,10 +105,19 @@ class TrajectoryProblem:
 
     def split(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Friction parameters, plant parameters, window states (window, 2 joint)."""
-        friction, plant, state = x.split(
-            [self.friction_count, len(self.plant_terms), x.numel() - self.shared_count]
-        )
+        friction, plant, state, _ = x.split(
+            [self.friction_count, len(self.plant_terms), 2 * self.windows.q0.numel(),
+             self.zero_count]
+        )  # fmt: skip
         return friction, plant, state.reshape(len(self.windows), -1)
+
+    def zeros(self, x: Tensor) -> Tensor:
+        """What is added to the measured angles of each window, (window, joint) [rad]."""
+        return self._of_recording @ self.split_zeros(x).reshape(-1, self.windows.q0.shape[-1])
+
+    def split_zeros(self, x: Tensor) -> Tensor:
+        """Zeros of each recording, in one row."""
+        return x[len(x) - self.zero_count :]
 
     def plant_at(self, vector: Tensor) -> PendulumChain | LinearAxis:
         """The plant with its adjustable terms at a parameter vector."""
@@ -107,7 +129,8 @@ class TrajectoryProblem:
 
         Longer windows then start from states that a fit has found, not a smoother.
         """
-        run = self._simulate(x)
+        run, zeros = self._simulate(x), self.zeros(x)
+        run = replace(run, q=run.q - zeros[:, None])
         states = [(m.q.copy(), m.qd.copy()) for m in motions]
         # A sample that two windows share is taken from the later one's fitted start.
         for w, (place, first, last) in enumerate(self.windows.spans):
@@ -118,12 +141,12 @@ class TrajectoryProblem:
 
     def errors(self, x: Tensor) -> Tensor:
         """Position error at every sample of the windows [rad or m], (window, step + 1, joint)."""
-        q = self._simulate(x).q[:, :: self.substeps]
+        q = self._simulate(x).q[:, :: self.substeps] - self.zeros(x)[:, None]
         return (q - self.windows.q) @ self.mixing.T * self.windows.weight[..., None]
 
     def residuals(self, x: Tensor) -> Tensor:
         """Error of the counted samples over the noise, (window, step + 1, joint)."""
-        q = self._simulate(x).q[:, :: self.substeps]
+        q = self._simulate(x).q[:, :: self.substeps] - self.zeros(x)[:, None]
         return (q - self.windows.q) @ self.mixing.T * self._scale
 
     def cost(self, x: Tensor) -> Tensor:
@@ -153,6 +176,7 @@ class TrajectoryProblem:
         parameters, plant_vector, state = self.split(x)
         self.friction.schedule.set_parameter_vector(parameters)
         q0, qd0 = state.chunk(2, -1)
+        q0 = q0 + self.zeros(x)
         plant = self.plant_at(plant_vector)
         motion = integrate(plant, self.friction, q0, qd0, self.tau, self.step, memory=self.memory)
         self._simulated = (x.clone(), motion)
@@ -182,8 +206,9 @@ class TrajectoryProblem:
         spread = torch.cat(
             [torch.full_like(w.q0, START_Q_SD), torch.full_like(w.qd0, START_QD_SD)], -1
         )
-        sd = torch.cat([sd, spread.reshape(-1)])
-        return sd.square().reciprocal(), torch.cat([mean, start.reshape(-1)])
+        zeros = torch.zeros(self.zero_count, dtype=torch.float64)
+        sd = torch.cat([sd, spread.reshape(-1), zeros + self.zero_sd])
+        return sd.square().reciprocal(), torch.cat([mean, start.reshape(-1), zeros])
 
     def score_covariance(self, x: Tensor, sd: Tensor) -> Tensor:
         """Covariance of J^T r where the errors have their own sizes.
@@ -203,22 +228,41 @@ class TrajectoryProblem:
         shared, windows, joints = self.shared_count, *self.windows.q0.shape
         gradient = torch.zeros_like(x)
         hessian = torch.zeros(len(x), len(x), dtype=torch.float64)
-        of_state = torch.zeros(windows, 2 * joints, 2 * joints, dtype=torch.float64)
-        mixed = torch.zeros(windows, 2 * joints, shared, dtype=torch.float64)
+        # Of each window: its state, then the zeros of its recording.
+        count = 3 * joints if self.zero_count else 2 * joints
+        slope = torch.zeros(windows, count, dtype=torch.float64)
+        of_own = torch.zeros(windows, count, count, dtype=torch.float64)
+        mixed = torch.zeros(windows, count, shared, dtype=torch.float64)
         for part, rows in self._sensitivities(x):
+            if self.zero_count:
+                # A zero moves the start, and what is measured with it.
+                measured = torch.eye(joints, dtype=torch.float64)
+                rows = torch.cat([rows, rows[..., shared : shared + joints] - measured], -1)
             scaled = (self.mixing @ rows) * scale[:, part, :, None]
-            common, own = scaled.flatten(1, 2).split([shared, 2 * joints], -1)
+            common, own = scaled.flatten(1, 2).split([shared, count], -1)
             left = r[:, part].flatten(1)
             gradient[:shared] += left.flatten() @ common.flatten(0, 1)
-            gradient[shared:] += (left[:, None] @ own).flatten()
-            # A window's own state has nothing to do with another's.
+            slope += (left[:, None] @ own)[:, 0]
             hessian[:shared, :shared] += common.flatten(0, 1).T @ common.flatten(0, 1)
             mixed += own.mT @ common
-            of_state += own.mT @ own
-        hessian[shared:, :shared] = mixed.flatten(0, 1)
-        hessian[:shared, shared:] = mixed.flatten(0, 1).T
-        hessian[shared:, shared:] = torch.block_diag(*of_state)
+            of_own += own.mT @ own
+        place = self._own_places()
+        # A window's own state has nothing to do with another's.
+        for w in range(windows):
+            gradient[place[w]] += slope[w]
+            hessian[place[w], :shared] += mixed[w]
+            hessian[:shared, place[w]] += mixed[w].T
+            hessian[place[w][:, None], place[w]] += of_own[w]
         return gradient, hessian
+
+    def _own_places(self) -> Tensor:
+        """Where each window's state and the zeros of its recording stand, (window, ·)."""
+        windows, joints = self.windows.q0.shape
+        states = torch.arange(2 * windows * joints).reshape(windows, -1) + self.shared_count
+        if not self.zero_count:
+            return states
+        first = self.shared_count + states.numel() + joints * self._of_recording.argmax(1)
+        return torch.cat([states, first[:, None] + torch.arange(joints)], 1)
 
     def _sensitivities(self, x: Tensor) -> Iterator[tuple[slice, Tensor]]:
         """Derivatives of the positions at the samples that count, some samples at a time.

@@ -3,10 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 from nfriction import LFM, NLFM, PendulumChain, Recording, fit, rollout
-from nfriction.friction import CVFM, Constant, FrictionModel
+from nfriction.friction import ACVFM, CVFM, Constant, FrictionModel
 from nfriction.signals import quantise
 from tests.fitting.recordings import F64, pendulum, swing
 
@@ -54,6 +55,33 @@ def test_friction_and_masses_of_a_driven_mechanism_are_recovered_from_irregular_
         torch.testing.assert_close(
             getattr(found.plant, term)(pose), getattr(plant, term)(pose), rtol=0.01, atol=1e-3
         )
+
+
+def test_encoders_zeroed_anew_at_the_start_of_each_recording():
+    """Only the truth's zeros differ; a plant with one offset for all cannot follow."""
+    plant = geared()
+    law = CVFM(2, DRY, v_smooth=V_SMOOTH)
+    off = ([0.06, -0.08], [-0.03, 0.05])
+    recordings = [driven(plant, law, seed) for seed in (0, 1)]
+    recordings = [replace(r, q=r.q - o) for r, o in zip(recordings, off, strict=True)]
+    once, each = (
+        fit(CVFM(2, v_smooth=V_SMOOTH), plant, recordings, windows=(1.0,), zeroed=zeroed)
+        for zeroed in ("once", "each")
+    )
+    truth = torch.tensor(DRY, dtype=F64)
+    assert each.converged, each.status
+    assert each.residual < 0.05 * once.residual
+    torch.testing.assert_close(each.model.schedule.values, truth, rtol=0.01, atol=1e-4)
+    assert torch.equal(each.plant.angle_offset, plant.angle_offset)
+
+
+def test_zeroed_is_refused_where_it_means_nothing():
+    plant = geared()
+    recording = driven(plant, CVFM(2, DRY, v_smooth=V_SMOOTH), 0, seconds=0.5)
+    with pytest.raises(ValueError, match="`zeroed` must be one of"):
+        fit(CVFM(2), plant, recording, zeroed="never")
+    with pytest.raises(ValueError, match="not for an adaptive model"):
+        fit(ACVFM(2), plant, recording, zeroed="each")
 
 
 def test_load_dependent_friction_leaves_more_of_a_geared_mechanism_unexplained():

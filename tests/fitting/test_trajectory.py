@@ -29,14 +29,17 @@ def windows(steps=20, step=2e-3) -> Windows:
     steps_[1, -4:], weight[1, -4:] = 0.0, 0.0
     truth = LFM(2, [[4e-3, 3e-3], [2e-3, 1e-3]], v_smooth=0.1)
     q = integrate(pendulum(), truth, q0, qd0, tau, steps_).q
-    return Windows(q, tau, steps_, weight, q0, qd0, ("a", "b"))
+    spans = ((0, 0, steps), (1, 0, steps - 4))
+    return Windows(q, tau, steps_, weight, q0, qd0, ("a", "b"), spans)
 
 
-def problem(model, substeps=2, stride=1) -> TrajectoryProblem:
+def problem(model, substeps=2, stride=1, **settings) -> TrajectoryProblem:
     plant = pendulum()
     terms = plant_parameters(plant, driven=True, largest_torque=0.1)
     jacobian = StepJacobian(plant, model, terms)
-    return TrajectoryProblem(jacobian, windows(), 1e-3, ABSOLUTE, substeps, stride=stride)
+    return TrajectoryProblem(
+        jacobian, windows(), 1e-3, ABSOLUTE, substeps, stride=stride, **settings
+    )
 
 
 def bent(name):
@@ -59,11 +62,12 @@ def point(p: TrajectoryProblem) -> torch.Tensor:
     return x
 
 
+@pytest.mark.parametrize("zero_sd", [0.0, 0.05])
 @pytest.mark.parametrize("name", ["LFM", "NFLFM"])
 @pytest.mark.parametrize(("substeps", "stride"), [(1, 1), (2, 1), (2, 3), (1, 20)])
-def test_gradient_and_hessian_against_finite_differences(name, substeps, stride):
+def test_gradient_and_hessian_against_finite_differences(name, substeps, stride, zero_sd):
     """Also where samples are passed over: 3 leaves steps after the last that counts, 20 none."""
-    p = problem(bent(name), substeps, stride)
+    p = problem(bent(name), substeps, stride, zero_sd=zero_sd)
     x = point(p)
     found = p.quadratic(x)
     torch.testing.assert_close(found.cost, p.cost(x))
