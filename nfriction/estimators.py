@@ -35,7 +35,7 @@ class FrictionEstimator:
     Args:
         plant: the mechanism.
         model: name of a friction model, or one to start from, which stays as it is.
-        method, windows, fit_plant, drag, eccentricity, max_steps: see `nfriction.fit`.
+        method, windows, fit_plant, drag, eccentricity, zeroed, max_steps: see `nfriction.fit`.
         horizon: length of the simulations by which `score` judges [s].
 
     Attributes:
@@ -62,6 +62,7 @@ class FrictionEstimator:
         fit_plant: bool = True,
         drag: bool | None = None,
         eccentricity: bool | None = False,
+        zeroed: str = "once",
         max_steps: int = 30,
         horizon: float = 5.0,
     ) -> None:
@@ -73,6 +74,7 @@ class FrictionEstimator:
         self.fit_plant = fit_plant
         self.drag = drag
         self.eccentricity = eccentricity
+        self.zeroed = zeroed
         self.max_steps = max_steps
         self.horizon = horizon
 

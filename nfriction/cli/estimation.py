@@ -40,6 +40,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--eccentricity", choices=("none", "fit", "evidence"), default="none",
                         help="how far encoders sit off their shafts: none, fitted, or fitted "
                         "where the evidence asks for it")  # fmt: skip
+    parser.add_argument("--zeroed", choices=("once", "each"), default="once",
+                        help="when incremental encoders were set to zero: once, or at the start of "
+                        "each recording, wherever dry friction held the links")  # fmt: skip
     parser.add_argument("--max-steps", type=count, default=30, metavar="N",
                         help="most steps of the search at each window length")  # fmt: skip
 
@@ -52,6 +55,7 @@ def fit_settings(arguments: argparse.Namespace) -> dict[str, Any]:
         "fit_plant": arguments.plant == "fit",
         "drag": arguments.drag,
         "eccentricity": {"none": False, "fit": True, "evidence": None}[arguments.eccentricity],
+        "zeroed": arguments.zeroed,
         "max_steps": arguments.max_steps,
     }
 

@@ -99,7 +99,7 @@ def fit_adaptive(
     if search_settings:
         raise ValueError(f"{sorted(search_settings)} are settings of a search, not of {method!r}.")
     classes = adopt_classes(model.schedule, classes, joint, moved, plant)
-    terms = adjustable_terms(plant, joint, fit_plant, drag)
+    terms = adjustable_terms(plant, joint, fit_plant, drag, zeroed_once=not constant.zeros)
     known = {name: value for name, value, _ in constant.plant_terms}
     vector = torch.tensor([known.get(t.name, 0.0) for t in terms], dtype=torch.float64)
     labelled = labelled_model(model, constant, joint, moved, prior_sd)

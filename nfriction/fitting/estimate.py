@@ -3,25 +3,24 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
 
 from nfriction.fitting.eccentricity import may_be_eccentric, richer_by_evidence
-from nfriction.fitting.holdback import HEAD_START, gain_on, judged_windows
-from nfriction.fitting.neurofuzzy_start import is_constant_fit, settle_on, start_at
+from nfriction.fitting.neurofuzzy_start import is_constant_fit
 from nfriction.fitting.outcome import Fit, Plant, torque_outcome, trajectory_outcome
 from nfriction.fitting.preparation import (
     adjustable_terms,
+    at_zeros,
     constant_schedule,
-    has_encoder_terms,
     in_joint_coordinates,
+    is_eccentric,
     listed,
     mixing_of,
 )
-from nfriction.fitting.residuals import effective_noise, stride_of
-from nfriction.fitting.stages import Callback, Refinement, Stage
+from nfriction.fitting.stages import Callback, Refinement, Stage, flat, least
 from nfriction.fitting.torque import fit_torque, prior_sd
 from nfriction.fitting.windows import cut_windows
 from nfriction.friction import Adaptive, Constant, FrictionModel
@@ -42,8 +41,6 @@ FIRST_NOISE = 1e-3
 WINDOWS = (0.5, 2.0, 5.0)
 # Relative fall of the cost that ends a search of which only the neighbourhood matters.
 LOOSE = 1e-4
-# Priors of a network that are tried, over its own: windows held back choose among them.
-PRIOR_SHARES = (1.0, 1 / 3)
 # Errors that count for less would be rounding [rad or m].
 LEAST_NOISE = 1e-9
 
@@ -90,7 +87,7 @@ def fit(
             that an angle offset is part of the plant. `"each"`: at the start of each recording,
             wherever dry friction held the links then; how far that was off is found for each
             recording and left out of the plant, whose offset stays as given, as that of a further
-            recording cannot be known. Not with an adaptive model.
+            recording cannot be known.
         start: an earlier fit to start from: of the same law for a neuro-fuzzy model, of any model
             for the plant's terms.
         motions: smoothed motions in joint coordinates, to save smoothing again.
@@ -113,62 +110,51 @@ def fit(
     if eccentricity and not may_be_eccentric(plant):
         raise ValueError(f"{plant.name or 'the axis'} has no encoders that turn with its joints.")
     moved = tuple(motions or (kalman_smoother(r.time, r.q) for r in joint))
-    if isinstance(model.schedule, Adaptive):
-        if zeroed == "each":
-            raise ValueError('`zeroed="each"` is not for an adaptive model; fit its constant law.')
+    if isinstance(model.schedule, (Adaptive, NeuroFuzzy)):
         if method == "torque":
-            raise ValueError("an adaptive model is fitted to trajectories, not to torques.")
-        # It fits the constant law first, so it stands above this module.
-        from nfriction.fitting.adaptive import fit_adaptive
-
-        return fit_adaptive(
-            model, plant, given, windows=windows, fit_plant=fit_plant, drag=drag, start=start,
-            motions=moved, max_steps=max_steps, callback=callback,
-        )  # fmt: skip
-    if isinstance(model.schedule, NeuroFuzzy):
-        if method == "torque":
-            raise ValueError("a neuro-fuzzy model is fitted to trajectories, not to torques.")
-        if start is None or not is_constant_fit(start, model):
+            raise ValueError("coefficients that follow the motion are not fitted to torques.")
+        same: dict[str, Any] = {
+            "windows": windows, "fit_plant": fit_plant, "drag": drag, "max_steps": max_steps,
+            "callback": callback,
+        }  # fmt: skip
+        if isinstance(model.schedule, NeuroFuzzy):
+            same["eccentricity"] = eccentricity
+        if not is_constant_fit(start, model) or bool(start.zeros) != (zeroed == "each"):
             constant = FrictionModel(model.law, Constant(model.law, model.joints), model.v_smooth)
-            start = fit(
-                constant, plant, given, windows=windows, fit_plant=fit_plant, drag=drag,
-                eccentricity=eccentricity, zeroed=zeroed, start=start, motions=moved,
-                max_steps=max_steps, callback=callback,
-            )  # fmt: skip
-        start_at(model, start, joint, moved)
-    else:
-        torque = fit_torque(
-            model.law, start.plant if start else plant, joint, moved, model.v_smooth
-        )
-        schedule = constant_schedule(model)
-        schedule.set_coefficients(torque.coefficients)
-        schedule.set_prior_sd(prior_sd(model.law, torque))
-        if method == "torque":
-            return torque_outcome(model, start, plant, moved, torque)
+            start = fit(constant, plant, given, zeroed=zeroed, start=start, motions=moved, **same)
+        given, motions = at_zeros(start.zeros, plant, given, moved)
+        # They fit or take a constant law first, so they stand above this module.
+        from nfriction.fitting.adaptive import fit_adaptive
+        from nfriction.fitting.network import fit_network
+
+        further = fit_adaptive if isinstance(model.schedule, Adaptive) else fit_network
+        found = further(model, plant, given, start=start, motions=motions, **same)
+        return replace(found, motions=moved, zeros=start.zeros)
+    torque = fit_torque(model.law, start.plant if start else plant, joint, moved, model.v_smooth)
+    schedule = constant_schedule(model)
+    schedule.set_coefficients(torque.coefficients)
+    schedule.set_prior_sd(prior_sd(model.law, torque))
+    if method == "torque":
+        return torque_outcome(model, start, plant, moved, torque)
     if not windows:
         raise ValueError("`windows` must name at least one window length [s].")
     mixing = mixing_of(plant, given[0].convention_on(plant))
     known = {name: value for name, value, _ in start.plant_terms} if start else {}
-    # A chain of fits asks for the encoders once, in its first.
-    eccentric = eccentricity or (eccentricity is None and has_encoder_terms(known))
+    zero_sd = torch.full((len(joint), plant.joints), ZERO_SD, dtype=torch.float64)
 
     def refinement(eccentric: bool) -> Refinement:
-        terms = adjustable_terms(plant, joint, fit_plant, drag, eccentric)
-        # A shared offset beside them is no more than their mean.
-        zero_sd = ZERO_SD if zeroed == "each" and fit_plant else 0.0
-        if zero_sd:
-            terms = [t for t in terms if t.buffer != "angle_offset"]
-        return Refinement(plant, model, joint, mixing, terms, max_steps, callback, zero_sd)
+        once = zeroed == "once"
+        terms = adjustable_terms(plant, joint, fit_plant, drag, eccentric, zeroed_once=once)
+        return Refinement(
+            plant, model, joint, mixing, terms, max_steps, callback, None if once else zero_sd
+        )
 
-    search = refinement(bool(eccentric))
+    search = refinement(is_eccentric(eccentricity, known))
     vector = torch.tensor([known.get(t.name, 0.0) for t in search.terms], dtype=torch.float64)
-    if isinstance(model.schedule, NeuroFuzzy):
-        assert start is not None
-        return _refine_network(search, start, vector, windows[-1], moved)
     stage = _through_windows(search, windows, vector, moved)
     undecided = start is None and eccentricity is None and fit_plant and may_be_eccentric(plant)
     if undecided and stage.result.status != "stopped":
-        tolerance = _flat(stage.result.cost)
+        tolerance = flat(stage.result.cost)
         stage = richer_by_evidence(stage, refinement(True), tolerance) or stage
     return trajectory_outcome(stage.problem, stage.result, stage.residuals, moved)
 
@@ -185,8 +171,8 @@ def _through_windows(
         tolerance = LOOSE
         if length == windows[-1]:
             # Of a start far away the cost says nothing; the last stage's minimum is as high.
-            near = reached and _least(reached.residuals, noise)
-            tolerance = _flat(near or float(problem.cost(problem.start(vector))))
+            near = reached and least(reached.residuals, noise)
+            tolerance = flat(near or float(problem.cost(problem.start(vector))))
         stage = search.search(problem, vector, tolerance, f"{length:g} s windows", zeros)
         if reached is not None and stage.lost_since(reached):
             logger.warning("%g s windows are too long for this motion; left out", length)
@@ -200,54 +186,3 @@ def _through_windows(
         traced = problem.traced(stage.result.x, traced)
     assert reached is not None
     return reached
-
-
-def _refine_network(
-    search: Refinement, start: Fit, vector: Tensor, length: float, motions: tuple[Motion, ...]
-) -> Fit:
-    """Refine a network that starts at a constant fit, and keep it where it earns its place."""
-    # What the constant law left over, at the same window length, is the noise that the prior is
-    # weighed against.
-    noise = effective_noise(start._residuals)
-    stride = stride_of(start._residuals)
-    seen, held_back = judged_windows(search, motions, length)
-    part = search.problem(seen, noise, vector, stride)
-    # The constant law's own cost, in which the gain of a step is judged.
-    tolerance = _flat(_least(start._residuals, noise))
-    schedule = search.model.schedule
-    assert isinstance(schedule, NeuroFuzzy)
-    widest, trials = schedule.prior_sd, []
-    for share in PRIOR_SHARES:
-        # From nothing: on from another prior's end a search stays near it, and judges that.
-        schedule.set_parameter_vector(torch.zeros_like(schedule.parameter_vector()))
-        schedule.prior_sd = share * widest
-        stage = search.search(part, vector, tolerance, "a third held back")
-        if stage.result.status == "stopped":
-            return trajectory_outcome(stage.problem, stage.result, stage.residuals, motions)
-        ratio = gain_on(held_back, stage, vector)
-        trials.append((ratio, schedule.prior_sd, schedule.parameter_vector(), stage))
-    ratio, schedule.prior_sd, network, stage = min(trials, key=lambda trial: trial[0])
-    schedule.set_parameter_vector(network)
-    if ratio > HEAD_START:
-        settle_on(search.model, start)
-        note = (
-            f"The network predicts windows held back {100 * (ratio - 1):.3g} % worse than its "
-            "constant law, which is kept."
-        )
-        return replace(
-            start, model=search.model.requires_grad_(False), status=f"{start.status} {note}",
-            warnings=(*start.warnings, note),
-        )  # fmt: skip
-    whole = search.problem(cut_windows(search.joint, motions, length), noise, vector, stride)
-    stage = search.search(whole, stage.vector, tolerance, f"{length:g} s windows")
-    return trajectory_outcome(stage.problem, stage.result, stage.residuals, motions)
-
-
-def _least(residuals: Tensor, noise: float) -> float:
-    """Cost of residuals counted in what they turned out to be."""
-    return float(0.5 * (residuals / noise).square().sum())
-
-
-def _flat(cost: float) -> float:
-    """Relative fall of the cost that changes the log likelihood by a tenth."""
-    return 0.1 / max(cost, 1.0)

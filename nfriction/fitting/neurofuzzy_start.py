@@ -1,6 +1,7 @@
 """Where a neuro-fuzzy model starts: at the constant fit of its law."""
 
 from collections.abc import Sequence
+from typing import TypeGuard
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from nfriction.signals import Motion
 NOTHING = 1e-6
 
 
-def is_constant_fit(start: Fit | None, model: FrictionModel) -> bool:
+def is_constant_fit(start: Fit | None, model: FrictionModel) -> TypeGuard[Fit]:
     """Whether a fit is one of the model's law with constant coefficients, by trajectories."""
     return (
         start is not None

@@ -49,6 +49,8 @@ class Fit:
             that last in time count for as few as they are worth. None for a torque fit.
         lost: what the data cannot tell, parameters or combinations of them, in words.
         warnings: what to be wary of, a sentence each.
+        zeros: of encoders that were zeroed anew at the start of each recording, what they fall
+            short of the true angles, in joint coordinates [rad]; a row for each recording.
         uncertainty: standard deviation of the coefficients at any motion; None for a torque fit.
     """
 
@@ -65,6 +67,7 @@ class Fit:
     intervals: tuple[Interval, ...] = ()
     lost: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    zeros: tuple[tuple[float, ...], ...] = ()
     uncertainty: CoefficientUncertainty | None = None
 
     @property
@@ -88,6 +91,7 @@ class Fit:
             },
             "lost": list(self.lost),
             "warnings": list(self.warnings),
+            **({"zeros": [list(zero) for zero in self.zeros]} if self.zeros else {}),
         }
 
 
@@ -156,6 +160,7 @@ def trajectory_outcome(
         _residuals=residuals,
         intervals=told,
         lost=lost,
+        zeros=tuple(map(tuple, problem.split_zeros(result.x).reshape(-1, plant.joints).tolist())),
         warnings=warnings_of(
             converged=result.converged, at_bounds=at_bounds, lost=lost, residual=residual,
             effective_sd=noise, quantum=plant.position_quantum, unit=plant.unit,

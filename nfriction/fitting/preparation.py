@@ -3,6 +3,7 @@
 import logging
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from nfriction.fitting.plant_parameters import PlantParameter, plant_parameters
 from nfriction.friction import Constant, FrictionModel
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.recording import Recording
+from nfriction.signals import Motion
 from nfriction.simulation import required_substeps
 from nfriction.solve.levenberg import Step
 
@@ -106,22 +108,53 @@ def adjustable_terms(
     fit_plant: bool,
     drag: bool | None,
     eccentricity: bool = False,
+    *,
+    zeroed_once: bool = True,
 ) -> list[PlantParameter]:
-    """Terms of the plant that a fit adjusts; `drag` None means where a chain swings freely."""
+    """Terms of the plant that a fit adjusts; `drag` None means where a chain swings freely.
+
+    Beside zeros of each recording, an angle offset would be no more than their mean.
+    """
     if not fit_plant:
         return []
     if drag is None:
         drag = _swings_freely(plant, joint)
     largest = _largest_torque(joint)
-    return plant_parameters(
+    terms = plant_parameters(
         plant, driven=largest > 0, largest_torque=largest, largest_rate=_largest_rate(joint),
         drag=drag, eccentricity=eccentricity,
     )  # fmt: skip
+    return [t for t in terms if zeroed_once or t.buffer != "angle_offset"]
 
 
-def has_encoder_terms(names: Iterable[str]) -> bool:
-    """Whether an earlier fit's plant terms tell of eccentric encoders."""
-    return any(name.startswith("encoder ") for name in names)
+def is_eccentric(asked: bool | None, known: Iterable[str]) -> bool:
+    """Whether to fit eccentric encoders; None means where an earlier fit's plant terms have them.
+
+    A chain of fits asks for them once, in its first.
+    """
+    return bool(asked) or (asked is None and any(name.startswith("encoder ") for name in known))
+
+
+def at_zeros(
+    zeros: Sequence[Sequence[float]],
+    plant: Plant,
+    recordings: Sequence[Recording],
+    motions: Sequence[Motion],
+) -> tuple[list[Recording], tuple[Motion, ...]]:
+    """Recordings and motions as if their encoders had no zeros of their own.
+
+    Args:
+        zeros: of a `Fit`; where there are none, all stays.
+        plant: the mechanism.
+        recordings: one for each row of `zeros`.
+        motions: theirs, in joint coordinates.
+    """
+    if not zeros:
+        return list(recordings), tuple(motions)
+    mixing = mixing_of(plant, recordings[0].convention_on(plant)).numpy()
+    off = [np.array(zero) for zero in zeros]
+    shifted = [replace(r, q=r.q + mixing @ z) for r, z in zip(recordings, off, strict=True)]
+    return shifted, tuple(replace(m, q=m.q + z) for m, z in zip(motions, off, strict=True))
 
 
 def mixing_of(plant: Plant, convention: AngleConvention) -> Tensor:

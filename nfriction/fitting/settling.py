@@ -11,6 +11,7 @@ from torch import Tensor
 from nfriction.fitting import estimate
 from nfriction.fitting.classes import AccelerationClasses, find_classes
 from nfriction.fitting.labelled import Labelled
+from nfriction.fitting.neurofuzzy_start import is_constant_fit
 from nfriction.fitting.outcome import Fit, Plant
 from nfriction.fitting.position_error import PositionError
 from nfriction.fitting.preparation import constant_schedule
@@ -34,12 +35,7 @@ def constant_start(
     **settings: Any,
 ) -> Fit:
     """The fit of the model's law with constant coefficients."""
-    if (
-        start is not None
-        and start.model.law == model.law
-        and isinstance(start.model.schedule, Constant)
-        and start._residuals.numel()
-    ):
+    if is_constant_fit(start, model):
         return start
     constant = FrictionModel(model.law, Constant(model.law, model.joints), model.v_smooth)
     return estimate.fit(constant, plant, recordings, motions=motions, start=start, **settings)

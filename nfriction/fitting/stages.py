@@ -52,7 +52,7 @@ class Stage:
 
     @property
     def zeros(self) -> Tensor:
-        """Zeros of each recording, as the problem takes them to start from."""
+        """Zeros of the recordings in one row; none where they were not sought."""
         return self.problem.split_zeros(self.result.x).clone()
 
     @property
@@ -89,7 +89,7 @@ class Refinement:
     terms: list[PlantParameter]
     max_steps: int = 30
     callback: Callback | None = None
-    zero_sd: float = 0.0
+    zero_sd: Tensor | None = None
     jacobian: StepJacobian = field(init=False)
 
     def __post_init__(self) -> None:
@@ -171,3 +171,13 @@ class _Watch:
         if before is None or step.damping > FULL:
             return torch.inf
         return float(((shared - before[: problem.shared_count]) / problem.spread()).abs().max())
+
+
+def least(residuals: Tensor, noise: float) -> float:
+    """Cost of residuals counted in what they turned out to be."""
+    return float(0.5 * (residuals / noise).square().sum())
+
+
+def flat(cost: float) -> float:
+    """Relative fall of the cost that changes the log likelihood by a tenth."""
+    return 0.1 / max(cost, 1.0)

@@ -49,7 +49,7 @@ class TrajectoryProblem:
         plant_mean: where the prior of the plant's terms is centred; default the plant as given.
         stride: only every so many-th sample counts, for as many: errors of a model last far
             longer than a sample, and the sums over many parameters are what a step costs.
-        zero_sd: what is expected of the zeros of each recording [rad]; 0 holds them at 0.
+        zero_sd: what is expected of the zeros, (recording, joint) [rad]; none are sought without.
         memory: of the coefficients at the start of each window, (window, joint, state_size), of a
             schedule that has one. It advances with every step of the integration.
     """
@@ -62,7 +62,7 @@ class TrajectoryProblem:
     plant_mean: Tensor | None = None
     stride: int = 1
     memory: Tensor | None = None
-    zero_sd: float = 0.0
+    zero_sd: Tensor | None = None
 
     def __post_init__(self) -> None:
         w = self.windows
@@ -75,13 +75,12 @@ class TrajectoryProblem:
         self.shared_count = self.friction_count + len(self.plant_terms)
         self.step = w.step.repeat_interleave(self.substeps, 1) / self.substeps
         self.tau = w.tau.repeat_interleave(self.substeps, 1)
-        places = [place for place, *_ in w.spans] if self.zero_sd > 0 else []
-        known = sorted(set(places))
-        self.zero_count = len(known) * w.q0.shape[-1]
+        recordings = 0 if self.zero_sd is None else len(self.zero_sd)
+        self.zero_count = recordings * w.q0.shape[-1]
         # Which recording a window is of, (window, recording).
-        self._of_recording = torch.zeros(len(w), len(known), dtype=torch.float64)
-        for i, place in enumerate(places):
-            self._of_recording[i, known.index(place)] = 1.0
+        self._of_recording = torch.zeros(len(w), recordings, dtype=torch.float64)
+        if recordings:
+            self._of_recording[torch.arange(len(w)), [place for place, *_ in w.spans]] = 1.0
         self._simulated: tuple[Tensor, Rollout] | None = None
         self._hessian = torch.zeros(0, 0, dtype=torch.float64)
 
@@ -206,8 +205,9 @@ class TrajectoryProblem:
         spread = torch.cat(
             [torch.full_like(w.q0, START_Q_SD), torch.full_like(w.qd0, START_QD_SD)], -1
         )
-        zeros = torch.zeros(self.zero_count, dtype=torch.float64)
-        sd = torch.cat([sd, spread.reshape(-1), zeros + self.zero_sd])
+        zero_sd = sd.new_zeros(0) if self.zero_sd is None else self.zero_sd.reshape(-1)
+        sd = torch.cat([sd, spread.reshape(-1), zero_sd])
+        zeros = torch.zeros_like(zero_sd)
         return sd.square().reciprocal(), torch.cat([mean, start.reshape(-1), zeros])
 
     def score_covariance(self, x: Tensor, sd: Tensor) -> Tensor:

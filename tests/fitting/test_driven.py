@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nfriction import LFM, NLFM, PendulumChain, Recording, fit, rollout
-from nfriction.friction import ACVFM, CVFM, Constant, FrictionModel
+from nfriction.friction import ACVFM, CVFM, NFCVFM, Constant, FrictionModel
 from nfriction.signals import quantise
 from tests.fitting.recordings import F64, pendulum, swing
 
@@ -75,13 +75,27 @@ def test_encoders_zeroed_anew_at_the_start_of_each_recording():
     assert torch.equal(each.plant.angle_offset, plant.angle_offset)
 
 
+@pytest.mark.parametrize("kind", [ACVFM, NFCVFM])
+def test_models_that_follow_the_motion_take_the_zeros_of_their_constant_law(kind):
+    plant = geared()
+    law = CVFM(2, DRY, v_smooth=V_SMOOTH)
+    off = ([0.06, -0.08], [-0.03, 0.05])
+    recordings = [driven(plant, law, seed) for seed in (0, 1)]
+    moved = [replace(r, q=r.q - o) for r, o in zip(recordings, off, strict=True)]
+    found = fit(kind(2, v_smooth=V_SMOOTH), plant, moved, windows=(1.0,), zeroed="each")
+    np.testing.assert_allclose(found.zeros, off, atol=2e-3)
+    np.testing.assert_allclose(found.to_dict()["zeros"], found.zeros)
+    assert found.residual < 1e-3
+    assert torch.equal(found.plant.angle_offset, plant.angle_offset)
+    for recording, motion in zip(moved, found.motions, strict=True):
+        assert np.abs(motion.q - recording.joint_coordinates(plant).q).max() < 0.01
+
+
 def test_zeroed_is_refused_where_it_means_nothing():
     plant = geared()
     recording = driven(plant, CVFM(2, DRY, v_smooth=V_SMOOTH), 0, seconds=0.5)
     with pytest.raises(ValueError, match="`zeroed` must be one of"):
         fit(CVFM(2), plant, recording, zeroed="never")
-    with pytest.raises(ValueError, match="not for an adaptive model"):
-        fit(ACVFM(2), plant, recording, zeroed="each")
 
 
 def test_load_dependent_friction_leaves_more_of_a_geared_mechanism_unexplained():

@@ -131,7 +131,7 @@ def test_a_model_settles_on_a_coefficient_of_zero(constant):
 
 def test_a_network_that_does_not_win_is_put_back(constant, monkeypatch):
     joint, found = constant
-    monkeypatch.setattr("nfriction.fitting.estimate.gain_on", lambda *_: 1.3)
+    monkeypatch.setattr("nfriction.fitting.network.gain_on", lambda *_: 1.3)
     model = NFLFM(2, v_smooth=V_SMOOTH, **SMALL)
     kept = fit(model, pendulum(), joint, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
     assert kept.model is model

@@ -3,7 +3,7 @@
 import pytest
 
 from nfriction import LFM, NFLFM, fit
-from nfriction.fitting.estimate import PRIOR_SHARES
+from nfriction.fitting.network import PRIOR_SHARES
 from tests.fitting.recordings import pendulum, swing
 
 V_SMOOTH = 0.05
@@ -28,7 +28,7 @@ def test_the_prior_is_the_one_whose_network_predicts_best(constant, monkeypatch,
         seen.append(trained.problem.friction.schedule.prior_sd)
         return gains[len(seen) - 1]
 
-    monkeypatch.setattr("nfriction.fitting.estimate.gain_on", gain)
+    monkeypatch.setattr("nfriction.fitting.network.gain_on", gain)
     model = NFLFM(2, v_smooth=V_SMOOTH, prior_sd=0.6, **SMALL)
     fit(model, pendulum(), recording, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
     assert seen == pytest.approx([0.6 * share for share in PRIOR_SHARES])

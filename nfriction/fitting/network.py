@@ -1,0 +1,107 @@
+"""Fit a neuro-fuzzy model: a network that corrects a constant law, where windows bear it out."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from nfriction.fitting.holdback import HEAD_START, gain_on, judged_windows
+from nfriction.fitting.neurofuzzy_start import settle_on, start_at
+from nfriction.fitting.outcome import Fit, Plant, trajectory_outcome
+from nfriction.fitting.preparation import (
+    adjustable_terms,
+    in_joint_coordinates,
+    is_eccentric,
+    mixing_of,
+)
+from nfriction.fitting.residuals import effective_noise, stride_of
+from nfriction.fitting.stages import Refinement, flat, least
+from nfriction.fitting.windows import cut_windows
+from nfriction.friction import FrictionModel
+from nfriction.friction.neurofuzzy import NeuroFuzzy
+from nfriction.recording import Recording
+from nfriction.signals import Motion
+from nfriction.solve.levenberg import Step
+
+# Priors of a network that are tried, over its own: windows held back choose among them.
+PRIOR_SHARES = (1.0, 1 / 3)
+
+
+def fit_network(
+    model: FrictionModel,
+    plant: Plant,
+    recordings: Sequence[Recording],
+    *,
+    start: Fit,
+    motions: tuple[Motion, ...],
+    windows: Sequence[float],
+    fit_plant: bool,
+    drag: bool | None,
+    eccentricity: bool | None,
+    max_steps: int,
+    callback: Callable[[str, Step], bool | None] | None,
+) -> Fit:
+    """The fit of a neuro-fuzzy model from that of its constant law.
+
+    Args:
+        model, plant: see `fit`.
+        recordings, motions: at the zeros that the constant fit found.
+        start: the constant fit.
+        windows, fit_plant, drag, eccentricity, max_steps, callback: see `fit`; of the windows the
+            last length serves.
+    """
+    if not windows:
+        raise ValueError("`windows` must name at least one window length [s].")
+    joint = in_joint_coordinates(plant, model, recordings)
+    start_at(model, start, joint, motions)
+    known = {name: value for name, value, _ in start.plant_terms}
+    terms = adjustable_terms(
+        plant, joint, fit_plant, drag, is_eccentric(eccentricity, known),
+        zeroed_once=not start.zeros,
+    )  # fmt: skip
+    mixing = mixing_of(plant, recordings[0].convention_on(plant))
+    search = Refinement(plant, model, joint, mixing, terms, max_steps, callback)
+    vector = torch.tensor([known.get(t.name, 0.0) for t in terms], dtype=torch.float64)
+    return _refined(search, start, vector, windows[-1], motions)
+
+
+def _refined(
+    search: Refinement, start: Fit, vector: Tensor, length: float, motions: tuple[Motion, ...]
+) -> Fit:
+    """Refine a network that starts at a constant fit, and keep it where it earns its place."""
+    # What the constant law left over, at the same window length, is the noise that the prior is
+    # weighed against.
+    noise = effective_noise(start._residuals)
+    stride = stride_of(start._residuals)
+    seen, held_back = judged_windows(search, motions, length)
+    part = search.problem(seen, noise, vector, stride)
+    # The constant law's own cost, in which the gain of a step is judged.
+    tolerance = flat(least(start._residuals, noise))
+    schedule = search.model.schedule
+    assert isinstance(schedule, NeuroFuzzy)
+    widest, trials = schedule.prior_sd, []
+    for share in PRIOR_SHARES:
+        # From nothing: on from another prior's end a search stays near it, and judges that.
+        schedule.set_parameter_vector(torch.zeros_like(schedule.parameter_vector()))
+        schedule.prior_sd = share * widest
+        stage = search.search(part, vector, tolerance, "a third held back")
+        if stage.result.status == "stopped":
+            return trajectory_outcome(stage.problem, stage.result, stage.residuals, motions)
+        ratio = gain_on(held_back, stage, vector)
+        trials.append((ratio, schedule.prior_sd, schedule.parameter_vector(), stage))
+    ratio, schedule.prior_sd, network, stage = min(trials, key=lambda trial: trial[0])
+    schedule.set_parameter_vector(network)
+    if ratio > HEAD_START:
+        settle_on(search.model, start)
+        note = (
+            f"The network predicts windows held back {100 * (ratio - 1):.3g} % worse than its "
+            "constant law, which is kept."
+        )
+        return replace(
+            start, model=search.model.requires_grad_(False), status=f"{start.status} {note}",
+            warnings=(*start.warnings, note),
+        )  # fmt: skip
+    whole = search.problem(cut_windows(search.joint, motions, length), noise, vector, stride)
+    stage = search.search(whole, stage.vector, tolerance, f"{length:g} s windows")
+    return trajectory_outcome(stage.problem, stage.result, stage.residuals, motions)
