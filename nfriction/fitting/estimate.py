@@ -112,7 +112,9 @@ def fit(
     moved = tuple(motions or (kalman_smoother(r.time, r.q) for r in joint))
     if isinstance(model.schedule, (Adaptive, NeuroFuzzy)):
         if method == "torque":
-            raise ValueError("coefficients that follow the motion are not fitted to torques.")
+            raise ValueError(
+                "adaptive and neuro-fuzzy models are fitted to trajectories, not to torques."
+            )
         same: dict[str, Any] = {
             "windows": windows, "fit_plant": fit_plant, "drag": drag, "max_steps": max_steps,
             "callback": callback,
