@@ -120,6 +120,8 @@ def _known(table: pd.DataFrame, aliases: dict[str, str], source: Source) -> Sour
     if column in table.attrs.get("repeated", ()) or (table.columns == column).sum() > 1:
         raise ValueError(f"column {column} is there more than once; rename one of them.")
     said = _texts(table, "units").get(column)
+    if source.unit and said and not is_unit(said):
+        said = None  # a word of the user's own; what he says counts
     if source.unit and said and canonical_unit(said) != canonical_unit(source.unit):
         raise ValueError(
             f"column {column} is said to be in {source.unit!r}, but the file says {said!r}."

@@ -21,8 +21,12 @@ _PER_SI: dict[str, dict[str, float]] = {
     | {"rpm": 60 / _TURN, "m/s": 1.0, "mm/s": 1e3},
     "tau": {"N m": 1.0, "mN m": 1e3, "N": 1.0, "mN": 1e3},
 }
-_SPELLINGS = {"°": "deg", "°/s": "deg/s", "1/min": "rpm", "Nm": "N m", "N*m": "N m", "N.m": "N m",
-              "mNm": "mN m", "sec": "s", "msec": "ms", "μs": "us"}  # fmt: skip
+_SPELLINGS = {
+    "°": "deg", "°/s": "deg/s", "degree": "deg", "degrees": "deg", "degrees/s": "deg/s",
+    "Grad": "deg", "Grad/s": "deg/s", "radian": "rad", "radians": "rad", "radians/s": "rad/s",
+    "1/min": "rpm", "U/min": "rpm", "Nm": "N m", "N*m": "N m", "N.m": "N m", "mNm": "mN m",
+    "sec": "s", "msec": "ms", "μs": "us",
+}  # fmt: skip
 
 
 def canonical_unit(text: str) -> str:

@@ -166,6 +166,17 @@ def test_units_that_contradict_are_refused(tmp_path: Path) -> None:
         read(tmp_path, text, columns={"q1": "q1 [rad]:deg"})
 
 
+def test_a_german_row_of_units_is_read_and_own_words_give_way(tmp_path: Path) -> None:
+    rows = "".join(f"{k};{10 * k},5;{k}\n" for k in range(9))
+    columns = {"time": "Zeit", "q1": "Winkel", "q2": "Arm:mrad"}
+    found = read(tmp_path, "Zeit;Winkel;Arm\nms;Grad;Striche\n" + rows, columns=columns)
+    np.testing.assert_allclose(found.time[:2], [0, 1e-3])
+    np.testing.assert_allclose(np.rad2deg(found.q[1, 0]), 10.5)
+    np.testing.assert_allclose(found.q[8, 1], 8e-3)
+    with pytest.raises(ValueError, match="'Striche' is no unit of q"):
+        read(tmp_path, "Zeit;Winkel;Arm\nms;Grad;Striche\n" + rows, columns=columns | {"q2": "Arm"})
+
+
 def test_what_unpacks_to_far_more_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
