@@ -30,6 +30,7 @@ def contents(path: str | Path, ours: re.Pattern[str], what: str) -> dict[str, by
         OSError: it cannot be read.
     """
     found: dict[str, bytes] = {}
+    known: set[str] = set()
     if Path(path).stat().st_size > LARGEST:
         raise ExportError(f"{path}: too large for a {what} of nfriction.")
     try:
@@ -40,9 +41,9 @@ def contents(path: str | Path, ours: re.Pattern[str], what: str) -> dict[str, by
             for entry in entries:
                 name = entry.filename.partition("/")[2]
                 # torch looks for names without regard to case.
-                taken = name.lower() in {known.lower() for known in found}
-                if taken or not ours.fullmatch(name):
+                if name.lower() in known or not ours.fullmatch(name):
                     raise ExportError(f"{path}: holds {entry.filename[:80]!r}, which is not ours.")
+                known.add(name.lower())
                 found[name] = archive.read(entry)
     except _DAMAGED as error:
         if isinstance(error, ExportError):

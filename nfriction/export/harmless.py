@@ -6,7 +6,10 @@ TorchScript may read and write files. Whatever is not known to be harmless is re
 
 import re
 from collections.abc import Iterator
+from functools import cache
 from typing import Any
+
+import torch
 
 from nfriction.codegen.operations import supported_operations
 from nfriction.export.errors import ExportError
@@ -21,12 +24,13 @@ _MORE = """
     reshape_as round scalar_tensor searchsorted sinc size softmax square std swapaxes sym_size take
     tile to tril triu true_divide type_as unflatten unfold var vdot view_as xlogy zeros
 """
-_TENSORS = {*supported_operations(), *_MORE.split()}
+# One of those that can be compiled sees memory beyond its tensor, unchecked.
+_TENSORS = {*supported_operations(), *_MORE.split()} - {"_reshape_alias"}
 # Numbers, lists and words of the TorchScript language.
 _WORDS_OF_SCRIPT = """
     Bool Float FloatImplicit Int IntImplicit ScalarImplicit __contains__ __getitem__ __is__
     __isnot__ __not__ __range_length append dim extend format is_floating_point item len list numel
-    range tensor warn prim::Constant prim::If prim::Loop prim::ListConstruct prim::ListUnpack
+    range tensor prim::Constant prim::If prim::Loop prim::ListConstruct prim::ListUnpack
     prim::NumToTensor prim::RaiseException prim::TupleConstruct prim::TupleIndex prim::TupleUnpack
     prim::Uninitialized prim::device prim::dtype prim::layout prim::max prim::min
     prim::unchecked_cast
@@ -44,8 +48,8 @@ _EXPRESSION = (
 )
 _SIZE = r"L\['\w+'\]\.size\(\)\[\d+\]"
 _SPEC = (
-    r"(?:null|\"(?:type|context|children_spec|null|\[\]|builtins\.(?:tuple|list|dict))\"|\d+"
-    r"|[][{}:, ])*"
+    r"(?:null|\"(?:type|context|children_spec|null|\[\]|builtins\.(?:tuple|list|dict))\""
+    r"|[][{}:, 0-9])*"
 )
 # Strings of a program by their key; all others, and all keys, are plain words.
 _WORDS = re.compile(r"-?[\w.]*")
@@ -60,6 +64,9 @@ _STRINGS = {
         "torch_version": r"[\w.+]*",
     }.items()
 }
+# In the source of a TorchScript: words after a dot, and what else leads to an operator.
+_DOTTED = re.compile(rb"\.(?:\s|\\|#[^\n]*)*([A-Za-z_]\w*)")
+_DETOUR = re.compile(rb"__setstate__|\bgetattr\b|\bops\b(?!\.(?:aten|prim)\.)")
 
 
 def refuse_harmful_program(document: Any) -> None:
@@ -71,11 +78,41 @@ def refuse_harmful_program(document: Any) -> None:
     for key, value in _strings("", document):
         sound = _STRINGS.get(key, _WORDS).fullmatch(value) is not None
         if key == "target":
-            sound = sound and _is_arithmetic(value.split(".")[3])
+            sound = sound and _is_overload(*value.split(".")[3:])
         elif key == "":
             sound = sound and (not value.startswith("as_") or value in _KINDS)
         if not sound:
             raise _foreign(value)
+
+
+def refuse_harmful_source(name: str, content: bytes) -> None:
+    """Refuse a file of a TorchScript that does more than arithmetic of tensors as it is loaded.
+
+    torch evaluates defaults of arguments and constants of classes then, before a graph is there,
+    and lets objects of its own classes restore themselves.
+
+    Args:
+        name: of the file in the archive.
+        content: of the file.
+
+    Raises:
+        ExportError: names what it holds.
+    """
+    found: set[bytes] = set()
+    if name.endswith(".py"):
+        found |= {*_DETOUR.findall(content)} | (_foreign_words() & {*_DOTTED.findall(content)})
+    elif name.endswith(".pkl"):
+        found |= {*re.findall(rb"__setstate__|\bclasses\b", content)}
+    if found:
+        raise _foreign(min(found).decode())
+
+
+@cache
+def _foreign_words() -> frozenset[bytes]:
+    """Names of torch's operators that are more than arithmetic, and of the home of its classes."""
+    names = {schema.name.partition("::")[2] for schema in torch._C._jit_get_all_schemas()}
+    own = {n for n in names if any(map(_is_harmless, (n, f"prim::{n}", f"aten::{n}")))}
+    return frozenset(word.encode() for word in {"classes", *(names - own)})
 
 
 def refuse_harmful_script(graph: Any) -> None:
@@ -85,10 +122,20 @@ def refuse_harmful_script(graph: Any) -> None:
         ExportError: names what it holds.
     """
     for node in _nodes(graph):
-        kind = node.kind()
-        name = kind.removeprefix("aten::")
-        if not (name in _LANGUAGE or (name != kind and _is_arithmetic(name))):
-            raise _foreign(kind)
+        if not _is_harmless(node.kind()):
+            raise _foreign(node.kind())
+
+
+def _is_harmless(kind: str) -> bool:
+    """Whether a kind of node of TorchScript is arithmetic of tensors, or of the language."""
+    name = kind.removeprefix("aten::")
+    return name in _LANGUAGE or (name != kind and _is_arithmetic(name))
+
+
+def _is_overload(name: str, overload: str) -> bool:
+    """Whether it names an operator on tensors, not some other attribute of torch's object."""
+    known = getattr(torch.ops.aten, name, None) if _is_arithmetic(name) else None
+    return known is not None and overload in known.overloads()
 
 
 def _is_arithmetic(name: str) -> bool:

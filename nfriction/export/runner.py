@@ -20,6 +20,8 @@ OPENERS = {".pt": open_torchscript, ".pt2": open_pt2}
 # Processor time [s]: to begin with, and for a sample of a controller with a state.
 STARTING, BY_SAMPLE = 120.0, 0.01
 ROOM = 2**34
+# Numbers that come out for one that goes in: expanded from nothing, they would fill the disk.
+MOST_BY_NUMBER = 1000
 _INPUTS, _OUTPUTS = "inputs.npz", "outputs.npz"
 
 
@@ -82,8 +84,10 @@ def work(asked: Mapping[str, Any], folder: Path) -> None:
         for k, count in enumerate(asked["batches"]):
             inputs = [torch.from_numpy(given[f"{k}_{i}"]) for i in range(count)]
             try:
-                outputs = run(*inputs)
-                found |= {f"{k}_{i}": torch.as_tensor(x).numpy() for i, x in enumerate(outputs)}
+                outputs = [torch.as_tensor(x) for x in run(*inputs)]
+                if max(x.numel() for x in outputs) > MOST_BY_NUMBER * inputs[0].numel():
+                    raise ValueError("its outputs are too large")
+                found |= {f"{k}_{i}": x.numpy() for i, x in enumerate(outputs)}
             except (RuntimeError, TypeError, AttributeError, LookupError, ValueError) as error:
                 told = f"{path}: cannot be run by its metadata ({error})."
                 raise ExportError(told) from error

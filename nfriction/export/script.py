@@ -18,7 +18,7 @@ from nfriction.export.controller import AnyController, controller_of
 from nfriction.export.errors import ExportError, first_line
 from nfriction.export.filtered import FilteredController
 from nfriction.export.flat import shortened
-from nfriction.export.harmless import refuse_harmful_script
+from nfriction.export.harmless import refuse_harmful_script, refuse_harmful_source
 from nfriction.export.unfiltered import Controller, MemoryController
 from nfriction.friction import FrictionModel
 from nfriction.modelfile import ModelInfo
@@ -111,8 +111,11 @@ def open_torchscript(path: str | Path) -> tuple[Contract, Runner]:
         OSError: if it cannot be read.
     """
     files = contents(path, _OURS, "TorchScript")
-    if any(b"__setstate__" in content for content in files.values()):
-        raise ExportError(f"{path}: runs as it is loaded, which is refused.")
+    try:
+        for name, content in files.items():
+            refuse_harmful_source(name, content)
+    except ExportError as error:
+        raise ExportError(f"{path}: {error}") from None
     contract = Contract.from_json(files.get(f"extra/{METADATA}", b""))
     with _silent():
         try:

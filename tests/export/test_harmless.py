@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from nfriction.export import ExportError, pt2, runner, torchscript, verify_artefact
 from nfriction.export.archive import METADATA
-from nfriction.export.harmless import refuse_harmful_program
+from nfriction.export.harmless import refuse_harmful_program, refuse_harmful_source
 from nfriction.export.program import open_pt2
 from nfriction.export.script import open_torchscript
 from nfriction.friction import LFM
@@ -46,6 +46,8 @@ def changed(value: Any, key: str, to: Any) -> Any:
         ("target", "torch.hub.load"),
         ("target", "torch.ops.aten.from_file.default"),
         ("target", "math.factorial"),
+        ("target", "torch.ops.aten.add.__init__"),
+        ("target", "torch.ops.aten.add.op"),
         ("in_spec", IMPORT),
         ("out_spec", IMPORT),
         ("name", f"x, y={ATTACK}"),
@@ -110,6 +112,13 @@ class Endless(Saving):
         return qd, qdd, load
 
 
+class Swollen(Saving):
+    @torch.jit.export
+    def step(self, qd: Tensor, qdd: Tensor, load: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        large = torch.zeros([1], dtype=torch.float64).expand(100_000_000_000)
+        return large, large, large
+
+
 class Waking(Saving):
     """Runs as it is loaded."""
 
@@ -133,7 +142,7 @@ def scripted(module: nn.Module, path: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("kind", "said"), [(Saving, "aten::save"), (Reading, "from_file"), (Waking, "as it is loaded")]
+    ("kind", "said"), [(Saving, "save"), (Reading, "from_file"), (Waking, "__setstate__")]
 )
 def test_a_script_that_does_more_than_arithmetic_is_refused(
     kind: type[nn.Module], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -145,6 +154,56 @@ def test_a_script_that_does_more_than_arithmetic_is_refused(
     assert [x.name for x in tmp_path.iterdir()] == ["bad.pt"]
 
 
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("load: Tensor)", "load: Tensor, x: Tensor=torch.{})"),
+        ("load: Tensor)", "load: Tensor, x: Tensor=torch . {})"),
+        ("load: Tensor)", "load: Tensor, x: Tensor=torch.# more\n    {})"),
+        ("load: Tensor)", "load: Tensor, x: Tensor=ops.aten.{})"),
+        ("load: Tensor)", "load: Tensor, x: Tensor=getattr(torch, 'from_' 'file')('a', True, 8))"),
+        ("  def forward", "  k : Final[Tensor] = torch.{}\n  def forward"),
+    ],
+)
+def test_a_script_that_runs_as_it_is_loaded_is_refused(
+    before: str, after: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    sound, bad = torchscript(MODEL, tmp_path / "good.pt", INFO), tmp_path / "bad.pt"
+    evil = after.format('from_file("attacked", True, 8)')
+    with zipfile.ZipFile(sound) as archive, zipfile.ZipFile(bad, "w") as written:
+        for name in archive.namelist():
+            text = archive.read(name)
+            if name.endswith(".py"):
+                text = text.replace(before.encode(), evil.encode())
+                assert evil.encode() in text
+            if not name.endswith("debug_pkl"):
+                written.writestr(name, text)
+    with pytest.raises(ExportError, match=r"bad\.pt: it holds .* no part of a controller"):
+        open_torchscript(bad)
+    assert sorted(x.name for x in tmp_path.iterdir()) == ["bad.pt", "good.pt"]
+
+
+def test_objects_of_torchs_own_classes_are_refused() -> None:
+    state = b"\x80\x02c__torch__.torch.classes.quantized\nLinearPackedParamsBase\n"
+    with pytest.raises(ExportError, match="'classes'"):
+        refuse_harmful_source("data.pkl", state)
+
+
+def test_numbers_without_an_end_are_refused_at_once(program: Path, tmp_path: Path) -> None:
+    with zipfile.ZipFile(program) as archive:
+        name = next(n for n in archive.namelist() if n.endswith("models/model.json"))
+        evil = changed(json.loads(archive.read(name)), "in_spec", 100 * "1" + "x")
+    bad = rewritten(program, tmp_path / "bad.pt2", {"models/model.json": json.dumps(evil).encode()})
+    with pytest.raises(ExportError, match="no part of a controller"):
+        open_pt2(bad)
+
+
+def test_views_of_memory_beyond_a_tensor_are_refused() -> None:
+    with pytest.raises(ExportError, match="_reshape_alias"):
+        refuse_harmful_program({"target": "torch.ops.aten._reshape_alias.default"})
+
+
 def test_a_script_without_an_end_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runner, "STARTING", 8.0)
     monkeypatch.setattr(runner, "BY_SAMPLE", 0.0)
@@ -152,6 +211,11 @@ def test_a_script_without_an_end_is_told(tmp_path: Path, monkeypatch: pytest.Mon
         verify_artefact(scripted(Endless(), tmp_path / "bad.pt"), MODEL, INFO)
 
 
+def test_outputs_that_would_fill_the_disk_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ExportError, match="too large"):
+        verify_artefact(scripted(Swollen(), tmp_path / "bad.pt"), MODEL, INFO)
+
+
 def test_what_verification_refuses_is_told_across_the_process(tmp_path: Path) -> None:
-    with pytest.raises(ExportError, match="aten::save"):
+    with pytest.raises(ExportError, match="'save'"):
         verify_artefact(scripted(Saving(), tmp_path / "bad.pt"), MODEL, INFO)
