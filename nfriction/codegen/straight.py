@@ -40,25 +40,38 @@ def code_of(x: Any) -> Any:
     return ir.Constant(_TRUTH if isinstance(x, bool) else _REAL, x)
 
 
-def _operators(instruction: str, *flags: Any) -> tuple[Callable[..., Any], Callable[..., Any]]:
+def _real(builder: Any, x: Any) -> Any:
+    """LLVM's value as a number: truth counts as one."""
+    code = code_of(x)
+    return builder.uitofp(code, _REAL) if code.type == _TRUTH else code
+
+
+def _truth(builder: Any, x: Any) -> Any:
+    """LLVM's value as a truth value: whatever is not zero is true, NaN too."""
+    code = code_of(x)
+    return code if code.type == _TRUTH else builder.fcmp_unordered("!=", code, _REAL(0.0))
+
+
+def _operators(
+    instruction: str, taken: Callable[..., Any], *flags: Any
+) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """An operator with the recorded value on its left, and on its right."""
 
-    def apply(self: "Value", a: Any, b: Any) -> "Value":
-        return Value(self.builder, getattr(self.builder, instruction)(a, b, *flags))
+    def apply(a: Any, b: Any, builder: Any) -> "Value":
+        pair = (taken(builder, x) for x in (a, b))
+        return Value(builder, getattr(builder, instruction)(*pair, *flags))
 
     return (
-        lambda self, other: apply(self, self.code, code_of(other)),
-        lambda self, other: apply(self, code_of(other), self.code),
+        lambda self, other: apply(self, other, self.builder),
+        lambda self, other: apply(other, self, self.builder),
     )
 
 
 def _comparison(sign: str) -> Callable[..., Any]:
     def compare(self: "Value", other: Any) -> "Value":
         b = self.builder
-        if self.code.type == _TRUTH:
-            return Value(b, b.icmp_unsigned(sign, self.code, code_of(other)))
         test = b.fcmp_unordered if sign == "!=" else b.fcmp_ordered  # of NaN only that is true
-        return Value(b, test(sign, self.code, code_of(other)))
+        return Value(b, test(sign, _real(b, self), _real(b, other)))
 
     return compare
 
@@ -70,21 +83,21 @@ class Value:
         self.builder = builder
         self.code = code
 
-    __add__, __radd__ = _operators("fadd", "", _FUSED)
-    __sub__, __rsub__ = _operators("fsub", "", _FUSED)
-    __mul__, __rmul__ = _operators("fmul", "", _FUSED)
-    __truediv__, __rtruediv__ = _operators("fdiv", "", _FUSED)
-    __and__, __rand__ = _operators("and_")
-    __or__, __ror__ = _operators("or_")
+    __add__, __radd__ = _operators("fadd", _real, "", _FUSED)
+    __sub__, __rsub__ = _operators("fsub", _real, "", _FUSED)
+    __mul__, __rmul__ = _operators("fmul", _real, "", _FUSED)
+    __truediv__, __rtruediv__ = _operators("fdiv", _real, "", _FUSED)
+    __and__, __rand__ = _operators("and_", _truth)
+    __or__, __ror__ = _operators("or_", _truth)
     __lt__, __le__, __gt__, __ge__ = map(_comparison, ("<", "<=", ">", ">="))
     __eq__, __ne__ = map(_comparison, ("==", "!="))
     __hash__ = None  # type: ignore[assignment]
 
     def __neg__(self) -> "Value":
-        return Value(self.builder, self.builder.fneg(self.code))
+        return Value(self.builder, self.builder.fneg(_real(self.builder, self)))
 
     def __invert__(self) -> "Value":
-        return Value(self.builder, self.builder.not_(self.code))
+        return Value(self.builder, self.builder.not_(_truth(self.builder, self)))
 
 
 class _Array:
@@ -101,7 +114,7 @@ class _Array:
         return Value(self.builder, self.builder.load(self._at(index)))
 
     def __setitem__(self, index: int, value: Any) -> None:
-        self.builder.store(code_of(value), self._at(index))
+        self.builder.store(_real(self.builder, value), self._at(index))
 
 
 def builder_of(given: Sequence[Any]) -> Any:
@@ -118,24 +131,27 @@ def _call(name: str, *given: Any) -> Value:
     else:
         known = builder.module.globals
         function = known[name] if name in known else ir.Function(builder.module, kind, name)
-    return Value(builder, builder.call(function, [code_of(x) for x in given]))
+    return Value(builder, builder.call(function, [_real(builder, x) for x in given]))
 
 
 def _where(condition: Any, a: Any, b: Any) -> Value:
     builder = builder_of((condition, a, b))
-    return Value(builder, builder.select(code_of(condition), code_of(a), code_of(b)))
+    taken = _truth if code_of(a).type == code_of(b).type == _TRUTH else _real
+    pair = (taken(builder, x) for x in (a, b))
+    return Value(builder, builder.select(_truth(builder, condition), *pair))
 
 
 def _fmod(a: Any, b: Any) -> Value:
     builder = builder_of((a, b))
-    return Value(builder, builder.frem(code_of(a), code_of(b)))
+    return Value(builder, builder.frem(_real(builder, a), _real(builder, b)))
 
 
 def _extreme(sign: str, a: Any, b: Any) -> Value:
     builder = builder_of((a, b))
-    first = builder.fcmp_ordered(sign, code_of(a), code_of(b))
-    missing = builder.fcmp_unordered("uno", code_of(a), code_of(a))  # NaN stays
-    return _where(Value(builder, builder.or_(first, missing)), a, b)
+    x, y = _real(builder, a), _real(builder, b)
+    first = builder.fcmp_ordered(sign, x, y)
+    missing = builder.fcmp_unordered("uno", x, x)  # NaN stays
+    return Value(builder, builder.select(builder.or_(first, missing), x, y))
 
 
 _OWN = ("sqrt", "exp", "log", "sin", "cos", "floor", "ceil", "trunc", "pow")
@@ -198,6 +214,6 @@ def _record(function: Callable[..., Any], caller: Any, arguments: Any, kind: Any
     else:
         values = ir.Constant(kind, ir.Undefined)
         for i, value in enumerate(found):
-            values = builder.insert_value(values, code_of(value), i)
+            values = builder.insert_value(values, _real(builder, value), i)
         builder.ret(values)
     return made

@@ -50,6 +50,19 @@ def test_every_operation_agrees_in_every_language(backend):
 
 
 @pytest.mark.parametrize("backend", ["c", "numba"])
+def test_truth_values_are_numbers_where_numbers_are_wanted(backend):
+    def f(x):
+        above = x > 0
+        counted = above.to(F64) * (x < 2)
+        return torch.where(torch.isfinite(x), counted, above + 1.0), ~above, torch.maximum(above, x)
+
+    x = np.array([[np.nan, np.inf, -1.0, 0.0, 1.0, 3.0]])
+    compiled = compile_function(f, [torch.ones(6, dtype=F64)], backend=backend)
+    for ours, expected in zip(compiled(x), f(torch.tensor(x[0])), strict=True):
+        np.testing.assert_array_equal(ours[0], expected.numpy().astype(float))
+
+
+@pytest.mark.parametrize("backend", ["c", "numba"])
 def test_nan_and_infinity_pass_as_in_torch(backend):
     def f(x, y):
         return torch.stack([torch.maximum(x, y), torch.minimum(x, y), x.clamp(-1.0, 1.0), 1 / x])
