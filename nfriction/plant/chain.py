@@ -291,8 +291,9 @@ class PendulumChain(Plant):
         return torch.cat([torch.ones_like(load[..., :1]), load], -1) if self.first_link else load
 
     def has_slopes(self) -> bool:
-        """Whether `slopes` knows all terms of this chain."""
-        return not (self.first_link or self.has_drag or self.has_eccentricity)
+        """Whether `slopes` knows all terms of this chain; what a subclass adds it does not."""
+        more = self.first_link or self.has_drag or self.has_eccentricity
+        return type(self) is PendulumChain and not more
 
     @torch.no_grad()
     def slopes(self, q: Tensor, qd: Tensor, qdd: Tensor) -> PlantSlopes:

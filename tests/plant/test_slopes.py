@@ -50,3 +50,12 @@ def test_a_chain_with_other_terms_has_none():
     assert fixed.has_slopes()
     for plant in (free, fixed.replace(drag_linear=some), fixed.replace(encoder_sine=some)):
         assert not plant.has_slopes()
+
+
+class Sprung(PendulumChain):
+    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
+        return super().forward_dynamics(q, qd, tau - 0.1 * q)
+
+
+def test_a_chain_of_another_kind_has_none():
+    assert not Sprung([0.3], [0.2]).has_slopes()
