@@ -121,7 +121,8 @@ def fit(
         }  # fmt: skip
         if isinstance(model.schedule, NeuroFuzzy):
             same["eccentricity"] = eccentricity
-        if not is_constant_fit(start, model) or bool(start.zeros) != (zeroed == "each"):
+        wanted = len(given) if zeroed == "each" else 0
+        if not is_constant_fit(start, model) or len(start.zeros) != wanted:
             constant = FrictionModel(model.law, Constant(model.law, model.joints), model.v_smooth)
             start = fit(constant, plant, given, zeroed=zeroed, start=start, motions=moved, **same)
         given, motions = at_zeros(start.zeros, plant, given, moved)

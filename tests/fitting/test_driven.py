@@ -91,6 +91,17 @@ def test_models_that_follow_the_motion_take_the_zeros_of_their_constant_law(kind
         assert np.abs(motion.q - recording.joint_coordinates(plant).q).max() < 0.01
 
 
+def test_a_start_with_the_zeros_of_other_recordings_is_fitted_anew():
+    plant = geared()
+    law = CVFM(2, DRY, v_smooth=V_SMOOTH)
+    recordings = [driven(plant, law, seed, seconds=2.0) for seed in (0, 1)]
+    settings = {"windows": (0.5,), "zeroed": "each", "max_steps": 2}
+    start = fit(CVFM(2, v_smooth=V_SMOOTH), plant, recordings, **settings)
+    found = fit(NFCVFM(2, v_smooth=V_SMOOTH), plant, recordings[:1], start=start, **settings)
+    assert len(start.zeros) == 2
+    assert len(found.zeros) == 1
+
+
 def test_zeroed_is_refused_where_it_means_nothing():
     plant = geared()
     recording = driven(plant, CVFM(2, DRY, v_smooth=V_SMOOTH), 0, seconds=0.5)
