@@ -11,6 +11,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Mapping
 from multiprocessing.spawn import get_executable
@@ -20,6 +21,8 @@ from typing import Any
 # How much longer than its processor time a busy machine may take.
 BUSY = 10.0
 _REFUSAL = "refusal.txt"
+# Bytes of room to a byte that it may write into a file.
+_WRITTEN = 4
 # Python puts the folder where the user stands first in the path; what lies there is no module.
 _START = """import sys
 sys.path[:] = [place for place in sys.path if place]
@@ -29,7 +32,7 @@ main()
 
 
 class PerishedError(ValueError):
-    """The process ended otherwise than by its own will, or not at all."""
+    """The process was ended by a signal or an error, or did not end in time."""
 
 
 class RefusedError(ValueError):
@@ -53,19 +56,22 @@ def run(module: str, asked: Mapping[str, Any], folder: Path, *, seconds: float) 
     places = os.pathsep.join(place or os.getcwd() for place in sys.path)
     temporary = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(folder))
     told = {"folder": str(folder), "seconds": seconds, "asked": dict(asked)}
-    try:
-        ended = subprocess.run(
-            [get_executable(), "-c", _START.format(module=module)],
-            input=json.dumps(told).encode(), capture_output=True, check=False,
-            env=os.environ | temporary | {"PYTHONPATH": places}, timeout=BUSY * seconds,
-        )  # fmt: skip
-    except subprocess.TimeoutExpired:
-        raise PerishedError("it does not come to an end") from None
-    refusal = folder / _REFUSAL
-    if refusal.exists():
-        raise RefusedError(refusal.read_text(encoding="utf-8", errors="replace"))
-    if ended.returncode:
-        raise PerishedError(_end(ended))
+    with tempfile.TemporaryFile() as words:
+        try:
+            ended = subprocess.run(
+                [get_executable(), "-c", _START.format(module=module)],
+                input=json.dumps(told).encode(), stdout=subprocess.DEVNULL, stderr=words,
+                env=os.environ | temporary | {"PYTHONPATH": places}, timeout=BUSY * seconds,
+                check=False,
+            )  # fmt: skip
+        except subprocess.TimeoutExpired:
+            raise PerishedError("it does not come to an end") from None
+        refusal = folder / _REFUSAL
+        if refusal.exists():
+            raise RefusedError(refusal.read_text(encoding="utf-8", errors="replace"))
+        if ended.returncode:
+            words.seek(max(0, words.seek(0, os.SEEK_END) - 1000))
+            raise PerishedError(_end(ended.returncode, words.read()))
 
 
 def serve(
@@ -79,7 +85,7 @@ def serve(
     Args:
         work: takes what is asked and the folder for results.
         refusals: errors of it that tell of the file.
-        room: address space that it may take [bytes].
+        room: address space that it may take [bytes]; no file that it writes takes over a quarter.
     """
     told = json.load(sys.stdin)
     folder = Path(told["folder"])
@@ -100,6 +106,7 @@ def _limit(seconds: float, room: int) -> None:
     bounds = {
         resource.RLIMIT_CPU: math.ceil(time.process_time() + seconds),
         resource.RLIMIT_AS: room,
+        resource.RLIMIT_FSIZE: room // _WRITTEN,
         resource.RLIMIT_CORE: 0,
     }
     for what, bound in bounds.items():
@@ -109,10 +116,10 @@ def _limit(seconds: float, room: int) -> None:
             resource.setrlimit(what, (min([bound, *known]), hard))
 
 
-def _end(ended: "subprocess.CompletedProcess[bytes]") -> str:
+def _end(status: int, words: bytes) -> str:
     """How a process ended: the signal, or its last words."""
-    if ended.returncode < 0:
-        name = signal.Signals(-ended.returncode).name
+    if status < 0:
+        name = signal.Signals(-status).name
         return "it does not come to an end" if name == "SIGXCPU" else name
-    words = ended.stderr.decode(errors="replace").strip().splitlines()
-    return words[-1][:200] if words else f"exit status {ended.returncode}"
+    lines = words.decode(errors="replace").strip().splitlines()
+    return lines[-1][:200] if lines else f"exit status {status}"

@@ -52,9 +52,9 @@ _SPEC = (
     r"|[][{}:, 0-9])*"
 )
 # Strings of a program by their key; all others, and all keys, are plain words.
-_WORDS = re.compile(r"-?[\w.]*")
+_WORDS = re.compile(r"-?[\w.]*", re.ASCII)
 _STRINGS = {
-    key: re.compile(pattern)
+    key: re.compile(pattern, re.ASCII)
     for key, pattern in {
         "target": r"torch\.ops\.aten\.\w+\.\w+",
         "expr_str": _EXPRESSION,

@@ -121,7 +121,7 @@ def open_torchscript(path: str | Path) -> tuple[Contract, Runner]:
         try:
             module = torch.jit.load(repacked(files), map_location="cpu")
             graphs = [getattr(module, name).inlined_graph for name in _methods(module)]
-        except (RuntimeError, ValueError, LookupError, AttributeError) as error:
+        except (RuntimeError, ValueError, LookupError, AttributeError, TypeError) as error:
             raise ExportError(f"{path}: no TorchScript ({first_line(error)}).") from error
     if not hasattr(module, "step"):
         raise ExportError(f"{path}: a TorchScript, but none of nfriction: it has no `step`.")
@@ -130,6 +130,8 @@ def open_torchscript(path: str | Path) -> tuple[Contract, Runner]:
             refuse_harmful_script(graph)
     except ExportError as error:
         raise ExportError(f"{path}: {error}") from None
+    except RecursionError:
+        raise ExportError(f"{path}: nested without end.") from None
     size = contract.state_size
 
     @torch.no_grad()

@@ -158,7 +158,7 @@ def _controller(
             with_filter=filtered is not None,
             cutoff_hz=filtered["cutoff_hz"] if filtered else 20.0,
         )
-    except (TypeError, KeyError) as error:
+    except (TypeError, KeyError, ValueError) as error:
         raise ContractError(f"the metadata's filter or limit is damaged ({error}).") from error
 
 

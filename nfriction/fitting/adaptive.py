@@ -12,6 +12,7 @@ from nfriction.fitting.labelled import LabelledProblem, driving_classes, labelle
 from nfriction.fitting.outcome import Fit, Plant, trajectory_outcome
 from nfriction.fitting.preparation import (
     adjustable_terms,
+    at_zeros,
     in_joint_coordinates,
     listed,
     mixing_of,
@@ -90,12 +91,16 @@ def fit_adaptive(
         model, plant, given, moved, start, windows=windows, fit_plant=fit_plant, drag=drag,
         max_steps=max_steps, callback=callback,
     )  # fmt: skip
+    raw = moved
+    given, moved = at_zeros(constant.zeros, plant, given, moved)
+    joint = in_joint_coordinates(plant, model, given)
     if method != "gauss-newton":
         settings = {"horizon": windows[-1], "prior_sd": prior_sd, **search_settings}
-        return fit_by_search(
-            model, plant, given, method=method, start=constant, motions=moved, classes=classes,
-            **settings,
+        found = fit_by_search(
+            model, plant, given, method=method, start=replace(constant, zeros=()), motions=moved,
+            classes=classes, **settings,
         )  # fmt: skip
+        return replace(found, motions=raw, zeros=constant.zeros)
     if search_settings:
         raise ValueError(f"{sorted(search_settings)} are settings of a search, not of {method!r}.")
     classes = adopt_classes(model.schedule, classes, joint, moved, plant)
@@ -115,7 +120,8 @@ def fit_adaptive(
     residuals = problem.errors(result.x)
     found = trajectory_outcome(problem, result, residuals, moved)
     states = problem.split(result.x)[2].chunk(2, -1)
-    return settled(
+    found = settled(
         model, labelled, classes, constant, found, replace(cut, q0=states[0], qd0=states[1]),
         problem.mixing, problem.substeps, constant.residual,
     )  # fmt: skip
+    return replace(found, motions=raw, zeros=constant.zeros)

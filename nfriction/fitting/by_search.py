@@ -90,6 +90,8 @@ def fit_by_search(
         raise ValueError(
             f"a search fits constant or adaptive coefficients, not {type(schedule).__name__}."
         )
+    if start is not None and start.zeros:
+        raise ValueError("a search takes no zeros of recordings; start from a fit without them.")
     given = listed(model, plant, recordings)
     joint = in_joint_coordinates(plant, model, given)
     moved = tuple(motions or (kalman_smoother(r.time, r.q) for r in joint))

@@ -50,7 +50,7 @@ def richer_by_evidence(base: Stage, richer: Refinement, tolerance: float) -> Sta
     occam -= 0.5 * (_log_volume(before, both) - _log_volume(before, known))
     if _newton_fall(before, both) - _newton_fall(before, known) + occam <= 0:
         return None
-    stage = richer.search(problem, vector, tolerance, "eccentric encoders")
+    stage = richer.search(problem, vector, tolerance, "eccentric encoders", base.zeros)
     gain = float(before.cost) - float(stage.result.cost)
     after = Quadratic(stage.result.cost, stage.result.gradient, stage.result.hessian)
     occam = 0.5 * float(problem.prior()[0][added].log().sum())

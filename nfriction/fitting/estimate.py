@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, Literal, get_args
 
 import torch
@@ -13,12 +12,12 @@ from nfriction.fitting.neurofuzzy_start import is_constant_fit
 from nfriction.fitting.outcome import Fit, Plant, torque_outcome, trajectory_outcome
 from nfriction.fitting.preparation import (
     adjustable_terms,
-    at_zeros,
     constant_schedule,
     in_joint_coordinates,
     is_eccentric,
     listed,
     mixing_of,
+    zeros_serve,
 )
 from nfriction.fitting.stages import Callback, Refinement, Stage, flat, least
 from nfriction.fitting.torque import fit_torque, prior_sd
@@ -87,7 +86,8 @@ def fit(
             that an angle offset is part of the plant. `"each"`: at the start of each recording,
             wherever dry friction held the links then; how far that was off is found for each
             recording and left out of the plant, whose offset stays as given, as that of a further
-            recording cannot be known.
+            recording cannot be known. Whoever scores a recording that was trained on scores it as
+            it is, zeros and all.
         start: an earlier fit to start from: of the same law for a neuro-fuzzy model, of any model
             for the plant's terms.
         motions: smoothed motions in joint coordinates, to save smoothing again.
@@ -105,6 +105,8 @@ def fit(
         raise ValueError(f"`method` must be one of {get_args(Method)}, got {method!r}.")
     if zeroed not in get_args(Zeroed):
         raise ValueError(f"`zeroed` must be one of {get_args(Zeroed)}, got {zeroed!r}.")
+    if zeroed == "each" and method == "torque":
+        raise ValueError('`zeroed="each"` is found from trajectories, not from torques.')
     given = listed(model, plant, recordings)
     joint = in_joint_coordinates(plant, model, given)
     if eccentricity and not may_be_eccentric(plant):
@@ -121,18 +123,15 @@ def fit(
         }  # fmt: skip
         if isinstance(model.schedule, NeuroFuzzy):
             same["eccentricity"] = eccentricity
-        wanted = len(given) if zeroed == "each" else 0
-        if not is_constant_fit(start, model) or len(start.zeros) != wanted:
+        if not is_constant_fit(start, model) or not zeros_serve(start, moved, zeroed == "each"):
             constant = FrictionModel(model.law, Constant(model.law, model.joints), model.v_smooth)
             start = fit(constant, plant, given, zeroed=zeroed, start=start, motions=moved, **same)
-        given, motions = at_zeros(start.zeros, plant, given, moved)
         # They fit or take a constant law first, so they stand above this module.
         from nfriction.fitting.adaptive import fit_adaptive
         from nfriction.fitting.network import fit_network
 
         further = fit_adaptive if isinstance(model.schedule, Adaptive) else fit_network
-        found = further(model, plant, given, start=start, motions=motions, **same)
-        return replace(found, motions=moved, zeros=start.zeros)
+        return further(model, plant, given, start=start, motions=moved, **same)
     torque = fit_torque(model.law, start.plant if start else plant, joint, moved, model.v_smooth)
     schedule = constant_schedule(model)
     schedule.set_coefficients(torque.coefficients)

@@ -11,6 +11,7 @@ from nfriction.fitting.neurofuzzy_start import settle_on, start_at
 from nfriction.fitting.outcome import Fit, Plant, trajectory_outcome
 from nfriction.fitting.preparation import (
     adjustable_terms,
+    at_zeros,
     in_joint_coordinates,
     is_eccentric,
     mixing_of,
@@ -46,15 +47,16 @@ def fit_network(
 
     Args:
         model, plant: see `fit`.
-        recordings, motions: at the zeros that the constant fit found.
+        recordings, motions: as they are; the zeros that the constant fit found are added here.
         start: the constant fit.
         windows, fit_plant, drag, eccentricity, max_steps, callback: see `fit`; of the windows the
             last length serves.
     """
     if not windows:
         raise ValueError("`windows` must name at least one window length [s].")
-    joint = in_joint_coordinates(plant, model, recordings)
-    start_at(model, start, joint, motions)
+    given, moved = at_zeros(start.zeros, plant, recordings, motions)
+    joint = in_joint_coordinates(plant, model, given)
+    start_at(model, start, joint, moved)
     known = {name: value for name, value, _ in start.plant_terms}
     terms = adjustable_terms(
         plant, joint, fit_plant, drag, is_eccentric(eccentricity, known),
@@ -63,7 +65,8 @@ def fit_network(
     mixing = mixing_of(plant, recordings[0].convention_on(plant))
     search = Refinement(plant, model, joint, mixing, terms, max_steps, callback)
     vector = torch.tensor([known.get(t.name, 0.0) for t in terms], dtype=torch.float64)
-    return _refined(search, start, vector, windows[-1], motions)
+    found = _refined(search, start, vector, windows[-1], moved)
+    return replace(found, motions=motions, zeros=start.zeros)
 
 
 def _refined(

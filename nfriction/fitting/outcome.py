@@ -50,7 +50,7 @@ class Fit:
         lost: what the data cannot tell, parameters or combinations of them, in words.
         warnings: what to be wary of, a sentence each.
         zeros: of encoders that were zeroed anew at the start of each recording, what they fall
-            short of the true angles, in joint coordinates [rad]; a row for each recording.
+            short of the true positions, in joint coordinates [rad or m]; a row for each recording.
         uncertainty: standard deviation of the coefficients at any motion; None for a torque fit.
     """
 

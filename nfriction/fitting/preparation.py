@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from nfriction.angles import AngleConvention
-from nfriction.fitting.outcome import Plant
+from nfriction.fitting.outcome import Fit, Plant
 from nfriction.fitting.plant_parameters import PlantParameter, plant_parameters
 from nfriction.friction import Constant, FrictionModel
 from nfriction.plant import LinearAxis, PendulumChain
@@ -133,6 +133,14 @@ def is_eccentric(asked: bool | None, known: Iterable[str]) -> bool:
     A chain of fits asks for them once, in its first.
     """
     return bool(asked) or (asked is None and any(name.startswith("encoder ") for name in known))
+
+
+def zeros_serve(start: Fit, motions: Sequence[Motion], each: bool) -> bool:
+    """Whether an earlier fit has zeros of just these recordings, or none where none are sought."""
+    if not each:
+        return not start.zeros
+    pairs = zip(start.motions, motions, strict=False)
+    return len(start.zeros) == len(motions) and all(np.array_equal(a.q, b.q) for a, b in pairs)
 
 
 def at_zeros(

@@ -49,7 +49,8 @@ class TrajectoryProblem:
         plant_mean: where the prior of the plant's terms is centred; default the plant as given.
         stride: only every so many-th sample counts, for as many: errors of a model last far
             longer than a sample, and the sums over many parameters are what a step costs.
-        zero_sd: what is expected of the zeros, (recording, joint) [rad]; none are sought without.
+        zero_sd: what is expected of the zeros, (recording, joint) [rad or m]; without it none are
+            sought.
         memory: of the coefficients at the start of each window, (window, joint, state_size), of a
             schedule that has one. It advances with every step of the integration.
     """

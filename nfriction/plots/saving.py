@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -88,7 +89,10 @@ def _figures(
         return
     last = list(comparison.fits.values())[-1]
     order = [s.recording for s in next(iter(comparison.train.values()))]
-    trained = dict(zip(order, last.motions, strict=True))
+    moved = last.motions
+    if last.zeros:
+        moved = tuple(replace(m, q=m.q + z) for m, z in zip(moved, last.zeros, strict=True))
+    trained = dict(zip(order, moved, strict=True))
     given = [r for r in recordings if r.name in trained]
     joints = comparison.joint_names
     models = {name: found.model for name, found in comparison.fits.items()}

@@ -1,6 +1,7 @@
 """Validation of what a rollout is given."""
 
 import logging
+import math
 
 import numpy as np
 import torch
@@ -10,6 +11,14 @@ from nfriction.simulation.protocols import Friction, Plant
 from nfriction.simulation.steps import required_substeps, stability_limit
 
 logger = logging.getLogger(__name__)
+
+
+def all_finite(x: Tensor) -> bool:
+    """Whether no element is NaN or infinite, in one pass over them."""
+    if not x.numel():
+        return True
+    low, high = x.detach().aminmax()  # NaN if there is one
+    return math.isfinite(low) and math.isfinite(high)
 
 
 def driving_motion(
@@ -25,7 +34,7 @@ def driving_motion(
         return None
     found = torch.as_tensor(measured[0]).to(q), torch.as_tensor(measured[1]).to(q)
     for x in found:
-        if x.shape[-2:] != (steps, q.shape[-1]) or not torch.isfinite(x.detach()).all():
+        if x.shape[-2:] != (steps, q.shape[-1]) or not all_finite(x):
             raise ValueError(
                 f"`measured` must be two finite (*batch, {steps}, {q.shape[-1]}), a value a step, "
                 f"got {tuple(found[0].shape)} and {tuple(found[1].shape)}."
@@ -55,7 +64,7 @@ def prepared(
             raise ValueError(
                 f"`{name}` must be (*batch, joint) with {joints} joints, got {tuple(value.shape)}."
             )
-        if not torch.isfinite(value.detach()).all():
+        if not all_finite(value):
             raise ValueError(f"`{name}` must be finite, got NaN or infinity.")
     step = torch.as_tensor(sample_time, dtype=q0.dtype, device=q0.device)
     lengths = {
@@ -67,14 +76,14 @@ def prepared(
     if not known or len(set(known.values())) != 1:
         raise ValueError(f"the number of steps must be given and agree, got {known or 'nothing'}.")
     steps = next(iter(known.values()))
-    if steps < 1 or not bool((step >= 0).all()) or not torch.isfinite(step).all():
+    if steps < 1 or not bool((step >= 0).all()) or not all_finite(step):
         raise ValueError("`steps` must be at least 1 and `sample_time` finite and positive [s].")
     if step.ndim == 0:
         step = step.expand(steps)
     torque = q0.new_zeros(1, 1).expand(steps, joints) if tau is None else tau.to(q0)
     if torque.shape[-1] != joints:
         raise ValueError(f"`tau` must be (*batch, steps, {joints}), got {tuple(torque.shape)}.")
-    if not torch.isfinite(torque.detach()).all():
+    if tau is not None and not all_finite(torque):
         raise ValueError("`tau` must be finite, got NaN or infinity.")
     shape = np.broadcast_shapes(
         q0.shape, qd0.shape, (*torque.shape[:-2], joints), (*step.shape[:-1], joints)
@@ -121,7 +130,7 @@ def given_memory(friction: Friction | None, memory: Tensor | None, q: Tensor) ->
     given, size = torch.as_tensor(memory).to(q), getattr(friction, "state_size", 0)
     if size == 0:
         raise ValueError("`memory` is for friction whose coefficients have one; leave it out.")
-    if given.shape[-2:] != (q.shape[-1], size) or not torch.isfinite(given).all():
+    if given.shape[-2:] != (q.shape[-1], size) or not all_finite(given):
         raise ValueError(
             f"`memory` must be finite (*batch, {q.shape[-1]}, {size}), got {tuple(given.shape)}."
         )

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from nfriction.compiled import Backend, integrate_compiled, wants_compiled
 from nfriction.simulation.adjoint import differentiable
 from nfriction.simulation.inputs import (
+    all_finite,
     compare_sample_times,
     driving_motion,
     given_memory,
@@ -206,6 +207,8 @@ def _asks_gradients(plant: Plant, friction: Friction | None, *inputs: Tensor) ->
 def _divergence(time: Tensor, q: Tensor, qd: Tensor) -> Tensor:
     """Time of the first sample that is not finite or beyond any speed, infinity where none."""
     with torch.no_grad():
+        if all_finite(q) and bool(qd.detach().abs().amax() < SPEED_LIMIT):
+            return time.new_full(q.shape[:-2], torch.inf)
         lost = ~(torch.isfinite(q) & (qd.abs() < SPEED_LIMIT)).all(-1)
         first = lost.to(torch.int64).argmax(-1, keepdim=True)
         at = torch.gather(time.expand(lost.shape), -1, first).squeeze(-1)

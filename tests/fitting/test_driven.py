@@ -100,6 +100,9 @@ def test_a_start_with_the_zeros_of_other_recordings_is_fitted_anew():
     found = fit(NFCVFM(2, v_smooth=V_SMOOTH), plant, recordings[:1], start=start, **settings)
     assert len(start.zeros) == 2
     assert len(found.zeros) == 1
+    turned = fit(NFCVFM(2, v_smooth=V_SMOOTH), plant, recordings[::-1], start=start, **settings)
+    np.testing.assert_allclose(turned.zeros[0], start.zeros[1], atol=1e-2)
+    assert not np.allclose(turned.zeros, start.zeros, atol=1e-6)
 
 
 def test_zeroed_is_refused_where_it_means_nothing():
@@ -107,6 +110,8 @@ def test_zeroed_is_refused_where_it_means_nothing():
     recording = driven(plant, CVFM(2, DRY, v_smooth=V_SMOOTH), 0, seconds=0.5)
     with pytest.raises(ValueError, match="`zeroed` must be one of"):
         fit(CVFM(2), plant, recording, zeroed="never")
+    with pytest.raises(ValueError, match="not from torques"):
+        fit(CVFM(2), plant, recording, zeroed="each", method="torque")
 
 
 def test_load_dependent_friction_leaves_more_of_a_geared_mechanism_unexplained():
