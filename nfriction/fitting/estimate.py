@@ -123,15 +123,7 @@ def fit(
         }  # fmt: skip
         if isinstance(model.schedule, NeuroFuzzy):
             same["eccentricity"] = eccentricity
-        if not is_constant_fit(start, model) or not zeros_serve(start, moved, zeroed == "each"):
-            constant = FrictionModel(model.law, Constant(model.law, model.joints), model.v_smooth)
-            start = fit(constant, plant, given, zeroed=zeroed, start=start, motions=moved, **same)
-        # They fit or take a constant law first, so they stand above this module.
-        from nfriction.fitting.adaptive import fit_adaptive
-        from nfriction.fitting.network import fit_network
-
-        further = fit_adaptive if isinstance(model.schedule, Adaptive) else fit_network
-        return further(model, plant, given, start=start, motions=moved, **same)
+        return _fit_further(model, plant, given, moved, start, zeroed, same)
     torque = fit_torque(model.law, start.plant if start else plant, joint, moved, model.v_smooth)
     schedule = constant_schedule(model)
     schedule.set_coefficients(torque.coefficients)
@@ -159,6 +151,29 @@ def fit(
         tolerance = flat(stage.result.cost)
         stage = richer_by_evidence(stage, refinement(True), tolerance) or stage
     return trajectory_outcome(stage.problem, stage.result, stage.residuals, moved)
+
+
+def _fit_further(
+    model: FrictionModel,
+    plant: Plant,
+    recordings: Sequence[Recording],
+    motions: tuple[Motion, ...],
+    start: Fit | None,
+    zeroed: Zeroed,
+    settings: dict[str, Any],
+) -> Fit:
+    """The fit of coefficients that follow the motion, from that of the constant law."""
+    if not is_constant_fit(start, model) or not zeros_serve(start, motions, zeroed == "each"):
+        constant = FrictionModel(model.law, Constant(model.law, model.joints), model.v_smooth)
+        start = fit(
+            constant, plant, recordings, zeroed=zeroed, start=start, motions=motions, **settings
+        )
+    # They fit or take a constant law first, so they stand above this module.
+    from nfriction.fitting.adaptive import fit_adaptive
+    from nfriction.fitting.network import fit_network
+
+    further = fit_adaptive if isinstance(model.schedule, Adaptive) else fit_network
+    return further(model, plant, recordings, start=start, motions=motions, **settings)
 
 
 def _through_windows(

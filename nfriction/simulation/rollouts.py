@@ -207,7 +207,7 @@ def _asks_gradients(plant: Plant, friction: Friction | None, *inputs: Tensor) ->
 def _divergence(time: Tensor, q: Tensor, qd: Tensor) -> Tensor:
     """Time of the first sample that is not finite or beyond any speed, infinity where none."""
     with torch.no_grad():
-        if all_finite(q) and bool(qd.detach().abs().amax() < SPEED_LIMIT):
+        if all_finite(q) and all(abs(float(v)) < SPEED_LIMIT for v in qd.aminmax()):
             return time.new_full(q.shape[:-2], torch.inf)
         lost = ~(torch.isfinite(q) & (qd.abs() < SPEED_LIMIT)).all(-1)
         first = lost.to(torch.int64).argmax(-1, keepdim=True)
