@@ -68,6 +68,8 @@ def _channels(file: Any, sources: Sequence[str]) -> tuple[dict[str, NDArray], di
                 f"channel {name} was not sampled together with {next(iter(columns))}; export the "
                 "measurement on one raster, such as by asammdf's `MDF.resample`"
             )
+        if np.ndim(signal.samples) != 1:
+            raise UnfitError(f"channel {name} holds arrays instead of numbers")
         stamps = _plain(signal.timestamps)
         columns[name] = _plain(signal.samples)
         if signal.unit:

@@ -2,12 +2,14 @@
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from nfriction.formats import mdf
+from nfriction.formats.mdf_reader import UnfitError, _channels
 from nfriction.recording import Recording
 
 TIME = np.arange(40) / 1000
@@ -58,6 +60,14 @@ def test_channels_of_different_rasters_are_refused(asammdf: Any, tmp_path: Path)
     write(asammdf, path, [("q1", Q[:, 0], "rad")], [("q2", Q[:, 1], "rad")])
     with pytest.raises(ValueError, match="q2 was not sampled together with q1"):
         Recording.read(path)
+
+
+def test_channels_of_arrays_are_refused() -> None:
+    """Damaged files have such, where none can be written."""
+    arrays = SimpleNamespace(samples=Q, timestamps=TIME, unit="rad")
+    file = SimpleNamespace(channels_db={"q1": ((0, 1),)}, get=lambda _: arrays)
+    with pytest.raises(UnfitError, match="channel q1 holds arrays"):
+        _channels(file, ())
 
 
 def test_a_file_cut_short_is_refused(asammdf: Any, tmp_path: Path) -> None:

@@ -297,9 +297,9 @@ def _read_mdf(path: Path) -> None:
     folder.mkdir(exist_ok=True)
     try:
         mdf_reader.read({"path": str(path), "sources": []}, folder)
+        mdf.table_of(folder)
     except Exception as error:
         raise ValueError(f"{path}: {error}") from error
-    mdf.table_of(folder)
 
 
 # Rigs, rules, states.
