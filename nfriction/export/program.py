@@ -93,6 +93,8 @@ def pt2(
 def open_pt2(path: str | Path) -> tuple[Contract, Runner]:
     """Load an artefact: what it says of itself, and how to run it.
 
+    A damaged one may lead torch to errors of its own besides; see `verify_artefact`.
+
     Raises:
         ExportError: if it is no program of `torch.export`, or holds more than arithmetic of
             tensors.
@@ -105,7 +107,15 @@ def open_pt2(path: str | Path) -> tuple[Contract, Runner]:
     try:
         with silent():
             module = torch.export.load(repacked(files)).module()
-    except Exception as error:  # torch raises whatever a damaged document leads it to
+    except (
+        RuntimeError,
+        ArithmeticError,
+        AttributeError,
+        AssertionError,
+        LookupError,
+        TypeError,
+        ValueError,
+    ) as error:
         raise ExportError(f"{path}: no program of nfriction ({first_line(error)}).") from error
     size = contract.state_size
 

@@ -583,7 +583,7 @@ LOADERS: dict[str, Loader] = {
                names_file=False),
         Loader("figure", ".png", _figure_samples, _read_figure, damage_bytes, names_file=False),
         Loader("pt2", ".pt2", _artefact(pt2), _read_pt2, _damage_artefact, _ARTEFACT,
-               names_file=False),
+               names_file=False, apart=True),
         Loader("onnx", ".onnx", _artefact(onnx), _read_onnx, damage_bytes, _ARTEFACT,
                names_file=False, needs="onnx"),
         Loader("torchscript", ".pt", _artefact(torchscript), _read_torchscript, _damage_artefact,
