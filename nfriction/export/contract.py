@@ -167,10 +167,10 @@ def _single_tolerance(controller: AnyController) -> float:
     """What a target in single precision may err.
 
     A network that is steep in its inputs passes their roundings on: twice what torch errs in
-    single precision over 2000 samples is allowed where that is more.
+    single precision over 20,000 samples is allowed where that is more.
     """
     inner = controller.inner if isinstance(controller, FilteredController) else controller
-    inputs = tuple(x.float() for x in draw(inner, 2000, seed=7))
+    inputs = tuple(x.float() for x in draw(inner, 20_000, seed=7))
     single = copy.deepcopy(inner).float()
     doubled = tuple(x.double() for x in inputs)
     if isinstance(inner, MemoryController) and isinstance(single, MemoryController):
