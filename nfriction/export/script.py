@@ -117,9 +117,11 @@ def open_torchscript(path: str | Path) -> tuple[Contract, Runner]:
     except ExportError as error:
         raise ExportError(f"{path}: {error}") from None
     contract = Contract.from_json(files.get(f"extra/{METADATA}", b""))
+    # Pickles that only tell of lines are not looked at, and so not handed on.
+    needed = {name: x for name, x in files.items() if not name.endswith(".debug_pkl")}
     with _silent():
         try:
-            module = torch.jit.load(repacked(files), map_location="cpu")
+            module = torch.jit.load(repacked(needed), map_location="cpu")
             graphs = [getattr(module, name).inlined_graph for name in _methods(module)]
         except (RuntimeError, ValueError, LookupError, AttributeError, TypeError) as error:
             raise ExportError(f"{path}: no TorchScript ({first_line(error)}).") from error
