@@ -15,9 +15,9 @@ from nfriction.signals import Motion
 
 # Every so many-th window is held back, so that all sizes of the motion are judged.
 FOLDS = 3
-# How much worse a network may do on windows held back than the law that it corrects: that law has
-# seen them, and where a recording is short few windows judge.
-HEAD_START = 1.1
+# A network's error on windows held back must be at most so much of that of the law that it
+# corrects, fitted to the same windows: where a recording is short few windows judge.
+WORTH = 0.9
 # What may be taken of a correction; of what serves alike, the least.
 SHARES = (0.0, 0.25, 0.5, 1.0)
 # Standard errors by which a gain must show: 95 % of a normal distribution.
@@ -83,25 +83,22 @@ def shares_by_joint(errors: Callable[[Tensor], Tensor], joints: int) -> Tensor:
     return torch.tensor(best, dtype=torch.float64)
 
 
-def gain_on(held_back: Windows, trained: Stage, mean: Tensor) -> float:
-    """Error on windows held back over that of the constant law from which a network started.
+def ratio_on(held_back: Windows, network: Stage, constant: Stage, mean: Tensor) -> float:
+    """Error of a network on windows held back over that of its constant law.
 
-    Both start from the smoothed states, as a score does, and move the constant law's plant: that
-    one has seen all windows, and an inertia that is off by some parts in ten thousand shifts a
-    swing by more than friction does. Infinite where the network diverges.
+    Both were trained on the other windows and start from the smoothed states, as a score does. They
+    move the same plant, that of a fit to all windows: an inertia that is off by some parts in ten
+    thousand shifts a swing by more than friction does. Infinite where the network diverges.
 
     Args:
-        held_back: windows that the network has not seen.
-        trained: the network's search on the others.
-        mean: plant terms of the constant law.
+        held_back: windows that neither has seen.
+        network, constant: their searches on the others.
+        mean: terms of the plant.
     """
-    problem = trained.problem
-    schedule = problem.friction.schedule
-    network = schedule.parameter_vector()
-    judged = replace(problem, windows=held_back)
-    own = judged.errors(judged.start(mean)).square().mean()
-    schedule.set_parameter_vector(torch.zeros_like(network))
-    constant = judged.errors(judged.start(mean)).square().mean()
-    schedule.set_parameter_vector(network)
-    ratio = float((own / constant).sqrt())
+
+    def error(stage: Stage) -> Tensor:
+        judged = replace(stage.problem, windows=held_back)
+        return judged.errors(judged.start(mean)).square().mean().sqrt()
+
+    ratio = float(error(network) / error(constant))
     return ratio if math.isfinite(ratio) else math.inf

@@ -1,12 +1,14 @@
 """Fit a neuro-fuzzy model: a network that corrects a constant law, where windows bear it out."""
 
+import copy
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from nfriction.fitting.holdback import HEAD_START, gain_on, judged_windows
+from nfriction.fitting.holdback import WORTH, judged_windows, ratio_on
 from nfriction.fitting.neurofuzzy_start import settle_on, start_at
 from nfriction.fitting.outcome import Fit, Plant, trajectory_outcome
 from nfriction.fitting.preparation import (
@@ -17,7 +19,8 @@ from nfriction.fitting.preparation import (
     mixing_of,
 )
 from nfriction.fitting.residuals import effective_noise, stride_of
-from nfriction.fitting.stages import Refinement, flat, least
+from nfriction.fitting.stages import Refinement, Stage, flat, least
+from nfriction.fitting.trajectory import TrajectoryProblem
 from nfriction.fitting.windows import cut_windows
 from nfriction.friction import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
@@ -74,13 +77,48 @@ def _refined(
 ) -> Fit:
     """Refine a network that starts at a constant fit, and keep it where it earns its place."""
     # What the constant law left over, at the same window length, is the noise that the prior is
-    # weighed against.
-    noise = effective_noise(start._residuals)
-    stride = stride_of(start._residuals)
-    seen, held_back = judged_windows(search, motions, length)
-    part = search.problem(seen, noise, vector, stride)
-    # The constant law's own cost, in which the gain of a step is judged.
+    # weighed against; its own cost is the one in which the gain of a step is judged.
+    noise, stride = effective_noise(start._residuals), stride_of(start._residuals)
     tolerance = flat(least(start._residuals, noise))
+    seen, held_back = judged_windows(search, motions, length)
+    law = replace(search, model=copy.deepcopy(start.model))
+    constant = law.search(
+        law.problem(seen, noise, vector, stride), vector, tolerance, "constants, a third held back"
+    )
+    if constant.result.status == "stopped":
+        return _constant_kept(search, start, constant.result.message, converged=False)
+    ratio, stage = _best_prior(
+        search,
+        search.problem(seen, noise, vector, stride),
+        vector,
+        tolerance,
+        lambda stage: ratio_on(held_back, stage, constant, vector),
+    )
+    if stage.result.status == "stopped":
+        return trajectory_outcome(stage.problem, stage.result, stage.residuals, motions)
+    if ratio > WORTH:
+        change = f"{100 * abs(ratio - 1):.3g} % {'worse' if ratio > 1 else 'better'}"
+        note = (
+            f"The network predicts windows held back {change} than its constant law, which is kept "
+            f"unless it is at least {100 * (1 - WORTH):.3g} % better."
+        )
+        return _constant_kept(search, start, note)
+    whole = search.problem(cut_windows(search.joint, motions, length), noise, vector, stride)
+    stage = search.search(whole, stage.vector, tolerance, f"{length:g} s windows")
+    return trajectory_outcome(stage.problem, stage.result, stage.residuals, motions)
+
+
+def _best_prior(
+    search: Refinement,
+    part: TrajectoryProblem,
+    vector: Tensor,
+    tolerance: float,
+    judge: Callable[[Stage], float],
+) -> tuple[float, Stage]:
+    """Train under each prior: the least of what `judge` says, and its stage.
+
+    The model is left with that network and prior; a stage that was stopped ends the trials.
+    """
     schedule = search.model.schedule
     assert isinstance(schedule, NeuroFuzzy)
     widest, trials = schedule.prior_sd, []
@@ -90,21 +128,20 @@ def _refined(
         schedule.prior_sd = share * widest
         stage = search.search(part, vector, tolerance, "a third held back")
         if stage.result.status == "stopped":
-            return trajectory_outcome(stage.problem, stage.result, stage.residuals, motions)
-        ratio = gain_on(held_back, stage, vector)
-        trials.append((ratio, schedule.prior_sd, schedule.parameter_vector(), stage))
+            return math.inf, stage
+        trials.append((judge(stage), schedule.prior_sd, schedule.parameter_vector(), stage))
     ratio, schedule.prior_sd, network, stage = min(trials, key=lambda trial: trial[0])
     schedule.set_parameter_vector(network)
-    if ratio > HEAD_START:
-        settle_on(search.model, start)
-        note = (
-            f"The network predicts windows held back {100 * (ratio - 1):.3g} % worse than its "
-            "constant law, which is kept."
-        )
-        return replace(
-            start, model=search.model.requires_grad_(False), status=f"{start.status} {note}",
-            warnings=(*start.warnings, note),
-        )  # fmt: skip
-    whole = search.problem(cut_windows(search.joint, motions, length), noise, vector, stride)
-    stage = search.search(whole, stage.vector, tolerance, f"{length:g} s windows")
-    return trajectory_outcome(stage.problem, stage.result, stage.residuals, motions)
+    return ratio, stage
+
+
+def _constant_kept(search: Refinement, start: Fit, note: str, *, converged: bool = True) -> Fit:
+    """The constant fit as the neuro-fuzzy model's."""
+    settle_on(search.model, start)
+    return replace(
+        start,
+        model=search.model.requires_grad_(False),
+        status=f"{start.status} {note}" if converged else f"not converged: {note}",
+        converged=start.converged and converged,
+        warnings=(*start.warnings, note),
+    )

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from nfriction import LFM, NFLFM, fit
-from nfriction.fitting.holdback import FOLDS, gain_on, judged_windows, shares_by_joint
+from nfriction.fitting.holdback import FOLDS, judged_windows, ratio_on, shares_by_joint
 from nfriction.fitting.neurofuzzy_start import settle_on, start_at
 from nfriction.fitting.preparation import mixing_of
-from nfriction.fitting.stages import Refinement
+from nfriction.fitting.stages import Refinement, Stage
 from tests.fitting.recordings import F64, pendulum, swing
 
 V_SMOOTH = 0.05
@@ -110,13 +110,25 @@ def test_the_ratio_is_one_for_the_constant_law_and_large_for_nonsense(constant):
     search, motions = refinement(constant), constant[1].motions
     seen, held_back = judged_windows(search, motions, 0.5)
     none = torch.zeros(0, dtype=F64)
+    law = replace(search, model=constant[1].model)
+    by_law = Stage(law.problem(seen, 1e-3), None, none)
     schedule = search.model.schedule
-    for value, least, most in ((0.0, 1.0, 1.0), (1.0, 1.5, np.inf)):
+    for value, least, most in ((0.0, 1 - 1e-9, 1 + 1e-9), (1.0, 1.5, np.inf)):
         schedule.set_parameter_vector(torch.full_like(schedule.parameter_vector(), value))
-        search_ended = search.search(search.problem(seen, 1e-3), none, 1.0, "")
-        schedule.set_parameter_vector(torch.full_like(schedule.parameter_vector(), value))
-        assert least <= gain_on(held_back, search_ended, none) <= most
+        by_network = Stage(search.problem(seen, 1e-3), None, none)
+        assert least <= ratio_on(held_back, by_network, by_law, none) <= most
         assert float(schedule.parameter_vector().mean()) == value
+
+
+def test_a_network_that_diverges_has_no_ratio(constant):
+    search, motions = refinement(constant), constant[1].motions
+    seen, held_back = judged_windows(search, motions, 0.5)
+    none = torch.zeros(0, dtype=F64)
+    law = replace(search, model=constant[1].model)
+    schedule = search.model.schedule
+    schedule.set_parameter_vector(torch.full_like(schedule.parameter_vector(), 1e6))
+    stages = (Stage(s.problem(seen, 1e-3), None, none) for s in (search, law))
+    assert ratio_on(held_back, *stages, none) == np.inf
 
 
 def test_a_model_settles_on_a_coefficient_of_zero(constant):
@@ -129,14 +141,35 @@ def test_a_model_settles_on_a_coefficient_of_zero(constant):
     torch.testing.assert_close(rest[:, 1], torch.full((2,), 2e-3, dtype=F64), rtol=1e-6, atol=0)
 
 
-def test_a_network_that_does_not_win_is_put_back(constant, monkeypatch):
+@pytest.mark.parametrize(("ratio", "told"), [(1.3, "30 % worse"), (0.95, "5 % better")])
+def test_a_network_that_does_not_win_is_put_back(constant, monkeypatch, ratio, told):
     joint, found = constant
-    monkeypatch.setattr("nfriction.fitting.network.gain_on", lambda *_: 1.3)
+    monkeypatch.setattr("nfriction.fitting.network.ratio_on", lambda *_: ratio)
     model = NFLFM(2, v_smooth=V_SMOOTH, **SMALL)
     kept = fit(model, pendulum(), joint, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
     assert kept.model is model
-    assert "30 % worse" in kept.status
+    assert told in kept.status
     assert any("constant law, which is kept" in w for w in kept.warnings)
     qd = torch.linspace(-3, 3, 14, dtype=F64).reshape(7, 2)
     at = qd, torch.zeros_like(qd), torch.ones_like(qd)
+    torch.testing.assert_close(model(*at), found.model(*at), rtol=1e-6, atol=1e-9)
+
+
+def test_a_fit_stopped_before_its_network_keeps_the_constant_law(constant):
+    joint, found = constant
+    stages = []
+
+    def stop(stage, step):
+        stages.append(stage)
+        return True
+
+    model = NFLFM(2, v_smooth=V_SMOOTH, **SMALL)
+    kept = fit(
+        model, pendulum(), joint, start=found, windows=(0.5,), fit_plant=False, callback=stop
+    )
+    assert set(stages) == {"constants, a third held back"}
+    assert kept.model is model
+    assert not kept.converged
+    assert "Stopped" in kept.status
+    at = (torch.ones(1, 2, dtype=F64),) * 3
     torch.testing.assert_close(model(*at), found.model(*at), rtol=1e-6, atol=1e-9)

@@ -21,14 +21,14 @@ def constant():
 @pytest.mark.parametrize("best", range(len(PRIOR_SHARES)))
 def test_the_prior_is_the_one_whose_network_predicts_best(constant, monkeypatch, best):
     recording, found = constant
-    gains = [0.9 - 0.2 * (k == best) for k in range(len(PRIOR_SHARES))]
+    ratios = [0.8 - 0.2 * (k == best) for k in range(len(PRIOR_SHARES))]
     seen = []
 
-    def gain(held_back, trained, mean):
+    def ratio(held_back, trained, constant, mean):
         seen.append(trained.problem.friction.schedule.prior_sd)
-        return gains[len(seen) - 1]
+        return ratios[len(seen) - 1]
 
-    monkeypatch.setattr("nfriction.fitting.network.gain_on", gain)
+    monkeypatch.setattr("nfriction.fitting.network.ratio_on", ratio)
     model = NFLFM(2, v_smooth=V_SMOOTH, prior_sd=0.6, **SMALL)
     fit(model, pendulum(), recording, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
     assert seen == pytest.approx([0.6 * share for share in PRIOR_SHARES])
