@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         NFNLFM,
         NLFM,
         FrictionModel,
+        NFStribeck,
         Stribeck,
     )
     from nfriction.modelfile import ModelInfo, info_of, load, plant_of, save
@@ -54,6 +55,7 @@ _HOME = {
         "NFLFM",
         "NFNCFM",
         "NFNLFM",
+        "NFStribeck",
         "NLFM",
         "FrictionModel",
         "Stribeck",
@@ -87,6 +89,7 @@ __all__ = [
     "FrictionModel",
     "LinearAxis",
     "ModelInfo",
+    "NFStribeck",
     "PendulumChain",
     "Recording",
     "Rollout",

@@ -8,7 +8,7 @@ from pathlib import Path
 
 MODELS = (
     "NCFM", "LFM", "NLFM", "CVFM", "Stribeck", "ANCFM", "ALFM", "ANLFM", "ACVFM",
-    "NFNCFM", "NFLFM", "NFNLFM", "NFCVFM",
+    "NFNCFM", "NFLFM", "NFNLFM", "NFCVFM", "NFStribeck",
 )  # fmt: skip
 RIGS = (
     "tlrip", "rtip", "multiarm-single", "multiarm-double", "multiarm-triple",

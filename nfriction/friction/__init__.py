@@ -20,6 +20,7 @@ from nfriction.friction.models import (
     NFNLFM,
     NLFM,
     FrictionModel,
+    NFStribeck,
     Stribeck,
     model_by_name,
 )
@@ -47,6 +48,7 @@ __all__ = [
     "Constant",
     "FrictionModel",
     "Law",
+    "NFStribeck",
     "NeuroFuzzy",
     "RadialBasis",
     "Schedule",

@@ -305,12 +305,19 @@ class NFNLFM(NeuroFuzzyModel):
     definition = laws.NONLINEAR
 
 
+class NFStribeck(NeuroFuzzyModel):
+    """Generalised Stribeck friction with neuro-fuzzy F_c, F_d, F_v, v_s and delta."""
+
+    definition = laws.STRIBECK
+
+
 NamedModel = type[ConstantModel] | type[AdaptiveModel] | type[NeuroFuzzyModel]
 
 MODELS: dict[str, NamedModel] = {
     model.__name__: model
     for model in (
         NCFM, LFM, NLFM, CVFM, Stribeck, ANCFM, ALFM, ANLFM, ACVFM, NFNCFM, NFLFM, NFNLFM, NFCVFM,
+        NFStribeck,
     )
 }  # fmt: skip
 
