@@ -65,8 +65,9 @@ def fit(
     The friction torque that the smoothed motion implies gives constant coefficients; simulated
     windows of growing length then refine them, and what the data tell of the plant. A
     neuro-fuzzy model starts at the constant fit of its own law and is pulled toward it, by its
-    own prior or a tighter one that serves windows held back better. So
-    does every class of an adaptive model; `fit_adaptive` has its further settings.
+    own prior or a tighter one, whichever predicts windows held back better; unless that is a tenth
+    better than the law, the law is kept. Every class of an adaptive model starts there, too;
+    `fit_adaptive` has its further settings.
 
     Args:
         model: the model to fit; changed in place.

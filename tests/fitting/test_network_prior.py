@@ -2,7 +2,7 @@
 
 import pytest
 
-from nfriction import LFM, NFLFM, fit
+from nfriction import LFM, NFLFM, NFStribeck, Stribeck, fit
 from nfriction.fitting.network import PRIOR_SHARES
 from tests.fitting.recordings import pendulum, swing
 
@@ -34,3 +34,16 @@ def test_the_prior_is_the_one_whose_network_predicts_best(constant, monkeypatch,
     assert seen == pytest.approx([0.6 * share for share in PRIOR_SHARES])
     # It travels with the model as what it was fitted with.
     assert model.options()["prior_sd"] == pytest.approx(0.6 * PRIOR_SHARES[best])
+
+
+def test_a_law_that_is_not_linear_has_a_network_too(constant):
+    recording, _ = constant
+    settings = {"windows": (0.5,), "fit_plant": False, "max_steps": 8}
+    law = fit(Stribeck(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("nfriction.fitting.network.WORTH", float("inf"))
+        model = NFStribeck(2, v_smooth=V_SMOOTH, **SMALL)
+        found = fit(model, pendulum(), recording, start=law, **settings)
+    assert found.model is model
+    assert found.residual <= 1.001 * law.residual
+    assert float(model.schedule.parameter_vector().abs().max()) > 0
