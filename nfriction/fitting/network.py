@@ -97,15 +97,21 @@ def _refined(
     if stage.result.status == "stopped":
         return trajectory_outcome(stage.problem, stage.result, stage.residuals, motions)
     if ratio > WORTH:
-        change = f"{100 * abs(ratio - 1):.3g} % {'worse' if ratio > 1 else 'better'}"
-        note = (
-            f"The network predicts windows held back {change} than its constant law, which is kept "
-            f"unless it is at least {100 * (1 - WORTH):.3g} % better."
-        )
-        return _constant_kept(search, start, note)
+        return _constant_kept(search, start, _judgement(ratio))
     whole = search.problem(cut_windows(search.joint, motions, length), noise, vector, stride)
     stage = search.search(whole, stage.vector, tolerance, f"{length:g} s windows")
     return trajectory_outcome(stage.problem, stage.result, stage.residuals, motions)
+
+
+def _judgement(ratio: float) -> str:
+    """Why a network is not kept."""
+    if math.isinf(ratio):
+        return "The network diverges on windows held back; its constant law is kept."
+    change = f"{100 * abs(ratio - 1):.3g} % {'worse' if ratio > 1 else 'better'}"
+    return (
+        f"The network predicts windows held back {change} than its constant law, which is kept "
+        f"unless it is at least {100 * (1 - WORTH):.3g} % better."
+    )
 
 
 def _best_prior(
