@@ -13,7 +13,7 @@ from nfriction import Recording, rigs
 from nfriction.fitting import Fit, fit, nearest_fit
 from nfriction.fitting.estimate import Zeroed
 from nfriction.friction import model_by_name
-from nfriction.friction.models import V_SMOOTH
+from nfriction.friction.model import V_SMOOTH
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.scoring import score
 

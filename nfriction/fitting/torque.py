@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nfriction.friction import Law
-from nfriction.friction.models import V_SMOOTH
+from nfriction.friction.model import V_SMOOTH
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.recording import Recording
 from nfriction.signals import Motion

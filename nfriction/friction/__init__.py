@@ -5,6 +5,7 @@ from nfriction.friction.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
 from nfriction.friction.constant import Constant
 from nfriction.friction.controller_schedule import RadialBasis
 from nfriction.friction.laws import Coefficient, Law
+from nfriction.friction.model import FrictionModel
 from nfriction.friction.models import (
     ACVFM,
     ALFM,
@@ -19,7 +20,6 @@ from nfriction.friction.models import (
     NFNCFM,
     NFNLFM,
     NLFM,
-    FrictionModel,
     NFStribeck,
     Stribeck,
     model_by_name,
