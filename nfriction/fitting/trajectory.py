@@ -27,10 +27,8 @@ logger = logging.getLogger(__name__)
 # Samples, over all windows, whose sensitivities are accumulated together: enough for fast matrix
 # products, few enough for the processor's cache.
 PIECE = 2000
-# A start state may leave the smoothed one by so many of the smoother's standard deviations, and by
-# this much in any case [rad, rad/s]: more, and it takes up what the parameters ought to explain.
-START_SDS = 3.0
-START_Q_SD, START_QD_SD = 0.001, 0.03
+# Smoothed start states are off by far less; the prior only keeps a window from running away.
+START_Q_SD, START_QD_SD = 0.01, 0.3
 
 
 @dataclass
@@ -208,8 +206,6 @@ class TrajectoryProblem:
         spread = torch.cat(
             [torch.full_like(w.q0, START_Q_SD), torch.full_like(w.qd0, START_QD_SD)], -1
         )
-        if w.start_sd is not None:
-            spread = torch.maximum(spread, START_SDS * w.start_sd)
         zero_sd = sd.new_zeros(0) if self.zero_sd is None else self.zero_sd.reshape(-1)
         sd = torch.cat([sd, spread.reshape(-1), zero_sd])
         zeros = torch.zeros_like(zero_sd)

@@ -24,8 +24,6 @@ class Windows:
         q0, qd0: smoothed state at the start, (window, joint).
         names: recording that each window comes from.
         spans: of each window, the recording's place among those given, its first and last sample.
-        start_sd: standard deviations of [q0, qd0] by the smoother, (window, 2 joint), 0 where it
-            knows none; None where no smoother does.
     """
 
     q: Tensor
@@ -36,7 +34,6 @@ class Windows:
     qd0: Tensor
     names: tuple[str, ...]
     spans: tuple[tuple[int, int, int], ...] = ()
-    start_sd: Tensor | None = None
 
     def __len__(self) -> int:
         return self.q.shape[0]
@@ -49,7 +46,6 @@ class Windows:
             weight=self.weight[index], q0=self.q0[index], qd0=self.qd0[index],
             names=tuple(self.names[i] for i in index),
             spans=tuple(self.spans[i] for i in index if self.spans),
-            start_sd=None if self.start_sd is None else self.start_sd[index],
         )  # fmt: skip
 
 
@@ -95,17 +91,9 @@ def cut_windows(
         if recording.tau is not None:
             tau[i, :n] = recording.tau[a:b]
     start = [np.stack([getattr(m, name)[a] for _, _, m, a, _ in pieces]) for name in ("q", "qd")]
-    start_sd = np.stack([_spread_of(m, a) for _, _, m, a, _ in pieces])
-    q_, tau_, step_, weight_, q0, qd0, sd = (
-        torch.as_tensor(x, dtype=torch.float64) for x in (q, tau, step, weight, *start, start_sd)
+    q_, tau_, step_, weight_, q0, qd0 = (
+        torch.as_tensor(x, dtype=torch.float64) for x in (q, tau, step, weight, *start)
     )
     names = tuple(r.name for _, r, *_ in pieces)
     spans = tuple((place, a, b) for place, _, _, a, b in pieces)
-    return Windows(q_, tau_, step_, weight_, q0, qd0, names, spans, sd)
-
-
-def _spread_of(motion: Motion, sample: int) -> np.ndarray:
-    """Standard deviations of position and velocity at a sample, (2 joint,)."""
-    if motion.std is None:
-        return np.zeros(2 * motion.q.shape[1])
-    return np.concatenate([motion.std.q[sample], motion.std.qd[sample]])
+    return Windows(q_, tau_, step_, weight_, q0, qd0, names, spans)

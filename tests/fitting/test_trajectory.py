@@ -9,13 +9,7 @@ import torch
 from nfriction import LFM, NFLFM
 from nfriction.fitting.plant_parameters import plant_parameters
 from nfriction.fitting.sensitivity import StepJacobian
-from nfriction.fitting.trajectory import (
-    START_Q_SD,
-    START_QD_SD,
-    START_SDS,
-    TrajectoryProblem,
-    solve_trajectory,
-)
+from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
 from nfriction.fitting.windows import Windows
 from nfriction.signals import Motion
 from nfriction.simulation import integrate
@@ -161,19 +155,6 @@ def test_the_prior_of_the_plant_may_be_centred_elsewhere():
     sd = torch.tensor([t.prior_sd for t in p.plant_terms], dtype=F64)
     prior = 0.5 * float(((mean / sd) ** 2).sum())
     assert float(p.cost(x) - moved.cost(x)) == pytest.approx(prior)
-
-
-def test_a_start_is_as_free_as_the_smoother_is_unsure():
-    p = problem(bent("LFM"))
-    known = torch.tensor([[1e-6, 1e-2, 1e-6, 1.0]] * 2, dtype=F64)
-    told = replace(p, windows=replace(p.windows, start_sd=known))
-    first = p.shared_count
-    for which, expected in (
-        (p, [START_Q_SD, START_Q_SD, START_QD_SD, START_QD_SD]),
-        (told, [START_Q_SD, START_SDS * 1e-2, START_QD_SD, START_SDS]),
-    ):
-        sd = which.prior()[0][first : first + 4].rsqrt()
-        torch.testing.assert_close(sd, torch.tensor(expected, dtype=F64))
 
 
 def test_a_traced_motion_is_the_simulated_one_where_windows_lie():

@@ -1,7 +1,5 @@
 """Windows cover recordings, restart at their own samples, and pad without weight."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -51,19 +49,8 @@ def test_a_subset_keeps_what_belongs_to_its_windows():
     some = w.subset(chosen)
     assert len(some) == int(chosen.sum())
     assert some.spans == w.spans[::2]
-    for name in ("q", "tau", "step", "weight", "q0", "qd0", "start_sd"):
+    for name in ("q", "tau", "step", "weight", "q0", "qd0"):
         assert torch.equal(getattr(some, name), getattr(w, name)[::2])
-
-
-def test_a_start_carries_what_the_smoother_knows_of_it():
-    recording, motion = made(301)
-    spread = Motion(motion.time, *(np.abs(x) for x in (motion.q, motion.qd, motion.qdd)))
-    w = cut_windows([recording] * 2, [motion, replace(motion, std=spread)], 0.5)
-    half = len(w) // 2
-    assert not w.start_sd[:half].any()
-    np.testing.assert_array_equal(
-        w.start_sd[half:], torch.cat([w.q0[half:], w.qd0[half:]], -1).abs()
-    )
 
 
 def test_several_recordings_share_one_stack():
