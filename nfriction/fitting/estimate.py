@@ -1,7 +1,7 @@
 """Fit a friction model to recordings: torques first, then trajectories."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, get_args
 
 import torch
@@ -63,7 +63,8 @@ def fit(
     """Estimate a friction model from recordings.
 
     The friction torque that the smoothed motion implies gives constant coefficients; simulated
-    windows of growing length then refine them, and what the data tell of the plant. A
+    windows of growing length then refine them, and what the data tell of the plant. Where the law
+    is not linear in one, the first windows are searched again from the torques on that plant. A
     neuro-fuzzy model starts at the constant fit of its own law and is pulled toward it, by its
     own prior or a tighter one, whichever predicts windows held back better; unless that is a tenth
     better than the law, the law is kept. Every class of an adaptive model starts there, too;
@@ -146,7 +147,12 @@ def fit(
 
     search = refinement(is_eccentric(eccentricity, known))
     vector = torch.tensor([known.get(t.name, 0.0) for t in search.terms], dtype=torch.float64)
-    stage = _through_windows(search, windows, vector, moved)
+
+    def by_torque(found: Plant) -> Tensor:
+        return fit_torque(model.law, found, joint, moved, model.v_smooth).coefficients
+
+    linear = all(c.linear or not c.fitted for c in model.law.coefficients)
+    stage = _through_windows(search, windows, vector, moved, None if linear else by_torque)
     undecided = start is None and eccentricity is None and fit_plant and may_be_eccentric(plant)
     if undecided and stage.result.status != "stopped":
         tolerance = flat(stage.result.cost)
@@ -178,9 +184,18 @@ def _fit_further(
 
 
 def _through_windows(
-    search: Refinement, windows: Sequence[float], vector: Tensor, motions: tuple[Motion, ...]
+    search: Refinement,
+    windows: Sequence[float],
+    vector: Tensor,
+    motions: tuple[Motion, ...],
+    by_torque: Callable[[Plant], Tensor] | None,
 ) -> Stage:
-    """Stages of growing length, each from the states and weighed by the errors of the last."""
+    """Stages of growing length, each from the states and weighed by the errors of the last.
+
+    With coefficients `by_torque` on a plant, the first stage is searched a second time from what
+    they are on the plant that it found: a law that is not linear has several minima, and on an
+    inertia that is a little wrong the torques lead to a worse one.
+    """
     reached: Stage | None = None
     zeros: Tensor | None = None
     noise, traced = FIRST_NOISE, motions
@@ -191,7 +206,10 @@ def _through_windows(
             # Of a start far away the cost says nothing; the last stage's minimum is as high.
             near = reached and least(reached.residuals, noise)
             tolerance = flat(near or float(problem.cost(problem.start(vector))))
-        stage = search.search(problem, vector, tolerance, f"{length:g} s windows", zeros)
+        name = f"{length:g} s windows"
+        stage = search.search(problem, vector, tolerance, name, zeros)
+        if reached is None and by_torque is not None and stage.result.status != "stopped":
+            stage = _better_start(search, stage, tolerance, name, by_torque)
         if reached is not None and stage.lost_since(reached):
             logger.warning("%g s windows are too long for this motion; left out", length)
             schedule = search.model.schedule
@@ -204,3 +222,24 @@ def _through_windows(
         traced = problem.traced(stage.result.x, traced)
     assert reached is not None
     return reached
+
+
+def _better_start(
+    search: Refinement,
+    stage: Stage,
+    tolerance: float,
+    name: str,
+    by_torque: Callable[[Plant], Tensor],
+) -> Stage:
+    """A stage, or the same searched from the coefficients by torque on its plant if that is better.
+
+    The model is left with the coefficients of the one returned.
+    """
+    problem, schedule = stage.problem, constant_schedule(search.model)
+    found = schedule.parameter_vector()
+    schedule.set_coefficients(by_torque(problem.plant_at(stage.vector)))
+    other = search.search(problem, stage.vector, tolerance, name, stage.zeros)
+    if other.result.status == "stopped" or other.result.cost < stage.result.cost:
+        return other
+    schedule.set_parameter_vector(found)
+    return stage

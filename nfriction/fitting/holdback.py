@@ -2,22 +2,25 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 
 import torch
 from torch import Tensor
 
-from nfriction.fitting.stages import Refinement, Stage
+from nfriction.fitting.stages import Refinement
+from nfriction.fitting.trajectory import TrajectoryProblem
 from nfriction.fitting.windows import Windows, cut_windows
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
 # Every so many-th window is held back, so that all sizes of the motion are judged.
 FOLDS = 3
-# A network's error on windows held back must be at most so much of that of the law that it
-# corrects, fitted to the same windows: where a recording is short few windows judge.
+# What a network's error on windows held back may be at most, where a recording is short and few
+# windows judge: over that of the law that it corrects, fitted to the same windows as it is,
 WORTH = 0.9
+# and over that of the law fitted to all windows, which would be taken in its place.
+HEAD_START = 1.1
 # What may be taken of a correction; of what serves alike, the least.
 SHARES = (0.0, 0.25, 0.5, 1.0)
 # Standard errors by which a gain must show: 95 % of a normal distribution.
@@ -83,21 +86,54 @@ def shares_by_joint(errors: Callable[[Tensor], Tensor], joints: int) -> Tensor:
     return torch.tensor(best, dtype=torch.float64)
 
 
-def ratio_on(held_back: Windows, network: Stage, constant: Stage, mean: Tensor) -> float:
-    """Error of a network on windows held back over that of its constant law.
+@dataclass(frozen=True)
+class Judgement:
+    """A network's error on windows held back over that of its constant law.
 
-    Both were trained on the other windows and start from the smoothed states, as a score does. They
-    move the same plant, that of a fit to all windows: an inertia that is off by some parts in ten
-    thousand shifts a swing by more than friction does. Infinite where the network diverges.
+    Attributes:
+        same: with the law fitted to the same windows as the network.
+        all: with the law fitted to all windows, those held back too.
+    """
+
+    same: float
+    all: float
+
+    @property
+    def score(self) -> float:
+        """At most 1 where the network is worth keeping."""
+        return max(self.same / WORTH, self.all / HEAD_START)
+
+    def __str__(self) -> str:
+        if math.isinf(self.score):
+            return "The network diverges on windows held back; its constant law is kept."
+        return (
+            f"The network predicts windows held back {_change(self.same)} than its constant law "
+            f"fitted to the same others, {_change(self.all)} than that fitted to all; it had to be "
+            f"{_change(WORTH)} and at most {_change(HEAD_START)}, so the constant law is kept."
+        )
+
+
+def _change(ratio: float) -> str:
+    return f"{100 * abs(ratio - 1):.3g} % {'worse' if ratio > 1 else 'better'}"
+
+
+def ratio_on(
+    held_back: Windows, network: TrajectoryProblem, constant: TrajectoryProblem, mean: Tensor
+) -> float:
+    """Error of a network on windows over that of a constant law.
+
+    Both start from the smoothed states, as a score does, and move the same plant: an inertia that
+    is off by some parts in ten thousand shifts a swing by more than friction does. Infinite where
+    the network diverges.
 
     Args:
-        held_back: windows that neither has seen.
-        network, constant: their searches on the others.
+        held_back: the windows.
+        network, constant: problems whose models have the coefficients to judge.
         mean: terms of the plant.
     """
 
-    def error(stage: Stage) -> Tensor:
-        judged = replace(stage.problem, windows=held_back)
+    def error(problem: TrajectoryProblem) -> Tensor:
+        judged = replace(problem, windows=held_back)
         return judged.errors(judged.start(mean)).square().mean().sqrt()
 
     ratio = float(error(network) / error(constant))

@@ -1,14 +1,13 @@
 """Fit a neuro-fuzzy model: a network that corrects a constant law, where windows bear it out."""
 
 import copy
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from nfriction.fitting.holdback import WORTH, judged_windows, ratio_on
+from nfriction.fitting.holdback import Judgement, judged_windows, ratio_on
 from nfriction.fitting.neurofuzzy_start import settle_on, start_at
 from nfriction.fitting.outcome import Fit, Plant, trajectory_outcome
 from nfriction.fitting.preparation import (
@@ -82,36 +81,26 @@ def _refined(
     tolerance = flat(least(start._residuals, noise))
     seen, held_back = judged_windows(search, motions, length)
     law = replace(search, model=copy.deepcopy(start.model))
-    constant = law.search(
+    same = law.search(
         law.problem(seen, noise, vector, stride), vector, tolerance, "constants, a third held back"
     )
-    if constant.result.status == "stopped":
-        return _constant_kept(search, start, constant.result.message, converged=False)
-    ratio, stage = _best_prior(
-        search,
-        search.problem(seen, noise, vector, stride),
-        vector,
-        tolerance,
-        lambda stage: ratio_on(held_back, stage, constant, vector),
-    )
-    if stage.result.status == "stopped":
+    if same.result.status == "stopped":
+        return _constant_kept(search, start, same.result.message, converged=False)
+    law_of_all = replace(search, model=start.model).problem(held_back, noise)
+
+    def judge(network: Stage) -> Judgement:
+        against = (same.problem, law_of_all)
+        return Judgement(*(ratio_on(held_back, network.problem, law, vector) for law in against))
+
+    part = search.problem(seen, noise, vector, stride)
+    judgement, stage = _best_prior(search, part, vector, tolerance, judge)
+    if judgement is None:
         return trajectory_outcome(stage.problem, stage.result, stage.residuals, motions)
-    if ratio > WORTH:
-        return _constant_kept(search, start, _judgement(ratio))
+    if judgement.score > 1:
+        return _constant_kept(search, start, str(judgement))
     whole = search.problem(cut_windows(search.joint, motions, length), noise, vector, stride)
     stage = search.search(whole, stage.vector, tolerance, f"{length:g} s windows")
     return trajectory_outcome(stage.problem, stage.result, stage.residuals, motions)
-
-
-def _judgement(ratio: float) -> str:
-    """Why a network is not kept."""
-    if math.isinf(ratio):
-        return "The network diverges on windows held back; its constant law is kept."
-    change = f"{100 * abs(ratio - 1):.3g} % {'worse' if ratio > 1 else 'better'}"
-    return (
-        f"The network predicts windows held back {change} than its constant law, which is kept "
-        f"unless it is at least {100 * (1 - WORTH):.3g} % better."
-    )
 
 
 def _best_prior(
@@ -119,11 +108,12 @@ def _best_prior(
     part: TrajectoryProblem,
     vector: Tensor,
     tolerance: float,
-    judge: Callable[[Stage], float],
-) -> tuple[float, Stage]:
-    """Train under each prior: the least of what `judge` says, and its stage.
+    judge: Callable[[Stage], Judgement],
+) -> tuple[Judgement | None, Stage]:
+    """Train under each prior: what is said of the best, and its stage.
 
-    The model is left with that network and prior; a stage that was stopped ends the trials.
+    The model is left with that network and prior. A stage that was stopped ends the trials without
+    a judgement.
     """
     schedule = search.model.schedule
     assert isinstance(schedule, NeuroFuzzy)
@@ -134,11 +124,11 @@ def _best_prior(
         schedule.prior_sd = share * widest
         stage = search.search(part, vector, tolerance, "a third held back")
         if stage.result.status == "stopped":
-            return math.inf, stage
+            return None, stage
         trials.append((judge(stage), schedule.prior_sd, schedule.parameter_vector(), stage))
-    ratio, schedule.prior_sd, network, stage = min(trials, key=lambda trial: trial[0])
+    judgement, schedule.prior_sd, network, stage = min(trials, key=lambda trial: trial[0].score)
     schedule.set_parameter_vector(network)
-    return ratio, stage
+    return judgement, stage
 
 
 def _constant_kept(search: Refinement, start: Fit, note: str, *, converged: bool = True) -> Fit:

@@ -226,7 +226,8 @@ STRIBECK = Law(
     "stribeck",
     (
         Coefficient("F_c", "N m"),
-        Coefficient("F_d", "N m"),
+        # Of a spike at rest that is narrower than the sign's passage data tell next to nothing.
+        Coefficient("F_d", "N m", share=1.0),
         Coefficient("F_v", "N m s/rad"),
         Coefficient("v_s", "rad/s", linear=False, search=(0.03, 0.1, 0.3, 1.0, 3.0)),
         Coefficient("delta", "-", linear=False, search=(2.0,), fitted=False),

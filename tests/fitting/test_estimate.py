@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction import LFM, NCFM, NFLFM, LinearAxis, Recording, fit, rollout
+from nfriction import LFM, NCFM, NFLFM, LinearAxis, Recording, Stribeck, fit, rollout
+from nfriction.fitting import estimate
 from nfriction.fitting.residuals import effective_noise
+from nfriction.fitting.torque import fit_torque
 from tests.fitting.recordings import F64, driven_axis, pendulum, swing
 
 TRUTH = [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]]
@@ -298,3 +300,61 @@ def test_what_is_something_else_is_told(arguments, told):
     recording = swing(pendulum(), LFM(2, v_smooth=0.05), seconds=0.2)
     with pytest.raises(TypeError, match=told):
         fit(*arguments(LFM(2), pendulum(), recording))
+
+
+FALLING = [[4e-4, 6e-3, 3e-4, 0.8, 2.0], [3e-4, 4e-3, 2e-4, 0.8, 2.0]]
+POOR = [[3e-3, 0.0, 1e-4, 20.0, 2.0]] * 2
+
+
+@pytest.fixture
+def misled(monkeypatch):
+    """Torques that tell nonsense of a law, the first time that they are asked."""
+    asked = []
+
+    def by_torque(law, plant, *rest):
+        asked.append(plant)
+        found = fit_torque(law, plant, *rest)
+        if len(asked) > 1:
+            return found
+        poor = torch.tensor(POOR, dtype=F64)[:, : found.coefficients.shape[1]]
+        return replace(found, coefficients=poor)
+
+    monkeypatch.setattr(estimate, "fit_torque", by_torque)
+    return asked
+
+
+def test_a_law_that_is_not_linear_starts_anew_on_the_plant_that_it_found(misled, monkeypatch):
+    truth = Stribeck(2, FALLING, v_smooth=V_SMOOTH)
+    recording = swing(pendulum(), truth)
+
+    def fitted():
+        misled.clear()
+        return fit(Stribeck(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5,))
+
+    found = fitted()
+    assert len(misled) == 2
+    assert misled[1] is not misled[0]
+    # What is left over is the encoder's rounding.
+    assert found.residual == pytest.approx(2 * np.pi / 8192 / 12**0.5, rel=0.2)
+    monkeypatch.setattr(estimate, "_better_start", lambda search, stage, *rest: stage)
+    assert fitted().residual > 1.02 * found.residual
+
+
+def test_what_stops_the_second_search_stops_the_fit(misled):
+    recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH), seconds=2.0)
+    told = []
+
+    def stop(stage, step):
+        told.append(stage)
+        return len(misled) == 2
+
+    model = Stribeck(2, v_smooth=V_SMOOTH)
+    found = fit(model, pendulum(), recording, windows=(0.5, 1.0), max_steps=4, callback=stop)
+    assert set(told) == {"0.5 s windows"}
+    assert not found.converged
+
+
+def test_a_law_that_is_linear_is_searched_once(misled):
+    fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), swing(pendulum(), true_model(), seconds=1.0),
+        windows=(0.5,), max_steps=1)  # fmt: skip
+    assert len(misled) == 1

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from nfriction import LFM, NFLFM, fit
-from nfriction.fitting.holdback import FOLDS, judged_windows, ratio_on, shares_by_joint
+from nfriction.fitting.holdback import FOLDS, Judgement, judged_windows, ratio_on, shares_by_joint
 from nfriction.fitting.neurofuzzy_start import settle_on, start_at
 from nfriction.fitting.preparation import mixing_of
-from nfriction.fitting.stages import Refinement, Stage
+from nfriction.fitting.stages import Refinement
 from tests.fitting.recordings import F64, pendulum, swing
 
 V_SMOOTH = 0.05
@@ -111,11 +111,11 @@ def test_the_ratio_is_one_for_the_constant_law_and_large_for_nonsense(constant):
     seen, held_back = judged_windows(search, motions, 0.5)
     none = torch.zeros(0, dtype=F64)
     law = replace(search, model=constant[1].model)
-    by_law = Stage(law.problem(seen, 1e-3), None, none)
+    by_law = law.problem(seen, 1e-3)
     schedule = search.model.schedule
     for value, least, most in ((0.0, 1 - 1e-9, 1 + 1e-9), (1.0, 1.5, np.inf)):
         schedule.set_parameter_vector(torch.full_like(schedule.parameter_vector(), value))
-        by_network = Stage(search.problem(seen, 1e-3), None, none)
+        by_network = search.problem(seen, 1e-3)
         assert least <= ratio_on(held_back, by_network, by_law, none) <= most
         assert float(schedule.parameter_vector().mean()) == value
 
@@ -127,8 +127,17 @@ def test_a_network_that_diverges_has_no_ratio(constant):
     law = replace(search, model=constant[1].model)
     schedule = search.model.schedule
     schedule.set_parameter_vector(torch.full_like(schedule.parameter_vector(), 1e6))
-    stages = (Stage(s.problem(seen, 1e-3), None, none) for s in (search, law))
-    assert ratio_on(held_back, *stages, none) == np.inf
+    problems = (s.problem(seen, 1e-3) for s in (search, law))
+    assert ratio_on(held_back, *problems, none) == np.inf
+
+
+@pytest.mark.parametrize(
+    ("same", "of_all", "kept"), [(0.9, 1.1, True), (0.91, 1.0, False), (0.5, 1.11, False)]
+)
+def test_a_network_beats_the_law_that_saw_as_much_and_nears_the_one_that_saw_all(
+    same, of_all, kept
+):
+    assert (Judgement(same, of_all).score <= 1) is kept
 
 
 def test_a_model_settles_on_a_coefficient_of_zero(constant):

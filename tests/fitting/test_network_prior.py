@@ -21,12 +21,13 @@ def constant():
 @pytest.mark.parametrize("best", range(len(PRIOR_SHARES)))
 def test_the_prior_is_the_one_whose_network_predicts_best(constant, monkeypatch, best):
     recording, found = constant
-    ratios = [0.8 - 0.2 * (k == best) for k in range(len(PRIOR_SHARES))]
     seen = []
 
-    def ratio(held_back, trained, constant, mean):
-        seen.append(trained.problem.friction.schedule.prior_sd)
-        return ratios[len(seen) - 1]
+    def ratio(held_back, network, constant, mean):
+        prior_sd = network.friction.schedule.prior_sd
+        if prior_sd not in seen:
+            seen.append(prior_sd)
+        return 0.8 - 0.2 * (len(seen) == best + 1)
 
     monkeypatch.setattr("nfriction.fitting.network.ratio_on", ratio)
     model = NFLFM(2, v_smooth=V_SMOOTH, prior_sd=0.6, **SMALL)
@@ -41,7 +42,7 @@ def test_a_law_that_is_not_linear_has_a_network_too(constant):
     settings = {"windows": (0.5,), "fit_plant": False, "max_steps": 8}
     law = fit(Stribeck(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nfriction.fitting.network.WORTH", float("inf"))
+        patch.setattr("nfriction.fitting.holdback.Judgement.score", 0.0)
         model = NFStribeck(2, v_smooth=V_SMOOTH, **SMALL)
         found = fit(model, pendulum(), recording, start=law, **settings)
     assert found.model is model
