@@ -1,13 +1,15 @@
-"""Real recordings left out one at a time, and simulated by what the others taught."""
+"""Parts of real recordings left out, and simulated by what the rest taught."""
 
 import math
 import time
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from nfriction import Recording, rigs
 from nfriction.fitting import Fit, fit, nearest_fit
@@ -16,6 +18,9 @@ from nfriction.friction import model_by_name
 from nfriction.friction.model import V_SMOOTH
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.scoring import score
+from nfriction.signals import kalman_smoother
+
+State = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 class Set(NamedTuple):
@@ -69,7 +74,45 @@ def read(data: Path, of: Set) -> list[Recording]:
     return found
 
 
-def first_state(data: Path, of: Set, recording: Recording) -> tuple[np.ndarray, np.ndarray] | None:
+class Fold(NamedTuple):
+    """What is fitted, and what is left out with the state that its free run starts from."""
+
+    fitted: list[Recording]
+    left: list[tuple[Recording, State | None]]
+
+
+def folds(data: Path, of: Set, blocks: int) -> list[Fold]:
+    """One recording left out at a time, or with blocks one block in time of every recording."""
+    recordings = read(data, of)
+    if blocks == 1:
+        return [
+            Fold([*recordings[:k], *recordings[k + 1 :]], [(left, first_state(data, of, left))])
+            for k, left in enumerate(recordings)
+        ]
+    pieces = [in_blocks(r, of.plant(), blocks) for r in recordings]
+    return [
+        Fold([p for row in pieces for n, (p, _) in enumerate(row) if n != k],
+             [row[k] for row in pieces])
+        for k in range(blocks)
+    ]  # fmt: skip
+
+
+def in_blocks(
+    recording: Recording, plant: PendulumChain | LinearAxis, blocks: int
+) -> list[tuple[Recording, State]]:
+    """A recording cut in time; the state at each cut is smoothed from both sides of it."""
+    joint = recording.joint_coordinates(plant)
+    motion = kalman_smoother(joint.time, joint.q)
+    convention = recording.convention_on(plant)
+    edges = np.linspace(0, len(recording) - 1, blocks + 1).astype(int)
+    return [
+        (recording[a : b + 1], (convention.position_from_joint(motion.q[a], plant.first_link),
+                                convention.rate_from_joint(motion.qd[a], plant.first_link)))
+        for a, b in pairwise(edges)
+    ]  # fmt: skip
+
+
+def first_state(data: Path, of: Set, recording: Recording) -> State | None:
     """Initial state of a whole recording as its card gives it."""
     table = pd.read_csv(data / of.folder / "recordings.csv").set_index("id")
     if len(of.names) == 1 or recording.name not in table.index:
@@ -82,29 +125,36 @@ def first_state(data: Path, of: Set, recording: Recording) -> tuple[np.ndarray, 
     return q, qd
 
 
-def real(data: Path, only: Sequence[str], models: Sequence[str]) -> None:
-    """Print the error of every model on recordings left out, one at a time."""
+def real(data: Path, only: Sequence[str], models: Sequence[str], blocks: int = 1) -> None:
+    """Print the error of every model on what was left out of its recordings.
+
+    Args:
+        data: holds a folder to each set.
+        only: sets by name.
+        models: by name, each fitted from the fit of one before it where that helps.
+        blocks: in time, of which one is left out of every recording; 1 leaves out recordings.
+    """
     print("set     model    unit  free run   aim  met       5 s   aim  met  cpu [s]  one by one")
     for name in only:
         of = SETS[name]
-        plant, recordings = of.plant(), read(data, of)
+        plant = of.plant()
         free: dict[str, list[float]] = {m: [] for m in models}
         short: dict[str, list[float]] = {m: [] for m in models}
         spent = dict.fromkeys(models, 0.0)
-        for k, left in enumerate(recordings):
+        for fold in folds(data, of, blocks):
             fits: list[Fit] = []
             for m in models:
                 start = time.process_time()
                 model = model_by_name(m)(plant.joints, v_smooth=of.v_smooth)
                 before = nearest_fit(fits, model)
-                others = [*recordings[:k], *recordings[k + 1 :]]
-                fits.append(fit(model, plant, others, start=before, zeroed=of.zeroed,
+                fits.append(fit(model, plant, fold.fitted, start=before, zeroed=of.zeroed,
                                 motions=before.motions if before else None))  # fmt: skip
                 spent[m] += time.process_time() - start
-                state = first_state(data, of, left)
-                told = score(fits[-1].plant, fits[-1].model, left, initial_state=state)
-                free[m].append(1e3 * told.free_run.all)
-                short[m].append(1e3 * told.windows["5"].all if "5" in told.windows else math.nan)
+                for left, state in fold.left:
+                    told = score(fits[-1].plant, fits[-1].model, left, initial_state=state)
+                    free[m].append(1e3 * told.free_run.all)
+                    five = told.windows.get("5")
+                    short[m].append(1e3 * five.all if five else math.nan)
         for m in models:
             rows = "  ".join(f"{e:.3g}" for e in free[m])
             errors = (root_mean_square(e[m]) for e in (free, short))
