@@ -35,7 +35,8 @@ class FrictionEstimator:
     Args:
         plant: the mechanism.
         model: name of a friction model, or one to start from, which stays as it is.
-        method, windows, fit_plant, drag, eccentricity, zeroed, max_steps: see `nfriction.fit`.
+        method, windows, fit_plant, drag, eccentricity, zeroed, continuity, max_steps: see
+            `nfriction.fit`.
         horizon: length of the simulations by which `score` judges [s].
 
     Attributes:
@@ -63,6 +64,7 @@ class FrictionEstimator:
         drag: bool | None = None,
         eccentricity: bool | None = False,
         zeroed: str = "once",
+        continuity: str = "free",
         max_steps: int = 30,
         horizon: float = 5.0,
     ) -> None:
@@ -75,6 +77,7 @@ class FrictionEstimator:
         self.drag = drag
         self.eccentricity = eccentricity
         self.zeroed = zeroed
+        self.continuity = continuity
         self.max_steps = max_steps
         self.horizon = horizon
 

@@ -43,6 +43,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--zeroed", choices=("once", "each"), default="once",
                         help="when incremental encoders were set to zero: once, or at the start of "
                         "each recording, wherever dry friction held the links")  # fmt: skip
+    parser.add_argument("--continuity", choices=("free", "soft", "hard"), default="free",
+                        help="whether the windows of a recording make one motion: no, but for "
+                        "little, or wholly")  # fmt: skip
     parser.add_argument("--max-steps", type=count, default=30, metavar="N",
                         help="most steps of the search at each window length")  # fmt: skip
 
@@ -56,6 +59,7 @@ def fit_settings(arguments: argparse.Namespace) -> dict[str, Any]:
         "drag": arguments.drag,
         "eccentricity": {"none": False, "fit": True, "evidence": None}[arguments.eccentricity],
         "zeroed": arguments.zeroed,
+        "continuity": arguments.continuity,
         "max_steps": arguments.max_steps,
     }
 

@@ -19,7 +19,7 @@ from nfriction.fitting.preparation import (
     mixing_of,
     zeros_serve,
 )
-from nfriction.fitting.stages import Callback, Refinement, Stage, flat, least
+from nfriction.fitting.stages import JUMP_SD, Callback, Continuity, Refinement, Stage, flat, least
 from nfriction.fitting.torque import fit_torque, prior_sd
 from nfriction.fitting.windows import cut_windows
 from nfriction.friction import Adaptive, Constant, FrictionModel
@@ -55,6 +55,7 @@ def fit(
     drag: bool | None = None,
     eccentricity: bool | None = False,
     zeroed: Zeroed = "once",
+    continuity: Continuity = "free",
     start: Fit | None = None,
     motions: Sequence[Motion] | None = None,
     max_steps: int = 30,
@@ -66,8 +67,9 @@ def fit(
     windows of growing length then refine them, and what the data tell of the plant. Where the law
     is not linear in one, the first windows are searched again from the torques on that plant. A
     neuro-fuzzy model starts at the constant fit of its own law and is pulled toward it, by its
-    own prior or a tighter one, whichever predicts windows held back better; unless that is a tenth
-    better than the law, the law is kept. Every class of an adaptive model starts there, too;
+    own prior or a tighter one, whichever predicts windows held back better, and more so at motions
+    that the recordings never came near; unless that is a tenth better than the law, the law is
+    kept. Every class of an adaptive model starts there, too;
     `fit_adaptive` has its further settings.
 
     Args:
@@ -90,6 +92,11 @@ def fit(
             recording and left out of the plant, whose offset stays as given, as that of a further
             recording cannot be known. Whoever scores a recording that was trained on scores it as
             it is, zeros and all.
+        continuity: of the state from a window to the next. `"free"`: every window has a start of
+            its own, as suits a law that is not wholly right, or motion that forgets its start.
+            `"soft"`, `"hard"`: the windows of a recording make one motion, but for a few counts of
+            an encoder or for nothing; what then counts is the error of whole recordings. Of an
+            adaptive model only the constant law is fitted so.
         start: an earlier fit to start from: of the same law for a neuro-fuzzy model, of any model
             for the plant's terms.
         motions: smoothed motions in joint coordinates, to save smoothing again.
@@ -101,7 +108,8 @@ def fit(
 
     Raises:
         TypeError: if model, plant or recordings are something else.
-        ValueError: if recordings and plant do not match, or there is no such method or zero.
+        ValueError: if recordings and plant do not match, or there is no such method, zero or
+            continuity.
     """
     if method not in get_args(Method):
         raise ValueError(f"`method` must be one of {get_args(Method)}, got {method!r}.")
@@ -109,6 +117,8 @@ def fit(
         raise ValueError(f"`zeroed` must be one of {get_args(Zeroed)}, got {zeroed!r}.")
     if zeroed == "each" and method == "torque":
         raise ValueError('`zeroed="each"` is found from trajectories, not from torques.')
+    if continuity not in JUMP_SD:
+        raise ValueError(f"`continuity` must be one of {tuple(JUMP_SD)}, got {continuity!r}.")
     given = listed(model, plant, recordings)
     joint = in_joint_coordinates(plant, model, given)
     if eccentricity and not may_be_eccentric(plant):
@@ -124,8 +134,8 @@ def fit(
             "callback": callback,
         }  # fmt: skip
         if isinstance(model.schedule, NeuroFuzzy):
-            same["eccentricity"] = eccentricity
-        return _fit_further(model, plant, given, moved, start, zeroed, same)
+            same |= {"eccentricity": eccentricity, "continuity": continuity}
+        return _fit_further(model, plant, given, moved, start, zeroed, continuity, same)
     torque = fit_torque(model.law, start.plant if start else plant, joint, moved, model.v_smooth)
     schedule = constant_schedule(model)
     schedule.set_coefficients(torque.coefficients)
@@ -142,8 +152,9 @@ def fit(
         once = zeroed == "once"
         terms = adjustable_terms(plant, joint, fit_plant, drag, eccentric, zeroed_once=once)
         return Refinement(
-            plant, model, joint, mixing, terms, max_steps, callback, None if once else zero_sd
-        )
+            plant, model, joint, mixing, terms, max_steps, callback, None if once else zero_sd,
+            JUMP_SD[continuity],
+        )  # fmt: skip
 
     search = refinement(is_eccentric(eccentricity, known))
     vector = torch.tensor([known.get(t.name, 0.0) for t in search.terms], dtype=torch.float64)
@@ -167,14 +178,16 @@ def _fit_further(
     motions: tuple[Motion, ...],
     start: Fit | None,
     zeroed: Zeroed,
+    continuity: Continuity,
     settings: dict[str, Any],
 ) -> Fit:
     """The fit of coefficients that follow the motion, from that of the constant law."""
     if not is_constant_fit(start, model) or not zeros_serve(start, motions, zeroed == "each"):
         constant = FrictionModel(model.law, Constant(model.law, model.joints), model.v_smooth)
         start = fit(
-            constant, plant, recordings, zeroed=zeroed, start=start, motions=motions, **settings
-        )
+            constant, plant, recordings, zeroed=zeroed, start=start, motions=motions,
+            **settings | {"continuity": continuity},
+        )  # fmt: skip
     # They fit or take a constant law first, so they stand above this module.
     from nfriction.fitting.adaptive import fit_adaptive
     from nfriction.fitting.network import fit_network

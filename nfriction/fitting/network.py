@@ -18,8 +18,9 @@ from nfriction.fitting.preparation import (
     mixing_of,
 )
 from nfriction.fitting.residuals import effective_noise, stride_of
-from nfriction.fitting.stages import Refinement, Stage, flat, least
+from nfriction.fitting.stages import JUMP_SD, Continuity, Refinement, Stage, flat, least
 from nfriction.fitting.trajectory import TrajectoryProblem
+from nfriction.fitting.unseen import unseen
 from nfriction.fitting.windows import cut_windows
 from nfriction.friction import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
@@ -42,6 +43,7 @@ def fit_network(
     fit_plant: bool,
     drag: bool | None,
     eccentricity: bool | None,
+    continuity: Continuity,
     max_steps: int,
     callback: Callable[[str, Step], bool | None] | None,
 ) -> Fit:
@@ -51,8 +53,8 @@ def fit_network(
         model, plant: see `fit`.
         recordings, motions: as they are; the zeros that the constant fit found are added here.
         start: the constant fit.
-        windows, fit_plant, drag, eccentricity, max_steps, callback: see `fit`; of the windows the
-            last length serves.
+        windows, fit_plant, drag, eccentricity, continuity, max_steps, callback: see `fit`; of the
+            windows the last length serves.
     """
     if not windows:
         raise ValueError("`windows` must name at least one window length [s].")
@@ -65,7 +67,11 @@ def fit_network(
         zeroed_once=not start.zeros,
     )  # fmt: skip
     mixing = mixing_of(plant, recordings[0].convention_on(plant))
-    search = Refinement(plant, model, joint, mixing, terms, max_steps, callback)
+    assert isinstance(model.schedule, NeuroFuzzy)
+    search = Refinement(
+        plant, model, joint, mixing, terms, max_steps, callback, jump_sd=JUMP_SD[continuity],
+        unseen=unseen(model.schedule, moved),
+    )  # fmt: skip
     vector = torch.tensor([known.get(t.name, 0.0) for t in terms], dtype=torch.float64)
     found = _refined(search, start, vector, windows[-1], moved)
     return replace(found, motions=motions, zeros=start.zeros)
@@ -80,13 +86,13 @@ def _refined(
     noise, stride = effective_noise(start._residuals), stride_of(start._residuals)
     tolerance = flat(least(start._residuals, noise))
     seen, held_back = judged_windows(search, motions, length)
-    law = replace(search, model=copy.deepcopy(start.model))
+    law = replace(search, model=copy.deepcopy(start.model), unseen=None)
     same = law.search(
         law.problem(seen, noise, vector, stride), vector, tolerance, "constants, a third held back"
     )
     if same.result.status == "stopped":
         return _constant_kept(search, start, same.result.message, converged=False)
-    law_of_all = replace(search, model=start.model).problem(held_back, noise)
+    law_of_all = replace(law, model=start.model).problem(held_back, noise)
 
     def judge(network: Stage) -> Judgement:
         against = (same.problem, law_of_all)

@@ -185,7 +185,10 @@ def _told_by_data(
         return (), (), None
     precision, _ = problem.prior()
     score = problem.score_covariance(result.x, local_noise(residuals))
-    known = evidence(result.hessian, precision, count, problem.noise_sd, problem.noise_sd, score)
+    # Where a network is only held to its law, the data leave it open.
+    curvature, n = result.hessian.clone(), problem.friction_count
+    curvature[:n, :n] -= problem.held_curvature(result.x)
+    known = evidence(curvature, precision, count, problem.noise_sd, problem.noise_sd, score)
     constant = isinstance(problem.friction.schedule, Constant)
     shown = fitted.clone()
     if not constant:

@@ -10,6 +10,7 @@ coefficients, so constant and neuro-fuzzy models are fitted alike.
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 import torch.autograd.forward_ad as forward_ad
@@ -149,7 +150,7 @@ def step_maps(
     """Linearise windows, `run` blocks of `block` steps at a time, in order.
 
     What lies between the ends of a block is composed for few directions before the many
-    parameters come in. Steps after the last whole block are left out.
+    parameters come in. Steps after the last whole block are a shorter one of their own.
 
     Args:
         jacobian: derivatives of one step.
@@ -164,25 +165,24 @@ def step_maps(
     """
     windows, steps = step.shape
 
-    def samples(x: Tensor, part: slice) -> Tensor:
-        return x[:, part].unflatten(1, (-1, block)).transpose(0, 1).flatten(0, 2)
+    whole = steps // block * block
+    for start, end in pairwise(sorted({*range(0, whole, run * block), whole, steps})):
+        part, length = slice(start, end), min(block, end - start)
 
-    last = steps // block * block
-    for start in range(0, last, run * block):
-        part = slice(start, min(start + run * block, last))
-        q, qd, qdd = (samples(x, part) for x in (motion.q, motion.qd, motion.qdd))
+        def samples(x: Tensor, part: slice = part, length: int = length) -> Tensor:
+            return x[:, part].unflatten(1, (-1, length)).transpose(0, 1).flatten(0, 2)
+
+        q, qd, qdd = (samples(x) for x in (motion.q, motion.qd, motion.qdd))
         schedule = jacobian.friction.schedule
         if states is None:
             held, slope = schedule(qd, qdd), schedule.sensitivities(qd, qdd)
         else:
-            memory = samples(states, part)
+            memory = samples(states)
             held = schedule.coefficients_from(qd, qdd, memory)
             slope = schedule.sensitivities_from(qd, qdd, memory)
         held = held.detach().expand(*qd.shape, held.shape[-1])
-        derivative = jacobian(
-            q, qd, held, samples(tau, part), samples(step[..., None], part), vector
-        )
-        maps = _compose(slope, derivative, block, len(jacobian.parameters))
+        derivative = jacobian(q, qd, held, samples(tau), samples(step[..., None]), vector)
+        maps = _compose(slope, derivative, length, len(jacobian.parameters))
         yield StepMaps(*(m.unflatten(0, (len(m) // windows, windows)) for m in maps))
 
 

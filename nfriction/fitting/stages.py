@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -12,6 +13,7 @@ from nfriction.fitting.preparation import substeps_of
 from nfriction.fitting.residuals import effective_noise
 from nfriction.fitting.sensitivity import StepJacobian
 from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
+from nfriction.fitting.unseen import Unseen
 from nfriction.fitting.windows import Windows
 from nfriction.friction import Constant, FrictionModel
 from nfriction.recording import Recording
@@ -19,6 +21,14 @@ from nfriction.solve.least_squares import Status
 from nfriction.solve.levenberg import FULL, LeastSquaresResult, Step
 
 Callback = Callable[[str, Step], bool | None]
+Continuity = Literal["free", "soft", "hard"]
+
+# By how much position and velocity may jump from the end of a window to the start of the next
+# [rad, rad/s; m, m/s]. In short windows the positions outweigh that: a search from far away finds
+# its way, and the windows come together as they grow.
+JUMP_SD: dict[Continuity, tuple[float, float] | None] = {
+    "free": None, "soft": (3e-4, 0.01), "hard": (1e-6, 3e-5),
+}  # fmt: skip
 
 # Residuals grow with the windows, but not so much unless the search went astray.
 LOST_TRACK = 10.0
@@ -79,7 +89,7 @@ class Refinement:
         terms: adjustable terms of the plant.
         max_steps: limit to each stage.
         callback: told every step with its stage; True stops.
-        zero_sd: see `TrajectoryProblem`.
+        zero_sd, jump_sd, unseen: see `TrajectoryProblem`.
     """
 
     plant: Plant
@@ -90,6 +100,8 @@ class Refinement:
     max_steps: int = 30
     callback: Callback | None = None
     zero_sd: Tensor | None = None
+    jump_sd: tuple[float, float] | None = None
+    unseen: Unseen | None = None
     jacobian: StepJacobian = field(init=False)
 
     def __post_init__(self) -> None:
@@ -103,7 +115,8 @@ class Refinement:
         return TrajectoryProblem(
             self.jacobian, windows, noise, self.mixing,
             substeps=substeps_of(self.plant, self.model, self.joint), plant_mean=mean,
-            stride=stride, zero_sd=self.zero_sd,
+            stride=stride, zero_sd=self.zero_sd, jump_sd=self.jump_sd,
+            unseen=self.unseen,
         )  # fmt: skip
 
     def search(

@@ -1,32 +1,33 @@
 """Output error: friction and plant terms from the positions of simulated windows.
 
-Each window starts from a free state of its own (multiple shooting without continuity), because
-the motion of a light mechanism forgets its start within seconds. Parameters and window states
-are found together by Levenberg-Marquardt with exact sensitivities.
+Each window starts from a state of its own (multiple shooting), because the motion of a light
+mechanism forgets its start within seconds. Where one window begins as another ends, the two may
+be made to agree. Parameters and window states are found together by Levenberg-Marquardt with
+exact sensitivities.
+
+References:
+    H. G. Bock, in: Modelling of Chemical Reaction Systems, Springer (1981), 102-125.
 """
 
-import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from nfriction.fitting.normal_equations import add_jumps, normal_equations
 from nfriction.fitting.plant_parameters import adjusted_buffers
-from nfriction.fitting.sensitivity import StepJacobian, StepMaps, start_slope, step_maps
+from nfriction.fitting.propagation import propagated
+from nfriction.fitting.sensitivity import StepJacobian
+from nfriction.fitting.unseen import Unseen
 from nfriction.fitting.verdict import evidence, standard_deviations
 from nfriction.fitting.windows import Windows
+from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.signals import Motion
 from nfriction.simulation import Rollout, integrate
 from nfriction.solve.levenberg import LeastSquaresResult, LevenbergMarquardt, Quadratic, Step
 
-logger = logging.getLogger(__name__)
-
-# Samples, over all windows, whose sensitivities are accumulated together: enough for fast matrix
-# products, few enough for the processor's cache.
-PIECE = 2000
 # Smoothed start states are off by far less; the prior only keeps a window from running away.
 START_Q_SD, START_QD_SD = 0.01, 0.3
 
@@ -51,6 +52,9 @@ class TrajectoryProblem:
             longer than a sample, and the sums over many parameters are what a step costs.
         zero_sd: what is expected of the zeros, (recording, joint) [rad or m]; without it none are
             sought.
+        jump_sd: by how much position and velocity may jump from the end of a window to the start of
+            the next [rad, rad/s; m, m/s]; without it by as much as they like.
+        unseen: motions at which a neuro-fuzzy schedule is held to its constant law.
         memory: of the coefficients at the start of each window, (window, joint, state_size), of a
             schedule that has one. It advances with every step of the integration.
     """
@@ -64,6 +68,8 @@ class TrajectoryProblem:
     stride: int = 1
     memory: Tensor | None = None
     zero_sd: Tensor | None = None
+    jump_sd: tuple[float, float] | None = None
+    unseen: Unseen | None = None
 
     def __post_init__(self) -> None:
         w = self.windows
@@ -76,6 +82,9 @@ class TrajectoryProblem:
         self.shared_count = self.friction_count + len(self.plant_terms)
         self.step = w.step.repeat_interleave(self.substeps, 1) / self.substeps
         self.tau = w.tau.repeat_interleave(self.substeps, 1)
+        self._seams = w.seams() if self.jump_sd else []
+        jump_sd = torch.tensor(self.jump_sd or (torch.inf, torch.inf), dtype=torch.float64)
+        self._jump_sd = jump_sd.repeat_interleave(w.q0.shape[-1])
         recordings = 0 if self.zero_sd is None else len(self.zero_sd)
         self.zero_count = recordings * w.q0.shape[-1]
         # Which recording a window is of, (window, recording).
@@ -150,15 +159,50 @@ class TrajectoryProblem:
         return (q - self.windows.q) @ self.mixing.T * self._scale
 
     def cost(self, x: Tensor) -> Tensor:
-        """Half the sum of squares of residuals and prior."""
+        """Half the sum of squares of residuals, jumps, what is held and prior."""
         precision, mean = self.prior()
-        return 0.5 * (self.residuals(x).square().sum() + (precision * (x - mean) ** 2).sum())
+        rows = (self.residuals(x), self.jumps(x), self.held(x))
+        misfit = torch.stack([row.square().sum() for row in rows]).sum()
+        return 0.5 * (misfit + (precision * (x - mean) ** 2).sum())
+
+    def jumps(self, x: Tensor) -> Tensor:
+        """From a window's end to the next one's start, over what is expected, (seam, 2 joint)."""
+        run = self._simulate(x)
+        before, after = ([pair[k] for pair in self._seams] for k in (0, 1))
+        end = torch.cat([run.q[before, -1] - self.zeros(x)[before], run.qd[before, -1]], -1)
+        return (end - self.split(x)[2][after]) / self._jump_sd
+
+    def held(self, x: Tensor) -> Tensor:
+        """Deviation from the constant law at unseen motions over what is expected, in one row."""
+        if self.unseen is None:
+            return torch.zeros(0, dtype=torch.float64)
+        return self.unseen.residuals(self._network(x))
+
+    def held_curvature(self, x: Tensor) -> Tensor:
+        """Its share of the Gauss-Newton model's curvature, over the friction model's parameters."""
+        if self.unseen is None:
+            return torch.zeros(self.friction_count, self.friction_count, dtype=torch.float64)
+        slope = self.unseen.jacobian(self._network(x))
+        return slope.T @ slope
+
+    def _network(self, x: Tensor) -> NeuroFuzzy:
+        schedule = self.friction.schedule
+        assert isinstance(schedule, NeuroFuzzy)
+        schedule.set_parameter_vector(self.split(x)[0])
+        return schedule
 
     def quadratic(self, x: Tensor) -> Quadratic:
         """Gauss-Newton model of the cost at `x`."""
         r = self.residuals(x)
         precision, mean = self.prior()
-        gradient, hessian = self._normal_equations(x, r)
+        gradient, hessian, ends = self._normal_equations(x, r)
+        if self._seams:
+            places = self._own_places()
+            add_jumps(gradient, hessian, self.jumps(x), ends, self._seams, places, self._jump_sd)
+        if self.unseen is not None:
+            slope, n = self.unseen.jacobian(self._network(x)), self.friction_count
+            gradient[:n] += self.held(x) @ slope
+            hessian[:n, :n] += slope.T @ slope
         hessian.diagonal().add_(precision)
         self._hessian = hessian
         return Quadratic(self.cost(x), gradient + precision * (x - mean), hessian)
@@ -223,38 +267,15 @@ class TrajectoryProblem:
 
     def _normal_equations(
         self, x: Tensor, r: Tensor, scale: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """J^T r and J^T J of all unknowns; errors count over the noise, or as `scale` says."""
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Of all unknowns; errors count over the noise, or as `scale` says."""
+        motion = self._simulate(x)
+        pieces = propagated(
+            self.jacobian, self.friction_count, motion, self.tau, self.step, self.split(x)[1],
+            self.substeps, self.stride, self._states(motion),
+        )  # fmt: skip
         scale = self._scale if scale is None else scale
-        shared, windows, joints = self.shared_count, *self.windows.q0.shape
-        gradient = torch.zeros_like(x)
-        hessian = torch.zeros(len(x), len(x), dtype=torch.float64)
-        # Of each window: its state, then the zeros of its recording.
-        count = 3 * joints if self.zero_count else 2 * joints
-        slope = torch.zeros(windows, count, dtype=torch.float64)
-        of_own = torch.zeros(windows, count, count, dtype=torch.float64)
-        mixed = torch.zeros(windows, count, shared, dtype=torch.float64)
-        for part, rows in self._sensitivities(x):
-            if self.zero_count:
-                # A zero moves the start, and what is measured with it.
-                measured = torch.eye(joints, dtype=torch.float64)
-                rows = torch.cat([rows, rows[..., shared : shared + joints] - measured], -1)
-            scaled = (self.mixing @ rows) * scale[:, part, :, None]
-            common, own = scaled.flatten(1, 2).split([shared, count], -1)
-            left = r[:, part].flatten(1)
-            gradient[:shared] += left.flatten() @ common.flatten(0, 1)
-            slope += (left[:, None] @ own)[:, 0]
-            hessian[:shared, :shared] += common.flatten(0, 1).T @ common.flatten(0, 1)
-            mixed += own.mT @ common
-            of_own += own.mT @ own
-        place = self._own_places()
-        # A window's own state has nothing to do with another's.
-        for w in range(windows):
-            gradient[place[w]] += slope[w]
-            hessian[place[w], :shared] += mixed[w]
-            hessian[:shared, place[w]] += mixed[w].T
-            hessian[place[w][:, None], place[w]] += of_own[w]
-        return gradient, hessian
+        return normal_equations(pieces, r, scale, self.mixing, self._own_places(), len(x))
 
     def _own_places(self) -> Tensor:
         """Where each window's state and the zeros of its recording stand, (window, ·)."""
@@ -264,60 +285,6 @@ class TrajectoryProblem:
             return states
         first = self.shared_count + states.numel() + joints * self._of_recording.argmax(1)
         return torch.cat([states, first[:, None] + torch.arange(joints)], 1)
-
-    def _sensitivities(self, x: Tensor) -> Iterator[tuple[slice, Tensor]]:
-        """Derivatives of the positions at the samples that count, some samples at a time.
-
-        Each (window, sample, joint, column); columns are what is shared, then the window's state.
-        """
-        plant_vector = self.split(x)[1]
-        motion = self._simulate(x)
-        windows, joints = self.windows.q0.shape
-        n, shared = self.friction_count, self.shared_count
-        carried = torch.zeros(windows, 3 * joints, shared + 2 * joints, dtype=torch.float64)
-        carried[:, : 2 * joints, shared:] = torch.eye(2 * joints, dtype=torch.float64)
-        by_q, by_plant = start_slope(
-            self.jacobian, motion.q[:, 0], motion.qd[:, 0], self.tau[:, 0], plant_vector
-        ).tensor_split([2 * joints], -1)
-        carried[:, 2 * joints :, n:shared] = by_plant
-        carried[:, 2 * joints :, shared:] = by_q
-        block = self.stride * self.substeps
-        run = max(1, PIECE // (windows * block))
-        sample = 0
-        for maps in step_maps(
-            self.jacobian, motion, self.tau, self.step, plant_vector, run, block,
-            self._states(motion),
-        ):  # fmt: skip
-            rows, carried = _carried(maps, carried, joints)
-            end = sample + self.stride * rows.shape[1]
-            yield slice(sample, end, self.stride), rows
-            sample = end
-        yield slice(sample, sample + 1), carried[:, None, :joints]
-
-
-def _carried(maps: StepMaps, start: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Carry the derivatives of a state through a run of maps.
-
-    Args:
-        maps: of the run, one after another.
-        start: derivatives before it, (window, row, column); what is shared comes first.
-        count: leading rows that are kept.
-
-    Returns:
-        The kept rows before every map, (window, map, count, column), and all rows after the last.
-    """
-    # Thousands of products of small matrices: NumPy's cost a fifth of torch's.
-    state = maps.state.numpy()
-    shared = torch.cat([maps.parameters, maps.plant], -1).numpy()
-    before = start.numpy().copy()
-    after = np.empty_like(before)
-    rows = np.empty((len(state), len(before), count, before.shape[-1]))
-    for k in range(len(state)):
-        rows[k] = before[:, :count]
-        np.matmul(state[k], before, out=after)
-        after[..., : shared.shape[-1]] += shared[k]
-        before, after = after, before
-    return torch.from_numpy(rows).transpose(0, 1), torch.from_numpy(before)
 
 
 def solve_trajectory(

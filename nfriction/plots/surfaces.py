@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter
 
 from nfriction.fitting.uncertainty import CoefficientUncertainty
+from nfriction.fitting.unseen import visits
 from nfriction.fitting.verdict import NORMAL_95
-from nfriction.friction import FrictionModel, NeuroFuzzy
+from nfriction.friction import Coefficient, FrictionModel, NeuroFuzzy
 from nfriction.plots import style
 from nfriction.plots.fuzzy import Array, Edges, draw_map, neuro_fuzzy, range_of
 from nfriction.signals import Motion
@@ -53,14 +54,14 @@ def coefficient_surfaces(
         width: of the figure [in].
 
     Returns:
-        A map a coefficient and joint.
+        A map a joint and coefficient that is fitted.
 
     Raises:
         ValueError: if the model's coefficients do not follow a neuro-fuzzy schedule.
     """
     schedule = neuro_fuzzy(model)
     names = style.joint_labels(joint_names, model.joints)
-    coefficients = model.law.coefficients
+    coefficients = _varied(model)
     # The fewer of the two stand side by side: the maps with their bars need the room.
     across = model.joints <= len(coefficients)
     rows, columns = sorted((model.joints, len(coefficients)), reverse=True)
@@ -74,10 +75,10 @@ def coefficient_surfaces(
         qd, qdd = _middles(schedule, edges)
         with torch.no_grad():
             values = schedule(qd, qdd)[:, :, j].numpy()
-        counts = None if motions is None else _visits(schedule, motions, j, edges)
+        counts = None if motions is None else visits(schedule, motions, CELLS)[j].T
         seen = None if counts is None else binary_dilation(counts > 0, iterations=NEAR)
         sd = None if uncertainty is None else uncertainty.sd(qd, qdd)[:, :, j].numpy()
-        for k, (ax, coefficient) in enumerate(zip(maps, coefficients, strict=True)):
+        for ax, (k, coefficient) in zip(maps, coefficients, strict=True):
             value = values[..., k]
             opacity = None if sd is None else _opacity(value, sd[..., k], seen)
             label = style.sliding(coefficient.unit, unit)
@@ -114,14 +115,14 @@ def coefficient_sections(
         width: of the figure [in].
 
     Returns:
-        A panel a coefficient and joint; a joint's accelerations stand in its title.
+        A panel a joint and coefficient that is fitted; a joint's accelerations stand in its title.
 
     Raises:
         ValueError: if the model's coefficients do not follow a neuro-fuzzy schedule.
     """
     schedule = neuro_fuzzy(model)
     names = style.joint_labels(joint_names, model.joints)
-    coefficients = model.law.coefficients
+    coefficients = _varied(model)
     rows, columns = model.joints, len(coefficients)
     figure, axes = style.panels(
         rows, columns, width or (style.COLUMN if columns == 1 else style.PAGE), 0.4 + 1.5 * rows,
@@ -139,7 +140,7 @@ def coefficient_sections(
         seen = [_seen_along(schedule, motions, j, edges, a) for a in accelerations]
         told = ", ".join(f"{float(f'{a:.2g}'):g}" for a in accelerations).replace("-", "−")
         style.title(panels[0], f"{names[j]}, at {told} {unit}/s²")
-        for k, (ax, coefficient) in enumerate(zip(panels, coefficients, strict=True)):
+        for ax, (k, coefficient) in zip(panels, coefficients, strict=True):
             label = style.sliding(coefficient.unit, unit)
             factor, label = style.scaled(label, value[..., k])
             for n, level in enumerate(levels):
@@ -162,6 +163,11 @@ def coefficient_sections(
     handles = [Line2D([], [], **looks[level].line) for level in levels]
     style.legend(figure, handles, list(levels))
     return figure
+
+
+def _varied(model: FrictionModel) -> list[tuple[int, Coefficient]]:
+    """Coefficients that are fitted, with their places; the others are the same everywhere."""
+    return [(k, c) for k, c in enumerate(model.law.coefficients) if c.fitted]
 
 
 def _levels(low: float, high: float) -> list[float]:
@@ -228,7 +234,7 @@ def _seen_along(
     """Where along a line of constant acceleration the motions came near, (cell,)."""
     if motions is None:
         return np.ones(CELLS, dtype=bool)
-    near = binary_dilation(_visits(schedule, motions, joint, edges) > 0, iterations=NEAR)
+    near = binary_dilation(visits(schedule, motions, CELLS)[joint].T > 0, iterations=NEAR)
     row = np.clip(np.searchsorted(edges[1], acceleration) - 1, 0, CELLS - 1)
     return np.asarray(near[row], dtype=bool)
 
@@ -245,16 +251,6 @@ def _middles(schedule: NeuroFuzzy, edges: Edges) -> tuple[torch.Tensor, torch.Te
     grid = np.meshgrid(*(0.5 * (e[1:] + e[:-1]) for e in edges))
     qd, qdd = (torch.as_tensor(g)[..., None].expand(*g.shape, schedule.joints) for g in grid)
     return qd, qdd
-
-
-def _visits(schedule: NeuroFuzzy, motions: Sequence[Motion], joint: int, edges: Edges) -> Array:
-    """Samples in each cell, (acceleration, velocity); those outside the range in the edge's."""
-    qd = np.concatenate([m.qd[:, joint] for m in motions])
-    qdd = np.concatenate([m.qdd[:, joint] for m in motions])
-    if schedule.along_motion:
-        qdd = qdd * np.sign(qd)
-    inside = [np.clip(v, e[0], e[-1]) for v, e in zip((np.abs(qd), qdd), edges, strict=True)]
-    return np.histogram2d(inside[1], inside[0], [edges[1], edges[0]])[0]
 
 
 def _density_lines(ax: Axes, edges: Edges, counts: Array) -> None:

@@ -21,16 +21,28 @@ def test_what_is_not_given_is_left_to_the_fit() -> None:
     assert "windows" not in settings
     assert settings["drag"] is None
     assert settings["zeroed"] == "once"
+    assert settings["continuity"] == "free"
     assert f"(default: {','.join(f'{w:g}' for w in WINDOWS)})" in " ".join(
         parser.format_help().split()
     )
     told = parser.parse_args(
-        ["--rig", "tlrip", "--windows", "1,3", "--no-drag", "--zeroed", "each"]
+        [
+            "--rig",
+            "tlrip",
+            "--windows",
+            "1,3",
+            "--no-drag",
+            "--zeroed",
+            "each",
+            "--continuity",
+            "soft",
+        ]
     )
     settings = estimation.fit_settings(told)
     assert settings["windows"] == (1.0, 3.0)
     assert settings["drag"] is False
     assert settings["zeroed"] == "each"
+    assert settings["continuity"] == "soft"
 
 
 @pytest.mark.parametrize(

@@ -137,7 +137,7 @@ def test_pieces_of_a_run_are_the_whole(run):
 
 @pytest.mark.parametrize("name", ["LFM", "NFLFM"])
 def test_a_block_is_the_chain_of_its_steps(name):
-    """Two blocks of three steps; the seventh step makes no block and is left out."""
+    """Two blocks of three steps; the seventh step is a block of its own."""
     plant, model = pendulum(), MODELS[name](2, v_smooth=0.5)
     jacobian = StepJacobian(plant, model, [])
     q0, qd0 = torch.ones(2, 2, dtype=F64), torch.zeros(2, 2, dtype=F64)
@@ -145,8 +145,11 @@ def test_a_block_is_the_chain_of_its_steps(name):
     motion = integrate(plant, model, q0, qd0, tau, step)
     empty = torch.zeros(0, dtype=F64)
     single = next(step_maps(jacobian, motion, tau, step, empty, 7))
-    (blocks,) = step_maps(jacobian, motion, tau, step, empty, 7, block=3)
+    blocks, rest = step_maps(jacobian, motion, tau, step, empty, 7, block=3)
     assert len(blocks.state) == 2
+    assert len(rest.state) == 1
+    torch.testing.assert_close(rest.state[0], single.state[6], rtol=1e-13, atol=1e-14)
+    torch.testing.assert_close(rest.parameters[0], single.parameters[6], rtol=1e-13, atol=1e-14)
     for b in range(2):
         state = torch.eye(6, dtype=F64).expand(2, -1, -1)
         parameters = torch.zeros_like(single.parameters[0])

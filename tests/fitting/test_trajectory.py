@@ -18,8 +18,8 @@ from tests.fitting.recordings import F64, pendulum
 ABSOLUTE = torch.tensor([[1.0, 0.0], [1.0, 1.0]], dtype=F64)
 
 
-def windows(steps=20, step=2e-3) -> Windows:
-    """Two windows with torque, the second of them shorter."""
+def windows(steps=20, step=2e-3, joined=False) -> Windows:
+    """Two windows with torque, the second of them shorter; it may begin where the first ends."""
     g = torch.Generator().manual_seed(5)
     q0 = torch.tensor([[1.6, 0.5], [2.5, -0.4]], dtype=F64)
     qd0 = torch.tensor([[2.0, -3.0], [-1.0, 4.0]], dtype=F64)
@@ -29,16 +29,18 @@ def windows(steps=20, step=2e-3) -> Windows:
     steps_[1, -4:], weight[1, -4:] = 0.0, 0.0
     truth = LFM(2, [[4e-3, 3e-3], [2e-3, 1e-3]], v_smooth=0.1)
     q = integrate(pendulum(), truth, q0, qd0, tau, steps_).q
-    spans = ((0, 0, steps), (1, 0, steps - 4))
+    second = (0, steps, 2 * steps - 4) if joined else (1, 0, steps - 4)
+    spans = ((0, 0, steps), second)
     return Windows(q, tau, steps_, weight, q0, qd0, ("a", "b"), spans)
 
 
-def problem(model, substeps=2, stride=1, **settings) -> TrajectoryProblem:
+def problem(model, substeps=2, stride=1, joined=False, **settings) -> TrajectoryProblem:
     plant = pendulum()
     terms = plant_parameters(plant, driven=True, largest_torque=0.1)
     jacobian = StepJacobian(plant, model, terms)
+    settings = {"jump_sd": (3e-4, 0.01), **settings}
     return TrajectoryProblem(
-        jacobian, windows(), 1e-3, ABSOLUTE, substeps, stride=stride, **settings
+        jacobian, windows(joined=joined), 1e-3, ABSOLUTE, substeps, stride=stride, **settings
     )
 
 
@@ -62,12 +64,17 @@ def point(p: TrajectoryProblem) -> torch.Tensor:
     return x
 
 
+def misfit(p: TrajectoryProblem, x: torch.Tensor) -> torch.Tensor:
+    return torch.cat([p.residuals(x).flatten(), p.jumps(x).flatten()])
+
+
 @pytest.mark.parametrize("zero_sd", [None, torch.full((2, 2), 0.05, dtype=torch.float64)])
 @pytest.mark.parametrize("name", ["LFM", "NFLFM"])
-@pytest.mark.parametrize(("substeps", "stride"), [(1, 1), (2, 1), (2, 3), (1, 20)])
-def test_gradient_and_hessian_against_finite_differences(name, substeps, stride, zero_sd):
+@pytest.mark.parametrize(("substeps", "stride"), [(1, 1), (2, 1), (2, 3), (1, 20), (1, 12)])
+@pytest.mark.parametrize("joined", [False, True])
+def test_gradient_and_hessian_against_finite_differences(name, substeps, stride, zero_sd, joined):
     """Also where samples are passed over: 3 leaves steps after the last that counts, 20 none."""
-    p = problem(bent(name), substeps, stride, zero_sd=zero_sd)
+    p = problem(bent(name), substeps, stride, joined, zero_sd=zero_sd)
     x = point(p)
     found = p.quadratic(x)
     torch.testing.assert_close(found.cost, p.cost(x))
@@ -79,9 +86,9 @@ def test_gradient_and_hessian_against_finite_differences(name, substeps, stride,
         unit[i] = 1e-4 * max(
             0.1 if i < p.friction_count and name == "NFLFM" else 1e-3, float(x[i].abs())
         )
-        ends = [p.residuals(x + s * unit).flatten() for s in (-2, -1, 1, 2)]
+        ends = [misfit(p, x + s * unit) for s in (-2, -1, 1, 2)]
         columns.append((ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * unit[i]))
-    jacobian, r = torch.stack(columns, -1), p.residuals(x).flatten()
+    jacobian, r = torch.stack(columns, -1), misfit(p, x)
     gradient = jacobian.T @ r + precision * (x - mean)
     hessian = jacobian.T @ jacobian + torch.diag(precision)
     # Entries differ by orders of magnitude: compared in units of the diagonal.
@@ -109,7 +116,7 @@ def test_pieces_do_not_show(piece, monkeypatch):
     """However many samples are accumulated at a time, the model of the cost is the same."""
     p = problem(bent("NFLFM"), stride=3)
     whole = p.quadratic(point(p))
-    monkeypatch.setattr("nfriction.fitting.trajectory.PIECE", piece)
+    monkeypatch.setattr("nfriction.fitting.propagation.PIECE", piece)
     parts = p.quadratic(point(p))
     torch.testing.assert_close(parts.gradient, whole.gradient, rtol=1e-10, atol=1e-10)
     torch.testing.assert_close(parts.hessian, whole.hessian, rtol=1e-10, atol=1e-10)

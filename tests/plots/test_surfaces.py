@@ -5,7 +5,7 @@ import pytest
 import torch
 from matplotlib.collections import LineCollection, QuadMesh
 
-from nfriction import LFM, NFLFM, plots
+from nfriction import LFM, NFLFM, NFStribeck, plots
 from nfriction.fitting.uncertainty import CoefficientUncertainty
 from nfriction.signals import Motion
 
@@ -101,3 +101,15 @@ def test_sections_are_faint_where_nothing_was_seen(known):
 def test_only_neuro_fuzzy_models_have_sections():
     with pytest.raises(ValueError, match="neuro-fuzzy"):
         plots.coefficient_sections(LFM(2))
+
+
+@pytest.mark.parametrize("draw", [plots.coefficient_surfaces, plots.coefficient_sections])
+def test_a_coefficient_that_is_not_fitted_is_not_drawn(draw):
+    """It is the same everywhere: the exponent of the Stribeck law."""
+    model = NFStribeck(1, terms=(2, 2), head_units=2)
+    model.schedule.set_range(5.0, [-100.0, 100.0])
+    figure = draw(model)
+    said = [f"{ax.get_ylabel()} {ax.get_title()}" for ax in figure.axes]
+    symbols = {word for text in said for word in text.split() if word.startswith("$")}
+    assert len(symbols) == 4
+    assert not any("delta" in symbol for symbol in symbols)

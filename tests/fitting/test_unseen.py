@@ -1,0 +1,124 @@
+"""Where recordings never were, a network stays with its constant law."""
+
+import numpy as np
+import pytest
+import torch
+
+from nfriction import NFLFM
+from nfriction.fitting.sensitivity import StepJacobian
+from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
+from nfriction.fitting.unseen import HELD_SD, Unseen, unseen, visits
+from nfriction.fitting.windows import Windows
+from nfriction.signals import Motion
+from nfriction.simulation import integrate
+from tests.fitting.recordings import F64, pendulum
+
+FASTEST, STRONGEST = 5.0, 100.0
+
+
+def network(size: float = 0.0) -> NFLFM:
+    """A small one over known ranges, with parameters of a size drawn by a fixed seed."""
+    model = NFLFM(2, [4e-3, 2e-3], v_smooth=0.1, terms=(3, 3), head_units=2)
+    model.schedule.set_range(FASTEST, [-STRONGEST, STRONGEST])
+    vector = model.schedule.parameter_vector()
+    g = torch.Generator().manual_seed(3)
+    model.schedule.set_parameter_vector(size * torch.randn(vector.shape, generator=g, dtype=F64))
+    return model
+
+
+def swings(*sizes: float) -> Motion:
+    """Harmonic swings of one size a joint, as shares of the ranges; an arc of them each."""
+    phase = np.linspace(0.0, 2 * np.pi, 4000)
+    qd = np.stack([FASTEST * size * np.sin(phase) for size in sizes], -1)
+    qdd = np.stack([STRONGEST * size * np.cos(phase) for size in sizes], -1)
+    return Motion(phase, qd, qd, qdd)
+
+
+def test_small_swings_are_unseen_among_large_ones_and_seen_where_a_joint_made_them():
+    schedule = network().schedule
+    motions = [swings(1.0, 0.1), swings(1.0, 0.5)]
+    found = unseen(schedule, motions)
+    size = torch.hypot(found.qd / FASTEST, found.qdd / STRONGEST)
+    assert found.weight[size[:, 0] < 0.75, 0].all()
+    assert not found.weight[(size[:, 0] - 1).abs() < 0.05, 0].any()
+    assert not found.weight[size[:, 1] < 0.15, 1].any()
+    assert found.weight[size[:, 1] > 0.7, 1].all()
+    assert (found.qd > 0).all()
+    assert (found.qd < FASTEST).all()
+
+
+def test_every_sample_is_counted_those_beyond_the_range_at_its_edge():
+    counts = visits(network().schedule, [swings(2.0, 0.5)], 10)
+    assert counts.shape == (2, 10, 10)
+    assert (counts.sum((1, 2)) == 4000).all()
+    assert counts[0, -1].sum() > 2000
+    assert not counts[1, 6:].any()
+
+
+def test_jacobian_is_the_derivative_of_the_residuals():
+    schedule = network(0.2).schedule
+    held = unseen(schedule, [swings(1.0, 0.5)])
+    at, found, columns = schedule.parameter_vector(), held.jacobian(schedule), []
+    for k in range(len(at)):
+        unit = torch.zeros_like(at)
+        unit[k] = 1e-5
+        ends = []
+        for sign in (-1, 1):
+            schedule.set_parameter_vector(at + sign * unit)
+            ends.append(held.residuals(schedule))
+        columns.append((ends[1] - ends[0]) / 2e-5)
+    torch.testing.assert_close(found, torch.stack(columns, -1), rtol=1e-5, atol=1e-6)
+
+
+def test_a_deviation_counts_in_units_of_the_scale():
+    schedule = network().schedule
+    held = unseen(schedule, [swings(1.0, 1.0)])
+    torch.testing.assert_close(held.residuals(schedule), torch.zeros_like(held.residuals(schedule)))
+    (bias,) = [p for n, p in schedule.named_parameters() if n.endswith("output_bias")]
+    with torch.no_grad():
+        bias.add_(HELD_SD)
+    found = held.residuals(schedule).unflatten(0, (-1, 2, 2))
+    # The coefficients' positive map rounds near zero: a deviation of HELD_SD is one, but for that.
+    torch.testing.assert_close(found[held.weight > 0], torch.ones(1, dtype=F64).expand_as(
+        found[held.weight > 0]), rtol=0, atol=1e-3)  # fmt: skip
+    assert not found[held.weight == 0].any()
+
+
+def problem(model: NFLFM, held: Unseen | None) -> TrajectoryProblem:
+    """Windows of large swings, simulated with a network of its own."""
+    g = torch.Generator().manual_seed(5)
+    q0 = torch.tensor([[1.6, 0.5], [2.5, -0.4]], dtype=F64)
+    qd0 = torch.tensor([[2.0, -3.0], [-1.0, 4.0]], dtype=F64)
+    tau = 0.05 * torch.randn(2, 60, 2, generator=g, dtype=F64)
+    step = torch.full((2, 60), 5e-3, dtype=F64)
+    q = integrate(pendulum(), network(0.3), q0, qd0, tau, step).q
+    w = Windows(q, tau, step, torch.ones(2, 61, dtype=F64), q0, qd0, ("a", "b"))
+    jacobian = StepJacobian(pendulum(), model, [])
+    return TrajectoryProblem(jacobian, w, 1e-4, torch.eye(2, dtype=F64), unseen=held)
+
+
+@pytest.mark.parametrize("size", [0.0, 0.2])
+def test_what_is_held_is_part_of_the_cost_and_of_its_model(size):
+    model = network(size)
+    held = unseen(model.schedule, [swings(1.0, 0.5)])
+    free, tied = problem(model, None), problem(model, held)
+    x = free.start()
+    r, slope, n = held.residuals(model.schedule), held.jacobian(model.schedule), tied.friction_count
+    torch.testing.assert_close(tied.cost(x) - free.cost(x), 0.5 * r.square().sum())
+    a, b = free.quadratic(x), tied.quadratic(x)
+    torch.testing.assert_close(b.gradient[:n] - a.gradient[:n], r @ slope, rtol=1e-7, atol=1e-6)
+    difference = b.hessian - a.hessian
+    torch.testing.assert_close(difference[:n, :n], tied.held_curvature(x), rtol=1e-7, atol=1e-4)
+    assert not difference[n:].any()
+
+
+def test_a_network_fitted_so_deviates_less_where_nothing_was_seen():
+    deviation = []
+    for tied in (False, True):
+        model = network()
+        held = unseen(model.schedule, [swings(1.0, 1.0)])
+        p = problem(model, held if tied else None)
+        result = solve_trajectory(p, p.start())
+        deviation.append(float(held.residuals(model.schedule).square().mean().sqrt()))
+        assert float(p.errors(result.x).abs().max()) < 1e-3
+    assert deviation[1] < 0.5 * deviation[0]
