@@ -9,6 +9,7 @@ import torch
 from nfriction import LFM, NFLFM
 from nfriction.fitting.plant_parameters import plant_parameters
 from nfriction.fitting.sensitivity import StepJacobian
+from nfriction.fitting.stages import JUMP_SD
 from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
 from nfriction.fitting.windows import Windows
 from nfriction.signals import Motion
@@ -181,3 +182,45 @@ def test_a_traced_motion_is_the_simulated_one_where_windows_lie():
     np.testing.assert_allclose(after.q[36], w.q[1, 16].numpy() + error, rtol=0, atol=1e-12)
     assert not after.q[37:].any()
     assert not before.q.any()
+
+
+def halves(noise: float = 1e-3) -> Windows:
+    """One motion with noise, cut in two, from starts that are a little off."""
+    g = torch.Generator().manual_seed(7)
+    truth = LFM(2, [[4e-3, 3e-3], [2e-3, 1e-3]], v_smooth=0.1)
+    q0, qd0 = torch.tensor([[1.6, 0.5]], dtype=F64), torch.tensor([[2.0, -3.0]], dtype=F64)
+    step = torch.full((1, 80), 5e-3, dtype=F64)
+    run = integrate(pendulum(), truth, q0, qd0, torch.zeros(1, 80, 2, dtype=F64), step)
+    q = run.q + noise * torch.randn(run.q.shape, generator=g, dtype=F64)
+    start = [x[0, [0, 40]] + 0.01 for x in (run.q, run.qd)]
+    return Windows(
+        torch.cat([q[:, :41], q[:, 40:]]), torch.zeros(2, 40, 2, dtype=F64),
+        step.reshape(2, 40), torch.ones(2, 41, dtype=F64), *start, ("a", "a"),
+        ((0, 0, 40), (0, 40, 80)),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("continuity", ["free", "soft", "hard"])
+def test_windows_come_together_as_far_as_they_are_to(continuity):
+    model = LFM(2, [3e-3, 2e-3], v_smooth=0.1)
+    jacobian = StepJacobian(pendulum(), model, [])
+    settings = {"noise_sd": 1e-3, "mixing": ABSOLUTE}
+    sd = JUMP_SD[continuity]
+    p = TrajectoryProblem(jacobian, halves(), jump_sd=sd, **settings)
+    result = solve_trajectory(p, p.start(), cost_tolerance=1e-10)
+    assert result.converged
+    apart = TrajectoryProblem(jacobian, halves(), jump_sd=(1.0, 1.0), **settings)
+    jump = apart.jumps(result.x).abs().amax(0)
+    assert (jump[:2].max() > 3e-4) == (continuity == "free")
+    if sd is not None:
+        assert (jump[:2] < 2 * sd[0]).all()
+        assert (jump[2:] < 2 * sd[1]).all()
+
+
+def test_only_neighbours_in_time_have_seams():
+    w = replace(windows(), spans=((0, 0, 20), (1, 20, 36)))
+    assert w.seams() == []
+    assert replace(w, spans=((0, 0, 20), (0, 20, 36))).seams() == [(0, 1)]
+    assert replace(w, spans=((0, 20, 36), (0, 0, 20))).seams() == [(1, 0)]
+    assert replace(w, spans=((0, 0, 20), (0, 21, 36))).seams() == []
+    assert replace(w, spans=()).seams() == []
