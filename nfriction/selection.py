@@ -7,8 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from nfriction.fitting import Fit
+from nfriction.fitting.holdback import LEAST_ERROR
 from nfriction.friction import model_by_name
 from nfriction.many import Data, Fits, fit_models
 from nfriction.plant import LinearAxis, PendulumChain
@@ -115,7 +117,9 @@ def select(
     Every recording is cut into as many blocks of time as there are folds. Each fold leaves one
     block of every recording out, fits all models to the rest and simulates the blocks left out. A
     model with fewer parameters is preferred where its error cannot be told from the least one:
-    within `tolerance`, or within the standard error of the difference over blocks.
+    within `tolerance`, or within the standard error of the difference over blocks, both of their
+    mean squares and of the logarithms: one block of violent motion must not hide that it is worse
+    on all others.
 
     Args:
         plant: the mechanism as given.
@@ -255,13 +259,21 @@ def block_error(found: Fit, block: Block, horizon: float) -> float:
 
 
 def _alike(one: Candidate, best: Candidate, tolerance: float) -> bool:
-    """Whether two mean squares differ by no more than their blocks make them."""
+    """Whether two errors differ by no more than their blocks make them."""
     if not math.isfinite(one.error):
         return False
-    difference = np.square(one.errors) - np.square(best.errors)
+    if one.error <= (1 + tolerance) * best.error:
+        return True
+    squares = np.square([one.errors, best.errors])
+    logarithms = np.log(squares.clip(min=LEAST_ERROR**2))
+    return all(_within_error(a - b) for a, b in (squares, logarithms))
+
+
+def _within_error(difference: NDArray[np.float64]) -> bool:
+    """Whether a mean is no larger than its standard error."""
     n = len(difference)
     error = float(difference.std(ddof=1)) / math.sqrt(n) if n > 1 else 0.0
-    return one.error <= (1 + tolerance) * best.error or float(difference.mean()) <= error
+    return float(difference.mean()) <= error
 
 
 def _finite(value: float) -> float | None:

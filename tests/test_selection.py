@@ -35,6 +35,18 @@ def test_what_one_block_alone_decides_is_a_draw():
     assert choose([steady, rich])[0] == "B"
 
 
+def test_one_violent_block_does_not_hide_what_is_worse_on_all_others():
+    """The single pendulum's blocks: of nine, two of far larger swings than were trained on."""
+    simple = candidate("A", (2.24, 2.98, 6.36, 5.02, 2.33, 1.87, 4.16, 4.63, 3.34), 1)
+    rich = candidate("B", (7.25, 1.77, 2.85, 6.35, 1.3, 1.22, 0.91, 2.04, 1.29), 5)
+    name, reason = choose([simple, rich])
+    assert name == "B"
+    assert "A follows" in reason
+    # As many better as worse, and nothing is told.
+    mixed = candidate("A", (7.9, 1.9, 2.6, 6.3, 1.2, 1.3, 1.0, 1.9, 1.4), 1)
+    assert choose([mixed, rich])[0] == "A"
+
+
 def test_what_diverges_is_not_chosen():
     lost, fine = candidate("A", (math.inf, 1.0), 1), candidate("B", (5.0, 5.0), 9)
     assert choose([lost, fine])[0] == "B"
