@@ -100,7 +100,11 @@ def folds(data: Path, of: Set, blocks: int) -> list[Fold]:
 def in_blocks(
     recording: Recording, plant: PendulumChain | LinearAxis, blocks: int
 ) -> list[tuple[Recording, State]]:
-    """A recording cut in time; the state at each cut is smoothed from both sides of it."""
+    """A recording cut in time; the state at each cut is smoothed from both sides of it.
+
+    Each block then has a zero of its own where encoders were zeroed anew: one that is left out is
+    scored without it.
+    """
     joint = recording.joint_coordinates(plant)
     motion = kalman_smoother(joint.time, joint.q)
     convention = recording.convention_on(plant)

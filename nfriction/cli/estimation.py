@@ -44,8 +44,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         help="when incremental encoders were set to zero: once, or at the start of "
                         "each recording, wherever dry friction held the links")  # fmt: skip
     parser.add_argument("--continuity", choices=("free", "soft", "hard"), default="free",
-                        help="whether the windows of a recording make one motion: no, but for "
-                        "little, or wholly")  # fmt: skip
+                        help="windows of a recording: each with a start of its own, or one "
+                        "motion but for jumps of 0.3 mrad, or for none")  # fmt: skip
     parser.add_argument("--max-steps", type=count, default=30, metavar="N",
                         help="most steps of the search at each window length")  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, Literal, get_args
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from nfriction.fitting.eccentricity import may_be_eccentric, richer_by_evidence
 from nfriction.fitting.neurofuzzy_start import is_constant_fit
-from nfriction.fitting.outcome import Fit, Plant, torque_outcome, trajectory_outcome
+from nfriction.fitting.outcome import Continuity, Fit, Plant, torque_outcome, trajectory_outcome
 from nfriction.fitting.preparation import (
     adjustable_terms,
     constant_schedule,
@@ -19,7 +20,7 @@ from nfriction.fitting.preparation import (
     mixing_of,
     zeros_serve,
 )
-from nfriction.fitting.stages import JUMP_SD, Callback, Continuity, Refinement, Stage, flat, least
+from nfriction.fitting.stages import JUMP_SD, Callback, Refinement, Stage, flat, least
 from nfriction.fitting.torque import fit_torque, prior_sd
 from nfriction.fitting.windows import cut_windows
 from nfriction.friction import Adaptive, Constant, FrictionModel
@@ -94,9 +95,10 @@ def fit(
             it is, zeros and all.
         continuity: of the state from a window to the next. `"free"`: every window has a start of
             its own, as suits a law that is not wholly right, or motion that forgets its start.
-            `"soft"`, `"hard"`: the windows of a recording make one motion, but for a few counts of
-            an encoder or for nothing; what then counts is the error of whole recordings. Of an
-            adaptive model only the constant law is fitted so.
+            `"soft"`, `"hard"`: the windows of a recording make one motion, but for jumps of about
+            0.3 mrad and 0.01 rad/s (mm, m/s), or for nothing; what then counts is the error of
+            whole recordings. A neuro-fuzzy model takes `"hard"` for its constant law only, and is
+            itself soft; an adaptive one is always free. Intervals take jumps for exact.
         start: an earlier fit to start from: of the same law for a neuro-fuzzy model, of any model
             for the plant's terms.
         motions: smoothed motions in joint coordinates, to save smoothing again.
@@ -119,6 +121,8 @@ def fit(
         raise ValueError('`zeroed="each"` is found from trajectories, not from torques.')
     if continuity not in JUMP_SD:
         raise ValueError(f"`continuity` must be one of {tuple(JUMP_SD)}, got {continuity!r}.")
+    if continuity != "free" and method == "torque":
+        raise ValueError(f"`continuity={continuity!r}` is of trajectories, not of torques.")
     given = listed(model, plant, recordings)
     joint = in_joint_coordinates(plant, model, given)
     if eccentricity and not may_be_eccentric(plant):
@@ -135,7 +139,7 @@ def fit(
         }  # fmt: skip
         if isinstance(model.schedule, NeuroFuzzy):
             same |= {"eccentricity": eccentricity, "continuity": continuity}
-        return _fit_further(model, plant, given, moved, start, zeroed, continuity, same)
+        return _fit_further(model, plant, given, moved, start, zeroed, same)
     torque = fit_torque(model.law, start.plant if start else plant, joint, moved, model.v_smooth)
     schedule = constant_schedule(model)
     schedule.set_coefficients(torque.coefficients)
@@ -168,7 +172,8 @@ def fit(
     if undecided and stage.result.status != "stopped":
         tolerance = flat(stage.result.cost)
         stage = richer_by_evidence(stage, refinement(True), tolerance) or stage
-    return trajectory_outcome(stage.problem, stage.result, stage.residuals, moved)
+    found = trajectory_outcome(stage.problem, stage.result, stage.residuals, moved)
+    return replace(found, continuity=continuity)
 
 
 def _fit_further(
@@ -178,16 +183,16 @@ def _fit_further(
     motions: tuple[Motion, ...],
     start: Fit | None,
     zeroed: Zeroed,
-    continuity: Continuity,
     settings: dict[str, Any],
 ) -> Fit:
     """The fit of coefficients that follow the motion, from that of the constant law."""
-    if not is_constant_fit(start, model) or not zeros_serve(start, motions, zeroed == "each"):
+    alike = settings.get("continuity", "free")
+    each = zeroed == "each"
+    if not is_constant_fit(start, model, alike) or not zeros_serve(start, motions, each):
         constant = FrictionModel(model.law, Constant(model.law, model.joints), model.v_smooth)
         start = fit(
-            constant, plant, recordings, zeroed=zeroed, start=start, motions=motions,
-            **settings | {"continuity": continuity},
-        )  # fmt: skip
+            constant, plant, recordings, zeroed=zeroed, start=start, motions=motions, **settings
+        )
     # They fit or take a constant law first, so they stand above this module.
     from nfriction.fitting.adaptive import fit_adaptive
     from nfriction.fitting.network import fit_network
@@ -213,7 +218,8 @@ def _through_windows(
     zeros: Tensor | None = None
     noise, traced = FIRST_NOISE, motions
     for length in windows:
-        problem = search.problem(cut_windows(search.joint, traced, length), noise)
+        cut = cut_windows(search.joint, traced, length)
+        problem = search.problem(cut, noise, far=reached is None and len(windows) > 1)
         tolerance = LOOSE
         if length == windows[-1]:
             # Of a start far away the cost says nothing; the last stage's minimum is as high.

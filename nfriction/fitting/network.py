@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nfriction.fitting.holdback import Judgement, judged_windows, ratio_on
 from nfriction.fitting.neurofuzzy_start import settle_on, start_at
-from nfriction.fitting.outcome import Fit, Plant, trajectory_outcome
+from nfriction.fitting.outcome import Continuity, Fit, Plant, trajectory_outcome
 from nfriction.fitting.preparation import (
     adjustable_terms,
     at_zeros,
@@ -18,7 +18,7 @@ from nfriction.fitting.preparation import (
     mixing_of,
 )
 from nfriction.fitting.residuals import effective_noise, stride_of
-from nfriction.fitting.stages import JUMP_SD, Continuity, Refinement, Stage, flat, least
+from nfriction.fitting.stages import JUMP_SD, Refinement, Stage, flat, least
 from nfriction.fitting.trajectory import TrajectoryProblem
 from nfriction.fitting.unseen import unseen
 from nfriction.fitting.windows import cut_windows
@@ -68,13 +68,15 @@ def fit_network(
     )  # fmt: skip
     mixing = mixing_of(plant, recordings[0].convention_on(plant))
     assert isinstance(model.schedule, NeuroFuzzy)
+    # From smoothed states at full length a search creeps along hard seams.
+    jump_sd = None if continuity == "free" else JUMP_SD["soft"]
     search = Refinement(
-        plant, model, joint, mixing, terms, max_steps, callback, jump_sd=JUMP_SD[continuity],
+        plant, model, joint, mixing, terms, max_steps, callback, jump_sd=jump_sd,
         unseen=unseen(model.schedule, moved),
     )  # fmt: skip
     vector = torch.tensor([known.get(t.name, 0.0) for t in terms], dtype=torch.float64)
     found = _refined(search, start, vector, windows[-1], moved)
-    return replace(found, motions=motions, zeros=start.zeros)
+    return replace(found, motions=motions, zeros=start.zeros, continuity=continuity)
 
 
 def _refined(

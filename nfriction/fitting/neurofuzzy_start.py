@@ -6,7 +6,7 @@ from typing import TypeGuard
 import numpy as np
 import torch
 
-from nfriction.fitting.outcome import Fit
+from nfriction.fitting.outcome import Continuity, Fit
 from nfriction.fitting.preparation import constant_schedule
 from nfriction.fitting.torque import fit_torque, natural_scale
 from nfriction.friction import Constant, FrictionModel
@@ -18,13 +18,16 @@ from nfriction.signals import Motion
 NOTHING = 1e-6
 
 
-def is_constant_fit(start: Fit | None, model: FrictionModel) -> TypeGuard[Fit]:
-    """Whether a fit is one of the model's law with constant coefficients, by trajectories."""
+def is_constant_fit(
+    start: Fit | None, model: FrictionModel, continuity: Continuity = "free"
+) -> TypeGuard[Fit]:
+    """Whether a fit is one of the model's law with constant coefficients, by such trajectories."""
     return (
         start is not None
         and start.model.law == model.law
         and isinstance(start.model.schedule, Constant)
         and start._residuals.numel() > 0
+        and start.continuity == continuity
     )
 
 

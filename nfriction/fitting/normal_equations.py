@@ -80,10 +80,16 @@ def add_jumps(
         seams: pairs of windows.
         sd: standard deviations, (2 joint,).
     """
-    shared, state = torch.arange(int(places[0, 0])), len(sd)
-    start = -torch.eye(state, dtype=torch.float64)
-    for (before, after), jump in zip(seams, jumps, strict=True):
-        index = torch.cat([shared, places[before], places[after, :state]])
-        rows = torch.cat([ends[before], start], -1) / sd[:, None]
-        gradient[index] += jump @ rows
-        hessian[index[:, None], index] += rows.T @ rows
+    shared, state = int(places[0, 0]), len(sd)
+    before, after = ([pair[k] for pair in seams] for k in (0, 1))
+    start = -torch.eye(state, dtype=torch.float64).expand(len(seams), -1, -1)
+    rows = torch.cat([ends[before], start], -1) / sd[:, None]
+    common, own = rows[..., :shared], rows[..., shared:]
+    gradient[:shared] += jumps.flatten() @ common.flatten(0, 1)
+    hessian[:shared, :shared] += common.flatten(0, 1).T @ common.flatten(0, 1)
+    for k, place in enumerate(torch.cat([places[before], places[after, :state]], -1)):
+        mixed = own[k].T @ common[k]
+        gradient[place] += jumps[k] @ own[k]
+        hessian[place, :shared] += mixed
+        hessian[:shared, place] += mixed.T
+        hessian[place[:, None], place] += own[k].T @ own[k]

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -27,6 +27,8 @@ from nfriction.signals import Motion
 from nfriction.solve.levenberg import LeastSquaresResult
 
 Plant = PendulumChain | LinearAxis
+# Whether the windows of a recording make one motion.
+Continuity = Literal["free", "soft", "hard"]
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,7 @@ class Fit:
         zeros: of encoders that were zeroed anew at the start of each recording, what they fall
             short of the true positions, in joint coordinates [rad or m]; a row for each recording.
         uncertainty: standard deviation of the coefficients at any motion; None for a torque fit.
+        continuity: of the windows that were fitted, see `fit`.
     """
 
     model: FrictionModel
@@ -69,6 +72,7 @@ class Fit:
     warnings: tuple[str, ...] = ()
     zeros: tuple[tuple[float, ...], ...] = ()
     uncertainty: CoefficientUncertainty | None = None
+    continuity: Continuity = "free"
 
     @property
     def residual_unit(self) -> str:
@@ -91,6 +95,7 @@ class Fit:
             },
             "lost": list(self.lost),
             "warnings": list(self.warnings),
+            **({} if self.continuity == "free" else {"continuity": self.continuity}),
             **({"zeros": [list(zero) for zero in self.zeros]} if self.zeros else {}),
         }
 
@@ -164,6 +169,7 @@ def trajectory_outcome(
         warnings=warnings_of(
             converged=result.converged, at_bounds=at_bounds, lost=lost, residual=residual,
             effective_sd=noise, quantum=plant.position_quantum, unit=plant.unit,
+            largest_jump=problem.largest_jump(result.x),
         ),
         uncertainty=uncertainty,
     )  # fmt: skip
@@ -187,7 +193,7 @@ def _told_by_data(
     score = problem.score_covariance(result.x, local_noise(residuals))
     # Where a network is only held to its law, the data leave it open.
     curvature, n = result.hessian.clone(), problem.friction_count
-    curvature[:n, :n] -= problem.held_curvature(result.x)
+    curvature[:n, :n] -= problem.held(result.x)[1]
     known = evidence(curvature, precision, count, problem.noise_sd, problem.noise_sd, score)
     constant = isinstance(problem.friction.schedule, Constant)
     shown = fitted.clone()

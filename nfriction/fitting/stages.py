@@ -2,12 +2,11 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import torch
 from torch import Tensor
 
-from nfriction.fitting.outcome import Plant
+from nfriction.fitting.outcome import Continuity, Plant
 from nfriction.fitting.plant_parameters import PlantParameter
 from nfriction.fitting.preparation import substeps_of
 from nfriction.fitting.residuals import effective_noise
@@ -21,11 +20,10 @@ from nfriction.solve.least_squares import Status
 from nfriction.solve.levenberg import FULL, LeastSquaresResult, Step
 
 Callback = Callable[[str, Step], bool | None]
-Continuity = Literal["free", "soft", "hard"]
 
 # By how much position and velocity may jump from the end of a window to the start of the next
-# [rad, rad/s; m, m/s]. In short windows the positions outweigh that: a search from far away finds
-# its way, and the windows come together as they grow.
+# [rad, rad/s; m, m/s]. Beside the soft ones the positions of short windows count enough for a
+# search from far away to find its way; along the hard ones it would creep.
 JUMP_SD: dict[Continuity, tuple[float, float] | None] = {
     "free": None, "soft": (3e-4, 0.01), "hard": (1e-6, 3e-5),
 }  # fmt: skip
@@ -109,13 +107,22 @@ class Refinement:
         object.__setattr__(self, "jacobian", jacobian)
 
     def problem(
-        self, windows: Windows, noise: float, mean: Tensor | None = None, stride: int = 1
+        self,
+        windows: Windows,
+        noise: float,
+        mean: Tensor | None = None,
+        stride: int = 1,
+        far: bool = False,
     ) -> TrajectoryProblem:
-        """The least-squares problem of windows; see `TrajectoryProblem`."""
+        """The least-squares problem of windows; see `TrajectoryProblem`.
+
+        From `far`, windows join softly at most.
+        """
+        jump_sd = JUMP_SD["soft"] if far and self.jump_sd else self.jump_sd
         return TrajectoryProblem(
             self.jacobian, windows, noise, self.mixing,
             substeps=substeps_of(self.plant, self.model, self.joint), plant_mean=mean,
-            stride=stride, zero_sd=self.zero_sd, jump_sd=self.jump_sd,
+            stride=stride, zero_sd=self.zero_sd, jump_sd=jump_sd,
             unseen=self.unseen,
         )  # fmt: skip
 

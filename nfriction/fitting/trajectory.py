@@ -161,7 +161,8 @@ class TrajectoryProblem:
     def cost(self, x: Tensor) -> Tensor:
         """Half the sum of squares of residuals, jumps, what is held and prior."""
         precision, mean = self.prior()
-        rows = (self.residuals(x), self.jumps(x), self.held(x))
+        held = torch.zeros(0) if self.unseen is None else self.unseen.residuals(self._network(x))
+        rows = (self.residuals(x), self.jumps(x), held)
         misfit = torch.stack([row.square().sum() for row in rows]).sum()
         return 0.5 * (misfit + (precision * (x - mean) ** 2).sum())
 
@@ -172,18 +173,17 @@ class TrajectoryProblem:
         end = torch.cat([run.q[before, -1] - self.zeros(x)[before], run.qd[before, -1]], -1)
         return (end - self.split(x)[2][after]) / self._jump_sd
 
-    def held(self, x: Tensor) -> Tensor:
-        """Deviation from the constant law at unseen motions over what is expected, in one row."""
-        if self.unseen is None:
-            return torch.zeros(0, dtype=torch.float64)
-        return self.unseen.residuals(self._network(x))
+    def largest_jump(self, x: Tensor) -> float:
+        """Over what is expected; 0 where windows have nothing to do with each other."""
+        jumps = self.jumps(x).abs()
+        return float(jumps.max()) if jumps.numel() else 0.0
 
-    def held_curvature(self, x: Tensor) -> Tensor:
-        """Its share of the Gauss-Newton model's curvature, over the friction model's parameters."""
+    def held(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradient and curvature by what is held at unseen motions, over friction parameters."""
         if self.unseen is None:
-            return torch.zeros(self.friction_count, self.friction_count, dtype=torch.float64)
-        slope = self.unseen.jacobian(self._network(x))
-        return slope.T @ slope
+            none = torch.zeros(self.friction_count, dtype=torch.float64)
+            return none, none.expand(len(none), -1)
+        return self.unseen.normal_equations(self._network(x))
 
     def _network(self, x: Tensor) -> NeuroFuzzy:
         schedule = self.friction.schedule
@@ -199,10 +199,9 @@ class TrajectoryProblem:
         if self._seams:
             places = self._own_places()
             add_jumps(gradient, hessian, self.jumps(x), ends, self._seams, places, self._jump_sd)
-        if self.unseen is not None:
-            slope, n = self.unseen.jacobian(self._network(x)), self.friction_count
-            gradient[:n] += self.held(x) @ slope
-            hessian[:n, :n] += slope.T @ slope
+        slope, curvature = self.held(x)
+        gradient[: len(slope)] += slope
+        hessian[: len(slope), : len(slope)] += curvature
         hessian.diagonal().add_(precision)
         self._hessian = hessian
         return Quadratic(self.cost(x), gradient + precision * (x - mean), hessian)

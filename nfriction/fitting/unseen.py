@@ -42,12 +42,21 @@ class Unseen:
         deviation = schedule(self.qd, self.qdd) - schedule.reference_coefficients()
         return (deviation * self._factor(schedule)).flatten()
 
-    def jacobian(self, schedule: NeuroFuzzy) -> Tensor:
-        """Its derivative by the parameter vector, (row, parameter)."""
-        by = schedule.sensitivities(self.qd, self.qdd)
-        own = by.joint == torch.arange(schedule.joints)[:, None]
-        rows = by.parameters[:, None] * own[:, None].to(self.qd)
-        return (rows * self._factor(schedule)[..., None]).flatten(0, 2)
+    def normal_equations(self, schedule: NeuroFuzzy) -> tuple[Tensor, Tensor]:
+        """J^T r and J^T J of the residuals, over the parameter vector."""
+        by, factor = schedule.sensitivities(self.qd, self.qdd), self._factor(schedule)
+        r = self.residuals(schedule).view_as(factor)
+        slopes, count = by.parameters, len(by.joint)
+        gradient = torch.zeros(count, dtype=torch.float64)
+        hessian = torch.zeros(count, count, dtype=torch.float64)
+        # No parameter acts on two joints.
+        for j in range(schedule.joints):
+            own = (by.joint == j).nonzero().squeeze(-1)
+            held = self.weight[:, j] > 0
+            rows = (slopes[held][..., own] * factor[held, j, :, None]).flatten(0, 1)
+            gradient[own] = r[held, j].flatten() @ rows
+            hessian[own[:, None], own] = rows.T @ rows
+        return gradient, hessian
 
     def _factor(self, schedule: NeuroFuzzy) -> Tensor:
         return self.weight[..., None] / (HELD_SD * schedule.scale)
@@ -64,7 +73,7 @@ def unseen(schedule: NeuroFuzzy, motions: Sequence[Motion]) -> Unseen:
         [binary_dilation(n > 0, iterations=NEAR) for n in visits(schedule, motions, CELLS)]
     )
     places = np.arange(SPACING // 2, CELLS, SPACING)
-    points = (torch.as_tensor(places) + 0.5) / CELLS
+    points = (torch.as_tensor(places, dtype=torch.float64) + 0.5) / CELLS
     velocity, acceleration = torch.cartesian_prod(points, points).unbind(-1)
     lower, upper = schedule.acceleration_lower, schedule.acceleration_upper
     weight = ~near[:, places[:, None], places].reshape(schedule.joints, -1)

@@ -21,6 +21,8 @@ TRADED = 30.0
 NAMED = 0.3
 # Left over beyond this many times the encoder's rounding is the model's own error.
 MODEL_ERROR = 3.0
+# Windows that are to make one motion do so up to this many standard deviations of a jump.
+JOINED = 5.0
 
 
 @dataclass(frozen=True)
@@ -178,11 +180,17 @@ def warnings_of(
     effective_sd: float,
     quantum: float | None,
     unit: str,
+    largest_jump: float = 0.0,
 ) -> tuple[str, ...]:
     """Sentences on what to be wary of; none for a fit without blemish."""
     found = []
     if not converged:
         found.append("The search did not end at a minimum; intervals may be too narrow.")
+    if not largest_jump <= JOINED:
+        found.append(
+            f"Windows do not join: the state jumps by {largest_jump:.3g} times what their "
+            "continuity expects. The law is not right, or the motion forgets its start."
+        )
     if at_bounds:
         found.append(f"At a bound: {', '.join(at_bounds)}; the data ask for values beyond it.")
     if lost:

@@ -70,12 +70,13 @@ def coefficient_surfaces(
         rows, columns, width or (style.COLUMN if columns == 1 else style.PAGE), 0.7 + 1.5 * rows,
         sharex=share, sharey=share,
     )  # fmt: skip
+    visited = None if motions is None else visits(schedule, motions, CELLS)
     for j, maps in enumerate(axes.T if across else axes):
         edges = _edges(schedule, j)
         qd, qdd = _middles(schedule, edges)
         with torch.no_grad():
             values = schedule(qd, qdd)[:, :, j].numpy()
-        counts = None if motions is None else visits(schedule, motions, CELLS)[j].T
+        counts = None if visited is None else visited[j].T
         seen = None if counts is None else binary_dilation(counts > 0, iterations=NEAR)
         sd = None if uncertainty is None else uncertainty.sd(qd, qdd)[:, :, j].numpy()
         for ax, (k, coefficient) in zip(maps, coefficients, strict=True):
@@ -132,12 +133,14 @@ def coefficient_sections(
     if schedule.along_motion:
         levels = ("braking", "steady", "speeding up")
     looks = style.looks(levels)
+    visited = None if motions is None else visits(schedule, motions, CELLS)
     for j, panels in enumerate(axes):
         edges = _edges(schedule, j)
         accelerations = _levels(*range_of(schedule, j, 1))
         speed = 0.5 * (edges[0][1:] + edges[0][:-1])
         value, sd = _sections(schedule, uncertainty, j, speed, accelerations)
-        seen = [_seen_along(schedule, motions, j, edges, a) for a in accelerations]
+        counts = None if visited is None else visited[j].T
+        seen = [_seen_along(counts, edges, a) for a in accelerations]
         told = ", ".join(f"{float(f'{a:.2g}'):g}" for a in accelerations).replace("-", "−")
         style.title(panels[0], f"{names[j]}, at {told} {unit}/s²")
         for ax, (k, coefficient) in zip(panels, coefficients, strict=True):
@@ -224,17 +227,11 @@ def _acceleration_label(schedule: NeuroFuzzy, unit: str) -> str:
     return f"acceleration{' along motion' if schedule.along_motion else ''} [{unit}/s²]"
 
 
-def _seen_along(
-    schedule: NeuroFuzzy,
-    motions: Sequence[Motion] | None,
-    joint: int,
-    edges: Edges,
-    acceleration: float,
-) -> NDArray[np.bool_]:
-    """Where along a line of constant acceleration the motions came near, (cell,)."""
-    if motions is None:
+def _seen_along(counts: Array | None, edges: Edges, acceleration: float) -> NDArray[np.bool_]:
+    """Where along a line of constant acceleration samples came near, (cell,)."""
+    if counts is None:
         return np.ones(CELLS, dtype=bool)
-    near = binary_dilation(visits(schedule, motions, CELLS)[joint].T > 0, iterations=NEAR)
+    near = binary_dilation(counts > 0, iterations=NEAR)
     row = np.clip(np.searchsorted(edges[1], acceleration) - 1, 0, CELLS - 1)
     return np.asarray(near[row], dtype=bool)
 

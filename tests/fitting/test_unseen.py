@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from nfriction import NFLFM
+from nfriction.fitting.outcome import trajectory_outcome
 from nfriction.fitting.sensitivity import StepJacobian
 from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
 from nfriction.fitting.unseen import HELD_SD, Unseen, unseen, visits
@@ -55,10 +56,11 @@ def test_every_sample_is_counted_those_beyond_the_range_at_its_edge():
     assert not counts[1, 6:].any()
 
 
-def test_jacobian_is_the_derivative_of_the_residuals():
+def test_normal_equations_are_of_the_derivatives_of_the_residuals():
     schedule = network(0.2).schedule
     held = unseen(schedule, [swings(1.0, 0.5)])
-    at, found, columns = schedule.parameter_vector(), held.jacobian(schedule), []
+    at, columns = schedule.parameter_vector(), []
+    r, (gradient, hessian) = held.residuals(schedule), held.normal_equations(schedule)
     for k in range(len(at)):
         unit = torch.zeros_like(at)
         unit[k] = 1e-5
@@ -67,7 +69,9 @@ def test_jacobian_is_the_derivative_of_the_residuals():
             schedule.set_parameter_vector(at + sign * unit)
             ends.append(held.residuals(schedule))
         columns.append((ends[1] - ends[0]) / 2e-5)
-    torch.testing.assert_close(found, torch.stack(columns, -1), rtol=1e-5, atol=1e-6)
+    slope = torch.stack(columns, -1)
+    torch.testing.assert_close(gradient, slope.T @ r, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(hessian, slope.T @ slope, rtol=1e-5, atol=1e-5)
 
 
 def test_a_deviation_counts_in_units_of_the_scale():
@@ -103,13 +107,15 @@ def test_what_is_held_is_part_of_the_cost_and_of_its_model(size):
     held = unseen(model.schedule, [swings(1.0, 0.5)])
     free, tied = problem(model, None), problem(model, held)
     x = free.start()
-    r, slope, n = held.residuals(model.schedule), held.jacobian(model.schedule), tied.friction_count
+    r, n = held.residuals(model.schedule), tied.friction_count
+    slope, curvature = held.normal_equations(model.schedule)
     torch.testing.assert_close(tied.cost(x) - free.cost(x), 0.5 * r.square().sum())
     a, b = free.quadratic(x), tied.quadratic(x)
-    torch.testing.assert_close(b.gradient[:n] - a.gradient[:n], r @ slope, rtol=1e-7, atol=1e-6)
+    torch.testing.assert_close(b.gradient[:n] - a.gradient[:n], slope, rtol=1e-7, atol=1e-6)
     difference = b.hessian - a.hessian
-    torch.testing.assert_close(difference[:n, :n], tied.held_curvature(x), rtol=1e-7, atol=1e-4)
+    torch.testing.assert_close(difference[:n, :n], curvature, rtol=1e-7, atol=1e-4)
     assert not difference[n:].any()
+    assert not free.held(x)[0].any()
 
 
 def test_a_network_fitted_so_deviates_less_where_nothing_was_seen():
@@ -122,3 +128,23 @@ def test_a_network_fitted_so_deviates_less_where_nothing_was_seen():
         deviation.append(float(held.residuals(model.schedule).square().mean().sqrt()))
         assert float(p.errors(result.x).abs().max()) < 1e-3
     assert deviation[1] < 0.5 * deviation[0]
+
+
+def test_what_is_only_held_is_not_taken_for_told_by_the_data(monkeypatch):
+    model = network()
+    held = unseen(model.schedule, [swings(1.0, 1.0)])
+    p = problem(model, held)
+    result = solve_trajectory(p, p.start(), max_steps=5)
+    where = (held.weight > 0)[..., None].expand(-1, -1, 2)
+
+    def openness() -> torch.Tensor:
+        found = trajectory_outcome(p, result, p.errors(result.x), ())
+        return (found.uncertainty.sd(held.qd, held.qdd) / model.schedule.scale)[where]
+
+    told = openness()
+    # As if the data had said what was held.
+    none = torch.zeros(p.friction_count, dtype=F64)
+    monkeypatch.setattr(p, "held", lambda x: (none, none.expand(len(none), -1)))
+    mistaken = openness()
+    assert (told >= (1 - 1e-6) * mistaken).all()
+    assert told.median() > 1.3 * mistaken.median()

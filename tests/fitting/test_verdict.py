@@ -149,3 +149,7 @@ def test_warnings_name_what_is_wrong_and_are_silent_otherwise():
     assert "B of joint1" in bad[1]
     assert "drag reach" in bad[2]
     assert "10 times" in bad[3]
+    assert warnings_of(**good, largest_jump=4.9) == ()
+    for jump in (6.0, float("inf"), float("nan")):
+        (told,) = warnings_of(**good, largest_jump=jump)
+        assert "do not join" in told
