@@ -1,6 +1,7 @@
 """Scores: position errors of free runs and of windows, in the recording's own coordinates."""
 
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -14,7 +15,7 @@ from nfriction.friction import FrictionModel
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.recording import Recording
 from nfriction.signals import Motion, kalman_smoother
-from nfriction.simulation import Friction, required_substeps, rollout
+from nfriction.simulation import Friction, Scheme, required_substeps, rollout
 
 logger = logging.getLogger(__name__)
 
@@ -25,6 +26,8 @@ HORIZONS = (1.0, 2.0, 5.0)
 # A sign that passes within a hundredth of a sample is a wall, not friction: scoring it would take
 # minutes, and its search has failed anyhow.
 MOST_SUBSTEPS = 100
+# Semi-implicit steps are of first order: short ones for errors below an encoder's [s].
+STOP_STEP = 2e-4
 
 
 @dataclass(frozen=True)
@@ -94,6 +97,7 @@ def score(
     motion: Motion | None = None,
     initial_state: Start | None = None,
     horizons: Sequence[float] = HORIZONS,
+    scheme: Scheme = "rk4",
 ) -> Score:
     """Simulate a recording and measure the position error.
 
@@ -106,6 +110,8 @@ def score(
         initial_state: q0 and qd0 of the free run in the recording's convention, (joint,) each;
             default from the smoothed motion.
         horizons: lengths of windows [s]; those longer than the recording are left out.
+        scheme: of the integration, see `rollout`; `"stop"` where joints come to rest off their
+            balance, which a smoothed sign lets creep back.
 
     Returns:
         Errors in the recording's coordinates and unit.
@@ -117,7 +123,10 @@ def score(
     if initial_state is not None:
         q0 = convention.position_to_joint(np.asarray(initial_state[0]), first_link)
         qd0 = convention.rate_to_joint(np.asarray(initial_state[1]), first_link)
-    substeps = _substeps(plant, friction, recording.longest_step, recording.name)
+    if scheme == "stop":
+        substeps: int | None = max(1, math.ceil(recording.longest_step / STOP_STEP))
+    else:
+        substeps = _substeps(plant, friction, recording.longest_step, recording.name)
     quantum = getattr(plant, "position_quantum", None)
     off = np.zeros((1, len(q0))) if quantum is None else np.eye(len(q0) + 1, len(q0), -1) * quantum
     run = np.broadcast_to(motion.q, (len(off), *motion.q.shape)).copy()
@@ -127,7 +136,9 @@ def score(
             q0, qd0 = motion.q[first], motion.qd[first]
         tau = None if joint.tau is None else joint.tau[first:last]
         step = np.diff(joint.time[first : last + 1])
-        piece, lost = _simulate(plant, friction, (q0 + off, qd0), tau, step, substeps)
+        piece, lost = _simulate(
+            plant, friction, (q0 + off, qd0), tau, step, substeps, scheme=scheme
+        )
         run[:, first : last + 1] = piece
         diverged_at = min(diverged_at, joint.time[first] - joint.time[0] + float(lost[0]))
     simulated = convention.position_from_joint(run, first_link)
@@ -138,7 +149,7 @@ def score(
     return Score(
         recording=recording.name,
         free_run=Rmse.of(simulated[0] - recording.q),
-        windows=_windows(plant, friction, recording, motion, horizons, substeps),
+        windows=_windows(plant, friction, recording, motion, horizons, substeps, scheme),
         floor=floor,
         time=recording.time,
         simulated=simulated[0],
@@ -175,6 +186,7 @@ def _simulate(
     step: Array,
     substeps: int | None,
     memory: torch.Tensor | None = None,
+    scheme: Scheme = "rk4",
 ) -> tuple[Array, Array]:
     """Positions (*batch, sample, joint) in joint coordinates, and when they diverged (*batch,)."""
     q0, qd0 = start
@@ -186,7 +198,7 @@ def _simulate(
     with torch.no_grad():
         run = rollout(
             plant, friction, torch.tensor(q0), torch.tensor(qd0), torque,
-            sample_time=torch.tensor(step), substeps=substeps, memory=memory,
+            sample_time=torch.tensor(step), substeps=substeps, scheme=scheme, memory=memory,
         )  # fmt: skip
     return run.q.numpy(), run.diverged_at.numpy()
 
@@ -198,6 +210,7 @@ def _windows(
     motion: Motion,
     horizons: Sequence[float],
     substeps: int | None,
+    scheme: Scheme,
 ) -> dict[str, Rmse]:
     """Error of windows that follow each other, restarted from the smoothed motion."""
     convention = recording.convention_on(plant)
@@ -218,7 +231,7 @@ def _windows(
         tau = None if recording.tau is None else recording.tau[index]
         state = motion.q[starts], motion.qd[starts]
         memory = None if known is None else known[starts]
-        run, _ = _simulate(plant, friction, state, tau, steps[index], substeps, memory)
+        run, _ = _simulate(plant, friction, state, tau, steps[index], substeps, memory, scheme)
         simulated = convention.position_from_joint(run, plant.first_link)
         measured = recording.q[np.array(starts)[:, None] + np.arange(length + 1)]
         found[f"{horizon:g}"] = Rmse.of(simulated - measured)

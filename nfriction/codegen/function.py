@@ -106,11 +106,25 @@ class CompiledFunction:
             if x.shape[1:] != shape or not x.ndim:
                 raise ValueError(f"input {i} must be (batch, *{shape}), got {x.shape}.")
         rows = arguments.candidates({f"input {i}": len(x) for i, x in enumerate(given)})
-        p, _ = arguments.parameter_rows(self._lifted.values(), {})
-        out = [np.empty((rows, *shape)) for shape in self._outputs]
-        flat = [arguments.repeated(x, rows) for x in given]
-        self._kernel(rows, p.reshape(-1), *flat, *(o.reshape(-1) for o in out))
+        out = self.bound()(rows, *(arguments.repeated(x, rows) for x in given))
         return out[0] if len(out) == 1 else tuple(out)
+
+    def bound(self) -> Callable[..., list[arguments.Array]]:
+        """The function with its parameters as they are now and no checks, for calls in a row.
+
+        Returns:
+            `(rows, *inputs) -> outputs`, where inputs are flat, contiguous and float64, and
+            outputs (rows, *shape).
+        """
+        p, _ = arguments.parameter_rows(self._lifted.values(), {})
+        flat = p.reshape(-1)
+
+        def call(rows: int, *inputs: arguments.Array) -> list[arguments.Array]:
+            out = [np.empty((rows, *shape)) for shape in self._outputs]
+            self._kernel(rows, flat, *inputs, *(o.reshape(-1) for o in out))
+            return out
+
+        return call
 
     def check(self, example_inputs: Sequence[Tensor]) -> None:
         """Compare with eager torch at the example inputs and near them.

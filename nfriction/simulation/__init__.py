@@ -1,7 +1,7 @@
 """Rollouts of plants with friction: compiled, stepped in torch, differentiated."""
 
 from nfriction.simulation.protocols import Friction, Plant, RememberingFriction
-from nfriction.simulation.rollouts import Rollout, integrate, rollout
+from nfriction.simulation.rollouts import Rollout, Scheme, integrate, rollout
 from nfriction.simulation.steps import (
     RK4_STABILITY,
     acceleration,
@@ -16,6 +16,7 @@ __all__ = [
     "Plant",
     "RememberingFriction",
     "Rollout",
+    "Scheme",
     "acceleration",
     "integrate",
     "required_substeps",

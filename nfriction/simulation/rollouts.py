@@ -7,7 +7,7 @@ acceleration needs friction.
 
 import logging
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -26,9 +26,11 @@ from nfriction.simulation.inputs import (
 from nfriction.simulation.mechanism import mechanism_of
 from nfriction.simulation.protocols import Friction, Plant
 from nfriction.simulation.steps import stepped
+from nfriction.simulation.sticking import stuck
 
 logger = logging.getLogger(__name__)
 
+Scheme = Literal["rk4", "stop"]
 # Beyond this many steps gradients are rarely meant and may take gigabytes: they must be asked for.
 GRADIENT_STEPS = 10_000
 # A joint faster than this [rad/s] has left any mechanism's range: the rollout has diverged.
@@ -71,6 +73,7 @@ def rollout(
     sample_time: float | Tensor = 1e-3,
     steps: int | None = None,
     substeps: int = 1,
+    scheme: Scheme = "rk4",
     drive: Literal["simulated", "measured"] = "simulated",
     measured: tuple[Tensor, Tensor] | None = None,
     memory: Tensor | None = None,
@@ -95,6 +98,10 @@ def rollout(
         steps: number of steps; may be left out where `tau` or `sample_time` gives it.
         substeps: Runge-Kutta steps to each sample. Coefficients with a memory advance once a
             sample; others are held anew at each of these steps.
+        scheme: `"rk4"` takes friction as the smooth function of velocity that it is, and creeps
+            where it ought to rest; `"stop"` takes semi-implicit steps of first order in which dry
+            friction stops a joint and holds it, however steep. It needs shorter steps, and has no
+            gradients, no measured drive and no coefficients with a memory.
         drive: what drives motion-dependent coefficients: the simulated motion, or the
             `measured` one, as in the papers.
         measured: velocity and acceleration for `drive="measured"`, each (*batch, steps, joint).
@@ -115,14 +122,23 @@ def rollout(
         no error: `diverged_at` tells when, and NaN follows.
 
     Raises:
-        ValueError: if shapes do not fit, inputs are not finite, or the friction is so steep at
-            rest that the integration would be unstable.
+        ValueError: if shapes do not fit, inputs are not finite, the friction is so steep at rest
+            that the integration would be unstable, or the scheme cannot do what is asked.
         CodegenError: if a backend asked for by name cannot serve.
     """
     if substeps < 1:
         raise ValueError(f"`substeps` must be at least 1, got {substeps}.")
     q, qd, torque, step, steps = prepared(plant, friction, q0, qd0, tau, sample_time, steps)
     measured = driving_motion(drive, measured, q, steps)
+    if scheme not in get_args(Scheme):
+        raise ValueError(f"`scheme` must be one of {get_args(Scheme)}, got {scheme!r}.")
+    if scheme == "stop":
+        if friction is None or gradients or measured is not None or memory is not None:
+            raise ValueError(
+                '`scheme="stop"` needs a friction model, and has no gradients, measured drive or '
+                'memory; use scheme="rk4" for these.'
+            )
+        return _finished(step, stuck(plant, friction, q, qd, torque, step, substeps, progress))
     refuse_unstable(plant, friction, float(step.max()), substeps)
     memory = given_memory(friction, memory, q)
     if memory is not None:
@@ -187,6 +203,11 @@ def integrate(
     else:
         with torch.no_grad():
             states = simulate()
+    return _finished(step, states)
+
+
+def _finished(step: Tensor, states: tuple[Tensor, ...]) -> Rollout:
+    """A motion with its time; what diverged is NaN from there on."""
     time = torch.cat([torch.zeros_like(step[..., :1]), step.cumsum(-1)], -1)
     q, qd, qdd = states
     diverged_at = _divergence(time, q, qd)
