@@ -204,7 +204,10 @@ class TrajectoryProblem:
         hessian[: len(slope), : len(slope)] += curvature
         hessian.diagonal().add_(precision)
         self._hessian = hessian
-        return Quadratic(self.cost(x), gradient + precision * (x - mean), hessian)
+        # Neither seams nor zeros make states of windows depend on each other.
+        alone = not self._seams and not self.zero_count
+        blocks = (self.shared_count, 2 * self.windows.q0.shape[-1]) if alone else None
+        return Quadratic(self.cost(x), gradient + precision * (x - mean), hessian, blocks)
 
     def spread(self) -> Tensor:
         """Standard deviation of every shared parameter by the last quadratic model."""

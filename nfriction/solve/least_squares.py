@@ -40,11 +40,13 @@ class Quadratic:
         cost: half the sum of squared residuals.
         gradient: J^T r, shape (p,).
         hessian: Gauss-Newton J^T J (or any positive semidefinite curvature), shape (p, p).
+        blocks: where the Hessian's last part is block diagonal, its first row and the blocks' size.
     """
 
     cost: float | Tensor
     gradient: Tensor
     hessian: Tensor
+    blocks: tuple[int, int] | None = None
 
     @property
     def finite(self) -> bool:

@@ -23,6 +23,7 @@ from nfriction.solve.least_squares import (
     from_residuals,
     positive_diagonal,
 )
+from nfriction.solve.semidefinite import solve_bordered, solve_semidefinite
 
 __all__ = [
     "LeastSquaresResult",
@@ -233,12 +234,20 @@ class _Search:
         free = ~self.frozen()
         while free.any():
             given = slope[free] + system[free][:, ~free] @ step[~free]
-            step[free] = -_solve(system[free][:, free], given)
+            step[free] = -self._solved(system[free][:, free], given, free)
             outside = free & ((step < low) | (step > high))
             if not outside.any():
                 break
             step, free = step.clamp(low, high), free & ~outside
         return step / root
+
+    def _solved(self, matrix: Tensor, vector: Tensor, free: Tensor) -> Tensor:
+        """Solution for the free parameters, block by block where the model has blocks."""
+        if self.local.blocks is not None:
+            first, size = self.local.blocks
+            if first < len(free) and free[first:].all():
+                return solve_bordered(matrix, vector, int(free[:first].sum()), size)
+        return solve_semidefinite(matrix, vector)
 
     def predicted_fall(self, step: Tensor) -> float:
         return -float(self.local.gradient @ step + 0.5 * step @ (self.local.hessian @ step))
@@ -285,20 +294,8 @@ class _Search:
                 f"of shape ({p}, {p}), got {tuple(local.gradient.shape)} and "
                 f"{tuple(local.hessian.shape)}."
             )
-        return Quadratic(float(local.cost), local.gradient.detach(), local.hessian.detach())
-
-
-def _solve(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Solve a positive semidefinite system; in singular ones the shortest solution."""
-    factor, failed = torch.linalg.cholesky_ex(matrix)
-    if not failed:
-        solution = torch.cholesky_solve(vector[:, None], factor)[:, 0]
-        if torch.isfinite(solution).all():
-            return solution
-    values, vectors = torch.linalg.eigh(matrix)
-    cut = torch.finfo(matrix.dtype).eps * len(values) * values.abs().max()
-    inverse = torch.where(values > cut, 1 / values, 0.0)
-    return vectors @ (inverse * (vectors.T @ vector))
+        cost, gradient, hessian = local.cost, local.gradient.detach(), local.hessian.detach()
+        return Quadratic(float(cost), gradient, hessian, local.blocks)
 
 
 def _bounds(

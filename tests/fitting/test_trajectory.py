@@ -226,3 +226,15 @@ def test_only_neighbours_in_time_have_seams():
     assert replace(w, spans=((0, 20, 36), (0, 0, 20))).seams() == [(1, 0)]
     assert replace(w, spans=((0, 0, 20), (0, 21, 36))).seams() == []
     assert replace(w, spans=()).seams() == []
+
+
+@pytest.mark.parametrize("joined", [False, True])
+@pytest.mark.parametrize("zero_sd", [None, torch.full((2, 2), 0.05, dtype=torch.float64)])
+def test_states_are_told_to_be_blocks_only_where_they_are(joined, zero_sd):
+    p = problem(bent("LFM"), joined=joined, zero_sd=zero_sd)
+    found = p.quadratic(point(p))
+    first, count = p.shared_count, 2 * p.windows.q0.shape[-1]
+    across = found.hessian[first : first + count, first + count :]
+    assert (found.blocks is None) == bool(across.any() or zero_sd is not None)
+    if found.blocks is not None:
+        assert found.blocks == (first, count)
