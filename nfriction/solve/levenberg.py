@@ -34,6 +34,8 @@ __all__ = [
     "from_residuals",
 ]
 
+# Fewer blocks than this are solved as fast in one piece.
+MANY = 100
 # Damping is relative to the (unit) scaled diagonal. Beyond LARGEST a step is lost in rounding;
 # a rejection lifts it at least to SMALLEST, where it begins to matter at all. Below FLOOR it no
 # longer keeps rounding from drifting along a singular direction. Only up to FULL is a short step
@@ -245,7 +247,7 @@ class _Search:
         """Solution for the free parameters, block by block where the model has blocks."""
         if self.local.blocks is not None:
             first, size = self.local.blocks
-            if first < len(free) and free[first:].all():
+            if len(free) - first >= MANY * size and free[first:].all():
                 return solve_bordered(matrix, vector, int(free[:first].sum()), size)
         return solve_semidefinite(matrix, vector)
 

@@ -42,8 +42,9 @@ def test_what_nothing_tells_stays_at_zero(lost):
 
 
 @pytest.mark.parametrize("bound", [float("inf"), 0.05])
-def test_a_search_goes_the_same_way_with_blocks_and_without(bound):
+def test_a_search_goes_the_same_way_with_blocks_and_without(bound, monkeypatch):
     """Also where a shared unknown ends at a bound."""
+    monkeypatch.setattr("nfriction.solve.levenberg.MANY", COUNT)
     jacobian, r = bordered()
     upper = torch.full((jacobian.shape[1],), torch.inf, dtype=F64)
     upper[0] = bound
