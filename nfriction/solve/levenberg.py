@@ -14,6 +14,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from nfriction.solve.box import bounds_of, minimise_within, on_bounds
 from nfriction.solve.least_squares import (
     LeastSquaresResult,
     Quadratic,
@@ -117,7 +118,7 @@ class LevenbergMarquardt:
             raise ValueError(
                 f"`x0` must be a vector of floats, got {x0.dtype} of shape {tuple(x0.shape)}."
             )
-        low, high = _bounds(x0, lower, upper)
+        low, high = bounds_of(x0, lower, upper)
         search = _Search(model, cost, x0.detach().clamp(low, high), low, high)
         try:
             status = self._run(search, callback)
@@ -228,19 +229,13 @@ class _Search:
         return float(cosines.max()) if len(cosines) else 0.0
 
     def bounded_step(self, root: Tensor) -> Tensor:
-        """Minimiser of the damped quadratic; what would leave the bounds is pinned to them."""
+        """Minimiser of the damped quadratic within the bounds."""
         system = self.local.hessian / (root[:, None] * root)
         system.diagonal().add_(self.damping)
-        slope, step = self.local.gradient / root, torch.zeros_like(root)
         low, high = (self.lower - self.x) * root, (self.upper - self.x) * root
-        free = ~self.frozen()
-        while free.any():
-            given = slope[free] + system[free][:, ~free] @ step[~free]
-            step[free] = -self._solved(system[free][:, free], given, free)
-            outside = free & ((step < low) | (step > high))
-            if not outside.any():
-                break
-            step, free = step.clamp(low, high), free & ~outside
+        step = minimise_within(
+            system, self.local.gradient / root, low, high, ~self.frozen(), self._solved
+        )
         return step / root
 
     def _solved(self, matrix: Tensor, vector: Tensor, free: Tensor) -> Tensor:
@@ -256,7 +251,7 @@ class _Search:
 
     def attempt(self, step: Tensor, norm: float) -> float:
         """Move if the cost falls and all is finite; return the fall (-inf where not finite)."""
-        trial = (self.x + step).clamp(self.lower, self.upper)
+        trial = on_bounds(self.x + step, self.lower, self.upper)
         self.evaluations += 1
         if self.trial_cost is None:
             there = self._checked(self.model(trial))
@@ -298,19 +293,3 @@ class _Search:
             )
         cost, gradient, hessian = local.cost, local.gradient.detach(), local.hessian.detach()
         return Quadratic(float(cost), gradient, hessian, local.blocks)
-
-
-def _bounds(
-    x0: Tensor, lower: Tensor | float | None, upper: Tensor | float | None
-) -> tuple[Tensor, Tensor]:
-    low = torch.as_tensor(-math.inf if lower is None else lower, dtype=x0.dtype, device=x0.device)
-    high = torch.as_tensor(math.inf if upper is None else upper, dtype=x0.dtype, device=x0.device)
-    for name, bound in (("lower", low), ("upper", high)):
-        if bound.shape not in ((), x0.shape):
-            raise ValueError(
-                f"`{name}` must be a number or have the shape of `x0`, {tuple(x0.shape)}, got "
-                f"{tuple(bound.shape)}."
-            )
-    if not (low <= high).all():
-        raise ValueError("`lower` must not exceed `upper`, and neither may be NaN.")
-    return low.expand_as(x0), high.expand_as(x0)
