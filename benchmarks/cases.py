@@ -90,11 +90,13 @@ def numbers(plant: PendulumChain, friction: FrictionModel) -> Numbers:
             "unit_centre": head.centres,
             "unit_precision": 0.5 * torch.exp(-2.0 * head.log_widths),
             "unit_out": head.output_weight,
-            "bias": head.output_bias + schedule.reference,
+            "bias": head.output_bias,
+            "reference": schedule.reference,
             "scale": schedule.scale,
         }
         network = {name: t.detach().numpy() for name, t in tensors.items()}
-        network |= {"turn": np.array(schedule.turn), "roundness": np.array(schedule.roundness)}
+        for name in ("turn", "reach", "roundness"):
+            network[name] = np.array(getattr(schedule, name))
     rest = torch.zeros(3, dtype=torch.float64)
     values = friction.coefficients(rest, rest).detach().numpy()
     return Numbers(

@@ -17,7 +17,8 @@ struct rig { /* a_ij [kg m^2], g b_i [N m], l_i/g [s^2], 1/v_smooth [s/rad] */
 struct network { /* of one joint; `plane` holds slopes and constant of both outputs */
     double inverse_range, inverse_turn, lower, inverse_span, centre[2][TERMS],
         inverse_width[2][TERMS], plane[TERMS][TERMS][6], unit_centre[UNITS][4],
-        unit_precision[UNITS][4], unit_out[UNITS][2], bias[2], scale[2], roundness;
+        unit_precision[UNITS][4], unit_out[UNITS][2], bias[2], reference[2], scale[2], roundness,
+        inverse_reach;
 };
 
 static void acceleration(const struct rig *p, const double c[N][2], int loaded, const double *q,
@@ -82,7 +83,11 @@ static void coefficients(const struct network *f, const double *qd, const double
     int j, k, a, b, u;
     for (j = 0; j < N; ++j, ++f) {
         const double v = qd[j] * f->inverse_range, along = qdd[j] * tanh(v * f->inverse_turn);
-        const double x[2] = {clamp(fabs(v)), clamp((along - f->lower) * f->inverse_span)};
+        const double given[2] = {fabs(v), (along - f->lower) * f->inverse_span};
+        const double x[2] = {clamp(given[0]), clamp(given[1])};
+        const double e0 = (given[0] - x[0]) * f->inverse_reach;
+        const double e1 = (given[1] - x[1]) * f->inverse_reach;
+        const double left = fmax(1.0 - e0 * e0 - e1 * e1, 0.0);
         double w[2][TERMS], plane[6] = {0.0}, y[2], o[2];
         for (k = 0; k < 2; ++k) {
             double top = -HUGE_VAL, sum = 0.0;
@@ -112,8 +117,10 @@ static void coefficients(const struct network *f, const double *qd, const double
             o[0] += g * f->unit_out[u][0];
             o[1] += g * f->unit_out[u][1];
         }
-        for (k = 0; k < 2; ++k)
-            c[j][k] = f->scale[k] * (o[k] + sqrt(o[k] * o[k] + f->roundness));
+        for (k = 0; k < 2; ++k) {
+            const double r = f->reference[k] + left * left * o[k];
+            c[j][k] = f->scale[k] * (r + sqrt(r * r + f->roundness));
+        }
     }
 }
 

@@ -48,8 +48,8 @@ def _packed(n: dict[str, np.ndarray]) -> np.ndarray:
         fields = [
             *(1.0 / n["velocity_range"][j], 1.0 / n["turn"], n["lower"][j], 1.0 / n["span"][j]),
             *(n["centre"][j], 1.0 / n["width"][j], plane, n["unit_centre"][j]),
-            *(n["unit_precision"][j], n["unit_out"][j].T, n["bias"][j], 0.5 * n["scale"][j]),
-            4.0 * n["roundness"] ** 2,
+            *(n["unit_precision"][j], n["unit_out"][j].T, n["bias"][j], n["reference"][j]),
+            *(0.5 * n["scale"][j], 4.0 * n["roundness"] ** 2, 1.0 / n["reach"]),
         ]
         joints += [np.asarray(field).ravel() for field in fields]
     return np.concatenate(joints)

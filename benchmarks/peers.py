@@ -69,7 +69,10 @@ def jax_parts(n: Numbers) -> tuple[Callable, Callable]:
         w = n.network
         v = qd / w["velocity_range"]
         along = (qdd * jnp.tanh(v / w["turn"]) - w["lower"]) / w["span"]
-        x = jnp.clip(jnp.stack([jnp.abs(v), along], -1), 0.0, 1.0)
+        given = jnp.stack([jnp.abs(v), along], -1)
+        x = jnp.clip(given, 0.0, 1.0)
+        beyond = (given - x) / w["reach"]
+        left = jnp.maximum(1.0 - (beyond * beyond).sum(-1, keepdims=True), 0.0)
         z = (x[:, :, None] - w["centre"]) / w["width"]
         logs = -0.5 * z * z
         share = jnp.exp(logs - logs.max(-1, keepdims=True))
@@ -80,6 +83,7 @@ def jax_parts(n: Numbers) -> tuple[Callable, Callable]:
         d = jnp.concatenate([x, y], -1)[:, None, :] - w["unit_centre"]
         units = jnp.exp(-(d * d * w["unit_precision"]).sum(-1))
         u = y + w["bias"] + jnp.einsum("ju,jou->jo", units, w["unit_out"])
+        u = w["reference"] + left * left * u
         return w["scale"] * 0.5 * (u + jnp.sqrt(u * u + 4.0 * w["roundness"] ** 2))
 
     return rate, coefficients

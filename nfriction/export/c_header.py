@@ -7,7 +7,7 @@ from nfriction.codegen.emit import Real
 from nfriction.export.c_dialect import comment
 from nfriction.export.controller import AnyController
 from nfriction.export.filtered import FILTER_STATE, FilteredController
-from nfriction.export.unfiltered import CLAMPED, NOT_FINITE, SATURATED, Controller, MemoryController
+from nfriction.export.unfiltered import NOT_FINITE, OUTSIDE, SATURATED, Controller, MemoryController
 
 
 def header_of(
@@ -25,7 +25,7 @@ def header_of(
         "COEFFICIENTS": inner.coefficient_count,
         "STATE_SIZE": memory,
         "FILTER_SIZE": FILTER_STATE if filters else 0,
-        "CLAMPED": CLAMPED,
+        "OUTSIDE": OUTSIDE,
         "NOT_FINITE": NOT_FINITE,
         "SATURATED": SATURATED,
     }
@@ -85,9 +85,9 @@ def _banner(description: Mapping[str, Any]) -> str:
         *(f"    {name}" for name in names),
         "Trained ranges:",
         *(f"    {key}: {value}" for key, value in sorted(description["input_ranges"].items())),
-        "Outside them the coefficients stay as at the edge while the law goes on (CLAMPED). NaN or",
-        "infinity gives NaN for that joint (NOT_FINITE), under -ffast-math too. SATURATED: the "
-        "torque limit.",
+        f"Outside them (OUTSIDE): {description['edges']['outside_input_ranges']}.",
+        "NaN or infinity gives NaN for that joint (NOT_FINITE), under -ffast-math too.",
+        "SATURATED: the torque limit.",
         f"Torque limit: {description['torque_limit']}.",
         f"Filter: {description['filter']}.",
         f"Parameters: {description['parameter_hash']}.",

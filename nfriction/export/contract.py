@@ -16,14 +16,14 @@ from nfriction.export.errors import ContractError, first_line
 from nfriction.export.filtered import FilteredController
 from nfriction.export.parity import COEFFICIENT_SLACK, Parity, compare
 from nfriction.export.points import draw, trials
-from nfriction.export.unfiltered import CLAMPED, NOT_FINITE, SATURATED, Controller, MemoryController
+from nfriction.export.unfiltered import NOT_FINITE, OUTSIDE, SATURATED, Controller, MemoryController
 from nfriction.friction import FrictionModel
 from nfriction.modelfile import ModelInfo, describe
 
 __all__ = [
-    "CLAMPED",
     "COEFFICIENT_SLACK",
     "NOT_FINITE",
+    "OUTSIDE",
     "SATURATED",
     "AnyController",
     "Contract",
@@ -188,7 +188,7 @@ def _interface(controller: AnyController, inputs: Sequence[str]) -> dict[str, An
     """What goes in and comes out, and what happens at the edges."""
     inner = controller.inner if isinstance(controller, FilteredController) else controller
     assert isinstance(inner, (Controller, MemoryController))
-    clamped = "clamped" if inner.clamps else "held by the schedule at the edge of its own range"
+    beyond = "of clamped inputs" if inner.clamps else "as the model has them there"
     return {
         "inputs": list(inputs),
         "outputs": list(OUTPUTS),
@@ -201,9 +201,9 @@ def _interface(controller: AnyController, inputs: Sequence[str]) -> dict[str, An
         }
         if isinstance(controller, FilteredController)
         else None,
-        "status_bits": {"clamped": CLAMPED, "not_finite": NOT_FINITE, "saturated": SATURATED},
+        "status_bits": {"outside": OUTSIDE, "not_finite": NOT_FINITE, "saturated": SATURATED},
         "edges": {
-            "outside_input_ranges": f"inputs of the coefficients {clamped}; the law goes on",
+            "outside_input_ranges": f"coefficients {beyond}; the law goes on",
             "not_finite": "NaN torque and coefficients of that joint; its state stays",
         },
     }

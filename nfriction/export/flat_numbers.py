@@ -16,9 +16,8 @@ _DEEP = 40.0
 class NumberByNumber(nn.Module):
     """Coefficients of `NeuroFuzzy` for one sample of all joints.
 
-    Inputs are clamped in SI and count from the middle of their range. The rules' strengths p_i q_j
-    are never formed: consequents are blended by q, then by p. What all rules share is left out of
-    the blend: shares sum to one, and small numbers round less, which counts in single precision.
+    The rules' strengths p_i q_j are never formed: consequents are blended by q, then by p. The
+    reference is left out of the blend: small numbers round less, which counts in single precision.
 
     Args:
         schedule: as many sets of velocity as of acceleration.
@@ -28,10 +27,9 @@ class NumberByNumber(nn.Module):
     """
 
     rate: Tensor
-    lower: Tensor
-    upper: Tensor
-    middle: Tensor
-    shared: Tensor
+    gain: Tensor
+    shift: Tensor
+    reference: Tensor
     set_slope: Tensor
     set_shift: Tensor
     planes: Tensor
@@ -50,38 +48,38 @@ class NumberByNumber(nn.Module):
         self.along_motion = schedule.along_motion
         self.all_positive = bool(schedule.positive.all())
         self.least_exponent = float(schedule.network.head.least_exponent)
+        self.per_reach = 0.5 / schedule.reach
         self.joints, self.sets = schedule.joints, schedule.terms[0]
         self.outputs = schedule.network.outputs
         with torch.no_grad():
-            made = constants(schedule, centred=True)
+            made = constants(schedule)
         for name, value in made.items():
             self.register_buffer(name, value.contiguous())
-        ends = self.lower - self.middle, self.upper - self.middle
+        ends = -torch.ones_like(self.gain), torch.ones_like(self.gain)
         deepest = _deepest(self.set_slope.mT, self.set_shift.mT, *ends)
         self.shallow = deepest < _DEEP
 
     def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
         if self.along_motion:
             qdd = qdd * torch.tanh(qd * self.rate)
-        x = torch.clamp(torch.stack([qd.abs(), qdd], 1), self.lower, self.upper).unsqueeze(1)
-        x = x - self.middle.unsqueeze(1)
-        shared, own = self._at(self.shared, x), self._at(self._blended(x), x)
-        d = torch.addcmul(self.unit_shift, torch.cat([x, shared + own], 2), self.unit_slope)
+        given = torch.addcmul(self.shift, torch.stack([qd.abs(), qdd], 1), self.gain)
+        x = given.clamp(-1.0, 1.0)
+        beyond = self.per_reach * (given - x)
+        weight = (1.0 - (beyond * beyond).sum(1)).clamp_min(0.0).square()
+        x = x.unsqueeze(1)
+        planes = self._blended(x)
+        y = torch.baddbmm(planes.narrow(1, 2, 1), x, planes.narrow(1, 0, 2))
+        d = torch.addcmul(self.unit_shift, torch.cat([x, y], 2), self.unit_slope)
         exponent = (d * -d).sum(2).clamp(self.least_exponent)
-        # What is small is summed first.
-        u = shared + torch.baddbmm(own, exponent.exp().unsqueeze(1), self.weights)
-        u = u.squeeze(1)
+        u = torch.baddbmm(y, exponent.exp().unsqueeze(1), self.weights).squeeze(1)
+        u = torch.addcmul(self.reference, weight.unsqueeze(1), u)
         rounded = u + torch.sqrt(torch.addcmul(self.roundness, u, u))
         if self.all_positive:
             return rounded
         return torch.where(self.positive, rounded, 2.0 * u)
 
-    def _at(self, planes: Tensor, x: Tensor) -> Tensor:
-        """Heights of planes (joint, 3, coefficient): two slopes and a constant."""
-        return torch.baddbmm(planes.narrow(1, 2, 1), x, planes.narrow(1, 0, 2))
-
     def _blended(self, x: Tensor) -> Tensor:
-        """What the rules' planes have of their own, (joint, 3, coefficient), blended.
+        """The rules' planes blended, (joint, 3, coefficient): two slopes and a constant.
 
         It is normalised last, and numbers come in the order that loops in C run through.
         """

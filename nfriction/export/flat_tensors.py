@@ -25,8 +25,10 @@ class TensorByTensor(nn.Module):
     """
 
     rate: Tensor
-    lower: Tensor
-    upper: Tensor
+    gain: Tensor
+    shift: Tensor
+    one: Tensor
+    reference: Tensor
     set_slope: Tensor
     set_shift: Tensor
     set_sums: Tensor
@@ -48,8 +50,9 @@ class TensorByTensor(nn.Module):
         self.all_positive = bool(schedule.positive.all())
         self.joints, self.rules = schedule.joints, schedule.terms[0] ** 2
         self.outputs = schedule.network.outputs
+        self.per_reach = 0.5 / schedule.reach
         with torch.no_grad():
-            buffers = _matrices(constants(schedule, centred=False), schedule.terms[0])
+            buffers = _matrices(constants(schedule), schedule.terms[0])
         for name, value in buffers.items():
             self.register_buffer(name, value.contiguous())
 
@@ -57,17 +60,21 @@ class TensorByTensor(nn.Module):
         if self.along_motion:
             qdd = qdd * torch.tanh(qd * self.rate)
         # They pass over NaN, which products of matrices would carry from joint to joint.
-        x = torch.fmin(torch.fmax(torch.cat([qd.abs(), qdd]), self.lower), self.upper)
+        given = torch.addcmul(self.shift, torch.cat([qd.abs(), qdd]), self.gain)
+        x = torch.fmin(torch.fmax(given, -self.one), self.one)
+        beyond = self.per_reach * (given - x)
+        weight = (1.0 - (beyond * beyond).view(2, self.joints).sum(0)).clamp_min(0.0).square()
         z = torch.addmv(self.set_shift, self.set_slope, x)
         shares = torch.mv(self.set_sums, z * z).view(self.joints, self.rules, 1).softmax(1)
         rules = torch.addmv(self.rule_shift, self.rule_slope, x)
         y = torch.bmm(rules.view(self.joints, self.outputs, self.rules), shares).view(-1)
         d = torch.addmv(self.unit_shift, self.unit_slope, torch.cat([x, y]))
         u = torch.addmv(y, self.weights, torch.mv(self.unit_sums, d * d).exp())
+        u = torch.addcmul(self.reference, weight.unsqueeze(1), u.view(self.joints, self.outputs))
         rounded = u + torch.sqrt(torch.addcmul(self.roundness, u, u))
         if not self.all_positive:
             rounded = torch.where(self.positive, rounded, 2.0 * u)
-        return rounded.view(self.joints, self.outputs)
+        return rounded
 
 
 def _matrices(given: dict[str, Tensor], sets: int) -> dict[str, Tensor]:
@@ -88,8 +95,10 @@ def _matrices(given: dict[str, Tensor], sets: int) -> dict[str, Tensor]:
     by_joint = torch.eye(joints, dtype=one.dtype)
     return {
         "rate": given["rate"],
-        "lower": given["lower"].mT.flatten(),
-        "upper": given["upper"].mT.flatten(),
+        "gain": given["gain"].mT.flatten(),
+        "shift": given["shift"].mT.flatten(),
+        "one": torch.ones_like(given["gain"][0, 0]),
+        "reference": given["reference"],
         "set_slope": _placed(_by_input(set_slope), own, 2 * joints),
         "set_shift": set_shift.mT.flatten(),
         "set_sums": -torch.kron(by_joint, pairs),
@@ -101,8 +110,8 @@ def _matrices(given: dict[str, Tensor], sets: int) -> dict[str, Tensor]:
         "unit_shift": given["unit_shift"].flatten(),
         "unit_sums": -torch.kron(by_joint, joined),
         "weights": torch.block_diag(*given["weights"].mT),
-        "roundness": given["roundness"].flatten(),
-        "positive": given["positive"].expand(joints, outputs).flatten(),
+        "roundness": given["roundness"],
+        "positive": given["positive"],
     }
 
 

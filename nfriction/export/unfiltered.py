@@ -1,13 +1,13 @@
 """Controllers of a motion: a friction model under the one contract of its edges.
 
     finite inputs      torque and coefficients of the model
-    outside the range  coefficients as at the range's edge, the law itself goes on; CLAMPED
+    outside the range  coefficients as the schedule has them there, the law goes on; OUTSIDE
     NaN or infinity    NaN torque and coefficients of that joint, the others as ever; NOT_FINITE
     beyond a limit     torque at the limit; SATURATED
 
-A schedule that keeps to its trained range itself (every one of the library does) is left to do so,
-which makes the torque that of the model for all finite inputs. Any other is given inputs clamped to
-`ModelInfo.input_ranges`. CLAMPED always means: outside `input_ranges`.
+Schedules of the library know their trained range and are left to themselves: neuro-fuzzy ones
+return to their constant law, and the torque is that of the model for all finite inputs. Any other
+is given inputs clamped to `ModelInfo.input_ranges`. OUTSIDE always means: outside `input_ranges`.
 """
 
 import copy
@@ -21,7 +21,7 @@ from nfriction.friction import Adaptive, Constant, FrictionModel, NeuroFuzzy
 from nfriction.modelfile import ModelInfo
 
 # Bits of the status.
-CLAMPED, NOT_FINITE, SATURATED = 1, 2, 4
+OUTSIDE, NOT_FINITE, SATURATED = 1, 2, 4
 # Edge of a range that nobody gave; the largest float, so that targets of single precision know it.
 UNBOUNDED = float(torch.finfo(torch.float32).max)
 
@@ -54,7 +54,7 @@ class _Contracted(nn.Module):
         self.model = copy.deepcopy(model).to("cpu", torch.float64).eval().requires_grad_(False)
         self.joints = model.joints
         self.coefficient_count = len(model.law.names)
-        self.clamps = not _keeps_to_its_range(model)
+        self.clamps = not _knows_its_range(model)
         ranges = dict((info or ModelInfo()).input_ranges)
         for name in ("qd", "qdd"):
             lower, upper = _range(name, ranges.get(name), model.joints)
@@ -207,8 +207,8 @@ def memory_of(model: FrictionModel) -> int:
     return int(getattr(model.schedule, "state_size", 0))
 
 
-def _keeps_to_its_range(model: FrictionModel) -> bool:
-    """Whether the schedule holds its coefficients at the edge of its range by itself."""
+def _knows_its_range(model: FrictionModel) -> bool:
+    """Whether the schedule itself sees to inputs outside its range."""
     own = isinstance(model.schedule, (Constant, Adaptive, NeuroFuzzy))
     return bool(getattr(model.schedule, "bounded", own))
 

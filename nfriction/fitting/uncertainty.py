@@ -31,6 +31,9 @@ class CoefficientUncertainty:
     def sd(self, qd: Tensor, qdd: Tensor) -> Tensor:
         """Standard deviation of the coefficients at motions.
 
+        Beyond the trained range it is that at the range's edge: a network fades there, but not for
+        knowing better.
+
         Args:
             qd, qdd: joint velocity [rad/s] and acceleration [rad/s^2], (*batch, joint).
         Returns:
@@ -42,7 +45,7 @@ class CoefficientUncertainty:
         return found.reshape(*shape, -1)
 
     def _sd(self, qd: Tensor, qdd: Tensor) -> Tensor:
-        by = self.schedule.sensitivities(qd, qdd)
+        by = self.schedule.sensitivities(*self.schedule.within_range(qd, qdd))
         slopes, joint = by.parameters, by.joint
         unknown = torch.isinf(self.root).any(1)
         root = torch.where(unknown[:, None], 0.0, self.root)

@@ -8,14 +8,10 @@ from torch import Tensor
 
 from nfriction.friction.adaptive import Adaptive
 from nfriction.friction.laws import Law
-from nfriction.friction.neurofuzzy import (
-    LEAST_RATIO,
-    PRIOR_SD,
-    NeuroFuzzy,
-    soft_positive_inverse,
-)
+from nfriction.friction.neurofuzzy import LEAST_RATIO, PRIOR_SD, NeuroFuzzy
 from nfriction.friction.schedules import Schedule
 from nfriction.friction.sensitivity import FactoredSensitivity
+from nfriction.friction.smooth import soft_positive_inverse
 from nfriction.fuzzy.membership import HALF_WIDTH_OF_GAUSSIAN
 from nfriction.fuzzy.placement import crossing_half_widths
 
@@ -179,6 +175,9 @@ class AdaptiveNeuroFuzzy(Schedule):
     def sensitivities_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> FactoredSensitivity:
         reference = self._lifted(self.adaptive.coefficients_from(qd, qdd, state)).detach()
         return self.deviation.deviating_sensitivities(reference, qd, qdd)
+
+    def within_range(self, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor]:
+        return self.deviation.within_range(qd, qdd)
 
     def options(self) -> dict[str, Any]:
         memory = {"memory": self.adaptive.options()}

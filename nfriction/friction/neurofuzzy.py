@@ -10,6 +10,7 @@ from nfriction.friction.constant import Constant
 from nfriction.friction.laws import Law
 from nfriction.friction.schedules import Schedule
 from nfriction.friction.sensitivity import FactoredSensitivity
+from nfriction.friction.smooth import fading, fading_slope, soft_positive, soft_positive_inverse
 from nfriction.fuzzy import AnfisRBF
 
 # Below a thousandth of its scale a coefficient is as good as zero, and must be able to rise.
@@ -19,22 +20,13 @@ LEAST_RATIO = 1e-3
 PRIOR_SD = 0.3
 
 
-def soft_positive(u: Tensor, roundness: float) -> Tensor:
-    """A positive number for every u, and u itself away from zero: `(u + sqrt(u^2 + 4 r^2)) / 2`."""
-    return 0.5 * (u + torch.sqrt(u * u + 4.0 * roundness * roundness))
-
-
-def soft_positive_inverse(y: Tensor, roundness: float) -> Tensor:
-    """The u for which `soft_positive(u, roundness)` is y > 0."""
-    return y - roundness * roundness / y
-
-
 class NeuroFuzzy(Schedule):
     """An ANFIS layer and a radial basis head give the coefficients of a law.
 
     Inputs are |velocity| and acceleration, scaled to their trained range and clamped to it. The
     network's output is the deviation from a constant reference, in units of a scale; it starts at
     zero, so an untrained model *is* the constant law, and a prior around zero pulls toward it.
+    Beyond the trained range the deviation fades, and the constant law is left.
 
     Args:
         law: the law whose coefficients these are.
@@ -54,6 +46,7 @@ class NeuroFuzzy(Schedule):
 
     # Final, so that TorchScript takes them for constants.
     roundness: Final[float] = 0.005  # of the positive map, in units of a coefficient's scale
+    reach: Final[float] = 0.5  # how far beyond its trained range the network counts, in ranges
     turn: Final[float] = 3e-3  # where qdd sgn(qd) turns, in units of the velocity's range
 
     reference: Tensor
@@ -99,11 +92,8 @@ class NeuroFuzzy(Schedule):
         self.set_reference(Constant(law, joints, initial).values)
         self.set_range(20.0, [-200.0, 200.0])
 
-    def inputs(self, qd: Tensor, qdd: Tensor) -> Tensor:
-        """Scaled inputs of the network in [0, 1], shape (*batch, joint, 2)."""
-        return self._scaled(qd, qdd).clamp(0.0, 1.0)
-
-    def _scaled(self, qd: Tensor, qdd: Tensor) -> Tensor:
+    def scaled(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        """Inputs over their trained range, within it in [0, 1], shape (*batch, joint, 2)."""
         velocity = qd / self.velocity_range
         if self.along_motion:
             qdd = qdd * torch.tanh(velocity / self.turn)
@@ -115,7 +105,10 @@ class NeuroFuzzy(Schedule):
 
     def deviating(self, reference: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
         """Coefficients where the network deviates from a reference in its own units."""
-        return self._coefficients(reference + self.network(self.inputs(qd, qdd)))
+        scaled = self.scaled(qd, qdd)
+        x = scaled.clamp(0.0, 1.0)
+        weight = fading(scaled - x, self.reach).unsqueeze(-1)
+        return self._coefficients(reference + weight * self.network(x))
 
     def at_reference(self, reference: Tensor) -> Tensor:
         """Coefficients at a reference in the network's own units, without the network."""
@@ -157,7 +150,7 @@ class NeuroFuzzy(Schedule):
         velocity: Tensor | Sequence[float] | float,
         acceleration: Tensor | Sequence[float],
     ) -> None:
-        """Set the trained range, outside which inputs are clamped.
+        """Set the trained range, beyond which the network fades.
 
         Args:
             velocity: largest |velocity| of each joint [rad/s], (joint,) or one for all.
@@ -180,6 +173,11 @@ class NeuroFuzzy(Schedule):
         self.velocity_range.copy_(fastest)
         self.acceleration_lower.copy_(lower)
         self.acceleration_upper.copy_(upper)
+
+    def within_range(self, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor]:
+        forward = torch.where(qd < 0, -1.0, 1.0) if self.along_motion else torch.ones_like(qd)
+        held = (forward * qdd).clamp(self.acceleration_lower, self.acceleration_upper)
+        return qd.clamp(-self.velocity_range, self.velocity_range), forward * held
 
     def trained(self) -> tuple[nn.Parameter, nn.Parameter]:
         """The parameters that a trajectory fit varies, each (joint, coefficient, ...).
@@ -235,14 +233,16 @@ class NeuroFuzzy(Schedule):
     def slopes(self, qd: Tensor, qdd: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """Derivatives of the coefficients by the joint's own velocity and acceleration.
 
-        With u the reference plus the network's outputs, x its scaled inputs, v = qd / v_max and
-        t = tanh(v / turn), which stands for 1 where acceleration is signed:
+        With x the scaled inputs, u the reference plus the network's outputs n of x clamped, times
+        their weight w, v = qd / v_max and t = tanh(v / turn), which stands for 1 where acceleration
+        is signed:
 
+            du/dx   = w dn/dx within the range, n dw/dx beyond it,
             dc/dqd  = dc/du (du/dx_1 sgn(v) / v_max + du/dx_2 qdd dt/dqd / span),
             dc/dqdd = dc/du du/dx_2 t / span.
 
-        Inputs beyond their range do not count. The positive map s(u) with roundness r has the
-        slope s^2 / (s^2 + r^2), which its value tells.
+        The positive map s(u) with roundness r has the slope s^2 / (s^2 + r^2), which its value
+        tells.
 
         Args:
             qd, qdd: shape (*batch, joint).
@@ -250,15 +250,12 @@ class NeuroFuzzy(Schedule):
         Returns:
             Each (*batch, joint, coefficient).
         """
-        scaled = self._scaled(qd, qdd)
-        inside = ((scaled >= 0.0) & (scaled <= 1.0)).to(scaled.dtype)
-        x = scaled.clamp(0.0, 1.0).reshape(-1, self.joints, 2)
-        by_x = self.network.input_jacobian(x).permute(3, 0, 1, 2).reshape(*coefficients.shape, 2)
+        by_x = self._slopes_over_range(self.scaled(qd, qdd))
         s = coefficients / self.scale
         rounded = s * s / (s * s + self.roundness**2)
         by_u = self.scale * torch.where(self.positive, rounded, 1.0)
         velocity, span = self.velocity_range, self.acceleration_upper - self.acceleration_lower
-        by_speed, by_acceleration = (by_x * by_u[..., None] * inside[..., None, :]).unbind(-1)
+        by_speed, by_acceleration = (by_x * by_u[..., None]).unbind(-1)
         by_acceleration = by_acceleration / span[:, None]
         by_qd = by_speed * (qd.sign() / velocity)[..., None]
         if not self.along_motion:
@@ -267,19 +264,32 @@ class NeuroFuzzy(Schedule):
         turning = qdd * (1.0 - turned * turned) / (velocity * self.turn)
         return by_qd + by_acceleration * turning[..., None], by_acceleration * turned[..., None]
 
+    def _slopes_over_range(self, scaled: Tensor) -> Tensor:
+        """Derivatives of the weighted network by its scaled inputs, (*batch, joint, output, 2)."""
+        x = scaled.clamp(0.0, 1.0)
+        beyond = scaled - x
+        by_x = self.network.input_jacobian(x.reshape(-1, self.joints, 2)).permute(3, 0, 1, 2)
+        weight = fading(beyond, self.reach)[..., None] * (beyond == 0.0)
+        slope = fading_slope(beyond, self.reach)
+        by_x = by_x.reshape(*x.shape[:-1], -1, 2) * weight[..., None, :]
+        return by_x + self.network(x)[..., None] * slope[..., None, :]
+
     @torch.no_grad()
     def deviating_sensitivities(
         self, reference: Tensor, qd: Tensor, qdd: Tensor
     ) -> FactoredSensitivity:
         """Derivatives of what `deviating` gives, the reference held."""
         anfis, head = self.network.anfis, self.network.head
-        x = self.inputs(qd, qdd)
+        scaled = self.scaled(qd, qdd)
+        x = scaled.clamp(0.0, 1.0)
+        weight = fading(scaled - x, self.reach).unsqueeze(-1)
         y = anfis(x)
         both = torch.cat([x, y], -1)
         with torch.enable_grad():
-            u = (reference + y + head(both)).detach().requires_grad_()
+            u = (reference + weight * (y + head(both))).detach().requires_grad_()
             coefficients = self._coefficients(u)
             (by_u,) = torch.autograd.grad(coefficients.sum(), u)
+        by_u = by_u * weight
         own = torch.eye(y.shape[-1], dtype=y.dtype, device=y.device)
         # The head sees the rules' outputs too.
         by_y = head.input_jacobian(both)[:, :, x.shape[-1] :].permute(3, 0, 1, 2)

@@ -133,6 +133,10 @@ class Schedule(nn.Module, ABC):
         """Derivatives of `coefficients_from`, the memory (sample, joint, state_size) held."""
         return self.sensitivities(qd, qdd)
 
+    def within_range(self, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor]:
+        """The nearest motion of which the schedule was told anything."""
+        return qd, qdd
+
     def options(self) -> dict[str, Any]:
         """Constructor arguments beyond law, joints and initial values, as plain JSON."""
         return {}

@@ -20,7 +20,7 @@ from nfriction.export.contract import compare, run_through, verify
 from nfriction.export.controller import controller_of
 from nfriction.export.errors import ExportError
 from nfriction.export.points import draw
-from nfriction.export.unfiltered import CLAMPED, NOT_FINITE, SATURATED
+from nfriction.export.unfiltered import NOT_FINITE, OUTSIDE, SATURATED
 from nfriction.friction import MODELS, Coefficient, FrictionModel, Law
 from nfriction.friction.constant import Constant
 from nfriction.modelfile import ModelInfo
@@ -209,7 +209,7 @@ def test_status_tells_clamping_and_saturation(exported):
     tau, _, status = c_runner(folder / "nfriction.c")(*inputs)
     np.testing.assert_array_equal(status, run_through(controller, inputs)[2])
     assert np.abs(tau).max() == 0.05
-    for bit in (CLAMPED, SATURATED):
+    for bit in (OUTSIDE, SATURATED):
         assert 0 < (status & bit > 0).mean() < 1
     self_test(folder)
 

@@ -77,7 +77,7 @@ def test_it_says_what_a_host_needs() -> None:
     assert told["sample_time"] == 2e-3
     assert told["training_data"] == {"run": "ab12"}
     assert told["torque_limit"] == [2.0, 2.0, 2.0]
-    assert told["status_bits"] == {"clamped": 1, "not_finite": 2, "saturated": 4}
+    assert told["status_bits"] == {"outside": 1, "not_finite": 2, "saturated": 4}
     assert {"version", "schema", "parameter_hash", "model", "edges", "tolerance"} <= told.keys()
 
 

@@ -83,7 +83,7 @@ def test_known_friction_lies_within_and_unvisited_motion_is_less_known(fits):
     sd = found.uncertainty.sd(*there)
     error = found.model.schedule(*there).detach() - torch.tensor([4e-4, 2e-3], dtype=F64)
     assert (error.abs() <= 4 * sd).all()
-    never = torch.full((1, 1), 1e3, dtype=F64)  # taken for the corner of the range
+    never = torch.full((1, 1), 1e3, dtype=F64)  # as at the corner of the range
     assert (found.uncertainty.sd(never, never)[0, 0] > 1.5 * sd.median(0).values).all()
 
 

@@ -40,6 +40,7 @@ def test_until_it_has_learned_it_is_the_adaptive_schedule(law) -> None:
     reference = adaptive(law, time_constant=0.5, sample_time=2e-3)
     made = AdaptiveNeuroFuzzy(law, 2)
     made.set_adaptive(reference, torch.full((2, len(law.names)), 0.5, dtype=F64))
+    made.deviation.set_range(40.0, [-400.0, 400.0])
     states = reference.states(qd, qdd)
     torch.testing.assert_close(made.states(qd, qdd), states)
     expected = reference.coefficients_from(qd, qdd, states)

@@ -1,4 +1,4 @@
-"""Neuro-fuzzy coefficients: a constant law until trained, positive, clamped, told to fits."""
+"""Neuro-fuzzy coefficients: a constant law until trained, and beyond what it was trained on."""
 
 from collections.abc import Callable
 
@@ -11,7 +11,7 @@ from torch.func import functional_call, jacrev
 
 from nfriction.friction import Constant, FrictionModel, NeuroFuzzy
 from nfriction.friction.laws import LINEAR, NONLINEAR, STRIBECK, VISCOUS
-from nfriction.friction.neurofuzzy import LEAST_RATIO, soft_positive, soft_positive_inverse
+from nfriction.friction.neurofuzzy import LEAST_RATIO
 from nfriction.friction.sensitivity import Sensitivity
 from tests.friction.samples import LAWS, QUADRATIC, motion, normal, randomise
 
@@ -23,21 +23,6 @@ def trained(law=LINEAR, joints: int = 2, spread: float = 0.5, seed: int = 0, **o
     schedule = NeuroFuzzy(law, joints, **options)
     randomise(schedule, spread, seed)
     return schedule
-
-
-@given(st.floats(-1e100, 1e100), st.floats(1e-6, 1.0))
-def test_the_positive_map_is_positive_and_hardly_changes_what_is(u: float, roundness: float):
-    y = soft_positive(torch.tensor(u, dtype=torch.float64), roundness)
-    assert y >= 0
-    assert y >= u
-    assert abs(float(y) - max(u, 0.0)) <= roundness * (1 + 1e-9) + 1e-15 * abs(u)
-
-
-@given(st.floats(1e-2, 1e6))
-def test_the_positive_map_is_undone(y: float) -> None:
-    u = soft_positive_inverse(torch.tensor(y, dtype=torch.float64), 0.05)
-    # For y below the roundness, u is negative and up to 25 times as large: two digits are lost.
-    assert float(soft_positive(u, 0.05)) == pytest.approx(y, rel=1e-13)
 
 
 @every_law
@@ -111,14 +96,36 @@ def test_with_signed_acceleration_the_directions_differ() -> None:
 
 
 @both_ways
-def test_beyond_the_trained_range_coefficients_stay_what_they_are_at_its_edge(acceleration: str):
+def test_beyond_the_trained_range_coefficients_return_to_the_constant_law(acceleration: str):
     schedule = trained(acceleration=acceleration)
     schedule.set_range([4.0, 5.0], [[-30.0, 60.0], [-20.0, 20.0]])
+    law = schedule.reference_coefficients()
     edge = torch.tensor([4.0, 5.0], dtype=torch.float64), torch.tensor([60.0, 20.0]).double()
-    outside = torch.tensor([400.0, 5.1], dtype=torch.float64), torch.tensor([61.0, 1e9]).double()
-    assert torch.equal(schedule(*edge), schedule(*outside))
-    inside = edge[0] - 0.1, edge[1] - 1.0
-    assert (schedule(*edge) != schedule(*inside)).all()
+    # Half the range beyond it, of velocity in one joint and of acceleration in the other.
+    far = torch.tensor([6.0, 5.0], dtype=torch.float64), torch.tensor([60.0, 40.0]).double()
+    farther = torch.tensor([400.0, 5.1], dtype=torch.float64), torch.tensor([61.0, 1e9]).double()
+    assert (schedule(*edge) != law).all()
+    for gone in (far, farther, (torch.full_like(edge[0], torch.inf), edge[1])):
+        assert torch.equal(schedule(*gone), law)
+    way = torch.linspace(0.0, 1.0, 101, dtype=torch.float64)[:, None]
+    found = schedule(*(a + way * (b - a) for a, b in zip(edge, far, strict=True)))
+    left = (found - law) / (found[0] - law)
+    assert (left.diff(dim=0) < 1e-9).all()
+    assert (left.diff(dim=0) > -0.1).all()
+
+
+@both_ways
+def test_the_nearest_trained_motion(acceleration: str) -> None:
+    schedule = trained(acceleration=acceleration)
+    schedule.set_range([4.0, 5.0], [[-30.0, 60.0], [-20.0, 20.0]])
+    qd, qdd = 10 * normal(200, 2), 100 * normal(200, 2, seed=1)
+    nearest = schedule.within_range(qd, qdd)
+    # What is near is left alone, and nothing nearer than the clamped inputs is found.
+    scaled = schedule.scaled(qd, qdd)
+    away = qd.abs() > 0.1
+    torch.testing.assert_close(schedule.scaled(*nearest)[away], scaled.clamp(0, 1)[away])
+    again = schedule.within_range(*nearest)
+    assert torch.equal(torch.stack(again), torch.stack(nearest))
 
 
 @pytest.mark.parametrize(
