@@ -9,13 +9,13 @@ References:
     H. G. Bock, in: Modelling of Chemical Reaction Systems, Springer (1981), 102-125.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from nfriction.fitting.normal_equations import add_jumps, normal_equations
+from nfriction.fitting.normal_equations import Rows, add_jumps, normal_equations, scaled_rows
 from nfriction.fitting.plant_parameters import adjusted_buffers
 from nfriction.fitting.propagation import propagated
 from nfriction.fitting.sensitivity import StepJacobian
@@ -195,9 +195,10 @@ class TrajectoryProblem:
         """Gauss-Newton model of the cost at `x`."""
         r = self.residuals(x)
         precision, mean = self.prior()
-        gradient, hessian, ends = self._normal_equations(x, r)
+        places = self._own_places()
+        rows = self._rows(x, self._scale)
+        gradient, hessian, ends = normal_equations(rows, r, places, len(x))
         if self._seams:
-            places = self._own_places()
             add_jumps(gradient, hessian, self.jumps(x), ends, self._seams, places, self._jump_sd)
         slope, curvature = self.held(x)
         gradient[: len(slope)] += slope
@@ -264,20 +265,17 @@ class TrajectoryProblem:
             x: unknowns.
             sd: of each error, enlarged for its correlation in time, (window, step + 1, joint).
         """
-        r = torch.zeros_like(sd)
-        return self._normal_equations(x, r, self._scale * sd / self.noise_sd)[1]
+        rows = self._rows(x, self._scale * sd / self.noise_sd)
+        return normal_equations(rows, torch.zeros_like(sd), self._own_places(), len(x))[1]
 
-    def _normal_equations(
-        self, x: Tensor, r: Tensor, scale: Tensor | None = None
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Of all unknowns; errors count over the noise, or as `scale` says."""
+    def _rows(self, x: Tensor, scale: Tensor) -> Iterator[Rows]:
+        """Rows of the Jacobian, some samples at a time; errors count as `scale` says."""
         motion = self._simulate(x)
         pieces = propagated(
             self.jacobian, self.friction_count, motion, self.tau, self.step, self.split(x)[1],
             self.substeps, self.stride, self._states(motion),
         )  # fmt: skip
-        scale = self._scale if scale is None else scale
-        return normal_equations(pieces, r, scale, self.mixing, self._own_places(), len(x))
+        return scaled_rows(pieces, scale, self.mixing, self._own_places())
 
     def _own_places(self) -> Tensor:
         """Where each window's state and the zeros of its recording stand, (window, ·)."""
