@@ -15,7 +15,6 @@ from nfriction.fitting.uncertainty import CoefficientUncertainty
 from nfriction.fitting.verdict import (
     Interval,
     covariance_root,
-    evidence,
     intervals,
     lost_directions,
     open_values,
@@ -189,12 +188,8 @@ def _told_by_data(
     count, noise = problem.shared_count, effective_noise(residuals)
     if not torch.isfinite(result.hessian).all() or not noise > 0:
         return (), (), None
-    precision, _ = problem.prior()
-    score = problem.score_covariance(result.x, local_noise(residuals))
-    # Where a network is only held to its law, the data leave it open.
-    curvature, n = result.hessian.clone(), problem.friction_count
-    curvature[:n, :n] -= problem.held(result.x)[1]
-    known = evidence(curvature, precision, count, problem.noise_sd, problem.noise_sd, score)
+    # Where a network is only held to its law, the data leave it open: that is not among them.
+    known = problem.told(result.x, local_noise(residuals))
     constant = isinstance(problem.friction.schedule, Constant)
     shown = fitted.clone()
     if not constant:

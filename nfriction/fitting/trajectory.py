@@ -15,12 +15,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from nfriction.fitting.elimination import Layout, eliminated, score
 from nfriction.fitting.normal_equations import Rows, add_jumps, normal_equations, scaled_rows
 from nfriction.fitting.plant_parameters import adjusted_buffers
 from nfriction.fitting.propagation import propagated
 from nfriction.fitting.sensitivity import StepJacobian
 from nfriction.fitting.unseen import Unseen
-from nfriction.fitting.verdict import evidence, standard_deviations
+from nfriction.fitting.verdict import Evidence, evidence, standard_deviations
 from nfriction.fitting.windows import Windows
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.plant import LinearAxis, PendulumChain
@@ -258,15 +259,24 @@ class TrajectoryProblem:
         zeros = torch.zeros_like(zero_sd)
         return sd.square().reciprocal(), torch.cat([mean, start.reshape(-1), zeros])
 
-    def score_covariance(self, x: Tensor, sd: Tensor) -> Tensor:
-        """Covariance of J^T r where the errors have their own sizes.
+    def told(self, x: Tensor, sd: Tensor) -> Evidence:
+        """What the data say of the shared parameters, where the errors have their own sizes.
 
         Args:
             x: unknowns.
             sd: of each error, enlarged for its correlation in time, (window, step + 1, joint).
         """
+        places, state = self._own_places(), 2 * self.windows.q0.shape[-1]
+        layout = Layout.of(places, state, len(x))
+        precision, _ = self.prior()
+        first = self.shared_count
+        of_states = precision[first : len(x) - self.zero_count].reshape(-1, state)
+        kept = torch.cat([precision[:first], self.split_zeros(precision)])
+        joined = (self._seams, self._jump_sd) if self._seams else ((), None)
+        known = eliminated(self._rows(x, self._scale), layout, of_states, *joined)
         rows = self._rows(x, self._scale * sd / self.noise_sd)
-        return normal_equations(rows, torch.zeros_like(sd), self._own_places(), len(x))[1]
+        spread = score(rows, layout, known, of_states)
+        return evidence(known.data + torch.diag(kept), kept, first, 1.0, 1.0, spread)
 
     def _rows(self, x: Tensor, scale: Tensor) -> Iterator[Rows]:
         """Rows of the Jacobian, some samples at a time; errors count as `scale` says."""

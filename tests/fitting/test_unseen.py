@@ -6,9 +6,12 @@ import torch
 
 from nfriction import NFLFM
 from nfriction.fitting.outcome import trajectory_outcome
+from nfriction.fitting.residuals import local_noise
 from nfriction.fitting.sensitivity import StepJacobian
 from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
+from nfriction.fitting.uncertainty import CoefficientUncertainty
 from nfriction.fitting.unseen import HELD_SD, Unseen, unseen, visits
+from nfriction.fitting.verdict import covariance_root
 from nfriction.fitting.windows import Windows
 from nfriction.signals import Motion
 from nfriction.simulation import integrate
@@ -130,21 +133,23 @@ def test_a_network_fitted_so_deviates_less_where_nothing_was_seen():
     assert deviation[1] < 0.5 * deviation[0]
 
 
-def test_what_is_only_held_is_not_taken_for_told_by_the_data(monkeypatch):
+def test_what_is_only_held_is_not_taken_for_told_by_the_data():
     model = network()
     held = unseen(model.schedule, [swings(1.0, 1.0)])
     p = problem(model, held)
     result = solve_trajectory(p, p.start(), max_steps=5)
+    errors, n = p.errors(result.x), p.friction_count
     where = (held.weight > 0)[..., None].expand(-1, -1, 2)
 
-    def openness() -> torch.Tensor:
-        found = trajectory_outcome(p, result, p.errors(result.x), ())
-        return (found.uncertainty.sd(held.qd, held.qdd) / model.schedule.scale)[where]
+    def openness(uncertainty: CoefficientUncertainty) -> torch.Tensor:
+        return (uncertainty.sd(held.qd, held.qdd) / model.schedule.scale)[where]
 
-    told = openness()
+    told = openness(trajectory_outcome(p, result, errors, ()).uncertainty)
+    alone = trajectory_outcome(problem(model, None), result, errors, ())
+    torch.testing.assert_close(told, openness(alone.uncertainty))
     # As if the data had said what was held.
-    none = torch.zeros(p.friction_count, dtype=F64)
-    monkeypatch.setattr(p, "held", lambda x: (none, none.expand(len(none), -1)))
-    mistaken = openness()
+    known = p.told(result.x, local_noise(errors))
+    known.data[:n, :n] += p.held(result.x)[1]
+    mistaken = openness(CoefficientUncertainty(model.schedule, covariance_root(known)[:n]))
     assert (told >= (1 - 1e-6) * mistaken).all()
     assert told.median() > 1.3 * mistaken.median()

@@ -1,0 +1,194 @@
+"""What windows tell is the same however far their states grow, and rounding tells nothing."""
+
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import torch
+
+from nfriction import LFM
+from nfriction.fitting.elimination import Layout, eliminated
+from nfriction.fitting.normal_equations import Rows, normal_equations
+from nfriction.fitting.outcome import trajectory_outcome
+from nfriction.fitting.preparation import adjustable_terms, mixing_of
+from nfriction.fitting.stages import Refinement
+from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
+from nfriction.fitting.verdict import Evidence, evidence, lost_directions
+from nfriction.fitting.windows import cut_windows
+from nfriction.signals import kalman_smoother
+from tests.fitting.recordings import F64, pendulum, swing
+
+NAMES = tuple("abcdefghij")
+# Unknowns of two joints' states, and some that windows share.
+STATE, SHARED = 4, 6
+
+
+def swings(seconds, length, friction, start, recordings=1, **settings):
+    """A search of the law and the plant that made swings, and windows of these."""
+    law = LFM(2, friction, v_smooth=0.05)
+    plant = pendulum()
+    made = [
+        swing(plant, law, seconds=seconds, start=(q + 0.1 * k, qd))
+        for k, (q, qd) in enumerate([start] * recordings)
+    ]
+    motions = [kalman_smoother(r.time, r.q) for r in made]
+    each = settings.get("zero_sd") is not None
+    terms = adjustable_terms(plant, made, True, False, False, zeroed_once=not each)
+    mixing = mixing_of(plant, made[0].convention_on(plant))
+    search = Refinement(plant, law, made, mixing, terms, **settings)
+    return search, cut_windows(made, motions, length)
+
+
+def tame(stride=1, **settings) -> TrajectoryProblem:
+    friction = [[2e-3, 3e-3], [1e-3, 2e-3]]
+    search, windows = swings(0.6, 0.2, friction, (1.6, 0.8), recordings=2, **settings)
+    return search.problem(windows, 2e-4, stride=stride)
+
+
+def error_sizes(p: TrajectoryProblem) -> torch.Tensor:
+    g = torch.Generator().manual_seed(4)
+    return 2e-4 * (0.5 + torch.rand(p.windows.q.shape, generator=g, dtype=F64))
+
+
+def by_squares(p: TrajectoryProblem, x: torch.Tensor, sd: torch.Tensor) -> Evidence:
+    """All unknowns' normal equations, and the states eliminated from these."""
+    rows = p._rows(x, p._scale * sd / p.noise_sd)
+    covariance = normal_equations(rows, torch.zeros_like(sd), p._own_places(), len(x))[1]
+    hessian = p.quadratic(x).hessian
+    return evidence(hessian, p.prior()[0], p.shared_count, 1.0, 1.0, covariance)
+
+
+@pytest.mark.parametrize("jump_sd", [None, (3e-4, 0.01), (1e-6, 3e-5)])
+@pytest.mark.parametrize("zero_sd", [None, torch.full((2, 2), 0.05, dtype=F64)])
+@pytest.mark.parametrize("stride", [1, 3])
+def test_rows_tell_what_squares_do_where_motion_is_tame(stride, zero_sd, jump_sd):
+    p = tame(stride, zero_sd=zero_sd, jump_sd=jump_sd)
+    assert len(p.windows) == 6
+    assert len(p._seams) == (4 if jump_sd else 0)
+    x, sd = p.start(), error_sizes(p)
+    found, expected = p.told(x, sd), by_squares(p, x, sd)
+    torch.testing.assert_close(found.prior, expected.prior)
+    for name in ("data", "score"):
+        one, other = getattr(found, name), getattr(expected, name)
+        # Entries differ by orders of magnitude: compared in units of the diagonal.
+        scale = other.diagonal().clamp_min(1e-12).rsqrt()
+        one, other = (scale[:, None] * matrix * scale for matrix in (one, other))
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("piece", [1, 50])
+def test_pieces_do_not_show(piece, monkeypatch):
+    p = tame(zero_sd=torch.full((2, 2), 0.05, dtype=F64), jump_sd=(3e-4, 0.01))
+    x, sd = p.start(), error_sizes(p)
+    whole = p.told(x, sd)
+    monkeypatch.setattr("nfriction.fitting.propagation.PIECE", piece)
+    parts = p.told(x, sd)
+    torch.testing.assert_close(parts.data, whole.data, rtol=1e-8, atol=1e-3)
+    torch.testing.assert_close(parts.score, whole.score, rtol=1e-8, atol=1e-3)
+
+
+def grown(growth, told, seed=0):
+    """A window whose rows, free of its state, have the triangle `told`; both grow alike.
+
+    Returns:
+        What its rows tell of what is shared, and what their squares do.
+    """
+    g = torch.Generator().manual_seed(seed)
+    shared, size = len(told), len(told) + STATE
+    turn = torch.linalg.qr(torch.randn(300, size, generator=g, dtype=F64)).Q
+    states, others = growth * torch.randn(2, STATE, size, generator=g, dtype=F64)
+    own, free = turn[:, :STATE], turn[:, STATE:]
+    common = own @ others[:, :shared] + free @ told
+    jacobian = torch.cat([common, own @ states[:, :STATE]], 1)
+    # Of the states so little that it tells nothing of what is shared.
+    precision = torch.full((size,), 1e-12, dtype=F64)
+    precision[:shared] = 0.0
+    layout = Layout.of(torch.arange(shared, size)[None], STATE, size)
+    pieces = [Rows(slice(None), part[None], part[None, None]) for part in jacobian.split(60)]
+    data = eliminated(pieces, layout, precision[None, shared:]).data
+    hessian = jacobian.T @ jacobian + torch.diag(precision)
+    return Evidence(data, precision[:shared]), evidence(hessian, precision, shared, 1.0, 1.0)
+
+
+def triangle(seed):
+    g = torch.Generator().manual_seed(100 + seed)
+    return 1e3 * torch.randn(SHARED, SHARED, generator=g, dtype=F64)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_is_told_beside_states_that_grow_is_not_lost(seed):
+    told = triangle(seed)
+    rows, squares = grown(1e12, told, seed)
+    assert lost_directions(NAMES, rows) == ()
+    # In units of the diagonal; rows are rounded to 1e-4 where 1e3 was told, by a state of its own.
+    scale = (told.T @ told).diagonal().rsqrt()
+    difference = scale[:, None] * (rows.data - told.T @ told) * scale
+    assert float(difference.abs().max()) < 1e-3
+    # Their squares are rounding of 1e8 where 1e6 was told.
+    assert lost_directions(NAMES, squares) != ()
+
+
+def test_what_is_not_told_beside_states_that_grow_is_not_claimed():
+    wrong = 0
+    for seed in range(10):
+        told = triangle(seed)
+        told[:, 1] = 2 * told[:, 0]
+        rows, squares = grown(1e12, told, seed)
+        (direction,) = lost_directions(NAMES, rows)
+        assert set(direction.split(" with ")) == {"a", "b"}
+        blind = 0 * told
+        blind[:, 1:] = triangle(seed)[:, 1:]
+        rows, squares = grown(1e12, blind, seed)
+        assert lost_directions(NAMES, rows) == ("a",)
+        wrong += float(squares.data[0, 0]) > 1e6
+    # Of the rounding of large squares about half is positive.
+    assert wrong
+
+
+@pytest.mark.parametrize("growth", [1e20, 1e25])
+def test_rounding_of_rows_tells_nothing(growth):
+    """Beyond what rows can hold, all is lost; none is claimed for the rounding's sake."""
+    rows, _ = grown(growth, triangle(0))
+    told = " with ".join(lost_directions(NAMES, rows))
+    assert set(told.split(" with ")) == set(NAMES[:SHARED])
+
+
+def in_whole_numbers(rows: np.ndarray, shared: int, precision: list[float]) -> np.ndarray:
+    """Curvature with the last columns eliminated, where nothing is rounded."""
+    digits = 200
+    whole = np.vectorize(lambda v: int(Fraction(v) * 2**digits), otypes=[object])(rows)
+    square = np.vectorize(Fraction, otypes=[object])(whole.T @ whole)
+    for i, p in enumerate(precision):
+        square[shared + i, shared + i] += Fraction(p) * 4**digits
+    for k in range(len(square) - 1, shared - 1, -1):
+        square = square[:k, :k] - np.outer(square[:k, k], square[k, :k]) / square[k, k]
+    return np.vectorize(lambda v: float(v / 4**digits))(square)
+
+
+@pytest.mark.filterwarnings("ignore:.*looks like degrees")
+def test_a_chaotic_window_loses_nothing_that_it_tells():
+    """A free swing from upright, the end of which moves by 1e12 times what its start does."""
+    search, windows = swings(4.0, 4.0, [[3e-4, 6e-4], [3e-4, 3e-4]], (0.02, 0.01))
+    p = search.problem(windows, 2e-4)
+    x, count = p.start(), p.shared_count
+    g = torch.Generator().manual_seed(0)
+    noise = 2e-4 * torch.randn(windows.q.shape, generator=g, dtype=F64)
+    # As if measured from exactly the start that its smoother found.
+    p = search.problem(
+        replace(windows, q=windows.q + p.errors(x) @ search.mixing.inverse().T + noise), 2e-4
+    )
+    result, errors = solve_trajectory(p, x, max_steps=0), p.errors(x)
+    assert float(result.hessian.max()) > 1e24
+    assert trajectory_outcome(p, result, errors, ()).lost == ()
+    rows = torch.cat([piece.scaled for piece in p._rows(x, p._scale)], 1)[0]
+    exact = in_whole_numbers(rows.numpy(), count, p.prior()[0][count:].tolist())
+    lower, upper = p.bounds()
+    fitted = (lower < upper)[:count]
+    index = fitted.nonzero().flatten()
+    sd = torch.full_like(errors, p.noise_sd)
+    told, squares = p.told(x, sd).subset(index), by_squares(p, x, sd).subset(index)
+    assert lost_directions(NAMES, squares) != ()
+    expected = torch.as_tensor(exact)[fitted][:, fitted]
+    scale = expected.diagonal().rsqrt()
+    assert float((scale[:, None] * (told.data - expected) * scale).abs().max()) < 1e-3
