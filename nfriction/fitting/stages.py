@@ -190,7 +190,11 @@ class _Watch:
         # A step that damping cut short is no sign of rest.
         if before is None or step.damping > FULL:
             return torch.inf
-        return float(((shared - before[: problem.shared_count]) / problem.spread()).abs().max())
+        spread = problem.spread()
+        # Chaotic windows leave a curvature of rounding alone, by which nothing would ever move.
+        if torch.isinf(spread).all():
+            return torch.inf
+        return float(((shared - before[: problem.shared_count]) / spread).abs().max())
 
 
 def least(residuals: Tensor, noise: float) -> float:
