@@ -3,7 +3,6 @@
 import math
 import time
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +17,8 @@ from nfriction.friction import model_by_name
 from nfriction.friction.model import V_SMOOTH
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.scoring import score
-from nfriction.signals import kalman_smoother
+from nfriction.selection import cut_blocks
+from nfriction.signals import Motion
 
 State = tuple[NDArray[np.float64], NDArray[np.float64]]
 
@@ -74,45 +74,42 @@ def read(data: Path, of: Set) -> list[Recording]:
     return found
 
 
+class Left(NamedTuple):
+    """A recording left out, with its smoothed motion, or the state that its free run starts from.
+
+    Where neither is given, both come of the recording itself.
+    """
+
+    recording: Recording
+    motion: Motion | None = None
+    initial_state: State | None = None
+
+
 class Fold(NamedTuple):
-    """What is fitted, and what is left out with the state that its free run starts from."""
+    """What is fitted, and what is left out."""
 
     fitted: list[Recording]
-    left: list[tuple[Recording, State | None]]
+    left: list[Left]
 
 
 def folds(data: Path, of: Set, blocks: int) -> list[Fold]:
-    """One recording left out at a time, or with blocks one block in time of every recording."""
+    """One recording left out at a time, or with blocks one block in time of every recording.
+
+    Each block has a zero of its own where encoders were zeroed anew: one that is left out is scored
+    without it.
+    """
     recordings = read(data, of)
     if blocks == 1:
         return [
-            Fold([*recordings[:k], *recordings[k + 1 :]], [(left, first_state(data, of, left))])
+            Fold([*recordings[:k], *recordings[k + 1 :]],
+                 [Left(left, initial_state=first_state(data, of, left))])
             for k, left in enumerate(recordings)
-        ]
-    pieces = [in_blocks(r, of.plant(), blocks) for r in recordings]
+        ]  # fmt: skip
+    pieces = [cut_blocks(of.plant(), r, blocks) for r in recordings]
     return [
-        Fold([p for row in pieces for n, (p, _) in enumerate(row) if n != k],
-             [row[k] for row in pieces])
+        Fold([block.recording for row in pieces for n, block in enumerate(row) if n != k],
+             [Left(*row[k]) for row in pieces])
         for k in range(blocks)
-    ]  # fmt: skip
-
-
-def in_blocks(
-    recording: Recording, plant: PendulumChain | LinearAxis, blocks: int
-) -> list[tuple[Recording, State]]:
-    """A recording cut in time; the state at each cut is smoothed from both sides of it.
-
-    Each block then has a zero of its own where encoders were zeroed anew: one that is left out is
-    scored without it.
-    """
-    joint = recording.joint_coordinates(plant)
-    motion = kalman_smoother(joint.time, joint.q)
-    convention = recording.convention_on(plant)
-    edges = np.linspace(0, len(recording) - 1, blocks + 1).astype(int)
-    return [
-        (recording[a : b + 1], (convention.position_from_joint(motion.q[a], plant.first_link),
-                                convention.rate_from_joint(motion.qd[a], plant.first_link)))
-        for a, b in pairwise(edges)
     ]  # fmt: skip
 
 
@@ -154,8 +151,8 @@ def real(data: Path, only: Sequence[str], models: Sequence[str], blocks: int = 1
                 fits.append(fit(model, plant, fold.fitted, start=before, zeroed=of.zeroed,
                                 motions=before.motions if before else None))  # fmt: skip
                 spent[m] += time.process_time() - start
-                for left, state in fold.left:
-                    told = score(fits[-1].plant, fits[-1].model, left, initial_state=state)
+                for left in fold.left:
+                    told = score(fits[-1].plant, fits[-1].model, **left._asdict())
                     free[m].append(1e3 * told.free_run.all)
                     five = told.windows.get("5")
                     short[m].append(1e3 * five.all if five else math.nan)
