@@ -89,7 +89,8 @@ def fit(
             it that other amplitudes do not have.
         zeroed: when incremental encoders were set to zero. `"once"`: before all recordings, so
             that an angle offset is part of the plant. `"each"`: at the start of each recording,
-            wherever dry friction held the links then; how far that was off is found for each
+            wherever dry friction held the links then, at rest: unless its first sample moves, a
+            recording's first window starts there. How far a zero was off is found for each
             recording and left out of the plant, whose offset stays as given, as that of a further
             recording cannot be known. Whoever scores a recording that was trained on scores it as
             it is, zeros and all.
@@ -218,7 +219,8 @@ def _through_windows(
     zeros: Tensor | None = None
     noise, traced = FIRST_NOISE, motions
     for length in windows:
-        cut = cut_windows(search.joint, traced, length)
+        # Encoders that were zeroed where dry friction held the links were zeroed at rest.
+        cut = cut_windows(search.joint, traced, length, from_rest=search.zero_sd is not None)
         problem = search.problem(cut, noise, far=reached is None and len(windows) > 1)
         tolerance = LOOSE
         if length == windows[-1]:

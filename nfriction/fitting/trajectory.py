@@ -31,6 +31,9 @@ from nfriction.solve.levenberg import LeastSquaresResult, LevenbergMarquardt, Qu
 
 # Smoothed start states are off by far less; the prior only keeps a window from running away.
 START_Q_SD, START_QD_SD = 0.01, 0.3
+# Of a start at rest, about what an encoder rounds, and less than it sees. Left free, a velocity
+# that nothing had would take over what friction did while the links broke loose.
+REST_Q_SD, REST_QD_SD = 1e-4, 1e-3
 
 
 @dataclass
@@ -254,6 +257,10 @@ class TrajectoryProblem:
         spread = torch.cat(
             [torch.full_like(w.q0, START_Q_SD), torch.full_like(w.qd0, START_QD_SD)], -1
         )
+        resting = list(w.at_rest)
+        spread[resting] = torch.cat(
+            [torch.full_like(w.q0, REST_Q_SD), torch.full_like(w.qd0, REST_QD_SD)], -1
+        )[resting]
         zero_sd = sd.new_zeros(0) if self.zero_sd is None else self.zero_sd.reshape(-1)
         sd = torch.cat([sd, spread.reshape(-1), zero_sd])
         zeros = torch.zeros_like(zero_sd)

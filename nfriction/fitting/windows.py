@@ -11,6 +11,10 @@ from torch import Tensor
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
+# What moves faster over its first sample is not at rest [rad/s or m/s]; an encoder that flickers
+# by one count at 500 Hz seems to move at 0.2 rad/s.
+AT_REST = 0.3
+
 
 @dataclass(frozen=True)
 class Windows:
@@ -24,6 +28,7 @@ class Windows:
         q0, qd0: smoothed state at the start, (window, joint).
         names: recording that each window comes from.
         spans: of each window, the recording's place among those given, its first and last sample.
+        at_rest: windows of which the start is known: where the encoders stood, and no velocity.
     """
 
     q: Tensor
@@ -34,6 +39,7 @@ class Windows:
     qd0: Tensor
     names: tuple[str, ...]
     spans: tuple[tuple[int, int, int], ...] = ()
+    at_rest: tuple[int, ...] = ()
 
     def __len__(self) -> int:
         return self.q.shape[0]
@@ -52,11 +58,16 @@ class Windows:
             weight=self.weight[index], q0=self.q0[index], qd0=self.qd0[index],
             names=tuple(self.names[i] for i in index),
             spans=tuple(self.spans[i] for i in index if self.spans),
+            at_rest=tuple(k for k, i in enumerate(index) if i in self.at_rest),
         )  # fmt: skip
 
 
 def cut_windows(
-    recordings: Sequence[Recording], motions: Sequence[Motion], length: float
+    recordings: Sequence[Recording],
+    motions: Sequence[Motion],
+    length: float,
+    *,
+    from_rest: bool = False,
 ) -> Windows:
     """Cut recordings into windows of about `length` seconds that cover all but their gaps.
 
@@ -64,6 +75,8 @@ def cut_windows(
         recordings: in joint coordinates; a recording shorter than `length` is one window.
         motions: the smoothed motion of each recording.
         length: [s].
+        from_rest: recordings begin at rest, so that their first windows start there and not from
+            the smoothed motion; one that moves at once is taken for what was cut out of another.
 
     Raises:
         ValueError: if a recording has so few samples that no window fits.
@@ -102,4 +115,15 @@ def cut_windows(
     )
     names = tuple(r.name for _, r, *_ in pieces)
     spans = tuple((place, a, b) for place, _, _, a, b in pieces)
-    return Windows(q_, tau_, step_, weight_, q0, qd0, names, spans)
+    resting = tuple(
+        i for i, (_, r, _, a, _) in enumerate(pieces) if from_rest and a == 0 and _is_still(r)
+    )
+    for i in resting:
+        q0[i], qd0[i] = q_[i, 0], 0.0
+    return Windows(q_, tau_, step_, weight_, q0, qd0, names, spans, resting)
+
+
+def _is_still(recording: Recording) -> bool:
+    """Whether a recording may begin at rest, for all that its first sample tells."""
+    moved = np.abs(recording.q[1] - recording.q[0]).max()
+    return bool(moved <= AT_REST * (recording.time[1] - recording.time[0]))

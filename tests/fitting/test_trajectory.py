@@ -167,6 +167,19 @@ def test_the_prior_of_the_plant_may_be_centred_elsewhere():
     assert float(p.cost(x) - moved.cost(x)) == pytest.approx(prior)
 
 
+def test_a_start_at_rest_is_held_and_the_others_are_free():
+    p = problem(bent("LFM"))
+    free, mean = p.prior()
+    p.windows = replace(p.windows, at_rest=(1,))
+    held, same = p.prior()
+    first = p.shared_count
+    torch.testing.assert_close(
+        held[first + 4 :].rsqrt(), torch.tensor([1e-4, 1e-4, 1e-3, 1e-3], dtype=F64)
+    )
+    assert torch.equal(held[: first + 4], free[: first + 4])
+    assert torch.equal(same, mean)
+
+
 def test_a_traced_motion_is_the_simulated_one_where_windows_lie():
     """Longer windows start from it; samples outside every window keep the smoother's state."""
     w = windows()

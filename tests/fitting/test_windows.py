@@ -53,6 +53,41 @@ def test_a_subset_keeps_what_belongs_to_its_windows():
         assert torch.equal(getattr(some, name), getattr(w, name)[::2])
 
 
+def still(samples=301, slope=0.0):
+    """Two recordings; the first moves at once by `slope` [rad/s], and both do later on."""
+    time = np.linspace(0.0, 3.0, samples)
+    parts = []
+    for rate in (slope, 0.0):
+        q = 0.2 + np.stack([rate * time + 0.3 * time**3, -0.1 * time**2], 1)
+        motion = Motion(time, q + 0.1, np.gradient(q, time, axis=0) + 0.2, np.zeros_like(q))
+        parts.append((Recording(time, q), motion))
+    return zip(*parts, strict=True)
+
+
+def test_recordings_that_begin_at_rest_start_where_the_encoders_stood():
+    recordings, motions = still()
+    smoothed = cut_windows(recordings, motions, 1.0)
+    w = cut_windows(recordings, motions, 1.0, from_rest=True)
+    assert smoothed.at_rest == ()
+    # The first window of each.
+    assert w.at_rest == (0, 3)
+    for i in range(len(w)):
+        if i in w.at_rest:
+            assert torch.equal(w.q0[i], w.q[i, 0])
+            assert not w.qd0[i].any()
+        else:
+            assert torch.equal(w.q0[i], smoothed.q0[i])
+            assert torch.equal(w.qd0[i], smoothed.qd0[i])
+    assert w.subset(torch.arange(len(w)) > 1).at_rest == (1,)
+
+
+def test_what_moves_from_its_first_sample_is_not_at_rest():
+    recordings, motions = still(slope=1.0)
+    w = cut_windows(recordings, motions, 1.0, from_rest=True)
+    assert w.at_rest == (3,)
+    np.testing.assert_array_equal(w.qd0[0], motions[0].qd[0])
+
+
 def test_several_recordings_share_one_stack():
     parts = [made(100, 1, name="long"), made(30, 2, tau=True, name="short")]
     w = cut_windows([r for r, _ in parts], [m for _, m in parts], 0.3)
