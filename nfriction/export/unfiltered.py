@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from nfriction.friction import Adaptive, Constant, FrictionModel, NeuroFuzzy
+from nfriction.friction.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
 from nfriction.modelfile import ModelInfo
 
 # Bits of the status.
@@ -209,7 +210,7 @@ def memory_of(model: FrictionModel) -> int:
 
 def _knows_its_range(model: FrictionModel) -> bool:
     """Whether the schedule itself sees to inputs outside its range."""
-    own = isinstance(model.schedule, (Constant, Adaptive, NeuroFuzzy))
+    own = isinstance(model.schedule, Constant | Adaptive | AdaptiveNeuroFuzzy | NeuroFuzzy)
     return bool(getattr(model.schedule, "bounded", own))
 
 

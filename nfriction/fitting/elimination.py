@@ -147,11 +147,24 @@ def score(rows: Iterable[Rows], layout: Layout, known: Eliminated, precision: Te
 
 
 def _beyond_rounding(data: Tensor, sizes: Tensor) -> Tensor:
-    """Curvature less what rounding may have made up in rows of these squares, each (kept, kept)."""
-    error = ROUNDING * torch.finfo(data.dtype).eps
-    told = data - torch.diag(error**2 * sizes.diagonal())
-    blind = told.diagonal() <= 0
-    return torch.where(blind[:, None] | blind, 0.0, told)
+    """Curvature less what rounding may have made up in rows of these squares, each (kept, kept).
+
+    Of what is all made up nothing is told. It is left open, the worst first, and the others are
+    told with it open, not as if it were known.
+    """
+    made_up = (ROUNDING * torch.finfo(data.dtype).eps) ** 2 * sizes.diagonal()
+    left_open = torch.zeros_like(made_up, dtype=torch.bool)
+    while True:
+        share = torch.where(left_open | (made_up == 0), torch.inf, data.diagonal() / made_up)
+        worst = int(share.argmin())
+        if not share[worst] <= 1:
+            break
+        pivot = data[worst, worst]
+        if pivot > 0:
+            data = data - torch.outer(data[:, worst], data[worst]) / pivot
+        left_open[worst] = True
+        data = torch.where(left_open[:, None] | left_open, 0.0, data)
+    return data - torch.diag(torch.where(left_open, 0.0, made_up))
 
 
 def _joined(

@@ -217,7 +217,7 @@ class TrajectoryProblem:
     def spread(self) -> Tensor:
         """Standard deviation of every shared parameter by the last quadratic model."""
         precision, _ = self.prior()
-        known = evidence(self._hessian, precision, self.shared_count, 1.0, 1.0)
+        known = evidence(self._hessian, precision, self.shared_count)
         return standard_deviations(known)
 
     def _simulate(self, x: Tensor) -> Rollout:
@@ -283,7 +283,7 @@ class TrajectoryProblem:
         known = eliminated(self._rows(x, self._scale), layout, of_states, *joined)
         rows = self._rows(x, self._scale * sd / self.noise_sd)
         spread = score(rows, layout, known, of_states)
-        return evidence(known.data + torch.diag(kept), kept, first, 1.0, 1.0, spread)
+        return evidence(known.data + torch.diag(kept), kept, first, spread)
 
     def _rows(self, x: Tensor, scale: Tensor) -> Iterator[Rows]:
         """Rows of the Jacobian, some samples at a time; errors count as `scale` says."""

@@ -65,29 +65,23 @@ def evidence(
     hessian: Tensor,
     precision: Tensor,
     shared: int,
-    noise_sd: float,
-    effective_sd: float,
     score: Tensor | None = None,
 ) -> Evidence:
     """Curvature over the shared parameters with every window's state eliminated.
 
     Args:
-        hessian: of the cost that counted residuals over `noise_sd`, prior included, (n, n).
+        hessian: of the cost, prior included, (n, n).
         precision: of the prior, (n,); its window states come last.
         shared: number of friction and plant parameters.
-        noise_sd: what the residuals were counted in.
-        effective_sd: of a residual, enlarged for its correlation in time.
         score: covariance of that cost's gradient by the data, (n, n), where it is not the
             curvature: residuals differ in size, or in how long they last.
     """
-    data = (hessian - torch.diag(precision)) * (noise_sd / effective_sd) ** 2
-    own = data[shared:, shared:] + torch.diag(precision[shared:])
-    across = data[:shared, shared:]
-    pull = torch.linalg.solve(own, across.T).T
-    eliminated = _symmetric(data[:shared, :shared] - pull @ across.T)
+    across = hessian[:shared, shared:]
+    pull = torch.linalg.solve(hessian[shared:, shared:], across.T).T
+    data = hessian[:shared, :shared] - torch.diag(precision[:shared])
+    eliminated = _symmetric(data - pull @ across.T)
     if score is None:
         return Evidence(eliminated, precision[:shared])
-    score = score * (noise_sd / effective_sd) ** 4
     passed = torch.cat([torch.eye(shared, dtype=data.dtype), -pull], 1)
     known = passed @ score @ passed.T + (pull * precision[shared:]) @ pull.T
     return Evidence(eliminated, precision[:shared], _symmetric(known))

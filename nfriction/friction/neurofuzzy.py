@@ -175,9 +175,13 @@ class NeuroFuzzy(Schedule):
         self.acceleration_upper.copy_(upper)
 
     def within_range(self, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor]:
-        forward = torch.where(qd < 0, -1.0, 1.0) if self.along_motion else torch.ones_like(qd)
-        held = (forward * qdd).clamp(self.acceleration_lower, self.acceleration_upper)
-        return qd.clamp(-self.velocity_range, self.velocity_range), forward * held
+        qd = qd.clamp(-self.velocity_range, self.velocity_range)
+        sign = torch.ones_like(qd)
+        if self.along_motion:
+            sign = torch.tanh(qd / self.velocity_range / self.turn)
+        held = (sign * qdd).clamp(self.acceleration_lower, self.acceleration_upper)
+        # At rest the network sees no acceleration, whatever it is.
+        return qd, torch.where(sign == 0, qdd, held / sign)
 
     def trained(self) -> tuple[nn.Parameter, nn.Parameter]:
         """The parameters that a trajectory fit varies, each (joint, coefficient, ...).

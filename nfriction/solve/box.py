@@ -6,10 +6,17 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from nfriction.solve.semidefinite import solve_semidefinite
+
 # Times the number of unknowns; a round pins one or lets one go.
 ROUNDS = 3
+# Unknowns without bounds from which on it pays to solve for them apart.
+MANY = 400
 # In roundings of a bound; nearer than that a parameter is on it.
 NEAR = 4
+
+# (matrix, right sides, which unknowns these are) -> solutions.
+Solve = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 def bounds_of(
@@ -29,22 +36,17 @@ def bounds_of(
     return low.expand_as(x0), high.expand_as(x0)
 
 
-def on_bounds(x: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Within bounds, and on them where only a rounding is between."""
+def on_bounds(x: Tensor, lower: Tensor, upper: Tensor, before: Tensor) -> Tensor:
+    """Within bounds, and on them where only a rounding of the step from `before` is between."""
     near = NEAR * torch.finfo(x.dtype).eps
     for bound, inside in ((lower, x - lower), (upper, upper - x)):
-        there = bound.isfinite() & (inside <= near * bound.abs())
+        there = bound.isfinite() & (inside <= near * torch.maximum(bound.abs(), before.abs()))
         x = torch.where(there, bound, x)
     return x
 
 
 def minimise_within(
-    system: Tensor,
-    slope: Tensor,
-    low: Tensor,
-    high: Tensor,
-    free: Tensor,
-    solve: Callable[[Tensor, Tensor, Tensor], Tensor],
+    system: Tensor, slope: Tensor, low: Tensor, high: Tensor, free: Tensor, solve: Solve
 ) -> Tensor:
     """Minimiser of `slope @ x + x @ system @ x / 2` within `low <= 0 <= high`, by an active set.
 
@@ -57,12 +59,37 @@ def minimise_within(
         system: positive semidefinite, (p, p).
         slope, low, high: (p,); bounds may be infinite.
         free: what to begin with, bool (p,); the rest is at a bound.
-        solve: (matrix, vector, free) -> solution over the free ones.
+        solve: (matrix, right sides, free) -> solutions over the free ones; one or several.
 
     References:
         J. Nocedal, S. J. Wright, Numerical Optimization (2006), algorithm 16.3.
     """
+    if len(free) and free.all():
+        x, hit = _towards(torch.zeros_like(slope), -solve(system, slope, free), low, high)
+        if not hit.any():
+            return x
+    loose = low.isinf() & high.isinf()
+    if loose.all() or int(loose.sum()) < MANY:
+        return _active_set(system, slope, low, high, free, solve)
+    # What has no bounds follows the rest, and is solved for once.
+    tight = ~loose
+    right = torch.cat([system[loose][:, tight], slope[loose, None]], 1)
+    following = solve(system[loose][:, loose], right, loose)
+    taken = system[tight][:, loose] @ following
+    x = torch.zeros_like(slope)
+    x[tight] = _active_set(
+        system[tight][:, tight] - taken[:, :-1], slope[tight] - taken[:, -1],
+        low[tight], high[tight], free[tight], lambda part, sides, _: solve_semidefinite(part, sides)
+    )  # fmt: skip
+    x[loose] = -(following[:, -1] + following[:, :-1] @ x[tight])
+    return x
+
+
+def _active_set(
+    system: Tensor, slope: Tensor, low: Tensor, high: Tensor, free: Tensor, solve: Solve
+) -> Tensor:
     x, free = torch.zeros_like(slope), free.clone()
+    rounding = 10 * len(slope) * torch.finfo(slope.dtype).eps
     for _ in range(ROUNDS * len(x)):
         if free.any():
             given = slope[free] + system[free][:, ~free] @ x[~free]
@@ -74,6 +101,7 @@ def minimise_within(
         pull = slope + system @ x
         inward = ((x <= low) & (pull < 0)) | ((x >= high) & (pull > 0))
         inward &= ~free & (low < high)
+        inward &= pull.abs() > rounding * (slope.abs() + system.abs() @ x.abs())
         if not inward.any():
             break
         free[torch.where(inward, pull.abs(), -1.0).argmax()] = True

@@ -238,20 +238,20 @@ class _Search:
         )
         return step / root
 
-    def _solved(self, matrix: Tensor, vector: Tensor, free: Tensor) -> Tensor:
+    def _solved(self, matrix: Tensor, right: Tensor, free: Tensor) -> Tensor:
         """Solution for the free parameters, block by block where the model has blocks."""
         if self.local.blocks is not None:
             first, size = self.local.blocks
             if len(free) - first >= MANY * size and free[first:].all():
-                return solve_bordered(matrix, vector, int(free[:first].sum()), size)
-        return solve_semidefinite(matrix, vector)
+                return solve_bordered(matrix, right, int(free[:first].sum()), size)
+        return solve_semidefinite(matrix, right)
 
     def predicted_fall(self, step: Tensor) -> float:
         return -float(self.local.gradient @ step + 0.5 * step @ (self.local.hessian @ step))
 
     def attempt(self, step: Tensor, norm: float) -> float:
         """Move if the cost falls and all is finite; return the fall (-inf where not finite)."""
-        trial = on_bounds(self.x + step, self.lower, self.upper)
+        trial = on_bounds(self.x + step, self.lower, self.upper, self.x)
         self.evaluations += 1
         if self.trial_cost is None:
             there = self._checked(self.model(trial))

@@ -4,20 +4,26 @@ import torch
 from torch import Tensor
 
 
-def solve_semidefinite(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Solve a positive semidefinite system; in singular ones the shortest solution."""
+def solve_semidefinite(matrix: Tensor, right: Tensor) -> Tensor:
+    """Solve a positive semidefinite system; in singular ones the shortest solution.
+
+    Args:
+        matrix: (p, p).
+        right: right sides, (p,) or (p, k); the solutions have its shape.
+    """
+    sides = right if right.ndim == 2 else right[:, None]
     factor, failed = torch.linalg.cholesky_ex(matrix)
     if not failed:
-        solution = torch.cholesky_solve(vector[:, None], factor)[:, 0]
+        solution = torch.cholesky_solve(sides, factor)
         if torch.isfinite(solution).all():
-            return solution
+            return solution.view_as(right)
     values, vectors = torch.linalg.eigh(matrix)
     cut = torch.finfo(matrix.dtype).eps * len(values) * values.abs().max()
     inverse = torch.where(values > cut, 1 / values, 0.0)
-    return vectors @ (inverse * (vectors.T @ vector))
+    return (vectors @ (inverse[:, None] * (vectors.T @ sides))).view_as(right)
 
 
-def solve_bordered(matrix: Tensor, vector: Tensor, first: int, size: int) -> Tensor:
+def solve_bordered(matrix: Tensor, right: Tensor, first: int, size: int) -> Tensor:
     """The same of a matrix that is block diagonal from some row on, block by block.
 
     The blocks' unknowns are eliminated (Schur complement), so that the cost grows with the number
@@ -25,22 +31,25 @@ def solve_bordered(matrix: Tensor, vector: Tensor, first: int, size: int) -> Ten
 
     Args:
         matrix: symmetric, (p, p).
-        vector: (p,).
+        right: right sides, (p,) or (p, k).
         first: row from which on the matrix is block diagonal.
         size: of each block.
     """
-    count = (len(vector) - first) // size
+    count = (len(matrix) - first) // size
+    sides = right if right.ndim == 2 else right[:, None]
     at = torch.arange(count)
     own = matrix[first:, first:].reshape(count, size, count, size)[at, :, at]
     across = matrix[first:, :first].reshape(count, size, first)
     factor, failed = torch.linalg.cholesky_ex(own)
     if failed.any():
-        return solve_semidefinite(matrix, vector)
-    right = torch.cat([across, vector[first:].reshape(count, size, 1)], -1)
-    solved = torch.cholesky_solve(right, factor)
-    # Of the shared rows: what the blocks take of matrix and vector.
+        return solve_semidefinite(matrix, right)
+    solved = torch.cholesky_solve(
+        torch.cat([across, sides[first:].reshape(count, size, -1)], -1), factor
+    )
+    # Of the shared rows: what the blocks take of matrix and right sides.
     taken = across.flatten(0, 1).T @ solved.flatten(0, 1)
     shared = solve_semidefinite(
-        matrix[:first, :first] - taken[:, :first], vector[:first] - taken[:, first]
+        matrix[:first, :first] - taken[:, :first], sides[:first] - taken[:, first:]
     )
-    return torch.cat([shared, (solved[..., first] - solved[..., :first] @ shared).reshape(-1)])
+    own = solved[..., first:] - solved[..., :first] @ shared
+    return torch.cat([shared, own.flatten(0, 1)]).view_as(right)

@@ -25,7 +25,7 @@ def regression(samples=200, parameters=3):
 def test_intervals_of_a_linear_fit_cover_as_often_as_they_say():
     design, g = regression()
     truth, noise = torch.tensor([1.0, -2.0, 0.5], dtype=F64), 0.3
-    known = evidence(design.T @ design, torch.zeros(3, dtype=F64), 3, 1.0, noise)
+    known = evidence(design.T @ design / noise**2, torch.zeros(3, dtype=F64), 3)
     sd, free = standard_deviations(known), torch.full((3,), torch.inf, dtype=F64)
     hits = []
     for _ in range(400):
@@ -40,11 +40,9 @@ def test_intervals_of_a_linear_fit_cover_as_often_as_they_say():
 def test_eliminating_window_states_is_marginalising_them():
     design, _ = regression(parameters=5)
     precision = torch.tensor([0.0, 2.0, 0.0, 1.0, 3.0], dtype=F64)
-    noise_sd, sd = 0.5, 0.7
-    hessian = design.T @ design / noise_sd**2 + torch.diag(precision)
-    whole = torch.linalg.inv(design.T @ design / sd**2 + torch.diag(precision))
-    found = standard_deviations(evidence(hessian, precision, 3, noise_sd, sd))
-    torch.testing.assert_close(found, whole.diagonal()[:3].sqrt())
+    hessian = design.T @ design / 0.7**2 + torch.diag(precision)
+    found = standard_deviations(evidence(hessian, precision, 3))
+    torch.testing.assert_close(found, torch.linalg.inv(hessian).diagonal()[:3].sqrt())
 
 
 def test_a_score_as_large_as_the_curvature_changes_nothing():
@@ -52,12 +50,12 @@ def test_a_score_as_large_as_the_curvature_changes_nothing():
     precision = torch.tensor([0.0, 2.0, 0.0, 1.0, 3.0], dtype=F64)
     data = design.T @ design / 0.25
     hessian = data + torch.diag(precision)
-    plain = evidence(hessian, precision, 3, 0.5, 0.5)
-    same = evidence(hessian, precision, 3, 0.5, 0.5, data)
+    plain = evidence(hessian, precision, 3)
+    same = evidence(hessian, precision, 3, data)
     torch.testing.assert_close(standard_deviations(same), standard_deviations(plain))
     # Errors twice as large make intervals as wide, be that said of the score or of all residuals.
-    wide = evidence(design.T @ design / 0.25, 0 * precision, 3, 0.5, 1.0)
-    score = evidence(design.T @ design / 0.25, 0 * precision, 3, 0.5, 0.5, 4 * data)
+    wide = evidence(design.T @ design, 0 * precision, 3)
+    score = evidence(data, 0 * precision, 3, 4 * data)
     torch.testing.assert_close(standard_deviations(score), standard_deviations(wide))
 
 
@@ -72,8 +70,8 @@ def test_intervals_cover_where_residuals_are_not_alike():
     free = torch.full((3,), torch.inf, dtype=F64)
     hits: dict[str, list[bool]] = {"sandwich": [], "alike": []}
     sd = {
-        "sandwich": standard_deviations(evidence(hessian, zero, 3, 1.0, 1.0, score)),
-        "alike": standard_deviations(evidence(hessian, zero, 3, 1.0, alike)),
+        "sandwich": standard_deviations(evidence(hessian, zero, 3, score)),
+        "alike": standard_deviations(evidence(hessian / alike**2, zero, 3)),
     }
     for _ in range(400):
         y = sizes * torch.randn(len(design), generator=g, dtype=F64)

@@ -119,13 +119,13 @@ def test_the_nearest_trained_motion(acceleration: str) -> None:
     schedule = trained(acceleration=acceleration)
     schedule.set_range([4.0, 5.0], [[-30.0, 60.0], [-20.0, 20.0]])
     qd, qdd = 10 * normal(200, 2), 100 * normal(200, 2, seed=1)
+    qd[:50] *= 1e-3
     nearest = schedule.within_range(qd, qdd)
     # What is near is left alone, and nothing nearer than the clamped inputs is found.
     scaled = schedule.scaled(qd, qdd)
-    away = qd.abs() > 0.1
-    torch.testing.assert_close(schedule.scaled(*nearest)[away], scaled.clamp(0, 1)[away])
-    again = schedule.within_range(*nearest)
-    assert torch.equal(torch.stack(again), torch.stack(nearest))
+    torch.testing.assert_close(schedule.scaled(*nearest), scaled.clamp(0, 1))
+    rest = torch.zeros(1, 2, dtype=torch.float64), qdd[:1]
+    assert all(torch.isfinite(x).all() for x in schedule.within_range(*rest))
 
 
 @pytest.mark.parametrize(
