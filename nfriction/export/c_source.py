@@ -24,7 +24,7 @@ from nfriction.export.controller import AnyController
 from nfriction.export.errors import ExportError
 from nfriction.export.filtered import FILTER_STATE, FilteredController
 from nfriction.export.flat import shortened
-from nfriction.export.unfiltered import Controller, MemoryController
+from nfriction.export.unfiltered import Controller, MemoryController, for_single_precision
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def source_of(
     assert isinstance(inner, (Controller, MemoryController))
     inner = shortened(inner, number_by_number=True)
     if real == "float":
-        inner = _single(inner)
+        inner = for_single_precision(inner)
     dialect = ControllerC(real, prefix)
     try:
         parts = [_step(inner, dialect)]
@@ -107,19 +107,6 @@ def source_of(
     code = [f"{head}\n{includes}", dialect.functions(), bits(prefix, real), rapid, *parts]
     header = header_of(controller, inner, description, real, prefix)
     return Source("\n".join(part for part in code if part), header)
-
-
-def _single(controller: Controller | MemoryController) -> Controller | MemoryController:
-    """With ranges such that no number in single precision changes its side by their rounding."""
-    single = copy.deepcopy(controller)
-    for name in ("qd", "qdd"):
-        for edge, inward in (("lower", math.inf), ("upper", -math.inf)):
-            exact = single.get_buffer(f"{name}_{edge}")
-            near = exact.float()
-            outside = near.double() < exact if edge == "lower" else near.double() > exact
-            next_in = torch.nextafter(near, torch.full_like(near, inward))
-            exact.copy_(torch.where(outside, next_in, near))
-    return single
 
 
 def _example(joints: int, *size: int) -> Tensor:

@@ -15,7 +15,7 @@ from nfriction.export.controller import controller_of
 from nfriction.export.errors import ExportError, first_line
 from nfriction.export.onnx_graph import OnnxGraph
 from nfriction.export.program import exported, run_stateful, silent
-from nfriction.export.unfiltered import Controller
+from nfriction.export.unfiltered import Controller, MemoryController, for_single_precision
 from nfriction.friction import FrictionModel
 from nfriction.modelfile import ModelInfo
 
@@ -71,6 +71,9 @@ def onnx(
     inputs, outputs = list(contract.inputs), list(OUTPUTS)
     if not isinstance(controller, Controller):
         inputs, outputs = [*inputs, "state"], [*outputs, "next_state"]
+    if dtype == "float32":
+        assert isinstance(controller, Controller | MemoryController)
+        controller = for_single_precision(controller)
     with silent():
         program = exported(controller).run_decompositions()
     graph = OnnxGraph(program, inputs, outputs, REAL[dtype])

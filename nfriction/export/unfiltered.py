@@ -203,6 +203,21 @@ class MemoryController(_Contracted):
         return tau_f, coefficients, status, following
 
 
+def for_single_precision(
+    controller: Controller | MemoryController,
+) -> Controller | MemoryController:
+    """With ranges such that no number in single precision changes its side by their rounding."""
+    single = copy.deepcopy(controller)
+    for name in ("qd", "qdd"):
+        for edge, inward in (("lower", math.inf), ("upper", -math.inf)):
+            exact = single.get_buffer(f"{name}_{edge}")
+            near = exact.float()
+            outside = near.double() < exact if edge == "lower" else near.double() > exact
+            next_in = torch.nextafter(near, torch.full_like(near, inward))
+            exact.copy_(torch.where(outside, next_in, near))
+    return single
+
+
 def memory_of(model: FrictionModel) -> int:
     """Numbers a joint that the model's schedule carries from sample to sample."""
     return int(getattr(model.schedule, "state_size", 0))

@@ -18,6 +18,7 @@ from nfriction.export.controller import controller_of
 from nfriction.export.onnx_file import open_onnx
 from nfriction.export.points import draw
 from nfriction.friction import LFM, Coefficient, Constant, FrictionModel, Law
+from nfriction.modelfile import ModelInfo
 from tests.export.artefacts import INFO, rising
 from tests.friction.samples import named_models
 
@@ -39,6 +40,14 @@ def test_in_double_it_equals_the_model(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["LFM", "NFLFM"])
 def test_in_single_precision_it_is_as_close_as_that_allows(name: str, tmp_path: Path) -> None:
     check_parity(MODELS[name], tmp_path / "m.onnx", "float32", 5000)
+
+
+@needs_onnx
+def test_edges_that_single_precision_does_not_know_are_those_of_the_model(tmp_path: Path) -> None:
+    """Both ways of rounding: none of the edges may count as outside, none beyond as inside."""
+    info = ModelInfo(input_ranges={"qd": [[-0.1, 0.7]] * 3, "qdd": [[-20.1, 1 / 3]] * 3})
+    contract, run = open_onnx(onnx(MODELS["LFM"], tmp_path / "m.onnx", info, dtype="float32"))
+    assert verify(run, contract).passed
 
 
 @needs_onnx
