@@ -63,7 +63,7 @@ class FrictionEstimator:
         fit_plant: bool = True,
         drag: bool | None = None,
         eccentricity: bool | None = False,
-        zeroed: str = "once",
+        zeroed: str = "auto",
         continuity: str = "free",
         max_steps: int = 30,
         horizon: float = 5.0,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from nfriction.fitting import Fit
 from nfriction.fitting.holdback import LEAST_ERROR
+from nfriction.fitting.preparation import zeroed_each
 from nfriction.friction import model_by_name
 from nfriction.many import Data, Fits, fit_models
 from nfriction.plant import LinearAxis, PendulumChain
@@ -144,6 +145,10 @@ def select(
             "a choice needs models, recordings and at least 2 folds, got "
             f"{len(models)} models, {len(recordings)} recordings and {folds} folds."
         )
+    if fit_settings.get("zeroed", "auto") == "auto":
+        # Blocks no longer show where their recording began.
+        each = zeroed_each(plant, recordings)
+        fit_settings["zeroed"] = "each" if each else "once"
     names = list(dict.fromkeys(models))
     blocks = [cut_blocks(plant, recording, folds) for recording in recordings]
     horizon = min(horizon, *(b.recording.duration for row in blocks for b in row))

@@ -40,9 +40,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--eccentricity", choices=("none", "fit", "evidence"), default="none",
                         help="how far encoders sit off their shafts: none, fitted, or fitted "
                         "where the evidence asks for it")  # fmt: skip
-    parser.add_argument("--zeroed", choices=("once", "each"), default="once",
+    parser.add_argument("--zeroed", choices=("auto", "once", "each"), default="auto",
                         help="when incremental encoders were set to zero: once, or at the start of "
-                        "each recording, wherever dry friction held the links")  # fmt: skip
+                        "each recording, wherever dry friction held the links (default: each, "
+                        "where all recordings of a driven rig begin at rest at zero)")  # fmt: skip
     parser.add_argument("--continuity", choices=("free", "soft", "hard"), default="free",
                         help="windows of a recording: each with a start of its own, or one "
                         "motion but for jumps of 0.3 mrad, or for none")  # fmt: skip

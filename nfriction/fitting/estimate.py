@@ -18,6 +18,7 @@ from nfriction.fitting.preparation import (
     is_eccentric,
     listed,
     mixing_of,
+    zeroed_each,
     zeros_serve,
 )
 from nfriction.fitting.stages import JUMP_SD, Callback, Refinement, Stage, flat, least
@@ -31,8 +32,12 @@ from nfriction.signals import Motion, kalman_smoother
 logger = logging.getLogger(__name__)
 
 Method = Literal["trajectory", "torque"]
-# How encoders were zeroed: once for all recordings, or anew at the start of each.
-Zeroed = Literal["once", "each"]
+# How encoders were zeroed: once for all recordings, anew at the start of each, or as it looks.
+Zeroed = Literal["auto", "once", "each"]
+ZEROED_EACH = (
+    "Every recording begins at rest with all encoders at zero, so they were taken for set to zero "
+    'there, wherever the links stood; `zeroed="once"` where they were not.'
+)
 # Dry friction of a tenth of a link's largest gravity moment lets it rest up to 0.1 rad off [rad].
 ZERO_SD = 0.05
 # First guess of what a model of a bench leaves unexplained, before a fit tells [rad or m].
@@ -55,7 +60,7 @@ def fit(
     fit_plant: bool = True,
     drag: bool | None = None,
     eccentricity: bool | None = False,
-    zeroed: Zeroed = "once",
+    zeroed: Zeroed = "auto",
     continuity: Continuity = "free",
     start: Fit | None = None,
     motions: Sequence[Motion] | None = None,
@@ -93,7 +98,8 @@ def fit(
             recording's first window starts there. How far a zero was off is found for each
             recording and left out of the plant, whose offset stays as given, as that of a further
             recording cannot be known. Whoever scores a recording that was trained on scores it as
-            it is, zeros and all.
+            it is, zeros and all. `"auto"`: `"each"` where several recordings of a driven chain
+            all begin at rest with every encoder at zero, which the fit then says.
         continuity: of the state from a window to the next. `"free"`: every window has a start of
             its own, as suits a law that is not wholly right, or motion that forgets its start.
             `"soft"`, `"hard"`: the windows of a recording make one motion, but for jumps of about
@@ -125,6 +131,10 @@ def fit(
     if continuity != "free" and method == "torque":
         raise ValueError(f"`continuity={continuity!r}` is of trajectories, not of torques.")
     given = listed(model, plant, recordings)
+    told: tuple[str, ...] = ()
+    if zeroed == "auto":
+        each = method == "trajectory" and zeroed_each(plant, given)
+        zeroed, told = ("each", (ZEROED_EACH,)) if each else ("once", ())
     joint = in_joint_coordinates(plant, model, given)
     if eccentricity and not may_be_eccentric(plant):
         raise ValueError(f"{plant.name or 'the axis'} has no encoders that turn with its joints.")
@@ -140,7 +150,7 @@ def fit(
         }  # fmt: skip
         if isinstance(model.schedule, NeuroFuzzy):
             same |= {"eccentricity": eccentricity, "continuity": continuity}
-        return _fit_further(model, plant, given, moved, start, zeroed, same)
+        return _saying(told, _fit_further(model, plant, given, moved, start, zeroed, same))
     torque = fit_torque(model.law, start.plant if start else plant, joint, moved, model.v_smooth)
     schedule = constant_schedule(model)
     schedule.set_coefficients(torque.coefficients)
@@ -174,7 +184,12 @@ def fit(
         tolerance = flat(stage.result.cost)
         stage = richer_by_evidence(stage, refinement(True), tolerance) or stage
     found = trajectory_outcome(stage.problem, stage.result, stage.residuals, moved)
-    return replace(found, continuity=continuity)
+    return _saying(told, replace(found, continuity=continuity))
+
+
+def _saying(told: tuple[str, ...], found: Fit) -> Fit:
+    """A fit that says this first, and once."""
+    return replace(found, warnings=(*told, *(w for w in found.warnings if w not in told)))
 
 
 def _fit_further(

@@ -12,6 +12,7 @@ from torch import Tensor
 from nfriction.angles import AngleConvention
 from nfriction.fitting.outcome import Fit, Plant
 from nfriction.fitting.plant_parameters import PlantParameter, plant_parameters
+from nfriction.fitting.windows import begins_still
 from nfriction.friction import Constant, FrictionModel
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.recording import Recording
@@ -23,6 +24,8 @@ logger = logging.getLogger(__name__)
 
 # Substeps beyond this say that the sign's passage is too steep for the sample time.
 MOST_SUBSTEPS = 8
+# An encoder that was just set to zero may flicker by some of its counts [rad].
+AT_ZERO = 2e-3
 
 
 def told_of(
@@ -133,6 +136,20 @@ def is_eccentric(asked: bool | None, known: Iterable[str]) -> bool:
     A chain of fits asks for them once, in its first.
     """
     return bool(asked) or (asked is None and any(name.startswith("encoder ") for name in known))
+
+
+def zeroed_each(plant: Plant, recordings: Sequence[Recording]) -> bool:
+    """Whether it looks as if encoders were set to zero at the start of each recording.
+
+    Links that dry friction holds stop where they stop. Where a driven chain begins several
+    recordings at rest, and all of its encoders read zero each time, they were set to it.
+    """
+    driven = isinstance(plant, PendulumChain) and _largest_torque(recordings) > 0
+    return (
+        driven
+        and len(recordings) > 1
+        and all(begins_still(r) and np.abs(r.q[0]).max() <= AT_ZERO for r in recordings)
+    )
 
 
 def zeros_serve(start: Fit, motions: Sequence[Motion], each: bool) -> bool:

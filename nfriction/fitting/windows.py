@@ -116,14 +116,14 @@ def cut_windows(
     names = tuple(r.name for _, r, *_ in pieces)
     spans = tuple((place, a, b) for place, _, _, a, b in pieces)
     resting = tuple(
-        i for i, (_, r, _, a, _) in enumerate(pieces) if from_rest and a == 0 and _is_still(r)
+        i for i, (_, r, _, a, _) in enumerate(pieces) if from_rest and a == 0 and begins_still(r)
     )
     for i in resting:
         q0[i], qd0[i] = q_[i, 0], 0.0
     return Windows(q_, tau_, step_, weight_, q0, qd0, names, spans, resting)
 
 
-def _is_still(recording: Recording) -> bool:
+def begins_still(recording: Recording) -> bool:
     """Whether a recording may begin at rest, for all that its first sample tells."""
     moved = np.abs(recording.q[1] - recording.q[0]).max()
     return bool(moved <= AT_REST * (recording.time[1] - recording.time[0]))

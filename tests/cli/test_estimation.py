@@ -20,7 +20,7 @@ def test_what_is_not_given_is_left_to_the_fit() -> None:
     settings = estimation.fit_settings(parser.parse_args(["--rig", "tlrip"]))
     assert "windows" not in settings
     assert settings["drag"] is None
-    assert settings["zeroed"] == "once"
+    assert settings["zeroed"] == "auto"
     assert settings["continuity"] == "free"
     assert f"(default: {','.join(f'{w:g}' for w in WINDOWS)})" in " ".join(
         parser.format_help().split()

@@ -75,6 +75,34 @@ def test_encoders_zeroed_anew_at_the_start_of_each_recording():
     assert torch.equal(each.plant.angle_offset, plant.angle_offset)
 
 
+def test_recordings_that_all_begin_at_rest_at_zero_are_taken_for_zeroed_there():
+    plant = geared()
+    law = CVFM(2, DRY, v_smooth=V_SMOOTH)
+    recordings = [driven(plant, law, seed, seconds=2.0) for seed in (0, 1)]
+    zeroed = [replace(r, q=r.q - r.q[0]) for r in recordings]
+    cases = {
+        "zeroed": (zeroed, True),
+        "alone": (zeroed[:1], False),
+        "off zero": ([zeroed[0], replace(zeroed[1], q=zeroed[1].q + 0.01)], False),
+        "in motion": (
+            [zeroed[0], replace(r := zeroed[1][len(zeroed[1]) // 2 :], q=r.q - r.q[0])],
+            False,
+        ),
+    }
+    for name, (given, each) in cases.items():
+        found = fit(CVFM(2, v_smooth=V_SMOOTH), plant, given, windows=(0.5,), max_steps=2)
+        assert bool(found.zeros) == each, name
+        assert any("begins at rest" in w for w in found.warnings) == each, name
+    further = fit(
+        NFCVFM(2, v_smooth=V_SMOOTH), plant, zeroed, windows=(0.5,), max_steps=2,
+        start=fit(CVFM(2, v_smooth=V_SMOOTH), plant, zeroed, windows=(0.5,), max_steps=2),
+    )  # fmt: skip
+    assert len(further.zeros) == 2
+    assert sum("begins at rest" in w for w in further.warnings) == 1
+    free = [replace(r, tau=None) for r in zeroed]
+    assert not fit(CVFM(2), plant, free, windows=(0.5,), max_steps=1).zeros
+
+
 def test_zeroed_at_rest_no_velocity_makes_up_for_friction_at_the_start():
     """A law with too smooth a sign lets the links creep away; a free start would hide it."""
     plant = geared()
