@@ -145,12 +145,12 @@ def select(
             "a choice needs models, recordings and at least 2 folds, got "
             f"{len(models)} models, {len(recordings)} recordings and {folds} folds."
         )
+    names = list(dict.fromkeys(models))
+    blocks = [cut_blocks(plant, recording, folds) for recording in recordings]
     if fit_settings.get("zeroed", "auto") == "auto":
         # Blocks no longer show where their recording began.
         each = zeroed_each(plant, recordings)
         fit_settings["zeroed"] = "each" if each else "once"
-    names = list(dict.fromkeys(models))
-    blocks = [cut_blocks(plant, recording, folds) for recording in recordings]
     horizon = min(horizon, *(b.recording.duration for row in blocks for b in row))
     seen, unseen = _folds(blocks, folds)
     fits = fit_models(

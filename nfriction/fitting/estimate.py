@@ -131,13 +131,13 @@ def fit(
     if continuity != "free" and method == "torque":
         raise ValueError(f"`continuity={continuity!r}` is of trajectories, not of torques.")
     given = listed(model, plant, recordings)
+    joint = in_joint_coordinates(plant, model, given)
+    if eccentricity and not may_be_eccentric(plant):
+        raise ValueError(f"{plant.name or 'the axis'} has no encoders that turn with its joints.")
     told: tuple[str, ...] = ()
     if zeroed == "auto":
         each = method == "trajectory" and zeroed_each(plant, given)
         zeroed, told = ("each", (ZEROED_EACH,)) if each else ("once", ())
-    joint = in_joint_coordinates(plant, model, given)
-    if eccentricity and not may_be_eccentric(plant):
-        raise ValueError(f"{plant.name or 'the axis'} has no encoders that turn with its joints.")
     moved = tuple(motions or (kalman_smoother(r.time, r.q) for r in joint))
     if isinstance(model.schedule, (Adaptive, NeuroFuzzy)):
         if method == "torque":
