@@ -105,10 +105,14 @@ class NeuroFuzzy(Schedule):
 
     def deviating(self, reference: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
         """Coefficients where the network deviates from a reference in its own units."""
+        x, weight = self._seen(qd, qdd)
+        return self._coefficients(reference + weight * self.network(x))
+
+    def _seen(self, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor]:
+        """Inputs as the network takes them, and the weight of what it says (*batch, joint, 1)."""
         scaled = self.scaled(qd, qdd)
         x = scaled.clamp(0.0, 1.0)
-        weight = fading(scaled - x, self.reach).unsqueeze(-1)
-        return self._coefficients(reference + weight * self.network(x))
+        return x, fading(scaled - x, self.reach).unsqueeze(-1)
 
     def at_reference(self, reference: Tensor) -> Tensor:
         """Coefficients at a reference in the network's own units, without the network."""
@@ -284,9 +288,7 @@ class NeuroFuzzy(Schedule):
     ) -> FactoredSensitivity:
         """Derivatives of what `deviating` gives, the reference held."""
         anfis, head = self.network.anfis, self.network.head
-        scaled = self.scaled(qd, qdd)
-        x = scaled.clamp(0.0, 1.0)
-        weight = fading(scaled - x, self.reach).unsqueeze(-1)
+        x, weight = self._seen(qd, qdd)
         y = anfis(x)
         both = torch.cat([x, y], -1)
         with torch.enable_grad():

@@ -11,7 +11,7 @@ from nfriction.solve.semidefinite import solve_semidefinite
 # Times the number of unknowns; a round pins one or lets one go.
 ROUNDS = 3
 # Unknowns without bounds from which on it pays to solve for them apart.
-MANY = 400
+APART = 400
 # In roundings of a bound; nearer than that a parameter is on it.
 NEAR = 4
 
@@ -69,7 +69,7 @@ def minimise_within(
         if not hit.any():
             return x
     loose = low.isinf() & high.isinf()
-    if loose.all() or int(loose.sum()) < MANY:
+    if loose.all() or int(loose.sum()) < APART:
         return _active_set(system, slope, low, high, free, solve)
     # What has no bounds follows the rest, and is solved for once.
     tight = ~loose

@@ -41,7 +41,7 @@ def test_what_has_no_bounds_may_be_solved_for_apart(seed, monkeypatch):
     whole = found(*given)
     assert_minimum(whole, *given)
     assert 2 < ((whole == given[2]) | (whole == given[3])).sum() < 20
-    monkeypatch.setattr(box, "MANY", 10)
+    monkeypatch.setattr(box, "APART", 10)
     torch.testing.assert_close(found(*given), whole, rtol=1e-9, atol=1e-12)
 
 
