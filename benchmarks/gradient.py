@@ -122,7 +122,6 @@ def gauss_newton(repeats: int) -> None:
             weight=torch.ones(WINDOWS, STEPS + 1, dtype=torch.float64),
             q0=q0,
             qd0=qd0,
-            names=("benchmark",) * WINDOWS,
         )
         identity = torch.eye(3, dtype=torch.float64)
         problem = TrajectoryProblem(StepJacobian(plant, model, []), windows, 1e-3, identity)

@@ -26,7 +26,6 @@ class Windows:
         step: [s], (window, step); zero where a window ends early.
         weight: 1 where a sample counts, 0 where it pads, (window, step + 1).
         q0, qd0: smoothed state at the start, (window, joint).
-        names: recording that each window comes from.
         spans: of each window, the recording's place among those given, its first and last sample.
         at_rest: windows of which the start is known: where the encoders stood, and no velocity.
     """
@@ -37,7 +36,6 @@ class Windows:
     weight: Tensor
     q0: Tensor
     qd0: Tensor
-    names: tuple[str, ...]
     spans: tuple[tuple[int, int, int], ...] = ()
     at_rest: tuple[int, ...] = ()
 
@@ -56,7 +54,6 @@ class Windows:
         return Windows(
             q=self.q[index], tau=self.tau[index], step=self.step[index],
             weight=self.weight[index], q0=self.q0[index], qd0=self.qd0[index],
-            names=tuple(self.names[i] for i in index),
             spans=tuple(self.spans[i] for i in index if self.spans),
             at_rest=tuple(k for k, i in enumerate(index) if i in self.at_rest),
         )  # fmt: skip
@@ -113,14 +110,13 @@ def cut_windows(
     q_, tau_, step_, weight_, q0, qd0 = (
         torch.as_tensor(x, dtype=torch.float64) for x in (q, tau, step, weight, *start)
     )
-    names = tuple(r.name for _, r, *_ in pieces)
     spans = tuple((place, a, b) for place, _, _, a, b in pieces)
     resting = tuple(
         i for i, (_, r, _, a, _) in enumerate(pieces) if from_rest and a == 0 and begins_still(r)
     )
     for i in resting:
         q0[i], qd0[i] = q_[i, 0], 0.0
-    return Windows(q_, tau_, step_, weight_, q0, qd0, names, spans, resting)
+    return Windows(q_, tau_, step_, weight_, q0, qd0, spans, resting)
 
 
 def begins_still(recording: Recording) -> bool:

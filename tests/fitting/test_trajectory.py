@@ -32,7 +32,7 @@ def windows(steps=20, step=2e-3, joined=False) -> Windows:
     q = integrate(pendulum(), truth, q0, qd0, tau, steps_).q
     second = (0, steps, 2 * steps - 4) if joined else (1, 0, steps - 4)
     spans = ((0, 0, steps), second)
-    return Windows(q, tau, steps_, weight, q0, qd0, ("a", "b"), spans)
+    return Windows(q, tau, steps_, weight, q0, qd0, spans)
 
 
 def problem(model, substeps=2, stride=1, joined=False, **settings) -> TrajectoryProblem:
@@ -183,7 +183,7 @@ def test_a_start_at_rest_is_held_and_the_others_are_free():
 def test_a_traced_motion_is_the_simulated_one_where_windows_lie():
     """Longer windows start from it; samples outside every window keep the smoother's state."""
     w = windows()
-    w = replace(w, names=("a", "a"), spans=((0, 0, 20), (0, 20, 36)))
+    w = replace(w, spans=((0, 0, 20), (0, 20, 36)))
     model, plant = bent("LFM"), pendulum()
     p = TrajectoryProblem(StepJacobian(plant, model, []), w, 1e-3, ABSOLUTE, substeps=2)
     x, zero = point(p), np.zeros((40, 2))
@@ -210,7 +210,7 @@ def halves(noise: float = 1e-3) -> Windows:
     start = [x[0, [0, 40]] + 0.01 for x in (run.q, run.qd)]
     return Windows(
         torch.cat([q[:, :41], q[:, 40:]]), torch.zeros(2, 40, 2, dtype=F64),
-        step.reshape(2, 40), torch.ones(2, 41, dtype=F64), *start, ("a", "a"),
+        step.reshape(2, 40), torch.ones(2, 41, dtype=F64), *start,
         ((0, 0, 40), (0, 40, 80)),
     )  # fmt: skip
 

@@ -99,7 +99,7 @@ def problem(model: NFLFM, held: Unseen | None) -> TrajectoryProblem:
     tau = 0.05 * torch.randn(2, 60, 2, generator=g, dtype=F64)
     step = torch.full((2, 60), 5e-3, dtype=F64)
     q = integrate(pendulum(), network(0.3), q0, qd0, tau, step).q
-    w = Windows(q, tau, step, torch.ones(2, 61, dtype=F64), q0, qd0, ("a", "b"))
+    w = Windows(q, tau, step, torch.ones(2, 61, dtype=F64), q0, qd0)
     jacobian = StepJacobian(pendulum(), model, [])
     return TrajectoryProblem(jacobian, w, 1e-4, torch.eye(2, dtype=F64), unseen=held)
 

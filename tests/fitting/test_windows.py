@@ -9,11 +9,11 @@ from nfriction.fitting.windows import cut_windows
 from nfriction.signals import Motion
 
 
-def made(samples, seed=0, tau=False, name="r"):
+def made(samples, seed=0, tau=False):
     rng = np.random.default_rng(seed)
     time = np.cumsum(rng.uniform(5e-3, 15e-3, samples))
     q = rng.normal(size=(samples, 2))
-    recording = Recording(time, q, tau=rng.normal(size=(samples, 2)) if tau else None, name=name)
+    recording = Recording(time, q, tau=rng.normal(size=(samples, 2)) if tau else None)
     return recording, Motion(time, q + 0.1, q + 0.2, q + 0.3)
 
 
@@ -89,11 +89,11 @@ def test_what_moves_from_its_first_sample_is_not_at_rest():
 
 
 def test_several_recordings_share_one_stack():
-    parts = [made(100, 1, name="long"), made(30, 2, tau=True, name="short")]
+    parts = [made(100, 1), made(30, 2, tau=True)]
     w = cut_windows([r for r, _ in parts], [m for _, m in parts], 0.3)
-    assert w.names.count("long") + w.names.count("short") == len(w)
-    assert w.names == tuple(sorted(w.names))
-    first_short = w.names.index("short")
+    places = [place for place, *_ in w.spans]
+    assert places == sorted(places)
+    first_short = places.index(1)
     assert not w.tau[:first_short].any()
     assert w.tau[first_short:].any()
 
