@@ -25,7 +25,7 @@ from nfriction.plots import style
 from nfriction.recording import Recording
 from nfriction.scoring import Rmse, Score
 from nfriction.signals import Motion
-from nfriction.solve.levenberg import Step
+from nfriction.solve.least_squares import Step
 
 NAMES = (NO_FRICTION, "NCFM", "LFM", "NFLFM")
 

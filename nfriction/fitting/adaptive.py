@@ -27,7 +27,7 @@ from nfriction.fitting.windows import cut_windows
 from nfriction.friction import Adaptive, FrictionModel
 from nfriction.recording import Recording
 from nfriction.signals import Motion, kalman_smoother
-from nfriction.solve.levenberg import Step
+from nfriction.solve.least_squares import Step
 
 AdaptiveMethod = Literal["gauss-newton", "pattern", "sqp"]
 

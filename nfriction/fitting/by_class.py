@@ -22,7 +22,7 @@ from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
 from nfriction.friction import Adaptive, FrictionModel
 from nfriction.friction.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
 from nfriction.recording import Recording
-from nfriction.solve.levenberg import Step
+from nfriction.solve.least_squares import Step
 
 # Relative fall of the cost that ends the search: only its neighbourhood matters to a correction.
 LOOSE = 1e-3

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from nfriction.fitting.stages import Refinement, Stage
 from nfriction.plant import LinearAxis, PendulumChain
-from nfriction.solve.levenberg import Quadratic
+from nfriction.solve.least_squares import Quadratic
 
 TERMS = ("encoder_cosine", "encoder_sine")
 

@@ -26,7 +26,7 @@ from nfriction.friction import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.recording import Recording
 from nfriction.signals import Motion
-from nfriction.solve.levenberg import Step
+from nfriction.solve.least_squares import Step
 
 # Priors of a network that are tried, over its own: windows held back choose among them.
 PRIOR_SHARES = (1.0, 1 / 3)

@@ -23,7 +23,7 @@ from nfriction.fitting.verdict import (
 from nfriction.friction import Constant, FrictionModel
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.signals import Motion
-from nfriction.solve.levenberg import LeastSquaresResult
+from nfriction.solve.least_squares import LeastSquaresResult
 
 Plant = PendulumChain | LinearAxis
 # Whether the windows of a recording make one motion.

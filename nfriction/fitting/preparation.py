@@ -18,7 +18,7 @@ from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 from nfriction.simulation import required_substeps
-from nfriction.solve.levenberg import Step
+from nfriction.solve.least_squares import Step
 
 logger = logging.getLogger(__name__)
 

@@ -16,8 +16,8 @@ from nfriction.fitting.unseen import Unseen
 from nfriction.fitting.windows import Windows
 from nfriction.friction import Constant, FrictionModel
 from nfriction.recording import Recording
-from nfriction.solve.least_squares import Status
-from nfriction.solve.levenberg import FULL, LeastSquaresResult, Step
+from nfriction.solve.least_squares import LeastSquaresResult, Status, Step
+from nfriction.solve.levenberg import FULL
 
 Callback = Callable[[str, Step], bool | None]
 

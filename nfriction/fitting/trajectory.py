@@ -27,7 +27,8 @@ from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.signals import Motion
 from nfriction.simulation import Rollout, integrate
-from nfriction.solve.levenberg import LeastSquaresResult, LevenbergMarquardt, Quadratic, Step
+from nfriction.solve.least_squares import LeastSquaresResult, Quadratic, Step
+from nfriction.solve.levenberg import LevenbergMarquardt
 
 # Smoothed start states are off by far less; the prior only keeps a window from running away.
 START_Q_SD, START_QD_SD = 0.01, 0.3

@@ -16,7 +16,7 @@ from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.plots import style
 from nfriction.recording import Recording
 from nfriction.signals import Motion, kalman_smoother
-from nfriction.solve.levenberg import Step
+from nfriction.solve.least_squares import Step
 
 Array = NDArray[np.float64]
 

@@ -18,22 +18,11 @@ from nfriction.solve.box import bounds_of, minimise_within, on_bounds
 from nfriction.solve.least_squares import (
     LeastSquaresResult,
     Quadratic,
-    ResidualModel,
     Status,
     Step,
-    from_residuals,
     positive_diagonal,
 )
 from nfriction.solve.semidefinite import solve_bordered, solve_semidefinite
-
-__all__ = [
-    "LeastSquaresResult",
-    "LevenbergMarquardt",
-    "Quadratic",
-    "ResidualModel",
-    "Step",
-    "from_residuals",
-]
 
 # Fewer blocks than this are solved as fast in one piece.
 MANY = 100

@@ -8,7 +8,7 @@ from nfriction.fitting.preparation import mixing_of
 from nfriction.fitting.stages import PATIENCE, SETTLED, Refinement, _Watch
 from nfriction.fitting.windows import cut_windows
 from nfriction.signals import kalman_smoother
-from nfriction.solve.levenberg import Step
+from nfriction.solve.least_squares import Step
 from tests.fitting.recordings import F64, pendulum, swing
 
 X = torch.zeros(1, dtype=F64)

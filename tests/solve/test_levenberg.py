@@ -7,7 +7,7 @@ import torch
 from scipy.optimize import lsq_linear
 from torch import Tensor
 
-from nfriction.solve.levenberg import LevenbergMarquardt, Quadratic, from_residuals
+from nfriction.solve import LevenbergMarquardt, Quadratic, from_residuals
 
 F64 = torch.float64
 
