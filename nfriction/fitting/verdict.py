@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from nfriction.solve.least_squares import scaled_spectrum
+
 # Two-sided 95 % of a normal distribution.
 NORMAL_95 = 1.959964
 # A direction is lost where it is worse determined than its parameters alone by this factor.
@@ -95,7 +97,7 @@ def covariance_root(known: Evidence) -> Tensor:
     References:
         H. White, Econometrica 50 (1982), 1-25.
     """
-    scale, values, vectors = _spectrum(known.data + torch.diag(known.prior))
+    scale, values, vectors = scaled_spectrum(known.data + torch.diag(known.prior))
     floor = torch.finfo(values.dtype).eps * len(values)
     least = values.clamp(min=floor)
     root = scale[:, None] * vectors * least.rsqrt()
@@ -140,7 +142,7 @@ def lost_directions(names: Sequence[str], known: Evidence) -> tuple[str, ...]:
     seen = diagonal > known.prior * LOST**-2
     found = [names[i] for i in (~seen).nonzero().flatten().tolist()]
     index = seen.nonzero().flatten()
-    _, values, vectors = _spectrum(known.data[index][:, index])
+    _, values, vectors = scaled_spectrum(known.data[index][:, index])
     for value, vector in zip(values, vectors.T, strict=True):
         if value > LOST**-2:
             break
@@ -202,11 +204,3 @@ def warnings_of(
 
 def _symmetric(matrix: Tensor) -> Tensor:
     return 0.5 * (matrix + matrix.T)
-
-
-def _spectrum(matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """1/sqrt(diagonal), eigenvalues (ascending) and vectors of the matrix of unit diagonal."""
-    diagonal = matrix.diagonal()
-    scale = torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
-    values, vectors = torch.linalg.eigh(scale[:, None] * matrix * scale)
-    return scale, values, vectors

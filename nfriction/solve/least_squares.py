@@ -145,10 +145,7 @@ class LeastSquaresResult:
     def _spectrum(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Free mask, 1/sqrt(diag H), eigenvalues (ascending) and vectors of the scaled Hessian."""
         free = ~(self.at_lower | self.at_upper)
-        hessian = self.hessian[free][:, free]
-        scale = positive_diagonal(hessian.diagonal()).rsqrt()
-        values, vectors = torch.linalg.eigh(scale[:, None] * hessian * scale)
-        return free, scale, values, vectors
+        return free, *scaled_spectrum(self.hessian[free][:, free])
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,3 +183,10 @@ def from_residuals(
 def positive_diagonal(diagonal: Tensor) -> Tensor:
     """1 in place of zeros: a parameter without influence takes any scale."""
     return torch.where(diagonal > 0, diagonal, 1.0)
+
+
+def scaled_spectrum(matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """1/sqrt(diagonal), eigenvalues (ascending) and vectors of the matrix of unit diagonal."""
+    scale = positive_diagonal(matrix.diagonal()).rsqrt()
+    values, vectors = torch.linalg.eigh(scale[:, None] * matrix * scale)
+    return scale, values, vectors
