@@ -155,13 +155,15 @@ class TrajectoryProblem:
 
     def errors(self, x: Tensor) -> Tensor:
         """Position error at every sample of the windows [rad or m], (window, step + 1, joint)."""
-        q = self._simulate(x).q[:, :: self.substeps] - self.zeros(x)[:, None]
-        return (q - self.windows.q) @ self.mixing.T * self.windows.weight[..., None]
+        return self._deviation(x) * self.windows.weight[..., None]
 
     def residuals(self, x: Tensor) -> Tensor:
         """Error of the counted samples over the noise, (window, step + 1, joint)."""
+        return self._deviation(x) * self._scale
+
+    def _deviation(self, x: Tensor) -> Tensor:
         q = self._simulate(x).q[:, :: self.substeps] - self.zeros(x)[:, None]
-        return (q - self.windows.q) @ self.mixing.T * self._scale
+        return (q - self.windows.q) @ self.mixing.T
 
     def cost(self, x: Tensor) -> Tensor:
         """Half the sum of squares of residuals, jumps, what is held and prior."""
@@ -228,11 +230,13 @@ class TrajectoryProblem:
         parameters, plant_vector, state = self.split(x)
         self.friction.schedule.set_parameter_vector(parameters)
         q0, qd0 = state.chunk(2, -1)
-        q0 = q0 + self.zeros(x)
-        plant = self.plant_at(plant_vector)
-        motion = integrate(plant, self.friction, q0, qd0, self.tau, self.step, memory=self.memory)
+        motion = self._run(self.plant_at(plant_vector), q0 + self.zeros(x), qd0)
         self._simulated = (x.clone(), motion)
         return motion
+
+    def _run(self, plant: PendulumChain | LinearAxis, q0: Tensor, qd0: Tensor) -> Rollout:
+        """Motion of all windows from their first states, with the schedule as it is."""
+        return integrate(plant, self.friction, q0, qd0, self.tau, self.step, memory=self.memory)
 
     @torch.no_grad()
     def _states(self, motion: Rollout) -> Tensor | None:
