@@ -1,7 +1,6 @@
 """Direct search of a cost within bounds: pattern search or sequential quadratic programming.
 
-The papers' way: pattern search or sequential quadratic programming. Every poll, and every
-gradient, is one batch of compiled rollouts.
+The papers' way. Every poll, and every gradient, is one batch of candidates.
 """
 
 from __future__ import annotations
@@ -9,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -123,17 +122,16 @@ def search(
         progress: show a bar (pattern search).
 
     Raises:
-        ValueError: if there is no such method, or the state is another's.
+        ValueError: if the state is another search's.
     """
-    if method not in get_args(SearchMethod):
-        raise ValueError(f"`method` must be one of {get_args(SearchMethod)}, got {method!r}.")
     if state is not None and (state.method != method or len(state.vector) != len(box.start)):
         raise ValueError(
             f"`state` is of {state.method!r} with {len(state.vector)} parameters, the search is "
             f"{method!r} with {len(box.start)}."
         )
-    run = _pattern if method == "pattern" else _sqp
-    return run(cost, box, max_evaluations, tolerance, seed, state, callback, progress)
+    if method == "sqp":
+        return _sqp(cost, box, max_evaluations, tolerance, state, callback)
+    return _pattern(cost, box, max_evaluations, tolerance, seed, state, callback, progress)
 
 
 def _pattern(
@@ -191,10 +189,8 @@ def _sqp(
     box: Box,
     max_evaluations: int,
     tolerance: float,
-    seed: int,
     state: SearchState | None,
     callback: Callback | None,
-    progress: bool,
 ) -> SearchResult:
     """SciPy's SLSQP with forward differences, every gradient one batch of candidates."""
     from scipy.optimize import minimize  # slow to import
