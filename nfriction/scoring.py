@@ -127,7 +127,7 @@ def score(
         substeps: int | None = max(1, math.ceil(recording.longest_step / STOP_STEP))
     else:
         substeps = _substeps(plant, friction, recording.longest_step, recording.name)
-    quantum = getattr(plant, "position_quantum", None)
+    quantum = plant.position_quantum
     off = np.zeros((1, len(q0))) if quantum is None else np.eye(len(q0) + 1, len(q0), -1) * quantum
     run = np.broadcast_to(motion.q, (len(off), *motion.q.shape)).copy()
     diverged_at = np.inf
@@ -267,12 +267,12 @@ def rmse_table(scores: Mapping[str, Sequence[Score]], horizon: str | None = None
     return np.array(rows)
 
 
-def improvement_table(rmse: Array, reference: int = 0) -> Array:
-    """Reduction of the error against a reference row [%]: `100 (1 - rmse / rmse_reference)`.
+def improvement_table(rmse: Array) -> Array:
+    """Reduction of the error against the first row [%]: `100 (1 - rmse / rmse_first)`.
 
     References:
         TLRIP paper, Table 11.
     """
     # Where both diverged there is nothing to compare: NaN.
     with np.errstate(divide="ignore", invalid="ignore"):
-        return 100.0 * (1.0 - rmse / rmse[reference])
+        return 100.0 * (1.0 - rmse / rmse[0])
