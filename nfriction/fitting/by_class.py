@@ -3,11 +3,11 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from nfriction.fitting.holdback import FOLDS, cut_for_folds, shares_by_joint
+from nfriction.fitting.neurofuzzy_start import range_of
 from nfriction.fitting.outcome import Fit, trajectory_outcome
 from nfriction.fitting.preparation import (
     in_joint_coordinates,
@@ -17,7 +17,7 @@ from nfriction.fitting.preparation import (
 )
 from nfriction.fitting.residuals import effective_noise, stride_of
 from nfriction.fitting.sensitivity import StepJacobian
-from nfriction.fitting.torque import fit_torque, natural_scale
+from nfriction.fitting.torque import natural_scale
 from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
 from nfriction.friction import Adaptive, FrictionModel
 from nfriction.friction.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
@@ -114,18 +114,9 @@ def _start_at(model: FrictionModel, adaptive: Fit, joint: Sequence[Recording]) -
     schedule, reference = model.schedule, adaptive.model.schedule
     assert isinstance(schedule, AdaptiveNeuroFuzzy)
     assert isinstance(reference, Adaptive)
-    qd, qdd = (
-        torch.cat([torch.as_tensor(getattr(m, name)) for m in adaptive.motions])
-        for name in ("qd", "qdd")
-    )
-    torque = fit_torque(model.law, adaptive.plant, joint, adaptive.motions, model.v_smooth)
-    schedule.set_adaptive(reference, natural_scale(model.law, torque, qd))
-    along = qdd * qd.sign() if schedule.deviation.along_motion else qdd
-    # Wild accelerations aside.
-    low, high = np.quantile(along.numpy(), [0.001, 0.999], axis=0)
-    schedule.set_range(
-        qd.abs().amax(0), torch.stack([torch.as_tensor(low), torch.as_tensor(high)], -1)
-    )
+    scale = natural_scale(model, adaptive.plant, joint, adaptive.motions)
+    schedule.set_adaptive(reference, scale)
+    schedule.set_range(*range_of(adaptive.motions, schedule.deviation.along_motion))
     model.requires_grad_(False)
 
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nfriction.fitting import estimate
 from nfriction.fitting.classes import AccelerationClasses
-from nfriction.fitting.labelled import driving_classes, labelled_model, natural_size
+from nfriction.fitting.labelled import driving_classes, labelled_model
 from nfriction.fitting.outcome import Fit, Plant
 from nfriction.fitting.position_error import PositionError
 from nfriction.fitting.preparation import (
@@ -28,6 +28,7 @@ from nfriction.fitting.search import (
     search,
 )
 from nfriction.fitting.settling import PRIOR_SD, adopt_classes, constant_start, settled
+from nfriction.fitting.torque import natural_scale
 from nfriction.fitting.windows import cut_windows
 from nfriction.friction import Adaptive, Constant, FrictionModel
 from nfriction.friction.schedules import Tabulated
@@ -156,7 +157,7 @@ def _box(
     schedule = model.schedule
     assert isinstance(schedule, Tabulated)
     values = schedule.values
-    natural = natural_size(model, constant, joint, motions)
+    natural = natural_scale(model, constant.plant, joint, motions)
     natural = natural.reshape(len(natural), *(1,) * (values.ndim - 2), -1)
     log = torch.tensor([not c.linear for c in model.law.coefficients]).expand_as(values)
     scale = torch.maximum(values.abs(), natural)

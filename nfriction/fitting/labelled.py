@@ -3,14 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from nfriction.fitting.classes import AccelerationClasses
 from nfriction.fitting.outcome import Fit, Plant
 from nfriction.fitting.preparation import constant_schedule
-from nfriction.fitting.torque import fit_torque, natural_scale
+from nfriction.fitting.torque import natural_scale
 from nfriction.fitting.trajectory import TrajectoryProblem
 from nfriction.fitting.windows import Windows
 from nfriction.friction import Adaptive, FrictionModel
@@ -75,20 +74,12 @@ def labelled_model(
 ) -> FrictionModel:
     """The model with given classes, at the constant law's coefficients."""
     values = constant_schedule(constant.model).values
-    sd = prior_sd * torch.maximum(values.abs(), natural_size(model, constant, joint, motions))
+    natural = natural_scale(model, constant.plant, joint, motions)
+    sd = prior_sd * torch.maximum(values.abs(), natural)
     # Where neither tells a size, the coefficient stays free.
     sd = torch.where(sd > 0, sd, torch.inf)
     schedule = Labelled(model, values, sd)
     return FrictionModel(model.law, schedule, model.v_smooth).requires_grad_(False)
-
-
-def natural_size(
-    model: FrictionModel, constant: Fit, joint: Sequence[Recording], motions: Sequence[Motion]
-) -> Tensor:
-    """Size of each coefficient that alone would explain a third of the friction torque."""
-    torque = fit_torque(model.law, constant.plant, joint, motions, model.v_smooth)
-    qd = torch.as_tensor(np.concatenate([m.qd for m in motions]))
-    return natural_scale(model.law, torque, qd)
 
 
 def driving_classes(classes: AccelerationClasses, cut: Windows) -> Tensor:

@@ -5,10 +5,11 @@ from typing import TypeGuard
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from nfriction.fitting.outcome import Continuity, Fit
 from nfriction.fitting.preparation import constant_schedule
-from nfriction.fitting.torque import fit_torque, natural_scale
+from nfriction.fitting.torque import natural_scale
 from nfriction.friction import Constant, FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.recording import Recording
@@ -31,6 +32,15 @@ def is_constant_fit(
     )
 
 
+def range_of(motions: Sequence[Motion], along_motion: bool) -> tuple[Tensor, Tensor]:
+    """Largest |velocity| of motions, (joint,), and ends of their acceleration, (joint, 2)."""
+    qd, qdd = (np.concatenate([getattr(m, name) for m in motions]) for name in ("qd", "qdd"))
+    along = qdd * np.sign(qd) if along_motion else qdd
+    # Wild accelerations aside.
+    ends = np.quantile(along, [0.001, 0.999], axis=0)
+    return torch.as_tensor(np.abs(qd).max(0)), torch.as_tensor(ends.T)
+
+
 def start_at(
     model: FrictionModel, constant: Fit, joint: Sequence[Recording], motions: Sequence[Motion]
 ) -> None:
@@ -45,15 +55,8 @@ def start_at(
     schedule = model.schedule
     assert isinstance(schedule, NeuroFuzzy)
     values = constant_schedule(constant.model).values
-    qd = torch.as_tensor(np.concatenate([m.qd for m in motions]))
-    qdd = torch.as_tensor(np.concatenate([m.qdd for m in motions]))
-    along = qdd * qd.sign() if schedule.along_motion else qdd
-    schedule.set_range(
-        qd.abs().amax(0),
-        torch.stack([torch.quantile(along, 0.001, 0), torch.quantile(along, 0.999, 0)], -1),
-    )
-    torque = fit_torque(model.law, constant.plant, joint, motions, model.v_smooth)
-    schedule.set_reference(values, natural_scale(model.law, torque, qd))
+    schedule.set_range(*range_of(motions, schedule.along_motion))
+    schedule.set_reference(values, natural_scale(model, constant.plant, joint, motions))
     schedule.set_parameter_vector(torch.zeros_like(schedule.parameter_vector()))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.friction import Law
+from nfriction.friction import FrictionModel, Law
 from nfriction.friction.model import V_SMOOTH
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.recording import Recording
@@ -100,26 +100,31 @@ def fit_torque(
     )
 
 
-def natural_scale(law: Law, torque: TorqueFit, qd: Tensor) -> Tensor:
+def natural_scale(
+    model: FrictionModel,
+    plant: PendulumChain | LinearAxis,
+    recordings: Sequence[Recording],
+    motions: Sequence[Motion],
+) -> Tensor:
     """Size of each coefficient that alone would explain a third of the friction torque.
 
     Args:
-        law: whose coefficients they are.
-        torque: its fit to the motion.
-        qd: velocity along the motion [rad/s], (sample, joint).
+        model: whose law's coefficients they are.
+        plant, recordings, motions: see `fit_torque`.
 
     Returns:
         In SI, (joint, coefficient); zero where the torque is not linear in the coefficient.
     """
-    rms = qd.square().mean(0).sqrt()
+    torque = fit_torque(model.law, plant, recordings, motions, model.v_smooth).torque
+    rms = torch.as_tensor(np.concatenate([m.qd for m in motions])).square().mean(0).sqrt()
     columns = []
-    for c in law.coefficients:
+    for c in model.law.coefficients:
         if not c.linear:
             columns.append(torch.zeros_like(rms))
         elif c.unit.endswith("s/rad"):
-            columns.append(torque.torque / rms / 3)
+            columns.append(torque / rms / 3)
         else:
-            columns.append(torque.torque / 3)
+            columns.append(torque / 3)
     return torch.stack(columns, -1)
 
 
