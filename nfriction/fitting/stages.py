@@ -158,11 +158,7 @@ class _Watch:
     """Tells the caller every step, and ends a search that creeps or has settled."""
 
     def __init__(
-        self,
-        name: str,
-        tolerance: float,
-        callback: Callback | None,
-        problem: TrajectoryProblem | None = None,
+        self, name: str, tolerance: float, callback: Callback | None, problem: TrajectoryProblem
     ) -> None:
         self.name, self.tolerance, self.callback, self.problem = name, tolerance, callback, problem
         self.costs: list[float] = []
@@ -184,7 +180,7 @@ class _Watch:
     def _moved(self, x: Tensor, step: Step) -> float:
         """By how many standard deviations a full step moved a shared parameter at most."""
         problem = self.problem
-        if problem is None or not isinstance(problem.friction.schedule, Constant):
+        if not isinstance(problem.friction.schedule, Constant):
             return torch.inf
         shared, self.before, before = x[: problem.shared_count], x, self.before
         # A step that damping cut short is no sign of rest.

@@ -11,13 +11,13 @@ from nfriction.signals import kalman_smoother
 from nfriction.solve.least_squares import Step
 from tests.fitting.recordings import F64, pendulum, swing
 
-X = torch.zeros(1, dtype=F64)
-
 
 def stops(costs, tolerance=1e-3, callback=None):
     """After how many steps the watch ends a search of these costs."""
-    watch = _Watch("stage", tolerance, callback)
-    return [watch(X, Step(cost, 1.0, 1.0)) for cost in costs], watch
+    _, problem = short_search()
+    watch, x = _Watch("stage", tolerance, callback, problem), problem.start()
+    # Damped, so that a point that stays is no rest.
+    return [watch(x, Step(cost, 10.0, 1.0)) for cost in costs], watch
 
 
 def test_only_a_search_that_creeps_is_ended():
