@@ -11,9 +11,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from nfriction import Recording, rigs
-from nfriction.fitting import Fit, fit, nearest_fit
+from nfriction.fitting import Fit, fit
 from nfriction.fitting.estimate import Zeroed
-from nfriction.friction import model_by_name
+from nfriction.friction import Constant, FrictionModel, model_by_name
 from nfriction.friction.model import V_SMOOTH
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.scoring import score
@@ -161,6 +161,15 @@ def real(data: Path, only: Sequence[str], models: Sequence[str], blocks: int = 1
             errors = (root_mean_square(e[m]) for e in (free, short))
             judged = " ".join(beside(e, t) for e, t in zip(errors, of.target, strict=True))
             print(f"{name:7} {m:8} {of.unit:4} {judged} {spent[m]:8.0f}  {rows}", flush=True)
+
+
+def nearest_fit(fits: Sequence[Fit], model: FrictionModel) -> Fit | None:
+    """The fit to start from: the constant one of the model's law, else the last."""
+    last = None
+    for last in fits:
+        if last.model.law == model.law and isinstance(last.model.schedule, Constant):
+            break
+    return last
 
 
 def beside(error: float, target: float) -> str:

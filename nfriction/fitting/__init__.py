@@ -5,7 +5,7 @@ from nfriction.fitting.by_class import refine_adaptive
 from nfriction.fitting.classes import AccelerationClasses, find_classes
 from nfriction.fitting.estimate import fit
 from nfriction.fitting.neurofuzzy import NetworkFit, train_network, train_on_controller
-from nfriction.fitting.outcome import Fit, nearest_fit
+from nfriction.fitting.outcome import Fit
 from nfriction.fitting.search import SearchState
 
 __all__ = [
@@ -17,7 +17,6 @@ __all__ = [
     "fit",
     "fit_adaptive",
     "fit_by_search",
-    "nearest_fit",
     "refine_adaptive",
     "train_network",
     "train_on_controller",

@@ -1,7 +1,7 @@
 """A fitted model with its verdict: whether the search converged, and what the data tell."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -97,15 +97,6 @@ class Fit:
             **({} if self.continuity == "free" else {"continuity": self.continuity}),
             **({"zeros": [list(zero) for zero in self.zeros]} if self.zeros else {}),
         }
-
-
-def nearest_fit(fits: Iterable[Fit], model: FrictionModel) -> Fit | None:
-    """The fit to start from: the constant one of the model's law, else the last."""
-    last = None
-    for last in fits:
-        if last.model.law == model.law and isinstance(last.model.schedule, Constant):
-            break
-    return last
 
 
 def torque_outcome(
