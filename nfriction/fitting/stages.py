@@ -149,7 +149,7 @@ class Refinement:
             cost_tolerance=tolerance,
         )  # fmt: skip
         if result.status == "stopped" and (watch.settles or watch.creeps):
-            status: Status = "converged_step" if watch.settles else "stalled"
+            status: Status = "converged_step" if watch.settles else "creeping"
             result = replace(result, status=status)
         return Stage(problem, result, problem.errors(result.x))
 

@@ -15,6 +15,7 @@ Status = Literal[
     "converged_cost",
     "converged_step",
     "max_steps",
+    "creeping",
     "stalled",
     "not_finite",
     "stopped",
@@ -25,6 +26,8 @@ MESSAGES: dict[str, str] = {
     "converged_cost": "A full step can lower the cost by no more than its tolerance.",
     "converged_step": "A full step moves the parameters by no more than the tolerance.",
     "max_steps": "The step limit was reached before convergence.",
+    "creeping": "Steps creep: several in a row together lowered the cost by no more than their "
+    "tolerance, short of the minimum (a kink or a narrow valley).",
     "stalled": "No step lowers the cost although the gradient is not small: the gradient and the "
     "cost disagree (a kink, noise or a wrong derivative).",
     "not_finite": "Cost or derivatives are not finite, at the start or at every step from `x`.",

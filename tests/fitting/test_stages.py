@@ -52,7 +52,7 @@ def short_search():
     return search, search.problem(cut_windows([recording], [motion], 0.5), 1e-3)
 
 
-@pytest.mark.parametrize(("why", "status"), [("creeps", "stalled"), ("settles", "converged_step")])
+@pytest.mark.parametrize(("why", "status"), [("creeps", "creeping"), ("settles", "converged_step")])
 def test_only_a_search_that_settled_claims_convergence(monkeypatch, why, status):
     def end(self, x, step):
         setattr(self, why, True)
