@@ -74,7 +74,7 @@ def fit(
     is not linear in one, the first windows are searched again from the torques on that plant. A
     neuro-fuzzy model starts at the constant fit of its own law and is pulled toward it, by its
     own prior or a tighter one, whichever predicts windows held back better, and more so at motions
-    that the recordings never came near; unless that is a tenth better than the law, the law is
+    that the recordings never came near; unless that is a fifth better than the law, the law is
     kept. Every class of an adaptive model starts there, too;
     `fit_adaptive` has its further settings.
 

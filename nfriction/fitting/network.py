@@ -1,13 +1,14 @@
 """Fit a neuro-fuzzy model: a network that corrects a constant law, where windows bear it out."""
 
 import copy
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from nfriction.fitting.holdback import Judgement, judged_windows, ratio_on
+from nfriction.fitting.holdback import Judgement, error_on, judged_windows
 from nfriction.fitting.neurofuzzy_start import settle_on, start_at
 from nfriction.fitting.outcome import Continuity, Fit, Plant, trajectory_outcome
 from nfriction.fitting.preparation import (
@@ -95,10 +96,14 @@ def _refined(
     if same.result.status == "stopped":
         return _constant_kept(search, start, same.result.message, converged=False)
     law_of_all = replace(law, model=start.model).problem(held_back, noise)
+    laws = [
+        error_on(held_back, problem, found)
+        for problem, found in ((same.problem, same.vector), (law_of_all, vector))
+    ]
 
     def judge(network: Stage) -> Judgement:
-        against = (same.problem, law_of_all)
-        return Judgement(*(ratio_on(held_back, network.problem, law, vector) for law in against))
+        error = error_on(held_back, network.problem, network.vector)
+        return Judgement(*(error / law if math.isfinite(error) else math.inf for law in laws))
 
     part = search.problem(seen, noise, vector, stride)
     judgement, stage = _best_prior(search, part, vector, tolerance, judge)

@@ -4,6 +4,7 @@ import pytest
 
 from nfriction import LFM, NFLFM, NFStribeck, Stribeck, fit
 from nfriction.fitting.network import PRIOR_SHARES
+from nfriction.friction.neurofuzzy import NeuroFuzzy
 from tests.fitting.recordings import pendulum, swing
 
 V_SMOOTH = 0.05
@@ -23,13 +24,14 @@ def test_the_prior_is_the_one_whose_network_predicts_best(constant, monkeypatch,
     recording, found = constant
     seen = []
 
-    def ratio(held_back, network, constant, mean):
-        prior_sd = network.friction.schedule.prior_sd
-        if prior_sd not in seen:
-            seen.append(prior_sd)
-        return 0.8 - 0.2 * (len(seen) == best + 1)
+    def error(held_back, problem, vector):
+        schedule = problem.friction.schedule
+        if not isinstance(schedule, NeuroFuzzy):
+            return 1.0
+        seen.append(schedule.prior_sd)
+        return 0.7 - 0.2 * (len(seen) == best + 1)
 
-    monkeypatch.setattr("nfriction.fitting.network.ratio_on", ratio)
+    monkeypatch.setattr("nfriction.fitting.network.error_on", error)
     model = NFLFM(2, v_smooth=V_SMOOTH, prior_sd=0.6, **SMALL)
     fit(model, pendulum(), recording, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
     assert seen == pytest.approx([0.6 * share for share in PRIOR_SHARES])
