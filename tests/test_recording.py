@@ -104,14 +104,66 @@ def test_columns_map_names_and_swap_and_shift() -> None:
     assert np.array_equal(renumbered.q, recording.q)
 
 
-def test_extra_columns_are_ignored_and_partial_ones_left_out() -> None:
+def test_extra_columns_are_ignored_and_a_partial_velocity_left_out() -> None:
     recording = swing()
-    table = recording.to_pandas().drop(columns=["tau2", "qd1"])
+    table = recording.to_pandas().drop(columns=["qd1"])
     table["remark"] = "fine"
-    back = Recording.from_pandas(table)
-    assert back.tau is None
+    with pytest.warns(RecordingWarning, match="column qd1 is missing, so no measured velocity"):
+        back = Recording.from_pandas(table)
     assert back.qd is None
     assert np.array_equal(back.q, recording.q)
+    assert np.array_equal(back.tau, recording.tau)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("columns", [{}, {"tau2": "tau2"}])
+def test_a_joint_without_torque_beside_a_driven_one_is_undriven_and_said(
+    tmp_path: Path, columns: dict[str, str]
+) -> None:
+    """As of an acrobot, whose one motor is between its links."""
+    recording = swing()
+    table = recording.to_pandas().drop(columns=["tau1"])
+    said = r"'run': column tau1 is missing, so nothing .*columns=\{\"tau1\": \"\.\.\.\"\}"
+    with pytest.warns(RecordingWarning, match=said):
+        back = Recording.from_pandas(table, columns=columns, name="run")
+    table.to_csv(tmp_path / "run.csv", index=False)
+    with pytest.warns(RecordingWarning, match=said):
+        read = Recording.read(tmp_path / "run.csv", columns=columns)
+    assert recording.tau is not None
+    for found in (back, read):
+        assert found.tau is not None
+        assert not found.tau[:, 0].any()
+        assert np.array_equal(found.tau[:, 1], recording.tau[:, 1])
+
+
+@pytest.mark.parametrize(
+    ("name", "joints", "own"),
+    [
+        ("tau", 1, "tau1"), ("tau", 2, "tau1"), ("Tau1", 1, "tau1"), ("tau_2", 2, "tau2"),
+        ("torque1", 2, "tau1"), ("motorTorque2 [Nm]", 2, "tau2"), ("tau0", 1, "tau1"),
+    ],
+)  # fmt: skip
+def test_a_column_that_looks_like_torque_is_not_left_out_without_a_word(
+    name: str, joints: int, own: str
+) -> None:
+    table = swing(joints=joints).to_pandas().filter(regex="time|q")
+    table[name] = 1.0
+    with pytest.warns(RecordingWarning, match="looks like torque and is not read") as said:
+        assert Recording.from_pandas(table).tau is None
+    assert len(said) == 1
+    assert f'columns={{"{own}": "{name}"}}' in str(said[0].message)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # Who has named all torques knows what else there is.
+        Recording.from_pandas(table, columns={f"tau{k + 1}": name for k in range(joints)})
+        Recording.from_pandas(table.rename(columns={name: "torque_on"}))
+
+
+def test_named_columns_must_be_there_and_of_joints_that_are() -> None:
+    table = swing().to_pandas()
+    with pytest.raises(ValueError, match="column motor is missing; found time"):
+        Recording.from_pandas(table, columns={"tau1": "motor"})
+    with pytest.raises(ValueError, match="names tau3, but the last position is q2"):
+        Recording.from_pandas(table, columns={"tau3": "tau1"})
 
 
 def test_foreign_csv_with_blanks_and_byte_order_mark(tmp_path: Path) -> None:

@@ -70,6 +70,7 @@ def check_writable(folder: Path) -> None:
 # The library advises its caller in Python; who types a command has options instead.
 _OPTIONS = (
     (re.compile(r'columns=\{"(\w+)": "\.\.\."\}'), r"--columns \1=NAME"),
+    (re.compile(r'columns=\{"(\w+)": "([^"]+)"\}'), r'--columns "\1=\2"'),
     (re.compile(r"`degrees=True`"), "--degrees"),
     (re.compile(r"`columns`"), "--columns"),
 )

@@ -79,7 +79,8 @@ def read_recordings(
     from nfriction.recording import Recording, RecordingWarning
 
     unit: Literal["rad", "m"] = "m" if plant.unit == "m" else "rad"
-    recordings, in_degrees = [], []
+    recordings: list[Recording] = []
+    said: dict[str, list[str]] = {}
     for path in paths:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -90,11 +91,13 @@ def read_recordings(
         if recording.joints != plant.joints:
             raise UsageError(f"{path} has {recording.joints} joints, the rig has {plant.joints}.")
         recordings.append(recording)
-        messages = [str(warning.message) for warning in caught]
-        in_degrees += [recording.name for m in messages if "degrees=True" in m]
-        for message in messages:
-            if "degrees=True" not in message:
-                warn(one_line(message))
+        for warning in caught:
+            message = str(warning.message).removeprefix(f"recording '{recording.name}': ")
+            said.setdefault(message, []).append(recording.name)
+    in_degrees = [name for told, of in said.items() if "degrees=True" in told for name in of]
+    for told, of in said.items():
+        if "degrees=True" not in told:
+            warn(f"{', '.join(of)}: {one_line(told)}")
     # Told once: every change of coordinates would say it again.
     warnings.simplefilter("ignore", RecordingWarning)
     if in_degrees:

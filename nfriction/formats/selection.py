@@ -15,6 +15,11 @@ from nfriction.formats.units import canonical_unit, is_unit, slides, to_si
 Array = NDArray[np.float64]
 
 OURS = re.compile(r"time|(q|qd|tau)[1-9]\d{0,3}", re.ASCII)
+# What people call a torque, a number and a unit behind it; "torque_on" and "taut" are none.
+_LIKE_TORQUE = re.compile(
+    r"(torque|drehmoment|(?<![a-z])(tau|force))(_(cmd|command|meas|measured))?[\W_]*\d*\s*([\[(].*)?$",
+    re.IGNORECASE,
+)
 
 
 class Source(NamedTuple):
@@ -28,25 +33,28 @@ class Arrays(NamedTuple):
     """What a table holds of a recording, in SI.
 
     Attributes:
-        values: time, q and, where every joint has them, qd and tau.
+        values: time, q; qd where every joint has it; tau where any has, zero for the others.
         slides: whether positions are said to be lengths; None where nothing is said.
+        remarks: what may be wrong with the choice of columns, and the mend of each.
     """
 
     values: dict[str, Array]
     slides: bool | None
+    remarks: tuple[tuple[str, str], ...] = ()
 
 
 def table_arrays(
     table: pd.DataFrame, columns: Mapping[str, str] | None = None, *, degrees: bool = False
 ) -> Arrays:
-    """Arrays time, q and, where every joint has them, qd and tau.
+    """Arrays time, q and perhaps qd and tau.
 
     Args:
         table: with columns time, q1 …, perhaps qd1 …, tau1 …; others are ignored.
         columns: the table's name for ours where they differ, perhaps with a unit: "enc_1:deg".
         degrees: positions and velocities that say no unit are in degrees.
     Raises:
-        ValueError: a column or unit that is missing, unknown or contradicts another.
+        ValueError: a column or unit that is missing, unknown or contradicts another, or a column
+            named for a joint that is not there.
     """
     # A table made elsewhere may number its columns.
     table = table.set_axis([str(name) for name in table.columns], axis=1)
@@ -55,20 +63,28 @@ def table_arrays(
     joints = max((int(key[1:]) for key in sources if re.fullmatch(r"q\d+", key)), default=1)
     # Of a lone q9999 one missing column tells enough.
     needed = ["time", *(f"q{k + 1}" for k in range(min(joints, len(sources) + 1)))]
-    missing = [key for key in needed if key not in sources]
+    missing = [key for key in dict.fromkeys((*needed, *columns)) if key not in sources]
     if missing:
         raise ValueError(_missing(table, columns, missing))
+    beyond = [key for key in columns if _number(key) > joints]
+    if beyond:
+        raise ValueError(
+            f"`columns` names {', '.join(beyond)}, but the last position is q{joints}; name "
+            f"positions of those joints, too, or drop them."
+        )
+    sources = {key: source for key, source in sources.items() if _number(key) <= joints}
     arrays = {"time": _column(table, "time", sources["time"])}
     for key in ("q", "qd", "tau"):
         group = [sources.get(f"{key}{k + 1}") for k in range(joints)]
-        present = [_default_unit(key, s, degrees) for s in group if s is not None]
-        if len(present) == joints:
-            arrays[key] = np.stack([_column(table, key, s) for s in present], axis=1)
+        # A joint without a motor has no torque to log; a velocity that nobody logged is not zero.
+        if all(group) or (key == "tau" and any(group)):
+            stack = [_joint_column(table, key, source, degrees) for source in group]
+            arrays[key] = np.stack(stack, axis=1)
     said = [s.unit for key, s in sources.items() if re.fullmatch(r"q\d+", key) and s.unit]
     kinds = {slides(unit) for unit in said}
     if len(kinds) > 1:
         raise ValueError(f"positions must all be angles or all be lengths, got {', '.join(said)}.")
-    return Arrays(arrays, kinds.pop() if kinds else None)
+    return Arrays(arrays, kinds.pop() if kinds else None, _remarks(table, sources, joints))
 
 
 def parse_source(spec: str, names: set[str]) -> Source | None:
@@ -127,6 +143,55 @@ def _known(table: pd.DataFrame, aliases: dict[str, str], source: Source) -> Sour
             f"column {column} is said to be in {source.unit!r}, but the file says {said!r}."
         )
     return Source(column, source.unit or said)
+
+
+def _joint_column(table: pd.DataFrame, key: str, source: Source | None, degrees: bool) -> Array:
+    """A joint's numbers in SI, zeros where the table has none."""
+    if source is None:
+        return np.zeros(len(table))
+    return _column(table, key, _default_unit(key, source, degrees))
+
+
+def _number(name: str) -> int:
+    """The last number in a name such as "tau_1 [Nm]", 0 where there is none."""
+    digits = re.search(r"([0-9]{1,4})[^0-9]*$", name)
+    return int(digits[1]) if digits else 0
+
+
+def _remarks(
+    table: pd.DataFrame, sources: dict[str, Source], joints: int
+) -> tuple[tuple[str, str], ...]:
+    """What may be wrong where velocity or torque is not there for every joint."""
+    lacking = {
+        key: [f"{key}{k + 1}" for k in range(joints) if f"{key}{k + 1}" not in sources]
+        for key in ("qd", "tau")
+    }
+    told = []
+    if 0 < len(lacking["qd"]) < joints:
+        finding = f"column {', '.join(lacking['qd'])} is missing, so no measured velocity is read"
+        told.append((finding, "name or drop those of all joints"))
+    free = lacking["tau"]
+    if 0 < len(free) < joints:
+        finding = f"column {', '.join(free)} is missing, so nothing is taken to drive that joint"
+        told.append((finding, f'if something does, name it with columns={{"{free[0]}": "..."}}'))
+    unread = _unread_torques(table, sources) if free else []
+    if unread:
+        own = f"tau{_number(unread[0])}"
+        mend = f'columns={{"{own if own in free else free[0]}": "{unread[0]}"}}'
+        finding = f"column {', '.join(unread[:3])} looks like torque and is not read"
+        told.append((finding, f"if it is, name it with {mend}"))
+    return tuple(told)
+
+
+def _unread_torques(table: pd.DataFrame, sources: dict[str, Source]) -> list[str]:
+    """Columns that look like torque of joints that have none yet."""
+    read = {source.column for source in sources.values()}
+    names = [str(name) for name in table.attrs.get("found", table.columns)]
+    return [
+        name
+        for name in names
+        if name not in read and _LIKE_TORQUE.search(name) and f"tau{_number(name)}" not in sources
+    ]
 
 
 def _default_unit(key: str, source: Source, degrees: bool) -> Source:

@@ -19,6 +19,7 @@ from nfriction.recording.validation import (
     frozen,
     gaps_in,
     is_uniform,
+    warn_of_columns,
     warn_of_gaps,
     warn_of_units,
 )
@@ -237,7 +238,8 @@ class Recording:
     ) -> Recording:
         """Recording from a table with columns time, q1 …, and perhaps qd1 … and tau1 ….
 
-        Velocity and torque are taken where every joint has them; other columns are ignored.
+        Of several joints those without a torque are undriven: theirs is zero where another has
+        one. Velocity is taken where every joint has it; other columns are ignored.
 
         Args:
             table: a row per sample.
@@ -251,10 +253,13 @@ class Recording:
                 of the plant in whose fit or score the recording is used.
             unit: of position; else `table.attrs["unit"]`, else rad.
             name: what to call the recording.
+        Warns:
+            RecordingWarning: velocity or torque of some joints only, columns that look like torque
+                and are not read; and as `Recording`.
         """
         attributes = table.attrs
         said = attributes.get("convention") if convention is None else convention
-        arrays, slides = formats.table_arrays(table, columns, degrees=degrees)
+        arrays, slides, remarks = formats.table_arrays(table, columns, degrees=degrees)
         told: Unit | None = None if slides is None else "m" if slides else "rad"
         written = attributes.get("unit")
         if degrees and written == "deg":
@@ -268,7 +273,7 @@ class Recording:
             raise ValueError("`degrees=True` needs angles, but `unit` is 'm'; drop one of the two.")
         given = str(attributes.get("names", "")).split(",")
         names = [part.strip() for part in given if part.strip()]
-        return cls(
+        recording = cls(
             time=arrays["time"],
             q=arrays["q"],
             tau=arrays.get("tau"),
@@ -278,6 +283,8 @@ class Recording:
             unit=unit,
             name=name,
         )
+        warn_of_columns(recording, remarks)
+        return recording
 
     @classmethod
     def read(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,7 +21,7 @@ LARGEST_VALUE = 1e30
 
 
 class RecordingWarning(UserWarning):
-    """A recording is valid but looks as if its units were not SI, or has gaps."""
+    """A recording is valid but looks as if its units were not SI, lacks columns, or has gaps."""
 
 
 def is_uniform(time: Array) -> bool:
@@ -143,6 +144,12 @@ def warn_of_units(recording: Recording) -> None:
         )
 
 
-def _warn(recording: Recording, finding: str, mend: str) -> None:
+def warn_of_columns(recording: Recording, remarks: Sequence[tuple[str, str]]) -> None:
+    """Pass on what a table's columns left open: findings, and the mend of each."""
+    for finding, mend in remarks:
+        _warn(recording, finding, mend, stacklevel=4)
+
+
+def _warn(recording: Recording, finding: str, mend: str, *, stacklevel: int = 5) -> None:
     label = f"recording '{recording.name}': " if recording.name else ""
-    warnings.warn(f"{label}{finding}; {mend}.", RecordingWarning, stacklevel=5)
+    warnings.warn(f"{label}{finding}; {mend}.", RecordingWarning, stacklevel=stacklevel)

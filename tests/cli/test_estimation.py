@@ -1,6 +1,7 @@
 """How recordings are read as options say, and what a user is told of those that do not fit."""
 
 import argparse
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -147,6 +148,30 @@ def test_stamps_in_milliseconds_are_told(bench: Path, capsys, monkeypatch) -> No
     first, _ = capsys.readouterr().err.splitlines()
     assert "slow" in first
     assert "milliseconds" in first
+
+
+@pytest.mark.parametrize(
+    ("header", "said"),
+    [
+        ("time,q1,q2,tau2", "column tau1 is missing, so nothing is taken to drive that joint; if "
+         "something does, name it with --columns tau1=NAME."),
+        ("time,q1,q2,torque1", "column torque1 looks like torque and is not read; if it is, name "
+         'it with --columns "tau1=torque1".'),
+    ],
+)  # fmt: skip
+def test_torque_that_is_not_read_is_told_once_with_the_option_that_helps(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], header: str, said: str
+) -> None:
+    rows = "".join(f"{0.01 * k},0.1,0.2,0.3\n" for k in range(9))
+    paths = [tmp_path / "a.csv", tmp_path / "b.csv"]
+    for path in paths:
+        path.write_text(f"{header}\n{rows}")
+    parser = argparse.ArgumentParser()
+    estimation.add_options(parser)
+    arguments = parser.parse_args(["--rig", "multiarm-double"])
+    with warnings.catch_warnings():
+        estimation.read_recordings(paths, estimation.read_rig("multiarm-double"), arguments)
+    assert capsys.readouterr().err == f"nfriction: warning: a, b: {said}\n"
 
 
 def test_a_robot_description_is_as_good_as_a_rig_file(bench: Path, compared: Path) -> None:
