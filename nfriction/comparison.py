@@ -9,6 +9,7 @@ import pandas as pd
 from torch import Tensor
 
 from nfriction.fitting import Fit
+from nfriction.fitting.preparation import warn_of_undriven
 from nfriction.friction import Constant, FrictionModel, NeuroFuzzy
 from nfriction.friction.adaptive import CLASSES, Adaptive
 from nfriction.friction.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
@@ -210,6 +211,7 @@ def compare(
     repeated = sorted({n for n in names if names.count(n) > 1})
     if repeated:
         raise ValueError(f"recordings must have different names, {', '.join(repeated)} repeats.")
+    warn_of_undriven([*train, *held_out])
     # Smoothed once, for all fits and scores.
     moved = [[_motion(plant, r) for r in kind] for kind in (train, held_out)]
     fits, failed = fit_models(

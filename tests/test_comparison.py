@@ -105,6 +105,12 @@ def test_names_must_tell_recordings_apart():
         compare(pendulum(), ["NOPE"], [A])
 
 
+def test_a_held_out_recording_without_torque_is_named_where_those_of_training_have_it():
+    driven = dataclasses.replace(A, tau=np.full_like(A.q, 1e-3))
+    with pytest.warns(UserWarning, match=r"no torque is recorded in b, unlike"):
+        compare(pendulum(), "NCFM", driven, B, horizons=(0.5,), windows=(0.5,), max_steps=1)
+
+
 def test_without_held_out_recordings_there_is_no_such_table(comparison):
     found = compare(pendulum(), ["NCFM"], [A], horizons=(0.5,), windows=(0.5,), max_steps=1)
     assert found.table(held_out=False).shape == (2, 3)

@@ -2,6 +2,7 @@
 
 import logging
 import textwrap
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
@@ -42,6 +43,8 @@ def listed(
 
     Raises:
         TypeError: if model, plant or recordings are something else.
+    Warns:
+        UserWarning: if only some recordings have torques.
     """
     many = [recordings] if isinstance(recordings, Recording) else recordings
     given = list(many) if isinstance(many, Iterable) and not isinstance(many, str) else [many]
@@ -53,7 +56,20 @@ def listed(
     for name, value, kinds, what in wanted:
         if not isinstance(value, kinds):
             raise TypeError(f"`{name}` must be {what}, got {textwrap.shorten(repr(value), 60)}.")
+    warn_of_undriven(given)
     return given
+
+
+def warn_of_undriven(recordings: Sequence[Recording]) -> None:
+    """Say which recordings count as undriven where others have torques."""
+    free = [r.name or f"recording {k + 1}" for k, r in enumerate(recordings) if r.tau is None]
+    if 0 < len(free) < len(recordings):
+        # Not of a category that is silenced once recordings are read. One place, so shown once.
+        warnings.warn(
+            f"no torque is recorded in {', '.join(free)}, unlike in other recordings, so nothing "
+            f"is taken to drive the joints there; add the torque, or zeros where there was none.",
+            stacklevel=1,
+        )
 
 
 def in_joint_coordinates(

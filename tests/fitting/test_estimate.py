@@ -1,6 +1,7 @@
 """Fits recover what made the recording, say how they ended, and refuse what does not match."""
 
 import logging
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -254,6 +255,20 @@ def test_what_does_not_match_is_refused():
             fit(*arguments)
     with pytest.raises(ValueError, match="windows"):
         fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=())
+
+
+def test_recordings_without_torque_beside_driven_ones_are_named():
+    free, other = (swing(pendulum(), true_model(), seconds=0.5, start=s, name=n)
+                   for s, n in (((1.6, 0.8), "free"), ((2.0, 0.2), "other")))  # fmt: skip
+    torque = replace(other, tau=np.full_like(other.q, 1e-3), name="driven")
+    for recordings in ([free, torque], [torque, free]):
+        with pytest.warns(UserWarning, match=r"no torque is recorded in free, unlike") as said:
+            fit(LFM(2), pendulum(), recordings, method="torque")
+        assert len([w for w in said if "no torque" in str(w.message)]) == 1
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="no torque is recorded")
+        for alike in ([free, other], [torque, replace(free, tau=np.zeros_like(free.q))]):
+            fit(LFM(2), pendulum(), alike, method="torque")
 
 
 def test_nothing_is_logged_as_a_warning_in_a_plain_fit(caplog):
