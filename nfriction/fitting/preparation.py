@@ -43,6 +43,7 @@ def listed(
 
     Raises:
         TypeError: if model, plant or recordings are something else.
+        ValueError: if a recording is given twice.
     Warns:
         UserWarning: if only some recordings have torques.
     """
@@ -56,8 +57,22 @@ def listed(
     for name, value, kinds, what in wanted:
         if not isinstance(value, kinds):
             raise TypeError(f"`{name}` must be {what}, got {textwrap.shorten(repr(value), 60)}.")
+    _refuse_repeated(given)
     warn_of_undriven(given)
     return given
+
+
+def _refuse_repeated(recordings: Sequence[Recording]) -> None:
+    """Whatever a copy is called: the same errors counted twice would narrow the intervals."""
+    first: dict[str, int] = {}
+    for k, recording in enumerate(recordings):
+        before = first.setdefault(recording.digest(), k)
+        if before != k:
+            names = (recordings[before].name or "unnamed", recording.name or "unnamed")
+            raise ValueError(
+                f"a fit takes every recording once, got the same data as recordings {before + 1} "
+                f"({names[0]}) and {k + 1} ({names[1]}); leave one out."
+            )
 
 
 def warn_of_undriven(recordings: Sequence[Recording]) -> None:

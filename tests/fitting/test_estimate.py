@@ -250,6 +250,11 @@ def test_what_does_not_match_is_refused():
         ((LFM(3), pendulum(), recording), "must agree"),
         ((LFM(2), LinearAxis(1.0), recording), "must agree"),
         ((LFM(2), pendulum(), [recording, other]), "convention"),
+        ((LFM(2), pendulum(), [recording, recording]), "recordings 1 .swing. and 2 .swing."),
+        (
+            (LFM(2), pendulum(), [other, recording, replace(other, name="copy")]),
+            "3 .copy.; leave one",
+        ),
     ):
         with pytest.raises(ValueError, match=message):
             fit(*arguments)
