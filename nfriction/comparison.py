@@ -205,12 +205,9 @@ def compare(
     train, held_out = (
         [given] if isinstance(given, Recording) else list(given) for given in (train, held_out)
     )
-    names = [r.name for r in (*train, *held_out)]
     if not models or not train:
         raise ValueError("at least one model and one training recording are needed.")
-    repeated = sorted({n for n in names if names.count(n) > 1})
-    if repeated:
-        raise ValueError(f"recordings must have different names, {', '.join(repeated)} repeats.")
+    check_recordings(train, held_out)
     warn_of_undriven([*train, *held_out])
     # Smoothed once, for all fits and scores.
     moved = [[_motion(plant, r) for r in kind] for kind in (train, held_out)]
@@ -241,6 +238,30 @@ def compare(
         fits, *scored, unit=plant.unit, joint_names=tuple(plant.joint_names),
         horizons_asked=tuple(horizons), failed=failed,
     )  # fmt: skip
+
+
+def check_recordings(train: Sequence[Recording], held_out: Sequence[Recording]) -> None:
+    """Whether recordings can be told apart, and those to judge by are none that a fit sees.
+
+    Raises:
+        ValueError: names that repeat, or a recording both trained on and held out, whatever its
+            names.
+    """
+    trained = {recording.digest() for recording in train}
+    seen = [r.name or "a recording" for r in held_out if r.digest() in trained]
+    if seen:
+        raise ValueError(
+            f"{', '.join(seen)}: trained on and held out; a model is judged by recordings it has "
+            f"not seen."
+        )
+    names = [r.name for r in (*train, *held_out)]
+    repeated = sorted({n for n in names if names.count(n) > 1})
+    if repeated:
+        told = ", ".join(n or "the empty one" for n in repeated)
+        raise ValueError(
+            f"recordings must have different names, {told} repeats; rename one, in Python by the "
+            f"`name` of `Recording`."
+        )
 
 
 def coefficient_sets(model: FrictionModel) -> dict[str, Tensor]:

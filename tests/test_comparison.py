@@ -97,12 +97,21 @@ def test_results_are_plain_json_with_the_names_others_rely_on(comparison):
 
 
 def test_names_must_tell_recordings_apart():
-    with pytest.raises(ValueError, match="a repeats"):
-        compare(pendulum(), ["NCFM"], [A], [A])
+    with pytest.raises(ValueError, match="a repeats; rename one"):
+        compare(pendulum(), ["NCFM"], [A], [dataclasses.replace(B, name="a")])
+    unnamed = [dataclasses.replace(r, name="") for r in (A, B)]
+    with pytest.raises(ValueError, match=r"different names, the empty one repeats; .*`name`"):
+        compare(pendulum(), ["NCFM"], *unnamed)
     with pytest.raises(ValueError, match="at least one"):
         compare(pendulum(), [], [A])
     with pytest.raises(ValueError, match="there are"):
         compare(pendulum(), ["NOPE"], [A])
+
+
+def test_a_recording_is_not_judged_by_under_another_name_either():
+    for name in ("a", "copy"):
+        with pytest.raises(ValueError, match=rf"{name}: trained on and held out; .*not seen"):
+            compare(pendulum(), ["NCFM"], [A], [B, dataclasses.replace(A, name=name)])
 
 
 def test_a_held_out_recording_without_torque_is_named_where_those_of_training_have_it():
