@@ -22,13 +22,16 @@ MeasuredFrom = Literal["upright", "hanging"]
 
 
 class Mechanism(Protocol):
-    """What tells how a mechanism's encoders write: every plant does."""
+    """What tells how a mechanism's encoders write, and in which unit: every plant does."""
 
     @property
     def convention(self) -> Sequence[str]: ...
 
     @property
     def first_link(self) -> int: ...
+
+    @property
+    def unit(self) -> str: ...
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ class Rig:
 
     convention: tuple[str, str]
     first_link: int
+    unit: str = "rad"
 
 
 def swing(n: int = 60, joints: int = 2, **settings: object) -> Recording:
@@ -435,6 +436,17 @@ def test_joint_coordinates() -> None:
     assert joint.joint_coordinates(on_arm).digest() == joint.digest()
     axis = changed(unit="m", convention=AngleConvention("absolute", "hanging"))
     assert axis.joint_coordinates() is axis
+
+
+def test_metres_are_no_angles_of_a_plant() -> None:
+    turns, slides = (Rig(("relative", "upright"), 0, unit) for unit in ("rad", "m"))
+    for unit, plant in (("m", turns), ("rad", slides)):
+        recording = swing(unit=unit, name="run")
+        said = rf"run is in {unit}, the plant's joints are in .*`unit='{plant.unit}'`"
+        with pytest.raises(ValueError, match=said):
+            recording.convention_on(plant)
+        with pytest.raises(ValueError, match=said):
+            recording.joint_coordinates(plant)
 
 
 def test_what_a_recording_does_not_say_the_plant_says() -> None:

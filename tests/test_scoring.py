@@ -64,6 +64,12 @@ def test_angles_are_written_as_the_plant_says_unless_the_recording_says_otherwis
     assert score(plant(), MODEL, unsaid, **start).free_run.all > 0.1
 
 
+def test_metres_are_not_scored_as_angles():
+    recording = replace(swing(plant(), MODEL, seconds=0.5), unit="m")
+    with pytest.raises(ValueError, match="swing is in m, the plant's joints are in rad"):
+        score(plant(), MODEL, recording)
+
+
 def test_friction_too_steep_to_simulate_is_diverged_and_said(caplog):
     recording = swing(plant(), MODEL, seconds=1.0)
     nan = LFM(2, [1e-3, 1e-3], v_smooth=0.05)

@@ -171,7 +171,15 @@ class Recording:
         """How this recording of a plant is written: as it says itself, else as the plant says.
 
         Sliding joints have no angles; for them it is the convention that changes nothing.
+
+        Raises:
+            ValueError: the recording is in metres and the plant turns, or the other way round.
         """
+        if self.unit != plant.unit:
+            raise ValueError(
+                f"{self.name or 'the recording'} is in {self.unit}, the plant's joints are in "
+                f"{plant.unit}; read it with `unit={plant.unit!r}` if it is, too."
+            )
         if self.unit == "m":
             return AngleConvention()
         return AngleConvention.of(plant) if self.convention is None else self.convention
@@ -183,11 +191,12 @@ class Recording:
             plant: whose recording this is; may be left out where the recording says its convention
                 and its first column is a link's.
         Raises:
-            ValueError: neither recording nor plant say how the angles are written.
+            ValueError: neither recording nor plant say how the angles are written, or their units
+                differ.
         """
+        convention = self.convention if plant is None else self.convention_on(plant)
         if self.unit == "m":
             return self
-        convention = self.convention if plant is None else self.convention_on(plant)
         if convention is None:
             raise ValueError(
                 "the recording does not say how its angles are written; give the plant, or read "

@@ -250,6 +250,7 @@ def test_what_does_not_match_is_refused():
         ((LFM(3), pendulum(), recording), "must agree"),
         ((LFM(2), LinearAxis(1.0), recording), "must agree"),
         ((LFM(2), pendulum(), [recording, other]), "convention"),
+        ((LFM(2), pendulum(), replace(recording, unit="m")), "swing is in m, .* in rad"),
         ((LFM(2), pendulum(), [recording, recording]), "recordings 1 .swing. and 2 .swing."),
         (
             (LFM(2), pendulum(), [other, recording, replace(other, name="copy")]),
