@@ -15,7 +15,7 @@ from nfriction.fitting import Fit, fit
 from nfriction.fitting.estimate import WINDOWS
 from nfriction.friction import Constant, FrictionModel, model_by_name
 from nfriction.plant import LinearAxis, PendulumChain
-from nfriction.recording import Recording
+from nfriction.recording import Recording, Unit
 from nfriction.scoring import score
 from nfriction.signals import kalman_smoother
 
@@ -105,7 +105,7 @@ class FrictionEstimator:
         settings = self.get_params()
         for own in ("plant", "model", "horizon"):
             del settings[own]
-        self.fit_ = fit(model, self.plant, _recordings(X), **settings)
+        self.fit_ = fit(model, self.plant, _recordings(X, self.plant), **settings)
         return self
 
     @property
@@ -158,7 +158,7 @@ class FrictionEstimator:
         model, plant = self._fitted.model, self._fitted.plant
         with torch.no_grad():
             if isinstance(X, Recording | pd.DataFrame):
-                (recording,) = _recordings(X)
+                (recording,) = _recordings(X, plant)
                 joint = recording.joint_coordinates(plant)
                 motion = kalman_smoother(joint.time, joint.q)
                 q, velocity, acceleration = map(torch.tensor, (motion.q, motion.qd, motion.qdd))
@@ -188,7 +188,7 @@ class FrictionEstimator:
             sample, NaN from where the simulation diverged: `Recording.to_pandas` of what was
             measured has the same columns.
         """
-        (given,) = _recordings(recording)
+        (given,) = _recordings(recording, self.plant_)
         run = score(self.plant_, self.model_, given, horizons=())
         table = given.to_pandas()[["time", *(f"q{k + 1}" for k in range(given.joints))]]
         table.iloc[:, 1:] = run.simulated
@@ -205,7 +205,7 @@ class FrictionEstimator:
             y: ignored.
         """
         errors = []
-        for recording in _recordings(X):
+        for recording in _recordings(X, self.plant_):
             horizon = min(self.horizon, recording.duration)
             found = score(self.plant_, self.model_, recording, horizons=(horizon,))
             errors.append(found.windows[f"{horizon:g}"].all)
@@ -279,15 +279,17 @@ def _parameters() -> dict[str, Any]:
     return {name: p.default for name, p in signature.parameters.items() if name != "self"}
 
 
-def _recordings(X: object) -> list[Recording]:
-    """Recordings of what a user gives for them."""
+def _recordings(X: object, plant: Plant) -> list[Recording]:
+    """Recordings of what a user gives for them; a table that says no unit is in the plant's."""
     many = [X] if isinstance(X, Recording | pd.DataFrame) else X
     if not isinstance(many, Sequence | np.ndarray) or not len(many):
         raise ValueError(f"recordings are needed, one or a list of them, got {X!r}.")
     found = []
     for k, given in enumerate(many):
         if isinstance(given, pd.DataFrame):
-            given = Recording.from_pandas(given, name=f"table {k + 1}")
+            known: Unit = "m" if plant.unit == "m" else "rad"
+            unit = None if "unit" in given.attrs else known
+            given = Recording.from_pandas(given, unit=unit, name=f"table {k + 1}")
         if not isinstance(given, Recording):
             raise ValueError(
                 f"a sample is a Recording, or a table with columns time, q1, ..., got "

@@ -8,9 +8,9 @@ import pandas as pd
 import pytest
 import torch
 
-from nfriction import ALFM, LFM, NCFM, Recording, fit, score
+from nfriction import ALFM, LFM, NCFM, LinearAxis, Recording, fit, score
 from nfriction.estimators import FrictionEstimator
-from tests.fitting.recordings import pendulum, swing
+from tests.fitting.recordings import driven_axis, pendulum, swing
 
 TRUE = [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]]
 STARTS = ((1.6, 0.8), (2.0, 0.2), (1.2, -0.5))
@@ -106,6 +106,17 @@ def test_tables_serve_as_recordings(fitted: FrictionEstimator, recordings: list[
     tables = [r.to_pandas() for r in recordings]
     assert fitted.score(tables) == fitted.score(recordings)
     pd.testing.assert_frame_equal(fitted.simulate(tables[0]), fitted.simulate(recordings[0]))
+
+
+def test_a_table_that_says_no_unit_is_in_the_plant_s() -> None:
+    axis, said = LinearAxis(2.0), "table 1 is in rad, the plant's joints are in m"
+    table = driven_axis(axis, LFM(1, [[3.0, 2.0]])).to_pandas()
+    plain = pd.DataFrame(table.to_numpy(), columns=table.columns)
+    found = FrictionEstimator(axis, "LFM", **QUICK).fit(plain)
+    assert found.simulate(plain).shape == (len(plain), 2)
+    table.attrs["unit"] = "rad"
+    with pytest.raises(ValueError, match=said):
+        FrictionEstimator(axis, "LFM", **QUICK).fit(table)
 
 
 def test_the_right_law_scores_higher(
