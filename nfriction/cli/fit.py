@@ -54,5 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     if intervals := interval_table(found):
         print(intervals)
     print(f"wrote {arguments.out}")
-    print(f"next: {shlex.join(['nfriction', 'export', str(arguments.out), '--to', 'torchscript'])}")
+    if found.converged:
+        further = ["nfriction", "export", str(arguments.out), "--to", "torchscript"]
+        print(f"next: {shlex.join(further)}")
     return 0

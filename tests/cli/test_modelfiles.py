@@ -40,6 +40,18 @@ def test_what_fit_prints_next_works(
     torch.jit.load(bench / "x" / "m.pt")
 
 
+def test_a_fit_that_did_not_converge_is_not_told_to_be_exported(
+    bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = ["--rig", str(bench / "bench.json"), "--model", "LFM", "--out", str(tmp_path / "m.json")]
+    words = ["fit", str(bench / "a.csv.gz"), *rig, *QUICK, "--max-steps", "1"]
+    assert cli.main(words) == 0
+    said = capsys.readouterr().out
+    assert "LFM: not converged" in said
+    assert f"wrote {tmp_path / 'm.json'}" in said
+    assert "next:" not in said
+
+
 def test_info_tells_what_the_file_says(fitted: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["info", str(fitted)]) == 0
     said = capsys.readouterr().out
