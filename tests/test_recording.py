@@ -363,13 +363,47 @@ def test_gaps_are_noticed_and_jitter_is_not() -> None:
         Recording(time + 1.0 * (time >= 0.2) + 2.0 * (time >= 0.4), np.zeros((100, 1)), name="a")
 
 
-def test_wrapped_and_whirling_angles_are_not_taken_for_degrees() -> None:
+def test_whirling_angles_are_not_taken_for_degrees_or_wrapped() -> None:
     time = np.arange(2000) * 1e-3
     whirling = 25.0 * time[:, None]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        Recording(time, np.remainder(whirling, 2 * np.pi))
         Recording(time, whirling)
+    with pytest.warns(RecordingWarning) as said:
+        Recording(time, np.remainder(whirling, 2 * np.pi))
+    assert not any("degrees" in str(warning.message) for warning in said)
+
+
+@pytest.mark.parametrize("low", [0.0, -np.pi])
+@pytest.mark.parametrize("sample_time", [1e-3, 0.05])
+def test_wrapped_angles_are_noticed_and_their_joint_is_named(
+    low: float, sample_time: float
+) -> None:
+    """The second joint of two goes round, up to a quarter of a turn to a sample."""
+    time = np.arange(400) * sample_time
+    q = np.stack([np.sin(time), 25.0 * time]).T
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Recording(time, q)
+    wrapped = np.remainder(q - low, 2 * np.pi) + low
+    with pytest.warns(RecordingWarning, match=r"'a': `q` of elbow looks wrapped .*numpy\.unwrap"):
+        Recording(time, np.stack([q[:, 0], wrapped[:, 1]]).T, names=("hip", "elbow"), name="a")
+
+
+def test_what_jumps_by_a_turn_for_other_reasons_is_not_taken_for_wrapped() -> None:
+    time = np.arange(400) * 1e-2
+    turn = 2 * np.pi * (time >= 2)[:, None]
+    # Steps of the degrees grow to a turn of 2π and beyond.
+    degrees = 180 * np.sin(6 * time)[:, None]
+    assert np.abs(np.diff(degrees, axis=0)).max() > 3 * np.pi
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        warnings.filterwarnings("error", message=".*wrapped")
+        Recording(time, degrees)
+        Recording(time + 5.0 * (time >= 2), turn)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Recording(time, turn, unit="m")
 
 
 # --- cutting ---------------------------------------------------------------------------------

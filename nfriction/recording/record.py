@@ -22,6 +22,7 @@ from nfriction.recording.validation import (
     warn_of_columns,
     warn_of_gaps,
     warn_of_units,
+    warn_of_wrapping,
 )
 
 if TYPE_CHECKING:
@@ -57,8 +58,8 @@ class Recording:
         ValueError: arrays that do not fit together, NaN or infinity, stamps that do not increase,
             fewer than 8 samples.
     Warns:
-        RecordingWarning: positions that look like degrees, stamps that look like milliseconds or
-            leave gaps.
+        RecordingWarning: positions that look like degrees or wrapped, stamps that look like
+            milliseconds or leave gaps.
     """
 
     time: Array
@@ -87,6 +88,7 @@ class Recording:
         check_content(self)
         warn_of_units(self)
         warn_of_gaps(self)
+        warn_of_wrapping(self)
 
     @property
     def joints(self) -> int:

@@ -144,6 +144,25 @@ def warn_of_units(recording: Recording) -> None:
         )
 
 
+def warn_of_wrapping(recording: Recording) -> None:
+    if recording.unit == "m":
+        return
+    step = np.abs(np.diff(recording.q, axis=0))
+    step[gaps_in(recording.time)] = 0.0
+    # A jump of about a turn between steps that are short: no joint starts and stops so fast, in
+    # degrees neither.
+    short = np.pad(step < np.pi / 2, ((1, 1), (0, 0)), constant_values=True)
+    jumps = (np.abs(step - 2 * np.pi) < np.pi / 2) & short[:-2] & short[2:]
+    count = jumps.sum(axis=0)
+    if count.any():
+        names = ", ".join(name for name, n in zip(recording.names, count, strict=True) if n)
+        _warn(
+            recording,
+            f"`q` of {names} looks wrapped ({count.sum()} jumps of about a turn)",
+            "if so, unwrap it with `numpy.unwrap(q, axis=0)`",
+        )
+
+
 def warn_of_columns(recording: Recording, remarks: Sequence[tuple[str, str]]) -> None:
     """Pass on what a table's columns left open: findings, and the mend of each."""
     for finding, mend in remarks:
