@@ -314,6 +314,11 @@ def poked(shape: tuple[int, ...], index: tuple[int, ...], value: float) -> np.nd
         ({"time": poked((60,), (0,), np.nan)}, "`time` must be finite"),
         ({"time": np.repeat(np.arange(30.0), 2)}, r"`time` must increase.*sample 1 \(30 such"),
         ({"time": -np.arange(60.0)}, "`time` must increase"),
+        ({"time": poked((60,), (1,), 0.5)}, r"got 0\.5 then 0\.0 s at sample 2 .*sort the rows"),
+        (
+            {"time": 1.7e9 + np.repeat(np.arange(30.0), 2)},
+            r"got 1700000000\.0 then 1700000000\.0 s .*with more digits, or count from",
+        ),
         ({"names": ("a",)}, "`names` must name each of 2 joints once"),
         ({"names": ("a", "a")}, "once"),
         ({"names": ("a", "b,c")}, "free of commas"),

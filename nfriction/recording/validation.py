@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 MINIMUM_SAMPLES = 8
 # In no unit is a measurement larger; squares and differences of it are finite.
 LARGEST_VALUE = 1e30
+# No recording lasts eleven days: such a stamp is a clock's [s].
+LARGE_STAMP = 1e6
 
 
 class RecordingWarning(UserWarning):
@@ -95,9 +97,17 @@ def check_content(recording: Recording) -> None:
     stuck = np.flatnonzero(np.diff(recording.time) <= 0)
     if len(stuck):
         k = int(stuck[0])
+        before, after = float(recording.time[k]), float(recording.time[k + 1])
+        # Stamps of a clock of many digits repeat where a logger wrote fewer.
+        rounded = before == after and abs(after) >= LARGE_STAMP
+        mend = (
+            "write so large stamps with more digits, or count from the recording's start"
+            if rounded
+            else "sort the rows and drop repeated stamps"
+        )
         raise ValueError(
-            f"`time` must increase, got {recording.time[k]!r} then {recording.time[k + 1]!r} s at "
-            f"sample {k + 1} ({len(stuck)} such steps); sort the rows and drop repeated stamps."
+            f"`time` must increase, got {before!r} then {after!r} s at sample {k + 1} "
+            f"({len(stuck)} such steps); {mend}."
         )
 
 
