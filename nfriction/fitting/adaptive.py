@@ -16,6 +16,7 @@ from nfriction.fitting.preparation import (
     in_joint_coordinates,
     listed,
     mixing_of,
+    motions_of,
     substeps_of,
     told_of,
 )
@@ -26,7 +27,7 @@ from nfriction.fitting.trajectory import solve_trajectory
 from nfriction.fitting.windows import cut_windows
 from nfriction.friction import Adaptive, FrictionModel
 from nfriction.recording import Recording
-from nfriction.signals import Motion, kalman_smoother
+from nfriction.signals import Motion
 from nfriction.solve.least_squares import Step
 
 AdaptiveMethod = Literal["gauss-newton", "pattern", "sqp"]
@@ -86,7 +87,7 @@ def fit_adaptive(
     if not prior_sd > 0:
         raise ValueError(f"`prior_sd` must be positive, got {prior_sd}.")
     joint = in_joint_coordinates(plant, model, given)
-    moved = tuple(motions or (kalman_smoother(r.time, r.q) for r in joint))
+    moved = motions_of(joint, motions)
     constant = constant_start(
         model, plant, given, moved, start, windows=windows, fit_plant=fit_plant, drag=drag,
         max_steps=max_steps, callback=callback,

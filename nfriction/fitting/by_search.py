@@ -16,6 +16,7 @@ from nfriction.fitting.preparation import (
     in_joint_coordinates,
     listed,
     mixing_of,
+    motions_of,
     substeps_of,
 )
 from nfriction.fitting.residuals import effective_noise
@@ -33,7 +34,7 @@ from nfriction.fitting.windows import cut_windows
 from nfriction.friction import Adaptive, Constant, FrictionModel
 from nfriction.friction.schedules import Tabulated
 from nfriction.recording import Recording
-from nfriction.signals import Motion, kalman_smoother
+from nfriction.signals import Motion
 
 
 def fit_by_search(
@@ -95,7 +96,7 @@ def fit_by_search(
         raise ValueError("a search takes no zeros of recordings; start from a fit without them.")
     given = listed(model, plant, recordings)
     joint = in_joint_coordinates(plant, model, given)
-    moved = tuple(motions or (kalman_smoother(r.time, r.q) for r in joint))
+    moved = motions_of(joint, motions)
     if isinstance(schedule, Adaptive):
         constant = constant_start(model, plant, given, moved, start)
         classes = adopt_classes(schedule, classes, joint, moved, plant)

@@ -18,6 +18,7 @@ from nfriction.fitting.preparation import (
     is_eccentric,
     listed,
     mixing_of,
+    motions_of,
     zeroed_each,
     zeros_serve,
 )
@@ -27,7 +28,7 @@ from nfriction.fitting.windows import cut_windows
 from nfriction.friction import Adaptive, Constant, FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.recording import Recording
-from nfriction.signals import Motion, kalman_smoother
+from nfriction.signals import Motion
 
 logger = logging.getLogger(__name__)
 
@@ -138,7 +139,7 @@ def fit(
     if zeroed == "auto":
         each = method == "trajectory" and zeroed_each(plant, given)
         zeroed, told = ("each", (ZEROED_EACH,)) if each else ("once", ())
-    moved = tuple(motions or (kalman_smoother(r.time, r.q) for r in joint))
+    moved = motions_of(joint, motions)
     if isinstance(model.schedule, (Adaptive, NeuroFuzzy)):
         if method == "torque":
             raise ValueError(

@@ -17,7 +17,7 @@ from nfriction.fitting.windows import begins_still
 from nfriction.friction import Constant, FrictionModel
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.recording import Recording
-from nfriction.signals import Motion
+from nfriction.signals import Motion, kalman_smoother
 from nfriction.simulation import required_substeps
 from nfriction.solve.least_squares import Step
 
@@ -107,6 +107,19 @@ def in_joint_coordinates(
             f"{' and '.join(sorted(conventions))}."
         )
     return [r.joint_coordinates(plant) for r in recordings]
+
+
+def motions_of(joint: Sequence[Recording], motions: Sequence[Motion] | None) -> tuple[Motion, ...]:
+    """The smoothed motion of each recording in joint coordinates, found where none are given."""
+    if not motions:
+        return tuple(kalman_smoother(r.time, r.q) for r in joint)
+    if [len(m.q) for m in motions] != [len(r) for r in joint]:
+        raise ValueError(
+            f"`motions` must be one of each recording, sample by sample, got {len(motions)} of "
+            f"{sum(len(m.q) for m in motions)} samples for {len(joint)} recordings of "
+            f"{sum(map(len, joint))}; left out, they are computed."
+        )
+    return tuple(motions)
 
 
 def constant_schedule(model: FrictionModel) -> Constant:

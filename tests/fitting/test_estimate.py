@@ -12,6 +12,7 @@ from nfriction import LFM, NCFM, NFLFM, LinearAxis, Recording, Stribeck, fit, ro
 from nfriction.fitting import estimate
 from nfriction.fitting.residuals import effective_noise
 from nfriction.fitting.torque import fit_torque
+from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import F64, driven_axis, pendulum, swing
 
 TRUTH = [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]]
@@ -261,6 +262,16 @@ def test_what_does_not_match_is_refused():
             fit(*arguments)
     with pytest.raises(ValueError, match="windows"):
         fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=())
+
+
+@pytest.mark.parametrize("model", [LFM, NFLFM])
+def test_motions_must_be_those_of_the_recordings(model):
+    one, other = (swing(pendulum(), true_model(), seconds=s, name=n)
+                  for s, n in ((0.5, "one"), (0.6, "other")))  # fmt: skip
+    motion = kalman_smoother(one.time, one.q)
+    for recordings, motions in (([one, other], [motion]), ([other], [motion])):
+        with pytest.raises(ValueError, match=r"`motions` must be one of each recording.*got 1 of"):
+            fit(model(2), pendulum(), recordings, motions=motions)
 
 
 def test_recordings_without_torque_beside_driven_ones_are_named():
