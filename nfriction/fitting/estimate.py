@@ -24,7 +24,7 @@ from nfriction.fitting.preparation import (
 )
 from nfriction.fitting.stages import JUMP_SD, Callback, Refinement, Stage, flat, least
 from nfriction.fitting.torque import fit_torque, prior_sd
-from nfriction.fitting.windows import cut_windows
+from nfriction.fitting.windows import check_lengths, cut_windows
 from nfriction.friction import Adaptive, Constant, FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.recording import Recording
@@ -131,6 +131,7 @@ def fit(
         raise ValueError(f"`continuity` must be one of {tuple(JUMP_SD)}, got {continuity!r}.")
     if continuity != "free" and method == "torque":
         raise ValueError(f"`continuity={continuity!r}` is of trajectories, not of torques.")
+    check_lengths(windows)
     given = listed(model, plant, recordings)
     joint = in_joint_coordinates(plant, model, given)
     if eccentricity and not may_be_eccentric(plant):
@@ -158,8 +159,6 @@ def fit(
     schedule.set_prior_sd(prior_sd(model.law, torque))
     if method == "torque":
         return torque_outcome(model, start, plant, moved, torque)
-    if not windows:
-        raise ValueError("`windows` must name at least one window length [s].")
     mixing = mixing_of(plant, given[0].convention_on(plant))
     known = {name: value for name, value, _ in start.plant_terms} if start else {}
     zero_sd = torch.full((len(joint), plant.joints), ZERO_SD, dtype=torch.float64)

@@ -1,8 +1,9 @@
 """Recordings cut into windows of equal length with an initial state each."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from numbers import Real
 
 import numpy as np
 import torch
@@ -57,6 +58,16 @@ class Windows:
             spans=tuple(self.spans[i] for i in index if self.spans),
             at_rest=tuple(k for k, i in enumerate(index) if i in self.at_rest),
         )  # fmt: skip
+
+
+def check_lengths(windows: object) -> None:
+    """Refuse what are no lengths of windows [s]; a single one is a list of one, too."""
+    lengths = list(windows) if isinstance(windows, Iterable) else []
+    if not lengths or not all(isinstance(w, Real) and float(w) > 0 for w in lengths):
+        raise ValueError(
+            f"`windows` must be positive lengths [s] such as (0.5, 2.0), got {windows!r}; a single "
+            f"one is (2.0,)."
+        )
 
 
 def cut_windows(

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction import LFM, NCFM, NFLFM, LinearAxis, Recording, Stribeck, fit, rollout
+from nfriction import ALFM, LFM, NCFM, NFLFM, LinearAxis, Recording, Stribeck, fit, rollout
 from nfriction.fitting import estimate
+from nfriction.fitting.adaptive import fit_adaptive
 from nfriction.fitting.residuals import effective_noise
 from nfriction.fitting.torque import fit_torque
 from nfriction.signals import kalman_smoother
@@ -260,8 +261,10 @@ def test_what_does_not_match_is_refused():
     ):
         with pytest.raises(ValueError, match=message):
             fit(*arguments)
-    with pytest.raises(ValueError, match="windows"):
-        fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=())
+    for model, fitting in ((LFM, fit), (NFLFM, fit), (ALFM, fit), (ALFM, fit_adaptive)):
+        for windows in ((), 2.0, (-1.0,), ("1",), "12"):
+            with pytest.raises(ValueError, match=r"`windows` must be positive lengths \[s\]"):
+                fitting(model(2), pendulum(), recording, windows=windows)
 
 
 @pytest.mark.parametrize("model", [LFM, NFLFM])
