@@ -45,6 +45,19 @@ def test_eliminating_window_states_is_marginalising_them():
     torch.testing.assert_close(found, torch.linalg.inv(hessian).diagonal()[:3].sqrt())
 
 
+def test_nothing_is_known_where_the_windows_diverged():
+    """Their states answer to each other to the last digit, and no solver parts them."""
+    grown = torch.tensor([1e15, 1.0, 1.0, 3.0], dtype=F64)
+    state = grown.outer(grown)
+    hessian = torch.block_diag(torch.eye(3, dtype=F64), state)
+    across = torch.linspace(1.0, 2.0, 12, dtype=F64).reshape(3, 4) * grown
+    hessian[:3, 3:], hessian[3:, :3] = across, across.T
+    for score in (None, hessian):
+        known = evidence(hessian, torch.ones(7, dtype=F64), 3, score)
+        assert torch.isinf(standard_deviations(known)).all()
+        assert lost_directions(NAMES, known) == NAMES
+
+
 def test_a_score_as_large_as_the_curvature_changes_nothing():
     design, _ = regression(parameters=5)
     precision = torch.tensor([0.0, 2.0, 0.0, 1.0, 3.0], dtype=F64)
