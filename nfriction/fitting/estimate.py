@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.eccentricity import may_be_eccentric, richer_by_evidence
+from nfriction.fitting.misgivings import misgivings
 from nfriction.fitting.neurofuzzy_start import is_constant_fit
 from nfriction.fitting.outcome import Continuity, Fit, Plant, torque_outcome, trajectory_outcome
 from nfriction.fitting.preparation import (
@@ -141,6 +142,7 @@ def fit(
         each = method == "trajectory" and zeroed_each(plant, given)
         zeroed, told = ("each", (ZEROED_EACH,)) if each else ("once", ())
     moved = motions_of(joint, motions)
+    told += misgivings(plant, given, joint, moved)
     if isinstance(model.schedule, (Adaptive, NeuroFuzzy)):
         if method == "torque":
             raise ValueError(
@@ -158,7 +160,7 @@ def fit(
     schedule.set_coefficients(torque.coefficients)
     schedule.set_prior_sd(prior_sd(model.law, torque))
     if method == "torque":
-        return torque_outcome(model, start, plant, moved, torque)
+        return _saying(told, torque_outcome(model, start, plant, moved, torque))
     mixing = mixing_of(plant, given[0].convention_on(plant))
     known = {name: value for name, value, _ in start.plant_terms} if start else {}
     zero_sd = torch.full((len(joint), plant.joints), ZERO_SD, dtype=torch.float64)

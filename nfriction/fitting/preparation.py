@@ -143,7 +143,7 @@ def _largest_rate(joint: Sequence[Recording]) -> float:
     return max(float(rate.max()) for rate in rates)
 
 
-def _swings_freely(plant: Plant, joint: Sequence[Recording]) -> bool:
+def swings_freely(plant: Plant, joint: Sequence[Recording]) -> bool:
     """Whether nothing drives a chain on a fixed pivot."""
     fixed = isinstance(plant, PendulumChain) and not plant.first_link
     return fixed and _largest_torque(joint) == 0
@@ -165,7 +165,7 @@ def adjustable_terms(
     if not fit_plant:
         return []
     if drag is None:
-        drag = _swings_freely(plant, joint)
+        drag = swings_freely(plant, joint)
     largest = _largest_torque(joint)
     terms = plant_parameters(
         plant, driven=largest > 0, largest_torque=largest, largest_rate=_largest_rate(joint),

@@ -7,8 +7,9 @@ The keys are the constructor arguments of `PendulumChain` (kind "chain", the def
      "com": [0.16, 0.18], "inertia": [1e-4, 1.7e-4], "convention": ["absolute", "hanging"],
      "position_quantum": 1.571e-4}
 
-Only `mass` and, for a chain, `length` are required. `buffers` may hold values that take the place
-of derived constants, such as `{"drag_quadratic": [0.01, 0.01]}`; a fitted plant is written so.
+Only `mass` and, for a chain, `length` are required; angles of a chain without a `convention` are
+relative, from upright. `buffers` may hold values that take the place of derived constants, such as
+`{"drag_quadratic": [0.01, 0.01]}`; a fitted plant is written so.
 """
 
 import json
