@@ -17,6 +17,7 @@ from nfriction.signals import (
     Motion,
     SecondOrderLowPass,
     causal_motion,
+    count_seen,
     frequency_counting,
     initial_state,
     kalman_smoother,
@@ -486,3 +487,18 @@ def test_bad_settings_are_refused() -> None:
         initial_state(time, q, duration=-1.0)
     with pytest.raises(ValueError, match="positive and finite, got inf"):
         quantise(q, math.inf)
+
+
+def test_a_count_is_seen_where_changes_repeat():
+    time = np.arange(0.0, 4.0, 1e-3)
+    smooth = np.stack([np.sin(time), np.exp(-time) * np.cos(9 * time)], -1)
+    assert np.isnan(count_seen(smooth)).all()
+    assert np.isnan(count_seen(smooth.round(9))).all()
+    assert np.isnan(count_seen(np.zeros((9, 2)))).all()
+    read = quantise(smooth, 8192)
+    quantum = 2 * np.pi / 8192
+    # Turned into other coordinates and back, or written with few digits.
+    for q in (read, np.pi + (read - np.pi), read.round(5)):
+        np.testing.assert_allclose(count_seen(q), quantum, rtol=0.02)
+    # Windows have no change from one to the next.
+    np.testing.assert_allclose(count_seen(read[:3600].reshape(9, 400, 2)), quantum)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.eccentricity import may_be_eccentric, richer_by_evidence
-from nfriction.fitting.misgivings import misgivings
+from nfriction.fitting.misgivings import misgivings, refuse_motionless
 from nfriction.fitting.neurofuzzy_start import is_constant_fit
 from nfriction.fitting.outcome import Continuity, Fit, Plant, torque_outcome, trajectory_outcome
 from nfriction.fitting.preparation import (
@@ -148,6 +148,7 @@ def fit(
             raise ValueError(
                 "adaptive and neuro-fuzzy models are fitted to trajectories, not to torques."
             )
+        refuse_motionless(plant, joint)
         same: dict[str, Any] = {
             "windows": windows, "fit_plant": fit_plant, "drag": drag, "max_steps": max_steps,
             "callback": callback,

@@ -1,18 +1,25 @@
 """What recordings give away before a fit: that they may not be what plant and fit take them for."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
 
 from nfriction.fitting.outcome import Plant
 from nfriction.fitting.preparation import swings_freely
 from nfriction.fitting.torque import friction_torque
 from nfriction.recording import Recording
-from nfriction.signals import Motion
+from nfriction.signals import Motion, count_seen
+
+Array = NDArray[np.float64]
 
 # Measured from the right zero, a free swing leaves friction alone, from the other one twice its
 # weight: those of the public benches are 40 times apart and more.
 OTHER_ZERO = 5.0
+# Of so few counts an encoder's rounding is most of what a joint seems to do.
+FEW_COUNTS = 10
 
 
 def misgivings(
@@ -26,7 +33,45 @@ def misgivings(
         joint: the same in joint coordinates.
         motions: their smoothed motion.
     """
-    return tuple(_other_zero(plant, given, joint, motions))
+    return (*_still_joints(plant, given, joint), *_other_zero(plant, given, joint, motions))
+
+
+def refuse_motionless(plant: Plant, joint: Sequence[Recording]) -> None:
+    """Refuse to fit coefficients that follow the motion where a joint has none.
+
+    Raises:
+        ValueError: naming the joints.
+    """
+    still = [plant.joint_names[j] for j in np.flatnonzero(_spans(joint) == 0)]
+    if still:
+        raise ValueError(
+            f"{', '.join(still)} never moves in {', '.join(r.name or 'a recording' for r in joint)}"
+            ", and adaptive and neuro-fuzzy coefficients follow the motion; record it moving."
+        )
+
+
+def _spans(joint: Sequence[Recording]) -> Array:
+    """How far each joint moves in the recording in which it moves most, (joint,)."""
+    return np.max([np.ptp(r.q, axis=0) for r in joint], axis=0)
+
+
+def _still_joints(
+    plant: Plant, given: Sequence[Recording], joint: Sequence[Recording]
+) -> Iterator[str]:
+    """Joints that move by a few counts of their encoders at most."""
+    if plant.position_quantum is None:
+        # A joint that nowhere shows its count is not measured by it.
+        count = np.fmin.reduce([count_seen(r.q) for r in given])
+    else:
+        count = np.full(plant.joints, plant.position_quantum)
+    for name, span, one in zip(plant.joint_names, _spans(joint), count, strict=True):
+        if span == 0:
+            yield f"{name} never moves: of its friction the recordings tell nothing."
+        elif span < FEW_COUNTS * one:
+            yield (
+                f"{name} moves by {span:.3g} {plant.unit}, {span / one:.0f} of its encoder's "
+                "counts: of its friction the recordings tell hardly anything."
+            )
 
 
 def _other_zero(

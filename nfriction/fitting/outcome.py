@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.residuals import effective_noise, local_noise
-from nfriction.fitting.torque import TorqueFit
+from nfriction.fitting.torque import TorqueFit, largest_moved
 from nfriction.fitting.trajectory import TrajectoryProblem
 from nfriction.fitting.uncertainty import CoefficientUncertainty
 from nfriction.fitting.verdict import (
     Interval,
+    beyond_need,
     covariance_root,
     intervals,
     lost_directions,
@@ -138,7 +139,7 @@ def trajectory_outcome(
     hit = (result.at_lower | result.at_upper)[:count] & fitted
     at_bounds = tuple(names[i] for i in hit.nonzero().flatten().tolist())
     noise = effective_noise(residuals)
-    told, lost, uncertainty = _told_by_data(problem, result, names, fitted, residuals)
+    told, lost, uncertainty = _told_by_data(problem, result, names, fitted, residuals, motions)
     residual = float(residuals.square().mean().sqrt())
     return Fit(
         model=problem.friction.requires_grad_(False),
@@ -171,17 +172,20 @@ def _told_by_data(
     names: Sequence[str],
     fitted: Tensor,
     residuals: Tensor,
+    motions: Sequence[Motion],
 ) -> tuple[tuple[Interval, ...], tuple[str, ...], CoefficientUncertainty | None]:
     """Intervals, and what the data cannot tell; of a network, only of the plant's terms.
 
     What they leave open of the coefficients comes last.
     """
     count, noise = problem.shared_count, effective_noise(residuals)
+    constant = isinstance(problem.friction.schedule, Constant)
+    # Errors of nothing at all are those of joints that never moved.
     if not torch.isfinite(result.hessian).all() or not noise > 0:
-        return (), (), None
+        every = fitted.nonzero().flatten().tolist() if constant else []
+        return (), tuple(names[i] for i in every), None
     # Where a network is only held to its law, the data leave it open: that is not among them.
     known = problem.told(result.x, local_noise(residuals))
-    constant = isinstance(problem.friction.schedule, Constant)
     shown = fitted.clone()
     if not constant:
         shown[: problem.friction_count] = False
@@ -198,9 +202,30 @@ def _told_by_data(
         friction = fixed[fixed < problem.friction_count]
         coefficients = [names[i] for i in friction.tolist()]
         lost = lost_directions([names[i] for i in fixed.tolist()], part)
-        open_ = open_values(coefficients, result.x[friction], part)
-        lost += tuple(name for name in open_ if not any(name in told for told in lost))
+        slope, need = _needs(problem, result, motions)
+        open_ = (
+            *open_values(coefficients, result.x[friction], part),
+            *beyond_need(coefficients, sd[friction], slope[friction], need[friction]),
+        )
+        lost += tuple(n for n in dict.fromkeys(open_) if not any(n in told for told in lost))
     uncertainty = CoefficientUncertainty(
         problem.friction.schedule, root[: problem.friction_count].clone()
     )
     return intervals(chosen, result.x[index], sd[index], lower, upper), lost, uncertainty
+
+
+def _needs(
+    problem: TrajectoryProblem, result: LeastSquaresResult, motions: Sequence[Motion]
+) -> tuple[Tensor, Tensor]:
+    """Slope of the friction torque by every constant coefficient at its joint's largest speed, and
+    the largest torque that moves this joint, (friction parameter,) each.
+    """
+    friction, vector = problem.split(result.x)[:2]
+    speed, moved = largest_moved(problem.plant_at(vector), motions)
+    need = torch.maximum(moved, problem.windows.tau.abs().amax((0, 1)))
+    table = friction.reshape(len(speed), -1).clone().requires_grad_()
+    with torch.enable_grad():
+        # A law is elementwise, so the sum's gradient is each coefficient's own slope.
+        torque = problem.friction.torque(speed, torch.ones_like(speed), table)
+        (slope,) = torch.autograd.grad(torque.sum(), table)
+    return slope.flatten(), need[:, None].expand_as(slope).flatten()

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from nfriction.friction import FrictionModel, Law
@@ -50,13 +51,33 @@ def friction_torque(
         recording: in joint coordinates.
         motion: its smoothed motion.
     """
-    inside = (recording.time >= recording.time[0] + EDGE) & (
-        recording.time <= recording.time[-1] - EDGE
-    )
+    inside = _inside(motion.time)
     q, qd, qdd = (torch.as_tensor(x[inside]) for x in (motion.q, motion.qd, motion.qdd))
     tau = np.zeros_like(recording.q) if recording.tau is None else recording.tau
     left = torch.as_tensor(tau[inside]) - plant.inverse_dynamics(q, qd, qdd)
     return qd, plant.load(q, qd), left
+
+
+def largest_moved(
+    plant: PendulumChain | LinearAxis, motions: Sequence[Motion]
+) -> tuple[Tensor, Tensor]:
+    """Largest speed of each joint, and largest torque of gravity or of inertia there, (joint,).
+
+    Of a free swing they all but cancel; each by itself tells what moves the joint.
+    """
+    speeds, torques = [], []
+    for motion in motions:
+        inside = _inside(motion.time)
+        q, qd, qdd = (torch.as_tensor(x[inside]) for x in (motion.q, motion.qd, motion.qdd))
+        weight = plant.gravity(q)
+        speeds.append(qd)
+        torques += [weight, plant.inverse_dynamics(q, qd, qdd) - weight]
+    return torch.cat(speeds).abs().amax(0), torch.cat(torques).abs().amax(0)
+
+
+def _inside(time: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Samples away from a record's ends, (time,)."""
+    return (time >= time[0] + EDGE) & (time <= time[-1] - EDGE)
 
 
 def fit_torque(

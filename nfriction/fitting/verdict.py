@@ -173,6 +173,22 @@ def open_values(names: Sequence[str], values: Tensor, known: Evidence) -> tuple[
     return tuple(names[i] for i in found.nonzero().flatten().tolist())
 
 
+def beyond_need(names: Sequence[str], sd: Tensor, slope: Tensor, need: Tensor) -> tuple[str, ...]:
+    """Coefficients so open that within their intervals friction exceeds all that moves the joint.
+
+    A ratio to the value itself would not do: a coefficient near zero is open by it, and yet known
+    to be small.
+
+    Args:
+        names: of some coefficients.
+        sd: standard deviation of each.
+        slope: of the friction torque by each, at its joint's largest speed.
+        need: the largest torque that moves its joint along the recordings.
+    """
+    found = NORMAL_95 * sd * slope.abs() > need
+    return tuple(names[i] for i in found.nonzero().flatten().tolist())
+
+
 def warnings_of(
     *,
     converged: bool,

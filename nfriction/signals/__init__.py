@@ -8,7 +8,7 @@ Arrays are (time, joint); time is (time,) in seconds; positions are in radians (
 """
 
 from nfriction.signals.causal import SecondOrderLowPass, causal_motion
-from nfriction.signals.encoder import frequency_counting, quantise
+from nfriction.signals.encoder import count_seen, frequency_counting, quantise
 from nfriction.signals.kalman import kalman_smoother
 from nfriction.signals.motion import Motion
 from nfriction.signals.polynomial import initial_state, savitzky_golay
@@ -17,6 +17,7 @@ __all__ = [
     "Motion",
     "SecondOrderLowPass",
     "causal_motion",
+    "count_seen",
     "frequency_counting",
     "initial_state",
     "kalman_smoother",

@@ -11,6 +11,13 @@ from nfriction.signals.motion import checked
 
 Array = NDArray[np.float64]
 
+# Changes of one count, of joints that turn, are this share of all that are not zero.
+REPEATED = 0.01
+# Positions written with few digits make one count now larger, now smaller, by this share.
+ALIKE = 0.05
+# Of the way that a joint goes: no encoder has so many counts, smaller changes are of arithmetic.
+ROUNDING = 1e-9
+
 
 def quantise(q: ArrayLike, counts_per_revolution: float, *, offset: float = 0.0) -> Array:
     """Position as an incremental encoder reports it: the nearest of its evenly spaced counts.
@@ -24,6 +31,26 @@ def quantise(q: ArrayLike, counts_per_revolution: float, *, offset: float = 0.0)
     """
     quantum = _quantum(counts_per_revolution)
     return offset + quantum * np.rint((np.asarray(q, dtype=np.float64) - offset) / quantum)
+
+
+def count_seen(q: ArrayLike) -> Array:
+    """One count of each joint's encoder as its positions show it, (joint,), NaN where they do not.
+
+    It is the smallest change from a sample to the next, where a hundredth of the changes are alike:
+    noise and numbers written with many digits have a smallest change, too, but it hardly repeats.
+
+    Args:
+        q: positions as they were read [rad or m], shape (..., time, joint).
+    """
+    q = np.asarray(q, dtype=np.float64)
+    changes = np.abs(np.diff(q, axis=-2)).reshape(-1, q.shape[-1])
+    spans = np.ptp(q.reshape(-1, q.shape[-1]), axis=0)
+    found = np.full(q.shape[-1], np.nan)
+    for joint, (change, span) in enumerate(zip(changes.T, spans, strict=True)):
+        moved = change[change > ROUNDING * span]
+        if len(moved) and np.mean(moved <= (1 + ALIKE) * moved.min()) >= REPEATED:
+            found[joint] = moved.min()
+    return found
 
 
 def frequency_counting(

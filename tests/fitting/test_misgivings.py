@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 
-from nfriction import LFM, PendulumChain, Recording, fit
+from nfriction import CVFM, LFM, NFLFM, PendulumChain, Recording, fit
 from nfriction.fitting.misgivings import misgivings
+from nfriction.friction.models import ALFM
 from nfriction.signals import kalman_smoother
-from tests.fitting.recordings import pendulum, swing
+from tests.fitting.recordings import COUNTS, pendulum, swing
 
+COUNT = 2 * np.pi / COUNTS
 MODEL = LFM(2, [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]], v_smooth=0.05)
 
 
@@ -47,3 +49,59 @@ def test_a_fit_says_it_once_and_by_either_method():
     for settings in ({"method": "torque"}, {"windows": (0.5,), "max_steps": 1}):
         found = fit(LFM(2), plant, recording, **settings)
         assert sum("measured from hanging" in told for told in found.warnings) == 1
+
+
+def resting(counts: int, **settings) -> tuple[PendulumChain, Recording]:
+    """A double pendulum that rests but for a flicker of its second encoder."""
+    time = np.arange(1000) * 2e-3
+    q = np.zeros((1000, 2))
+    q[::50, 1] = counts * COUNT
+    plant = pendulum(convention=("relative", "hanging"), **settings)
+    return plant, Recording(time, q, name="rest")
+
+
+@pytest.mark.parametrize("quantum", [None, COUNT])
+def test_joints_that_do_not_move_are_named(quantum):
+    still, flickers = said(*resting(1, position_quantum=quantum))
+    assert still.startswith("joint1 never moves")
+    assert "joint2 moves by 0.000767 rad, 1 of its encoder's counts" in flickers
+    (still,) = said(*resting(10, position_quantum=COUNT))
+    assert still.startswith("joint1 never moves")
+
+
+def test_a_joint_that_moves_in_one_recording_is_not_named():
+    plant, rest = resting(0)
+    moving = swing(pendulum(), MODEL, seconds=1.0, convention="relative,hanging")
+    assert said(plant, rest, moving) == ()
+
+
+@pytest.mark.parametrize("model", [NFLFM, ALFM])
+def test_coefficients_that_follow_the_motion_need_some(model):
+    plant, rest = resting(3)
+    with pytest.raises(ValueError, match=r"joint1 never moves in rest.*record it moving"):
+        fit(model(2), plant, rest)
+
+
+def test_of_a_motionless_recording_a_fit_knows_nothing():
+    plant, rest = resting(0)
+    found = fit(LFM(2), plant, rest, windows=(0.5,), fit_plant=False)
+    assert found.residual < 1e-12
+    lost = set(" with ".join(found.lost).split(" with "))
+    assert lost == {f"{c} of joint{j}" for c in "BC" for j in (1, 2)}
+    assert any("joint2 never moves" in told for told in found.warnings)
+
+
+def test_where_nothing_is_left_over_nothing_is_told():
+    plant = PendulumChain([0.4], [0.4], convention=("absolute", "hanging"))
+    rest = Recording(np.arange(1000) * 2e-3, np.zeros((1000, 1)))
+    found = fit(CVFM(1), plant, rest, windows=(0.5,), drag=False)
+    assert found.residual == 0
+    assert {"F_c of joint1", "F_v of joint1", "inertia 11"} < set(found.lost)
+
+
+def test_of_an_encoder_that_flickers_a_fit_knows_no_friction():
+    time = np.arange(2000) * 2e-3
+    q = COUNT * (np.random.default_rng(0).random(2000) < 0.5)
+    plant = PendulumChain([0.4], [0.4], convention=("absolute", "hanging"))
+    found = fit(CVFM(1), plant, Recording(time, q[:, None]), windows=(0.5, 2.0), drag=False)
+    assert {"F_c of joint1", "F_v of joint1"} <= set(" with ".join(found.lost).split(" with "))

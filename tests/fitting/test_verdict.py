@@ -5,6 +5,7 @@ import torch
 
 from nfriction.fitting.verdict import (
     Evidence,
+    beyond_need,
     evidence,
     intervals,
     lost_directions,
@@ -137,6 +138,14 @@ def test_a_value_is_open_only_where_others_make_up_for_it():
     assert open_values(NAMES[:2], 3.0 * sd[:2], known) == ()
     # One that is told by itself is but small.
     assert open_values(NAMES, torch.tensor([1e3, 1e3, 0.0], dtype=F64), known) == ()
+
+
+def test_a_coefficient_is_open_where_its_interval_outdoes_what_moves_the_joint():
+    sd, slope = torch.tensor([1.0, 1.0, 1e-3], dtype=F64), torch.tensor([1.0, -1.0, 1.0], dtype=F64)
+    need = torch.tensor([2.0, 1.9, 0.1], dtype=F64)
+    # However near to zero the values are.
+    assert beyond_need(NAMES, sd, slope, need) == ("b",)
+    assert beyond_need(NAMES, torch.full_like(sd, torch.inf), slope, need) == NAMES
 
 
 def test_nothing_is_lost_where_all_is_told():
