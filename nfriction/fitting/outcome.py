@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -23,7 +24,7 @@ from nfriction.fitting.verdict import (
 )
 from nfriction.friction import Constant, FrictionModel
 from nfriction.plant import LinearAxis, PendulumChain
-from nfriction.signals import Motion
+from nfriction.signals import Motion, count_seen
 from nfriction.solve.least_squares import LeastSquaresResult
 
 Plant = PendulumChain | LinearAxis
@@ -159,8 +160,8 @@ def trajectory_outcome(
         zeros=tuple(map(tuple, problem.split_zeros(result.x).reshape(-1, plant.joints).tolist())),
         warnings=warnings_of(
             converged=result.converged, at_bounds=at_bounds, lost=lost, residual=residual,
-            effective_sd=noise, quantum=plant.position_quantum, unit=plant.unit,
-            largest_jump=problem.largest_jump(result.x),
+            effective_sd=noise, quantum=plant.position_quantum or _count_seen(problem),
+            unit=plant.unit, largest_jump=problem.largest_jump(result.x),
         ),
         uncertainty=uncertainty,
     )  # fmt: skip
@@ -212,6 +213,13 @@ def _told_by_data(
         problem.friction.schedule, root[: problem.friction_count].clone()
     )
     return intervals(chosen, result.x[index], sd[index], lower, upper), lost, uncertainty
+
+
+def _count_seen(problem: TrajectoryProblem) -> float | None:
+    """Largest of the encoders' counts that the positions show; None where none does."""
+    read = problem.windows.q @ problem.mixing.T
+    seen = float(np.fmax.reduce(count_seen(read.numpy())))
+    return None if math.isnan(seen) else seen
 
 
 def _needs(

@@ -8,7 +8,18 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction import ALFM, LFM, NCFM, NFLFM, LinearAxis, Recording, Stribeck, fit, rollout
+from nfriction import (
+    ALFM,
+    LFM,
+    NCFM,
+    NFLFM,
+    LinearAxis,
+    PendulumChain,
+    Recording,
+    Stribeck,
+    fit,
+    rollout,
+)
 from nfriction.fitting import estimate
 from nfriction.fitting.adaptive import fit_adaptive
 from nfriction.fitting.residuals import effective_noise
@@ -41,6 +52,19 @@ def test_known_friction_is_recovered(convention):
     assert found.residual == pytest.approx(2 * np.pi / 8192 / 12**0.5, rel=0.2)
     assert found.at_bounds == ()
     assert found.plant_terms == ()
+
+
+@pytest.mark.parametrize("convention", ["relative,upright", "absolute,hanging"])
+def test_what_a_wrong_plant_leaves_over_is_told_whether_or_not_the_rig_says_its_count(convention):
+    recording = swing(pendulum(), true_model(), convention=convention)
+    wrong = {"mass": [0.3, 0.2], "length": [0.2, 0.15], "inertia": [2e-3, 1e-3]}
+    told = []
+    for quantum in (None, 2 * np.pi / 8192):
+        plant = PendulumChain(**wrong, position_quantum=quantum)
+        found = fit(LFM(2), plant, recording, fit_plant=False, windows=(1.0,))
+        told.append([warning for warning in found.warnings if "Left over" in warning])
+    assert len(told[0]) == 1
+    assert told[0] == told[1]
 
 
 def test_one_motion_tells_friction_better_than_windows_apart():
