@@ -1,6 +1,5 @@
 """Fit a friction model to recordings: torques first, then trajectories."""
 
-import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Literal, get_args
@@ -31,14 +30,16 @@ from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
-logger = logging.getLogger(__name__)
-
 Method = Literal["trajectory", "torque"]
 # How encoders were zeroed: once for all recordings, anew at the start of each, or as it looks.
 Zeroed = Literal["auto", "once", "each"]
 ZEROED_EACH = (
     "Every recording begins at rest with all encoders at zero, so they were taken for set to zero "
     'there, wherever the links stood; `zeroed="once"` where they were not.'
+)
+TOO_LONG = (
+    "Windows of {:g} s are too long for this motion, which forgets its start within them, or for a "
+    "law or plant that is wrong; left out."
 )
 # Dry friction of a tenth of a link's largest gravity moment lets it rest up to 0.1 rad off [rad].
 ZERO_SD = 0.05
@@ -181,13 +182,15 @@ def fit(
         return fit_torque(model.law, found, joint, moved, model.v_smooth).coefficients
 
     linear = all(c.linear or not c.fitted for c in model.law.coefficients)
-    stage = _through_windows(search, windows, vector, moved, None if linear else by_torque)
+    stage, left_out = _through_windows(
+        search, windows, vector, moved, None if linear else by_torque
+    )
     undecided = start is None and eccentricity is None and fit_plant and may_be_eccentric(plant)
     if undecided and stage.result.status != "stopped":
         tolerance = flat(stage.result.cost)
         stage = richer_by_evidence(stage, refinement(True), tolerance) or stage
     found = trajectory_outcome(stage.problem, stage.result, stage.residuals, moved)
-    return _saying(told, replace(found, continuity=continuity))
+    return _saying((*told, *left_out), replace(found, continuity=continuity))
 
 
 def _saying(told: tuple[str, ...], found: Fit) -> Fit:
@@ -226,8 +229,10 @@ def _through_windows(
     vector: Tensor,
     motions: tuple[Motion, ...],
     by_torque: Callable[[Plant], Tensor] | None,
-) -> Stage:
+) -> tuple[Stage, tuple[str, ...]]:
     """Stages of growing length, each from the states and weighed by the errors of the last.
+
+    Lengths that the motion does not allow are left out, which is said in a sentence.
 
     With coefficients `by_torque` on a plant, the first stage is searched a second time from what
     they are on the plant that it found: a law that is not linear has several minima, and on an
@@ -250,17 +255,16 @@ def _through_windows(
         if reached is None and by_torque is not None and stage.result.status != "stopped":
             stage = _better_start(search, stage, tolerance, name, by_torque)
         if reached is not None and stage.lost_since(reached):
-            logger.warning("%g s windows are too long for this motion; left out", length)
             schedule = search.model.schedule
             schedule.set_parameter_vector(reached.problem.split(reached.result.x)[0])
-            break
+            return reached, (TOO_LONG.format(length),)
         reached, vector, noise = stage, stage.vector, max(stage.noise, LEAST_NOISE)
         zeros = stage.zeros
         if stage.result.status == "stopped":
             break
         traced = problem.traced(stage.result.x, traced)
     assert reached is not None
-    return reached
+    return reached, ()
 
 
 def _better_start(

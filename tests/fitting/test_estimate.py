@@ -23,6 +23,7 @@ from nfriction import (
 from nfriction.fitting import estimate
 from nfriction.fitting.adaptive import fit_adaptive
 from nfriction.fitting.residuals import effective_noise
+from nfriction.fitting.stages import Stage
 from nfriction.fitting.torque import fit_torque
 from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import F64, driven_axis, pendulum, swing
@@ -182,6 +183,16 @@ def test_air_drag_is_told_from_joint_friction():
             assert told.low < 0.05 < told.high
             assert {"intervals", "lost", "warnings"} <= found.to_dict().keys()
     assert errors[0] < 0.2 * errors[1]
+
+
+def test_windows_that_are_left_out_are_told(monkeypatch):
+    monkeypatch.setattr(Stage, "lost_since", lambda self, before: True)
+    recording = swing(pendulum(), true_model(), seconds=2.0)
+    found = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5, 1.0), max_steps=3)
+    assert sum(told.startswith("Windows of 1 s are too long") for told in found.warnings) == 1
+    alone = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5,), max_steps=3)
+    assert not any("too long" in told for told in alone.warnings)
+    assert found.residual == pytest.approx(alone.residual, rel=0.2)
 
 
 def test_irregular_stamps_are_followed():
