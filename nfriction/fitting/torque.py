@@ -103,10 +103,17 @@ def fit_torque(
         Coefficients with what they leave unexplained.
 
     Raises:
-        ValueError: if the law's torque is not finite along the motion.
+        ValueError: if there are too few samples, or the law's torque is not finite along the
+            motion.
     """
     parts = [friction_torque(plant, r, m) for r, m in zip(recordings, motions, strict=True)]
     qd, load, torque = (torch.cat(x) for x in zip(*parts, strict=True))
+    if len(qd) <= len(law.coefficients):
+        names = ", ".join(r.name or "a recording" for r in recordings)
+        raise ValueError(
+            f"{names}: too few samples, {len(qd)} are left {EDGE:g} s away from the ends for "
+            f"{len(law.coefficients)} coefficients a joint; record for longer."
+        )
     searched = [c.search for c in law.coefficients if not c.linear]
     candidates = [_linear_fit(law, qd, load, torque, v_smooth, dict(zip(
         (i for i, c in enumerate(law.coefficients) if not c.linear), values, strict=True)))

@@ -62,6 +62,19 @@ def test_the_torque_of_a_motion_leaves_the_ends_out():
     assert qd.shape == load.shape == torque.shape
 
 
+def test_too_few_samples_are_refused():
+    plant, law = pendulum(), MODELS["LFM"](2, TRUTH["LFM"]).law
+    recording, motion, _ = moved(MODELS["LFM"](2, TRUTH["LFM"]), plant)
+    ends = 2 * round(EDGE / 2e-3)
+    for count, enough in ((12, False), (ends + 2, False), (ends + 10, True)):
+        part = Motion(*(x[:count] for x in (motion.time, motion.q, motion.qd, motion.qdd)))
+        if enough:
+            fit_torque(law, plant, [recording[:count]], [part])
+            continue
+        with pytest.raises(ValueError, match=r"too few samples.*2 coefficients.*for longer"):
+            fit_torque(law, plant, [recording[:count]], [part])
+
+
 def test_recordings_are_weighed_together_by_their_samples():
     plant = pendulum()
     models = [MODELS["NCFM"](2, [c], v_smooth=V_SMOOTH) for c in (1e-3, 3e-3)]
