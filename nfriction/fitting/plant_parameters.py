@@ -63,7 +63,7 @@ def plant_parameters(
         plant: `PendulumChain` or `LinearAxis`.
         driven: torque was measured. Free swing tells only ratios, so the first gravity term is
             kept as the scale.
-        largest_torque: largest torque in the recordings [N m]; bounds a torque offset.
+        largest_torque: largest torque in the recordings [N m; N]; bounds its offset.
         largest_rate: largest velocity in the recordings [m/s]; scale of an axis' asymmetry.
         drag: fit air drag on the links: one quadratic coefficient for all; of several links also
             a linear one, and how far the last reaches into the air.
@@ -105,9 +105,10 @@ def plant_parameters(
             ratio(f"{name} {j + 1}", name, (j,))
     if driven:
         joints = buffers["torque_offset"].shape[-1]
+        kind, force = ("force", "N") if plant.unit == "m" else ("torque", "N m")
         for j, unit in enumerate(torch.eye(joints, dtype=torch.float64)):
             bound = 0.3 * largest_torque
-            shift(f"torque offset {j + 1} [N m]", "torque_offset", unit, -bound, bound,
+            shift(f"{kind} offset {j + 1} [{force}]", "torque_offset", unit, -bound, bound,
                   OFFSET_SHARE * largest_torque)  # fmt: skip
     if driven and "asymmetry" in buffers and largest_rate > 0:
         unit, sd = torch.ones_like(buffers["asymmetry"]), largest_torque / largest_rate

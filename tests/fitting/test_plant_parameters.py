@@ -32,7 +32,7 @@ def test_terms_that_are_not_there_are_not_adjusted():
     single = names(rigs.multiarm_single(), driven=False, drag=True)
     assert [n for n in single if "drag" in n] == ["drag quadratic"]
     assert names(LinearAxis(2.0), driven=True, largest_torque=1.0) == [
-        "mass 1", "torque offset 1 [N m]"
+        "mass 1", "force offset 1 [N]"
     ]  # fmt: skip
     assert names(LinearAxis(2.0), driven=False) == []
     moved = names(LinearAxis(2.0), driven=True, largest_torque=1.0, largest_rate=0.1)
