@@ -130,12 +130,42 @@ class Comparison:
         rmse = self.table()["all"]
         if not np.isfinite(rmse.min()):
             return None
+        return min(rmse.index[rmse <= (1 + TIE) * rmse.min()], key=self._parameters)
 
-        def parameters(name: str) -> int:
-            found = self.fits.get(name)
-            return sum(p.numel() for p in found.model.parameters()) if found else 0
+    def floor(self, column: str = "all", *, held_out: bool = True) -> float | None:
+        """What one encoder count at the start makes of the free run: less tells no models apart.
 
-        return min(rmse.index[rmse <= (1 + TIE) * rmse.min()], key=parameters)
+        Args:
+            column: joint of the tables, or `"all"`.
+            held_out: over which recordings.
+
+        Returns:
+            Root mean square over them [rad or m], of the model with the least error; None where
+            the count is not known or a simulation diverged.
+        """
+        scores, free_run = self.scores(held_out=held_out), self.table(held_out=held_out)[column]
+        named = free_run.drop(NO_FRICTION, errors="ignore")
+        floors = [s.floor for s in scores[str((free_run if named.empty else named).idxmin())]]
+        place = [*self.joint_names, "all"].index(column)
+        values = [np.nan if f is None else [*f.joints, f.all][place] for f in floors]
+        floor = float(np.sqrt(np.mean(np.square(values))))
+        return floor if np.isfinite(floor) else None
+
+    def alike(self) -> tuple[str, ...]:
+        """The best and all within the floor of it, `"no friction"` among them, simplest first.
+
+        Empty where there is no best.
+        """
+        best, floor = self.best(), self.floor() if self.held_out else None
+        if best is None:
+            return ()
+        rmse = self.table()["all"]
+        near = rmse.index[rmse <= rmse.min() + (floor or 0.0)]
+        return tuple(sorted({best, *near}, key=lambda name: (self._parameters(name), rmse[name])))
+
+    def _parameters(self, name: str) -> int:
+        found = self.fits.get(name)
+        return sum(p.numel() for p in found.model.parameters()) if found else 0
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON: coefficients, scores, how each fit ended, and which model is best."""
@@ -151,12 +181,15 @@ class Comparison:
                     "coefficients": coefficient_summary(found.model),
                     "fit": found.to_dict(),
                 }
-        best = self.best()
+        best, judged = self.best(), None
+        if best is not None:
+            alike = list(self.alike())
+            judged = {"model": best, "by": JUDGED_BY, "floor": self.floor(), "alike": alike}
         failed = {"failed": dict(self.failed)} if self.failed else {}
         return {
             "models": models,
             **failed,
-            "best": None if best is None else {"model": best, "by": JUDGED_BY},
+            "best": judged,
             "units": self.unit,
             "joints": list(self.joint_names),
         }

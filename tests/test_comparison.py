@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from nfriction import LFM, NFLFM, compare
+from nfriction.cli.tables import error_tables, verdict
 from nfriction.comparison import Comparison, coefficient_summary
 from nfriction.friction.models import ALFM
 from nfriction.scoring import Rmse, Score
@@ -162,15 +163,28 @@ def test_recordings_too_short_for_a_window_are_named(comparison):
     assert mixed.horizons(held_out=True) == ["0.5", "1"]
 
 
-def judged(found: Comparison, **errors: float) -> str | None:
-    """The best of a comparison in which these were the errors of free runs."""
+def scored(found: Comparison, count: float | None = None, **errors: float) -> Comparison:
+    """A comparison in which these were the errors of free runs, and that of one count at the start.
+
+    Errors are of each of two recordings; the count's is of the first, and twice that of the second.
+    """
     held_out = {
         name.replace("_", " "): [
-            Score("b", Rmse((e, e), e), {}, None, np.zeros(1), np.zeros((1, 2)), np.inf)
+            Score(
+                recording, Rmse((e, e), e), {},
+                None if count is None else Rmse((0.0, 0.0), k * count),
+                np.zeros(1), np.zeros((1, 2)), np.inf,
+            )
+            for k, recording in enumerate("bc", 1)
         ]
         for name, e in errors.items()
-    }
-    return dataclasses.replace(found, held_out=held_out).best()
+    }  # fmt: skip
+    return dataclasses.replace(found, held_out=held_out)
+
+
+def judged(found: Comparison, **errors: float) -> str | None:
+    """The best of a comparison in which these were the errors of free runs."""
+    return scored(found, **errors).best()
 
 
 def test_best_is_the_least_error_and_of_equals_the_simplest(comparison):
@@ -185,6 +199,28 @@ def test_best_is_the_least_error_and_of_equals_the_simplest(comparison):
     alone = dataclasses.replace(found, held_out={})
     assert alone.best() is None
     assert alone.to_dict()["best"] is None
+
+
+def test_models_within_the_floor_of_the_best_are_not_told_apart(comparison):
+    found, _ = comparison
+    errors = {"no_friction": 5.0, "NCFM": 2.0, "LFM": 1.0}
+    assert scored(found, **errors).alike() == ("LFM",)
+    assert "cannot be told" not in verdict(scored(found, **errors))
+    near, far = scored(found, 0.7, **errors), scored(found, 0.6, **errors)
+    # Over both recordings root 2.5 of it: 1.1 and 0.95.
+    assert near.floor() == pytest.approx(0.7 * 2.5**0.5)
+    assert near.floor("joint1") == 0
+    assert near.alike() == ("NCFM", "LFM")
+    assert far.alike() == ("LFM",)
+    assert near.best() == far.best() == "LFM"
+    assert near.to_dict()["best"]["alike"] == ["NCFM", "LFM"]
+    assert "told from NCFM; the simplest of them is NCFM" in verdict(near)
+    assert "floor of the free run: 1107," in error_tables(near)
+    assert verdict(far).count("\n") == 0
+    all_alike = scored(found, 10.0, **errors)
+    assert all_alike.alike() == ("no friction", "NCFM", "LFM")
+    assert scored(found, np.inf, **errors).floor() is None
+    assert dataclasses.replace(found, held_out={}).alike() == ()
 
 
 def test_coefficients_that_follow_the_motion_say_what_they_hold_for():

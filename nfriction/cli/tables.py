@@ -42,6 +42,11 @@ def _error_table(comparison: Comparison, held_out: bool) -> str:
         f"position RMSE [m{comparison.unit}], {kind}: {', '.join(s.recording for s in scores)}",
         table.to_string(float_format=lambda x: f"{x:.4g}" if np.isfinite(x) else "diverged"),
     ]
+    floor = comparison.floor(held_out=held_out)
+    if floor is not None:
+        lines.append(
+            f"floor of the free run: {1e3 * floor:.4g}, which one encoder count at the start makes"
+        )
     for horizon, short in comparison.too_short(held_out=held_out).items():
         lasts = ", ".join(f"{name} lasts {duration:.3g} s" for name, duration in short.items())
         lines.append(f"windows of {horizon} s: none, {lasts}")
@@ -92,9 +97,16 @@ def verdict(comparison: Comparison) -> str:
         return "no verdict: every free run over the held-out recordings diverged"
     error = 1e3 * comparison.table()["all"][best]
     what = f"{best} (free run over all joints: {error:.3g} m{comparison.unit})"
-    if best == NO_FRICTION:
-        return f"best on held-out recordings: {what}; no model earns its place"
-    return f"best on held-out recordings: {what}"
+    end = "; no model earns its place" if best == NO_FRICTION else ""
+    told = f"best on held-out recordings: {what}{end}"
+    alike, floor = comparison.alike(), comparison.floor()
+    if len(alike) < 2 or floor is None:
+        return told
+    others = ", ".join(name for name in alike if name != best)
+    return (
+        f"{told}\nwithin the floor, {1e3 * floor:.3g} m{comparison.unit}, it cannot be told from "
+        f"{others}; the simplest of them is {alike[0]}"
+    )
 
 
 def coefficient_table(model: FrictionModel, joint_names: Sequence[str], unit: str) -> str:

@@ -145,7 +145,7 @@ def horizon_curve(
     horizons = [*comparison.horizons(), None]
     tables = [comparison.table(horizon, held_out=held_out)[column] for horizon in horizons]
     values = np.stack([table.to_numpy(dtype=np.float64) for table in tables], -1)
-    floor = _floor(comparison, held_out, column, values[:, -1])
+    floor = comparison.floor(column, held_out=held_out)
     shown = values[np.isfinite(values)]
     factor, unit = style.scaled(comparison.unit, shown)
     figure, axes = style.panels(1, 1, width, 2.2)
@@ -205,20 +205,3 @@ def _name_bar(ax: Axes, x: float, value: float, top: float, bottom: float) -> No
 
 def _digits(value: float) -> str:
     return f"{value:.0f}" if value >= 100 else f"{value:#.3g}"
-
-
-def _floor(
-    comparison: Comparison, held_out: bool, column: str, free_run: np.ndarray
-) -> float | None:
-    """Floor of the model that predicts best, over its recordings; None where one has none."""
-    scores = comparison.held_out if held_out else comparison.train
-    models = [k for k, name in enumerate(scores) if name != NO_FRICTION] or [0]
-    best = list(scores.values())[min(models, key=lambda k: free_run[k])]
-    floors = []
-    for score in best:
-        if score.floor is None:
-            return None
-        values = dict(zip(comparison.joint_names, score.floor.joints, strict=True))
-        floors.append({**values, "all": score.floor.all}[column])
-    floor = float(np.sqrt(np.mean(np.square(floors))))
-    return floor if np.isfinite(floor) else None

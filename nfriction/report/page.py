@@ -93,6 +93,12 @@ def _verdict(run: Run) -> Iterator[str]:
         yield "."
     if run.judged_by:
         yield f" Judged by {run.judged_by}."
+    others = ", ".join(name for name in run.alike if name != run.best)
+    if others:
+        yield (
+            " Differences below the floor, which one encoder count at the start makes, mean "
+            f"nothing: it cannot be told from {others}. The simplest of them is {run.alike[0]}."
+        )
     fit = run.fits.get(run.best)
     if fit is not None and not fit.converged:
         yield " Its fit did not converge; read its warnings below."

@@ -57,6 +57,7 @@ class Run:
             then by name: a value a joint.
         best: name of the best model, None where nothing was held out.
         judged_by: what it was judged by.
+        alike: it and all that cannot be told from it, simplest first; of older versions none.
         command: what made the results.
         recordings: digest by name of those trained on (`"train"`) and `"held_out"`.
         models: models and what their files say; those that could be read.
@@ -77,6 +78,7 @@ class Run:
     figures: tuple[Figure, ...]
     notes: tuple[str, ...]
     selection: Selection | None = None
+    alike: tuple[str, ...] = ()
 
 
 def read_run(folder: str | Path) -> Run:
@@ -161,6 +163,7 @@ def _run(folder: Path, content: Mapping[str, Any]) -> Run:
         figures=figures,
         notes=(*notes, *unread),
         selection=_selection(content.get("selection"), unit),
+        alike=texts(best.get("alike", []), "`best`"),
     )
 
 

@@ -59,7 +59,7 @@ def results() -> dict[str, Any]:
     models["NFLFM"] |= {"fit": fit(intervals={}), "coefficients": sets}
     return {
         "models": models,
-        "best": {"model": "LFM", "by": "free-run RMSE"},
+        "best": {"model": "LFM", "by": "free-run RMSE", "alike": [EVIL, "LFM"]},
         "units": "rad",
         "joints": JOINTS,
         "command": f"nfriction compare {EVIL}",

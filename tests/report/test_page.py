@@ -104,6 +104,7 @@ def test_verdicts_warnings_and_rules_are_told(page):
     for said in (
         "LFM predicts the recordings best that no fit has seen: 100 mrad, where no friction "
         "leaves 2000.",
+        f"it cannot be told from {EVIL}. The simplest of them is {EVIL}.",
         "Not converged.",
         "The data cannot tell: f_a with f_v.",
         "At a bound: f_b.",
