@@ -80,9 +80,11 @@ def _carried(maps: StepMaps, start: Tensor, count: int) -> tuple[Tensor, Tensor]
     before = start.numpy().copy()
     after = np.empty_like(before)
     rows = np.empty((len(state), len(before), count, before.shape[-1]))
-    for k in range(len(state)):
-        rows[k] = before[:, :count]
-        np.matmul(state[k], before, out=after)
-        after[..., : shared.shape[-1]] += shared[k]
-        before, after = after, before
+    # A search rejects a step at which derivatives overflow; NumPy need not speak of it.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for k in range(len(state)):
+            rows[k] = before[:, :count]
+            np.matmul(state[k], before, out=after)
+            after[..., : shared.shape[-1]] += shared[k]
+            before, after = after, before
     return torch.from_numpy(rows).transpose(0, 1), torch.from_numpy(before)

@@ -8,7 +8,8 @@ import torch
 
 from nfriction import LFM, NFLFM
 from nfriction.fitting.plant_parameters import plant_parameters
-from nfriction.fitting.sensitivity import StepJacobian
+from nfriction.fitting.propagation import _carried
+from nfriction.fitting.sensitivity import StepJacobian, StepMaps
 from nfriction.fitting.stages import JUMP_SD
 from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
 from nfriction.fitting.windows import Windows
@@ -251,3 +252,10 @@ def test_states_are_told_to_be_blocks_only_where_they_are(joined, zero_sd):
     assert (found.blocks is None) == bool(across.any() or zero_sd is not None)
     if found.blocks is not None:
         assert found.blocks == (first, count)
+
+
+@pytest.mark.filterwarnings("error")
+def test_derivatives_that_overflow_are_told_to_the_search_alone():
+    maps = StepMaps(*(torch.full((4, 1, 3, n), 1e200, dtype=F64) for n in (3, 1, 0)))
+    _, after = _carried(maps, torch.ones(1, 3, 2, dtype=F64), 2)
+    assert not torch.isfinite(after).any()
