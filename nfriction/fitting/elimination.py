@@ -132,7 +132,9 @@ def eliminated(
     return Eliminated(_beyond_rounding(data, layout.squares(unsure.sqrt()[:, None])), response)
 
 
-def score(rows: Iterable[Rows], layout: Layout, known: Eliminated, precision: Tensor) -> Tensor:
+def score_covariance(
+    rows: Iterable[Rows], layout: Layout, known: Eliminated, precision: Tensor
+) -> Tensor:
     """Covariance of the gradient over what is kept, (kept, kept), by rows scaled to its residuals.
 
     Args:

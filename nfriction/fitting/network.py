@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from nfriction.fitting.anchors import anchors_where_unseen
 from nfriction.fitting.holdback import Judgement, error_on, judged_windows
 from nfriction.fitting.neurofuzzy_start import settle_on, start_at
 from nfriction.fitting.outcome import Continuity, Fit, Plant, trajectory_outcome
@@ -21,7 +22,6 @@ from nfriction.fitting.preparation import (
 from nfriction.fitting.residuals import effective_noise, stride_of
 from nfriction.fitting.stages import JUMP_SD, Refinement, Stage, flat, least
 from nfriction.fitting.trajectory import TrajectoryProblem
-from nfriction.fitting.unseen import unseen
 from nfriction.fitting.windows import cut_windows
 from nfriction.friction import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
@@ -73,7 +73,7 @@ def fit_network(
     jump_sd = None if continuity == "free" else JUMP_SD["soft"]
     search = Refinement(
         plant, model, joint, mixing, terms, max_steps, callback, jump_sd=jump_sd,
-        unseen=unseen(model.schedule, moved),
+        anchors=anchors_where_unseen(model.schedule, moved),
     )  # fmt: skip
     vector = torch.tensor([known.get(t.name, 0.0) for t in terms], dtype=torch.float64)
     found = _refined(search, start, vector, windows[-1], moved)
@@ -89,7 +89,7 @@ def _refined(
     noise, stride = effective_noise(start._residuals), stride_of(start._residuals)
     tolerance = flat(least(start._residuals, noise))
     seen, held_back = judged_windows(search, motions, length)
-    law = replace(search, model=copy.deepcopy(start.model), unseen=None)
+    law = replace(search, model=copy.deepcopy(start.model), anchors=None)
     same = law.search(
         law.problem(seen, noise, vector, stride), vector, tolerance, "constants, a third held back"
     )

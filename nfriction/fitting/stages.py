@@ -6,13 +6,13 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
+from nfriction.fitting.anchors import Anchors
 from nfriction.fitting.outcome import Continuity, Plant
 from nfriction.fitting.plant_parameters import PlantParameter
 from nfriction.fitting.preparation import substeps_of
 from nfriction.fitting.residuals import effective_noise
 from nfriction.fitting.sensitivity import StepJacobian
 from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
-from nfriction.fitting.unseen import Unseen
 from nfriction.fitting.windows import Windows
 from nfriction.friction import Constant, FrictionModel
 from nfriction.recording import Recording
@@ -87,7 +87,7 @@ class Refinement:
         terms: adjustable terms of the plant.
         max_steps: limit to each stage.
         callback: told every step with its stage; True stops.
-        zero_sd, jump_sd, unseen: see `TrajectoryProblem`.
+        zero_sd, jump_sd, anchors: see `TrajectoryProblem`.
     """
 
     plant: Plant
@@ -99,7 +99,7 @@ class Refinement:
     callback: Callback | None = None
     zero_sd: Tensor | None = None
     jump_sd: tuple[float, float] | None = None
-    unseen: Unseen | None = None
+    anchors: Anchors | None = None
     jacobian: StepJacobian = field(init=False)
 
     def __post_init__(self) -> None:
@@ -123,7 +123,7 @@ class Refinement:
             self.jacobian, windows, noise, self.mixing,
             substeps=substeps_of(self.plant, self.model, self.joint), plant_mean=mean,
             stride=stride, zero_sd=self.zero_sd, jump_sd=jump_sd,
-            unseen=self.unseen,
+            anchors=self.anchors,
         )  # fmt: skip
 
     def search(

@@ -15,13 +15,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from nfriction.fitting.elimination import Layout, eliminated, score
+from nfriction.fitting.anchors import Anchors
+from nfriction.fitting.elimination import Layout, eliminated, score_covariance
 from nfriction.fitting.normal_equations import Rows, add_jumps, normal_equations, scaled_rows
 from nfriction.fitting.plant_parameters import adjusted_buffers
 from nfriction.fitting.propagation import propagated
 from nfriction.fitting.sensitivity import StepJacobian
-from nfriction.fitting.unseen import Unseen
-from nfriction.fitting.verdict import Evidence, evidence, standard_deviations
+from nfriction.fitting.verdict import Information, information, standard_deviations
 from nfriction.fitting.windows import Windows
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.plant import LinearAxis, PendulumChain
@@ -59,7 +59,7 @@ class TrajectoryProblem:
             sought.
         jump_sd: by how much position and velocity may jump from the end of a window to the start of
             the next [rad, rad/s; m, m/s]; without it by as much as they like.
-        unseen: motions at which a neuro-fuzzy schedule is held to its constant law.
+        anchors: where a neuro-fuzzy schedule is held to its constant law.
         memory: of the coefficients at the start of each window, (window, joint, state_size), of a
             schedule that has one. It advances with every step of the integration.
     """
@@ -74,7 +74,7 @@ class TrajectoryProblem:
     memory: Tensor | None = None
     zero_sd: Tensor | None = None
     jump_sd: tuple[float, float] | None = None
-    unseen: Unseen | None = None
+    anchors: Anchors | None = None
 
     def __post_init__(self) -> None:
         w = self.windows
@@ -166,10 +166,11 @@ class TrajectoryProblem:
         return (q - self.windows.q) @ self.mixing.T
 
     def cost(self, x: Tensor) -> Tensor:
-        """Half the sum of squares of residuals, jumps, what is held and prior."""
+        """Half the sum of squares of residuals, jumps, anchors and prior."""
         precision, mean = self.prior()
-        held = torch.zeros(0) if self.unseen is None else self.unseen.residuals(self._network(x))
-        rows = (self.residuals(x), self.jumps(x), held)
+        rows = [self.residuals(x), self.jumps(x)]
+        if self.anchors is not None:
+            rows.append(self.anchors.residuals(self._network(x)))
         misfit = torch.stack([row.square().sum() for row in rows]).sum()
         return 0.5 * (misfit + (precision * (x - mean) ** 2).sum())
 
@@ -184,13 +185,6 @@ class TrajectoryProblem:
         """Over what is expected; 0 where windows have nothing to do with each other."""
         jumps = self.jumps(x).abs()
         return float(jumps.max()) if jumps.numel() else 0.0
-
-    def held(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradient and curvature by what is held at unseen motions, over friction parameters."""
-        if self.unseen is None:
-            none = torch.zeros(self.friction_count, dtype=torch.float64)
-            return none, none.expand(len(none), -1)
-        return self.unseen.normal_equations(self._network(x))
 
     def _network(self, x: Tensor) -> NeuroFuzzy:
         schedule = self.friction.schedule
@@ -207,9 +201,10 @@ class TrajectoryProblem:
         gradient, hessian, ends = normal_equations(rows, r, places, len(x))
         if self._seams:
             add_jumps(gradient, hessian, self.jumps(x), ends, self._seams, places, self._jump_sd)
-        slope, curvature = self.held(x)
-        gradient[: len(slope)] += slope
-        hessian[: len(slope), : len(slope)] += curvature
+        if self.anchors is not None:
+            slope, curvature = self.anchors.normal_equations(self._network(x))
+            gradient[: len(slope)] += slope
+            hessian[: len(slope), : len(slope)] += curvature
         hessian.diagonal().add_(precision)
         self._hessian = hessian
         # Neither seams nor zeros make states of windows depend on each other.
@@ -220,7 +215,7 @@ class TrajectoryProblem:
     def spread(self) -> Tensor:
         """Standard deviation of every shared parameter by the last quadratic model."""
         precision, _ = self.prior()
-        known = evidence(self._hessian, precision, self.shared_count)
+        known = information(self._hessian, precision, self.shared_count)
         return standard_deviations(known)
 
     def _simulate(self, x: Tensor) -> Rollout:
@@ -271,7 +266,7 @@ class TrajectoryProblem:
         zeros = torch.zeros_like(zero_sd)
         return sd.square().reciprocal(), torch.cat([mean, start.reshape(-1), zeros])
 
-    def told(self, x: Tensor, sd: Tensor) -> Evidence:
+    def told(self, x: Tensor, sd: Tensor) -> Information:
         """What the data say of the shared parameters, where the errors have their own sizes.
 
         Args:
@@ -287,8 +282,8 @@ class TrajectoryProblem:
         joined = (self._seams, self._jump_sd) if self._seams else ((), None)
         known = eliminated(self._rows(x, self._scale), layout, of_states, *joined)
         rows = self._rows(x, self._scale * sd / self.noise_sd)
-        spread = score(rows, layout, known, of_states)
-        return evidence(known.data + torch.diag(kept), kept, first, spread)
+        spread = score_covariance(rows, layout, known, of_states)
+        return information(known.data + torch.diag(kept), kept, first, spread)
 
     def _rows(self, x: Tensor, scale: Tensor) -> Iterator[Rows]:
         """Rows of the Jacobian, some samples at a time; errors count as `scale` says."""

@@ -44,7 +44,7 @@ class Interval:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class Information:
     """What the data say of the shared parameters, once window states are eliminated.
 
     Attributes:
@@ -57,18 +57,18 @@ class Evidence:
     prior: Tensor
     score: Tensor | None = None
 
-    def subset(self, index: Tensor) -> "Evidence":
+    def subset(self, index: Tensor) -> "Information":
         """What is known of some of the parameters while the others are held."""
         score = None if self.score is None else self.score[index][:, index]
-        return Evidence(self.data[index][:, index], self.prior[index], score)
+        return Information(self.data[index][:, index], self.prior[index], score)
 
 
-def evidence(
+def information(
     hessian: Tensor,
     precision: Tensor,
     shared: int,
     score: Tensor | None = None,
-) -> Evidence:
+) -> Information:
     """Curvature over the shared parameters with every window's state eliminated.
 
     Nothing is known, prior included, where rounding has taken that curvature: windows that diverge
@@ -84,18 +84,18 @@ def evidence(
     across = hessian[:shared, shared:]
     solved, failed = torch.linalg.solve_ex(hessian[shared:, shared:], across.T)
     if failed or not solved.isfinite().all():
-        return Evidence(hessian.new_zeros(shared, shared), precision.new_zeros(shared))
+        return Information(hessian.new_zeros(shared, shared), precision.new_zeros(shared))
     pull = solved.T
     data = hessian[:shared, :shared] - torch.diag(precision[:shared])
     eliminated = _symmetric(data - pull @ across.T)
     if score is None:
-        return Evidence(eliminated, precision[:shared])
+        return Information(eliminated, precision[:shared])
     passed = torch.cat([torch.eye(shared, dtype=data.dtype), -pull], 1)
     known = passed @ score @ passed.T + (pull * precision[shared:]) @ pull.T
-    return Evidence(eliminated, precision[:shared], _symmetric(known))
+    return Information(eliminated, precision[:shared], _symmetric(known))
 
 
-def covariance_root(known: Evidence) -> Tensor:
+def covariance_root(known: Information) -> Tensor:
     """R of the posterior covariance R R^T, (p, p); rows are infinite where nothing is known.
 
     Where residuals are not alike it is the sandwich covariance H^-1 (score + prior) H^-1.
@@ -119,7 +119,7 @@ def covariance_root(known: Evidence) -> Tensor:
     return torch.where(lost[:, None], torch.inf, root)
 
 
-def standard_deviations(known: Evidence) -> Tensor:
+def standard_deviations(known: Information) -> Tensor:
     """Posterior standard deviation of each parameter, infinite where nothing is known, (p,)."""
     return covariance_root(known).norm(dim=1)
 
@@ -134,7 +134,7 @@ def intervals(
     return tuple(Interval(*row) for row in rows)
 
 
-def lost_directions(names: Sequence[str], known: Evidence) -> tuple[str, ...]:
+def lost_directions(names: Sequence[str], known: Information) -> tuple[str, ...]:
     """Parameters and combinations of them that the data cannot tell, in words.
 
     A prior may still hold them; it is not asked here, except that a parameter of which the data
@@ -159,7 +159,7 @@ def lost_directions(names: Sequence[str], known: Evidence) -> tuple[str, ...]:
     return tuple(found)
 
 
-def open_values(names: Sequence[str], values: Tensor, known: Evidence) -> tuple[str, ...]:
+def open_values(names: Sequence[str], values: Tensor, known: Information) -> tuple[str, ...]:
     """Parameters whose very size is open, because others make up for them.
 
     Args:

@@ -12,8 +12,8 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter
 
+from nfriction.fitting.anchors import visits
 from nfriction.fitting.uncertainty import CoefficientUncertainty
-from nfriction.fitting.unseen import visits
 from nfriction.fitting.verdict import NORMAL_95
 from nfriction.friction import Coefficient, FrictionModel, NeuroFuzzy
 from nfriction.plots import style

@@ -42,8 +42,8 @@ def test_a_search_from_far_away_is_soft_and_a_network_never_harder(made):
     networks = [p for p in made if not isinstance(p.friction.schedule, Constant)]
     assert [p.jump_sd for p in laws[:2]] == [SOFT, HARD]
     assert networks
-    assert all(p.jump_sd == SOFT and p.unseen is not None for p in networks)
-    assert all(p.unseen is None for p in laws)
+    assert all(p.jump_sd == SOFT and p.anchors is not None for p in networks)
+    assert all(p.anchors is None for p in laws)
 
 
 def test_windows_are_apart_by_default_and_for_adaptive_models(made):

@@ -15,8 +15,8 @@ from nfriction.fitting.preparation import adjustable_terms, mixing_of
 from nfriction.fitting.stages import Refinement
 from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
 from nfriction.fitting.verdict import (
-    Evidence,
-    evidence,
+    Information,
+    information,
     lost_directions,
     standard_deviations,
 )
@@ -56,12 +56,12 @@ def error_sizes(p: TrajectoryProblem) -> torch.Tensor:
     return 2e-4 * (0.5 + torch.rand(p.windows.q.shape, generator=g, dtype=F64))
 
 
-def by_squares(p: TrajectoryProblem, x: torch.Tensor, sd: torch.Tensor) -> Evidence:
+def by_squares(p: TrajectoryProblem, x: torch.Tensor, sd: torch.Tensor) -> Information:
     """All unknowns' normal equations, and the states eliminated from these."""
     rows = p._rows(x, p._scale * sd / p.noise_sd)
     covariance = normal_equations(rows, torch.zeros_like(sd), p._own_places(), len(x))[1]
     hessian = p.quadratic(x).hessian
-    return evidence(hessian, p.prior()[0], p.shared_count, covariance)
+    return information(hessian, p.prior()[0], p.shared_count, covariance)
 
 
 @pytest.mark.parametrize("jump_sd", [None, (3e-4, 0.01), (1e-6, 3e-5)])
@@ -113,7 +113,7 @@ def grown(growth, told, seed=0):
     pieces = [Rows(slice(None), part[None], part[None, None]) for part in jacobian.split(60)]
     data = eliminated(pieces, layout, precision[None, shared:]).data
     hessian = jacobian.T @ jacobian + torch.diag(precision)
-    return Evidence(data, precision[:shared]), evidence(hessian, precision, shared)
+    return Information(data, precision[:shared]), information(hessian, precision, shared)
 
 
 def triangle(seed):
@@ -166,7 +166,7 @@ def test_beside_what_is_lost_no_other_is_told_too_well(growth):
     for seed in range(60):
         told = triangle(seed)
         rows, _ = grown(growth, told, seed)
-        exact = standard_deviations(Evidence(told.T @ told, torch.zeros(SHARED, dtype=F64)))
+        exact = standard_deviations(Information(told.T @ told, torch.zeros(SHARED, dtype=F64)))
         share = standard_deviations(rows) / exact
         kept += int(share.isfinite().sum())
         too_sure += int((share < 0.9).sum())

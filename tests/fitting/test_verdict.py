@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from nfriction.fitting.verdict import (
-    Evidence,
+    Information,
     beyond_need,
-    evidence,
+    information,
     intervals,
     lost_directions,
     open_values,
@@ -26,7 +26,7 @@ def regression(samples=200, parameters=3):
 def test_intervals_of_a_linear_fit_cover_as_often_as_they_say():
     design, g = regression()
     truth, noise = torch.tensor([1.0, -2.0, 0.5], dtype=F64), 0.3
-    known = evidence(design.T @ design / noise**2, torch.zeros(3, dtype=F64), 3)
+    known = information(design.T @ design / noise**2, torch.zeros(3, dtype=F64), 3)
     sd, free = standard_deviations(known), torch.full((3,), torch.inf, dtype=F64)
     hits = []
     for _ in range(400):
@@ -42,7 +42,7 @@ def test_eliminating_window_states_is_marginalising_them():
     design, _ = regression(parameters=5)
     precision = torch.tensor([0.0, 2.0, 0.0, 1.0, 3.0], dtype=F64)
     hessian = design.T @ design / 0.7**2 + torch.diag(precision)
-    found = standard_deviations(evidence(hessian, precision, 3))
+    found = standard_deviations(information(hessian, precision, 3))
     torch.testing.assert_close(found, torch.linalg.inv(hessian).diagonal()[:3].sqrt())
 
 
@@ -54,7 +54,7 @@ def test_nothing_is_known_where_the_windows_diverged():
     across = torch.linspace(1.0, 2.0, 12, dtype=F64).reshape(3, 4) * grown
     hessian[:3, 3:], hessian[3:, :3] = across, across.T
     for score in (None, hessian):
-        known = evidence(hessian, torch.ones(7, dtype=F64), 3, score)
+        known = information(hessian, torch.ones(7, dtype=F64), 3, score)
         assert torch.isinf(standard_deviations(known)).all()
         assert lost_directions(NAMES, known) == NAMES
 
@@ -64,12 +64,12 @@ def test_a_score_as_large_as_the_curvature_changes_nothing():
     precision = torch.tensor([0.0, 2.0, 0.0, 1.0, 3.0], dtype=F64)
     data = design.T @ design / 0.25
     hessian = data + torch.diag(precision)
-    plain = evidence(hessian, precision, 3)
-    same = evidence(hessian, precision, 3, data)
+    plain = information(hessian, precision, 3)
+    same = information(hessian, precision, 3, data)
     torch.testing.assert_close(standard_deviations(same), standard_deviations(plain))
     # Errors twice as large make intervals as wide, be that said of the score or of all residuals.
-    wide = evidence(design.T @ design, 0 * precision, 3)
-    score = evidence(data, 0 * precision, 3, 4 * data)
+    wide = information(design.T @ design, 0 * precision, 3)
+    score = information(data, 0 * precision, 3, 4 * data)
     torch.testing.assert_close(standard_deviations(score), standard_deviations(wide))
 
 
@@ -84,8 +84,8 @@ def test_intervals_cover_where_residuals_are_not_alike():
     free = torch.full((3,), torch.inf, dtype=F64)
     hits: dict[str, list[bool]] = {"sandwich": [], "alike": []}
     sd = {
-        "sandwich": standard_deviations(evidence(hessian, zero, 3, score)),
-        "alike": standard_deviations(evidence(hessian / alike**2, zero, 3)),
+        "sandwich": standard_deviations(information(hessian, zero, 3, score)),
+        "alike": standard_deviations(information(hessian / alike**2, zero, 3)),
     }
     for _ in range(400):
         y = sizes * torch.randn(len(design), generator=g, dtype=F64)
@@ -104,15 +104,15 @@ def test_units_do_not_matter():
     units = torch.tensor([1e-6, 1.0, 1e5], dtype=F64)
     zero = torch.zeros(3, dtype=F64)
     scaled = design * units
-    one = standard_deviations(Evidence(design.T @ design, zero))
-    other = standard_deviations(Evidence(scaled.T @ scaled, zero))
+    one = standard_deviations(Information(design.T @ design, zero))
+    other = standard_deviations(Information(scaled.T @ scaled, zero))
     torch.testing.assert_close(other * units, one)
 
 
 def test_a_singular_direction_and_a_blind_parameter_are_named():
     design, _ = regression()
     design[:, 1] = 2.0 * design[:, 0]
-    known = Evidence(design.T @ design, torch.zeros(3, dtype=F64))
+    known = Information(design.T @ design, torch.zeros(3, dtype=F64))
     (direction,) = lost_directions(NAMES, known)
     assert set(direction.split(" with ")) == {"a", "b"}
     assert torch.isinf(standard_deviations(known)).tolist() == [True, True, False]
@@ -120,9 +120,9 @@ def test_a_singular_direction_and_a_blind_parameter_are_named():
     # Nor does a score of rounding in that direction make it known.
     nearly = known.data + 1e-12 * torch.eye(3, dtype=F64)
     for score in (None, 4 * known.data, torch.zeros(3, 3, dtype=F64)):
-        sd = standard_deviations(Evidence(nearly, known.prior, score))
+        sd = standard_deviations(Information(nearly, known.prior, score))
         assert sd[:2].min() > 1e4
-    blind = Evidence(design.T @ design, torch.tensor([0.0, 1.0, 0.0], dtype=F64))
+    blind = Information(design.T @ design, torch.tensor([0.0, 1.0, 0.0], dtype=F64))
     assert lost_directions(NAMES, blind) == ("b",)
     # Its prior still says what it says.
     assert float(standard_deviations(blind)[1]) == pytest.approx(1.0)
@@ -131,7 +131,7 @@ def test_a_singular_direction_and_a_blind_parameter_are_named():
 def test_a_value_is_open_only_where_others_make_up_for_it():
     design, _ = regression()
     design[:, 1] = design[:, 0] + 0.01 * design[:, 1]
-    known = Evidence(design.T @ design, torch.zeros(3, dtype=F64))
+    known = Information(design.T @ design, torch.zeros(3, dtype=F64))
     assert lost_directions(NAMES, known) == ()
     sd = standard_deviations(known)
     assert open_values(NAMES, 1.5 * sd, known) == ("a", "b")
@@ -150,7 +150,7 @@ def test_a_coefficient_is_open_where_its_interval_outdoes_what_moves_the_joint()
 
 def test_nothing_is_lost_where_all_is_told():
     design, _ = regression()
-    assert lost_directions(NAMES, Evidence(design.T @ design, torch.zeros(3, dtype=F64))) == ()
+    assert lost_directions(NAMES, Information(design.T @ design, torch.zeros(3, dtype=F64))) == ()
 
 
 def test_intervals_end_at_the_bounds():

@@ -5,12 +5,12 @@ import pytest
 import torch
 
 from nfriction import NFLFM
+from nfriction.fitting.anchors import ANCHOR_SD, Anchors, anchors_where_unseen, visits
 from nfriction.fitting.outcome import trajectory_outcome
 from nfriction.fitting.residuals import local_noise
 from nfriction.fitting.sensitivity import StepJacobian
 from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
 from nfriction.fitting.uncertainty import CoefficientUncertainty
-from nfriction.fitting.unseen import HELD_SD, Unseen, unseen, visits
 from nfriction.fitting.verdict import covariance_root
 from nfriction.fitting.windows import Windows
 from nfriction.signals import Motion
@@ -41,7 +41,7 @@ def swings(*sizes: float) -> Motion:
 def test_small_swings_are_unseen_among_large_ones_and_seen_where_a_joint_made_them():
     schedule = network().schedule
     motions = [swings(1.0, 0.1), swings(1.0, 0.5)]
-    found = unseen(schedule, motions)
+    found = anchors_where_unseen(schedule, motions)
     size = torch.hypot(found.qd / FASTEST, found.qdd / STRONGEST)
     assert found.weight[size[:, 0] < 0.75, 0].all()
     assert not found.weight[(size[:, 0] - 1).abs() < 0.05, 0].any()
@@ -61,7 +61,7 @@ def test_every_sample_is_counted_those_beyond_the_range_at_its_edge():
 
 def test_normal_equations_are_of_the_derivatives_of_the_residuals():
     schedule = network(0.2).schedule
-    held = unseen(schedule, [swings(1.0, 0.5)])
+    held = anchors_where_unseen(schedule, [swings(1.0, 0.5)])
     at, columns = schedule.parameter_vector(), []
     r, (gradient, hessian) = held.residuals(schedule), held.normal_equations(schedule)
     for k in range(len(at)):
@@ -79,19 +79,19 @@ def test_normal_equations_are_of_the_derivatives_of_the_residuals():
 
 def test_a_deviation_counts_in_units_of_the_scale():
     schedule = network().schedule
-    held = unseen(schedule, [swings(1.0, 1.0)])
+    held = anchors_where_unseen(schedule, [swings(1.0, 1.0)])
     torch.testing.assert_close(held.residuals(schedule), torch.zeros_like(held.residuals(schedule)))
     (bias,) = [p for n, p in schedule.named_parameters() if n.endswith("output_bias")]
     with torch.no_grad():
-        bias.add_(HELD_SD)
+        bias.add_(ANCHOR_SD)
     found = held.residuals(schedule).unflatten(0, (-1, 2, 2))
-    # The coefficients' positive map rounds near zero: a deviation of HELD_SD is one, but for that.
+    # The coefficients' positive map rounds near zero: but for that, one deviation of ANCHOR_SD.
     torch.testing.assert_close(found[held.weight > 0], torch.ones(1, dtype=F64).expand_as(
         found[held.weight > 0]), rtol=0, atol=1e-3)  # fmt: skip
     assert not found[held.weight == 0].any()
 
 
-def problem(model: NFLFM, held: Unseen | None) -> TrajectoryProblem:
+def problem(model: NFLFM, held: Anchors | None) -> TrajectoryProblem:
     """Windows of large swings, simulated with a network of its own."""
     g = torch.Generator().manual_seed(5)
     q0 = torch.tensor([[1.6, 0.5], [2.5, -0.4]], dtype=F64)
@@ -101,13 +101,13 @@ def problem(model: NFLFM, held: Unseen | None) -> TrajectoryProblem:
     q = integrate(pendulum(), network(0.3), q0, qd0, tau, step).q
     w = Windows(q, tau, step, torch.ones(2, 61, dtype=F64), q0, qd0)
     jacobian = StepJacobian(pendulum(), model, [])
-    return TrajectoryProblem(jacobian, w, 1e-4, torch.eye(2, dtype=F64), unseen=held)
+    return TrajectoryProblem(jacobian, w, 1e-4, torch.eye(2, dtype=F64), anchors=held)
 
 
 @pytest.mark.parametrize("size", [0.0, 0.2])
 def test_what_is_held_is_part_of_the_cost_and_of_its_model(size):
     model = network(size)
-    held = unseen(model.schedule, [swings(1.0, 0.5)])
+    held = anchors_where_unseen(model.schedule, [swings(1.0, 0.5)])
     free, tied = problem(model, None), problem(model, held)
     x = free.start()
     r, n = held.residuals(model.schedule), tied.friction_count
@@ -118,14 +118,13 @@ def test_what_is_held_is_part_of_the_cost_and_of_its_model(size):
     difference = b.hessian - a.hessian
     torch.testing.assert_close(difference[:n, :n], curvature, rtol=1e-7, atol=1e-4)
     assert not difference[n:].any()
-    assert not free.held(x)[0].any()
 
 
 def test_a_network_fitted_so_deviates_less_where_nothing_was_seen():
     deviation = []
     for tied in (False, True):
         model = network()
-        held = unseen(model.schedule, [swings(1.0, 1.0)])
+        held = anchors_where_unseen(model.schedule, [swings(1.0, 1.0)])
         p = problem(model, held if tied else None)
         result = solve_trajectory(p, p.start())
         deviation.append(float(held.residuals(model.schedule).square().mean().sqrt()))
@@ -135,7 +134,7 @@ def test_a_network_fitted_so_deviates_less_where_nothing_was_seen():
 
 def test_what_is_only_held_is_not_taken_for_told_by_the_data():
     model = network()
-    held = unseen(model.schedule, [swings(1.0, 1.0)])
+    held = anchors_where_unseen(model.schedule, [swings(1.0, 1.0)])
     p = problem(model, held)
     result = solve_trajectory(p, p.start(), max_steps=5)
     errors, n = p.errors(result.x), p.friction_count
@@ -149,7 +148,7 @@ def test_what_is_only_held_is_not_taken_for_told_by_the_data():
     torch.testing.assert_close(told, openness(alone.uncertainty))
     # As if the data had said what was held.
     known = p.told(result.x, local_noise(errors))
-    known.data[:n, :n] += p.held(result.x)[1]
+    known.data[:n, :n] += held.normal_equations(model.schedule)[1]
     mistaken = openness(CoefficientUncertainty(model.schedule, covariance_root(known)[:n]))
     assert (told >= (1 - 1e-6) * mistaken).all()
     assert told.median() > 1.3 * mistaken.median()

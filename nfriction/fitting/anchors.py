@@ -1,4 +1,4 @@
-"""Motions that recordings never came near, at which a network is held to its constant law.
+"""Anchors of a network: it is held to its constant law at motions that recordings never came near.
 
 Fuzzy sets reach far: what they learn of friction at the turning points of large swings they also
 say of small swings, slow and weakly accelerated, of which the recordings tell nothing.
@@ -20,11 +20,11 @@ from nfriction.signals import Motion
 # many-th one a network is held where none does.
 CELLS, NEAR, SPACING = 60, 5, 5
 # By how much coefficients may deviate there, in units of their scale.
-HELD_SD = 0.2
+ANCHOR_SD = 0.2
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Unseen:
+class Anchors:
     """Motions of each joint, and where its coefficients are held to those of the constant law.
 
     Attributes:
@@ -59,10 +59,10 @@ class Unseen:
         return gradient, hessian
 
     def _factor(self, schedule: NeuroFuzzy) -> Tensor:
-        return self.weight[..., None] / (HELD_SD * schedule.scale)
+        return self.weight[..., None] / (ANCHOR_SD * schedule.scale)
 
 
-def unseen(schedule: NeuroFuzzy, motions: Sequence[Motion]) -> Unseen:
+def anchors_where_unseen(schedule: NeuroFuzzy, motions: Sequence[Motion]) -> Anchors:
     """Where in a schedule's trained range motions never came near.
 
     Args:
@@ -77,7 +77,7 @@ def unseen(schedule: NeuroFuzzy, motions: Sequence[Motion]) -> Unseen:
     velocity, acceleration = torch.cartesian_prod(points, points).unbind(-1)
     lower, upper = schedule.acceleration_lower, schedule.acceleration_upper
     weight = ~near[:, places[:, None], places].reshape(schedule.joints, -1)
-    return Unseen(
+    return Anchors(
         velocity[:, None] * schedule.velocity_range,
         lower + acceleration[:, None] * (upper - lower),
         torch.as_tensor(weight.T, dtype=torch.float64),
