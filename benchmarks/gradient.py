@@ -125,12 +125,13 @@ def gauss_newton(repeats: int) -> None:
         )
         identity = torch.eye(3, dtype=torch.float64)
         problem = TrajectoryProblem(StepJacobian(plant, model, []), windows, 1e-3, identity)
-        x = problem.start()
+        x = problem.unknowns.start()
         found = problem.quadratic(x)
         if not torch.isfinite(found.hessian).all():
             raise SystemExit("the Gauss-Newton model is not finite")
         seconds, _ = median_time(lambda p=problem, x=x: p.quadratic(x), repeats)
-        print(f"  {name}: {problem.friction_count} friction parameters and {x.numel()} unknowns: "
+        count = problem.unknowns.friction_count
+        print(f"  {name}: {count} friction parameters and {x.numel()} unknowns: "
               f"{seconds:.3f} s, peak {peak_memory():.0f} MB", flush=True)  # fmt: skip
 
 

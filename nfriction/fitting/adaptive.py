@@ -118,10 +118,12 @@ def fit_adaptive(
         classes=driving_classes(classes, cut),
     )  # fmt: skip
     told = told_of(callback, f"{windows[-1]:g} s windows, by class")
-    result = solve_trajectory(problem, problem.start(vector), max_steps=max_steps, callback=told)
+    result = solve_trajectory(
+        problem, problem.unknowns.start(vector), max_steps=max_steps, callback=told
+    )
     residuals = problem.errors(result.x)
     found = trajectory_outcome(problem, result, residuals, moved)
-    states = problem.split(result.x)[2].chunk(2, -1)
+    states = problem.unknowns.split(result.x)[2].chunk(2, -1)
     found = settled(
         model, labelled, classes, constant, found, replace(cut, q0=states[0], qd0=states[1]),
         problem.mixing, problem.substeps, constant.residual,

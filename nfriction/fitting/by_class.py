@@ -81,7 +81,7 @@ def refine_adaptive(
     if part.any():
         schedule.set_parameter_vector(begun)
         result = solve_trajectory(
-            whole, whole.start(), max_steps=max_steps, cost_tolerance=LOOSE, callback=told
+            whole, whole.unknowns.start(), max_steps=max_steps, cost_tolerance=LOOSE, callback=told
         )
         result.x[: len(begun)] *= part
     if not part.any() or not _serves(whole, result.x[: len(begun)]):
@@ -139,9 +139,9 @@ def _cross_fitted(
         )
         schedule.set_parameter_vector(zero)
         result = solve_trajectory(
-            seen, seen.start(), max_steps=max_steps, cost_tolerance=LOOSE, callback=told
+            seen, seen.unknowns.start(), max_steps=max_steps, cost_tolerance=LOOSE, callback=told
         )
-        learned.append(seen.split(result.x)[0].clone())
+        learned.append(seen.unknowns.split(result.x)[0].clone())
         unseen.append(rest)
         if result.status == "stopped":
             break
@@ -167,4 +167,4 @@ def _serves(whole: TrajectoryProblem, vector: Tensor) -> bool:
 def _errors(problem: TrajectoryProblem, vector: Tensor) -> Tensor:
     """Root mean square error of windows from their smoothed starts, (window, joint)."""
     problem.friction.schedule.set_parameter_vector(vector)
-    return problem.errors(problem.start()).square().mean(1).sqrt()
+    return problem.errors(problem.unknowns.start()).square().mean(1).sqrt()

@@ -30,30 +30,30 @@ def richer_by_evidence(base: Stage, richer: Refinement, tolerance: float) -> Sta
     References:
         D. J. C. MacKay, Neural Computation 4 (1992), 415-447.
     """
-    extra = len(richer.terms) - len(base.problem.plant_terms)
+    extra = len(richer.terms) - len(base.problem.unknowns.terms)
     if not base.noise > 0 or extra < 1:
         return None
     problem = richer.problem(base.problem.windows, base.noise)
     vector = torch.cat([base.vector, torch.zeros(extra, dtype=torch.float64)])
-    shared, old = problem.shared_count, base.problem.shared_count
+    shared, old = problem.unknowns.shared_count, base.problem.unknowns.shared_count
     added = torch.arange(old, shared)
     start = torch.cat(
         [base.result.x[:old], torch.zeros(extra, dtype=torch.float64), base.result.x[old:]]
     )
     before = problem.quadratic(start)
-    lower, upper = problem.bounds()
+    lower, upper = problem.unknowns.bounds()
     known = (start > lower) & (start < upper)
     known[added] = False
     both = known.clone()
     both[added] = True
-    occam = 0.5 * float(problem.prior()[0][added].log().sum())
+    occam = 0.5 * float(problem.unknowns.prior()[0][added].log().sum())
     occam -= 0.5 * (_log_volume(before, both) - _log_volume(before, known))
     if _newton_fall(before, both) - _newton_fall(before, known) + occam <= 0:
         return None
     stage = richer.search(problem, vector, tolerance, "eccentric encoders", base.zeros)
     gain = float(before.cost) - float(stage.result.cost)
     after = Quadratic(stage.result.cost, stage.result.gradient, stage.result.hessian)
-    occam = 0.5 * float(problem.prior()[0][added].log().sum())
+    occam = 0.5 * float(problem.unknowns.prior()[0][added].log().sum())
     occam -= 0.5 * (_log_volume(after, both) - _log_volume(before, known))
     return stage if gain + occam > 0 else None
 

@@ -249,14 +249,14 @@ def _through_windows(
         if length == windows[-1]:
             # Of a start far away the cost says nothing; the last stage's minimum is as high.
             near = reached and least(reached.residuals, noise)
-            tolerance = flat(near or float(problem.cost(problem.start(vector))))
+            tolerance = flat(near or float(problem.cost(problem.unknowns.start(vector))))
         name = f"{length:g} s windows"
         stage = search.search(problem, vector, tolerance, name, zeros)
         if reached is None and by_torque is not None and stage.result.status != "stopped":
             stage = _better_start(search, stage, tolerance, name, by_torque)
         if reached is not None and stage.lost_since(reached):
             schedule = search.model.schedule
-            schedule.set_parameter_vector(reached.problem.split(reached.result.x)[0])
+            schedule.set_parameter_vector(reached.problem.unknowns.split(reached.result.x)[0])
             return reached, (TOO_LONG.format(length),)
         reached, vector, noise = stage, stage.vector, max(stage.noise, LEAST_NOISE)
         zeros = stage.zeros

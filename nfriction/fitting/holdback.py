@@ -135,8 +135,8 @@ def error_on(held_back: Windows, problem: TrajectoryProblem, vector: Tensor) -> 
         [rad or m]; infinite where the motion diverges.
     """
     judged = replace(problem, windows=held_back)
-    x = judged.start(vector)
-    shared = x[: judged.shared_count]
+    x = judged.unknowns.start(vector)
+    shared = x[: judged.unknowns.shared_count]
 
     def own(states: Tensor) -> Quadratic:
         found = judged.quadratic(torch.cat([shared, states]))

@@ -130,11 +130,11 @@ def trajectory_outcome(
     motions: tuple[Motion, ...],
 ) -> Fit:
     """A fit with its verdict, from where the search ended."""
-    vector = problem.split(result.x)[1]
-    plant, count = problem.plant, problem.shared_count
+    plant, unknowns = problem.plant, problem.unknowns
+    vector, count = unknowns.split(result.x)[1], unknowns.shared_count
     names = problem.friction.schedule.parameter_names(plant.joint_names)
-    names += [t.name for t in problem.plant_terms]
-    lower, upper = (bound[:count] for bound in problem.bounds())
+    names += [t.name for t in unknowns.terms]
+    lower, upper = (bound[:count] for bound in unknowns.bounds())
     # What was not to be fitted has equal bounds.
     fitted = lower < upper
     hit = (result.at_lower | result.at_upper)[:count] & fitted
@@ -146,7 +146,7 @@ def trajectory_outcome(
         model=problem.friction.requires_grad_(False),
         plant=problem.plant_at(vector),
         plant_terms=tuple(
-            (t.name, float(v), t.upper) for t, v in zip(problem.plant_terms, vector, strict=True)
+            (t.name, float(v), t.upper) for t, v in zip(unknowns.terms, vector, strict=True)
         ),
         status=("converged: " if result.converged else "not converged: ") + result.message,
         converged=result.converged,
@@ -157,7 +157,7 @@ def trajectory_outcome(
         _residuals=residuals,
         intervals=told,
         lost=lost,
-        zeros=tuple(map(tuple, problem.split_zeros(result.x).reshape(-1, plant.joints).tolist())),
+        zeros=tuple(map(tuple, unknowns.split_zeros(result.x).reshape(-1, plant.joints).tolist())),
         warnings=warnings_of(
             converged=result.converged, at_bounds=at_bounds, lost=lost, residual=residual,
             effective_sd=noise, quantum=plant.position_quantum or _count_seen(problem),
@@ -179,7 +179,7 @@ def _told_by_data(
 
     What they leave open of the coefficients comes last.
     """
-    count, noise = problem.shared_count, effective_noise(residuals)
+    count, noise = problem.unknowns.shared_count, effective_noise(residuals)
     constant = isinstance(problem.friction.schedule, Constant)
     # Errors of nothing at all are those of joints that never moved.
     if not torch.isfinite(result.hessian).all() or not noise > 0:
@@ -189,9 +189,9 @@ def _told_by_data(
     known = problem.told(result.x, local_noise(residuals))
     shown = fitted.clone()
     if not constant:
-        shown[: problem.friction_count] = False
+        shown[: problem.unknowns.friction_count] = False
     index = shown.nonzero().flatten()
-    lower, upper = (bound[index] for bound in problem.bounds())
+    lower, upper = (bound[index] for bound in problem.unknowns.bounds())
     chosen = [names[i] for i in index.tolist()]
     fixed = fitted.nonzero().flatten()
     part = known.subset(fixed)
@@ -200,7 +200,7 @@ def _told_by_data(
     sd = root.norm(dim=1)
     lost: tuple[str, ...] = ()
     if constant:
-        friction = fixed[fixed < problem.friction_count]
+        friction = fixed[fixed < problem.unknowns.friction_count]
         coefficients = [names[i] for i in friction.tolist()]
         lost = lost_directions([names[i] for i in fixed.tolist()], part)
         slope, need = _needs(problem, result, motions)
@@ -210,7 +210,7 @@ def _told_by_data(
         )
         lost += tuple(n for n in dict.fromkeys(open_) if not any(n in told for told in lost))
     uncertainty = CoefficientUncertainty(
-        problem.friction.schedule, root[: problem.friction_count].clone()
+        problem.friction.schedule, root[: problem.unknowns.friction_count].clone()
     )
     return intervals(chosen, result.x[index], sd[index], lower, upper), lost, uncertainty
 
@@ -228,7 +228,7 @@ def _needs(
     """Slope of the friction torque by every constant coefficient at its joint's largest speed, and
     the largest torque that moves this joint, (friction parameter,) each.
     """
-    friction, vector = problem.split(result.x)[:2]
+    friction, vector = problem.unknowns.split(result.x)[:2]
     speed, moved = largest_moved(problem.plant_at(vector), motions)
     need = torch.maximum(moved, problem.windows.tau.abs().amax((0, 1)))
     table = friction.reshape(len(speed), -1).clone().requires_grad_()

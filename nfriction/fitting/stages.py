@@ -56,12 +56,12 @@ class Stage:
     @property
     def vector(self) -> Tensor:
         """Values of the plant's terms."""
-        return self.problem.split(self.result.x)[1].clone()
+        return self.problem.unknowns.split(self.result.x)[1].clone()
 
     @property
     def zeros(self) -> Tensor:
         """Zeros of the recordings in one row; none where they were not sought."""
-        return self.problem.split_zeros(self.result.x).clone()
+        return self.problem.unknowns.split_zeros(self.result.x).clone()
 
     @property
     def noise(self) -> float:
@@ -145,8 +145,8 @@ class Refinement:
         """
         watch = _Watch(name, tolerance, self.callback, problem)
         result = solve_trajectory(
-            problem, problem.start(vector, zeros), max_steps=self.max_steps, callback=watch,
-            cost_tolerance=tolerance,
+            problem, problem.unknowns.start(vector, zeros), max_steps=self.max_steps,
+            callback=watch, cost_tolerance=tolerance,
         )  # fmt: skip
         if result.status == "stopped" and (watch.settles or watch.creeps):
             status: Status = "converged_step" if watch.settles else "creeping"
@@ -182,7 +182,7 @@ class _Watch:
         problem = self.problem
         if not isinstance(problem.friction.schedule, Constant):
             return torch.inf
-        shared, self.before, before = x[: problem.shared_count], x, self.before
+        shared, self.before, before = x[: problem.unknowns.shared_count], x, self.before
         # A step that damping cut short is no sign of rest.
         if before is None or step.damping > FULL:
             return torch.inf
@@ -190,7 +190,7 @@ class _Watch:
         # Chaotic windows leave a curvature of rounding alone, by which nothing would ever move.
         if torch.isinf(spread).all():
             return torch.inf
-        return float(((shared - before[: problem.shared_count]) / spread).abs().max())
+        return float(((shared - before[: problem.unknowns.shared_count]) / spread).abs().max())
 
 
 def least(residuals: Tensor, noise: float) -> float:

@@ -130,13 +130,13 @@ def test_gradient_by_class_against_finite_differences(substeps):
                         classes=classes)  # fmt: skip
     x = point(p)
     gradient = p.quadratic(x).gradient
-    for i in range(p.shared_count):
+    for i in range(p.unknowns.shared_count):
         step = torch.zeros_like(x)
         step[i] = 1e-6
         slope = (p.cost(x + step) - p.cost(x - step)) / 2e-6
         assert float(gradient[i]) == pytest.approx(float(slope), rel=2e-4, abs=1e-2)
     # Every class of both joints had a say.
-    assert (gradient[: p.friction_count].abs() > 1e-6).all()
+    assert (gradient[: p.unknowns.friction_count].abs() > 1e-6).all()
 
 
 def test_what_does_not_fit_is_refused(case):

@@ -109,8 +109,8 @@ def test_what_is_held_is_part_of_the_cost_and_of_its_model(size):
     model = network(size)
     held = anchors_where_unseen(model.schedule, [swings(1.0, 0.5)])
     free, tied = problem(model, None), problem(model, held)
-    x = free.start()
-    r, n = held.residuals(model.schedule), tied.friction_count
+    x = free.unknowns.start()
+    r, n = held.residuals(model.schedule), tied.unknowns.friction_count
     slope, curvature = held.normal_equations(model.schedule)
     torch.testing.assert_close(tied.cost(x) - free.cost(x), 0.5 * r.square().sum())
     a, b = free.quadratic(x), tied.quadratic(x)
@@ -126,7 +126,7 @@ def test_a_network_fitted_so_deviates_less_where_nothing_was_seen():
         model = network()
         held = anchors_where_unseen(model.schedule, [swings(1.0, 1.0)])
         p = problem(model, held if tied else None)
-        result = solve_trajectory(p, p.start())
+        result = solve_trajectory(p, p.unknowns.start())
         deviation.append(float(held.residuals(model.schedule).square().mean().sqrt()))
         assert float(p.errors(result.x).abs().max()) < 1e-3
     assert deviation[1] < 0.5 * deviation[0]
@@ -136,8 +136,8 @@ def test_what_is_only_held_is_not_taken_for_told_by_the_data():
     model = network()
     held = anchors_where_unseen(model.schedule, [swings(1.0, 1.0)])
     p = problem(model, held)
-    result = solve_trajectory(p, p.start(), max_steps=5)
-    errors, n = p.errors(result.x), p.friction_count
+    result = solve_trajectory(p, p.unknowns.start(), max_steps=5)
+    errors, n = p.errors(result.x), p.unknowns.friction_count
     where = (held.weight > 0)[..., None].expand(-1, -1, 2)
 
     def openness(uncertainty: CoefficientUncertainty) -> torch.Tensor:

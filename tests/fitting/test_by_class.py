@@ -126,8 +126,10 @@ def test_gradient_with_a_memory_is_the_cost_s_derivative():
         StepJacobian(pendulum(), model, []), w, 1e-3, ABSOLUTE, stride=4, memory=memory
     )
     g = torch.Generator().manual_seed(1)
-    x = p.start()
-    x[: p.friction_count] = 0.1 * torch.randn(p.friction_count, generator=g, dtype=F64)
+    x = p.unknowns.start()
+    x[: p.unknowns.friction_count] = 0.1 * torch.randn(
+        p.unknowns.friction_count, generator=g, dtype=F64
+    )
     found = p.quadratic(x)
     assert float(found.cost) == pytest.approx(float(p.cost(x)))
     for _ in range(4):

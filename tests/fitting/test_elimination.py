@@ -59,9 +59,9 @@ def error_sizes(p: TrajectoryProblem) -> torch.Tensor:
 def by_squares(p: TrajectoryProblem, x: torch.Tensor, sd: torch.Tensor) -> Information:
     """All unknowns' normal equations, and the states eliminated from these."""
     rows = p._rows(x, p._scale * sd / p.noise_sd)
-    covariance = normal_equations(rows, torch.zeros_like(sd), p._own_places(), len(x))[1]
+    covariance = normal_equations(rows, torch.zeros_like(sd), p.unknowns.places(), len(x))[1]
     hessian = p.quadratic(x).hessian
-    return information(hessian, p.prior()[0], p.shared_count, covariance)
+    return information(hessian, p.unknowns.prior()[0], p.unknowns.shared_count, covariance)
 
 
 @pytest.mark.parametrize("jump_sd", [None, (3e-4, 0.01), (1e-6, 3e-5)])
@@ -71,7 +71,7 @@ def test_rows_tell_what_squares_do_where_motion_is_tame(stride, zero_sd, jump_sd
     p = tame(stride, zero_sd=zero_sd, jump_sd=jump_sd)
     assert len(p.windows) == 6
     assert len(p._seams) == (4 if jump_sd else 0)
-    x, sd = p.start(), error_sizes(p)
+    x, sd = p.unknowns.start(), error_sizes(p)
     found, expected = p.told(x, sd), by_squares(p, x, sd)
     torch.testing.assert_close(found.prior, expected.prior)
     for name in ("data", "score"):
@@ -85,7 +85,7 @@ def test_rows_tell_what_squares_do_where_motion_is_tame(stride, zero_sd, jump_sd
 @pytest.mark.parametrize("piece", [1, 50])
 def test_pieces_do_not_show(piece, monkeypatch):
     p = tame(zero_sd=torch.full((2, 2), 0.05, dtype=F64), jump_sd=(3e-4, 0.01))
-    x, sd = p.start(), error_sizes(p)
+    x, sd = p.unknowns.start(), error_sizes(p)
     whole = p.told(x, sd)
     monkeypatch.setattr("nfriction.fitting.propagation.PIECE", piece)
     parts = p.told(x, sd)
@@ -191,7 +191,7 @@ def test_a_chaotic_window_loses_nothing_that_it_tells():
     """A free swing from upright, the end of which moves by 1e12 times what its start does."""
     search, windows = swings(4.0, 4.0, [[3e-4, 6e-4], [3e-4, 3e-4]], (0.02, 0.01))
     p = search.problem(windows, 2e-4)
-    x, count = p.start(), p.shared_count
+    x, count = p.unknowns.start(), p.unknowns.shared_count
     g = torch.Generator().manual_seed(0)
     noise = 2e-4 * torch.randn(windows.q.shape, generator=g, dtype=F64)
     # As if measured from exactly the start that its smoother found.
@@ -203,8 +203,8 @@ def test_a_chaotic_window_loses_nothing_that_it_tells():
     moved = tuple(kalman_smoother(r.time, r.q) for r in search.joint)
     assert trajectory_outcome(p, result, errors, moved).lost == ()
     rows = torch.cat([piece.scaled for piece in p._rows(x, p._scale)], 1)[0]
-    exact = in_whole_numbers(rows.numpy(), count, p.prior()[0][count:].tolist())
-    lower, upper = p.bounds()
+    exact = in_whole_numbers(rows.numpy(), count, p.unknowns.prior()[0][count:].tolist())
+    lower, upper = p.unknowns.bounds()
     fitted = (lower < upper)[:count]
     index = fitted.nonzero().flatten()
     sd = torch.full_like(errors, p.noise_sd)

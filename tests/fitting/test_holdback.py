@@ -128,7 +128,7 @@ def test_a_window_is_judged_from_the_state_that_suits_the_fit(constant):
     problem = replace(search, model=constant[1].model).problem(seen, 1e-4)
     off = replace(held_back, q0=held_back.q0 + 1e-3, qd0=held_back.qd0 - 0.01)
     from_off = replace(problem, windows=off)
-    unsettled = from_off.errors(from_off.start(none)).square().mean().sqrt()
+    unsettled = from_off.errors(from_off.unknowns.start(none)).square().mean().sqrt()
     settled = error_on(off, problem, none)
     assert settled < 0.1 * float(unsettled)
     assert settled == pytest.approx(error_on(held_back, problem, none), rel=0.05)

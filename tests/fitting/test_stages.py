@@ -15,7 +15,7 @@ from tests.fitting.recordings import F64, pendulum, swing
 def stops(costs, tolerance=1e-3, callback=None):
     """After how many steps the watch ends a search of these costs."""
     _, problem = short_search()
-    watch, x = _Watch("stage", tolerance, callback, problem), problem.start()
+    watch, x = _Watch("stage", tolerance, callback, problem), problem.unknowns.start()
     # Damped, so that a point that stays is no rest.
     return [watch(x, Step(cost, 10.0, 1.0)) for cost in costs], watch
 
@@ -69,9 +69,9 @@ def test_only_a_search_that_settled_claims_convergence(monkeypatch, why, status)
 def test_what_is_shared_has_settled_once_it_moves_no_more():
     """Window states may go on; a step that damping cut short is no rest."""
     _, problem = short_search()
-    x = problem.start()
+    x = problem.unknowns.start()
     problem.quadratic(x)
-    spread, count = problem.spread(), problem.shared_count
+    spread, count = problem.spread(), problem.unknowns.shared_count
     far, near, states = x.clone(), x.clone(), x.clone()
     far[:count] += spread
     near[:count] += 0.5 * SETTLED * spread

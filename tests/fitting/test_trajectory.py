@@ -61,8 +61,10 @@ def bent(name):
 def point(p: TrajectoryProblem) -> torch.Tensor:
     """Unknowns away from the prior's means, and inside every bound."""
     g = torch.Generator().manual_seed(2)
-    x = p.start(torch.full((len(p.plant_terms),), 0.02, dtype=F64))
-    x[p.shared_count :] += 0.01 * torch.randn(x.numel() - p.shared_count, generator=g, dtype=F64)
+    x = p.unknowns.start(torch.full((len(p.unknowns.terms),), 0.02, dtype=F64))
+    x[p.unknowns.shared_count :] += 0.01 * torch.randn(
+        x.numel() - p.unknowns.shared_count, generator=g, dtype=F64
+    )
     return x
 
 
@@ -82,13 +84,13 @@ def test_gradient_and_hessian_against_finite_differences(name, substeps, stride,
     x = point(p)
     found = p.quadratic(x)
     torch.testing.assert_close(found.cost, p.cost(x))
-    precision, mean = p.prior()
+    precision, mean = p.unknowns.prior()
     columns = []
     for i in range(x.numel()):
         unit = torch.zeros_like(x)
         # Fourth order: truncation and rounding are both far below the tolerance.
         unit[i] = 1e-4 * max(
-            0.1 if i < p.friction_count and name == "NFLFM" else 1e-3, float(x[i].abs())
+            0.1 if i < p.unknowns.friction_count and name == "NFLFM" else 1e-3, float(x[i].abs())
         )
         ends = [misfit(p, x + s * unit) for s in (-2, -1, 1, 2)]
         columns.append((ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * unit[i]))
@@ -138,7 +140,7 @@ def test_padding_counts_for_nothing():
 
 def test_residuals_are_counted_in_the_recording_s_coordinates():
     p = problem(bent("LFM"))
-    x = p.start()
+    x = p.unknowns.start()
     joint = TrajectoryProblem(p.jacobian, p.windows, 1e-3, torch.eye(2, dtype=F64), p.substeps)
     r, own = p.residuals(x), joint.residuals(x)
     torch.testing.assert_close(r[..., 0], own[..., 0])
@@ -151,29 +153,29 @@ def test_an_exact_problem_is_solved_exactly():
     plant = pendulum()
     w = windows(steps=60, step=5e-3)
     p = TrajectoryProblem(StepJacobian(plant, model, []), w, 1e-7, ABSOLUTE)
-    result = solve_trajectory(p, p.start(), cost_tolerance=1e-14)
+    result = solve_trajectory(p, p.unknowns.start(), cost_tolerance=1e-14)
     assert result.converged
     truth = torch.tensor([[4e-3, 3e-3], [2e-3, 1e-3]], dtype=F64)
     torch.testing.assert_close(model.schedule.values, truth, rtol=1e-4, atol=0)
-    torch.testing.assert_close(p.split(result.x)[0].reshape(2, 2), model.schedule.values)
+    torch.testing.assert_close(p.unknowns.split(result.x)[0].reshape(2, 2), model.schedule.values)
 
 
 def test_the_prior_of_the_plant_may_be_centred_elsewhere():
     p = problem(bent("LFM"))
-    mean = torch.full((len(p.plant_terms),), 0.03, dtype=F64)
+    mean = torch.full((len(p.unknowns.terms),), 0.03, dtype=F64)
     moved = TrajectoryProblem(p.jacobian, p.windows, 1e-3, ABSOLUTE, 2, plant_mean=mean)
-    x = p.start(mean)
-    sd = torch.tensor([t.prior_sd for t in p.plant_terms], dtype=F64)
+    x = p.unknowns.start(mean)
+    sd = torch.tensor([t.prior_sd for t in p.unknowns.terms], dtype=F64)
     prior = 0.5 * float(((mean / sd) ** 2).sum())
     assert float(p.cost(x) - moved.cost(x)) == pytest.approx(prior)
 
 
 def test_a_start_at_rest_is_held_and_the_others_are_free():
     p = problem(bent("LFM"))
-    free, mean = p.prior()
-    p.windows = replace(p.windows, at_rest=(1,))
-    held, same = p.prior()
-    first = p.shared_count
+    free, mean = p.unknowns.prior()
+    p = replace(p, windows=replace(p.windows, at_rest=(1,)))
+    held, same = p.unknowns.prior()
+    first = p.unknowns.shared_count
     torch.testing.assert_close(
         held[first + 4 :].rsqrt(), torch.tensor([1e-4, 1e-4, 1e-3, 1e-3], dtype=F64)
     )
@@ -190,7 +192,7 @@ def test_a_traced_motion_is_the_simulated_one_where_windows_lie():
     x, zero = point(p), np.zeros((40, 2))
     before = Motion(np.arange(40.0), zero, zero, zero)
     (after,) = p.traced(x, [before])
-    state = p.split(x)[2].numpy()
+    state = p.unknowns.split(x)[2].numpy()
     for window, sample in ((0, 0), (1, 20)):
         np.testing.assert_allclose(after.q[sample], state[window, :2], rtol=0, atol=1e-12)
         np.testing.assert_allclose(after.qd[sample], state[window, 2:], rtol=0, atol=1e-12)
@@ -223,7 +225,7 @@ def test_windows_come_together_as_far_as_they_are_to(continuity):
     settings = {"noise_sd": 1e-3, "mixing": ABSOLUTE}
     sd = JUMP_SD[continuity]
     p = TrajectoryProblem(jacobian, halves(), jump_sd=sd, **settings)
-    result = solve_trajectory(p, p.start(), cost_tolerance=1e-10)
+    result = solve_trajectory(p, p.unknowns.start(), cost_tolerance=1e-10)
     assert result.converged
     apart = TrajectoryProblem(jacobian, halves(), jump_sd=(1.0, 1.0), **settings)
     jump = apart.jumps(result.x).abs().amax(0)
@@ -247,7 +249,7 @@ def test_only_neighbours_in_time_have_seams():
 def test_states_are_told_to_be_blocks_only_where_they_are(joined, zero_sd):
     p = problem(bent("LFM"), joined=joined, zero_sd=zero_sd)
     found = p.quadratic(point(p))
-    first, count = p.shared_count, 2 * p.windows.q0.shape[-1]
+    first, count = p.unknowns.shared_count, 2 * p.windows.q0.shape[-1]
     across = found.hessian[first : first + count, first + count :]
     assert (found.blocks is None) == bool(across.any() or zero_sd is not None)
     if found.blocks is not None:
