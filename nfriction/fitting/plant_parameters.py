@@ -4,7 +4,7 @@ Every adjustable term enters its buffer linearly, `buffer = nominal + sum_p basi
 x = 0 the plant as given: ratios are deviations from 1, offsets are in SI.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -51,7 +51,7 @@ class PlantParameter:
 def plant_parameters(
     plant: nn.Module,
     *,
-    driven: bool,
+    driven: Sequence[int],
     largest_torque: float = 0.0,
     largest_rate: float = 0.0,
     drag: bool = False,
@@ -61,8 +61,8 @@ def plant_parameters(
 
     Args:
         plant: `PendulumChain` or `LinearAxis`.
-        driven: torque was measured. Free swing tells only ratios, so the first gravity term is
-            kept as the scale.
+        driven: joints whose torque was measured. Where there is none, free swing tells only
+            ratios, so the first gravity term is kept as the scale.
         largest_torque: largest torque in the recordings [N m; N]; bounds its offset.
         largest_rate: largest velocity in the recordings [m/s]; scale of an axis' asymmetry.
         drag: fit air drag on the links: one quadratic coefficient for all; of several links also
@@ -106,8 +106,9 @@ def plant_parameters(
     if driven:
         joints = buffers["torque_offset"].shape[-1]
         kind, force = ("force", "N") if plant.unit == "m" else ("torque", "N m")
-        for j, unit in enumerate(torch.eye(joints, dtype=torch.float64)):
-            bound = 0.3 * largest_torque
+        bound = 0.3 * largest_torque
+        for j in driven:
+            unit = torch.eye(joints, dtype=torch.float64)[j]
             shift(f"{kind} offset {j + 1} [{force}]", "torque_offset", unit, -bound, bound,
                   OFFSET_SHARE * largest_torque)  # fmt: skip
     if driven and "asymmetry" in buffers and largest_rate > 0:

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from nfriction.angles import AngleConvention
@@ -129,8 +130,10 @@ def constant_schedule(model: FrictionModel) -> Constant:
     return model.schedule
 
 
-def _largest_torque(joint: Sequence[Recording]) -> float:
-    return max(0.0 if r.tau is None else float(np.abs(r.tau).max()) for r in joint)
+def _largest_torques(joint: Sequence[Recording]) -> NDArray[np.float64]:
+    """Of every joint, (joint,)."""
+    still = np.zeros_like(joint[0].q[0])
+    return np.max([still if r.tau is None else np.abs(r.tau).max(0) for r in joint], axis=0)
 
 
 def _largest_rate(joint: Sequence[Recording]) -> float:
@@ -146,7 +149,7 @@ def _largest_rate(joint: Sequence[Recording]) -> float:
 def swings_freely(plant: Plant, joint: Sequence[Recording]) -> bool:
     """Whether nothing drives a chain on a fixed pivot."""
     fixed = isinstance(plant, PendulumChain) and not plant.first_link
-    return fixed and _largest_torque(joint) == 0
+    return fixed and not _largest_torques(joint).any()
 
 
 def adjustable_terms(
@@ -166,10 +169,10 @@ def adjustable_terms(
         return []
     if drag is None:
         drag = swings_freely(plant, joint)
-    largest = _largest_torque(joint)
+    largest = _largest_torques(joint)
     terms = plant_parameters(
-        plant, driven=largest > 0, largest_torque=largest, largest_rate=_largest_rate(joint),
-        drag=drag, eccentricity=eccentricity,
+        plant, driven=np.flatnonzero(largest).tolist(), largest_torque=float(largest.max()),
+        largest_rate=_largest_rate(joint), drag=drag, eccentricity=eccentricity,
     )  # fmt: skip
     return [t for t in terms if zeroed_once or t.buffer != "angle_offset"]
 
@@ -188,9 +191,9 @@ def zeroed_each(plant: Plant, recordings: Sequence[Recording]) -> bool:
     Links that dry friction holds stop where they stop. Where a driven chain begins several
     recordings at rest, and all of its encoders read zero each time, they were set to it.
     """
-    driven = isinstance(plant, PendulumChain) and _largest_torque(recordings) > 0
     return (
-        driven
+        isinstance(plant, PendulumChain)
+        and bool(_largest_torques(recordings).any())
         and len(recordings) > 1
         and all(begins_still(r) and np.abs(r.q[0]).max() <= AT_ZERO for r in recordings)
     )

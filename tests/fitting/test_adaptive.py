@@ -123,7 +123,7 @@ def test_gradient_by_class_against_finite_differences(substeps):
     plant, model = pendulum(), ALFM(2, v_smooth=0.1)
     one = torch.ones(2, 2, dtype=F64)
     given = FrictionModel(model.law, Labelled(model, 4e-3 * one, 1e-3 * one), 0.1)
-    terms = plant_parameters(plant, driven=True, largest_torque=0.1)
+    terms = plant_parameters(plant, driven=(0, 1), largest_torque=0.1)
     of = windows()
     classes = (torch.arange(of.tau.numel()).reshape(of.tau.shape) // 7 % 3).to(F64)
     p = LabelledProblem(StepJacobian(plant, given, terms), of, 1e-3, ABSOLUTE, substeps=substeps,

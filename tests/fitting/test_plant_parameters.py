@@ -13,40 +13,47 @@ def names(plant, **settings):
 
 
 def test_free_swing_keeps_one_gravity_term_as_the_scale():
-    free = names(pendulum(), driven=False)
+    free = names(pendulum(), driven=())
     assert "gravity 1" not in free
     assert {"inertia 11", "inertia 12", "inertia 22", "gravity 2"} < set(free)
-    driven = names(pendulum(), driven=True, largest_torque=1.0)
+    driven = names(pendulum(), driven=(0, 1), largest_torque=1.0)
     assert set(driven) - set(free) == {
         "gravity 1", "torque offset 1 [N m]", "torque offset 2 [N m]"
     }  # fmt: skip
 
 
+def test_a_joint_that_nothing_drives_has_no_torque_to_be_off():
+    told = names(pendulum(), driven=(1,), largest_torque=1.0)
+    assert "torque offset 2 [N m]" in told
+    assert "torque offset 1 [N m]" not in told
+    assert "gravity 1" in told
+
+
 def test_terms_that_are_not_there_are_not_adjusted():
-    assert not [n for n in names(pendulum(), driven=False) if "armature" in n or "drag" in n]
-    assert "armature 2" in names(pendulum(armature=[0.0, 1e-4]), driven=False)
-    assert "armature 1" not in names(pendulum(armature=[0.0, 1e-4]), driven=False)
+    assert not [n for n in names(pendulum(), driven=()) if "armature" in n or "drag" in n]
+    assert "armature 2" in names(pendulum(armature=[0.0, 1e-4]), driven=())
+    assert "armature 1" not in names(pendulum(armature=[0.0, 1e-4]), driven=())
     drag = ["drag linear", "drag quadratic", "drag reach"]
-    assert names(pendulum(), driven=False, drag=True)[-3:] == drag
+    assert names(pendulum(), driven=(), drag=True)[-3:] == drag
     # A single link's reach is but the scale of its drag, and its linear drag viscous friction.
-    single = names(rigs.multiarm_single(), driven=False, drag=True)
+    single = names(rigs.multiarm_single(), driven=(), drag=True)
     assert [n for n in single if "drag" in n] == ["drag quadratic"]
-    assert names(LinearAxis(2.0), driven=True, largest_torque=1.0) == [
+    assert names(LinearAxis(2.0), driven=(0,), largest_torque=1.0) == [
         "mass 1", "force offset 1 [N]"
     ]  # fmt: skip
-    assert names(LinearAxis(2.0), driven=False) == []
-    moved = names(LinearAxis(2.0), driven=True, largest_torque=1.0, largest_rate=0.1)
+    assert names(LinearAxis(2.0), driven=()) == []
+    moved = names(LinearAxis(2.0), driven=(0,), largest_torque=1.0, largest_rate=0.1)
     assert moved[-1] == "asymmetry [N s/m]"
 
 
 def test_an_arm_has_no_hanging_position_and_no_encoder_terms():
-    links = [n for n in names(rigs.tlrip("free"), driven=False, eccentricity=True) if "enc" in n]
+    links = [n for n in names(rigs.tlrip("free"), driven=(), eccentricity=True) if "enc" in n]
     assert links == [f"encoder {part} {j} [rad]" for j in (2, 3, 4) for part in ("cosine", "sine")]
 
 
 def test_ratios_scale_their_terms_and_nothing_else():
     plant = pendulum()
-    terms = plant_parameters(plant, driven=False)
+    terms = plant_parameters(plant, driven=())
     vector = torch.zeros(len(terms), dtype=F64)
     index = [t.name for t in terms].index("inertia 12")
     vector[index] = 0.1
@@ -60,7 +67,7 @@ def test_ratios_scale_their_terms_and_nothing_else():
 
 def test_buffers_are_linear_in_the_parameters_and_nominal_at_zero():
     plant = pendulum(armature=[1e-4, 1e-4])
-    terms = plant_parameters(plant, driven=True, largest_torque=2.0, drag=True)
+    terms = plant_parameters(plant, driven=(0, 1), largest_torque=2.0, drag=True)
     own = dict(plant.named_buffers())
     zero = adjusted_buffers(plant, terms, torch.zeros(len(terms), dtype=F64))
     for name, value in zero.items():
@@ -74,7 +81,7 @@ def test_buffers_are_linear_in_the_parameters_and_nominal_at_zero():
 
 def test_a_batch_of_vectors_gives_a_batch_of_plants():
     plant = pendulum()
-    terms = plant_parameters(plant, driven=False)
+    terms = plant_parameters(plant, driven=())
     vectors = 0.05 * torch.randn(
         3, len(terms), dtype=F64, generator=torch.Generator().manual_seed(1)
     )
@@ -87,7 +94,7 @@ def test_a_batch_of_vectors_gives_a_batch_of_plants():
 
 
 def test_bounds_hold_the_given_plant():
-    terms = plant_parameters(pendulum(), driven=True, largest_torque=2.0, drag=True)
+    terms = plant_parameters(pendulum(), driven=(0, 1), largest_torque=2.0, drag=True)
     assert all(t.lower <= 0.0 < t.upper and t.prior_sd > 0 for t in terms)
     offset = next(t for t in terms if t.buffer == "torque_offset")
     assert offset.upper == pytest.approx(0.6)

@@ -34,10 +34,10 @@ def without_compiler(monkeypatch, plant, model, terms):
 
 
 CASES = {
-    "pendulum": (pendulum(), {"driven": True, "largest_torque": 1.0}),
-    "drag": (pendulum(), {"driven": False, "drag": True}),
-    "armature": (pendulum(armature=[1e-4, 2e-4]), {"driven": False}),
-    "axis": (LinearAxis(2.0), {"driven": True, "largest_torque": 1.0}),
+    "pendulum": (pendulum(), {"driven": (0, 1), "largest_torque": 1.0}),
+    "drag": (pendulum(), {"driven": (), "drag": True}),
+    "armature": (pendulum(armature=[1e-4, 2e-4]), {"driven": ()}),
+    "axis": (LinearAxis(2.0), {"driven": (0,), "largest_torque": 1.0}),
 }
 
 
@@ -79,7 +79,7 @@ def test_compiled_and_eager_and_autograd_agree(case, law, monkeypatch):
 def test_eager_pieces_do_not_show(monkeypatch):
     """More samples than are linearised together give the same derivatives."""
     plant, model = LinearAxis(2.0), MODELS["NCFM"](1)
-    terms = plant_parameters(plant, driven=True, largest_torque=1.0)
+    terms = plant_parameters(plant, driven=(0,), largest_torque=1.0)
     given = samples(1, 1, len(terms), count=CHUNK + 3)
     found = without_compiler(monkeypatch, plant, model, terms)(*given)
     torch.testing.assert_close(found, StepJacobian(plant, model, terms)(*given), rtol=1e-10,
@@ -98,7 +98,7 @@ def test_a_plant_may_have_no_adjustable_terms(monkeypatch):
 
 def test_the_start_slope_is_the_frictionless_acceleration_s():
     plant = pendulum()
-    terms = plant_parameters(plant, driven=True, largest_torque=1.0)
+    terms = plant_parameters(plant, driven=(0, 1), largest_torque=1.0)
     q, qd, _, tau, _, vector = samples(2, 2, len(terms))
     found = start_slope(StepJacobian(plant, LFM(2), terms), q, qd, tau, vector)
     step = 1e-6

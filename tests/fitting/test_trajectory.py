@@ -38,7 +38,7 @@ def windows(steps=20, step=2e-3, joined=False) -> Windows:
 
 def problem(model, substeps=2, stride=1, joined=False, **settings) -> TrajectoryProblem:
     plant = pendulum()
-    terms = plant_parameters(plant, driven=True, largest_torque=0.1)
+    terms = plant_parameters(plant, driven=(0, 1), largest_torque=0.1)
     jacobian = StepJacobian(plant, model, terms)
     settings = {"jump_sd": (3e-4, 0.01), **settings}
     return TrajectoryProblem(
