@@ -31,6 +31,9 @@ Plant = PendulumChain | LinearAxis
 # Whether the windows of a recording make one motion.
 Continuity = Literal["free", "soft", "hard"]
 
+# A lower bound no larger is there for the logarithm of what cannot be negative, in SI.
+NOTHING = 1e-9
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -139,6 +142,7 @@ def trajectory_outcome(
     fitted = lower < upper
     hit = (result.at_lower | result.at_upper)[:count] & fitted
     at_bounds = tuple(names[i] for i in hit.nonzero().flatten().tolist())
+    none = hit & result.at_lower[:count] & (lower.abs() <= NOTHING)
     noise = effective_noise(residuals)
     told, lost, uncertainty = _told_by_data(problem, result, names, fitted, residuals, motions)
     residual = float(residuals.square().mean().sqrt())
@@ -162,6 +166,7 @@ def trajectory_outcome(
             converged=result.converged, at_bounds=at_bounds, lost=lost, residual=residual,
             effective_sd=noise, quantum=plant.position_quantum or _count_seen(problem),
             unit=plant.unit, largest_jump=problem.largest_jump(result.x),
+            at_zero=[names[i] for i in none.nonzero().flatten().tolist()],
         ),
         uncertainty=uncertainty,
     )  # fmt: skip

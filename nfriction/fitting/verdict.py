@@ -199,8 +199,12 @@ def warnings_of(
     quantum: float | None,
     unit: str,
     largest_jump: float = 0.0,
+    at_zero: Sequence[str] = (),
 ) -> tuple[str, ...]:
-    """Sentences on what to be wary of; none for a fit without blemish."""
+    """Sentences on what to be wary of; none for a fit without blemish.
+
+    Of `at_bounds`, those `at_zero` ended at what no coefficient can be less than.
+    """
     found = []
     if not converged:
         found.append("The search did not end at a minimum; intervals may be too narrow.")
@@ -209,8 +213,10 @@ def warnings_of(
             f"Windows do not join: the state jumps by {largest_jump:.3g} times what their "
             "continuity expects. The law is not right, or the motion forgets its start."
         )
-    if at_bounds:
-        found.append(f"At a bound: {', '.join(at_bounds)}; the data ask for values beyond it.")
+    if at_zero:
+        found.append(f"At zero: {', '.join(at_zero)}; the data show none.")
+    if beyond := [name for name in at_bounds if name not in at_zero]:
+        found.append(f"At a bound: {', '.join(beyond)}; the data ask for values beyond it.")
     if lost:
         found.append(f"The data cannot tell: {'; '.join(lost)}.")
     rounding = None if quantum is None else quantum / 12**0.5

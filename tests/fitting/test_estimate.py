@@ -443,3 +443,12 @@ def test_a_law_that_is_linear_is_searched_once(misled):
     fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), swing(pendulum(), true_model(), seconds=1.0),
         windows=(0.5,), max_steps=1)  # fmt: skip
     assert len(misled) == 1
+
+
+def test_what_ends_at_zero_is_told_as_none_of_it():
+    truth = LFM(2, [[0.0, 2e-3], [0.0, 1e-3]], v_smooth=0.05)
+    recording = swing(pendulum(), truth, seconds=3.0)
+    found = fit(LFM(2, v_smooth=0.05), pendulum(), recording, windows=(0.5,), max_steps=10)
+    assert {"B of joint1", "drag quadratic"} <= set(found.at_bounds)
+    assert f"At zero: {', '.join(found.at_bounds)}; the data show none." in found.warnings
+    assert not any("beyond" in w for w in found.warnings)

@@ -169,6 +169,9 @@ def test_warnings_name_what_is_wrong_and_are_silent_otherwise():
     assert "B of joint1" in bad[1]
     assert "drag reach" in bad[2]
     assert "10 times" in bad[3]
+    none, beyond = warnings_of(**good | {"at_bounds": ["B", "v_s", "C"]}, at_zero=["B", "C"])
+    assert none == "At zero: B, C; the data show none."
+    assert beyond == "At a bound: v_s; the data ask for values beyond it."
     assert warnings_of(**good, largest_jump=4.9) == ()
     for jump in (6.0, float("inf"), float("nan")):
         (told,) = warnings_of(**good, largest_jump=jump)
