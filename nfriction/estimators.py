@@ -12,7 +12,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from nfriction.fitting import Fit, fit
-from nfriction.fitting.estimate import WINDOWS
+from nfriction.fitting.constant import WINDOWS
 from nfriction.friction import Constant, FrictionModel, model_by_name
 from nfriction.plant import LinearAxis, PendulumChain
 from nfriction.recording import Recording, Unit

@@ -8,6 +8,8 @@ import torch
 
 from nfriction.fitting.by_search import fit_by_search
 from nfriction.fitting.classes import AccelerationClasses
+from nfriction.fitting.constant import Settings
+from nfriction.fitting.constant_start import constant_start
 from nfriction.fitting.labelled import LabelledProblem, driving_classes, labelled_model
 from nfriction.fitting.outcome import Fit, Plant, trajectory_outcome
 from nfriction.fitting.preparation import (
@@ -22,7 +24,7 @@ from nfriction.fitting.preparation import (
 )
 from nfriction.fitting.residuals import effective_noise
 from nfriction.fitting.sensitivity import StepJacobian
-from nfriction.fitting.settling import PRIOR_SD, adopt_classes, constant_start, settled
+from nfriction.fitting.settling import PRIOR_SD, adopt_classes, settled
 from nfriction.fitting.trajectory import solve_trajectory
 from nfriction.fitting.windows import check_lengths, cut_windows
 from nfriction.friction import Adaptive, FrictionModel
@@ -89,10 +91,8 @@ def fit_adaptive(
     check_lengths(windows)
     joint = in_joint_coordinates(plant, model, given)
     moved = motions_of(joint, motions)
-    constant = constant_start(
-        model, plant, given, moved, start, windows=windows, fit_plant=fit_plant, drag=drag,
-        max_steps=max_steps, callback=callback,
-    )  # fmt: skip
+    asked = Settings(windows, fit_plant, drag, max_steps=max_steps, callback=callback)
+    constant = constant_start(model, plant, given, moved, start, asked)
     raw = moved
     given, moved = at_zeros(constant.zeros, plant, given, moved)
     joint = in_joint_coordinates(plant, model, given)

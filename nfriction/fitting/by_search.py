@@ -6,8 +6,9 @@ from typing import get_args
 import torch
 from torch import Tensor
 
-from nfriction.fitting import estimate
 from nfriction.fitting.classes import AccelerationClasses
+from nfriction.fitting.constant import Settings, fit_by_torque
+from nfriction.fitting.constant_start import constant_start
 from nfriction.fitting.labelled import driving_classes, labelled_model
 from nfriction.fitting.outcome import Fit, Plant
 from nfriction.fitting.position_error import PositionError
@@ -28,7 +29,7 @@ from nfriction.fitting.search import (
     available_threads,
     search,
 )
-from nfriction.fitting.settling import PRIOR_SD, adopt_classes, constant_start, settled
+from nfriction.fitting.settling import PRIOR_SD, adopt_classes, settled
 from nfriction.fitting.torque import natural_scale
 from nfriction.fitting.windows import cut_windows
 from nfriction.friction import Adaptive, Constant, FrictionModel
@@ -98,11 +99,11 @@ def fit_by_search(
     joint = in_joint_coordinates(plant, model, given)
     moved = motions_of(joint, motions)
     if isinstance(schedule, Adaptive):
-        constant = constant_start(model, plant, given, moved, start)
+        constant = constant_start(model, plant, given, moved, start, Settings())
         classes = adopt_classes(schedule, classes, joint, moved, plant)
         varied = labelled_model(model, constant, joint, moved, prior_sd)
     else:
-        constant = start or estimate.fit(model, plant, given, method="torque", motions=moved)
+        constant = start or fit_by_torque(model, plant, given, moved)
         schedule.set_coefficients(constant_schedule(constant.model).values)
         varied = model
     span = max(float(r.time[-1] - r.time[0]) for r in joint)

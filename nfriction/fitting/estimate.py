@@ -1,31 +1,20 @@
-"""Fit a friction model to recordings: torques first, then trajectories."""
+"""Fit a friction model to recordings: the constant law first, then what follows the motion."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
-import torch
-from torch import Tensor
-
-from nfriction.fitting.eccentricity import may_be_eccentric, richer_by_evidence
-from nfriction.fitting.misgivings import misgivings, refuse_motionless
-from nfriction.fitting.neurofuzzy_start import is_constant_fit
-from nfriction.fitting.outcome import Continuity, Fit, Plant, torque_outcome, trajectory_outcome
-from nfriction.fitting.preparation import (
-    adjustable_terms,
-    constant_schedule,
-    in_joint_coordinates,
-    is_eccentric,
-    listed,
-    mixing_of,
-    motions_of,
-    zeroed_each,
-    zeros_serve,
-)
-from nfriction.fitting.stages import JUMP_SD, Callback, Refinement, Stage, flat, least
-from nfriction.fitting.torque import fit_torque, prior_sd
-from nfriction.fitting.windows import check_lengths, cut_windows
-from nfriction.friction import Adaptive, Constant, FrictionModel
+from nfriction.fitting.adaptive import fit_adaptive
+from nfriction.fitting.constant import WINDOWS, Settings, fit_by_torque, fit_constant
+from nfriction.fitting.constant_start import constant_start
+from nfriction.fitting.eccentricity import may_be_eccentric
+from nfriction.fitting.misgivings import as_it_looks, misgivings, refuse_motionless, saying
+from nfriction.fitting.network import fit_network
+from nfriction.fitting.outcome import Continuity, Fit, Plant
+from nfriction.fitting.preparation import in_joint_coordinates, listed, motions_of
+from nfriction.fitting.stages import JUMP_SD, Callback
+from nfriction.fitting.windows import check_lengths
+from nfriction.friction import Adaptive, FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.recording import Recording
 from nfriction.signals import Motion
@@ -33,24 +22,6 @@ from nfriction.signals import Motion
 Method = Literal["trajectory", "torque"]
 # How encoders were zeroed: once for all recordings, anew at the start of each, or as it looks.
 Zeroed = Literal["auto", "once", "each"]
-ZEROED_EACH = (
-    "Every recording begins at rest with all encoders at zero, so they were taken for set to zero "
-    'there, wherever the links stood; `zeroed="once"` where they were not.'
-)
-TOO_LONG = (
-    "Windows of {:g} s are too long for this motion, which forgets its start within them, or for a "
-    "law or plant that is wrong; left out."
-)
-# Dry friction of a tenth of a link's largest gravity moment lets it rest up to 0.1 rad off [rad].
-ZERO_SD = 0.05
-# First guess of what a model of a bench leaves unexplained, before a fit tells [rad or m].
-FIRST_NOISE = 1e-3
-# Short windows converge from far away, long ones tell small friction and small drag apart [s].
-WINDOWS = (0.5, 2.0, 5.0)
-# Relative fall of the cost that ends a search of which only the neighbourhood matters.
-LOOSE = 1e-4
-# Errors that count for less would be rounding [rad or m].
-LEAST_NOISE = 1e-9
 
 
 def fit(
@@ -138,64 +109,25 @@ def fit(
     joint = in_joint_coordinates(plant, model, given)
     if eccentricity and not may_be_eccentric(plant):
         raise ValueError(f"{plant.name or 'the axis'} has no encoders that turn with its joints.")
+    each = zeroed == "each"
     told: tuple[str, ...] = ()
-    if zeroed == "auto":
-        each = method == "trajectory" and zeroed_each(plant, given)
-        zeroed, told = ("each", (ZEROED_EACH,)) if each else ("once", ())
+    if zeroed == "auto" and method == "trajectory":
+        each, told = as_it_looks(plant, given)
     moved = motions_of(joint, motions)
     told += misgivings(plant, given, joint, moved)
+    settings = Settings(windows, fit_plant, drag, eccentricity, continuity, max_steps, callback)
     if isinstance(model.schedule, (Adaptive, NeuroFuzzy)):
         if method == "torque":
             raise ValueError(
                 "adaptive and neuro-fuzzy models are fitted to trajectories, not to torques."
             )
         refuse_motionless(plant, joint)
-        same: dict[str, Any] = {
-            "windows": windows, "fit_plant": fit_plant, "drag": drag, "max_steps": max_steps,
-            "callback": callback,
-        }  # fmt: skip
-        if isinstance(model.schedule, NeuroFuzzy):
-            same |= {"eccentricity": eccentricity, "continuity": continuity}
-        return _saying(told, _fit_further(model, plant, given, moved, start, zeroed, same))
-    torque = fit_torque(model.law, start.plant if start else plant, joint, moved, model.v_smooth)
-    schedule = constant_schedule(model)
-    schedule.set_coefficients(torque.coefficients)
-    schedule.set_prior_sd(prior_sd(model.law, torque))
-    if method == "torque":
-        return _saying(told, torque_outcome(model, start, plant, moved, torque))
-    mixing = mixing_of(plant, given[0].convention_on(plant))
-    known = {name: value for name, value, _ in start.plant_terms} if start else {}
-    zero_sd = torch.full((len(joint), plant.joints), ZERO_SD, dtype=torch.float64)
-
-    def refinement(eccentric: bool) -> Refinement:
-        once = zeroed == "once"
-        terms = adjustable_terms(plant, joint, fit_plant, drag, eccentric, zeroed_once=once)
-        return Refinement(
-            plant, model, joint, mixing, terms, max_steps, callback, None if once else zero_sd,
-            JUMP_SD[continuity],
-        )  # fmt: skip
-
-    search = refinement(is_eccentric(eccentricity, known))
-    vector = torch.tensor([known.get(t.name, 0.0) for t in search.terms], dtype=torch.float64)
-
-    def by_torque(found: Plant) -> Tensor:
-        return fit_torque(model.law, found, joint, moved, model.v_smooth).coefficients
-
-    linear = all(c.linear or not c.fitted for c in model.law.coefficients)
-    stage, left_out = _through_windows(
-        search, windows, vector, moved, None if linear else by_torque
-    )
-    undecided = start is None and eccentricity is None and fit_plant and may_be_eccentric(plant)
-    if undecided and stage.result.status != "stopped":
-        tolerance = flat(stage.result.cost)
-        stage = richer_by_evidence(stage, refinement(True), tolerance) or stage
-    found = trajectory_outcome(stage.problem, stage.result, stage.residuals, moved)
-    return _saying((*told, *left_out), replace(found, continuity=continuity))
-
-
-def _saying(told: tuple[str, ...], found: Fit) -> Fit:
-    """A fit that says this first, and once."""
-    return replace(found, warnings=(*told, *(w for w in found.warnings if w not in told)))
+        found = _fit_further(model, plant, given, moved, start, settings, each)
+    elif method == "torque":
+        found = fit_by_torque(model, plant, given, moved, start)
+    else:
+        found = fit_constant(model, plant, given, moved, start, settings, each=each)
+    return saying(told, found)
 
 
 def _fit_further(
@@ -204,85 +136,18 @@ def _fit_further(
     recordings: Sequence[Recording],
     motions: tuple[Motion, ...],
     start: Fit | None,
-    zeroed: Zeroed,
-    settings: dict[str, Any],
+    settings: Settings,
+    each: bool,
 ) -> Fit:
     """The fit of coefficients that follow the motion, from that of the constant law."""
-    alike = settings.get("continuity", "free")
-    each = zeroed == "each"
-    if not is_constant_fit(start, model, alike) or not zeros_serve(start, motions, each):
-        constant = FrictionModel(model.law, Constant(model.law, model.joints), model.v_smooth)
-        start = fit(
-            constant, plant, recordings, zeroed=zeroed, start=start, motions=motions, **settings
-        )
-    # They fit or take a constant law first, so they stand above this module.
-    from nfriction.fitting.adaptive import fit_adaptive
-    from nfriction.fitting.network import fit_network
-
-    further = fit_adaptive if isinstance(model.schedule, Adaptive) else fit_network
-    return further(model, plant, recordings, start=start, motions=motions, **settings)
-
-
-def _through_windows(
-    search: Refinement,
-    windows: Sequence[float],
-    vector: Tensor,
-    motions: tuple[Motion, ...],
-    by_torque: Callable[[Plant], Tensor] | None,
-) -> tuple[Stage, tuple[str, ...]]:
-    """Stages of growing length, each from the states and weighed by the errors of the last.
-
-    Lengths that the motion does not allow are left out, which is said in a sentence.
-
-    With coefficients `by_torque` on a plant, the first stage is searched a second time from what
-    they are on the plant that it found: a law that is not linear has several minima, and on an
-    inertia that is a little wrong the torques lead to a worse one.
-    """
-    reached: Stage | None = None
-    zeros: Tensor | None = None
-    noise, traced = FIRST_NOISE, motions
-    for length in windows:
-        # Encoders that were zeroed where dry friction held the links were zeroed at rest.
-        cut = cut_windows(search.joint, traced, length, from_rest=search.zero_sd is not None)
-        problem = search.problem(cut, noise, far=reached is None and len(windows) > 1)
-        tolerance = LOOSE
-        if length == windows[-1]:
-            # Of a start far away the cost says nothing; the last stage's minimum is as high.
-            near = reached and least(reached.residuals, noise)
-            tolerance = flat(near or float(problem.cost(problem.unknowns.start(vector))))
-        name = f"{length:g} s windows"
-        stage = search.search(problem, vector, tolerance, name, zeros)
-        if reached is None and by_torque is not None and stage.result.status != "stopped":
-            stage = _better_start(search, stage, tolerance, name, by_torque)
-        if reached is not None and stage.lost_since(reached):
-            schedule = search.model.schedule
-            schedule.set_parameter_vector(reached.problem.unknowns.split(reached.result.x)[0])
-            return reached, (TOO_LONG.format(length),)
-        reached, vector, noise = stage, stage.vector, max(stage.noise, LEAST_NOISE)
-        zeros = stage.zeros
-        if stage.result.status == "stopped":
-            break
-        traced = problem.traced(stage.result.x, traced)
-    assert reached is not None
-    return reached, ()
-
-
-def _better_start(
-    search: Refinement,
-    stage: Stage,
-    tolerance: float,
-    name: str,
-    by_torque: Callable[[Plant], Tensor],
-) -> Stage:
-    """A stage, or the same searched from the coefficients by torque on its plant if that is better.
-
-    The model is left with the coefficients of the one returned.
-    """
-    problem, schedule = stage.problem, constant_schedule(search.model)
-    found = schedule.parameter_vector()
-    schedule.set_coefficients(by_torque(problem.plant_at(stage.vector)))
-    other = search.search(problem, stage.vector, tolerance, name, stage.zeros)
-    if other.result.status == "stopped" or other.result.cost < stage.result.cost:
-        return other
-    schedule.set_parameter_vector(found)
-    return stage
+    if isinstance(model.schedule, NeuroFuzzy):
+        constant = constant_start(model, plant, recordings, motions, start, settings, each)
+        return fit_network(model, plant, recordings, motions, constant, settings)
+    # By class there are no eccentric encoders, and windows are free.
+    settings = replace(settings, eccentricity=False, continuity="free")
+    constant = constant_start(model, plant, recordings, motions, start, settings, each)
+    return fit_adaptive(
+        model, plant, recordings, windows=settings.windows, fit_plant=settings.fit_plant,
+        drag=settings.drag, start=constant, motions=motions, max_steps=settings.max_steps,
+        callback=settings.callback,
+    )  # fmt: skip

@@ -7,19 +7,34 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nfriction.fitting.outcome import Plant
-from nfriction.fitting.preparation import swings_freely
+from nfriction.fitting.outcome import Fit, Plant
+from nfriction.fitting.preparation import swings_freely, zeroed_each
 from nfriction.fitting.torque import friction_torque
 from nfriction.recording import Recording
 from nfriction.signals import Motion, count_seen
 
 Array = NDArray[np.float64]
 
+ZEROED_EACH = (
+    "Every recording begins at rest with all encoders at zero, so they were taken for set to zero "
+    'there, wherever the links stood; `zeroed="once"` where they were not.'
+)
 # Measured from the right zero, a free swing leaves friction alone, from the other one twice its
 # weight: those of the public benches are 40 times apart and more.
 OTHER_ZERO = 5.0
 # Of so few counts an encoder's rounding is most of what a joint seems to do.
 FEW_COUNTS = 10
+
+
+def saying(told: tuple[str, ...], found: Fit) -> Fit:
+    """A fit that says this first, and once."""
+    return replace(found, warnings=(*told, *(w for w in found.warnings if w not in told)))
+
+
+def as_it_looks(plant: Plant, given: Sequence[Recording]) -> tuple[bool, tuple[str, ...]]:
+    """Whether encoders look zeroed at the start of each recording, and what then is to be said."""
+    each = zeroed_each(plant, given)
+    return each, (ZEROED_EACH,) if each else ()
 
 
 def misgivings(

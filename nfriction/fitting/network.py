@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.anchors import anchors_where_unseen
+from nfriction.fitting.constant import Settings
 from nfriction.fitting.holdback import Judgement, error_on, judged_windows
 from nfriction.fitting.neurofuzzy_start import settle_on, start_at
-from nfriction.fitting.outcome import Continuity, Fit, Plant, trajectory_outcome
+from nfriction.fitting.outcome import Fit, Plant, trajectory_outcome
 from nfriction.fitting.preparation import (
     adjustable_terms,
     at_zeros,
@@ -27,7 +28,6 @@ from nfriction.friction import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.recording import Recording
 from nfriction.signals import Motion
-from nfriction.solve.least_squares import Step
 
 # Priors of a network that are tried, over its own: windows held back choose among them.
 PRIOR_SHARES = (1.0, 1 / 3)
@@ -37,16 +37,9 @@ def fit_network(
     model: FrictionModel,
     plant: Plant,
     recordings: Sequence[Recording],
-    *,
-    start: Fit,
     motions: tuple[Motion, ...],
-    windows: Sequence[float],
-    fit_plant: bool,
-    drag: bool | None,
-    eccentricity: bool | None,
-    continuity: Continuity,
-    max_steps: int,
-    callback: Callable[[str, Step], bool | None] | None,
+    start: Fit,
+    settings: Settings,
 ) -> Fit:
     """The fit of a neuro-fuzzy model from that of its constant law.
 
@@ -54,30 +47,27 @@ def fit_network(
         model, plant: see `fit`.
         recordings, motions: as they are; the zeros that the constant fit found are added here.
         start: the constant fit.
-        windows, fit_plant, drag, eccentricity, continuity, max_steps, callback: see `fit`; of the
-            windows the last length serves.
+        settings: see `fit`; of the windows the last length serves.
     """
-    if not windows:
-        raise ValueError("`windows` must name at least one window length [s].")
     given, moved = at_zeros(start.zeros, plant, recordings, motions)
     joint = in_joint_coordinates(plant, model, given)
     start_at(model, start, joint, moved)
     known = {name: value for name, value, _ in start.plant_terms}
     terms = adjustable_terms(
-        plant, joint, fit_plant, drag, is_eccentric(eccentricity, known),
-        zeroed_once=not start.zeros,
+        plant, joint, settings.fit_plant, settings.drag,
+        is_eccentric(settings.eccentricity, known), zeroed_once=not start.zeros,
     )  # fmt: skip
     mixing = mixing_of(plant, recordings[0].convention_on(plant))
     assert isinstance(model.schedule, NeuroFuzzy)
     # From smoothed states at full length a search creeps along hard seams.
-    jump_sd = None if continuity == "free" else JUMP_SD["soft"]
+    jump_sd = None if settings.continuity == "free" else JUMP_SD["soft"]
     search = Refinement(
-        plant, model, joint, mixing, terms, max_steps, callback, jump_sd=jump_sd,
-        anchors=anchors_where_unseen(model.schedule, moved),
+        plant, model, joint, mixing, terms, settings.max_steps, settings.callback,
+        jump_sd=jump_sd, anchors=anchors_where_unseen(model.schedule, moved),
     )  # fmt: skip
     vector = torch.tensor([known.get(t.name, 0.0) for t in terms], dtype=torch.float64)
-    found = _refined(search, start, vector, windows[-1], moved)
-    return replace(found, motions=motions, zeros=start.zeros, continuity=continuity)
+    found = _refined(search, start, vector, settings.windows[-1], moved)
+    return replace(found, motions=motions, zeros=start.zeros, continuity=settings.continuity)
 
 
 def _refined(

@@ -1,35 +1,21 @@
 """Where a neuro-fuzzy model starts: at the constant fit of its law."""
 
 from collections.abc import Sequence
-from typing import TypeGuard
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.fitting.outcome import Continuity, Fit
+from nfriction.fitting.outcome import Fit
 from nfriction.fitting.preparation import constant_schedule
 from nfriction.fitting.torque import natural_scale
-from nfriction.friction import Constant, FrictionModel
+from nfriction.friction import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
 # Of a coefficient's scale: far below what a simulation shows, far above rounding.
 NOTHING = 1e-6
-
-
-def is_constant_fit(
-    start: Fit | None, model: FrictionModel, continuity: Continuity = "free"
-) -> TypeGuard[Fit]:
-    """Whether a fit is one of the model's law with constant coefficients, by such trajectories."""
-    return (
-        start is not None
-        and start.model.law == model.law
-        and isinstance(start.model.schedule, Constant)
-        and start._residuals.numel() > 0
-        and start.continuity == continuity
-    )
 
 
 def range_of(motions: Sequence[Motion], along_motion: bool) -> tuple[Tensor, Tensor]:

@@ -1,22 +1,19 @@
-"""Where a fit by class starts, and how much of it is taken."""
+"""The classes of a fit by class, and how much of it is taken."""
 
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from nfriction.fitting import estimate
 from nfriction.fitting.classes import AccelerationClasses, find_classes
 from nfriction.fitting.labelled import Labelled
-from nfriction.fitting.neurofuzzy_start import is_constant_fit
 from nfriction.fitting.outcome import Fit, Plant
 from nfriction.fitting.position_error import PositionError
 from nfriction.fitting.preparation import constant_schedule
 from nfriction.fitting.windows import Windows
-from nfriction.friction import CLASSES, Adaptive, Constant, FrictionModel
+from nfriction.friction import CLASSES, Adaptive, FrictionModel
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
@@ -24,21 +21,6 @@ logger = logging.getLogger(__name__)
 
 # How far a class may deviate from the constant law, in units of a coefficient's natural scale.
 PRIOR_SD = 0.5
-
-
-def constant_start(
-    model: FrictionModel,
-    plant: Plant,
-    recordings: Sequence[Recording],
-    motions: Sequence[Motion],
-    start: Fit | None,
-    **settings: Any,
-) -> Fit:
-    """The fit of the model's law with constant coefficients."""
-    if is_constant_fit(start, model):
-        return start
-    constant = FrictionModel(model.law, Constant(model.law, model.joints), model.v_smooth)
-    return estimate.fit(constant, plant, recordings, motions=motions, start=start, **settings)
 
 
 def adopt_classes(

@@ -11,7 +11,7 @@ import pytest
 
 from nfriction import cli, rigs
 from nfriction.cli import estimation
-from nfriction.fitting.estimate import WINDOWS
+from nfriction.fitting.constant import WINDOWS
 from tests.cli.benches import compare, pendulum, results
 
 

@@ -4,7 +4,7 @@ import pytest
 
 from nfriction import ALFM, LFM, NFLFM, fit
 from nfriction.fitting import stages
-from nfriction.fitting.neurofuzzy_start import is_constant_fit
+from nfriction.fitting.constant_start import is_constant_fit
 from nfriction.fitting.trajectory import TrajectoryProblem
 from nfriction.friction import Constant
 from tests.fitting.recordings import pendulum, swing

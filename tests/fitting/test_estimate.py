@@ -1,8 +1,9 @@
 """Fits recover what made the recording, say how they ended, and refuse what does not match."""
 
+import inspect
 import logging
 import warnings
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -20,8 +21,8 @@ from nfriction import (
     fit,
     rollout,
 )
-from nfriction.fitting import estimate
 from nfriction.fitting.adaptive import fit_adaptive
+from nfriction.fitting.constant import Settings
 from nfriction.fitting.residuals import effective_noise
 from nfriction.fitting.stages import Stage
 from nfriction.fitting.torque import fit_torque
@@ -302,6 +303,13 @@ def test_what_does_not_match_is_refused():
                 fitting(model(2), pendulum(), recording, windows=windows)
 
 
+def test_a_constant_fit_that_others_ask_for_has_the_defaults_of_fit():
+    offered = inspect.signature(fit).parameters
+    assert {f.name: f.default for f in fields(Settings)} == {
+        f.name: offered[f.name].default for f in fields(Settings)
+    }
+
+
 @pytest.mark.parametrize("model", [LFM, NFLFM])
 def test_motions_must_be_those_of_the_recordings(model):
     one, other = (swing(pendulum(), true_model(), seconds=s, name=n)
@@ -404,7 +412,7 @@ def misled(monkeypatch):
         poor = torch.tensor(POOR, dtype=F64)[:, : found.coefficients.shape[1]]
         return replace(found, coefficients=poor)
 
-    monkeypatch.setattr(estimate, "fit_torque", by_torque)
+    monkeypatch.setattr("nfriction.fitting.constant.fit_torque", by_torque)
     return asked
 
 
@@ -421,7 +429,8 @@ def test_a_law_that_is_not_linear_starts_anew_on_the_plant_that_it_found(misled,
     assert misled[1] is not misled[0]
     # What is left over is the encoder's rounding.
     assert found.residual == pytest.approx(2 * np.pi / 8192 / 12**0.5, rel=0.2)
-    monkeypatch.setattr(estimate, "_better_start", lambda search, stage, *rest: stage)
+    better = "nfriction.fitting.constant._better_start"
+    monkeypatch.setattr(better, lambda search, stage, *rest: stage)
     assert fitted().residual > 1.02 * found.residual
 
 
