@@ -26,7 +26,7 @@ from nfriction.fitting.residuals import effective_noise
 from nfriction.fitting.sensitivity import StepJacobian
 from nfriction.fitting.settling import PRIOR_SD, adopt_classes, settled
 from nfriction.fitting.trajectory import solve_trajectory
-from nfriction.fitting.windows import check_lengths, cut_windows
+from nfriction.fitting.windows import checked_lengths, cut_windows
 from nfriction.friction import Adaptive, FrictionModel
 from nfriction.recording import Recording
 from nfriction.signals import Motion
@@ -88,7 +88,7 @@ def fit_adaptive(
         raise ValueError(f"{type(model).__name__} is no adaptive model; use `fit`.")
     if not prior_sd > 0:
         raise ValueError(f"`prior_sd` must be positive, got {prior_sd}.")
-    check_lengths(windows)
+    windows = checked_lengths(windows)
     joint = in_joint_coordinates(plant, model, given)
     moved = motions_of(joint, motions)
     asked = Settings(windows, fit_plant, drag, max_steps=max_steps, callback=callback)

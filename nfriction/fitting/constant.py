@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.eccentricity import may_be_eccentric, richer_by_evidence
-from nfriction.fitting.misgivings import saying
 from nfriction.fitting.outcome import Continuity, Fit, Plant, torque_outcome, trajectory_outcome
 from nfriction.fitting.preparation import (
     adjustable_terms,
@@ -122,7 +121,7 @@ def fit_constant(
         tolerance = flat(stage.result.cost)
         stage = richer_by_evidence(stage, refinement(True), tolerance) or stage
     found = trajectory_outcome(stage.problem, stage.result, stage.residuals, motions)
-    return saying(left_out, replace(found, continuity=settings.continuity))
+    return replace(found, continuity=settings.continuity).telling(left_out)
 
 
 def _set_by_torque(

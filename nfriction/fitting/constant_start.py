@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import TypeGuard
 
 from nfriction.fitting.constant import Settings, fit_constant
-from nfriction.fitting.misgivings import as_it_looks, misgivings, saying
+from nfriction.fitting.misgivings import as_it_looks, misgivings
 from nfriction.fitting.outcome import Continuity, Fit, Plant
 from nfriction.fitting.preparation import in_joint_coordinates, zeros_serve
 from nfriction.friction import Constant, FrictionModel
@@ -52,6 +52,5 @@ def constant_start(
         joint = in_joint_coordinates(plant, model, recordings)
         told += misgivings(plant, recordings, joint, motions)
     constant = FrictionModel(model.law, Constant(model.law, model.joints), model.v_smooth)
-    return saying(
-        told, fit_constant(constant, plant, recordings, motions, start, settings, each=each)
-    )
+    found = fit_constant(constant, plant, recordings, motions, start, settings, each=each)
+    return found.telling(told)

@@ -8,12 +8,12 @@ from nfriction.fitting.adaptive import fit_adaptive
 from nfriction.fitting.constant import WINDOWS, Settings, fit_by_torque, fit_constant
 from nfriction.fitting.constant_start import constant_start
 from nfriction.fitting.eccentricity import may_be_eccentric
-from nfriction.fitting.misgivings import as_it_looks, misgivings, refuse_motionless, saying
+from nfriction.fitting.misgivings import as_it_looks, misgivings, refuse_motionless
 from nfriction.fitting.network import fit_network
 from nfriction.fitting.outcome import Continuity, Fit, Plant
 from nfriction.fitting.preparation import in_joint_coordinates, listed, motions_of
 from nfriction.fitting.stages import JUMP_SD, Callback
-from nfriction.fitting.windows import check_lengths
+from nfriction.fitting.windows import checked_lengths
 from nfriction.friction import Adaptive, FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.recording import Recording
@@ -91,8 +91,8 @@ def fit(
 
     Raises:
         TypeError: if model, plant or recordings are something else.
-        ValueError: if recordings and plant do not match, or there is no such method, zero or
-            continuity.
+        ValueError: if recordings and plant do not match, one is given twice or holds too little,
+            or there is no such method, zero or continuity.
     """
     if method not in get_args(Method):
         raise ValueError(f"`method` must be one of {get_args(Method)}, got {method!r}.")
@@ -104,7 +104,7 @@ def fit(
         raise ValueError(f"`continuity` must be one of {tuple(JUMP_SD)}, got {continuity!r}.")
     if continuity != "free" and method == "torque":
         raise ValueError(f"`continuity={continuity!r}` is of trajectories, not of torques.")
-    check_lengths(windows)
+    windows = checked_lengths(windows)
     given = listed(model, plant, recordings)
     joint = in_joint_coordinates(plant, model, given)
     if eccentricity and not may_be_eccentric(plant):
@@ -121,13 +121,14 @@ def fit(
             raise ValueError(
                 "adaptive and neuro-fuzzy models are fitted to trajectories, not to torques."
             )
-        refuse_motionless(plant, joint)
+        if isinstance(model.schedule, NeuroFuzzy):
+            refuse_motionless(plant, joint)
         found = _fit_further(model, plant, given, moved, start, settings, each)
     elif method == "torque":
         found = fit_by_torque(model, plant, given, moved, start)
     else:
         found = fit_constant(model, plant, given, moved, start, settings, each=each)
-    return saying(told, found)
+    return found.telling(told)
 
 
 def _fit_further(

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nfriction.fitting.outcome import Fit, Plant
+from nfriction.fitting.outcome import Plant
 from nfriction.fitting.preparation import swings_freely, zeroed_each
 from nfriction.fitting.torque import friction_torque
 from nfriction.recording import Recording
@@ -22,13 +22,10 @@ ZEROED_EACH = (
 # Measured from the right zero, a free swing leaves friction alone, from the other one twice its
 # weight: those of the public benches are 40 times apart and more.
 OTHER_ZERO = 5.0
+# Of angles, from one operation to the next, with room.
+ROUNDING = 1e-9
 # Of so few counts an encoder's rounding is most of what a joint seems to do.
 FEW_COUNTS = 10
-
-
-def saying(told: tuple[str, ...], found: Fit) -> Fit:
-    """A fit that says this first, and once."""
-    return replace(found, warnings=(*told, *(w for w in found.warnings if w not in told)))
 
 
 def as_it_looks(plant: Plant, given: Sequence[Recording]) -> tuple[bool, tuple[str, ...]]:
@@ -61,13 +58,16 @@ def refuse_motionless(plant: Plant, joint: Sequence[Recording]) -> None:
     if still:
         raise ValueError(
             f"{', '.join(still)} never moves in {', '.join(r.name or 'a recording' for r in joint)}"
-            ", and adaptive and neuro-fuzzy coefficients follow the motion; record it moving."
+            ", and neuro-fuzzy coefficients follow the motion; record it moving."
         )
 
 
 def _spans(joint: Sequence[Recording]) -> Array:
     """How far each joint moves in the recording in which it moves most, (joint,)."""
-    return np.max([np.ptp(r.q, axis=0) for r in joint], axis=0)
+    spans = np.max([np.ptp(r.q, axis=0) for r in joint], axis=0)
+    # The difference of two absolute angles that turn as one is rounding.
+    largest = max(float(np.abs(r.q).max()) for r in joint)
+    return np.where(spans > ROUNDING * largest, spans, 0.0)
 
 
 def _still_joints(

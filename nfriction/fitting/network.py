@@ -67,7 +67,8 @@ def fit_network(
     )  # fmt: skip
     vector = torch.tensor([known.get(t.name, 0.0) for t in terms], dtype=torch.float64)
     found = _refined(search, start, vector, settings.windows[-1], moved)
-    return replace(found, motions=motions, zeros=start.zeros, continuity=settings.continuity)
+    found = replace(found, motions=motions, zeros=start.zeros, continuity=settings.continuity)
+    return found.telling(start.told)
 
 
 def _refined(
@@ -85,7 +86,7 @@ def _refined(
     )
     if same.result.status == "stopped":
         return _constant_kept(search, start, same.result.message, converged=False)
-    law_of_all = replace(law, model=start.model).problem(held_back, noise)
+    law_of_all = replace(law, model=start.model).problem(held_back, noise, vector, stride)
     laws = [
         error_on(held_back, problem, found)
         for problem, found in ((same.problem, same.vector), (law_of_all, vector))

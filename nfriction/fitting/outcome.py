@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -59,6 +59,8 @@ class Fit:
             short of the true positions, in joint coordinates [rad or m]; a row for each recording.
         uncertainty: standard deviation of the coefficients at any motion; None for a torque fit.
         continuity: of the windows that were fitted, see `fit`.
+        told: those of the warnings that are of recordings and windows; a fit that starts here says
+            them, too.
     """
 
     model: FrictionModel
@@ -77,6 +79,13 @@ class Fit:
     zeros: tuple[tuple[float, ...], ...] = ()
     uncertainty: CoefficientUncertainty | None = None
     continuity: Continuity = "free"
+    told: tuple[str, ...] = ()
+
+    def telling(self, told: Sequence[str]) -> "Fit":
+        """The same, which tells this of recordings and windows first, and once."""
+        whole = tuple(dict.fromkeys((*told, *self.told)))
+        others = (w for w in self.warnings if w not in whole)
+        return replace(self, told=whole, warnings=(*whole, *others))
 
     @property
     def residual_unit(self) -> str:

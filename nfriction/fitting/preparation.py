@@ -67,6 +67,9 @@ def _refuse_repeated(recordings: Sequence[Recording]) -> None:
     """Whatever a copy is called: the same errors counted twice would narrow the intervals."""
     first: dict[str, int] = {}
     for k, recording in enumerate(recordings):
+        # Cut into blocks, recordings may hold the same rest.
+        if not np.ptp(recording.q, axis=0).any():
+            continue
         before = first.setdefault(recording.digest(), k)
         if before != k:
             names = (recordings[before].name or "unnamed", recording.name or "unnamed")
@@ -80,9 +83,10 @@ def warn_of_undriven(recordings: Sequence[Recording]) -> None:
     """Say which recordings count as undriven where others have torques."""
     free = [r.name or f"recording {k + 1}" for k, r in enumerate(recordings) if r.tau is None]
     if 0 < len(free) < len(recordings):
+        names = ", ".join(dict.fromkeys(free))
         # Not of a category that is silenced once recordings are read. One place, so shown once.
         warnings.warn(
-            f"no torque is recorded in {', '.join(free)}, unlike in other recordings, so nothing "
+            f"no torque is recorded in {names}, unlike in other recordings, so nothing "
             f"is taken to drive the joints there; add the torque, or zeros where there was none.",
             stacklevel=1,
         )

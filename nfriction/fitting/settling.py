@@ -70,10 +70,11 @@ def settled(
         rms = float((residuals.square().sum() / error.values).sqrt())
         if rms <= baseline:
             part = "" if share == 1.0 else f" {share:g} of the way from the constant law is taken."
-            return replace(
+            taken = replace(
                 found, model=model, residual=rms, _residuals=residuals,
                 status=found.status + part + _said(classes),
             )  # fmt: skip
+            return taken.telling(constant.told)
     schedule.set_coefficients(flat.expand(-1, len(CLASSES), -1))
     return replace(
         constant, model=model,

@@ -203,7 +203,8 @@ def warnings_of(
 ) -> tuple[str, ...]:
     """Sentences on what to be wary of; none for a fit without blemish.
 
-    Of `at_bounds`, those `at_zero` ended at what no coefficient can be less than.
+    Of `at_bounds`, those `at_zero` ended at what no coefficient can be less than; of those that the
+    data cannot tell, that tells nothing.
     """
     found = []
     if not converged:
@@ -213,8 +214,8 @@ def warnings_of(
             f"Windows do not join: the state jumps by {largest_jump:.3g} times what their "
             "continuity expects. The law is not right, or the motion forgets its start."
         )
-    if at_zero:
-        found.append(f"At zero: {', '.join(at_zero)}; the data show none.")
+    if none := [name for name in at_zero if not any(name in told for told in lost)]:
+        found.append(f"At zero: {', '.join(none)}; the data show none.")
     if beyond := [name for name in at_bounds if name not in at_zero]:
         found.append(f"At a bound: {', '.join(beyond)}; the data ask for values beyond it.")
     if lost:

@@ -1,9 +1,9 @@
 """Recordings cut into windows of equal length with an initial state each."""
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from numbers import Real
 
 import numpy as np
 import torch
@@ -60,14 +60,19 @@ class Windows:
         )  # fmt: skip
 
 
-def check_lengths(windows: object) -> None:
-    """Refuse what are no lengths of windows [s]; a single one is a list of one, too."""
-    lengths = list(windows) if isinstance(windows, Iterable) else []
-    if not lengths or not all(isinstance(w, Real) and float(w) > 0 for w in lengths):
+def checked_lengths(windows: Iterable[float]) -> tuple[float, ...]:
+    """Lengths of windows [s], at least one; whatever else is given is refused."""
+    try:
+        # Texts are no lengths, though Python takes some for numbers.
+        lengths = tuple(float(1.0 * w) for w in windows)
+    except TypeError:
+        lengths = ()
+    if not lengths or not all(0 < w < math.inf for w in lengths):
         raise ValueError(
             f"`windows` must be positive lengths [s] such as (0.5, 2.0), got {windows!r}; a single "
             f"one is (2.0,)."
         )
+    return lengths
 
 
 def cut_windows(

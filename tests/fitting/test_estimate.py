@@ -194,6 +194,12 @@ def test_windows_that_are_left_out_are_told(monkeypatch):
     alone = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5,), max_steps=3)
     assert not any("too long" in told for told in alone.warnings)
     assert found.residual == pytest.approx(alone.residual, rel=0.2)
+    # Whatever starts there says it, too.
+    for score in (0.0, 2.0):
+        monkeypatch.setattr("nfriction.fitting.holdback.Judgement.score", score)
+        network = NFLFM(2, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2)
+        further = fit(network, pendulum(), recording, start=found, windows=(0.5,), max_steps=2)
+        assert sum("too long" in told for told in further.warnings) == 1
 
 
 def test_irregular_stamps_are_followed():
@@ -298,7 +304,7 @@ def test_what_does_not_match_is_refused():
         with pytest.raises(ValueError, match=message):
             fit(*arguments)
     for model, fitting in ((LFM, fit), (NFLFM, fit), (ALFM, fit), (ALFM, fit_adaptive)):
-        for windows in ((), 2.0, (-1.0,), ("1",), "12"):
+        for windows in ((), 2.0, np.array(0.5), (-1.0,), (np.inf,), ("1",), "12"):
             with pytest.raises(ValueError, match=r"`windows` must be positive lengths \[s\]"):
                 fitting(model(2), pendulum(), recording, windows=windows)
 

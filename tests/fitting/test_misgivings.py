@@ -5,7 +5,6 @@ import pytest
 
 from nfriction import CVFM, LFM, NFLFM, PendulumChain, Recording, fit
 from nfriction.fitting.misgivings import misgivings
-from nfriction.friction.models import ALFM
 from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import COUNTS, pendulum, swing
 
@@ -75,11 +74,22 @@ def test_a_joint_that_moves_in_one_recording_is_not_named():
     assert said(plant, rest, moving) == ()
 
 
-@pytest.mark.parametrize("model", [NFLFM, ALFM])
-def test_coefficients_that_follow_the_motion_need_some(model):
+def test_neuro_fuzzy_coefficients_need_some_motion():
     plant, rest = resting(3)
     with pytest.raises(ValueError, match=r"joint1 never moves in rest.*record it moving"):
-        fit(model(2), plant, rest)
+        fit(NFLFM(2), plant, rest)
+
+
+def test_a_joint_that_turns_with_the_last_never_moves_though_rounding_does():
+    turning = np.sin(5 * 1e-3 * np.arange(1000))
+    locked = Recording(1e-3 * np.arange(1000), np.stack([turning, turning + 0.3], 1), name="l",
+                       convention="absolute,hanging")  # fmt: skip
+    plant = pendulum()
+    assert np.ptp(locked.joint_coordinates(plant).q[:, 1]) > 0
+    (still,) = (told for told in said(plant, locked) if "moves" in told)
+    assert still.startswith("joint2 never moves")
+    with pytest.raises(ValueError, match="joint2 never moves"):
+        fit(NFLFM(2), plant, locked)
 
 
 def test_of_a_motionless_recording_a_fit_knows_nothing():

@@ -172,6 +172,8 @@ def test_warnings_name_what_is_wrong_and_are_silent_otherwise():
     none, beyond = warnings_of(**good | {"at_bounds": ["B", "v_s", "C"]}, at_zero=["B", "C"])
     assert none == "At zero: B, C; the data show none."
     assert beyond == "At a bound: v_s; the data ask for values beyond it."
+    (lost,) = warnings_of(**good | {"at_bounds": ["B"], "lost": ["B of joint1"]}, at_zero=["B"])
+    assert "cannot tell" in lost
     assert warnings_of(**good, largest_jump=4.9) == ()
     for jump in (6.0, float("inf"), float("nan")):
         (told,) = warnings_of(**good, largest_jump=jump)
