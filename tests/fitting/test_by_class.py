@@ -28,6 +28,8 @@ def truth() -> FrictionModel:
     """Viscous friction that falls by half over the speeds of the motion."""
     made = NeuroFuzzy(LINEAR, 2, [[4e-3, 3e-3], [2e-3, 1.5e-3]], terms=(2, 2), head_units=2)
     made.set_range(12.0, [-300.0, 300.0])
+    # The faster motions of these swings go beyond, and find it still low there.
+    made.reach = 100.0
     vector = made.parameter_vector().reshape(-1)
     consequents = made.network.anfis.consequents
     with torch.no_grad():
