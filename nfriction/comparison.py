@@ -154,13 +154,13 @@ class Comparison:
     def alike(self) -> tuple[str, ...]:
         """The best and all within the floor of it, `"no friction"` among them, simplest first.
 
-        Empty where there is no best.
+        The best alone where there is no floor; empty where there is no best.
         """
-        best, floor = self.best(), self.floor() if self.held_out else None
+        best = self.best()
         if best is None:
             return ()
-        rmse = self.table()["all"]
-        near = rmse.index[rmse <= rmse.min() + (floor or 0.0)]
+        rmse, floor = self.table()["all"], self.floor()
+        near = () if floor is None else rmse.index[rmse <= rmse.min() + floor]
         return tuple(sorted({best, *near}, key=lambda name: (self._parameters(name), rmse[name])))
 
     def _parameters(self, name: str) -> int:

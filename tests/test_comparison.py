@@ -206,6 +206,9 @@ def test_models_within_the_floor_of_the_best_are_not_told_apart(comparison):
     errors = {"no_friction": 5.0, "NCFM": 2.0, "LFM": 1.0}
     assert scored(found, **errors).alike() == ("LFM",)
     assert "cannot be told" not in verdict(scored(found, **errors))
+    # Without a floor equal errors say nothing of it, as those of a network that kept its law.
+    equal = scored(found, no_friction=5.0, NCFM=1.0, LFM=1.0)
+    assert equal.alike() == (equal.best(),)
     near, far = scored(found, 0.7, **errors), scored(found, 0.6, **errors)
     # Over both recordings root 2.5 of it: 1.1 and 0.95.
     assert near.floor() == pytest.approx(0.7 * 2.5**0.5)

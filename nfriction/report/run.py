@@ -163,8 +163,7 @@ def _run(folder: Path, content: Mapping[str, Any]) -> Run:
         figures=figures,
         notes=(*notes, *unread),
         selection=_selection(content.get("selection"), unit),
-        # Without a floor they are alike by their errors alone, as a network that kept its law is.
-        alike=texts(best.get("alike", []), "`best`") if best.get("floor") is not None else (),
+        alike=texts(best.get("alike", []), "`best`"),
     )
 
 
