@@ -133,6 +133,9 @@ def error_on(held_back: Windows, problem: TrajectoryProblem, vector: Tensor) -> 
 
     Returns:
         [rad or m]; infinite where the motion diverges.
+
+    Raises:
+        KeyboardInterrupt: if interrupted: states half searched would judge the model too hard.
     """
     judged = replace(problem, windows=held_back)
     x = judged.unknowns.start(vector)
@@ -148,5 +151,7 @@ def error_on(held_back: Windows, problem: TrajectoryProblem, vector: Tensor) -> 
     result = solver.minimise(
         own, x[len(shared) :], cost=lambda states: judged.cost(torch.cat([shared, states]))
     )
+    if result.status == "stopped":
+        raise KeyboardInterrupt
     error = float(judged.errors(torch.cat([shared, result.x])).square().mean().sqrt())
     return max(error, LEAST_ERROR) if math.isfinite(error) else math.inf

@@ -31,6 +31,7 @@ from nfriction.signals import Motion
 
 # Priors of a network that are tried, over its own: windows held back choose among them.
 PRIOR_SHARES = (1.0, 1 / 3)
+INTERRUPTED = "Stopped where windows held back judge the network; its constant law is kept."
 
 
 def fit_network(
@@ -66,7 +67,10 @@ def fit_network(
         jump_sd=jump_sd, anchors=anchors_where_unseen(model.schedule, moved),
     )  # fmt: skip
     vector = torch.tensor([known.get(t.name, 0.0) for t in terms], dtype=torch.float64)
-    found = _refined(search, start, vector, settings.windows[-1], moved)
+    try:
+        found = _refined(search, start, vector, settings.windows[-1], moved)
+    except KeyboardInterrupt:
+        found = _constant_kept(search, start, INTERRUPTED, converged=False)
     found = replace(found, motions=motions, zeros=start.zeros, continuity=settings.continuity)
     return found.telling(start.told)
 

@@ -11,6 +11,7 @@ from nfriction.fitting.holdback import FOLDS, Judgement, error_on, judged_window
 from nfriction.fitting.neurofuzzy_start import settle_on, start_at
 from nfriction.fitting.preparation import mixing_of
 from nfriction.fitting.stages import Refinement
+from nfriction.fitting.trajectory import TrajectoryProblem
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from tests.fitting.recordings import F64, pendulum, swing
 
@@ -194,6 +195,30 @@ def test_a_fit_stopped_before_its_network_keeps_the_constant_law(constant):
         model, pendulum(), joint, start=found, windows=(0.5,), fit_plant=False, callback=stop
     )
     assert set(stages) == {"constants, a third held back"}
+    assert kept.model is model
+    assert not kept.converged
+    assert "Stopped" in kept.status
+    at = (torch.ones(1, 2, dtype=F64),) * 3
+    torch.testing.assert_close(model(*at), found.model(*at), rtol=1e-6, atol=1e-9)
+
+
+def test_an_interrupt_while_windows_judge_keeps_the_constant_law(constant, monkeypatch):
+    joint, found = constant
+    cost = TrajectoryProblem.cost
+    judged = []
+
+    def interrupted(problem, x):
+        if len(problem.windows) == held_back:
+            judged.append(x)
+            raise KeyboardInterrupt
+        return cost(problem, x)
+
+    search = refinement(constant)
+    held_back = len(judged_windows(search, found.motions, 0.5)[1])
+    monkeypatch.setattr(TrajectoryProblem, "cost", interrupted)
+    model = NFLFM(2, v_smooth=V_SMOOTH, **SMALL)
+    kept = fit(model, pendulum(), joint, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
+    assert len(judged) == 1
     assert kept.model is model
     assert not kept.converged
     assert "Stopped" in kept.status
