@@ -1,7 +1,7 @@
 """Which terms of a plant a fit may adjust, and by how much.
 
-Every adjustable term enters its buffer linearly, `buffer = nominal + sum_p basis_p x_p`, with
-x = 0 the plant as given: ratios are deviations from 1, offsets are in SI.
+Every adjustable term enters the plant's buffers linearly, `buffer = nominal + sum_p change_p x_p`,
+with x = 0 the plant as given: ratios are deviations from 1, offsets are in SI.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,6 +12,8 @@ from torch import Tensor, nn
 
 # Inertia and gravity terms of a bench are known to about a tenth; the bound is the data cards'.
 RATIO_BOUND, RATIO_SD = 0.3, 0.1
+# A length from joint to joint is read off a drawing or a ruler.
+LENGTH_BOUND, LENGTH_SD = 0.1, 0.01
 # An encoder's zero is known to about a degree.
 ANGLE_BOUND, ANGLE_SD = 0.1, 0.02
 # A disc sits on its shaft to within some hundredths of a millimetre, at a radius of a centimetre.
@@ -34,15 +36,13 @@ class PlantParameter:
 
     Attributes:
         name: what a report calls it.
-        buffer: the plant's buffer that it changes.
-        basis: change of the buffer per unit, shape of the buffer.
+        change: of the plant's buffers per unit, each in the shape of its buffer.
         lower, upper: bounds.
         prior_sd: standard deviation of the prior around 0.
     """
 
     name: str
-    buffer: str
-    basis: Tensor
+    change: Mapping[str, Tensor]
     lower: float
     upper: float
     prior_sd: float
@@ -70,30 +70,43 @@ def plant_parameters(
         eccentricity: fit how far the encoders sit off their shafts, two numbers a link.
 
     Returns:
-        Ratios of inertia, gravity, armature and mass terms, angle offsets, torque offsets of
-        driven joints, drag, and eccentricity.
+        Ratios of inertia, gravity, length, armature and mass terms, angle offsets, torque offsets
+        of driven joints, drag, and eccentricity.
     """
     buffers = dict(plant.named_buffers())
     found: list[PlantParameter] = []
 
-    def ratio(label: str, buffer: str, *index: tuple[int, ...]) -> None:
-        nominal = buffers[buffer]
-        basis = torch.zeros_like(nominal)
+    def only(buffer: str, *index: tuple[int, ...]) -> dict[str, Tensor]:
+        kept = torch.zeros_like(buffers[buffer])
         for i in index:
-            basis[i] = nominal[i]
-        if basis.abs().sum() > 0:
-            found.append(PlantParameter(label, buffer, basis, -RATIO_BOUND, RATIO_BOUND, RATIO_SD))
+            kept[i] = buffers[buffer][i]
+        return {buffer: kept}
 
-    def shift(label: str, buffer: str, basis: Tensor, low: float, high: float, sd: float) -> None:
-        found.append(PlantParameter(label, buffer, basis, low, high, sd))
+    def ratio(
+        label: str, change: dict[str, Tensor], bound: float = RATIO_BOUND, sd: float = RATIO_SD
+    ) -> None:
+        if any(bool(x.any()) for x in change.values()):
+            found.append(PlantParameter(label, change, -bound, bound, sd))
+
+    def shift(label: str, buffer: str, unit: Tensor, low: float, high: float, sd: float) -> None:
+        found.append(PlantParameter(label, {buffer: unit}, low, high, sd))
 
     if "inertia_coupling" in buffers:
         links = buffers["gravity_moment"].shape[-1]
+
+        def coupled(*pairs: tuple[int, int]) -> dict[str, Tensor]:
+            return only("inertia_coupling", *pairs, *((j, i) for i, j in pairs))
+
         for i in range(links):
-            for j in range(i, links):
-                ratio(f"inertia {i + 1}{j + 1}", "inertia_coupling", (i, j), (j, i))
-        for i in range(0 if driven else 1, links):
-            ratio(f"gravity {i + 1}", "gravity_moment", (i,))
+            ratio(f"inertia {i + 1}{i + 1}", coupled((i, i)))
+        # What hangs on joint j couples to the link i before it by its first moment, which gravity
+        # pulls at, times that link's length: a_ij = L_i b_j.
+        for j in range(0 if driven else 1, links):
+            moved = coupled(*((i, j) for i in range(j)))
+            ratio(f"gravity {j + 1}", only("gravity_moment", (j,)) | moved)
+        for i in range(links - 1):
+            carried = coupled(*((i, j) for j in range(i + 1, links)))
+            ratio(f"length {i + 1}", carried, LENGTH_BOUND, LENGTH_SD)
         joints = buffers["angle_offset"].shape[-1]
         for j in range(joints - links, joints):
             unit = torch.eye(joints, dtype=torch.float64)[j]
@@ -102,7 +115,7 @@ def plant_parameters(
     # Without torque a mass alone is but the scale of the friction.
     for name in ("armature", "mass") if driven else ("armature",):
         for j in range(buffers[name].shape[-1] if name in buffers else 0):
-            ratio(f"{name} {j + 1}", name, (j,))
+            ratio(f"{name} {j + 1}", only(name, (j,)))
     if driven:
         joints = buffers["torque_offset"].shape[-1]
         kind, force = ("force", "N") if plant.unit == "m" else ("torque", "N m")
@@ -141,7 +154,7 @@ def adjusted_buffers(
     nominal = dict(plant.named_buffers())
     changed: dict[str, Tensor] = {}
     for i, parameter in enumerate(parameters):
-        before = changed.get(parameter.buffer, nominal[parameter.buffer])
-        value = vector[..., i].reshape(*vector.shape[:-1], *[1] * parameter.basis.ndim)
-        changed[parameter.buffer] = before + value * parameter.basis
+        for name, change in parameter.change.items():
+            value = vector[..., i].reshape(*vector.shape[:-1], *[1] * change.ndim)
+            changed[name] = changed.get(name, nominal[name]) + value * change
     return changed

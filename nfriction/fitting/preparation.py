@@ -178,7 +178,7 @@ def adjustable_terms(
         plant, driven=np.flatnonzero(largest).tolist(), largest_torque=float(largest.max()),
         largest_rate=_largest_rate(joint), drag=drag, eccentricity=eccentricity,
     )  # fmt: skip
-    return [t for t in terms if zeroed_once or t.buffer != "angle_offset"]
+    return [t for t in terms if zeroed_once or "angle_offset" not in t.change]
 
 
 def is_eccentric(asked: bool | None, known: Iterable[str]) -> bool:

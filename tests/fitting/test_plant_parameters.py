@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nfriction import LinearAxis, rigs
+from nfriction import LinearAxis, PendulumChain, rigs
 from nfriction.fitting.plant_parameters import RATIO_BOUND, adjusted_buffers, plant_parameters
 from tests.fitting.recordings import F64, pendulum
 
@@ -15,7 +15,7 @@ def names(plant, **settings):
 def test_free_swing_keeps_one_gravity_term_as_the_scale():
     free = names(pendulum(), driven=())
     assert "gravity 1" not in free
-    assert {"inertia 11", "inertia 12", "inertia 22", "gravity 2"} < set(free)
+    assert {"inertia 11", "inertia 22", "gravity 2", "length 1"} < set(free)
     driven = names(pendulum(), driven=(0, 1), largest_torque=1.0)
     assert set(driven) - set(free) == {
         "gravity 1", "torque offset 1 [N m]", "torque offset 2 [N m]"
@@ -55,14 +55,48 @@ def test_ratios_scale_their_terms_and_nothing_else():
     plant = pendulum()
     terms = plant_parameters(plant, driven=())
     vector = torch.zeros(len(terms), dtype=F64)
-    index = [t.name for t in terms].index("inertia 12")
+    index = [t.name for t in terms].index("inertia 22")
     vector[index] = 0.1
     coupling = adjusted_buffers(plant, terms, vector)["inertia_coupling"]
     expected = plant.inertia_coupling.clone()
-    expected[0, 1] *= 1.1
-    expected[1, 0] *= 1.1
+    expected[1, 1] *= 1.1
     torch.testing.assert_close(coupling, expected)
     assert all(t.upper == RATIO_BOUND for t in terms if "inertia" in t.name)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "ratios"),
+    [
+        # The last link's centre of mass, and the inertia about it.
+        ({"com": [0.05, 0.07, 0.066]}, {"gravity 3", "inertia 33"}),
+        # The first link's length moves what hangs on it, and counts in its own moment, too.
+        ({"length": [0.105, 0.12, 0.1]}, {"length 1", "gravity 1", "inertia 11"}),
+        ({"length": [0.1, 0.126, 0.1]}, {"length 2", "gravity 2", "inertia 22"}),
+    ],
+)
+def test_what_is_wrong_of_a_link_takes_the_ratios_of_that_link_alone(wrong, ratios):
+    link = {
+        "mass": [0.1, 0.2, 0.1], "com": [0.05, 0.07, 0.06], "length": [0.1, 0.12, 0.1],
+        "inertia": [1e-4, 2e-4, 1e-4],
+    }  # fmt: skip
+    plant, true = PendulumChain(**link), PendulumChain(**link | wrong)
+    terms = plant_parameters(plant, driven=(0, 1, 2), largest_torque=1.0)
+    names = [t.name for t in terms]
+    change = torch.stack([
+        torch.cat([t.change.get(b, torch.zeros_like(of)).flatten() for b, of in buffers(plant)])
+        for t in terms
+    ], 1)  # fmt: skip
+    sought = torch.cat([
+        (of - before).flatten()
+        for (_, of), (_, before) in zip(buffers(true), buffers(plant), strict=True)
+    ])  # fmt: skip
+    found = torch.linalg.lstsq(change, sought, driver="gelsd").solution
+    assert {n for n, x in zip(names, found, strict=True) if abs(x) > 1e-9} == ratios
+    torch.testing.assert_close(change @ found, sought)
+
+
+def buffers(plant):
+    return [(name, getattr(plant, name)) for name in ("inertia_coupling", "gravity_moment")]
 
 
 def test_buffers_are_linear_in_the_parameters_and_nominal_at_zero():
@@ -96,5 +130,5 @@ def test_a_batch_of_vectors_gives_a_batch_of_plants():
 def test_bounds_hold_the_given_plant():
     terms = plant_parameters(pendulum(), driven=(0, 1), largest_torque=2.0, drag=True)
     assert all(t.lower <= 0.0 < t.upper and t.prior_sd > 0 for t in terms)
-    offset = next(t for t in terms if t.buffer == "torque_offset")
+    offset = next(t for t in terms if "torque_offset" in t.change)
     assert offset.upper == pytest.approx(0.6)
