@@ -1,12 +1,13 @@
 """Fit the constant law: torques first, then windows of growing length."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from nfriction.fitting.eccentricity import may_be_eccentric, richer_by_evidence
+from nfriction.fitting.nested import lowest_of
 from nfriction.fitting.outcome import Continuity, Fit, Plant, torque_outcome, trajectory_outcome
 from nfriction.fitting.preparation import (
     adjustable_terms,
@@ -15,10 +16,10 @@ from nfriction.fitting.preparation import (
     is_eccentric,
     mixing_of,
 )
-from nfriction.fitting.stages import JUMP_SD, Callback, Refinement, Stage, flat, least
+from nfriction.fitting.stages import JUMP_SD, LEAST_NOISE, Callback, Refinement, Stage, flat, least
 from nfriction.fitting.torque import TorqueFit, fit_torque, prior_sd
 from nfriction.fitting.windows import cut_windows
-from nfriction.friction import FrictionModel
+from nfriction.friction import Constant, FrictionModel
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
@@ -34,8 +35,6 @@ FIRST_NOISE = 1e-3
 WINDOWS = (0.5, 2.0, 5.0)
 # Relative fall of the cost that ends a search of which only the neighbourhood matters.
 LOOSE = 1e-4
-# Errors that count for less would be rounding [rad or m].
-LEAST_NOISE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -108,13 +107,20 @@ def fit_constant(
     search = refinement(is_eccentric(settings.eccentricity, known))
     vector = torch.tensor([known.get(t.name, 0.0) for t in search.terms], dtype=torch.float64)
 
-    def by_torque(found: Plant) -> Tensor:
-        return fit_torque(model.law, found, joint, motions, model.v_smooth).coefficients
+    stage, left_out = _through_windows(search, settings.windows, vector, motions)
+    law = model.law.simpler
+    if law is not None and stage.result.status != "stopped":
+        simpler = FrictionModel(law, Constant(law, model.joints), model.v_smooth)
+        _set_by_torque(simpler, start.plant if start else plant, joint, motions)
+        base, _ = _through_windows(
+            replace(search, model=simpler), settings.windows, vector, motions,
+            f", {law.name} law",
+        )  # fmt: skip
 
-    linear = all(c.linear or not c.fitted for c in model.law.coefficients)
-    stage, left_out = _through_windows(
-        search, settings.windows, vector, motions, None if linear else by_torque
-    )
+        def by_torque(found: Plant) -> Tensor:
+            return fit_torque(model.law, found, joint, motions, model.v_smooth).coefficients
+
+        stage = lowest_of(search, stage, base, by_torque)
     undecided = start is None and settings.eccentricity is None
     possible = settings.fit_plant and may_be_eccentric(plant)
     if undecided and possible and stage.result.status != "stopped":
@@ -140,15 +146,11 @@ def _through_windows(
     windows: Sequence[float],
     vector: Tensor,
     motions: tuple[Motion, ...],
-    by_torque: Callable[[Plant], Tensor] | None,
+    of: str = "",
 ) -> tuple[Stage, tuple[str, ...]]:
     """Stages of growing length, each from the states and weighed by the errors of the last.
 
     Lengths that the motion does not allow are left out, which is said in a sentence.
-
-    With coefficients `by_torque` on a plant, the first stage is searched a second time from what
-    they are on the plant that it found: a law that is not linear has several minima, and on an
-    inertia that is a little wrong the torques lead to a worse one.
     """
     reached: Stage | None = None
     zeros: Tensor | None = None
@@ -162,10 +164,7 @@ def _through_windows(
             # Of a start far away the cost says nothing; the last stage's minimum is as high.
             near = reached and least(reached.residuals, noise)
             tolerance = flat(near or float(problem.cost(problem.unknowns.start(vector))))
-        name = f"{length:g} s windows"
-        stage = search.search(problem, vector, tolerance, name, zeros)
-        if reached is None and by_torque is not None and stage.result.status != "stopped":
-            stage = _better_start(search, stage, tolerance, name, by_torque)
+        stage = search.search(problem, vector, tolerance, f"{length:g} s windows{of}", zeros)
         if reached is not None and stage.lost_since(reached):
             schedule = search.model.schedule
             schedule.set_parameter_vector(reached.problem.unknowns.split(reached.result.x)[0])
@@ -177,24 +176,3 @@ def _through_windows(
         traced = problem.traced(stage.result.x, traced)
     assert reached is not None
     return reached, ()
-
-
-def _better_start(
-    search: Refinement,
-    stage: Stage,
-    tolerance: float,
-    name: str,
-    by_torque: Callable[[Plant], Tensor],
-) -> Stage:
-    """A stage, or the same searched from the coefficients by torque on its plant if that is better.
-
-    The model is left with the coefficients of the one returned.
-    """
-    problem, schedule = stage.problem, constant_schedule(search.model)
-    found = schedule.parameter_vector()
-    schedule.set_coefficients(by_torque(problem.plant_at(stage.vector)))
-    other = search.search(problem, stage.vector, tolerance, name, stage.zeros)
-    if other.result.status == "stopped" or other.result.cost < stage.result.cost:
-        return other
-    schedule.set_parameter_vector(found)
-    return stage

@@ -28,6 +28,9 @@ JUMP_SD: dict[Continuity, tuple[float, float] | None] = {
     "free": None, "soft": (3e-4, 0.01), "hard": (1e-6, 3e-5),
 }  # fmt: skip
 
+# Errors that count for less would be rounding [rad or m].
+LEAST_NOISE = 1e-9
+
 # Residuals grow with the windows, but not so much unless the search went astray.
 LOST_TRACK = 10.0
 # Dry friction puts kinks into the cost, along which a search may creep: so many steps in a row

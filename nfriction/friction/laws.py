@@ -63,9 +63,15 @@ class Law:
         name: name of the law.
         coefficients: description of each entry of the coefficients' last axis, in order.
         torque: `(qd, load, coefficients, v_smooth) -> tau_f`, elementwise and scriptable.
+        simpler: a law that this one contains: the same torque where all but the coefficients
+            `shared` with it are zero, or shape what is zero then. For laws that are not linear
+            and have several minima: a fit also starts from the simpler one's, and does not leave
+            more over than that.
+        shared: names here of the simpler law's coefficients, in its order.
 
     Raises:
-        ValueError: if there is no coefficient, or two bear the same name.
+        ValueError: if there is no coefficient, two bear the same name, or what is shared does not
+            fit the simpler law.
 
     Examples:
         >>> def drag(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
@@ -76,11 +82,19 @@ class Law:
     name: str
     coefficients: tuple[Coefficient, ...]
     torque: TorqueFunction
+    simpler: "Law | None" = None
+    shared: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.names or len(set(self.names)) < len(self.names):
             raise ValueError(
                 f"law {self.name!r} needs coefficients with names of their own, got {self.names}."
+            )
+        wanted = len(self.simpler.names) if self.simpler else 0
+        if len(set(self.shared)) != wanted or not set(self.shared) <= set(self.names):
+            raise ValueError(
+                f"law {self.name!r} must name its own {wanted} of {self.names} that a simpler law "
+                f"has, got `shared`={self.shared}."
             )
 
     @property
@@ -220,6 +234,8 @@ NONLINEAR = Law(
         Coefficient("f_b", "s/rad", linear=False, search=(0.1, 0.3, 1.0, 3.0, 10.0)),
     ),
     nonlinear,
+    simpler=COULOMB_VISCOUS,
+    shared=("f_c", "f_v"),
 )
 
 STRIBECK = Law(
@@ -233,4 +249,6 @@ STRIBECK = Law(
         Coefficient("delta", "-", linear=False, search=(2.0,), fitted=False),
     ),
     stribeck,
+    simpler=COULOMB_VISCOUS,
+    shared=("F_c", "F_v"),
 )

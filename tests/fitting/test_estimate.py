@@ -11,9 +11,11 @@ import torch
 
 from nfriction import (
     ALFM,
+    CVFM,
     LFM,
     NCFM,
     NFLFM,
+    NLFM,
     LinearAxis,
     PendulumChain,
     Recording,
@@ -422,39 +424,71 @@ def misled(monkeypatch):
     return asked
 
 
-def test_a_law_that_is_not_linear_starts_anew_on_the_plant_that_it_found(misled, monkeypatch):
-    truth = Stribeck(2, FALLING, v_smooth=V_SMOOTH)
-    recording = swing(pendulum(), truth)
+def test_stribeck_friction_is_found_again():
+    recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH))
+    found = fit(Stribeck(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5,))
+    # What is left over is the encoder's rounding.
+    assert found.residual == pytest.approx(2 * np.pi / 8192 / 12**0.5, rel=0.02)
+    truth = torch.tensor(FALLING, dtype=F64)
+    torch.testing.assert_close(found.model.schedule.values, truth, rtol=0.05, atol=0)
+
+
+def test_a_law_that_torques_mislead_also_starts_from_the_simpler_one(misled, monkeypatch):
+    recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH))
 
     def fitted():
         misled.clear()
         return fit(Stribeck(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5,))
 
     found = fitted()
-    assert len(misled) == 2
-    assert misled[1] is not misled[0]
-    # What is left over is the encoder's rounding.
-    assert found.residual == pytest.approx(2 * np.pi / 8192 / 12**0.5, rel=0.2)
-    better = "nfriction.fitting.constant._better_start"
-    monkeypatch.setattr(better, lambda search, stage, *rest: stage)
+    # Torques are asked on the plant as given, for both laws, and on that of the simpler one.
+    assert misled[1] is misled[0]
+    assert misled[2] is not misled[0]
+    monkeypatch.setattr("nfriction.fitting.constant.lowest_of", lambda search, own, *rest: own)
     assert fitted().residual > 1.02 * found.residual
 
 
-def test_what_stops_the_second_search_stops_the_fit(misled):
+@pytest.mark.parametrize("law", [Stribeck, NLFM])
+def test_a_law_leaves_no_more_over_than_the_simpler_one_in_it(law, monkeypatch):
+    """However badly torques mislead it."""
+
+    def by_torque(law, plant, *rest):
+        found = fit_torque(law, plant, *rest)
+        if law.simpler is None:
+            return found
+        return replace(found, coefficients=0 * found.coefficients + 10.0)
+
+    monkeypatch.setattr("nfriction.fitting.constant.fit_torque", by_torque)
     recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH), seconds=2.0)
+    simpler, found = (
+        fit(of(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5,), max_steps=8)
+        for of in (CVFM, law)
+    )
+    assert found.residual <= 1.001 * simpler.residual
+
+
+@pytest.mark.parametrize(
+    "last", ["0.5 s windows, coulomb_viscous law", "from the coulomb_viscous law"]
+)
+def test_what_stops_a_further_search_stops_the_fit_and_keeps_the_best(last):
+    recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH), seconds=2.0)
+    alone = fit(CVFM(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5,))
     told = []
 
     def stop(stage, step):
         told.append(stage)
-        return len(misled) == 2
+        return stage == last
 
     model = Stribeck(2, v_smooth=V_SMOOTH)
-    found = fit(model, pendulum(), recording, windows=(0.5, 1.0), max_steps=4, callback=stop)
-    assert set(told) == {"0.5 s windows"}
+    found = fit(model, pendulum(), recording, windows=(0.5,), callback=stop)
+    assert told[0] == "0.5 s windows"
+    assert told.count(last) == 1
     assert not found.converged
+    assert "Stopped" in found.status
+    assert found.residual < alone.residual
 
 
-def test_a_law_that_is_linear_is_searched_once(misled):
+def test_a_law_that_contains_no_simpler_one_is_searched_once(misled):
     fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), swing(pendulum(), true_model(), seconds=1.0),
         windows=(0.5,), max_steps=1)  # fmt: skip
     assert len(misled) == 1

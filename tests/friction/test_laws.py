@@ -10,6 +10,8 @@ from torch import Tensor
 
 from nfriction.friction import Coefficient, Law
 from nfriction.friction.laws import (
+    LINEAR,
+    NONLINEAR,
     STRIBECK,
     coulomb_viscous,
     linear,
@@ -156,3 +158,24 @@ def test_a_law_is_refused_that_could_not_be_fitted_or_told() -> None:
         Law("twice", (Coefficient("B", "N m"), Coefficient("B", "N m")), linear)
     with pytest.raises(ValueError, match="names of their own"):
         Law("none", (), linear)
+
+
+def test_a_law_names_what_it_shares_with_a_simpler_one():
+    own = (Coefficient("a", "N m"), Coefficient("b", "N m s/rad"))
+    assert Law("more", own, coulomb_viscous, LINEAR, ("b", "a")).shared == ("b", "a")
+    for simpler, shared in ((LINEAR, ()), (LINEAR, ("a",)), (LINEAR, ("a", "c")), (None, ("a",))):
+        with pytest.raises(ValueError, match="law 'more' must name its own"):
+            Law("more", own, coulomb_viscous, simpler, shared)
+
+
+@pytest.mark.parametrize("law", [NONLINEAR, STRIBECK])
+def test_a_law_is_the_simpler_one_where_nothing_else_is_left(law):
+    simpler = law.simpler
+    qd, load = torch.linspace(-3, 3, 7, dtype=torch.float64), torch.ones(7, dtype=torch.float64)
+    values = torch.tensor([0.3, 0.2], dtype=torch.float64)
+    lifted = torch.tensor([0.0 if c.linear else 0.7 for c in law.coefficients], dtype=torch.float64)
+    lifted[[law.names.index(name) for name in law.shared]] = values
+    torch.testing.assert_close(
+        law.torque(qd, load, lifted.expand(7, -1), 0.1),
+        simpler.torque(qd, load, values.expand(7, -1), 0.1),
+    )
