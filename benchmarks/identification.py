@@ -2,7 +2,7 @@
 
     python benchmarks/identification.py recovery [--seconds 10 20 40] [--seeds 1] [--peer mujoco]
     python benchmarks/identification.py real DATA [--only triple ...] [--models NCFM LFM NFLFM]
-                                                 [--blocks N]
+                                                 [--blocks N] [--peer scipy]
 
 Run from the repository's root, on one thread. `recovery` simulates the papers' three links with
 viscous and Coulomb friction, reads them with encoders of 8192 counts at 1 kHz and fits friction
@@ -15,7 +15,9 @@ from smoothed states.
 
 `real` leaves one recording out at a time, fits the others and simulates the one left out from its
 first state; with `--blocks N` each recording is cut in N, and one block of every recording is left
-out at a time. DATA holds a folder to each set, with a `recordings.csv` of initial states.
+out at a time. With `--peer scipy` every constant law is also fitted by single shooting, as the
+baselines on the recordings' cards were, which tells how hard these recordings are beside those that
+are kept apart. DATA holds a folder to each set, with a `recordings.csv` of initial states.
 """
 
 import argparse
@@ -40,12 +42,14 @@ def main() -> int:
     given.add_argument("--only", nargs="+", default=list(SETS), choices=list(SETS))
     given.add_argument("--models", nargs="+", default=["NCFM", "LFM", "NFLFM"])
     given.add_argument("--blocks", type=int, default=1)
+    given.add_argument("--peer", choices=["scipy"])
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     if arguments.command == "recovery":
         recovery(arguments.seconds, arguments.seeds, arguments.releases, arguments.peer)
     else:
-        real(arguments.data, arguments.only, arguments.models, arguments.blocks)
+        peer = arguments.peer is not None
+        real(arguments.data, arguments.only, arguments.models, arguments.blocks, peer)
     return 0
 
 

@@ -3,12 +3,14 @@
 import math
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from single_shooting import single_shooting
 
 from nfriction import Recording, rigs
 from nfriction.fitting import Fit, fit
@@ -126,7 +128,13 @@ def first_state(data: Path, of: Set, recording: Recording) -> State | None:
     return q, qd
 
 
-def real(data: Path, only: Sequence[str], models: Sequence[str], blocks: int = 1) -> None:
+def real(
+    data: Path,
+    only: Sequence[str],
+    models: Sequence[str],
+    blocks: int = 1,
+    peer: bool = False,
+) -> None:
     """Print the error of every model on what was left out of its recordings.
 
     Args:
@@ -134,14 +142,17 @@ def real(data: Path, only: Sequence[str], models: Sequence[str], blocks: int = 1
         only: sets by name.
         models: by name, each fitted from the fit of one before it where that helps.
         blocks: in time, of which one is left out of every recording; 1 leaves out recordings.
+        peer: also fit every constant model by single shooting with SciPy.
     """
-    print("set     model    unit  free run   aim  met       5 s   aim  met  cpu [s]  one by one")
+    print(
+        "set     model          unit  free run   aim  met       5 s   aim  met  cpu [s]  one by one"
+    )
     for name in only:
         of = SETS[name]
         plant = of.plant()
-        free: dict[str, list[float]] = {m: [] for m in models}
-        short: dict[str, list[float]] = {m: [] for m in models}
-        spent = dict.fromkeys(models, 0.0)
+        rows = {m: Row() for m in models}
+        if peer:
+            rows |= {f"{m}, SciPy": Row() for m in models if is_constant(m)}
         for fold in folds(data, of, blocks):
             fits: list[Fit] = []
             for m in models:
@@ -150,17 +161,47 @@ def real(data: Path, only: Sequence[str], models: Sequence[str], blocks: int = 1
                 before = nearest_fit(fits, model)
                 fits.append(fit(model, plant, fold.fitted, start=before, zeroed=of.zeroed,
                                 motions=before.motions if before else None))  # fmt: skip
-                spent[m] += time.process_time() - start
-                for left in fold.left:
-                    told = score(fits[-1].plant, fits[-1].model, **left._asdict())
-                    free[m].append(1e3 * told.free_run.all)
-                    five = told.windows.get("5")
-                    short[m].append(1e3 * five.all if five else math.nan)
-        for m in models:
-            rows = "  ".join(f"{e:.3g}" for e in free[m])
-            errors = (root_mean_square(e[m]) for e in (free, short))
+                rows[m].add(start, fits[-1].plant, model, fold.left)
+            states = [first_state(data, of, r) if blocks == 1 else None for r in fold.fitted]
+            for m in models if peer else ():
+                if is_constant(m):
+                    start = time.process_time()
+                    model = model_by_name(m)(plant.joints, v_smooth=of.v_smooth)
+                    found = single_shooting(model, plant, fold.fitted, states)
+                    rows[f"{m}, SciPy"].add(start, found, model, fold.left)
+        for m, row in rows.items():
+            each = "  ".join(f"{e:.3g}" for e in row.free)
+            errors = (root_mean_square(e) for e in (row.free, row.short))
             judged = " ".join(beside(e, t) for e, t in zip(errors, of.target, strict=True))
-            print(f"{name:7} {m:8} {of.unit:4} {judged} {spent[m]:8.0f}  {rows}", flush=True)
+            print(f"{name:7} {m:14} {of.unit:4} {judged} {row.spent:8.0f}  {each}", flush=True)
+
+
+@dataclass
+class Row:
+    """Errors of one contestant on all that was left out, and its processor time [s]."""
+
+    free: list[float] = field(default_factory=list)
+    short: list[float] = field(default_factory=list)
+    spent: float = 0.0
+
+    def add(
+        self,
+        start: float,
+        plant: PendulumChain | LinearAxis,
+        model: FrictionModel,
+        left: Sequence[Left],
+    ) -> None:
+        """Count the time since the start, and judge what was found in it."""
+        self.spent += time.process_time() - start
+        for one in left:
+            told = score(plant, model, **one._asdict())
+            self.free.append(1e3 * told.free_run.all)
+            five = told.windows.get("5")
+            self.short.append(1e3 * five.all if five else math.nan)
+
+
+def is_constant(name: str) -> bool:
+    return isinstance(model_by_name(name)(1).schedule, Constant)
 
 
 def nearest_fit(fits: Sequence[Fit], model: FrictionModel) -> Fit | None:

@@ -347,3 +347,9 @@ def test_save_all_writes_every_figure_and_leaves_matplotlib_alone(tmp_path):
     assert not any("held_out" in f.name or "positions" in f.name for f in only_train)
     with pytest.raises(ValueError, match="not in the comparison"):
         plots.save_all(comparison, [swing(1, "m", name="other")], tmp_path)
+
+
+def test_all_models_are_told_apart_by_marker_and_by_dashes():
+    looks = [style.looks(MODELS)[name] for name in MODELS]
+    assert len({(look.line["color"], look.marker["marker"]) for look in looks}) == len(MODELS)
+    assert len({(look.line["color"], str(look.line["linestyle"])) for look in looks}) == len(MODELS)

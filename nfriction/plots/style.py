@@ -23,7 +23,8 @@ LABEL, SMALL, TINY = 8.0, 7.0, 6.0  # sizes of text [pt]
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#5D3A9B")
 MEASURED: dict[str, Any] = {"color": "#bcbcbc", "linewidth": 3.0}
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)), (0, (6, 1.5, 1.2, 1.5)))
-_MARKERS = ("o", "s", "^", "D", "v", "P", "p")
+# Not as many as colours, or both would repeat together.
+_MARKERS = ("o", "s", "^", "D", "v", "P", "p", "<")
 _HATCHES = ("", "////", "....", "\\\\\\\\")
 MAP = "viridis"
 LOG_FROM = 30.0
