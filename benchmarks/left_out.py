@@ -145,7 +145,7 @@ def real(
         peer: also fit every constant model by single shooting with SciPy.
     """
     print(
-        "set     model          unit  free run   aim  met       5 s   aim  met  cpu [s]  one by one"
+        "set     model           unit  free run   aim  met       5 s   aim  met  cpu [s]  one by one"
     )
     for name in only:
         of = SETS[name]
@@ -173,7 +173,7 @@ def real(
             each = "  ".join(f"{e:.3g}" for e in row.free)
             errors = (root_mean_square(e) for e in (row.free, row.short))
             judged = " ".join(beside(e, t) for e, t in zip(errors, of.target, strict=True))
-            print(f"{name:7} {m:14} {of.unit:4} {judged} {row.spent:8.0f}  {each}", flush=True)
+            print(f"{name:7} {m:15} {of.unit:4} {judged} {row.spent:8.0f}  {each}", flush=True)
 
 
 @dataclass

@@ -46,11 +46,11 @@ def fit(
     The friction torque that the smoothed motion implies gives constant coefficients; simulated
     windows of growing length then refine them, and what the data tell of the plant. A law that is
     not linear and contains a simpler one (Stribeck, NLFM: Coulomb and viscous friction) is searched
-    again from where that ended; what leaves least over counts. A neuro-fuzzy model starts at the constant fit of its own law and is pulled toward it, by its
-    own prior or a tighter one, whichever predicts windows held back better, and more so at motions
-    that the recordings never came near; unless that is a fifth better than the law, the law is
-    kept. Every class of an adaptive model starts there, too;
-    `fit_adaptive` has its further settings.
+    again from where that ended; what leaves least over counts. A neuro-fuzzy model starts at the
+    constant fit of its own law and is pulled toward it, by its own prior or a tighter one,
+    whichever predicts windows held back better, and more so at motions that the recordings never
+    came near; unless that is a fifth better than the law, the law is kept. Every class of an
+    adaptive model starts there, too; `fit_adaptive` has its further settings.
 
     Args:
         model: the model to fit; changed in place.
