@@ -144,9 +144,8 @@ def real(
         blocks: in time, of which one is left out of every recording; 1 leaves out recordings.
         peer: also fit every constant model by single shooting with SciPy.
     """
-    print(
-        "set     model           unit  free run   aim  met       5 s   aim  met  cpu [s]  one by one"
-    )
+    aimed = f"{'aim':>5}  met"
+    print(f"{'set':7} {'model':15} unit  free run {aimed} {'5 s':>9} {aimed}  cpu [s]  one by one")
     for name in only:
         of = SETS[name]
         plant = of.plant()
