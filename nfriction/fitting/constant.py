@@ -112,7 +112,7 @@ def fit_constant(
     if law is not None and stage.result.status != "stopped":
         simpler = FrictionModel(law, Constant(law, model.joints), model.v_smooth)
         _set_by_torque(simpler, start.plant if start else plant, joint, motions)
-        base, _ = _through_windows(
+        base, without = _through_windows(
             replace(search, model=simpler), settings.windows, vector, motions,
             f", {law.name} law",
         )  # fmt: skip
@@ -120,7 +120,10 @@ def fit_constant(
         def by_torque(found: Plant) -> Tensor:
             return fit_torque(model.law, found, joint, motions, model.v_smooth).coefficients
 
-        stage = lowest_of(search, stage, base, by_torque)
+        lowest = lowest_of(search, stage, base, by_torque)
+        if lowest.problem is not stage.problem:
+            left_out = without
+        stage = lowest
     undecided = start is None and settings.eccentricity is None
     possible = settings.fit_plant and may_be_eccentric(plant)
     if undecided and possible and stage.result.status != "stopped":

@@ -22,7 +22,8 @@ def lowest_of(
     A law that is not linear has several minima, and to which of them torques lead depends on the
     plant. So it is searched again from what they tell on the simpler law's; and as long as it is
     above the law that it contains, from there. Priors guide each search; between their ends what is
-    left over counts alone. The model is left with the lowest.
+    left over counts alone. The model is left with the lowest; with one of longer windows where only
+    the simpler law could follow them.
 
     Args:
         search: of the law.
@@ -33,15 +34,17 @@ def lowest_of(
         return _stopped(own)
     states = simpler.problem.unknowns.split(simpler.result.x)[2].chunk(2, -1)
     windows = replace(simpler.problem.windows, q0=states[0], qd0=states[1])
-    if windows.spans != own.problem.windows.spans:
-        return own  # one of the two could not follow the longest windows
+    # Where one of the two could not follow the longest windows, what they left over is no measure.
+    alike = windows.spans == own.problem.windows.spans
+    if not alike and len(windows) >= len(own.problem.windows):
+        return own
     # By the worse of the two, priors would outweigh what it cannot explain.
     noise = max(np.fmin(own.noise, simpler.noise), LEAST_NOISE)
     schedule, problem = constant_schedule(search.model), search.problem(windows, noise)
     told = by_torque(problem.plant_at(simpler.vector))
     known = constant_schedule(simpler.problem.friction).values
     of_simpler = least(simpler.residuals, noise)
-    best, lowest = own, least(own.residuals, noise)
+    best, lowest = own, least(own.residuals, noise) if alike else math.inf
     if not math.isfinite(lowest):
         lowest = math.inf
     tolerance = flat(min(lowest, of_simpler))
