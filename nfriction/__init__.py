@@ -15,13 +15,16 @@ if TYPE_CHECKING:
     from nfriction.estimators import FrictionEstimator
     from nfriction.fitting import Fit, fit, fit_adaptive, fit_by_search
     from nfriction.friction import (
+        ACFM,
         ACVFM,
         ALFM,
         ANCFM,
         ANLFM,
+        CFM,
         CVFM,
         LFM,
         NCFM,
+        NFCFM,
         NFCVFM,
         NFLFM,
         NFNCFM,
@@ -44,13 +47,16 @@ _HOME = {
     "estimators": ("FrictionEstimator",),
     "fitting": ("Fit", "fit", "fit_adaptive", "fit_by_search"),
     "friction": (
+        "ACFM",
         "ACVFM",
         "ALFM",
         "ANCFM",
         "ANLFM",
+        "CFM",
         "CVFM",
         "LFM",
         "NCFM",
+        "NFCFM",
         "NFCVFM",
         "NFLFM",
         "NFNCFM",
@@ -70,13 +76,16 @@ _HOME = {
 _MODULE = {name: module for module, names in _HOME.items() for name in names}
 
 __all__ = [
+    "ACFM",
     "ACVFM",
     "ALFM",
     "ANCFM",
     "ANLFM",
+    "CFM",
     "CVFM",
     "LFM",
     "NCFM",
+    "NFCFM",
     "NFCVFM",
     "NFLFM",
     "NFNCFM",

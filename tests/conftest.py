@@ -1,6 +1,7 @@
 """Settings for every test: one thread, float64 by default where a test does not say."""
 
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -34,14 +35,15 @@ def reference_dir(request: pytest.FixtureRequest) -> Path:
 
 
 # Of the long tests over all models the short run takes those of the richest laws alone.
-LEFT_TO_THE_SLOW_RUN = ("CVFM", "ANCFM", "NFNCFM")
+LEFT_TO_THE_SLOW_RUN = {
+    *("CFM", "ACFM", "NFCFM"), *("CVFM", "ACVFM", "NFCVFM"), "ANCFM", "NFNCFM",
+}  # fmt: skip
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark what only repeats, with a law that is part of another, what another test does."""
     for item in items:
-        if item.path.parent.name in ("export", "simulation", "codegen") and any(
-            name in item.name for name in LEFT_TO_THE_SLOW_RUN
-        ):
+        named = LEFT_TO_THE_SLOW_RUN.intersection(re.split(r"\W+", item.name))
+        if named and item.path.parent.name in ("export", "simulation", "codegen"):
             item.add_marker(pytest.mark.slow)

@@ -7,8 +7,8 @@ import argparse
 from pathlib import Path
 
 MODELS = (
-    "NCFM", "LFM", "NLFM", "CVFM", "Stribeck", "ANCFM", "ALFM", "ANLFM", "ACVFM",
-    "NFNCFM", "NFLFM", "NFNLFM", "NFCVFM", "NFStribeck",
+    "NCFM", "LFM", "NLFM", "CFM", "CVFM", "Stribeck", "ANCFM", "ALFM", "ANLFM", "ACFM", "ACVFM",
+    "NFNCFM", "NFLFM", "NFNLFM", "NFCFM", "NFCVFM", "NFStribeck",
 )  # fmt: skip
 RIGS = (
     "tlrip", "rtip", "multiarm-single", "multiarm-double", "multiarm-triple",

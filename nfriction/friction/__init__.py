@@ -7,14 +7,17 @@ from nfriction.friction.controller_schedule import RadialBasis
 from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.model import FrictionModel
 from nfriction.friction.models import (
+    ACFM,
     ACVFM,
     ALFM,
     ANCFM,
     ANLFM,
+    CFM,
     CVFM,
     LFM,
     MODELS,
     NCFM,
+    NFCFM,
     NFCVFM,
     NFLFM,
     NFNCFM,
@@ -28,15 +31,18 @@ from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.friction.schedules import Schedule
 
 __all__ = [
+    "ACFM",
     "ACVFM",
     "ALFM",
     "ANCFM",
     "ANLFM",
+    "CFM",
     "CLASSES",
     "CVFM",
     "LFM",
     "MODELS",
     "NCFM",
+    "NFCFM",
     "NFCVFM",
     "NFLFM",
     "NFNCFM",

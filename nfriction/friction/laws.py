@@ -126,6 +126,24 @@ def viscous(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> 
     return coefficients.select(-1, 0) * qd
 
 
+def coulomb(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
+    """Coulomb friction `F_c sgn(qd)` (CFM).
+
+    Args:
+        qd: joint velocity [rad/s], shape (*batch, joint).
+        load: normal load over its value at rest [-]; not used by this law.
+        coefficients: F_c [N m], shape (*batch, joint, 1).
+        v_smooth: velocity over which the sign turns [rad/s].
+
+    Returns:
+        Friction torque [N m], shape (*batch, joint).
+
+    References:
+        Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30 (1994), section 2.
+    """
+    return coefficients.select(-1, 0) * smooth_sign(qd, v_smooth)
+
+
 def coulomb_viscous(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
     """Coulomb plus viscous friction `F_c sgn(qd) + F_v qd` (CVFM).
 
@@ -215,6 +233,8 @@ def stribeck(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) ->
 
 
 VISCOUS = Law("viscous", (Coefficient("C_p", "N m s/rad"),), viscous)
+
+COULOMB = Law("coulomb", (Coefficient("F_c", "N m"),), coulomb)
 
 COULOMB_VISCOUS = Law(
     "coulomb_viscous",

@@ -49,6 +49,15 @@ class LFM(ConstantModel):
     definition = laws.LINEAR
 
 
+class CFM(ConstantModel):
+    """Coulomb friction with a constant F_c, and nothing viscous.
+
+    The law of ball bearings whose links swing in air: what grows with velocity is the air's.
+    """
+
+    definition = laws.COULOMB
+
+
 class CVFM(ConstantModel):
     """Coulomb plus viscous friction with constants F_c and F_v, whatever the load.
 
@@ -109,6 +118,12 @@ class ANCFM(AdaptiveModel):
     """Viscous friction, its constant one for each class of acceleration (TLRIP paper)."""
 
     definition = laws.VISCOUS
+
+
+class ACFM(AdaptiveModel):
+    """Coulomb friction, F_c for each class of acceleration."""
+
+    definition = laws.COULOMB
 
 
 class ACVFM(AdaptiveModel):
@@ -189,6 +204,12 @@ class NFNCFM(NeuroFuzzyModel):
     definition = laws.VISCOUS
 
 
+class NFCFM(NeuroFuzzyModel):
+    """Coulomb friction with a neuro-fuzzy F_c: any curve over velocity that is odd."""
+
+    definition = laws.COULOMB
+
+
 class NFCVFM(NeuroFuzzyModel):
     """Coulomb plus viscous friction with neuro-fuzzy F_c and F_v."""
 
@@ -218,8 +239,8 @@ NamedModel = type[ConstantModel] | type[AdaptiveModel] | type[NeuroFuzzyModel]
 MODELS: dict[str, NamedModel] = {
     model.__name__: model
     for model in (
-        NCFM, LFM, NLFM, CVFM, Stribeck, ANCFM, ALFM, ANLFM, ACVFM, NFNCFM, NFLFM, NFNLFM, NFCVFM,
-        NFStribeck,
+        NCFM, LFM, NLFM, CFM, CVFM, Stribeck, ANCFM, ALFM, ANLFM, ACFM, ACVFM,
+        NFNCFM, NFLFM, NFNLFM, NFCFM, NFCVFM, NFStribeck,
     )
 }  # fmt: skip
 

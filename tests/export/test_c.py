@@ -37,6 +37,7 @@ TOLERANCE = {"float64": 1e-14, "float32": 5e-7}
 # Constants of the size that the papers' rigs have.
 INITIAL = {
     "viscous": [0.02],
+    "coulomb": [0.05],
     "coulomb_viscous": [0.05, 0.02],
     "linear": [0.02, 0.05],
     "nonlinear": [0.005, 0.05, 0.02, 0.02, 2.0],

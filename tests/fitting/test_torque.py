@@ -14,6 +14,7 @@ from tests.fitting.recordings import pendulum
 V_SMOOTH = 0.05
 TRUTH = {
     "NCFM": [[2e-3], [1e-3]],
+    "CFM": [[3e-3], [5e-4]],
     "CVFM": [[3e-3, 2e-3], [5e-4, 1e-3]],
     "LFM": [[2e-3, 3e-3], [1e-3, 5e-4]],
     "NLFM": [[1e-3, 2e-3, 3e-3, 4e-3, 3.0], [-1e-3, 1e-3, 2e-3, 1e-3, 0.3]],

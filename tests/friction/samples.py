@@ -4,9 +4,9 @@ import torch
 from torch import Tensor
 
 from nfriction.friction import MODELS, Coefficient, FrictionModel, Law
-from nfriction.friction.laws import COULOMB_VISCOUS, LINEAR, NONLINEAR, STRIBECK, VISCOUS
+from nfriction.friction.laws import COULOMB, COULOMB_VISCOUS, LINEAR, NONLINEAR, STRIBECK, VISCOUS
 
-LAWS = (VISCOUS, COULOMB_VISCOUS, LINEAR, NONLINEAR, STRIBECK)
+LAWS = (VISCOUS, COULOMB, COULOMB_VISCOUS, LINEAR, NONLINEAR, STRIBECK)
 
 
 def quadratic(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
