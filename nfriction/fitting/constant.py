@@ -1,6 +1,6 @@
 """Fit the constant law: torques first, then windows of growing length."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -107,19 +107,21 @@ def fit_constant(
     search = refinement(is_eccentric(settings.eccentricity, known))
     vector = torch.tensor([known.get(t.name, 0.0) for t in search.terms], dtype=torch.float64)
 
-    stage, left_out = _through_windows(search, settings.windows, vector, motions)
+    def by_torque(found: Plant) -> Tensor:
+        return fit_torque(model.law, found, joint, motions, model.v_smooth).coefficients
+
+    linear = all(c.linear or not c.fitted for c in model.law.coefficients)
+    stage, left_out = _through_windows(
+        search, settings.windows, vector, motions, None if linear else by_torque
+    )
     law = model.law.simpler
     if law is not None and stage.result.status != "stopped":
         simpler = FrictionModel(law, Constant(law, model.joints), model.v_smooth)
         _set_by_torque(simpler, start.plant if start else plant, joint, motions)
         base, without = _through_windows(
             replace(search, model=simpler), settings.windows, vector, motions,
-            f", {law.name} law",
+            of=f", {law.name} law",
         )  # fmt: skip
-
-        def by_torque(found: Plant) -> Tensor:
-            return fit_torque(model.law, found, joint, motions, model.v_smooth).coefficients
-
         lowest = lowest_of(search, stage, base, by_torque)
         if lowest.problem is not stage.problem:
             left_out = without
@@ -149,11 +151,16 @@ def _through_windows(
     windows: Sequence[float],
     vector: Tensor,
     motions: tuple[Motion, ...],
+    by_torque: Callable[[Plant], Tensor] | None = None,
     of: str = "",
 ) -> tuple[Stage, tuple[str, ...]]:
     """Stages of growing length, each from the states and weighed by the errors of the last.
 
     Lengths that the motion does not allow are left out, which is said in a sentence.
+
+    With coefficients `by_torque` on a plant, the first stage is searched a second time from what
+    they are on the plant that it found: a law that is not linear has several minima, and on an
+    inertia that is a little wrong the torques lead to a worse one.
     """
     reached: Stage | None = None
     zeros: Tensor | None = None
@@ -167,7 +174,10 @@ def _through_windows(
             # Of a start far away the cost says nothing; the last stage's minimum is as high.
             near = reached and least(reached.residuals, noise)
             tolerance = flat(near or float(problem.cost(problem.unknowns.start(vector))))
-        stage = search.search(problem, vector, tolerance, f"{length:g} s windows{of}", zeros)
+        name = f"{length:g} s windows{of}"
+        stage = search.search(problem, vector, tolerance, name, zeros)
+        if reached is None and by_torque is not None and stage.result.status != "stopped":
+            stage = _better_start(search, stage, tolerance, name, by_torque)
         if reached is not None and stage.lost_since(reached):
             schedule = search.model.schedule
             schedule.set_parameter_vector(reached.problem.unknowns.split(reached.result.x)[0])
@@ -179,3 +189,24 @@ def _through_windows(
         traced = problem.traced(stage.result.x, traced)
     assert reached is not None
     return reached, ()
+
+
+def _better_start(
+    search: Refinement,
+    stage: Stage,
+    tolerance: float,
+    name: str,
+    by_torque: Callable[[Plant], Tensor],
+) -> Stage:
+    """A stage, or the same searched from the coefficients by torque on its plant if that is better.
+
+    The model is left with the coefficients of the one returned.
+    """
+    problem, schedule = stage.problem, constant_schedule(search.model)
+    found = schedule.parameter_vector()
+    schedule.set_coefficients(by_torque(problem.plant_at(stage.vector)))
+    other = search.search(problem, stage.vector, tolerance, name, stage.zeros)
+    if other.result.status == "stopped" or other.result.cost < stage.result.cost:
+        return other
+    schedule.set_parameter_vector(found)
+    return stage

@@ -58,7 +58,7 @@ def fit(
         recordings: one or several, all in one convention; where they say none, in the plant's.
         method: `"torque"` stops after the torque fit (constant coefficients only).
         windows: lengths of the windows [s], in the order in which they are used.
-        fit_plant: adjust ratios of inertia and gravity terms and offsets, within bounds.
+        fit_plant: adjust ratios of inertia and gravity terms, lengths and offsets, within bounds.
         drag: also fit air drag on the links. None fits it where nothing drives a chain on a
             fixed pivot: a free swing loses as much to the air as to its joints, and without drag
             the joints' coefficients take it over and are wrong.

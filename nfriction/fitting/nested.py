@@ -4,13 +4,13 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from nfriction.fitting.outcome import Plant
 from nfriction.fitting.preparation import constant_schedule
 from nfriction.fitting.stages import LEAST_NOISE, Refinement, Stage, flat, least
+from nfriction.fitting.windows import Windows
 from nfriction.friction import Law
 
 
@@ -32,38 +32,56 @@ def lowest_of(
     """
     if simpler.result.status == "stopped":
         return _stopped(own)
-    states = simpler.problem.unknowns.split(simpler.result.x)[2].chunk(2, -1)
-    windows = replace(simpler.problem.windows, q0=states[0], qd0=states[1])
+    windows = _from_its_end(simpler)
     # Where one of the two could not follow the longest windows, what they left over is no measure.
     alike = windows.spans == own.problem.windows.spans
     if not alike and len(windows) >= len(own.problem.windows):
         return own
-    # By the worse of the two, priors would outweigh what it cannot explain.
-    noise = max(np.fmin(own.noise, simpler.noise), LEAST_NOISE)
-    schedule, problem = constant_schedule(search.model), search.problem(windows, noise)
-    told = by_torque(problem.plant_at(simpler.vector))
+    # By what the worse of the two could not explain, priors would outweigh the data.
+    sizes = (own.noise, simpler.noise, own.problem.noise_sd, simpler.problem.noise_sd)
+    noise = max(min(size for size in sizes if math.isfinite(size)), LEAST_NOISE)
+    schedule, name = constant_schedule(search.model), simpler.problem.friction.law.name
+    told = by_torque(own.problem.plant_at(simpler.vector))
     known = constant_schedule(simpler.problem.friction).values
-    of_simpler = least(simpler.residuals, noise)
-    best, lowest = own, least(own.residuals, noise) if alike else math.inf
-    if not math.isfinite(lowest):
-        lowest = math.inf
-    tolerance = flat(min(lowest, of_simpler))
+    contained = _left_over(simpler, noise)
+    best, lowest = own, _left_over(own, noise) if alike else math.inf
+    tolerance = flat(min(lowest, contained))
     for start in (told, _lifted(search.model.law, known, told)):
-        if start is not told and lowest <= of_simpler:
+        if start is not told and lowest <= contained:
             break
         schedule.set_coefficients(start)
+        problem = search.problem(windows, noise)
         stage = search.search(
-            problem, simpler.vector, tolerance,
-            f"from the {simpler.problem.friction.law.name} law", simpler.zeros,
-        )  # fmt: skip
-        over = least(stage.residuals, noise)
-        if over < lowest * (1 - tolerance):
-            best, lowest = stage, over
+            problem, simpler.vector, tolerance, f"from the {name} law", simpler.zeros
+        )
+        left, surer = _left_over(stage, noise), _surer(stage, best)
+        if left < lowest * (1 - tolerance) or (surer and left < lowest * (1 + tolerance)):
+            best, lowest = stage, left
         if stage.result.status == "stopped":
             best = _stopped(best)
             break
     schedule.set_parameter_vector(best.problem.unknowns.split(best.result.x)[0])
     return best
+
+
+def _from_its_end(stage: Stage) -> Windows:
+    """The windows of a stage with the states that it found, but for those that are known."""
+    windows = stage.problem.windows
+    q0, qd0 = (x.clone() for x in stage.problem.unknowns.split(stage.result.x)[2].chunk(2, -1))
+    known = list(windows.at_rest)
+    q0[known], qd0[known] = windows.q0[known], windows.qd0[known]
+    return replace(windows, q0=q0, qd0=qd0)
+
+
+def _left_over(stage: Stage, noise: float) -> float:
+    """Half the sum of squares of residuals and jumps; infinite where the motion diverged."""
+    jumps = 0.5 * float(stage.problem.jumps(stage.result.x).square().sum())
+    left = least(stage.residuals, noise) + jumps
+    return left if math.isfinite(left) else math.inf
+
+
+def _surer(stage: Stage, other: Stage) -> bool:
+    return stage.result.converged and not other.result.converged
 
 
 def _lifted(law: Law, simpler: Tensor, shapes: Tensor) -> Tensor:

@@ -31,7 +31,7 @@ from nfriction.signals import Motion
 
 # Priors of a network that are tried, over its own: windows held back choose among them.
 PRIOR_SHARES = (1.0, 1 / 3)
-INTERRUPTED = "Stopped where windows held back judge the network; its constant law is kept."
+INTERRUPTED = "Stopped before the network was found; its constant law is kept."
 
 
 def fit_network(

@@ -65,8 +65,7 @@ class Law:
         torque: `(qd, load, coefficients, v_smooth) -> tau_f`, elementwise and scriptable.
         simpler: a law that this one contains: the same torque where all but the coefficients
             `shared` with it are zero, or shape what is zero then. For laws that are not linear
-            and have several minima: a fit also starts from the simpler one's, and does not leave
-            more over than that.
+            and have several minima: a fit also starts from where the simpler one ended.
         shared: names here of the simpler law's coefficients, in its order.
 
     Raises:
@@ -90,12 +89,22 @@ class Law:
             raise ValueError(
                 f"law {self.name!r} needs coefficients with names of their own, got {self.names}."
             )
-        wanted = len(self.simpler.names) if self.simpler else 0
-        if len(set(self.shared)) != wanted or not set(self.shared) <= set(self.names):
+        if not isinstance(self.simpler, Law | None):
+            raise TypeError(f"`simpler` must be a Law, got {self.simpler!r}.")
+        wanted = self.simpler.coefficients if self.simpler else ()
+        own = {c.name: c for c in self.coefficients}
+        once = len(set(self.shared)) == len(self.shared) == len(wanted)
+        if not once or not set(self.shared) <= set(own):
             raise ValueError(
-                f"law {self.name!r} must name its own {wanted} of {self.names} that a simpler law "
-                f"has, got `shared`={self.shared}."
+                f"law {self.name!r} must name its own {len(wanted)} of {self.names} that a simpler "
+                f"law has, got `shared`={self.shared}."
             )
+        for name, other in zip(self.shared, wanted, strict=True):
+            if own[name].positive and not other.positive:
+                raise ValueError(
+                    f"{name!r} of law {self.name!r} is positive, {other.name!r} of the simpler one "
+                    "may be negative; let both be the same."
+                )
 
     @property
     def names(self) -> tuple[str, ...]:

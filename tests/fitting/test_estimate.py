@@ -28,6 +28,8 @@ from nfriction.fitting.constant import Settings
 from nfriction.fitting.residuals import effective_noise
 from nfriction.fitting.stages import Stage
 from nfriction.fitting.torque import fit_torque
+from nfriction.friction import Constant, FrictionModel
+from nfriction.friction.laws import STRIBECK
 from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import F64, driven_axis, pendulum, swing
 
@@ -433,19 +435,58 @@ def test_stribeck_friction_is_found_again():
     torch.testing.assert_close(found.model.schedule.values, truth, rtol=0.05, atol=0)
 
 
-def test_a_law_that_torques_mislead_also_starts_from_the_simpler_one(misled, monkeypatch):
+def test_stribeck_friction_is_found_again_on_a_plant_that_is_a_tenth_off():
+    recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH))
+    given = PendulumChain([0.27, 0.22], [0.2, 0.15], inertia=[1.5e-3, 4e-4])
+    found = fit(Stribeck(2, v_smooth=V_SMOOTH), given, recording, windows=(0.5, 2.0))
+    assert found.residual == pytest.approx(2 * np.pi / 8192 / 12**0.5, rel=0.05)
+
+
+def mine(joints, **settings):
+    """A law of one's own that does not say what it contains."""
+    law = replace(STRIBECK, name="mine", simpler=None, shared=())
+    return FrictionModel(law, Constant(law, joints), **settings)
+
+
+@pytest.mark.parametrize("law", [Stribeck, mine])
+def test_a_law_that_torques_mislead_starts_anew_on_the_plant_that_it_found(
+    misled, monkeypatch, law
+):
     recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH))
 
     def fitted():
         misled.clear()
-        return fit(Stribeck(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5,))
+        return fit(law(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5,))
 
     found = fitted()
-    # Torques are asked on the plant as given, for both laws, and on that of the simpler one.
-    assert misled[1] is misled[0]
-    assert misled[2] is not misled[0]
+    assert misled[1] is not misled[0]
+    assert found.residual == pytest.approx(2 * np.pi / 8192 / 12**0.5, rel=0.2)
+    better = "nfriction.fitting.constant._better_start"
+    monkeypatch.setattr(better, lambda search, stage, *rest: stage)
     monkeypatch.setattr("nfriction.fitting.constant.lowest_of", lambda search, own, *rest: own)
     assert fitted().residual > 1.02 * found.residual
+
+
+def test_a_search_in_vain_from_the_simpler_law_leaves_the_model_as_it_was(monkeypatch):
+    recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH))
+    settings = {"windows": (0.5, 1.0), "fit_plant": False}
+    simpler = []
+
+    def by_torque(law, plant, *rest):
+        found = fit_torque(law, plant, *rest)
+        if not simpler:
+            simpler.extend([1] if law.simpler is None else [])
+            return found
+        return replace(found, coefficients=torch.tensor(POOR, dtype=F64))
+
+    monkeypatch.setattr("nfriction.fitting.constant.fit_torque", by_torque)
+    found = fit(Stribeck(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
+    assert simpler
+    monkeypatch.setattr("nfriction.fitting.constant.lowest_of", lambda search, own, *rest: own)
+    simpler.clear()
+    alone = fit(Stribeck(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
+    assert torch.equal(found.model.schedule.values, alone.model.schedule.values)
+    assert found.residual == alone.residual
 
 
 @pytest.mark.parametrize("law", [Stribeck, NLFM])

@@ -13,6 +13,7 @@ from nfriction.friction.laws import (
     LINEAR,
     NONLINEAR,
     STRIBECK,
+    coulomb,
     coulomb_viscous,
     linear,
     nonlinear,
@@ -163,9 +164,18 @@ def test_a_law_is_refused_that_could_not_be_fitted_or_told() -> None:
 def test_a_law_names_what_it_shares_with_a_simpler_one():
     own = (Coefficient("a", "N m"), Coefficient("b", "N m s/rad"))
     assert Law("more", own, coulomb_viscous, LINEAR, ("b", "a")).shared == ("b", "a")
-    for simpler, shared in ((LINEAR, ()), (LINEAR, ("a",)), (LINEAR, ("a", "c")), (None, ("a",))):
+    wrong = ((), ("a",), ("a", "c"), ("a", "b", "a"))
+    for simpler, shared in (*((LINEAR, names) for names in wrong), (None, ("a",))):
         with pytest.raises(ValueError, match="law 'more' must name its own"):
             Law("more", own, coulomb_viscous, simpler, shared)
+
+
+def test_a_law_refuses_a_simpler_one_that_it_cannot_follow():
+    with pytest.raises(TypeError, match="`simpler` must be a Law, got 'linear'"):
+        Law("more", (Coefficient("a", "N m"),), coulomb_viscous, "linear", ("a",))
+    signed = Law("signed", (Coefficient("o", "N m", positive=False),), coulomb)
+    with pytest.raises(ValueError, match="'a' of law 'more' is positive, 'o' of the simpler"):
+        Law("more", (Coefficient("a", "N m"),), coulomb, signed, ("a",))
 
 
 @pytest.mark.parametrize("law", [NONLINEAR, STRIBECK])

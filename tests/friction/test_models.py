@@ -76,8 +76,8 @@ def test_the_slope_at_rest_is_that_of_differences(name: str) -> None:
     slope = model.slope_at_rest()
     assert slope.shape == (3,)
     expected = ((ahead - behind) / (2 * step)).detach().reshape(-1, 3).amax(0)
-    # Truncation is (step / v_smooth)^2 / 3.
-    torch.testing.assert_close(slope, expected, rtol=1e-7, atol=0)
+    # Truncation is (step / v_smooth)^2 / 3, and step / v_s where Stribeck's exponent is near 1.
+    torch.testing.assert_close(slope, expected, rtol=1e-6, atol=0)
     assert slope.shape == (3,)
     assert not slope.requires_grad
 
@@ -140,12 +140,13 @@ def test_nan_in_nan_out() -> None:
             clean = model(*inputs)
             changed = clean.clone()
             changed[1, 2] = torch.nan
-            # What a model does not read cannot harm it.
+            # What a model does not read cannot harm it; far from rest a sign reads nothing.
+            slow = [1e-4 * x if i == 0 else x for i, x in enumerate(motion(3))]
             reads = torch.autograd.functional.jacobian(
-                lambda x, w=which, m=model: m(
-                    *(x if i == w else y for i, y in enumerate(motion(3)))
+                lambda x, w=which, m=model, s=slow: m(
+                    *(x if i == w else y for i, y in enumerate(s))
                 ),
-                motion(3)[which],
+                slow[which],
             ).any()
             inputs[which][1, 2] = torch.nan
             expected = changed if reads else clean
