@@ -9,7 +9,8 @@ viscous and Coulomb friction, reads them with encoders of 8192 counts at 1 kHz a
 and plant with everything else unknown too. It prints the largest error of the six coefficients,
 the share of 95 % intervals that hold the truth, their median half-width, seconds to a fit, and
 what the fit says of itself. The model starts at three times the true friction (a fit of ours then
-takes its own start from the torques). With `--peer mujoco` the toolbox of `mujoco[sysid]` gets
+takes its own start from the torques), and a fit of ours is given a plant whose ratios, lengths and
+zeros are off by as much as it expects. With `--peer mujoco` the toolbox of `mujoco[sysid]` gets
 the same recordings and starts, and the true plant; it simulates them whole, or in short windows
 from smoothed states.
 

@@ -1,7 +1,7 @@
 """Which terms of a plant a fit may adjust, and by how much.
 
-Every adjustable term enters the plant's buffers linearly, `buffer = nominal + sum_p change_p x_p`,
-with x = 0 the plant as given: ratios are deviations from 1, offsets are in SI.
+With x = 0 the plant is as given: ratios are deviations from 1, `buffer = nominal (1 + x) (1 + x')`
+where two act on an entry; offsets are in SI, `buffer = nominal + x`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -36,9 +36,11 @@ class PlantParameter:
 
     Attributes:
         name: what a report calls it.
-        change: of the plant's buffers per unit, each in the shape of its buffer.
+        change: of the plant's buffers per unit, each in the shape of its buffer; of a ratio, 1 at
+            the entries that it scales.
         lower, upper: bounds.
         prior_sd: standard deviation of the prior around 0.
+        ratio: whether it scales its entries, and does not add to them.
     """
 
     name: str
@@ -46,6 +48,7 @@ class PlantParameter:
     lower: float
     upper: float
     prior_sd: float
+    ratio: bool = False
 
 
 def plant_parameters(
@@ -77,16 +80,16 @@ def plant_parameters(
     found: list[PlantParameter] = []
 
     def only(buffer: str, *index: tuple[int, ...]) -> dict[str, Tensor]:
-        kept = torch.zeros_like(buffers[buffer])
+        chosen = torch.zeros_like(buffers[buffer])
         for i in index:
-            kept[i] = buffers[buffer][i]
-        return {buffer: kept}
+            chosen[i] = 1.0
+        return {buffer: chosen}
 
     def ratio(
         label: str, change: dict[str, Tensor], bound: float = RATIO_BOUND, sd: float = RATIO_SD
     ) -> None:
-        if any(bool(x.any()) for x in change.values()):
-            found.append(PlantParameter(label, change, -bound, bound, sd))
+        if any(bool((buffers[name] * chosen).any()) for name, chosen in change.items()):
+            found.append(PlantParameter(label, change, -bound, bound, sd, ratio=True))
 
     def shift(label: str, buffer: str, unit: Tensor, low: float, high: float, sd: float) -> None:
         found.append(PlantParameter(label, {buffer: unit}, low, high, sd))
@@ -156,5 +159,7 @@ def adjusted_buffers(
     for i, parameter in enumerate(parameters):
         for name, change in parameter.change.items():
             value = vector[..., i].reshape(*vector.shape[:-1], *[1] * change.ndim)
-            changed[name] = changed.get(name, nominal[name]) + value * change
+            before = changed.get(name, nominal[name])
+            step = value * change
+            changed[name] = before * (1.0 + step) if parameter.ratio else before + step
     return changed

@@ -1,4 +1,4 @@
-"""Adjustable plant terms: what data can tell, linear in the buffers, within bounds."""
+"""Adjustable plant terms: what data can tell, ratios and offsets within bounds."""
 
 import pytest
 import torch
@@ -72,8 +72,11 @@ def test_ratios_scale_their_terms_and_nothing_else():
         # The first link's length moves what hangs on it, and counts in its own moment, too.
         ({"length": [0.105, 0.12, 0.1]}, {"length 1", "gravity 1", "inertia 11"}),
         ({"length": [0.1, 0.126, 0.1]}, {"length 2", "gravity 2", "inertia 22"}),
+        ({"com": [0.05, 0.08, 0.066], "length": [0.105, 0.126, 0.1]},
+         {"length 1", "length 2", *(f"gravity {j}" for j in (1, 2, 3)),
+          *(f"inertia {j}{j}" for j in (1, 2, 3))}),
     ],
-)
+)  # fmt: skip
 def test_what_is_wrong_of_a_link_takes_the_ratios_of_that_link_alone(wrong, ratios):
     link = {
         "mass": [0.1, 0.2, 0.1], "com": [0.05, 0.07, 0.06], "length": [0.1, 0.12, 0.1],
@@ -82,35 +85,42 @@ def test_what_is_wrong_of_a_link_takes_the_ratios_of_that_link_alone(wrong, rati
     plant, true = PendulumChain(**link), PendulumChain(**link | wrong)
     terms = plant_parameters(plant, driven=(0, 1, 2), largest_torque=1.0)
     names = [t.name for t in terms]
-    change = torch.stack([
-        torch.cat([t.change.get(b, torch.zeros_like(of)).flatten() for b, of in buffers(plant)])
-        for t in terms
-    ], 1)  # fmt: skip
-    sought = torch.cat([
-        (of - before).flatten()
-        for (_, of), (_, before) in zip(buffers(true), buffers(plant), strict=True)
-    ])  # fmt: skip
-    found = torch.linalg.lstsq(change, sought, driver="gelsd").solution
-    assert {n for n, x in zip(names, found, strict=True) if abs(x) > 1e-9} == ratios
-    torch.testing.assert_close(change @ found, sought)
+    vector = torch.zeros(len(terms), dtype=F64)
+    by = {
+        "gravity": true.gravity_moment / plant.gravity_moment,
+        "inertia": (true.inertia_coupling / plant.inertia_coupling).diagonal(),
+    }
+    for k, term in enumerate(names):
+        kind, _, index = term.partition(" ")
+        if kind in by:
+            vector[k] = by[kind][int(index[0]) - 1] - 1.0
+        if kind == "length":
+            vector[k] = true.length[int(index) - 1] / plant.length[int(index) - 1] - 1.0
+    assert {n for n, x in zip(names, vector, strict=True) if abs(x) > 1e-9} == ratios
+    adjusted = adjusted_buffers(plant, terms, vector)
+    for name, of in buffers(true):
+        torch.testing.assert_close(adjusted[name], of)
 
 
 def buffers(plant):
     return [(name, getattr(plant, name)) for name in ("inertia_coupling", "gravity_moment")]
 
 
-def test_buffers_are_linear_in_the_parameters_and_nominal_at_zero():
+def test_buffers_are_nominal_at_zero_and_ratios_multiply():
     plant = pendulum(armature=[1e-4, 1e-4])
     terms = plant_parameters(plant, driven=(0, 1), largest_torque=2.0, drag=True)
     own = dict(plant.named_buffers())
     zero = adjusted_buffers(plant, terms, torch.zeros(len(terms), dtype=F64))
     for name, value in zero.items():
         assert torch.equal(value, own[name])
-    g = torch.Generator().manual_seed(0)
-    a, b = 0.1 * torch.randn(2, len(terms), generator=g, dtype=F64)
-    at = {k: adjusted_buffers(plant, terms, v) for k, v in {"a": a, "b": b, "s": a + b}.items()}
-    for name in zero:
-        torch.testing.assert_close(at["s"][name] + own[name], at["a"][name] + at["b"][name])
+    names = [t.name for t in terms]
+    vector = torch.zeros(len(terms), dtype=F64)
+    for name, x in (("gravity 2", 0.2), ("length 1", -0.1), ("torque offset 2 [N m]", 0.3)):
+        vector[names.index(name)] = x
+    changed = adjusted_buffers(plant, terms, vector)
+    ratio = changed["inertia_coupling"] / own["inertia_coupling"]
+    torch.testing.assert_close(ratio, torch.tensor([[1.0, 1.08], [1.08, 1.0]], dtype=F64))
+    torch.testing.assert_close(changed["torque_offset"], torch.tensor([0.0, 0.3], dtype=F64))
 
 
 def test_a_batch_of_vectors_gives_a_batch_of_plants():
