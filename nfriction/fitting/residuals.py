@@ -9,6 +9,9 @@ CORRELATED, MOST_STRIDE = 8, 20
 # Stretches over which errors are taken as alike, in times that they last, and at least so many
 # samples: shorter ones tell too little of how long errors last in them.
 ALIKE, LEAST_ALIKE = 20, 500
+# Lags that tell how long errors last: so many times as far as they seem alike, and no less than
+# this share of a stretch.
+LAGS, LEAST_LAGS = 10, 0.1
 
 
 def correlation_time(residuals: Tensor) -> float:
@@ -35,15 +38,18 @@ def effective_noise(residuals: Tensor) -> float:
 def local_noise(residuals: Tensor) -> Tensor:
     """Standard deviation that each residual counts with, by how long errors last around it.
 
-    Rounding by an encoder is as good as white while a joint is fast; once it hardly moves, one and
-    the same error stays for a second. A sum of residuals times a sensitivity that changes slowly
-    has the variance of independent ones of this size.
+    Rounding by an encoder makes up for itself from count to count while a joint moves; once it
+    hardly does, one and the same error stays for a second. A sum of residuals times a sensitivity
+    that changes slowly has the variance of independent ones of this size.
 
     Args:
         residuals: [rad or m], shape (window, sample, joint).
 
     Returns:
         Of the same shape.
+
+    References:
+        W. K. Newey, K. D. West, Econometrica 55 (1987), 703-708.
     """
     samples = residuals.shape[1]
     length = max(ALIKE * correlation_time(residuals), LEAST_ALIKE)
@@ -51,7 +57,7 @@ def local_noise(residuals: Tensor) -> Tensor:
     size = torch.stack([part.square().mean(1) for part in stretches])
     # A stretch without error owes that to its window's free start, which is off by as much.
     size = torch.maximum(size, size.flatten(0, 1).median(0).values)
-    lasting = torch.stack([_integrated(_autocovariance(part)) for part in stretches])
+    lasting = torch.stack([_long_run(_autocovariance(part)) for part in stretches])
     counted = [part.shape[1] for part in stretches]
     return (size * lasting).sqrt().transpose(0, 1).repeat_interleave(torch.tensor(counted), 1)
 
@@ -72,10 +78,28 @@ def _autocovariance(residuals: Tensor) -> Tensor:
     return torch.fft.irfft(spectrum, n=2 * n, dim=1)[:, :n]
 
 
+def _correlation(covariance: Tensor) -> Tensor:
+    """Autocorrelation, (window, lag, joint); 1 all over where there is no error."""
+    none = covariance[:, :1] <= 0
+    return torch.where(none, 1.0, covariance / covariance[:, :1].clamp_min(1e-300))
+
+
 def _integrated(covariance: Tensor) -> Tensor:
     """Integrated autocorrelation time in samples, 1 or more, (window, joint)."""
-    none = covariance[:, :1] <= 0
-    correlation = torch.where(none, 1.0, covariance / covariance[:, :1].clamp_min(1e-300))
+    correlation = _correlation(covariance)
     # Summed up to its first zero, beyond which the estimate is noise.
     kept = (correlation >= 0).to(correlation).cumprod(1)
     return (2 * (correlation * kept).sum(1) - 1).clamp_min(1.0)
+
+
+def _long_run(covariance: Tensor) -> Tensor:
+    """Variance of a sum of errors over that of as many independent ones, (window, joint).
+
+    What has changed sign after a while makes up for what came before.
+    """
+    samples = covariance.shape[1]
+    far = (LAGS * _integrated(covariance)).clamp(LEAST_LAGS * samples, samples)
+    lag = torch.arange(samples, dtype=covariance.dtype)
+    # Bartlett's weights keep the sum from being negative.
+    weight = (1 - lag[:, None] / far[:, None]).clamp_min(0.0)
+    return 2 * (weight * _correlation(covariance)).sum(1) - 1
