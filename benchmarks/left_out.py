@@ -17,7 +17,7 @@ from nfriction.fitting import Fit, fit
 from nfriction.fitting.estimate import Zeroed
 from nfriction.friction import Constant, FrictionModel, model_by_name
 from nfriction.friction.model import V_SMOOTH
-from nfriction.plant import LinearAxis, PendulumChain
+from nfriction.plant import Plant
 from nfriction.scoring import score
 from nfriction.selection import cut_blocks
 from nfriction.signals import Motion
@@ -37,7 +37,7 @@ class Set(NamedTuple):
 
     folder: str
     names: tuple[str, ...]
-    plant: Callable[[], PendulumChain | LinearAxis]
+    plant: Callable[[], Plant]
     target: tuple[float, float] = (math.nan, math.nan)
     unit: str = "mrad"
     v_smooth: float = V_SMOOTH
@@ -186,7 +186,7 @@ class Row:
     def add(
         self,
         start: float,
-        plant: PendulumChain | LinearAxis,
+        plant: Plant,
         model: FrictionModel,
         left: Sequence[Left],
     ) -> None:

@@ -14,14 +14,12 @@ import pandas as pd
 import torch
 from dask.distributed import Client, LocalCluster
 
-from nfriction import LFM, LinearAxis, PendulumChain, Recording, compare, fit, twin
+from nfriction import LFM, Plant, Recording, compare, fit, twin
 
 QUICK = {"fit_plant": False, "windows": (0.5,), "max_steps": 1}
 
 
-def coefficients(
-    rig: PendulumChain | LinearAxis, recording: Recording, settings: dict
-) -> dict[str, float]:
+def coefficients(rig: Plant, recording: Recording, settings: dict) -> dict[str, float]:
     """Intervals' middles of one recording's own fit, done on some worker."""
     torch.set_num_threads(1)  # a worker has one, and small tensors want no more
     found = fit(LFM(rig.joints), rig, recording, **settings)

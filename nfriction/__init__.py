@@ -35,7 +35,7 @@ if TYPE_CHECKING:
         Stribeck,
     )
     from nfriction.modelfile import ModelInfo, info_of, load, plant_of, save
-    from nfriction.plant import LinearAxis, PendulumChain, rigs
+    from nfriction.plant import LinearAxis, PendulumChain, Plant, rigs
     from nfriction.recording import Recording
     from nfriction.scoring import Score, score
     from nfriction.selection import Selection, select
@@ -67,7 +67,7 @@ _HOME = {
         "Stribeck",
     ),
     "modelfile": ("ModelInfo", "info_of", "load", "plant_of", "save"),
-    "plant": ("LinearAxis", "PendulumChain", "rigs"),
+    "plant": ("LinearAxis", "PendulumChain", "Plant", "rigs"),
     "recording": ("Recording",),
     "scoring": ("Score", "score"),
     "selection": ("Selection", "select"),
@@ -100,6 +100,7 @@ __all__ = [
     "ModelInfo",
     "NFStribeck",
     "PendulumChain",
+    "Plant",
     "Recording",
     "Rollout",
     "Score",

@@ -14,7 +14,7 @@ from nfriction.friction import Constant, FrictionModel, NeuroFuzzy
 from nfriction.friction.adaptive import CLASSES, Adaptive
 from nfriction.friction.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
 from nfriction.many import Data, fit_models
-from nfriction.plant import LinearAxis, PendulumChain
+from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.scoring import HORIZONS, Score, improvement_table, rmse_table, score
 from nfriction.signals import Motion, kalman_smoother
@@ -196,7 +196,7 @@ class Comparison:
 
 
 def compare(
-    plant: PendulumChain | LinearAxis,
+    plant: Plant,
     models: str | Sequence[str],
     train: Recording | Sequence[Recording],
     held_out: Recording | Sequence[Recording] = (),
@@ -324,6 +324,6 @@ def coefficient_summary(model: FrictionModel) -> dict[str, Any]:
     return summary.get("always", summary)
 
 
-def _motion(plant: PendulumChain | LinearAxis, recording: Recording) -> Motion:
+def _motion(plant: Plant, recording: Recording) -> Motion:
     joint = recording.joint_coordinates(plant)
     return kalman_smoother(joint.time, joint.q)

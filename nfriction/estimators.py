@@ -14,13 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 from nfriction.fitting import Fit, fit
 from nfriction.fitting.constant import WINDOWS
 from nfriction.friction import Constant, FrictionModel, model_by_name
-from nfriction.plant import LinearAxis, PendulumChain
+from nfriction.plant import Plant
 from nfriction.recording import Recording, Unit
 from nfriction.scoring import score
 from nfriction.signals import kalman_smoother
 
 Array = NDArray[np.float64]
-Plant = PendulumChain | LinearAxis
 # One recording, or its table with columns time, q1, ... as `Recording.from_pandas` takes it.
 Sample = Recording | pd.DataFrame
 

@@ -10,13 +10,11 @@ from nfriction import parallel
 from nfriction.fitting import Fit, fit
 from nfriction.friction import model_by_name
 from nfriction.friction.models import ConstantModel
-from nfriction.plant import LinearAxis, PendulumChain
+from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
 logger = logging.getLogger(__name__)
-
-Plant = PendulumChain | LinearAxis
 
 
 class Data(NamedTuple):

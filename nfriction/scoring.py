@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from nfriction.friction import FrictionModel
-from nfriction.plant import LinearAxis, PendulumChain
+from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion, kalman_smoother
 from nfriction.simulation import Friction, Scheme, required_substeps, rollout
@@ -90,7 +90,7 @@ class Score:
 
 
 def score(
-    plant: PendulumChain | LinearAxis,
+    plant: Plant,
     friction: FrictionModel | None,
     recording: Recording,
     *,
@@ -157,9 +157,7 @@ def score(
     )
 
 
-def _substeps(
-    plant: PendulumChain | LinearAxis, friction: Friction | None, longest: float, name: str
-) -> int | None:
+def _substeps(plant: Plant, friction: Friction | None, longest: float, name: str) -> int | None:
     """Integration steps to a sample; None where friction is too steep to be simulated."""
     if friction is None:
         return 1
@@ -179,7 +177,7 @@ def _substeps(
 
 
 def _simulate(
-    plant: PendulumChain | LinearAxis,
+    plant: Plant,
     friction: Friction | None,
     start: Start,
     tau: Array | None,
@@ -204,7 +202,7 @@ def _simulate(
 
 
 def _windows(
-    plant: PendulumChain | LinearAxis,
+    plant: Plant,
     friction: FrictionModel | None,
     recording: Recording,
     motion: Motion,

@@ -14,7 +14,7 @@ from nfriction.fitting.holdback import LEAST_ERROR
 from nfriction.fitting.preparation import zeroed_each
 from nfriction.friction import model_by_name
 from nfriction.many import Data, Fits, fit_models
-from nfriction.plant import LinearAxis, PendulumChain
+from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.scoring import score
 from nfriction.signals import Motion, kalman_smoother
@@ -101,7 +101,7 @@ class Block(NamedTuple):
 
 
 def select(
-    plant: PendulumChain | LinearAxis,
+    plant: Plant,
     models: Sequence[str],
     recordings: Sequence[Recording],
     *,
@@ -176,7 +176,7 @@ def _folds(
 
 
 def _candidate(
-    plant: PendulumChain | LinearAxis,
+    plant: Plant,
     name: str,
     fits: Mapping[str, Fits],
     unseen: Mapping[str, list[Block]],
@@ -231,7 +231,7 @@ def choose(
     )
 
 
-def cut_blocks(plant: PendulumChain | LinearAxis, recording: Recording, count: int) -> list[Block]:
+def cut_blocks(plant: Plant, recording: Recording, count: int) -> list[Block]:
     """Blocks of a recording that follow each other, of equal numbers of samples.
 
     The whole recording is smoothed once: a block's ends are then as well known as its middle.

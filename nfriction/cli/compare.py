@@ -14,7 +14,7 @@ from nfriction.cli.console import Parser, Progress, UsageError, check_writable, 
 
 if TYPE_CHECKING:
     from nfriction.comparison import InitialStates
-    from nfriction.plant import LinearAxis, PendulumChain
+    from nfriction.plant import Plant
     from nfriction.recording import Recording
 
 EXAMPLE = """example:
@@ -81,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def run_comparison(
-    plant: PendulumChain | LinearAxis,
+    plant: Plant,
     train: list[Recording],
     held_out: list[Recording],
     arguments: argparse.Namespace,
@@ -168,7 +168,7 @@ def _log(path: Path | None) -> Iterator[logging.Logger]:
 
 def _initial_states(
     arguments: argparse.Namespace,
-    plant: PendulumChain | LinearAxis,
+    plant: Plant,
     recordings: Sequence[Recording],
 ) -> InitialStates | None:
     """States of these recordings; says which have none and so start from their smoothed motion."""

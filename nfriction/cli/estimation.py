@@ -12,7 +12,7 @@ from nfriction.cli import names
 from nfriction.cli.console import UsageError, count, one_line, seconds, warn
 
 if TYPE_CHECKING:
-    from nfriction.plant import LinearAxis, PendulumChain
+    from nfriction.plant import Plant
     from nfriction.recording import Recording
 
 
@@ -65,7 +65,7 @@ def fit_settings(arguments: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def read_rig(name: str) -> PendulumChain | LinearAxis:
+def read_rig(name: str) -> Plant:
     """The rig that `--rig` names."""
     from nfriction.plant import rigs
 
@@ -73,7 +73,7 @@ def read_rig(name: str) -> PendulumChain | LinearAxis:
 
 
 def read_recordings(
-    paths: Sequence[Path], plant: PendulumChain | LinearAxis, arguments: argparse.Namespace
+    paths: Sequence[Path], plant: Plant, arguments: argparse.Namespace
 ) -> list[Recording]:
     """The recordings in files, in the angles and units that the options tell."""
     from nfriction.recording import Recording, RecordingWarning

@@ -11,7 +11,7 @@ from nfriction.fitting.classes import AccelerationClasses
 from nfriction.fitting.constant import Settings
 from nfriction.fitting.constant_start import constant_start
 from nfriction.fitting.labelled import LabelledProblem, driving_classes, labelled_model
-from nfriction.fitting.outcome import Fit, Plant, trajectory_outcome
+from nfriction.fitting.outcome import Fit, trajectory_outcome
 from nfriction.fitting.preparation import (
     adjustable_terms,
     at_zeros,
@@ -28,6 +28,7 @@ from nfriction.fitting.settling import PRIOR_SD, adopt_classes, settled
 from nfriction.fitting.trajectory import solve_trajectory
 from nfriction.fitting.windows import checked_lengths, cut_windows
 from nfriction.friction import Adaptive, FrictionModel
+from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 from nfriction.solve.least_squares import Step

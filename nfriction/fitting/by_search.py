@@ -10,7 +10,7 @@ from nfriction.fitting.classes import AccelerationClasses
 from nfriction.fitting.constant import Settings, fit_by_torque
 from nfriction.fitting.constant_start import constant_start
 from nfriction.fitting.labelled import driving_classes, labelled_model
-from nfriction.fitting.outcome import Fit, Plant
+from nfriction.fitting.outcome import Fit
 from nfriction.fitting.position_error import PositionError
 from nfriction.fitting.preparation import (
     constant_schedule,
@@ -34,6 +34,7 @@ from nfriction.fitting.torque import natural_scale
 from nfriction.fitting.windows import cut_windows
 from nfriction.friction import Adaptive, Constant, FrictionModel
 from nfriction.friction.schedules import Tabulated
+from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 

@@ -1,14 +1,15 @@
 """Fit the constant law: torques first, then windows of growing length."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from nfriction.fitting.eccentricity import may_be_eccentric, richer_by_evidence
-from nfriction.fitting.nested import lowest_of
-from nfriction.fitting.outcome import Continuity, Fit, Plant, torque_outcome, trajectory_outcome
+from nfriction.fitting.growing import through_windows
+from nfriction.fitting.nested import from_simpler
+from nfriction.fitting.outcome import Continuity, Fit, torque_outcome, trajectory_outcome
 from nfriction.fitting.preparation import (
     adjustable_terms,
     constant_schedule,
@@ -16,10 +17,10 @@ from nfriction.fitting.preparation import (
     is_eccentric,
     mixing_of,
 )
-from nfriction.fitting.stages import JUMP_SD, LEAST_NOISE, Callback, Refinement, Stage, flat, least
+from nfriction.fitting.stages import JUMP_SD, Callback, Refinement, flat
 from nfriction.fitting.torque import TorqueFit, fit_torque, prior_sd
-from nfriction.fitting.windows import cut_windows
 from nfriction.friction import Constant, FrictionModel
+from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
@@ -29,12 +30,8 @@ TOO_LONG = (
 )
 # Dry friction of a tenth of a link's largest gravity moment lets it rest up to 0.1 rad off [rad].
 ZERO_SD = 0.05
-# First guess of what a model of a bench leaves unexplained, before a fit tells [rad or m].
-FIRST_NOISE = 1e-3
 # Short windows converge from far away, long ones tell small friction and small drag apart [s].
 WINDOWS = (0.5, 2.0, 5.0)
-# Relative fall of the cost that ends a search of which only the neighbourhood matters.
-LOOSE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -90,7 +87,8 @@ def fit_constant(
         each: whether encoders were zeroed anew at the start of each recording.
     """
     joint = in_joint_coordinates(plant, model, recordings)
-    _set_by_torque(model, start.plant if start else plant, joint, motions)
+    begun = start.plant if start else plant
+    _set_by_torque(model, begun, joint, motions)
     mixing = mixing_of(plant, recordings[0].convention_on(plant))
     known = {name: value for name, value, _ in start.plant_terms} if start else {}
     zero_sd = torch.full((len(joint), plant.joints), ZERO_SD, dtype=torch.float64)
@@ -111,28 +109,23 @@ def fit_constant(
         return fit_torque(model.law, found, joint, motions, model.v_smooth).coefficients
 
     linear = all(c.linear or not c.fitted for c in model.law.coefficients)
-    stage, left_out = _through_windows(
+    stage, left_out = through_windows(
         search, settings.windows, vector, motions, None if linear else by_torque
     )
-    law = model.law.simpler
-    if law is not None and stage.result.status != "stopped":
+    if (law := model.law.simpler) is not None and stage.result.status != "stopped":
         simpler = FrictionModel(law, Constant(law, model.joints), model.v_smooth)
-        _set_by_torque(simpler, start.plant if start else plant, joint, motions)
-        base, without = _through_windows(
-            replace(search, model=simpler), settings.windows, vector, motions,
-            of=f", {law.name} law",
-        )  # fmt: skip
-        lowest = lowest_of(search, stage, base, by_torque)
-        if lowest.problem is not stage.problem:
-            left_out = without
-        stage = lowest
+        _set_by_torque(simpler, begun, joint, motions)
+        stage, left_out = from_simpler(
+            search, stage, left_out, simpler, settings.windows, vector, motions, by_torque
+        )
     undecided = start is None and settings.eccentricity is None
     possible = settings.fit_plant and may_be_eccentric(plant)
     if undecided and possible and stage.result.status != "stopped":
         tolerance = flat(stage.result.cost)
         stage = richer_by_evidence(stage, refinement(True), tolerance) or stage
     found = trajectory_outcome(stage.problem, stage.result, stage.residuals, motions)
-    return replace(found, continuity=settings.continuity).telling(left_out)
+    found = replace(found, continuity=settings.continuity, left_out=left_out)
+    return found.telling([TOO_LONG.format(length) for length in left_out])
 
 
 def _set_by_torque(
@@ -144,69 +137,3 @@ def _set_by_torque(
     schedule.set_coefficients(torque.coefficients)
     schedule.set_prior_sd(prior_sd(model.law, torque))
     return torque
-
-
-def _through_windows(
-    search: Refinement,
-    windows: Sequence[float],
-    vector: Tensor,
-    motions: tuple[Motion, ...],
-    by_torque: Callable[[Plant], Tensor] | None = None,
-    of: str = "",
-) -> tuple[Stage, tuple[str, ...]]:
-    """Stages of growing length, each from the states and weighed by the errors of the last.
-
-    Lengths that the motion does not allow are left out, which is said in a sentence.
-
-    With coefficients `by_torque` on a plant, the first stage is searched a second time from what
-    they are on the plant that it found: a law that is not linear has several minima, and on an
-    inertia that is a little wrong the torques lead to a worse one.
-    """
-    reached: Stage | None = None
-    zeros: Tensor | None = None
-    noise, traced = FIRST_NOISE, motions
-    for length in windows:
-        # Encoders that were zeroed where dry friction held the links were zeroed at rest.
-        cut = cut_windows(search.joint, traced, length, from_rest=search.zero_sd is not None)
-        problem = search.problem(cut, noise, far=reached is None and len(windows) > 1)
-        tolerance = LOOSE
-        if length == windows[-1]:
-            # Of a start far away the cost says nothing; the last stage's minimum is as high.
-            near = reached and least(reached.residuals, noise)
-            tolerance = flat(near or float(problem.cost(problem.unknowns.start(vector))))
-        name = f"{length:g} s windows{of}"
-        stage = search.search(problem, vector, tolerance, name, zeros)
-        if reached is None and by_torque is not None and stage.result.status != "stopped":
-            stage = _better_start(search, stage, tolerance, name, by_torque)
-        if reached is not None and stage.lost_since(reached):
-            schedule = search.model.schedule
-            schedule.set_parameter_vector(reached.problem.unknowns.split(reached.result.x)[0])
-            return reached, (TOO_LONG.format(length),)
-        reached, vector, noise = stage, stage.vector, max(stage.noise, LEAST_NOISE)
-        zeros = stage.zeros
-        if stage.result.status == "stopped":
-            break
-        traced = problem.traced(stage.result.x, traced)
-    assert reached is not None
-    return reached, ()
-
-
-def _better_start(
-    search: Refinement,
-    stage: Stage,
-    tolerance: float,
-    name: str,
-    by_torque: Callable[[Plant], Tensor],
-) -> Stage:
-    """A stage, or the same searched from the coefficients by torque on its plant if that is better.
-
-    The model is left with the coefficients of the one returned.
-    """
-    problem, schedule = stage.problem, constant_schedule(search.model)
-    found = schedule.parameter_vector()
-    schedule.set_coefficients(by_torque(problem.plant_at(stage.vector)))
-    other = search.search(problem, stage.vector, tolerance, name, stage.zeros)
-    if other.result.status == "stopped" or other.result.cost < stage.result.cost:
-        return other
-    schedule.set_parameter_vector(found)
-    return stage

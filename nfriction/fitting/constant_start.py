@@ -5,9 +5,10 @@ from typing import TypeGuard
 
 from nfriction.fitting.constant import Settings, fit_constant
 from nfriction.fitting.misgivings import as_it_looks, misgivings
-from nfriction.fitting.outcome import Continuity, Fit, Plant
+from nfriction.fitting.outcome import Continuity, Fit
 from nfriction.fitting.preparation import in_joint_coordinates, zeros_serve
 from nfriction.friction import Constant, FrictionModel
+from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 

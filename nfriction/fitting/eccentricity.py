@@ -4,13 +4,13 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.stages import Refinement, Stage
-from nfriction.plant import LinearAxis, PendulumChain
+from nfriction.plant import PendulumChain, Plant
 from nfriction.solve.least_squares import Quadratic
 
 TERMS = ("encoder_cosine", "encoder_sine")
 
 
-def may_be_eccentric(plant: PendulumChain | LinearAxis) -> bool:
+def may_be_eccentric(plant: Plant) -> bool:
     """Whether the plant's encoders turn with joints."""
     return isinstance(plant, PendulumChain)
 

@@ -10,12 +10,13 @@ from nfriction.fitting.constant_start import constant_start
 from nfriction.fitting.eccentricity import may_be_eccentric
 from nfriction.fitting.misgivings import as_it_looks, misgivings, refuse_motionless
 from nfriction.fitting.network import fit_network
-from nfriction.fitting.outcome import Continuity, Fit, Plant
+from nfriction.fitting.outcome import Continuity, Fit
 from nfriction.fitting.preparation import in_joint_coordinates, listed, motions_of
 from nfriction.fitting.stages import JUMP_SD, Callback
 from nfriction.fitting.windows import checked_lengths
 from nfriction.friction import Adaptive, FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
+from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 

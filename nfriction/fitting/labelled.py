@@ -7,12 +7,13 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.classes import AccelerationClasses
-from nfriction.fitting.outcome import Fit, Plant
+from nfriction.fitting.outcome import Fit
 from nfriction.fitting.preparation import constant_schedule
 from nfriction.fitting.torque import natural_scale
 from nfriction.fitting.trajectory import TrajectoryProblem
 from nfriction.fitting.windows import Windows
 from nfriction.friction import Adaptive, FrictionModel
+from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 from nfriction.simulation import Rollout, integrate

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nfriction.fitting.outcome import Plant
 from nfriction.fitting.preparation import swings_freely, zeroed_each
 from nfriction.fitting.torque import friction_torque
+from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion, count_seen
 

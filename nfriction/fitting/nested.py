@@ -1,17 +1,48 @@
 """A law that is not linear, searched from where the simpler law that it contains ended."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from nfriction.fitting.outcome import Plant
+from nfriction.fitting.growing import through_windows
 from nfriction.fitting.preparation import constant_schedule
 from nfriction.fitting.stages import LEAST_NOISE, Refinement, Stage, flat, least
 from nfriction.fitting.windows import Windows
-from nfriction.friction import Law
+from nfriction.friction import FrictionModel, Law
+from nfriction.plant import Plant
+from nfriction.signals import Motion
+
+
+def from_simpler(
+    search: Refinement,
+    own: Stage,
+    left_out: tuple[float, ...],
+    simpler: FrictionModel,
+    windows: Sequence[float],
+    vector: Tensor,
+    motions: tuple[Motion, ...],
+    by_torque: Callable[[Plant], Tensor],
+) -> tuple[Stage, tuple[float, ...]]:
+    """The lowest end of a law, also looked for from its simpler law's; see `lowest_of`.
+
+    Args:
+        search: of the law.
+        own, left_out: its end, and the lengths of windows that it could not follow.
+        simpler: model of the simpler law, at what torques tell.
+        windows, vector, motions: see `through_windows`.
+        by_torque: coefficients of the law that torques tell on a plant, (joint, coefficient).
+
+    Returns:
+        Its stage, and the lengths of windows that it could not follow.
+    """
+    base, without = through_windows(
+        replace(search, model=simpler), windows, vector, motions, of=f", {simpler.law.name} law"
+    )
+    lowest = lowest_of(search, own, base, by_torque)
+    return lowest, left_out if lowest.problem is own.problem else without
 
 
 def lowest_of(

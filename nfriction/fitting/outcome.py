@@ -23,11 +23,10 @@ from nfriction.fitting.verdict import (
     warnings_of,
 )
 from nfriction.friction import Constant, FrictionModel
-from nfriction.plant import LinearAxis, PendulumChain
+from nfriction.plant import Plant
 from nfriction.signals import Motion, count_seen
 from nfriction.solve.least_squares import LeastSquaresResult
 
-Plant = PendulumChain | LinearAxis
 # Whether the windows of a recording make one motion.
 Continuity = Literal["free", "soft", "hard"]
 
@@ -61,6 +60,7 @@ class Fit:
         continuity: of the windows that were fitted, see `fit`.
         told: those of the warnings that are of recordings and windows; a fit that starts here says
             them, too.
+        left_out: lengths of windows that the law could not follow [s].
     """
 
     model: FrictionModel
@@ -80,6 +80,7 @@ class Fit:
     uncertainty: CoefficientUncertainty | None = None
     continuity: Continuity = "free"
     told: tuple[str, ...] = ()
+    left_out: tuple[float, ...] = ()
 
     def telling(self, told: Sequence[str]) -> "Fit":
         """The same, which tells this of recordings and windows first, and once."""

@@ -8,7 +8,7 @@ from torch import Tensor
 from nfriction.compiled import integrate_compiled
 from nfriction.fitting.windows import Windows
 from nfriction.friction import FrictionModel
-from nfriction.plant import LinearAxis, PendulumChain
+from nfriction.plant import Plant
 from nfriction.simulation import integrate
 
 
@@ -29,7 +29,7 @@ class PositionError:
 
     def __init__(
         self,
-        plant: PendulumChain | LinearAxis,
+        plant: Plant,
         friction: FrictionModel,
         windows: Windows,
         mixing: Tensor,

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nfriction.angles import AngleConvention
-from nfriction.fitting.outcome import Fit, Plant
+from nfriction.fitting.outcome import Fit
 from nfriction.fitting.plant_parameters import PlantParameter, plant_parameters
 from nfriction.fitting.windows import begins_still
 from nfriction.friction import Constant, FrictionModel
-from nfriction.plant import LinearAxis, PendulumChain
+from nfriction.plant import LinearAxis, PendulumChain, Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion, kalman_smoother
 from nfriction.simulation import required_substeps

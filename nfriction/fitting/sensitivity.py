@@ -20,7 +20,7 @@ from nfriction import codegen
 from nfriction.fitting.plant_parameters import PlantParameter, adjusted_buffers
 from nfriction.friction import FrictionModel
 from nfriction.friction.sensitivity import FactoredSensitivity, Sensitivity
-from nfriction.plant import LinearAxis, PendulumChain
+from nfriction.plant import Plant
 from nfriction.simulation import Rollout, rk4_step
 
 logger = logging.getLogger(__name__)
@@ -55,7 +55,7 @@ class StepJacobian:
 
     def __init__(
         self,
-        plant: PendulumChain | LinearAxis,
+        plant: Plant,
         friction: FrictionModel,
         parameters: list[PlantParameter],
     ) -> None:

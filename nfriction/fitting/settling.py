@@ -9,11 +9,12 @@ from torch import Tensor
 
 from nfriction.fitting.classes import AccelerationClasses, find_classes
 from nfriction.fitting.labelled import Labelled
-from nfriction.fitting.outcome import Fit, Plant
+from nfriction.fitting.outcome import Fit
 from nfriction.fitting.position_error import PositionError
 from nfriction.fitting.preparation import constant_schedule
 from nfriction.fitting.windows import Windows
 from nfriction.friction import CLASSES, Adaptive, FrictionModel
+from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 

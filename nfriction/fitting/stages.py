@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.anchors import Anchors
-from nfriction.fitting.outcome import Continuity, Plant
+from nfriction.fitting.outcome import Continuity
 from nfriction.fitting.plant_parameters import PlantParameter
 from nfriction.fitting.preparation import substeps_of
 from nfriction.fitting.residuals import effective_noise
@@ -15,6 +15,7 @@ from nfriction.fitting.sensitivity import StepJacobian
 from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
 from nfriction.fitting.windows import Windows
 from nfriction.friction import Constant, FrictionModel
+from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.solve.least_squares import LeastSquaresResult, Status, Step
 from nfriction.solve.levenberg import FULL

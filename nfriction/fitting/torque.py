@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nfriction.friction import FrictionModel, Law
 from nfriction.friction.model import V_SMOOTH
-from nfriction.plant import LinearAxis, PendulumChain
+from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
@@ -40,7 +40,7 @@ class TorqueFit:
 
 
 def friction_torque(
-    plant: PendulumChain | LinearAxis, recording: Recording, motion: Motion
+    plant: Plant, recording: Recording, motion: Motion
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Velocity, load and friction torque along a recording, each (sample, joint).
 
@@ -58,9 +58,7 @@ def friction_torque(
     return qd, plant.load(q, qd), left
 
 
-def largest_moved(
-    plant: PendulumChain | LinearAxis, motions: Sequence[Motion]
-) -> tuple[Tensor, Tensor]:
+def largest_moved(plant: Plant, motions: Sequence[Motion]) -> tuple[Tensor, Tensor]:
     """Largest speed of each joint, and largest torque of gravity or of inertia there, (joint,).
 
     Of a free swing they all but cancel; each by itself tells what moves the joint.
@@ -82,7 +80,7 @@ def _inside(time: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 def fit_torque(
     law: Law,
-    plant: PendulumChain | LinearAxis,
+    plant: Plant,
     recordings: Sequence[Recording],
     motions: Sequence[Motion],
     v_smooth: float = V_SMOOTH,
@@ -130,7 +128,7 @@ def fit_torque(
 
 def natural_scale(
     model: FrictionModel,
-    plant: PendulumChain | LinearAxis,
+    plant: Plant,
     recordings: Sequence[Recording],
     motions: Sequence[Motion],
 ) -> Tensor:

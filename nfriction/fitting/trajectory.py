@@ -25,7 +25,7 @@ from nfriction.fitting.unknowns import Unknowns
 from nfriction.fitting.verdict import Information, information, standard_deviations
 from nfriction.fitting.windows import Windows
 from nfriction.friction.neurofuzzy import NeuroFuzzy
-from nfriction.plant import LinearAxis, PendulumChain
+from nfriction.plant import Plant
 from nfriction.signals import Motion
 from nfriction.simulation import Rollout, integrate
 from nfriction.solve.least_squares import LeastSquaresResult, Quadratic, Step
@@ -87,7 +87,7 @@ class TrajectoryProblem:
         self._simulated: tuple[Tensor, Rollout] | None = None
         self._hessian = torch.zeros(0, 0, dtype=torch.float64)
 
-    def plant_at(self, vector: Tensor) -> PendulumChain | LinearAxis:
+    def plant_at(self, vector: Tensor) -> Plant:
         """The plant with its adjustable terms at a parameter vector."""
         changed = adjusted_buffers(self.plant, self.jacobian.parameters, vector)
         return self.plant.replace(**changed) if changed else self.plant
@@ -184,7 +184,7 @@ class TrajectoryProblem:
         self._simulated = (x.clone(), motion)
         return motion
 
-    def _run(self, plant: PendulumChain | LinearAxis, q0: Tensor, qd0: Tensor) -> Rollout:
+    def _run(self, plant: Plant, q0: Tensor, qd0: Tensor) -> Rollout:
         """Motion of all windows from their first states, with the schedule as it is."""
         return integrate(plant, self.friction, q0, qd0, self.tau, self.step, memory=self.memory)
 

@@ -13,7 +13,7 @@ from nfriction.atomic import write_atomically
 from nfriction.friction import MODELS, FrictionModel, model_by_name
 from nfriction.modelfile.content import ModelFileError, checksum_of, read_model_file, short
 from nfriction.modelfile.description import ModelInfo, describe
-from nfriction.plant import LinearAxis, PendulumChain
+from nfriction.plant import Plant
 from nfriction.plant.rigfile import from_dict
 
 # What building a mechanism from foreign JSON may raise.
@@ -93,7 +93,7 @@ def info_of(path: str | Path) -> ModelInfo:
         raise ModelFileError(f"{path}: {error}") from error
 
 
-def plant_of(path: str | Path) -> PendulumChain | LinearAxis:
+def plant_of(path: str | Path) -> Plant:
     """The mechanism that a model was fitted with, terms adjusted by the fit included.
 
     Raises:

@@ -76,9 +76,27 @@ class Plant(nn.Module):
         """Acceleration; the same as `forward_dynamics`, so that a plant can be exported."""
         return self.forward_dynamics(q, qd, tau)
 
+    # Each mechanism has its own; without an equation it is none.
+
+    def gravity(self, q: Tensor) -> Tensor:
+        """The gravity part of the bias."""
+        raise NotImplementedError(f"{type(self).__name__} does not say what gravity does to it.")
+
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
-        """Acceleration at a state under joint torques; each plant has its own."""
+        """Acceleration at a state under joint torques."""
         raise NotImplementedError(f"{type(self).__name__} has no equations of motion.")
+
+    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+        """Joint torques that give the accelerations."""
+        raise NotImplementedError(f"{type(self).__name__} has no inverse dynamics.")
+
+    def load(self, q: Tensor, qd: Tensor) -> Tensor:
+        """Normal load of each joint over its load at rest [-]."""
+        raise NotImplementedError(f"{type(self).__name__} does not say what its joints carry.")
+
+    def mobility(self) -> Tensor:
+        """Largest acceleration per torque of each joint, (*batch, joint)."""
+        raise NotImplementedError(f"{type(self).__name__} does not say how mobile it is.")
 
     def replace(self, **buffers: Tensor) -> Self:
         """A shallow copy with some buffers swapped; this plant stays as it is.

@@ -22,6 +22,7 @@ from nfriction import strict_json
 from nfriction.atomic import write_atomically
 from nfriction.plant import robotfile
 from nfriction.plant.axis import LinearAxis
+from nfriction.plant.base import Plant
 from nfriction.plant.chain import PendulumChain
 
 _KINDS: dict[str, type[PendulumChain] | type[LinearAxis]] = {
@@ -37,7 +38,7 @@ _TEXTS, _LISTS_OF_TEXT, _TABLES = (
 _MAY_BE_NULL = ("com", "inertia", "arm", "armature", "joint_names", "position_quantum")
 
 
-def from_dict(data: Mapping[str, Any]) -> PendulumChain | LinearAxis:
+def from_dict(data: Mapping[str, Any]) -> Plant:
     """The plant of a `to_dict`, whichever its kind.
 
     Raises:
@@ -54,7 +55,7 @@ def from_dict(data: Mapping[str, Any]) -> PendulumChain | LinearAxis:
         raise ValueError(f"its values do not fit together ({_short(error)}).") from error
 
 
-def read(path: str | Path) -> PendulumChain | LinearAxis:
+def read(path: str | Path) -> Plant:
     """Read a rig file: .json, .toml from Python 3.11 on, .urdf, or .xml (MJCF or URDF).
 
     Raises:
@@ -83,7 +84,7 @@ def read(path: str | Path) -> PendulumChain | LinearAxis:
         raise ValueError(f"{path}: {_short(error)}") from error
 
 
-def write(plant: PendulumChain | LinearAxis, path: str | Path) -> None:
+def write(plant: Plant, path: str | Path) -> None:
     """Write a plant, fitted buffers included, as JSON that `read` takes; whole or not at all.
 
     Raises:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from nfriction.plant.arm import Arm
 from nfriction.plant.axis import LinearAxis
+from nfriction.plant.base import Plant
 from nfriction.plant.chain import PendulumChain
 from nfriction.plant.rigfile import from_dict, read, write
 
@@ -219,7 +220,7 @@ def xl330() -> PendulumChain:
     )
 
 
-_RIGS: dict[str, Callable[[], PendulumChain | LinearAxis]] = {
+_RIGS: dict[str, Callable[[], Plant]] = {
     "tlrip": tlrip,
     "rtip": rtip,
     "multiarm-single": multiarm_single,
@@ -238,7 +239,7 @@ def names() -> list[str]:
     return list(_RIGS)
 
 
-def by_name(name: str) -> PendulumChain | LinearAxis:
+def by_name(name: str) -> Plant:
     """A rig by its name.
 
     Raises:

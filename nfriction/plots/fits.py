@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from nfriction.fitting.torque import friction_torque
 from nfriction.friction import FrictionModel
-from nfriction.plant import LinearAxis, PendulumChain
+from nfriction.plant import Plant
 from nfriction.plots import style
 from nfriction.recording import Recording
 from nfriction.signals import Motion, kalman_smoother
@@ -25,7 +25,7 @@ _BINS = 24  # of its medians
 
 
 def torque_over_velocity(
-    plant: PendulumChain | LinearAxis,
+    plant: Plant,
     models: Mapping[str, FrictionModel],
     recordings: Sequence[Recording],
     motions: Sequence[Motion] | None = None,

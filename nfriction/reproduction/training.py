@@ -21,7 +21,7 @@ from nfriction.export import torchscript
 from nfriction.fitting import Fit, SearchState
 from nfriction.friction import FrictionModel
 from nfriction.modelfile import ModelInfo, save
-from nfriction.plant import LinearAxis, PendulumChain, rigs
+from nfriction.plant import Plant, rigs
 from nfriction.recording import Recording
 from nfriction.reproduction.fitfile import load_fit, save_fit
 from nfriction.scoring import Score, score
@@ -68,7 +68,7 @@ class Data:
         states: exact q0 and qd0 of a twin's recordings.
     """
 
-    plant: PendulumChain | LinearAxis
+    plant: Plant
     train: list[Recording]
     held_out: list[Recording]
     motions: list[Motion]
@@ -112,7 +112,7 @@ class Training:
             made = twin.make(
                 given.twin, seed=given.seed, duration=given.seconds, progress=sys.stderr.isatty()
             )
-            plant: PendulumChain | LinearAxis = made.plant
+            plant: Plant = made.plant
             train, held_out = made.part("train"), made.part("held_out")
             states: dict[str, Any] = dict(made.initial_states)
         else:
@@ -175,7 +175,7 @@ class Training:
         data: Data,
         model: FrictionModel,
         info: ModelInfo,
-        plant: PendulumChain | LinearAxis | None = None,
+        plant: Plant | None = None,
     ) -> str:
         """Write the model and its TorchScript, score it, and say so in words."""
         name = type(model).__name__

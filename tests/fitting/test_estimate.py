@@ -461,9 +461,9 @@ def test_a_law_that_torques_mislead_starts_anew_on_the_plant_that_it_found(
     found = fitted()
     assert misled[1] is not misled[0]
     assert found.residual == pytest.approx(2 * np.pi / 8192 / 12**0.5, rel=0.2)
-    better = "nfriction.fitting.constant._better_start"
+    better = "nfriction.fitting.growing._better_start"
     monkeypatch.setattr(better, lambda search, stage, *rest: stage)
-    monkeypatch.setattr("nfriction.fitting.constant.lowest_of", lambda search, own, *rest: own)
+    monkeypatch.setattr("nfriction.fitting.nested.lowest_of", lambda search, own, *rest: own)
     assert fitted().residual > 1.02 * found.residual
 
 
@@ -482,7 +482,7 @@ def test_a_search_in_vain_from_the_simpler_law_leaves_the_model_as_it_was(monkey
     monkeypatch.setattr("nfriction.fitting.constant.fit_torque", by_torque)
     found = fit(Stribeck(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
     assert simpler
-    monkeypatch.setattr("nfriction.fitting.constant.lowest_of", lambda search, own, *rest: own)
+    monkeypatch.setattr("nfriction.fitting.nested.lowest_of", lambda search, own, *rest: own)
     simpler.clear()
     alone = fit(Stribeck(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
     assert torch.equal(found.model.schedule.values, alone.model.schedule.values)
