@@ -4,15 +4,17 @@ import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from nfriction.fitting.anchors import anchors_where_unseen
 from nfriction.fitting.constant import Settings
-from nfriction.fitting.holdback import Judgement, error_on, judged_windows
+from nfriction.fitting.holdback import WORTH, Judgement, error_on, judged_windows
 from nfriction.fitting.neurofuzzy_start import settle_on, start_at
-from nfriction.fitting.outcome import Fit, Plant, trajectory_outcome
+from nfriction.fitting.outcome import Fit, trajectory_outcome
+from nfriction.fitting.plant_parameters import PlantParameter
 from nfriction.fitting.preparation import (
     adjustable_terms,
     at_zeros,
@@ -26,11 +28,16 @@ from nfriction.fitting.trajectory import TrajectoryProblem
 from nfriction.fitting.windows import cut_windows
 from nfriction.friction import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
+from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
 # Priors of a network that are tried, over its own: windows held back choose among them.
 PRIOR_SHARES = (1.0, 1 / 3)
+# Within the motion recorded a plant and a network may make up for each other; beyond it, where the
+# network fades, such a plant is wrong. It stays as near to the constant fit's as so many standard
+# deviations of what that left open.
+PLANT_SDS = 3.0
 INTERRUPTED = "Stopped before the network was found; its constant law is kept."
 
 
@@ -48,7 +55,7 @@ def fit_network(
         model, plant: see `fit`.
         recordings, motions: as they are; the zeros that the constant fit found are added here.
         start: the constant fit.
-        settings: see `fit`; of the windows the last length serves.
+        settings: see `fit`; of the windows the last length serves that the constant fit followed.
     """
     given, moved = at_zeros(start.zeros, plant, recordings, motions)
     joint = in_joint_coordinates(plant, model, given)
@@ -62,23 +69,44 @@ def fit_network(
     assert isinstance(model.schedule, NeuroFuzzy)
     # From smoothed states at full length a search creeps along hard seams.
     jump_sd = None if settings.continuity == "free" else JUMP_SD["soft"]
-    search = Refinement(
+    free = Refinement(
         plant, model, joint, mixing, terms, settings.max_steps, settings.callback,
         jump_sd=jump_sd, anchors=anchors_where_unseen(model.schedule, moved),
     )  # fmt: skip
+    near = replace(free, terms=_as_open_as(start, terms))
     vector = torch.tensor([known.get(t.name, 0.0) for t in terms], dtype=torch.float64)
+    searches = (near, free) if terms else (near,)
     try:
-        found = _refined(search, start, vector, settings.windows[-1], moved)
+        found = _refined(searches, start, vector, _longest(settings.windows, start), moved)
     except KeyboardInterrupt:
-        found = _constant_kept(search, start, INTERRUPTED, converged=False)
+        found = _constant_kept(near, start, INTERRUPTED, converged=False)
     found = replace(found, motions=motions, zeros=start.zeros, continuity=settings.continuity)
     return found.telling(start.told)
 
 
+def _longest(windows: Sequence[float], start: Fit) -> float:
+    """The longest of the windows that the constant law could follow."""
+    return next((w for w in reversed(windows) if w not in start.left_out), windows[-1])
+
+
+def _as_open_as(start: Fit, terms: Sequence[PlantParameter]) -> list[PlantParameter]:
+    """Terms that are expected to stay near where a fit found them, by how far it left them open."""
+    near = {i.name: PLANT_SDS * i.sd for i in start.intervals}
+    return [replace(t, prior_sd=min(t.prior_sd, near.get(t.name, math.inf))) for t in terms]
+
+
 def _refined(
-    search: Refinement, start: Fit, vector: Tensor, length: float, motions: tuple[Motion, ...]
+    searches: Sequence[Refinement],
+    start: Fit,
+    vector: Tensor,
+    length: float,
+    motions: tuple[Motion, ...],
 ) -> Fit:
-    """Refine a network that starts at a constant fit, and keep it where it earns its place."""
+    """Refine a network that starts at a constant fit, and keep it where it earns its place.
+
+    Of searches that leave the plant ever freer, a freer one must earn its place, too.
+    """
+    search = searches[0]
     # What the constant law left over, at the same window length, is the noise that the prior is
     # weighed against; its own cost is the one in which the gain of a step is judged.
     noise, stride = effective_noise(start._residuals), stride_of(start._residuals)
@@ -100,15 +128,39 @@ def _refined(
         error = error_on(held_back, network.problem, network.vector)
         return Judgement(*(error / law if math.isfinite(error) else math.inf for law in laws))
 
-    part = search.problem(seen, noise, vector, stride)
-    judgement, stage = _best_prior(search, part, vector, tolerance, judge)
-    if judgement is None:
-        return trajectory_outcome(stage.problem, stage.result, stage.residuals, motions)
-    if judgement.score > 1:
-        return _constant_kept(search, start, str(judgement))
-    whole = search.problem(cut_windows(search.joint, motions, length), noise, vector, stride)
-    stage = search.search(whole, stage.vector, tolerance, f"{length:g} s windows")
+    best: _Trial | None = None
+    for search in searches:
+        part = search.problem(seen, noise, vector, stride)
+        trial = _best_prior(search, part, vector, tolerance, judge)
+        if isinstance(trial, Stage):
+            return trajectory_outcome(trial.problem, trial.result, trial.residuals, motions)
+        if best is None or trial.judgement.score <= WORTH * best.judgement.score:
+            best = trial
+    assert best is not None
+    if best.judgement.score > 1:
+        return _constant_kept(searches[0], start, str(best.judgement))
+    found = best.taken_up()
+    whole = best.search.problem(cut_windows(search.joint, motions, length), noise, vector, stride)
+    stage = best.search.search(whole, found, tolerance, f"{length:g} s windows")
     return trajectory_outcome(stage.problem, stage.result, stage.residuals, motions)
+
+
+class _Trial(NamedTuple):
+    """A network trained on some windows and judged on others, and how it was trained."""
+
+    judgement: Judgement
+    search: Refinement
+    prior_sd: float
+    network: Tensor
+    vector: Tensor
+
+    def taken_up(self) -> Tensor:
+        """Terms of the plant; the model is left with the network and its prior."""
+        schedule = self.search.model.schedule
+        assert isinstance(schedule, NeuroFuzzy)
+        schedule.prior_sd = self.prior_sd
+        schedule.set_parameter_vector(self.network)
+        return self.vector
 
 
 def _best_prior(
@@ -117,12 +169,8 @@ def _best_prior(
     vector: Tensor,
     tolerance: float,
     judge: Callable[[Stage], Judgement],
-) -> tuple[Judgement | None, Stage]:
-    """Train under each prior: what is said of the best, and its stage.
-
-    The model is left with that network and prior. A stage that was stopped ends the trials without
-    a judgement.
-    """
+) -> _Trial | Stage:
+    """Train under each prior: the best trial, or a stage that was stopped."""
     schedule = search.model.schedule
     assert isinstance(schedule, NeuroFuzzy)
     widest, trials = schedule.prior_sd, []
@@ -132,11 +180,11 @@ def _best_prior(
         schedule.prior_sd = share * widest
         stage = search.search(part, vector, tolerance, "a third held back")
         if stage.result.status == "stopped":
-            return None, stage
-        trials.append((judge(stage), schedule.prior_sd, schedule.parameter_vector(), stage))
-    judgement, schedule.prior_sd, network, stage = min(trials, key=lambda trial: trial[0].score)
-    schedule.set_parameter_vector(network)
-    return judgement, stage
+            return stage
+        network = schedule.parameter_vector()
+        trials.append(_Trial(judge(stage), search, schedule.prior_sd, network, stage.vector))
+    schedule.prior_sd = widest
+    return min(trials, key=lambda trial: trial.judgement.score)
 
 
 def _constant_kept(search: Refinement, start: Fit, note: str, *, converged: bool = True) -> Fit:

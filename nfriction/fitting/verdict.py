@@ -42,6 +42,11 @@ class Interval:
     low: float
     high: float
 
+    @property
+    def sd(self) -> float:
+        """Standard deviation, by the wider side: a bound cuts the other short."""
+        return max(self.high - self.value, self.value - self.low) / NORMAL_95
+
 
 @dataclass(frozen=True)
 class Information:

@@ -199,11 +199,19 @@ def test_windows_that_are_left_out_are_told(monkeypatch):
     assert not any("too long" in told for told in alone.warnings)
     assert found.residual == pytest.approx(alone.residual, rel=0.2)
     # Whatever starts there says it, too.
-    for score in (0.0, 2.0):
+    for score in (2.0, 0.0):
         monkeypatch.setattr("nfriction.fitting.holdback.Judgement.score", score)
         network = NFLFM(2, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2)
         further = fit(network, pendulum(), recording, start=found, windows=(0.5,), max_steps=2)
         assert sum("too long" in told for told in further.warnings) == 1
+    # A network is not to follow what its law could not.
+    stages = set()
+    fit(
+        network, pendulum(), recording, start=found, windows=(0.5, 1.0), max_steps=2,
+        callback=lambda stage, step: stages.add(stage),
+    )  # fmt: skip
+    assert "0.5 s windows" in stages
+    assert "1 s windows" not in stages
 
 
 def test_irregular_stamps_are_followed():

@@ -2,8 +2,9 @@
 
 import pytest
 
-from nfriction import LFM, NFLFM, NFStribeck, Stribeck, fit
-from nfriction.fitting.network import PRIOR_SHARES
+from nfriction import LFM, NCFM, NFLFM, NFNCFM, NFStribeck, Stribeck, fit
+from nfriction.fitting.network import PLANT_SDS, PRIOR_SHARES
+from nfriction.fitting.stages import Refinement
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from tests.fitting.recordings import pendulum, swing
 
@@ -50,3 +51,53 @@ def test_a_law_that_is_not_linear_has_a_network_too(constant):
     assert found.model is model
     assert found.residual <= 1.001 * law.residual
     assert float(model.schedule.parameter_vector().abs().max()) > 0
+
+
+def test_the_plant_stays_about_as_near_to_the_laws_as_that_left_it_open(monkeypatch):
+    truth = LFM(2, [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]], v_smooth=V_SMOOTH)
+    recording = swing(pendulum(), truth, seconds=2.0)
+    settings = {"windows": (0.5,), "max_steps": 4}
+    law = fit(NCFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
+    open_ = {i.name: i.sd for i in law.intervals}
+    monkeypatch.setattr("nfriction.fitting.holdback.Judgement.score", 0.5)
+
+    def moved(sds: float) -> float:
+        """By how many standard deviations that the law's fit left open, at most."""
+        monkeypatch.setattr("nfriction.fitting.network.PLANT_SDS", sds)
+        model = NFNCFM(2, v_smooth=V_SMOOTH, **SMALL)
+        found = fit(model, pendulum(), recording, start=law, **settings)
+        pairs = zip(found.plant_terms, law.plant_terms, strict=True)
+        return max(abs(new - old) / open_[name] for (name, new, _), (_, old, _) in pairs)
+
+    assert moved(1e-3) < 1e-3 < 0.3 < moved(PLANT_SDS) < 2 * PLANT_SDS
+
+
+@pytest.mark.parametrize(("of_near", "freed"), [(0.9, False), (0.7, True)])
+def test_a_plant_is_let_go_only_for_what_windows_held_back_gain(monkeypatch, of_near, freed):
+    truth = LFM(2, [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]], v_smooth=V_SMOOTH)
+    recording = swing(pendulum(), truth, seconds=2.0)
+    settings = {"windows": (0.5,), "max_steps": 2}
+    law = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
+    seen = []
+
+    def error(held_back, problem, vector):
+        if not isinstance(problem.friction.schedule, NeuroFuzzy):
+            return 1.0
+        seen.append([t.prior_sd for t in problem.unknowns.terms])
+        return 0.7 * (1.0 if seen[-1] == seen[0] else of_near)
+
+    searched = Refinement.search
+
+    def search(self, problem, *others):
+        trained.append([t.prior_sd for t in problem.unknowns.terms])
+        return searched(self, problem, *others)
+
+    trained: list[list[float]] = []
+    monkeypatch.setattr("nfriction.fitting.network.error_on", error)
+    monkeypatch.setattr(Refinement, "search", search)
+    model = NFLFM(2, v_smooth=V_SMOOTH, **SMALL)
+    fit(model, pendulum(), recording, start=law, **settings)
+    near, free = seen[0], seen[-1]
+    assert near != free
+    assert all(a <= b for a, b in zip(near, free, strict=True))
+    assert trained[-1] == (free if freed else near)
