@@ -3,6 +3,8 @@
     python benchmarks/identification.py recovery [--seconds 10 20 40] [--seeds 1] [--peer mujoco]
     python benchmarks/identification.py real DATA [--only triple ...] [--models NCFM LFM NFLFM]
                                                  [--blocks N] [--peer scipy]
+    python benchmarks/identification.py intervals DATA [--only triple ...] [--models CFM]
+                                                      [--seconds 5]
 
 Run from the repository's root, on one thread. `recovery` simulates the papers' three links with
 viscous and Coulomb friction, reads them with encoders of 8192 counts at 1 kHz and fits friction
@@ -19,6 +21,9 @@ first state; with `--blocks N` each recording is cut in N, and one block of ever
 out at a time. With `--peer scipy` every constant law is also fitted by single shooting, as the
 baselines on the recordings' cards were, which tells how hard these recordings are beside those that
 are kept apart. DATA holds a folder to each set, with a `recordings.csv` of initial states.
+
+`intervals` fits pieces of recordings, each alone, and prints how often the difference of what two
+of them say lies within its 95 % interval.
 """
 
 import argparse
@@ -27,6 +32,7 @@ from pathlib import Path
 
 import torch
 from left_out import SETS, real
+from pieces import intervals
 from recovery import RELEASES, recovery
 
 
@@ -44,10 +50,17 @@ def main() -> int:
     given.add_argument("--models", nargs="+", default=["NCFM", "LFM", "NFLFM"])
     given.add_argument("--blocks", type=int, default=1)
     given.add_argument("--peer", choices=["scipy"])
+    apart = commands.add_parser("intervals", help="intervals held against pieces of recordings")
+    apart.add_argument("data", type=Path)
+    apart.add_argument("--only", nargs="+", default=list(SETS), choices=list(SETS))
+    apart.add_argument("--models", nargs="+", default=["CFM"])
+    apart.add_argument("--seconds", type=float, default=5.0)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     if arguments.command == "recovery":
         recovery(arguments.seconds, arguments.seeds, arguments.releases, arguments.peer)
+    elif arguments.command == "intervals":
+        intervals(arguments.data, arguments.only, arguments.models, arguments.seconds)
     else:
         peer = arguments.peer is not None
         real(arguments.data, arguments.only, arguments.models, arguments.blocks, peer)

@@ -94,16 +94,16 @@ def fit_adaptive(
     moved = motions_of(joint, motions)
     asked = Settings(windows, fit_plant, drag, max_steps=max_steps, callback=callback)
     constant = constant_start(model, plant, given, moved, start, asked)
-    raw = moved
+    raw, length = moved, constant.longest(windows)
     given, moved = at_zeros(constant.zeros, plant, given, moved)
     joint = in_joint_coordinates(plant, model, given)
     if method != "gauss-newton":
-        settings = {"horizon": windows[-1], "prior_sd": prior_sd, **search_settings}
+        settings = {"horizon": length, "prior_sd": prior_sd, **search_settings}
         found = fit_by_search(
             model, plant, given, method=method, start=replace(constant, zeros=()), motions=moved,
             classes=classes, **settings,
         )  # fmt: skip
-        return replace(found, motions=raw, zeros=constant.zeros)
+        return replace(found, motions=raw, zeros=constant.zeros, left_out=constant.left_out)
     if search_settings:
         raise ValueError(f"{sorted(search_settings)} are settings of a search, not of {method!r}.")
     classes = adopt_classes(model.schedule, classes, joint, moved, plant)
@@ -111,14 +111,14 @@ def fit_adaptive(
     known = {name: value for name, value, _ in constant.plant_terms}
     vector = torch.tensor([known.get(t.name, 0.0) for t in terms], dtype=torch.float64)
     labelled = labelled_model(model, constant, joint, moved, prior_sd)
-    cut = cut_windows(joint, moved, windows[-1])
+    cut = cut_windows(joint, moved, length)
     problem = LabelledProblem(
         StepJacobian(plant, labelled, terms), cut, effective_noise(constant._residuals),
         mixing_of(plant, given[0].convention_on(plant)),
         substeps=substeps_of(plant, labelled, joint), plant_mean=vector,
         classes=driving_classes(classes, cut),
     )  # fmt: skip
-    told = told_of(callback, f"{windows[-1]:g} s windows, by class")
+    told = told_of(callback, f"{length:g} s windows, by class")
     result = solve_trajectory(
         problem, problem.unknowns.start(vector), max_steps=max_steps, callback=told
     )
@@ -129,4 +129,4 @@ def fit_adaptive(
         model, labelled, classes, constant, found, replace(cut, q0=states[0], qd0=states[1]),
         problem.mixing, problem.substeps, constant.residual,
     )  # fmt: skip
-    return replace(found, motions=raw, zeros=constant.zeros)
+    return replace(found, motions=raw, zeros=constant.zeros, left_out=constant.left_out)

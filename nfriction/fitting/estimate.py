@@ -50,8 +50,9 @@ def fit(
     again from where that ended; what leaves least over counts. A neuro-fuzzy model starts at the
     constant fit of its own law and is pulled toward it, by its own prior or a tighter one,
     whichever predicts windows held back better, and more so at motions that the recordings never
-    came near; unless that is a fifth better than the law, the law is kept. Every class of an
-    adaptive model starts there, too; `fit_adaptive` has its further settings.
+    came near; unless that is a fifth better than the law, the law is kept. Its plant stays near the
+    law's, unless windows held back gain another fifth without. Every class of an adaptive model
+    starts there, too; `fit_adaptive` has its further settings.
 
     Args:
         model: the model to fit; changed in place.

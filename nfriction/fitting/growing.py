@@ -26,7 +26,8 @@ def through_windows(
 ) -> tuple[Stage, tuple[float, ...]]:
     """Stages of growing length, each from the states and weighed by the errors of the last.
 
-    Lengths that the motion does not allow are left out, and returned.
+    At the first length that the motion does not allow, the last one before it is returned, with all
+    lengths that are left out.
 
     With coefficients `by_torque` on a plant, the first stage is searched a second time from what
     they are on the plant that it found: a law that is not linear has several minima, and on an
@@ -35,7 +36,7 @@ def through_windows(
     reached: Stage | None = None
     zeros: Tensor | None = None
     noise, traced = FIRST_NOISE, motions
-    for length in windows:
+    for place, length in enumerate(windows):
         # Encoders that were zeroed where dry friction held the links were zeroed at rest.
         cut = cut_windows(search.joint, traced, length, from_rest=search.zero_sd is not None)
         problem = search.problem(cut, noise, far=reached is None and len(windows) > 1)
@@ -51,7 +52,7 @@ def through_windows(
         if reached is not None and stage.lost_since(reached):
             schedule = search.model.schedule
             schedule.set_parameter_vector(reached.problem.unknowns.split(reached.result.x)[0])
-            return reached, (length,)
+            return reached, tuple(windows[place:])
         reached, vector, noise = stage, stage.vector, max(stage.noise, LEAST_NOISE)
         zeros = stage.zeros
         if stage.result.status == "stopped":

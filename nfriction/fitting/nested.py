@@ -30,13 +30,13 @@ def from_simpler(
 
     Args:
         search: of the law.
-        own, left_out: its end, and the lengths of windows that it could not follow.
+        own, left_out: its end, and the lengths of windows left out on the way there.
         simpler: model of the simpler law, at what torques tell.
         windows, vector, motions: see `through_windows`.
         by_torque: coefficients of the law that torques tell on a plant, (joint, coefficient).
 
     Returns:
-        Its stage, and the lengths of windows that it could not follow.
+        Its stage, and the lengths of windows left out on the way to it.
     """
     base, without = through_windows(
         replace(search, model=simpler), windows, vector, motions, of=f", {simpler.law.name} law"

@@ -37,7 +37,7 @@ PRIOR_SHARES = (1.0, 1 / 3)
 # Within the motion recorded a plant and a network may make up for each other; beyond it, where the
 # network fades, such a plant is wrong. It stays as near to the constant fit's as so many standard
 # deviations of what that left open.
-PLANT_SDS = 3.0
+PLANT_SDS = 2.0
 INTERRUPTED = "Stopped before the network was found; its constant law is kept."
 
 
@@ -55,7 +55,7 @@ def fit_network(
         model, plant: see `fit`.
         recordings, motions: as they are; the zeros that the constant fit found are added here.
         start: the constant fit.
-        settings: see `fit`; of the windows the last length serves that the constant fit followed.
+        settings: see `fit`; of the windows the last serves that the constant fit could follow.
     """
     given, moved = at_zeros(start.zeros, plant, recordings, motions)
     joint = in_joint_coordinates(plant, model, given)
@@ -75,18 +75,17 @@ def fit_network(
     )  # fmt: skip
     near = replace(free, terms=_as_open_as(start, terms))
     vector = torch.tensor([known.get(t.name, 0.0) for t in terms], dtype=torch.float64)
-    searches = (near, free) if terms else (near,)
+    differ = [t.prior_sd for t in near.terms] != [t.prior_sd for t in terms]
+    searches = (near, free) if differ else (near,)
     try:
-        found = _refined(searches, start, vector, _longest(settings.windows, start), moved)
+        found = _refined(searches, start, vector, start.longest(settings.windows), moved)
     except KeyboardInterrupt:
         found = _constant_kept(near, start, INTERRUPTED, converged=False)
-    found = replace(found, motions=motions, zeros=start.zeros, continuity=settings.continuity)
+    found = replace(
+        found, motions=motions, zeros=start.zeros, continuity=settings.continuity,
+        left_out=start.left_out,
+    )  # fmt: skip
     return found.telling(start.told)
-
-
-def _longest(windows: Sequence[float], start: Fit) -> float:
-    """The longest of the windows that the constant law could follow."""
-    return next((w for w in reversed(windows) if w not in start.left_out), windows[-1])
 
 
 def _as_open_as(start: Fit, terms: Sequence[PlantParameter]) -> list[PlantParameter]:
@@ -106,7 +105,7 @@ def _refined(
 
     Of searches that leave the plant ever freer, a freer one must earn its place, too.
     """
-    search = searches[0]
+    search = searches[-1]
     # What the constant law left over, at the same window length, is the noise that the prior is
     # weighed against; its own cost is the one in which the gain of a step is judged.
     noise, stride = effective_noise(start._residuals), stride_of(start._residuals)
@@ -117,7 +116,7 @@ def _refined(
         law.problem(seen, noise, vector, stride), vector, tolerance, "constants, a third held back"
     )
     if same.result.status == "stopped":
-        return _constant_kept(search, start, same.result.message, converged=False)
+        raise KeyboardInterrupt
     law_of_all = replace(law, model=start.model).problem(held_back, noise, vector, stride)
     laws = [
         error_on(held_back, problem, found)
@@ -132,13 +131,11 @@ def _refined(
     for search in searches:
         part = search.problem(seen, noise, vector, stride)
         trial = _best_prior(search, part, vector, tolerance, judge)
-        if isinstance(trial, Stage):
-            return trajectory_outcome(trial.problem, trial.result, trial.residuals, motions)
-        if best is None or trial.judgement.score <= WORTH * best.judgement.score:
+        if best is None or trial.judgement.score < WORTH * best.judgement.score:
             best = trial
     assert best is not None
     if best.judgement.score > 1:
-        return _constant_kept(searches[0], start, str(best.judgement))
+        return _constant_kept(best.search, start, str(best.judgement))
     found = best.taken_up()
     whole = best.search.problem(cut_windows(search.joint, motions, length), noise, vector, stride)
     stage = best.search.search(whole, found, tolerance, f"{length:g} s windows")
@@ -169,21 +166,27 @@ def _best_prior(
     vector: Tensor,
     tolerance: float,
     judge: Callable[[Stage], Judgement],
-) -> _Trial | Stage:
-    """Train under each prior: the best trial, or a stage that was stopped."""
+) -> _Trial:
+    """Train under each prior, of which the schedule keeps its own: the best trial.
+
+    Raises:
+        KeyboardInterrupt: if stopped: half trained and unjudged, a network is worth nothing.
+    """
     schedule = search.model.schedule
     assert isinstance(schedule, NeuroFuzzy)
     widest, trials = schedule.prior_sd, []
-    for share in PRIOR_SHARES:
-        # From nothing: on from another prior's end a search stays near it, and judges that.
-        schedule.set_parameter_vector(torch.zeros_like(schedule.parameter_vector()))
-        schedule.prior_sd = share * widest
-        stage = search.search(part, vector, tolerance, "a third held back")
-        if stage.result.status == "stopped":
-            return stage
-        network = schedule.parameter_vector()
-        trials.append(_Trial(judge(stage), search, schedule.prior_sd, network, stage.vector))
-    schedule.prior_sd = widest
+    try:
+        for share in PRIOR_SHARES:
+            # From nothing: on from another prior's end a search stays near it, and judges that.
+            schedule.set_parameter_vector(torch.zeros_like(schedule.parameter_vector()))
+            schedule.prior_sd = share * widest
+            stage = search.search(part, vector, tolerance, "a third held back")
+            if stage.result.status == "stopped":
+                raise KeyboardInterrupt
+            network = schedule.parameter_vector()
+            trials.append(_Trial(judge(stage), search, schedule.prior_sd, network, stage.vector))
+    finally:
+        schedule.prior_sd = widest
     return min(trials, key=lambda trial: trial.judgement.score)
 
 

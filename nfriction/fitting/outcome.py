@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.fitting.residuals import effective_noise, local_noise
+from nfriction.fitting.residuals import band_of, effective_noise, local_noise
 from nfriction.fitting.torque import TorqueFit, largest_moved
 from nfriction.fitting.trajectory import TrajectoryProblem
 from nfriction.fitting.uncertainty import CoefficientUncertainty
@@ -60,7 +60,7 @@ class Fit:
         continuity: of the windows that were fitted, see `fit`.
         told: those of the warnings that are of recordings and windows; a fit that starts here says
             them, too.
-        left_out: lengths of windows that the law could not follow [s].
+        left_out: lengths of windows that the constant law could not follow [s].
     """
 
     model: FrictionModel
@@ -81,6 +81,11 @@ class Fit:
     continuity: Continuity = "free"
     told: tuple[str, ...] = ()
     left_out: tuple[float, ...] = ()
+
+    def longest(self, windows: Sequence[float]) -> float:
+        """The last of some windows of growing length that the constant law could follow [s]."""
+        followed = [w for w in windows if w < min(self.left_out, default=math.inf)]
+        return followed[-1] if followed else windows[0]
 
     def telling(self, told: Sequence[str]) -> "Fit":
         """The same, which tells this of recordings and windows first, and once."""
@@ -201,7 +206,7 @@ def _told_by_data(
         every = fitted.nonzero().flatten().tolist() if constant else []
         return (), tuple(names[i] for i in every), None
     # Where a network is only held to its law, the data leave it open: that is not among them.
-    known = problem.told(result.x, local_noise(residuals))
+    known = problem.told(result.x, local_noise(residuals, band_of(problem.windows.q)))
     shown = fitted.clone()
     if not constant:
         shown[: problem.unknowns.friction_count] = False

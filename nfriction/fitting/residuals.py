@@ -1,5 +1,7 @@
 """How long the errors of a model last, and for how many independent ones they count."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -11,7 +13,10 @@ CORRELATED, MOST_STRIDE = 8, 20
 ALIKE, LEAST_ALIKE = 20, 500
 # Lags that tell how long errors last: so many times as far as they seem alike, and no less than
 # this share of a stretch.
-LAGS, LEAST_LAGS = 10, 0.1
+LAGS, LEAST_LAGS = 20, 0.1
+# Share of a motion's power within its band; what it does to friction and inertia has the second
+# harmonics, too.
+IN_BAND, HARMONICS = 0.999, 2
 
 
 def correlation_time(residuals: Tensor) -> float:
@@ -35,15 +40,30 @@ def effective_noise(residuals: Tensor) -> float:
     return float(residuals.square().mean().sqrt()) * correlation_time(residuals) ** 0.5
 
 
-def local_noise(residuals: Tensor) -> Tensor:
+def band_of(q: Tensor) -> float:
+    """Highest frequency of what a motion answers to parameters [cycles per sample].
+
+    Args:
+        q: positions, shape (window, sample, joint).
+    """
+    samples = q.shape[1]
+    hann = torch.hann_window(samples, periodic=False, dtype=q.dtype)[:, None]
+    power = torch.fft.rfft(hann * (q - q.mean(1, keepdim=True)), dim=1).abs().square().sum((0, 2))
+    within = power.cumsum(0) <= IN_BAND * power.sum()
+    return HARMONICS * float(within.sum()) / samples
+
+
+def local_noise(residuals: Tensor, band: float) -> Tensor:
     """Standard deviation that each residual counts with, by how long errors last around it.
 
     Rounding by an encoder makes up for itself from count to count while a joint moves; once it
-    hardly does, one and the same error stays for a second. A sum of residuals times a sensitivity
-    that changes slowly has the variance of independent ones of this size.
+    hardly does, one and the same error stays for a second. What a model leaves over swings with the
+    joints. A sum of residuals times a sensitivity of the same band has at most the variance of
+    independent ones of this size, which is that of the band's strongest frequency.
 
     Args:
         residuals: [rad or m], shape (window, sample, joint).
+        band: see `band_of` [cycles per sample].
 
     Returns:
         Of the same shape.
@@ -57,7 +77,7 @@ def local_noise(residuals: Tensor) -> Tensor:
     size = torch.stack([part.square().mean(1) for part in stretches])
     # A stretch without error owes that to its window's free start, which is off by as much.
     size = torch.maximum(size, size.flatten(0, 1).median(0).values)
-    lasting = torch.stack([_long_run(_autocovariance(part)) for part in stretches])
+    lasting = torch.stack([_strongest(_autocovariance(part), band) for part in stretches])
     counted = [part.shape[1] for part in stretches]
     return (size * lasting).sqrt().transpose(0, 1).repeat_interleave(torch.tensor(counted), 1)
 
@@ -92,14 +112,13 @@ def _integrated(covariance: Tensor) -> Tensor:
     return (2 * (correlation * kept).sum(1) - 1).clamp_min(1.0)
 
 
-def _long_run(covariance: Tensor) -> Tensor:
-    """Variance of a sum of errors over that of as many independent ones, (window, joint).
-
-    What has changed sign after a while makes up for what came before.
-    """
+def _strongest(covariance: Tensor, band: float) -> Tensor:
+    """Largest spectral density up to a frequency, over that of white errors, (window, joint)."""
     samples = covariance.shape[1]
     far = (LAGS * _integrated(covariance)).clamp(LEAST_LAGS * samples, samples)
     lag = torch.arange(samples, dtype=covariance.dtype)
-    # Bartlett's weights keep the sum from being negative.
+    # Bartlett's weights keep the density from being negative.
     weight = (1 - lag[:, None] / far[:, None]).clamp_min(0.0)
-    return 2 * (weight * _correlation(covariance)).sum(1) - 1
+    one_sided = weight * _correlation(covariance)
+    density = 2 * torch.fft.rfft(one_sided, n=2 * samples, dim=1).real - one_sided[:, :1]
+    return density[:, : math.ceil(2 * samples * band) + 1].amax(1)

@@ -24,6 +24,8 @@ ZEROS = ("upright", "hanging")
 class Plant(nn.Module):
     """Base of the mechanisms; all methods take joint coordinates of shape (*batch, joint).
 
+    A type for hints: fits know which terms of `PendulumChain` and `LinearAxis` they may adjust.
+
     Args:
         joints: number of joints.
         joint_names: one per joint; None for joint1, joint2, ...

@@ -34,6 +34,7 @@ def save_fit(found: Fit, path: Path, recordings: Sequence[Recording]) -> None:
             term_values=np.array(values, dtype=np.float64),
             term_bounds=np.array(bounds, dtype=np.float64),
             steps=np.array(found.steps),
+            left_out=np.array(found.left_out, dtype=np.float64),
             interval_names=np.array([i.name for i in found.intervals], dtype=str),
             intervals=np.array([(i.value, i.low, i.high) for i in found.intervals]).reshape(-1, 3),
         )
@@ -73,4 +74,5 @@ def load_fit(path: Path, motions: Sequence[Motion]) -> Fit:
             intervals=tuple(Interval(name, *ends) for name, ends in told_of),
             lost=tuple(told["lost"]),
             warnings=tuple(told["warnings"]),
+            left_out=tuple(kept["left_out"].tolist()),
         )

@@ -7,7 +7,7 @@ import torch
 from nfriction import NFLFM
 from nfriction.fitting.anchors import ANCHOR_SD, Anchors, anchors_where_unseen, visits
 from nfriction.fitting.outcome import trajectory_outcome
-from nfriction.fitting.residuals import local_noise
+from nfriction.fitting.residuals import band_of, local_noise
 from nfriction.fitting.sensitivity import StepJacobian
 from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
 from nfriction.fitting.uncertainty import CoefficientUncertainty
@@ -147,7 +147,7 @@ def test_what_is_only_held_is_not_taken_for_told_by_the_data():
     alone = trajectory_outcome(problem(model, None), result, errors, ())
     torch.testing.assert_close(told, openness(alone.uncertainty))
     # As if the data had said what was held.
-    known = p.told(result.x, local_noise(errors))
+    known = p.told(result.x, local_noise(errors, band_of(p.windows.q)))
     known.data[:n, :n] += held.normal_equations(model.schedule)[1]
     mistaken = openness(CoefficientUncertainty(model.schedule, covariance_root(known)[:n]))
     assert (told >= (1 - 1e-6) * mistaken).all()

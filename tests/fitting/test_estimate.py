@@ -205,13 +205,20 @@ def test_windows_that_are_left_out_are_told(monkeypatch):
         further = fit(network, pendulum(), recording, start=found, windows=(0.5,), max_steps=2)
         assert sum("too long" in told for told in further.warnings) == 1
     # A network is not to follow what its law could not.
+    assert found.left_out == (1.0,)
+    assert fit(network, pendulum(), recording, start=found, max_steps=2).left_out == (1.0,)
     stages = set()
     fit(
-        network, pendulum(), recording, start=found, windows=(0.5, 1.0), max_steps=2,
+        network, pendulum(), recording, start=found, windows=(0.5, 1.0, 2.0), max_steps=2,
         callback=lambda stage, step: stages.add(stage),
     )  # fmt: skip
     assert "0.5 s windows" in stages
-    assert "1 s windows" not in stages
+    assert not {"1 s windows", "2 s windows"} & stages
+    later = fit(
+        CVFM(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5, 1.0, 1.5), max_steps=3
+    )
+    assert later.left_out == (1.0, 1.5)
+    assert sum("too long" in told for told in later.warnings) == 2
 
 
 def test_irregular_stamps_are_followed():

@@ -1,6 +1,9 @@
 """How far a network may deviate from its constant law is for windows held back to say."""
 
+import math
+
 import pytest
+import torch
 
 from nfriction import LFM, NCFM, NFLFM, NFNCFM, NFStribeck, Stribeck, fit
 from nfriction.fitting.network import PLANT_SDS, PRIOR_SHARES
@@ -78,26 +81,87 @@ def test_a_plant_is_let_go_only_for_what_windows_held_back_gain(monkeypatch, of_
     recording = swing(pendulum(), truth, seconds=2.0)
     settings = {"windows": (0.5,), "max_steps": 2}
     law = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
-    seen = []
+    seen, trained = [], []
+
+    def expected(problem):
+        return [t.prior_sd for t in problem.unknowns.terms]
 
     def error(held_back, problem, vector):
-        if not isinstance(problem.friction.schedule, NeuroFuzzy):
+        schedule = problem.friction.schedule
+        if not isinstance(schedule, NeuroFuzzy):
             return 1.0
-        seen.append([t.prior_sd for t in problem.unknowns.terms])
-        return 0.7 * (1.0 if seen[-1] == seen[0] else of_near)
+        seen.append((expected(problem), schedule.prior_sd, schedule.parameter_vector(), vector))
+        near = expected(problem) == seen[0][0]
+        return 0.7 * (1.0 if near else of_near) * (1.0 if len(seen) % 2 else 1.01)
+
+    def search(self, problem, vector, *others):
+        schedule = problem.friction.schedule
+        trained.append(
+            (expected(problem), getattr(schedule, "prior_sd", None), schedule.parameter_vector(),
+             vector)
+        )  # fmt: skip
+        return searched(self, problem, vector, *others)
 
     searched = Refinement.search
+    monkeypatch.setattr("nfriction.fitting.network.error_on", error)
+    monkeypatch.setattr(Refinement, "search", search)
+    model = NFLFM(2, v_smooth=V_SMOOTH, **SMALL)
+    fit(model, pendulum(), recording, start=law, **settings)
+    near, _, free, _ = (trial[0] for trial in seen)
+    assert near != free
+    assert all(a <= b for a, b in zip(near, free, strict=True))
+    # Each search tries both priors, and the best is gone on with from where it stood.
+    assert [trial[1] for trial in seen] == 2 * [trial[1] for trial in seen[:2]]
+    best, last = seen[2 if freed else 0], trained[-1]
+    assert last[:2] == best[:2]
+    assert torch.equal(last[2], best[2])
+    assert torch.equal(last[3], best[3])
+
+
+def test_a_law_that_diverges_lets_go_of_no_plant(monkeypatch):
+    truth = LFM(2, [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]], v_smooth=V_SMOOTH)
+    recording = swing(pendulum(), truth, seconds=2.0)
+    settings = {"windows": (0.5,), "max_steps": 2}
+    law = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
+    trained = []
+
+    def error(held_back, problem, vector):
+        return 1.0 if isinstance(problem.friction.schedule, NeuroFuzzy) else math.inf
 
     def search(self, problem, *others):
         trained.append([t.prior_sd for t in problem.unknowns.terms])
         return searched(self, problem, *others)
 
-    trained: list[list[float]] = []
+    searched = Refinement.search
     monkeypatch.setattr("nfriction.fitting.network.error_on", error)
     monkeypatch.setattr(Refinement, "search", search)
-    model = NFLFM(2, v_smooth=V_SMOOTH, **SMALL)
-    fit(model, pendulum(), recording, start=law, **settings)
-    near, free = seen[0], seen[-1]
+    fit(NFLFM(2, v_smooth=V_SMOOTH, **SMALL), pendulum(), recording, start=law, **settings)
+    free, near, *_ = trained
     assert near != free
-    assert all(a <= b for a, b in zip(near, free, strict=True))
-    assert trained[-1] == (free if freed else near)
+    assert trained[-1] == near
+
+
+@pytest.mark.parametrize("place", range(2 * len(PRIOR_SHARES)))
+def test_a_network_stopped_before_it_is_judged_gives_way_to_its_law(place, monkeypatch):
+    truth = LFM(2, [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]], v_smooth=V_SMOOTH)
+    recording = swing(pendulum(), truth, seconds=2.0)
+    settings = {"windows": (0.5,), "max_steps": 2}
+    law = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
+    model, begun = NFLFM(2, v_smooth=V_SMOOTH, prior_sd=0.6, **SMALL), []
+
+    def search(self, problem, vector, tolerance, name):
+        begun.append(name)
+        return searched(self, problem, vector, tolerance, name)
+
+    def stop(stage, step):
+        return begun.count("a third held back") > place
+
+    searched = Refinement.search
+    monkeypatch.setattr(Refinement, "search", search)
+    kept = fit(model, pendulum(), recording, start=law, callback=stop, **settings)
+    assert begun[1:] == ["a third held back"] * (place + 1)
+    assert not kept.converged
+    assert "its constant law is kept" in kept.status
+    at = (torch.ones(1, 2, dtype=torch.float64),) * 3
+    torch.testing.assert_close(model(*at), law.model(*at), rtol=1e-5, atol=1e-9)
+    assert model.options()["prior_sd"] == 0.6

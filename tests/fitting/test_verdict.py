@@ -5,6 +5,7 @@ import torch
 
 from nfriction.fitting.verdict import (
     Information,
+    Interval,
     beyond_need,
     information,
     intervals,
@@ -21,6 +22,11 @@ NAMES = ("a", "b", "c")
 def regression(samples=200, parameters=3):
     g = torch.Generator().manual_seed(3)
     return torch.randn(samples, parameters, generator=g, dtype=F64), g
+
+
+def test_a_bound_that_cuts_an_interval_short_does_not_make_it_surer():
+    assert Interval("b", 0.1, 0.0, 0.1 + 1.959964 * 0.3).sd == pytest.approx(0.3)
+    assert Interval("b", -0.1, -0.1 - 1.959964 * 0.3, 0.0).sd == pytest.approx(0.3)
 
 
 def test_intervals_of_a_linear_fit_cover_as_often_as_they_say():
