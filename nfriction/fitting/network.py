@@ -34,10 +34,6 @@ from nfriction.signals import Motion
 
 # Priors of a network that are tried, over its own: windows held back choose among them.
 PRIOR_SHARES = (1.0, 1 / 3)
-# Within the motion recorded a plant and a network may make up for each other; beyond it, where the
-# network fades, such a plant is wrong. It stays as near to the constant fit's as so many standard
-# deviations of what that left open.
-PLANT_SDS = 2.0
 INTERRUPTED = "Stopped before the network was found; its constant law is kept."
 
 
@@ -89,9 +85,13 @@ def fit_network(
 
 
 def _as_open_as(start: Fit, terms: Sequence[PlantParameter]) -> list[PlantParameter]:
-    """Terms that are expected to stay near where a fit found them, by how far it left them open."""
-    near = {i.name: PLANT_SDS * i.sd for i in start.intervals}
-    return [replace(t, prior_sd=min(t.prior_sd, near.get(t.name, math.inf))) for t in terms]
+    """Terms that are expected as near to where a fit found them as it left them open.
+
+    Within the motion recorded a plant and a network may make up for each other; beyond it, where
+    the network fades, such a plant is wrong.
+    """
+    left = {i.name: i.sd for i in start.intervals}
+    return [replace(t, prior_sd=min(t.prior_sd, left.get(t.name, math.inf))) for t in terms]
 
 
 def _refined(
