@@ -105,13 +105,13 @@ def _refined(
 
     Of searches that leave the plant ever freer, a freer one must earn its place, too.
     """
-    search = searches[-1]
+    free = searches[-1]
     # What the constant law left over, at the same window length, is the noise that the prior is
     # weighed against; its own cost is the one in which the gain of a step is judged.
     noise, stride = effective_noise(start._residuals), stride_of(start._residuals)
     tolerance = flat(least(start._residuals, noise))
-    seen, held_back = judged_windows(search, motions, length)
-    law = replace(search, model=copy.deepcopy(start.model), anchors=None)
+    seen, held_back = judged_windows(free, motions, length)
+    law = replace(free, model=copy.deepcopy(start.model), anchors=None)
     same = law.search(
         law.problem(seen, noise, vector, stride), vector, tolerance, "constants, a third held back"
     )
@@ -136,9 +136,9 @@ def _refined(
     assert best is not None
     if best.judgement.score > 1:
         return _constant_kept(best.search, start, str(best.judgement))
-    found = best.taken_up()
-    whole = best.search.problem(cut_windows(search.joint, motions, length), noise, vector, stride)
-    stage = best.search.search(whole, found, tolerance, f"{length:g} s windows")
+    search, found = best.search, best.taken_up()
+    whole = search.problem(cut_windows(search.joint, motions, length), noise, vector, stride)
+    stage = search.search(whole, found, tolerance, f"{length:g} s windows")
     return trajectory_outcome(stage.problem, stage.result, stage.residuals, motions)
 
 

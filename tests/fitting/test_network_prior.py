@@ -14,6 +14,7 @@ from tests.fitting.recordings import pendulum, swing
 
 V_SMOOTH = 0.05
 SMALL = {"terms": (2, 2), "head_units": 2}
+BRIEF = {"windows": (0.5,), "max_steps": 2}
 
 
 @pytest.fixture(scope="module")
@@ -22,6 +23,12 @@ def constant():
     recording = swing(pendulum(), truth, seconds=2.0)
     model = LFM(2, v_smooth=V_SMOOTH)
     return recording, fit(model, pendulum(), recording, windows=(0.5,), fit_plant=False)
+
+
+@pytest.fixture(scope="module")
+def with_plant(constant):
+    recording, _ = constant
+    return recording, fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **BRIEF)
 
 
 @pytest.mark.parametrize("best", range(len(PRIOR_SHARES)))
@@ -57,9 +64,8 @@ def test_a_law_that_is_not_linear_has_a_network_too(constant):
     assert float(model.schedule.parameter_vector().abs().max()) > 0
 
 
-def test_the_plant_stays_about_as_near_to_the_laws_as_that_left_it_open(monkeypatch):
-    truth = LFM(2, [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]], v_smooth=V_SMOOTH)
-    recording = swing(pendulum(), truth, seconds=2.0)
+def test_the_plant_stays_about_as_near_to_the_laws_as_that_left_it_open(constant, monkeypatch):
+    recording, _ = constant
     settings = {"windows": (0.5,), "max_steps": 4}
     law = fit(NCFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
     open_ = {i.name: i.sd for i in law.intervals}
@@ -78,11 +84,10 @@ def test_the_plant_stays_about_as_near_to_the_laws_as_that_left_it_open(monkeypa
 
 
 @pytest.mark.parametrize(("of_near", "freed"), [(0.9, False), (0.7, True)])
-def test_a_plant_is_let_go_only_for_what_windows_held_back_gain(monkeypatch, of_near, freed):
-    truth = LFM(2, [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]], v_smooth=V_SMOOTH)
-    recording = swing(pendulum(), truth, seconds=2.0)
-    settings = {"windows": (0.5,), "max_steps": 2}
-    law = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
+def test_a_plant_is_let_go_only_for_what_windows_held_back_gain(
+    with_plant, monkeypatch, of_near, freed
+):
+    recording, law = with_plant
     seen, trained = [], []
 
     def expected(problem):
@@ -108,7 +113,7 @@ def test_a_plant_is_let_go_only_for_what_windows_held_back_gain(monkeypatch, of_
     monkeypatch.setattr("nfriction.fitting.network.error_on", error)
     monkeypatch.setattr(Refinement, "search", search)
     model = NFLFM(2, v_smooth=V_SMOOTH, **SMALL)
-    fit(model, pendulum(), recording, start=law, **settings)
+    fit(model, pendulum(), recording, start=law, **BRIEF)
     near, _, free, _ = (trial[0] for trial in seen)
     assert near != free
     assert all(a <= b for a, b in zip(near, free, strict=True))
@@ -120,11 +125,8 @@ def test_a_plant_is_let_go_only_for_what_windows_held_back_gain(monkeypatch, of_
     assert torch.equal(last[3], best[3])
 
 
-def test_a_law_that_diverges_lets_go_of_no_plant(monkeypatch):
-    truth = LFM(2, [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]], v_smooth=V_SMOOTH)
-    recording = swing(pendulum(), truth, seconds=2.0)
-    settings = {"windows": (0.5,), "max_steps": 2}
-    law = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
+def test_a_law_that_diverges_lets_go_of_no_plant(with_plant, monkeypatch):
+    recording, law = with_plant
     trained = []
 
     def error(held_back, problem, vector):
@@ -137,18 +139,15 @@ def test_a_law_that_diverges_lets_go_of_no_plant(monkeypatch):
     searched = Refinement.search
     monkeypatch.setattr("nfriction.fitting.network.error_on", error)
     monkeypatch.setattr(Refinement, "search", search)
-    fit(NFLFM(2, v_smooth=V_SMOOTH, **SMALL), pendulum(), recording, start=law, **settings)
+    fit(NFLFM(2, v_smooth=V_SMOOTH, **SMALL), pendulum(), recording, start=law, **BRIEF)
     free, near, *_ = trained
     assert near != free
     assert trained[-1] == near
 
 
 @pytest.mark.parametrize("place", range(2 * len(PRIOR_SHARES)))
-def test_a_network_stopped_before_it_is_judged_gives_way_to_its_law(place, monkeypatch):
-    truth = LFM(2, [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]], v_smooth=V_SMOOTH)
-    recording = swing(pendulum(), truth, seconds=2.0)
-    settings = {"windows": (0.5,), "max_steps": 2}
-    law = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
+def test_a_network_stopped_before_it_is_judged_gives_way_to_its_law(with_plant, place, monkeypatch):
+    recording, law = with_plant
     model, begun = NFLFM(2, v_smooth=V_SMOOTH, prior_sd=0.6, **SMALL), []
 
     def search(self, problem, vector, tolerance, name):
@@ -160,7 +159,7 @@ def test_a_network_stopped_before_it_is_judged_gives_way_to_its_law(place, monke
 
     searched = Refinement.search
     monkeypatch.setattr(Refinement, "search", search)
-    kept = fit(model, pendulum(), recording, start=law, callback=stop, **settings)
+    kept = fit(model, pendulum(), recording, start=law, callback=stop, **BRIEF)
     assert begun[1:] == ["a third held back"] * (place + 1)
     assert not kept.converged
     assert "its constant law is kept" in kept.status
