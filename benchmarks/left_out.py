@@ -16,11 +16,9 @@ from nfriction import Recording, rigs
 from nfriction.fitting import Fit, fit
 from nfriction.fitting.estimate import Zeroed
 from nfriction.friction import Constant, FrictionModel, model_by_name
-from nfriction.friction.model import V_SMOOTH
 from nfriction.plant import Plant
 from nfriction.scoring import score
-from nfriction.selection import cut_blocks
-from nfriction.signals import Motion
+from nfriction.selection import Block, at_found_zeros, leave_blocks_out
 
 State = tuple[NDArray[np.float64], NDArray[np.float64]]
 
@@ -29,10 +27,8 @@ class Set(NamedTuple):
     """Recordings of one mechanism: folder, files, plant, what is aimed at, unit in the table.
 
     `target` is the free run's error and that of 5 s windows; of recordings kept apart, which the
-    folder does not hold. `v_smooth` is where the sign of friction turns: geared drives with dry
-    friction of half their torque and encoders that resolve 0.2 rad/s in a sample need no sharper
-    one than that, and it saves seven integration steps of eight. `zeroed` is when the encoders
-    were: recordings that all begin at rest at 0 were zeroed anew.
+    folder does not hold. `zeroed` is when the encoders were: recordings that all begin at rest at 0
+    were zeroed anew.
     """
 
     folder: str
@@ -40,7 +36,6 @@ class Set(NamedTuple):
     plant: Callable[[], Plant]
     target: tuple[float, float] = (math.nan, math.nan)
     unit: str = "mrad"
-    v_smooth: float = V_SMOOTH
     zeroed: Zeroed = "once"
 
 
@@ -52,11 +47,11 @@ SETS = {
     "triple": Set("multiarm_pendulum", ("triple_b0", "triple_b2"), rigs.multiarm_triple,
                   (2.0, 1.2)),
     "C1": Set("dfki_double_pendulum", ("C1_143339", "C1_143601", "C1_143747", "C1_144003"),
-              lambda: rigs.dfki("C1"), (54.0, math.nan), v_smooth=0.04, zeroed="each"),
+              lambda: rigs.dfki("C1"), (54.0, math.nan), zeroed="each"),
     "C0": Set("dfki_double_pendulum", ("C0_00", "C0_02", "C0_04", "C0_06"),
-              lambda: rigs.dfki("C0"), (40.0, math.nan), v_smooth=0.04, zeroed="each"),
+              lambda: rigs.dfki("C0"), (40.0, math.nan), zeroed="each"),
     "A0": Set("dfki_double_pendulum", ("A0_00", "A0_02", "A0_12"), lambda: rigs.dfki("A0"),
-              (85.0, math.nan), v_smooth=0.04, zeroed="each"),
+              (85.0, math.nan), zeroed="each"),
     "emps": Set("emps", ("emps_first",), rigs.emps, (4.0, math.nan), "mm"),
     "xl330": Set("xl330_servo_pendulum", ("drop_kp100", "drop_kp400"), rigs.xl330,
                  (18.0, math.nan)),
@@ -77,42 +72,33 @@ def read(data: Path, of: Set) -> list[Recording]:
 
 
 class Left(NamedTuple):
-    """A recording left out, with its smoothed motion, or the state that its free run starts from.
-
-    Where neither is given, both come of the recording itself.
-    """
+    """A recording left out, and the state that its free run starts from; None for its own."""
 
     recording: Recording
-    motion: Motion | None = None
-    initial_state: State | None = None
+    initial_state: State | None
 
 
 class Fold(NamedTuple):
-    """What is fitted, and what is left out."""
+    """What is fitted, and what is left out; with blocks, one of every recording that is fitted."""
 
     fitted: list[Recording]
-    left: list[Left]
+    left: list[Left] | list[Block]
 
 
 def folds(data: Path, of: Set, blocks: int) -> list[Fold]:
-    """One recording left out at a time, or with blocks one block in time of every recording.
-
-    Each block has a zero of its own where encoders were zeroed anew: one that is left out is scored
-    without it.
-    """
+    """One recording left out at a time, or with blocks one block in time of every recording."""
     recordings = read(data, of)
     if blocks == 1:
         return [
             Fold([*recordings[:k], *recordings[k + 1 :]],
-                 [Left(left, initial_state=first_state(data, of, left))])
+                 [Left(left, first_state(data, of, left))])
             for k, left in enumerate(recordings)
         ]  # fmt: skip
-    pieces = [cut_blocks(of.plant(), r, blocks) for r in recordings]
+    splits = [leave_blocks_out(of.plant(), r, blocks) for r in recordings]
     return [
-        Fold([block.recording for row in pieces for n, block in enumerate(row) if n != k],
-             [Left(*row[k]) for row in pieces])
+        Fold([row[k].seen.recording for row in splits], [row[k].unseen for row in splits])
         for k in range(blocks)
-    ]  # fmt: skip
+    ]
 
 
 def first_state(data: Path, of: Set, recording: Recording) -> State | None:
@@ -156,16 +142,17 @@ def real(
             fits: list[Fit] = []
             for m in models:
                 start = time.process_time()
-                model = model_by_name(m)(plant.joints, v_smooth=of.v_smooth)
+                model = model_by_name(m)(plant.joints)
                 before = nearest_fit(fits, model)
                 fits.append(fit(model, plant, fold.fitted, start=before, zeroed=of.zeroed,
                                 motions=before.motions if before else None))  # fmt: skip
-                rows[m].add(start, fits[-1].plant, model, fold.left)
+                left = fold.left if blocks == 1 else at_found_zeros(fits[-1], fold.left)
+                rows[m].add(start, fits[-1].plant, model, left)
             states = [first_state(data, of, r) if blocks == 1 else None for r in fold.fitted]
             for m in models if peer else ():
                 if is_constant(m):
                     start = time.process_time()
-                    model = model_by_name(m)(plant.joints, v_smooth=of.v_smooth)
+                    model = model_by_name(m)(plant.joints)
                     found = single_shooting(model, plant, fold.fitted, states)
                     rows[f"{m}, SciPy"].add(start, found, model, fold.left)
         for m, row in rows.items():
@@ -188,7 +175,7 @@ class Row:
         start: float,
         plant: Plant,
         model: FrictionModel,
-        left: Sequence[Left],
+        left: Sequence[Left] | Sequence[Block],
     ) -> None:
         """Count the time since the start, and judge what was found in it."""
         self.spent += time.process_time() - start

@@ -29,7 +29,7 @@ def intervals(data: Path, only: Sequence[str], models: Sequence[str], seconds: f
         for law in models:
             found = []
             for piece in pieces(read(data, of), seconds):
-                model = model_by_name(law)(plant.joints, v_smooth=of.v_smooth)
+                model = model_by_name(law)(plant.joints)
                 told = fit(model, plant, piece, windows=WINDOWS, zeroed=of.zeroed).intervals
                 found.append({i.name: i for i in told if np.isfinite(i.sd) and i.sd > 0})
             z = np.array([

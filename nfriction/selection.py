@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from nfriction.fitting import Fit
 from nfriction.fitting.holdback import LEAST_ERROR
-from nfriction.fitting.preparation import zeroed_each
+from nfriction.fitting.preparation import at_zeros, zeroed_each
 from nfriction.friction import model_by_name
 from nfriction.many import Data, Fits, fit_models
 from nfriction.plant import Plant
@@ -94,10 +95,17 @@ class Selection:
 
 
 class Block(NamedTuple):
-    """A stretch of a recording, with its motion in joint coordinates."""
+    """A part of a recording, with its motion in joint coordinates."""
 
     recording: Recording
     motion: Motion
+
+
+class Split(NamedTuple):
+    """A stretch of a recording, and the recording without it."""
+
+    unseen: Block
+    seen: Block
 
 
 def select(
@@ -116,7 +124,8 @@ def select(
     """Choose a friction model from training recordings alone.
 
     Every recording is cut into as many blocks of time as there are folds. Each fold leaves one
-    block of every recording out, fits all models to the rest and simulates the blocks left out. A
+    block of every recording out, fits all models to the rest and simulates the blocks left out;
+    where encoders were zeroed anew for each recording, with the zeros that the rest showed. A
     model with fewer parameters is preferred where its error cannot be told from the least one:
     within `tolerance`, or within the standard error of the difference over blocks, both of their
     mean squares and of the logarithms: one block of violent motion must not hide that it is worse
@@ -146,13 +155,13 @@ def select(
             f"{len(models)} models, {len(recordings)} recordings and {folds} folds."
         )
     names = list(dict.fromkeys(models))
-    blocks = [cut_blocks(plant, recording, folds) for recording in recordings]
+    splits = [leave_blocks_out(plant, recording, folds) for recording in recordings]
     if fit_settings.get("zeroed", "auto") == "auto":
         # Blocks no longer show where their recording began.
         each = zeroed_each(plant, recordings)
         fit_settings["zeroed"] = "each" if each else "once"
-    horizon = min(horizon, *(b.recording.duration for row in blocks for b in row))
-    seen, unseen = _folds(blocks, folds)
+    horizon = min(horizon, *(s.unseen.recording.duration for row in splits for s in row))
+    seen, unseen = _folds(splits, folds)
     fits = fit_models(
         plant, names, seen, jobs=jobs, on_stage=on_stage, on_step=on_step, **fit_settings
     )
@@ -161,16 +170,16 @@ def select(
 
 
 def _folds(
-    blocks: Sequence[list[Block]], folds: int
+    splits: Sequence[list[Split]], folds: int
 ) -> tuple[dict[str, Data], dict[str, list[Block]]]:
-    """What each fold's fits see, and what they do not."""
+    """What each fold's fits see of every recording, and what they do not."""
     seen, unseen = {}, {}
     for fold in range(folds):
         label = f"fold {fold + 1} of {folds}: fit"
         # Staggered, so that no fold lacks the same stretch of every recording.
-        out = [(fold + i) % folds for i in range(len(blocks))]
-        unseen[label] = [row[k] for row, k in zip(blocks, out, strict=True)]
-        left = [b for row, k in zip(blocks, out, strict=True) for b in (*row[:k], *row[k + 1 :])]
+        chosen = [row[(fold + i) % folds] for i, row in enumerate(splits)]
+        unseen[label] = [split.unseen for split in chosen]
+        left = [split.seen for split in chosen]
         seen[label] = Data([b.recording for b in left], [b.motion for b in left])
     return seen, unseen
 
@@ -188,7 +197,7 @@ def _candidate(
     for label, blocks in unseen.items():
         found = fits[label].found.get(name)
         converged &= found is not None and found.converged
-        errors += [block_error(found, b, horizon) if found else math.inf for b in blocks]
+        errors += block_errors(found, blocks, horizon) if found else [math.inf] * len(blocks)
     parameters = model_by_name(name)(plant.joints).schedule.parameter_vector().numel()
     return Candidate(name, tuple(errors), parameters, converged)
 
@@ -231,8 +240,8 @@ def choose(
     )
 
 
-def cut_blocks(plant: Plant, recording: Recording, count: int) -> list[Block]:
-    """Blocks of a recording that follow each other, of equal numbers of samples.
+def leave_blocks_out(plant: Plant, recording: Recording, count: int) -> list[Split]:
+    """A recording without each of as many blocks of time, which share their ends with the rest.
 
     The whole recording is smoothed once: a block's ends are then as well known as its middle.
 
@@ -246,21 +255,35 @@ def cut_blocks(plant: Plant, recording: Recording, count: int) -> list[Block]:
         )
     joint = recording.joint_coordinates(plant)
     motion = kalman_smoother(joint.time, joint.q)
-    edges = np.linspace(0, len(recording) - 1, count + 1).astype(int).tolist()
-    blocks = []
-    for k in range(count):
-        part = slice(edges[k], edges[k + 1] + 1)
-        own = Motion(motion.time[part], motion.q[part], motion.qd[part], motion.qdd[part])
-        blocks.append(Block(recording[part], own))
-    return blocks
+    index = np.arange(len(recording))
+    splits = []
+    for first, last in pairwise(np.linspace(0, index[-1], count + 1).astype(int)):
+        inside = (first <= index) & (index <= last)
+        # A block at an end of the recording leaves no lone sample behind.
+        rest = ((index <= first) & (first > 0)) | ((last <= index) & (last < index[-1]))
+        splits.append(Split(*(Block(recording[m], _part(motion, m)) for m in (inside, rest))))
+    return splits
 
 
-def block_error(found: Fit, block: Block, horizon: float) -> float:
-    """Root mean square position error of simulations of `horizon` seconds over a block."""
-    result = score(
-        found.plant, found.model, block.recording, motion=block.motion, horizons=(horizon,)
+def _part(motion: Motion, mask: NDArray[np.bool_]) -> Motion:
+    return Motion(motion.time[mask], motion.q[mask], motion.qd[mask], motion.qdd[mask])
+
+
+def at_found_zeros(found: Fit, blocks: Sequence[Block]) -> list[Block]:
+    """Blocks with the zeros that a fit found in the rest of their recordings, one block to each."""
+    recordings, motions = at_zeros(
+        found.zeros, found.plant, [b.recording for b in blocks], [b.motion for b in blocks]
     )
-    return result.windows[f"{horizon:g}"].all
+    return [Block(*pair) for pair in zip(recordings, motions, strict=True)]
+
+
+def block_errors(found: Fit, blocks: Sequence[Block], horizon: float) -> list[float]:
+    """Root mean square position error of simulations of `horizon` seconds over each block."""
+    return [
+        score(found.plant, found.model, block.recording, motion=block.motion, horizons=(horizon,))
+        .windows[f"{horizon:g}"].all
+        for block in at_found_zeros(found, blocks)
+    ]  # fmt: skip
 
 
 def _alike(one: Candidate, best: Candidate, tolerance: float) -> bool:

@@ -368,6 +368,22 @@ def test_gaps_are_noticed_and_jitter_is_not() -> None:
         Recording(time + 1.0 * (time >= 0.2) + 2.0 * (time >= 0.4), np.zeros((100, 1)), name="a")
 
 
+def test_a_mask_leaves_samples_out_and_what_was_told_is_not_told_again() -> None:
+    time = np.arange(100) / 100
+    columns = {"tau": 2.0 * time[:, None], "qd": 3.0 * time[:, None]}
+    recording = Recording(time, time[:, None], **columns, convention="relative,upright", name="a")
+    keep = (time < 0.3) | (time > 0.6)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        part = recording[keep]
+        again = part[:60].joint_coordinates()
+    assert part.name == "a"
+    for key in ("time", "q", "tau", "qd"):
+        np.testing.assert_array_equal(getattr(part, key), getattr(recording, key)[keep])
+    assert part.spans == [(0, 29), (30, len(part) - 1)]
+    assert len(again) == 60
+
+
 def test_whirling_angles_are_not_taken_for_degrees_or_wrapped() -> None:
     time = np.arange(2000) * 1e-3
     whirling = 25.0 * time[:, None]

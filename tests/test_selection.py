@@ -1,12 +1,15 @@
 """The choice of a law: by error on blocks left out, and the simpler one where that is a draw."""
 
 import math
+import warnings
 from itertools import pairwise
 
+import numpy as np
 import pytest
 
 from nfriction import LFM, NCFM, fit
-from nfriction.selection import Candidate, Selection, choose, cut_blocks, select
+from nfriction.recording import RecordingWarning
+from nfriction.selection import Candidate, Selection, choose, leave_blocks_out, select
 from tests.fitting.recordings import pendulum, swing
 
 
@@ -79,14 +82,29 @@ def test_a_model_that_fails_in_a_fold_counts_as_diverged(monkeypatch):
     assert not failed.converged
 
 
-def test_blocks_cover_a_recording_and_share_their_ends():
+def test_blocks_cover_a_recording_and_share_their_ends_with_the_rest():
     recording = swing(pendulum(), LFM(2, [1e-3, 1e-3], v_smooth=0.05), seconds=1.0)
-    blocks = cut_blocks(pendulum(), recording, 3)
+    splits = leave_blocks_out(pendulum(), recording, 3)
+    blocks = [split.unseen for split in splits]
     assert blocks[0].recording.time[0] == recording.time[0]
     assert blocks[-1].recording.time[-1] == recording.time[-1]
     for before, after in pairwise(blocks):
         assert before.recording.time[-1] == after.recording.time[0]
-        assert len(before.motion.q) == len(before.recording)
+    for k, (block, rest) in enumerate(splits):
+        shared = np.intersect1d(block.recording.time, rest.recording.time)
+        assert len(shared) == (2 if k == 1 else 1)
+        assert len(rest.recording) + len(block.recording) == len(recording) + len(shared)
+        assert len(rest.recording.spans) == (2 if k == 1 else 1)
+        for part in (block, rest):
+            np.testing.assert_array_equal(part.motion.time, part.recording.time)
+
+
+def test_what_is_left_of_a_recording_is_no_reason_to_warn():
+    recording = swing(pendulum(), NCFM(2, [[1e-3]] * 2), seconds=1.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RecordingWarning)
+        middle = leave_blocks_out(pendulum(), recording, 3)[1].seen
+        middle.recording.joint_coordinates(pendulum())
 
 
 def test_bad_input_is_refused():

@@ -18,6 +18,8 @@ LENGTH_BOUND, LENGTH_SD = 0.1, 0.01
 ANGLE_BOUND, ANGLE_SD = 0.1, 0.02
 # A disc sits on its shaft to within some hundredths of a millimetre, at a radius of a centimetre.
 ECCENTRICITY_BOUND, ECCENTRICITY_SD = 0.02, 0.002
+# Of two drives, torque constants and losses of gears stand to each other as told to about a tenth.
+GAIN_BOUND, GAIN_SD = 0.3, 0.1
 # A force offset is a bias of the drive's current sensor; where friction is dry, a large one and a
 # wrong zero of an angle pass for each other.
 OFFSET_SHARE = 0.01
@@ -73,8 +75,8 @@ def plant_parameters(
         eccentricity: fit how far the encoders sit off their shafts, two numbers a link.
 
     Returns:
-        Ratios of inertia, gravity, length, armature and mass terms, angle offsets, torque offsets
-        of driven joints, drag, and eccentricity.
+        Ratios of inertia, gravity, length, armature and mass terms, angle offsets, torque gains of
+        driven joints beside the first's, torque offsets, drag, and eccentricity.
     """
     buffers = dict(plant.named_buffers())
     found: list[PlantParameter] = []
@@ -119,6 +121,9 @@ def plant_parameters(
     for name in ("armature", "mass") if driven else ("armature",):
         for j in range(buffers[name].shape[-1] if name in buffers else 0):
             ratio(f"{name} {j + 1}", only(name, (j,)))
+    # All gains alike are but the scale of the masses, so the first is kept.
+    for j in driven[1:] if "torque_gain" in buffers else ():
+        ratio(f"torque gain {j + 1}", only("torque_gain", (j,)), GAIN_BOUND, GAIN_SD)
     if driven:
         joints = buffers["torque_offset"].shape[-1]
         kind, force = ("force", "N") if plant.unit == "m" else ("torque", "N m")

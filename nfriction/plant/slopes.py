@@ -33,6 +33,16 @@ class PlantSlopes(NamedTuple):
     load_by_q: Tensor
     load_by_qd: Tensor
 
+    def geared(self, gain: Tensor) -> "PlantSlopes":
+        """By torques of which `gain`, (*batch, joint), reaches the joints."""
+        batch = (1,) * (self.by_q.ndim - 1 - gain.ndim)
+        own = gain.movedim(-1, 0).reshape(-1, *batch, *gain.shape[:-1])
+        return self._replace(
+            by_q=self.by_q / own.unsqueeze(1),
+            by_qd=self.by_qd / own.unsqueeze(1),
+            inverse_mass=self.inverse_mass * own,
+        )
+
 
 def planar_slopes(
     pose: Pose,

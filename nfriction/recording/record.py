@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import os
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from nfriction import formats
 from nfriction.angles import AngleConvention, ConventionLike, Mechanism
 from nfriction.recording.validation import (
+    RecordingWarning,
     check_content,
     check_shapes,
     frozen,
@@ -139,16 +141,25 @@ class Recording:
             f"convention={self._said or 'that of the plant'!r}, unit={self.unit!r}, with={extras})"
         )
 
-    def __getitem__(self, samples: slice) -> Recording:
-        """Samples as a recording, `recording[100:200]`; the stamps stay."""
-        if not isinstance(samples, slice):
+    def __getitem__(self, samples: slice | NDArray[np.bool_]) -> Recording:
+        """Samples as a recording, `recording[100:200]` or `recording[recording.time < 3]`.
+
+        The stamps stay.
+        """
+        if not isinstance(samples, slice) and getattr(samples, "dtype", None) != np.bool_:
             raise TypeError(
-                f"a recording is cut by a slice of samples, got {samples!r}; "
+                f"a recording is cut by a slice of samples or a mask, got {samples!r}; "
                 f"columns are `recording.q[:, k]`."
             )
         tau = None if self.tau is None else self.tau[samples]
         qd = None if self.qd is None else self.qd[samples]
-        return replace(self, time=self.time[samples], q=self.q[samples], tau=tau, qd=qd)
+        return self.derived(time=self.time[samples], q=self.q[samples], tau=tau, qd=qd)
+
+    def derived(self, **changes: Any) -> Recording:
+        """A recording made of this one, whose oddities were told when this one was made."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RecordingWarning)
+            return replace(self, **changes)
 
     def window(self, start: float, stop: float) -> Recording:
         """The samples from `start` to `stop` [s of the recording's own time], both included."""
@@ -207,7 +218,7 @@ class Recording:
         first_link = 0 if plant is None else plant.first_link
         qd = None if self.qd is None else convention.rate_to_joint(self.qd, first_link)
         q = convention.position_to_joint(self.q, first_link)
-        return replace(self, q=q, qd=qd, convention=AngleConvention())
+        return self.derived(q=q, qd=qd, convention=AngleConvention())
 
     def digest(self) -> str:
         """SHA-256 of the content in hexadecimal: arrays, joint names, convention and unit."""

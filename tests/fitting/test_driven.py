@@ -8,6 +8,7 @@ import torch
 
 from nfriction import LFM, NLFM, PendulumChain, Recording, fit, rollout
 from nfriction.friction import ACVFM, CVFM, NFCVFM, Constant, FrictionModel
+from nfriction.selection import block_errors, leave_blocks_out
 from nfriction.signals import quantise
 from tests.fitting.recordings import F64, pendulum, swing
 
@@ -57,6 +58,22 @@ def test_friction_and_masses_of_a_driven_mechanism_are_recovered_from_irregular_
         )
 
 
+def test_a_drive_that_gives_less_torque_than_it_reports_is_found():
+    plant = geared()
+    truth = plant.replace(torque_gain=torch.tensor([1.0, 0.85], dtype=F64))
+    law = CVFM(2, DRY, v_smooth=V_SMOOTH)
+    recordings = [driven(truth, law, seed) for seed in (0, 1)]
+    found = fit(CVFM(2, v_smooth=V_SMOOTH), plant, recordings, windows=(1.0,))
+    assert found.converged, found.status
+    (gain,) = (i for i in found.intervals if i.name == "torque gain 2")
+    assert gain.low < -0.15 < gain.high
+    assert gain.high - gain.low < 0.02
+    # Friction is told in the torques that the drive reports.
+    torch.testing.assert_close(
+        found.model.schedule.values, law.schedule.values, rtol=0.02, atol=2e-4
+    )
+
+
 def test_encoders_zeroed_anew_at_the_start_of_each_recording():
     """Only the truth's zeros differ; a plant with one offset for all cannot follow."""
     plant = geared()
@@ -73,6 +90,22 @@ def test_encoders_zeroed_anew_at_the_start_of_each_recording():
     assert each.residual < 0.05 * once.residual
     torch.testing.assert_close(each.model.schedule.values, truth, rtol=0.01, atol=1e-4)
     assert torch.equal(each.plant.angle_offset, plant.angle_offset)
+
+
+def test_a_block_left_out_has_the_zero_of_its_recording():
+    """Two thirds of a recording, the last and the first, tell where its encoders read zero."""
+    plant = geared()
+    truth, off = CVFM(2, DRY, v_smooth=V_SMOOTH), ([0.06, -0.08], [-0.03, 0.05])
+    recordings = [driven(plant, truth, seed) for seed in (0, 1)]
+    moved = [replace(r, q=r.q - o) for r, o in zip(recordings, off, strict=True)]
+    splits = [leave_blocks_out(plant, r, 3)[1] for r in moved]
+    seen = [split.seen.recording for split in splits]
+    found = fit(CVFM(2, v_smooth=V_SMOOTH), plant, seen, windows=(1.0,), zeroed="each")
+    np.testing.assert_allclose(found.zeros, off, atol=3e-3)
+    blocks = [split.unseen for split in splits]
+    for error, block in zip(block_errors(found, blocks, 1.0), blocks, strict=True):
+        assert error < 2e-3
+        assert block_errors(replace(found, zeros=()), [block], 1.0)[0] > 5 * error
 
 
 def test_recordings_that_all_begin_at_rest_at_zero_are_taken_for_zeroed_there():

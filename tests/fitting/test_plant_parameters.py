@@ -18,7 +18,7 @@ def test_free_swing_keeps_one_gravity_term_as_the_scale():
     assert {"inertia 11", "inertia 22", "gravity 2", "length 1"} < set(free)
     driven = names(pendulum(), driven=(0, 1), largest_torque=1.0)
     assert set(driven) - set(free) == {
-        "gravity 1", "torque offset 1 [N m]", "torque offset 2 [N m]"
+        "gravity 1", "torque gain 2", "torque offset 1 [N m]", "torque offset 2 [N m]"
     }  # fmt: skip
 
 
@@ -27,6 +27,8 @@ def test_a_joint_that_nothing_drives_has_no_torque_to_be_off():
     assert "torque offset 2 [N m]" in told
     assert "torque offset 1 [N m]" not in told
     assert "gravity 1" in told
+    # Nor has a lone drive a gain: it would be but the scale of the masses.
+    assert not [name for name in told if "gain" in name]
 
 
 def test_terms_that_are_not_there_are_not_adjusted():

@@ -28,11 +28,14 @@ def states(joints: int, batch: tuple[int, ...] = (20,), seed: int = 0) -> tuple[
 
 
 def every_kind(arm: Any) -> PendulumChain:
-    """Offsets, rotors, full tensors and, with a fixed arm, drag: every term of the mechanism."""
+    """Offsets, gains, rotors, full tensors and, with a fixed arm, drag: all terms there are."""
     rig = rigs.tlrip(arm, FULL_TENSOR)
     joints, links = torch.linspace(0.1, 0.2, rig.joints).double(), torch.ones(3).double()
     drag = {} if rig.first_link else {"drag_linear": 0.02 * links, "drag_quadratic": 0.03 * links}
-    return rig.replace(armature=joints / 10, angle_offset=joints, torque_offset=-joints, **drag)
+    return rig.replace(
+        armature=joints / 10, angle_offset=joints, torque_gain=1.0 + 2.0 * joints,
+        torque_offset=-joints, **drag,
+    )  # fmt: skip
 
 
 def with_encoders(rig: PendulumChain) -> PendulumChain:
@@ -80,9 +83,10 @@ def test_inverse_dynamics_undoes_forward_dynamics(rig: PendulumChain, seed: int)
 def test_forward_dynamics_is_mass_matrix_and_bias(arm: Any) -> None:
     rig = every_kind(arm)
     q, qd, tau = states(rig.joints)
-    rhs = tau + rig.torque_offset - rig.bias(q, qd)
+    rhs = rig.torque_gain * tau + rig.torque_offset - rig.bias(q, qd)
     expected = torch.linalg.solve(rig.mass_matrix(q), rhs)
     torch.testing.assert_close(rig(q, qd, tau), expected, rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(rig.inverse_dynamics(q, qd, expected), tau, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("arm", ARMS)
@@ -137,6 +141,7 @@ def test_mobility_bounds_random_poses(arm: Any) -> None:
     rig = every_kind(arm)
     q, _, _ = states(rig.joints, (2000,))
     found = torch.linalg.inv(rig.mass_matrix(q)).diagonal(dim1=-2, dim2=-1).amax(0)
+    found = rig.torque_gain * found
     # The grid's steps of 15 degrees for three angles miss the top by no more than a percent.
     assert (found <= 1.01 * rig.mobility()).all()
     assert (found >= 0.8 * rig.mobility()).all()
@@ -146,7 +151,7 @@ def test_mobility_bounds_random_poses(arm: Any) -> None:
 def test_gradients_of_both_modes(arm: Any) -> None:
     rig = with_encoders(every_kind(arm))
     names = ["inertia_coupling", "gravity_moment", "armature", "angle_offset", "torque_offset"]
-    names += ["encoder_cosine", "encoder_sine"]
+    names += ["torque_gain", "encoder_cosine", "encoder_sine"]
     names += ["arm_inertia", "arm_lever", "inertia_tensor"] if rig.first_link else []
     names += [] if rig.first_link else ["drag_linear", "drag_quadratic", "length"]
     values = [getattr(rig, name).clone() for name in names]

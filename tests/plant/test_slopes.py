@@ -15,6 +15,12 @@ CHAINS = {
     "three, offset": rigs.tlrip(arm="fixed").replace(
         angle_offset=torch.tensor([0.1, -0.2, 0.3], dtype=F64)
     ),
+    "three, driven otherwise than told": rigs.tlrip(arm="fixed").replace(
+        torque_gain=torch.tensor([1.2, 0.8, 1.1], dtype=F64)
+    ),
+    "three, of several gains": rigs.tlrip(arm="fixed").replace(
+        torque_gain=torch.linspace(0.7, 1.3, 15, dtype=F64).reshape(5, 1, 3)
+    ),
 }
 
 
@@ -34,10 +40,11 @@ def test_slopes_are_the_automatic_ones(name):
     q, qd, qdd = torch.randn(3, 5, 4, plant.joints, generator=random, dtype=F64) * 5.0
     found = plant.slopes(q, qd, qdd)
     load_by_qd = derivative(lambda x: plant.load(q, x), qd)
+    by_tau = derivative(lambda x: plant.forward_dynamics(q, qd, x), torch.zeros_like(q))
     for a, b in (
         (found.by_q, derivative(lambda x: plant.inverse_dynamics(x, qd, qdd), q)),
         (found.by_qd, derivative(lambda x: plant.inverse_dynamics(q, x, qdd), qd)),
-        (found.inverse_mass, torch.linalg.inv(plant.mass_matrix(q)).movedim((-2, -1), (0, 1))),
+        (found.inverse_mass, by_tau),
         (found.load_by_q, derivative(lambda x: plant.load(x, qd), q)),
         (torch.diag_embed(found.load_by_qd.movedim(0, -1)), load_by_qd.movedim((0, 1), (-2, -1))),
     ):
