@@ -20,6 +20,8 @@ ANGLE_BOUND, ANGLE_SD = 0.1, 0.02
 ECCENTRICITY_BOUND, ECCENTRICITY_SD = 0.02, 0.002
 # Of two drives, torque constants and losses of gears stand to each other as told to about a tenth.
 GAIN_BOUND, GAIN_SD = 0.3, 0.1
+# A stage of a gear loses some hundredths of the torque, a worm much more.
+LOSS_BOUND, LOSS_SD = 0.5, 0.05
 # A force offset is a bias of the drive's current sensor; where friction is dry, a large one and a
 # wrong zero of an angle pass for each other.
 OFFSET_SHARE = 0.01
@@ -76,7 +78,7 @@ def plant_parameters(
 
     Returns:
         Ratios of inertia, gravity, length, armature and mass terms, angle offsets, torque gains of
-        driven joints beside the first's, torque offsets, drag, and eccentricity.
+        driven joints beside the first's, their gears' losses, torque offsets, drag, eccentricity.
     """
     buffers = dict(plant.named_buffers())
     found: list[PlantParameter] = []
@@ -124,6 +126,9 @@ def plant_parameters(
     # All gains alike are but the scale of the masses, so the first is kept.
     for j in driven[1:] if "torque_gain" in buffers else ():
         ratio(f"torque gain {j + 1}", only("torque_gain", (j,)), GAIN_BOUND, GAIN_SD)
+    for j in driven if "gear_loss" in buffers else ():
+        unit = torch.eye(len(buffers["gear_loss"]), dtype=torch.float64)[j]
+        shift(f"gear loss {j + 1}", "gear_loss", unit, 0.0, LOSS_BOUND, LOSS_SD)
     if driven:
         joints = buffers["torque_offset"].shape[-1]
         kind, force = ("force", "N") if plant.unit == "m" else ("torque", "N m")

@@ -127,6 +127,10 @@ class Plant(nn.Module):
                 )
         clone = copy.copy(self)
         clone._buffers = {**self._buffers, **buffers}
+        for name, value in buffers.items():
+            # A module names a tensor but once, and each buffer is to be found by its own name.
+            if sum(value is other for other in clone._buffers.values()) > 1:
+                clone._buffers[name] = value.view_as(value)
         clone._note_replaced(buffers)
         return clone
 

@@ -19,6 +19,7 @@ from nfriction.plant.coordinates import (
 )
 from nfriction.plant.drag import drag_forces
 from nfriction.plant.encoder import Turned, true_angle
+from nfriction.plant.gear import by_velocity, delivered, demanded, passed_on
 from nfriction.plant.inertia import inertia_tensors
 from nfriction.plant.linear import Matrix, dot, entries, multiply, solve, stack, stack_matrix
 from nfriction.plant.planar import (
@@ -45,7 +46,7 @@ class _Geometry(NamedTuple):
 
 
 class PendulumChain(Plant):
-    """Frictionless equations of motion M(q) qdd + bias(q, qd) = torque_gain tau + torque_offset.
+    """Frictionless equations of motion M(q) qdd + bias(q, qd) = tau + torque_offset.
 
     Joint coordinates: with a free arm, column 0 is its angle about the vertical; the first link
     is measured from upright, each further one relative to the link before. Friction is not part
@@ -72,9 +73,9 @@ class PendulumChain(Plant):
         armature: (joints,) [kg m^2].
         angle_offset: added to q before the geometry is evaluated, (joints,) [rad].
         encoder_cosine, encoder_sine: eccentricity of the encoders, see `encoder`, (joints,) [rad].
-        torque_gain: torque at the joint for one that the drive reports, (joints,) [-]; friction is
-            told in the drive's, as a controller has to command it.
-        torque_offset: added to what gain and tau make, (joints,) [N m].
+        torque_gain, gear_loss: what becomes of tau before it reaches the joints, see `gear`,
+            (joints,) [-]. Friction is told in the drives' torque, as a controller commands it.
+        torque_offset: added to tau at the joints, (joints,) [N m].
         drag_linear, drag_quadratic: k1 [N s/m^2], k2 [N s^2/m^3] per link.
         length: (links,) [m].
         load_lever: l_i / g, (links,) [s^2].
@@ -103,6 +104,7 @@ class PendulumChain(Plant):
     encoder_sine: Tensor
     encoder_zero: Tensor
     torque_gain: Tensor
+    gear_loss: Tensor
     drag_linear: Tensor
     drag_quadratic: Tensor
     length: Tensor
@@ -160,6 +162,7 @@ class PendulumChain(Plant):
         hanging[first] = -1.0
         self.register_buffer("encoder_zero", hanging, persistent=False)
         self.register_buffer("torque_gain", torch.ones_like(rotor))
+        self.register_buffer("gear_loss", torch.zeros_like(rotor))
         self.register_buffer("torque_offset", torch.zeros_like(rotor))
         self.register_buffer("drag_linear", zero)
         self.register_buffer("drag_quadratic", zero.clone())
@@ -172,7 +175,7 @@ class PendulumChain(Plant):
         # What is not there costs nothing: Python flags, settled here and by `replace`, never in a
         # step.
         self.has_armature = bool(rotor.any())
-        self.has_gain = False
+        self.has_gear = False
         self.has_drag = False
         self.has_eccentricity = False
         self._slender = bool(torch.equal(tensors[:, 1], tensors[:, 2])) and not bool(
@@ -241,8 +244,8 @@ class PendulumChain(Plant):
     def _accelerate(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
         """True accelerations at true angles and rates."""
         geometry = self._geometry(q)
-        if self.has_gain:
-            tau = self.torque_gain * tau
+        if self.has_gear:
+            tau = delivered(tau, qd, self.torque_gain, self.gear_loss)
         force = link_forces((tau + self.torque_offset).unbind(-1), self.first_link)
         bias = self._bias(geometry, qd)
         rhs = [f - h for f, h in zip(force, bias, strict=True)]
@@ -266,7 +269,9 @@ class PendulumChain(Plant):
         inertial = multiply(self._mass(geometry), absolute(qdd.unbind(-1), self.first_link))
         force = [f + h for f, h in zip(inertial, self._bias(geometry, qd), strict=True)]
         torque = stack(joint_forces(force, self.first_link)) - self.torque_offset
-        return torque / self.torque_gain if self.has_gain else torque
+        if self.has_gear:
+            torque = demanded(torque, qd, self.torque_gain, self.gear_loss)
+        return torque
 
     def energy(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
         """Kinetic and potential energy [J], each (*batch); zero height is the first joint's."""
@@ -311,7 +316,10 @@ class PendulumChain(Plant):
         moment, lever = self.gravity_moment.unbind(-1), self.load_lever.unbind(-1)
         mass = self._mass(geometry)
         slopes = planar_slopes(geometry.pose, geometry.coupling, mass, moment, lever, qd, qdd)
-        return slopes.geared(self.torque_gain) if self.has_gain else slopes
+        if not self.has_gear:
+            return slopes
+        tau, gain, loss = self.inverse_dynamics(q, qd, qdd), self.torque_gain, self.gear_loss
+        return slopes.geared(passed_on(tau, qd, gain, loss), by_velocity(tau, qd, loss))
 
     @torch.no_grad()
     def mobility(self) -> Tensor:
@@ -321,7 +329,8 @@ class PendulumChain(Plant):
         Searched on a grid of at most 5 degrees for one or two turning angles, coarser for more.
         """
         inverse = torch.linalg.inv(self.mass_matrix(turning_poses(self.joints).to(self.armature)))
-        return (self.torque_gain * inverse.diagonal(dim1=-2, dim2=-1)).amax(-2)
+        most = self.torque_gain * (1.0 + self.gear_loss)
+        return (most * inverse.diagonal(dim1=-2, dim2=-1)).amax(-2)
 
     def extra_repr(self) -> str:
         """Name, links, arm and what is switched on."""
@@ -342,7 +351,7 @@ class PendulumChain(Plant):
         if {"encoder_cosine", "encoder_sine"} & set(names):
             self.has_eccentricity = True
         self.has_armature = self.has_armature or "armature" in names
-        self.has_gain = self.has_gain or "torque_gain" in names
+        self.has_gear = self.has_gear or bool({"torque_gain", "gear_loss"} & set(names))
         self._slender = self._slender and "inertia_tensor" not in names
 
     def _turned(self, q: Tensor) -> Turned:

@@ -33,13 +33,18 @@ class PlantSlopes(NamedTuple):
     load_by_q: Tensor
     load_by_qd: Tensor
 
-    def geared(self, gain: Tensor) -> "PlantSlopes":
-        """By torques of which `gain`, (*batch, joint), reaches the joints."""
-        batch = (1,) * (self.by_q.ndim - 1 - gain.ndim)
-        own = gain.movedim(-1, 0).reshape(-1, *batch, *gain.shape[:-1])
+    def geared(self, share: Tensor, by_velocity: Tensor) -> "PlantSlopes":
+        """Behind gears.
+
+        Args:
+            share: of the drives' torque that reaches the joints, (*batch, joint).
+            by_velocity: of the drives' torque by each joint's own velocity, (*batch, joint).
+        """
+        own = share.movedim(-1, 0)
+        turning = torch.diag_embed(by_velocity).movedim((-2, -1), (0, 1))
         return self._replace(
             by_q=self.by_q / own.unsqueeze(1),
-            by_qd=self.by_qd / own.unsqueeze(1),
+            by_qd=self.by_qd / own.unsqueeze(1) + turning,
             inverse_mass=self.inverse_mass * own,
         )
 

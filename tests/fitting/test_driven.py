@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nfriction import LFM, NLFM, PendulumChain, Recording, fit, rollout
-from nfriction.friction import ACVFM, CVFM, NFCVFM, Constant, FrictionModel
+from nfriction.friction import ACVFM, CFM, CVFM, NFCVFM, Constant, FrictionModel
 from nfriction.selection import block_errors, leave_blocks_out
 from nfriction.signals import quantise
 from tests.fitting.recordings import F64, pendulum, swing
@@ -72,6 +72,19 @@ def test_a_drive_that_gives_less_torque_than_it_reports_is_found():
     torch.testing.assert_close(
         found.model.schedule.values, law.schedule.values, rtol=0.02, atol=2e-4
     )
+
+
+def test_what_gears_lose_is_told_from_dry_friction():
+    plant = geared()
+    truth = plant.replace(gear_loss=torch.tensor([0.05, 0.12], dtype=F64))
+    law = CFM(2, [[0.20], [0.15]], v_smooth=V_SMOOTH)
+    recordings = [driven(truth, law, seed) for seed in (0, 1, 2)]
+    found = fit(CFM(2, v_smooth=V_SMOOTH), plant, recordings, windows=(1.0,))
+    told = {i.name: i for i in found.intervals}
+    for name, loss in (("gear loss 1", 0.05), ("gear loss 2", 0.12)):
+        assert told[name].low < loss < told[name].high, told[name]
+        assert told[name].high - told[name].low < 0.05
+    torch.testing.assert_close(found.model.schedule.values, law.schedule.values, rtol=0.02, atol=0)
 
 
 def test_encoders_zeroed_anew_at_the_start_of_each_recording():

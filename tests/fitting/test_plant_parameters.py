@@ -18,7 +18,8 @@ def test_free_swing_keeps_one_gravity_term_as_the_scale():
     assert {"inertia 11", "inertia 22", "gravity 2", "length 1"} < set(free)
     driven = names(pendulum(), driven=(0, 1), largest_torque=1.0)
     assert set(driven) - set(free) == {
-        "gravity 1", "torque gain 2", "torque offset 1 [N m]", "torque offset 2 [N m]"
+        "gravity 1", "torque gain 2", "gear loss 1", "gear loss 2", "torque offset 1 [N m]",
+        "torque offset 2 [N m]",
     }  # fmt: skip
 
 

@@ -21,6 +21,9 @@ CHAINS = {
     "three, of several gains": rigs.tlrip(arm="fixed").replace(
         torque_gain=torch.linspace(0.7, 1.3, 15, dtype=F64).reshape(5, 1, 3)
     ),
+    "three, behind gears": rigs.tlrip(arm="fixed").replace(
+        gear_loss=torch.tensor([0.3, 0.1, 0.0], dtype=F64)
+    ),
 }
 
 
@@ -38,9 +41,12 @@ def test_slopes_are_the_automatic_ones(name):
     plant = CHAINS[name]
     random = torch.Generator().manual_seed(0)
     q, qd, qdd = torch.randn(3, 5, 4, plant.joints, generator=random, dtype=F64) * 5.0
+    # As slow as a gear's loss turns.
+    qd[0] *= 0.02
     found = plant.slopes(q, qd, qdd)
     load_by_qd = derivative(lambda x: plant.load(q, x), qd)
-    by_tau = derivative(lambda x: plant.forward_dynamics(q, qd, x), torch.zeros_like(q))
+    tau = plant.inverse_dynamics(q, qd, qdd)
+    by_tau = derivative(lambda x: plant.forward_dynamics(q, qd, x), tau)
     for a, b in (
         (found.by_q, derivative(lambda x: plant.inverse_dynamics(x, qd, qdd), q)),
         (found.by_qd, derivative(lambda x: plant.inverse_dynamics(q, x, qdd), qd)),

@@ -1,0 +1,34 @@
+"""What a drive's torque becomes behind its gear: a gain, and a loss that opposes the motion.
+
+Of a torque tau, friction subtracted, gain (tau - loss |tau| sgn(qd)) reaches the joint: less where
+the drive moves the joint, more where the joint moves the drive.
+"""
+
+import torch
+from torch import Tensor
+
+# Over which the sense of the loss turns [rad/s]: slower motion is dry friction's, and a sharper
+# turn would ask for shorter integration steps.
+TURN = 0.1
+
+
+def delivered(tau: Tensor, qd: Tensor, gain: Tensor, loss: Tensor) -> Tensor:
+    """Torque at the joints [N m], (*batch, joint)."""
+    return gain * (tau - loss * tau.abs() * torch.tanh(qd / TURN))
+
+
+def demanded(torque: Tensor, qd: Tensor, gain: Tensor, loss: Tensor) -> Tensor:
+    """Torque of the drives that gives one at the joints; undoes `delivered`."""
+    return torque / passed_on(torque, qd, gain, loss)
+
+
+def passed_on(torque: Tensor, qd: Tensor, gain: Tensor, loss: Tensor) -> Tensor:
+    """Share of the drives' torque that reaches the joints, (*batch, joint)."""
+    return gain * (1.0 - loss * torque.sign() * torch.tanh(qd / TURN))
+
+
+def by_velocity(tau: Tensor, qd: Tensor, loss: Tensor) -> Tensor:
+    """Derivative of the torque demanded, `tau`, by the joint's own velocity."""
+    sense = torch.tanh(qd / TURN)
+    turning = loss * tau.abs() * (1.0 - sense * sense) / TURN
+    return turning / (1.0 - loss * tau.sign() * sense)
