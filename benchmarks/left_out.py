@@ -148,12 +148,14 @@ def real(
                                 motions=before.motions if before else None))  # fmt: skip
                 left = fold.left if blocks == 1 else at_found_zeros(fits[-1], fold.left)
                 rows[m].add(start, fits[-1].plant, model, left)
-            states = [first_state(data, of, r) if blocks == 1 else None for r in fold.fitted]
+            # The peer knows no gaps and one zero for all.
+            whole = [r[a : b + 1] for r in fold.fitted for a, b in r.spans]
+            states = [first_state(data, of, r) if blocks == 1 else None for r in whole]
             for m in models if peer else ():
                 if is_constant(m):
                     start = time.process_time()
                     model = model_by_name(m)(plant.joints)
-                    found = single_shooting(model, plant, fold.fitted, states)
+                    found = single_shooting(model, plant, whole, states)
                     rows[f"{m}, SciPy"].add(start, found, model, fold.left)
         for m, row in rows.items():
             each = "  ".join(f"{e:.3g}" for e in row.free)

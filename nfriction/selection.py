@@ -160,7 +160,7 @@ def select(
         # Blocks no longer show where their recording began.
         each = zeroed_each(plant, recordings)
         fit_settings["zeroed"] = "each" if each else "once"
-    horizon = min(horizon, *(s.unseen.recording.duration for row in splits for s in row))
+    horizon = min(horizon, *(_longest(s.unseen.recording) for row in splits for s in row))
     seen, unseen = _folds(splits, folds)
     fits = fit_models(
         plant, names, seen, jobs=jobs, on_stage=on_stage, on_step=on_step, **fit_settings
@@ -263,6 +263,11 @@ def leave_blocks_out(plant: Plant, recording: Recording, count: int) -> list[Spl
         rest = ((index <= first) & (first > 0)) | ((last <= index) & (last < index[-1]))
         splits.append(Split(*(Block(recording[m], _part(motion, m)) for m in (inside, rest))))
     return splits
+
+
+def _longest(recording: Recording) -> float:
+    """Duration of the longest stretch without a gap [s]."""
+    return max(float(recording.time[b] - recording.time[a]) for a, b in recording.spans)
 
 
 def _part(motion: Motion, mask: NDArray[np.bool_]) -> Motion:

@@ -382,6 +382,10 @@ def test_a_mask_leaves_samples_out_and_what_was_told_is_not_told_again() -> None
         np.testing.assert_array_equal(getattr(part, key), getattr(recording, key)[keep])
     assert part.spans == [(0, 29), (30, len(part) - 1)]
     assert len(again) == 60
+    assert recording[pd.Series(keep)].digest() == part.digest()
+    for wrong in (keep[:50], np.arange(10), True):
+        with pytest.raises(TypeError, match=r"100 times True or False, got .* of shape"):
+            recording[wrong]
 
 
 def test_whirling_angles_are_not_taken_for_degrees_or_wrapped() -> None:

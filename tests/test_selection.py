@@ -67,11 +67,15 @@ def test_it_tells_the_choice_and_every_candidate():
     assert list(table.loc["B"]) == [math.inf, 9, True]
 
 
+def by_torque(model, plant, recordings, *, motions, start, **_):
+    return fit(model, plant, recordings, motions=motions, method="torque")
+
+
 def test_a_model_that_fails_in_a_fold_counts_as_diverged(monkeypatch):
-    def fragile(model, plant, recordings, *, motions, start, **_):
+    def fragile(model, *args, motions, **settings):
         if isinstance(model, LFM) and motions[0].time[0] > 0:
             raise ValueError("nothing to be learnt")
-        return fit(model, plant, recordings, motions=motions, method="torque")
+        return by_torque(model, *args, motions=motions, **settings)
 
     monkeypatch.setattr("nfriction.many.fit", fragile)
     recording = swing(pendulum(), NCFM(2, [[2e-3], [1e-3]]), seconds=1.0)
@@ -97,6 +101,41 @@ def test_blocks_cover_a_recording_and_share_their_ends_with_the_rest():
         assert len(rest.recording.spans) == (2 if k == 1 else 1)
         for part in (block, rest):
             np.testing.assert_array_equal(part.motion.time, part.recording.time)
+
+
+def test_a_fold_sees_nothing_of_what_it_is_judged_by(monkeypatch):
+    """And of two recordings it misses different stretches."""
+    folds = []
+
+    def watched(plant, names, parts, **_):
+        folds.extend(parts.values())
+        raise InterruptedError
+
+    monkeypatch.setattr("nfriction.selection.fit_models", watched)
+    recordings = [
+        swing(pendulum(), NCFM(2, [[1e-3]] * 2), seconds=1.0),
+        swing(pendulum(), NCFM(2, [[2e-3]] * 2), seconds=1.0),
+    ]
+    with pytest.raises(InterruptedError):
+        select(pendulum(), ["NCFM"], recordings, folds=3)
+    assert len(folds) == 3
+    missing = []
+    for seen in folds:
+        for whole, part in zip(recordings, seen.recordings, strict=True):
+            out = np.setdiff1d(whole.time, part.time)
+            assert 0.3 < np.ptp(out) < 0.35
+            missing.append(out[0])
+    assert len(set(missing)) == 3
+    assert all(a != b for a, b in zip(missing[::2], missing[1::2], strict=True))
+
+
+def test_recordings_with_gaps_are_judged_by_what_fits_between_them(monkeypatch):
+    whole = swing(pendulum(), NCFM(2, [[2e-3], [1e-3]]), seconds=2.0)
+    recording = whole[(whole.time < 0.4) | (whole.time > 0.8)]
+    monkeypatch.setattr("nfriction.many.fit", by_torque)
+    found = select(pendulum(), ["NCFM"], [recording], folds=2)
+    assert found.horizon < 0.8
+    assert all(map(math.isfinite, found.candidates[0].errors))
 
 
 def test_what_is_left_of_a_recording_is_no_reason_to_warn():

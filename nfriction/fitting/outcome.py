@@ -157,7 +157,9 @@ def trajectory_outcome(
     fitted = lower < upper
     hit = (result.at_lower | result.at_upper)[:count] & fitted
     at_bounds = tuple(names[i] for i in hit.nonzero().flatten().tolist())
-    none = hit & result.at_lower[:count] & (lower.abs() <= NOTHING)
+    least = lower.abs() <= NOTHING
+    least[count - len(unknowns.terms) :] = torch.tensor([t.to_none for t in unknowns.terms])
+    none = hit & result.at_lower[:count] & least
     noise = effective_noise(residuals)
     told, lost, uncertainty = _told_by_data(problem, result, names, fitted, residuals, motions)
     residual = float(residuals.square().mean().sqrt())

@@ -28,7 +28,7 @@ OFFSET_SHARE = 0.01
 # Of the largest force over the largest speed, a guide's asymmetry is a small part.
 ASYMMETRY_SHARE = 0.1
 # Air drag: the quadratic term of a slender bar is 0.5 rho c_d width, below 0.1 N s^2/m^3.
-DRAG_SD = 0.05
+DRAG_BOUND, DRAG_SD = 1.0, 0.05
 # The last link's end is where nobody measures: what stands in the air may end before the tip or
 # be widest near the joint.
 REACH_LOWER, REACH_UPPER, REACH_SD = -0.7, 1.0, 0.3
@@ -45,6 +45,7 @@ class PlantParameter:
         lower, upper: bounds.
         prior_sd: standard deviation of the prior around 0.
         ratio: whether it scales its entries, and does not add to them.
+        to_none: at its lower bound, nothing is left of what it adjusts.
     """
 
     name: str
@@ -53,6 +54,7 @@ class PlantParameter:
     upper: float
     prior_sd: float
     ratio: bool = False
+    to_none: bool = False
 
 
 def plant_parameters(
@@ -78,7 +80,8 @@ def plant_parameters(
 
     Returns:
         Ratios of inertia, gravity, length, armature and mass terms, angle offsets, torque gains of
-        driven joints beside the first's, their gears' losses, torque offsets, drag, eccentricity.
+        driven joints (without an arm, beside the first's), their gears' losses, torque offsets,
+        drag, and eccentricity.
     """
     buffers = dict(plant.named_buffers())
     found: list[PlantParameter] = []
@@ -97,6 +100,11 @@ def plant_parameters(
 
     def shift(label: str, buffer: str, unit: Tensor, low: float, high: float, sd: float) -> None:
         found.append(PlantParameter(label, {buffer: unit}, low, high, sd))
+
+    def amount(label: str, buffer: str, unit: Tensor, most: float, sd: float) -> None:
+        given = buffers[buffer][unit > 0]
+        low, high = -float(given.min()), max(most - float(given.max()), 0.0)
+        found.append(PlantParameter(label, {buffer: unit}, low, high, sd, to_none=True))
 
     if "inertia_coupling" in buffers:
         links = buffers["gravity_moment"].shape[-1]
@@ -123,12 +131,13 @@ def plant_parameters(
     for name in ("armature", "mass") if driven else ("armature",):
         for j in range(buffers[name].shape[-1] if name in buffers else 0):
             ratio(f"{name} {j + 1}", only(name, (j,)))
-    # All gains alike are but the scale of the masses, so the first is kept.
-    for j in driven[1:] if "torque_gain" in buffers else ():
+    # All gains alike are but the scale of the masses, so the first is kept; beside an arm, whose
+    # inertia is kept, it is not.
+    for j in driven[0 if "arm_inertia" in buffers else 1 :] if "torque_gain" in buffers else ():
         ratio(f"torque gain {j + 1}", only("torque_gain", (j,)), GAIN_BOUND, GAIN_SD)
     for j in driven if "gear_loss" in buffers else ():
         unit = torch.eye(len(buffers["gear_loss"]), dtype=torch.float64)[j]
-        shift(f"gear loss {j + 1}", "gear_loss", unit, 0.0, LOSS_BOUND, LOSS_SD)
+        amount(f"gear loss {j + 1}", "gear_loss", unit, LOSS_BOUND, LOSS_SD)
     if driven:
         joints = buffers["torque_offset"].shape[-1]
         kind, force = ("force", "N") if plant.unit == "m" else ("torque", "N m")
@@ -146,7 +155,7 @@ def plant_parameters(
         # of the quadratic drag.
         for name in ("drag_linear", "drag_quadratic") if len(length) > 1 else ("drag_quadratic",):
             ones = torch.ones_like(buffers[name])
-            shift(name.replace("_", " "), name, ones, 0.0, 1.0, DRAG_SD)
+            amount(name.replace("_", " "), name, ones, DRAG_BOUND, DRAG_SD)
         if len(length) > 1:
             last = torch.zeros_like(length)
             last[-1] = length[-1]

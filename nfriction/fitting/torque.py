@@ -44,7 +44,7 @@ def friction_torque(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Velocity, load and friction torque along a recording, each (sample, joint).
 
-    `tau_f = tau - M(q) qdd - bias(q, qd)`, the ends of the record left out.
+    `tau_f = tau - inverse_dynamics(q, qd, qdd)`, the ends of the record left out.
 
     Args:
         plant: the mechanism.
@@ -69,7 +69,8 @@ def largest_moved(plant: Plant, motions: Sequence[Motion]) -> tuple[Tensor, Tens
         q, qd, qdd = (torch.as_tensor(x[inside]) for x in (motion.q, motion.qd, motion.qdd))
         weight = plant.gravity(q)
         speeds.append(qd)
-        torques += [weight, plant.inverse_dynamics(q, qd, qdd) - weight]
+        rest = plant.inverse_dynamics(q, torch.zeros_like(q), torch.zeros_like(q))
+        torques += [weight, plant.inverse_dynamics(q, qd, qdd) - rest]
     return torch.cat(speeds).abs().amax(0), torch.cat(torques).abs().amax(0)
 
 

@@ -1,7 +1,7 @@
 """What every plant shares: names and conventions, swapping buffers, plain numbers in and out.
 
 A plant is a module whose buffers are the constants of M(q) qdd + bias(q, qd) = tau +
-torque_offset.
+torque_offset, where tau is what gears deliver if there are any.
 """
 
 from __future__ import annotations
@@ -179,7 +179,15 @@ class Plant(nn.Module):
         given = {key: data[key] for key in (*cls.required, *cls.optional) if key in data}
         buffers = data.get("buffers", {})
         values = {name: torch.tensor(v, dtype=torch.float64) for name, v in buffers.items()}
+        cls._check_buffers(values)
         return cls(**cls._parse(given)).replace(**values)
+
+    @classmethod
+    def _check_buffers(cls, values: Mapping[str, Tensor]) -> None:
+        """Refuse buffers of a file that no mechanism has."""
+        for name, value in values.items():
+            if not value.isfinite().all():
+                raise ValueError(f"`{name}` must be finite, got {value.tolist()}.")
 
     @classmethod
     def _parse(cls, given: dict[str, Any]) -> dict[str, Any]:

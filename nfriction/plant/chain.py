@@ -1,6 +1,6 @@
 """A chain of pendulum links in one plane, on a fixed pivot or on a rotating arm."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
@@ -47,6 +47,8 @@ class _Geometry(NamedTuple):
 
 class PendulumChain(Plant):
     """Frictionless equations of motion M(q) qdd + bias(q, qd) = tau + torque_offset.
+
+    Behind gears, tau is what they deliver of the drives' torque.
 
     Joint coordinates: with a free arm, column 0 is its angle about the vertical; the first link
     is measured from upright, each further one relative to the link before. Friction is not part
@@ -312,18 +314,24 @@ class PendulumChain(Plant):
     @torch.no_grad()
     def slopes(self, q: Tensor, qd: Tensor, qdd: Tensor) -> PlantSlopes:
         """Derivatives of `inverse_dynamics` and `load` at a motion (*batch, joint)."""
+        gain, loss = self.torque_gain, self.gear_loss
+        if self.has_gear:
+            shape = torch.broadcast_shapes(q.shape, gain.shape, loss.shape)
+            q, qd, qdd = (x.expand(shape) for x in (q, qd, qdd))
         geometry = self._geometry(q)
         moment, lever = self.gravity_moment.unbind(-1), self.load_lever.unbind(-1)
         mass = self._mass(geometry)
         slopes = planar_slopes(geometry.pose, geometry.coupling, mass, moment, lever, qd, qdd)
         if not self.has_gear:
             return slopes
-        tau, gain, loss = self.inverse_dynamics(q, qd, qdd), self.torque_gain, self.gear_loss
+        tau = self.inverse_dynamics(q, qd, qdd)
         return slopes.geared(passed_on(tau, qd, gain, loss), by_velocity(tau, qd, loss))
 
     @torch.no_grad()
     def mobility(self) -> Tensor:
-        """Largest diagonal entry of M^-1 over poses, (*batch, joint) [rad/s^2 per N m].
+        """Largest acceleration of a joint by its own torque, (*batch, joint) [rad/s^2 per N m].
+
+        Over poses, the largest diagonal entry of M^-1, times what a gear makes of the torque.
 
         Explicit RK4 stays stable while a friction curve is flatter than 2.785 / (dt * mobility).
         Searched on a grid of at most 5 degrees for one or two turning angles, coarser for more.
@@ -338,7 +346,7 @@ class PendulumChain(Plant):
         parts.append(f"arm={'free' if self.first_link else 'fixed'}")
         parts.append(f"mass={self._given['mass']}, length={self._given['length']}")
         parts.append(f"convention={self.convention}, armature={self.has_armature}")
-        return ", ".join([*parts, f"drag={self.has_drag}"])
+        return ", ".join([*parts, f"drag={self.has_drag}, gears={self.has_gear}"])
 
     def _note_replaced(self, names: Collection[str]) -> None:
         if {"drag_linear", "drag_quadratic"} & set(names):
@@ -399,6 +407,18 @@ class PendulumChain(Plant):
         if geometry.arm is not None:
             bias = with_arm_bias(bias, geometry.arm, joint[0], rate, squared)
         return bias
+
+    @classmethod
+    def _check_buffers(cls, values: Mapping[str, Tensor]) -> None:
+        super()._check_buffers(values)
+        gain, loss = (values.get(name) for name in ("torque_gain", "gear_loss"))
+        if gain is not None and not (gain > 0).all():
+            raise ValueError(f"`torque_gain` must be positive, got {gain.tolist()}.")
+        if loss is not None and not ((loss >= 0) & (loss < 1)).all():
+            raise ValueError(
+                "`gear_loss`, the share of a torque that is lost, must be from 0 to less than 1, "
+                f"got {loss.tolist()}."
+            )
 
     @classmethod
     def _parse(cls, given: dict[str, Any]) -> dict[str, Any]:

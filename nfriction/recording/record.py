@@ -146,11 +146,14 @@ class Recording:
 
         The stamps stay.
         """
-        if not isinstance(samples, slice) and getattr(samples, "dtype", None) != np.bool_:
-            raise TypeError(
-                f"a recording is cut by a slice of samples or a mask, got {samples!r}; "
-                f"columns are `recording.q[:, k]`."
-            )
+        if not isinstance(samples, slice):
+            samples = np.asarray(samples)
+            if samples.dtype != np.bool_ or samples.shape != self.time.shape:
+                raise TypeError(
+                    f"a recording is cut by a slice of samples or by {len(self)} times True or "
+                    f"False, got {samples.dtype} of shape {samples.shape}; columns are "
+                    f"`recording.q[:, k]`."
+                )
         tau = None if self.tau is None else self.tau[samples]
         qd = None if self.qd is None else self.qd[samples]
         return self.derived(time=self.time[samples], q=self.q[samples], tau=tau, qd=qd)

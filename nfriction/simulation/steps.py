@@ -14,7 +14,7 @@ def stability_limit(plant: Plant, sample_time: float) -> Tensor:
     """Largest slope of friction over velocity that RK4 integrates stably [N m s/rad], (joint,).
 
     References:
-        RK4's real stability bound over the largest diagonal entry of the inverse mass matrix.
+        RK4's real stability bound over the plant's mobility.
     """
     return RK4_STABILITY / (sample_time * plant.mobility())
 

@@ -66,7 +66,14 @@ def stop_step(
         (plant.forward_dynamics(q, zero, zero + unit[j]) - rest).unbind(-1)
         for j in range(plant.joints)
     ]
-    v = list((qd + step * plant.forward_dynamics(q, qd, tau)).unbind(-1))
+    if getattr(plant, "has_gear", False):
+        # A gear loses of what friction leaves over, which the impulses are to take.
+        drag = friction.torque(qd, load, coefficients)
+        taken = sum(torch.stack(c, -1) * drag[..., j : j + 1] for j, c in enumerate(inverse))
+        qdd = plant.forward_dynamics(q, qd, tau - drag) + taken
+    else:
+        qdd = plant.forward_dynamics(q, qd, tau)
+    v = list((qd + step * qdd).unbind(-1))
     impulse = list(zero.unbind(-1))
     for _ in range(SWEEPS if plant.joints > 1 else 1):
         for j, column in enumerate(inverse):

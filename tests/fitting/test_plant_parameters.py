@@ -30,6 +30,21 @@ def test_a_joint_that_nothing_drives_has_no_torque_to_be_off():
     assert "gravity 1" in told
     # Nor has a lone drive a gain: it would be but the scale of the masses.
     assert not [name for name in told if "gain" in name]
+    # Unless an arm sets the scale, whose inertia is kept.
+    armed = names(rigs.tlrip("free"), driven=(0,), largest_torque=1.0)
+    assert "torque gain 1" in armed
+
+
+def test_what_a_plant_already_has_of_drag_and_loss_may_all_go():
+    loss, drag = torch.tensor([0.1, 0.2], dtype=F64), torch.full((2,), 0.03, dtype=F64)
+    plant = pendulum().replace(gear_loss=loss, drag_linear=drag)
+    terms = plant_parameters(plant, driven=(0, 1), largest_torque=1.0, drag=True)
+    least = adjusted_buffers(plant, terms, torch.tensor([t.lower for t in terms], dtype=F64))
+    for name in ("gear_loss", "drag_linear"):
+        torch.testing.assert_close(least[name], torch.zeros(2, dtype=F64))
+    assert {t.name for t in terms if t.to_none} == {
+        "gear loss 1", "gear loss 2", "drag linear", "drag quadratic"
+    }  # fmt: skip
 
 
 def test_terms_that_are_not_there_are_not_adjusted():

@@ -236,6 +236,21 @@ def test_buffers_replaced_by_one_tensor_keep_their_names() -> None:
     assert dragged.replace(drag_linear=both).has_drag
 
 
+def test_gears_stay_when_something_else_is_replaced_and_are_refused_where_they_give_power() -> None:
+    rig, loss = rigs.tlrip(), torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+    at = states(3)
+    lossy = rig.replace(gear_loss=loss)
+    again = lossy.replace(angle_offset=torch.zeros(3, dtype=torch.float64))
+    assert torch.equal(again(*at), lossy(*at))
+    assert not torch.equal(again(*at), rig(*at))
+    for name, bad in (("gear_loss", 1.0), ("gear_loss", -0.1), ("torque_gain", 0.0)):
+        data = rig.to_dict() | {"buffers": {name: [bad] * 3}}
+        with pytest.raises(ValueError, match=f"`{name}`.* must be"):
+            PendulumChain.from_dict(data)
+    with pytest.raises(ValueError, match="`torque_offset` must be finite"):
+        PendulumChain.from_dict(rig.to_dict() | {"buffers": {"torque_offset": [float("nan")] * 3}})
+
+
 def test_dtype_follows() -> None:
     rig = rigs.tlrip("free").float()
     q, qd, tau = (x.float() for x in states(4))

@@ -57,6 +57,17 @@ def test_slopes_are_the_automatic_ones(name):
         torch.testing.assert_close(a.expand(b.shape), b, rtol=1e-10, atol=1e-12)
 
 
+def test_several_gears_share_a_state():
+    gears = torch.tensor([[[0.1, 0.2, 0.3]], [[0.0, 0.1, 0.0]]], dtype=F64)
+    q, qd, qdd = torch.randn(3, 4, 3, generator=torch.Generator().manual_seed(0), dtype=F64)
+    plant = rigs.tlrip(arm="fixed")
+    found = plant.replace(gear_loss=gears).slopes(q, qd, qdd)
+    for p, loss in enumerate(gears):
+        one = plant.replace(gear_loss=loss[0]).slopes(q, qd, qdd)
+        for a, b in zip(found, one, strict=True):
+            torch.testing.assert_close(a[..., p, :].expand(b.shape), b)
+
+
 def test_a_chain_with_other_terms_has_none():
     fixed, free = rigs.tlrip(arm="fixed"), PendulumChain([0.3], [0.2], arm=Arm(0.1, 0.2))
     some = torch.full((3,), 1e-3, dtype=F64)

@@ -78,6 +78,26 @@ def test_shorter_steps_come_nearer_to_the_smooth_solution_while_joints_move():
         assert fine < 0.7 * coarse
 
 
+@pytest.mark.parametrize("torque", [0.0, 0.4])
+def test_gears_lose_what_they_lose_in_smooth_steps(torque):
+    """Driven, and back-driven by what swings against friction alone."""
+    plant = pendulum(armature=[1e-3, 1e-3]).replace(
+        gear_loss=torch.tensor([0.2, 0.4], dtype=F64)
+    )  # fmt: skip
+    model = CVFM(2, [[0.05, 1e-3], [0.03, 1e-3]], v_smooth=1e-2)
+    steps = 300
+    tau = torch.full((steps, 2), torque, dtype=F64) * torch.linspace(-1, 1, steps)[:, None]
+    start = torch.tensor([math.pi + 1.5, -0.8], dtype=F64), torch.zeros(2, dtype=F64)
+    settings = {"sample_time": 1e-3, "gradients": False}
+    smooth = rollout(plant, model, *start, tau, substeps=8, **settings).q
+    stopped = rollout(plant, model, *start, tau, substeps=8, scheme="stop", **settings).q
+    lossless = plant.replace(gear_loss=torch.zeros(2, dtype=F64))
+    free = rollout(lossless, model, *start, tau, substeps=8, scheme="stop", **settings).q
+    off = float((stopped - smooth).abs().max())
+    assert off < 0.01
+    assert float((free - stopped).abs().max()) > 5 * off
+
+
 def test_eager_torch_serves_where_nothing_compiles(monkeypatch, caplog):
     compiled = slide(2.5, v0=-0.1, steps=200)
 
