@@ -103,7 +103,7 @@ def plant_parameters(
 
     def amount(label: str, buffer: str, unit: Tensor, most: float, sd: float) -> None:
         given = buffers[buffer][unit > 0]
-        low, high = -float(given.min()), max(most - float(given.max()), 0.0)
+        low, high = 0.0 - float(given.min()), max(most - float(given.max()), 0.0)
         found.append(PlantParameter(label, {buffer: unit}, low, high, sd, to_none=True))
 
     if "inertia_coupling" in buffers:
