@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from single_shooting import single_shooting
 
 from nfriction import Recording, rigs
+from nfriction.blocks import Block, at_found_zeros, leave_blocks_out
 from nfriction.fitting import Fit, fit
 from nfriction.fitting.estimate import Zeroed
 from nfriction.friction import Constant, FrictionModel, model_by_name
 from nfriction.plant import Plant
 from nfriction.scoring import score
-from nfriction.selection import Block, at_found_zeros, leave_blocks_out
 
 State = tuple[NDArray[np.float64], NDArray[np.float64]]
 

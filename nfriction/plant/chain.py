@@ -19,7 +19,7 @@ from nfriction.plant.coordinates import (
 )
 from nfriction.plant.drag import drag_forces
 from nfriction.plant.encoder import Turned, true_angle
-from nfriction.plant.gear import by_velocity, delivered, demanded, passed_on
+from nfriction.plant.gear import by_velocity, delivered, demanded, passed_on, refuse_powered
 from nfriction.plant.inertia import inertia_tensors
 from nfriction.plant.linear import Matrix, dot, entries, multiply, solve, stack, stack_matrix
 from nfriction.plant.planar import (
@@ -411,14 +411,7 @@ class PendulumChain(Plant):
     @classmethod
     def _check_buffers(cls, values: Mapping[str, Tensor]) -> None:
         super()._check_buffers(values)
-        gain, loss = (values.get(name) for name in ("torque_gain", "gear_loss"))
-        if gain is not None and not (gain > 0).all():
-            raise ValueError(f"`torque_gain` must be positive, got {gain.tolist()}.")
-        if loss is not None and not ((loss >= 0) & (loss < 1)).all():
-            raise ValueError(
-                "`gear_loss`, the share of a torque that is lost, must be from 0 to less than 1, "
-                f"got {loss.tolist()}."
-            )
+        refuse_powered(values)
 
     @classmethod
     def _parse(cls, given: dict[str, Any]) -> dict[str, Any]:

@@ -4,6 +4,8 @@ Of a torque tau, friction subtracted, gain (tau - loss |tau| sgn(qd)) reaches th
 the drive moves the joint, more where the joint moves the drive.
 """
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
@@ -32,3 +34,19 @@ def by_velocity(tau: Tensor, qd: Tensor, loss: Tensor) -> Tensor:
     sense = torch.tanh(qd / TURN)
     turning = loss * tau.abs() * (1.0 - sense * sense) / TURN
     return turning / (1.0 - loss * tau.sign() * sense)
+
+
+def refuse_powered(buffers: Mapping[str, Tensor]) -> None:
+    """Refuse gears that would give power, or turn a torque round.
+
+    Raises:
+        ValueError: for a `torque_gain` that is not positive, or a `gear_loss` outside [0, 1).
+    """
+    gain, loss = buffers.get("torque_gain"), buffers.get("gear_loss")
+    if gain is not None and not (gain > 0).all():
+        raise ValueError(f"`torque_gain` must be positive, got {gain.tolist()}.")
+    if loss is not None and not ((loss >= 0) & (loss < 1)).all():
+        raise ValueError(
+            "`gear_loss`, the share of a torque that is lost, must be from 0 to less than 1, "
+            f"got {loss.tolist()}."
+        )

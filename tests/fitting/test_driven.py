@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from nfriction import LFM, NLFM, PendulumChain, Recording, fit, rollout
+from nfriction.blocks import block_errors, leave_blocks_out
 from nfriction.friction import ACVFM, CFM, CVFM, NFCVFM, Constant, FrictionModel
-from nfriction.selection import block_errors, leave_blocks_out
 from nfriction.signals import quantise
 from tests.fitting.recordings import F64, pendulum, swing
 
