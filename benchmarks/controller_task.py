@@ -22,9 +22,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from nfriction.fitting.neurofuzzy import controller_targets, train_on_controller
-from nfriction.fuzzy import Anfis, AnfisRBF, MamdaniController, RBFNetwork, paper_controller
+from nfriction.fuzzy import Anfis, AnfisRBF, RBFNetwork
 from nfriction.fuzzy import train_hybrid as hybrid
+from nfriction.papers.controller.mamdani import MamdaniController, paper_controller
+from nfriction.papers.nffem.train_network import controller_targets, train_on_controller
 
 Predictor = Callable[[Tensor], Tensor]
 

@@ -63,7 +63,7 @@ def torch_gradient(repeats: int) -> None:
     import torch
 
     from nfriction import rollout
-    from nfriction.compiled import Backend
+    from nfriction.simulation.compiled import Backend
 
     torch.set_num_threads(1)
     plant, model = cases.rig(), cases.neurofuzzy(terms=(5, 6))
@@ -89,7 +89,7 @@ def torch_gradient(repeats: int) -> None:
     )
     verdict("gradient, adjoint in eager torch, motion compiled [s]", seconds, 1.0)
     verdict("peak memory of the process [GB]", peak / 1e3, 1.0)
-    with mock.patch("nfriction.simulation.rollouts.integrate_compiled", return_value=None):
+    with mock.patch("nfriction.simulation.rollout.integrate_compiled", return_value=None):
         seconds, _ = median_time(gradient, repeats)
     verdict("the same with nothing compiled [s]", seconds, 1.0)
     seconds, _ = median_time(lambda: gradient("torch"), 1)
@@ -106,9 +106,9 @@ def gauss_newton(repeats: int) -> None:
     import torch
 
     from nfriction import rollout
-    from nfriction.fitting.sensitivity import StepJacobian
-    from nfriction.fitting.trajectory import TrajectoryProblem
-    from nfriction.fitting.windows import Windows
+    from nfriction.fitting.data.windows import Windows
+    from nfriction.fitting.shooting.problem import TrajectoryProblem
+    from nfriction.fitting.shooting.sensitivity import StepJacobian
 
     torch.set_num_threads(1)
     for name, model in (("constant", cases.constant()), ("neuro-fuzzy", cases.neurofuzzy())):
@@ -195,8 +195,8 @@ def regularised(repeats: int) -> None:
     import torch
 
     from nfriction.fuzzy import RBFNetwork
-    from nfriction.solve import bayesian_regularisation, per_sample_jacobian
-    from nfriction.solve.jacobian import trainable
+    from nfriction.optim.evidence import bayesian_regularisation
+    from nfriction.optim.jacobian import per_sample_jacobian, trainable
 
     torch.set_num_threads(1)
     random = torch.Generator().manual_seed(0)

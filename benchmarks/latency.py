@@ -29,7 +29,7 @@ from nfriction.codegen import build
 from nfriction.export.c_export import c
 from nfriction.export.controller import controller_of
 from nfriction.export.points import draw
-from nfriction.modelfile import ModelInfo
+from nfriction.io.model_info import ModelInfo
 
 JOINTS = (1, 4)
 ROWS = 1000  # different samples, taken in turn

@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 from single_shooting import single_shooting
 
 from nfriction import Recording, rigs
-from nfriction.blocks import Block, at_found_zeros, leave_blocks_out
-from nfriction.fitting import Fit, fit
-from nfriction.fitting.estimate import Zeroed
-from nfriction.friction import Constant, FrictionModel, model_by_name
+from nfriction.evaluation.score import score
+from nfriction.evaluation.time_blocks import Block, at_found_zeros, leave_blocks_out
+from nfriction.fitting.fit import Zeroed, fit
+from nfriction.fitting.result.fit_result import FitResult
+from nfriction.friction.constant import Constant
+from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import model_by_name
 from nfriction.plant import Plant
-from nfriction.scoring import score
 
 State = tuple[NDArray[np.float64], NDArray[np.float64]]
 
@@ -139,7 +141,7 @@ def real(
         if peer:
             rows |= {f"{m}, SciPy": Row() for m in models if is_constant(m)}
         for fold in folds(data, of, blocks):
-            fits: list[Fit] = []
+            fits: list[FitResult] = []
             for m in models:
                 start = time.process_time()
                 model = model_by_name(m)(plant.joints)
@@ -192,7 +194,7 @@ def is_constant(name: str) -> bool:
     return isinstance(model_by_name(name)(1).schedule, Constant)
 
 
-def nearest_fit(fits: Sequence[Fit], model: FrictionModel) -> Fit | None:
+def nearest_fit(fits: Sequence[FitResult], model: FrictionModel) -> FitResult | None:
     """The fit to start from: the constant one of the model's law, else the last."""
     last = None
     for last in fits:

@@ -18,8 +18,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from nfriction.fitting.neurofuzzy import train_network
 from nfriction.fuzzy import Anfis, train_hybrid
+from nfriction.papers.nffem.train_network import train_network
 
 Predictor = Callable[[Tensor], Tensor]
 

@@ -14,7 +14,7 @@ from timing import Contestant
 from torch import Tensor
 
 from nfriction import FrictionModel, PendulumChain
-from nfriction.simulation import acceleration as torch_acceleration
+from nfriction.simulation.rk4 import acceleration as torch_acceleration
 
 SHORT = 2_000  # steps of those so slow that their time is scaled
 

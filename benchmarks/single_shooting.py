@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from nfriction import Recording
-from nfriction.fitting import fit
+from nfriction.fitting.fit import fit
 from nfriction.fitting.plant_parameters import PlantParameter, adjusted_buffers, plant_parameters
-from nfriction.friction import FrictionModel
-from nfriction.simulation import required_substeps, rollout
+from nfriction.friction.model import FrictionModel
+from nfriction.simulation.rk4 import required_substeps
+from nfriction.simulation.rollout import rollout
 
 Array = NDArray[np.float64]
 SECONDS = (1.0, 3.0, np.inf)
@@ -54,8 +55,8 @@ def single_shooting(
     starts = [
         (motion.q[0], motion.qd[0])
         if state is None
-        else (r.convention_on(plant).position_to_joint(state[0]),
-              r.convention_on(plant).rate_to_joint(state[1]))
+        else (r.resolve_convention(plant).position_to_joint(state[0]),
+              r.resolve_convention(plant).rate_to_joint(state[1]))
         for r, motion, state in zip(recordings, motions, states, strict=True)
     ]  # fmt: skip
     problem = _Problem(model, plant, terms, recordings, starts)
@@ -91,7 +92,7 @@ class _Problem:
         self.model, self.plant, self.terms, self.recordings = model, plant, terms, recordings
         self.starts = starts
         self.joint = [r.joint_coordinates(plant) for r in recordings]
-        self.conventions = [r.convention_on(plant) for r in recordings]
+        self.conventions = [r.resolve_convention(plant) for r in recordings]
         # Coefficients in units of the largest of their kind.
         values = model.schedule.values
         size = values.abs().amax(0).expand_as(values).reshape(-1).clamp_min(1e-6)

@@ -4,7 +4,8 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from nfriction import LFM, NCFM, Recording, fit, save, score, twin
+from nfriction import LFM, NCFM, Recording, fit, save, score
+from nfriction.papers import twin
 
 
 def main(argv: Sequence[str] | None = None) -> int:

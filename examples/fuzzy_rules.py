@@ -7,8 +7,10 @@ from pathlib import Path
 import torch
 
 from nfriction import plots
-from nfriction.fitting import train_on_controller
-from nfriction.fuzzy import MamdaniController, RBFNetwork, parse_rules
+from nfriction.fuzzy import RBFNetwork
+from nfriction.papers.controller.mamdani import MamdaniController
+from nfriction.papers.controller.rulefile import parse_rules
+from nfriction.papers.nffem.train_network import train_on_controller
 
 RULES = """{
   "format": "nfriction-rules/1",

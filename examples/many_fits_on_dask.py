@@ -14,7 +14,8 @@ import pandas as pd
 import torch
 from dask.distributed import Client, LocalCluster
 
-from nfriction import LFM, Plant, Recording, compare, fit, twin
+from nfriction import LFM, Plant, Recording, compare, fit
+from nfriction.papers import twin
 
 QUICK = {"fit_plant": False, "windows": (0.5,), "max_steps": 1}
 

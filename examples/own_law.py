@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from nfriction import FrictionModel, PendulumChain, Recording, export, fit, rollout
-from nfriction.friction import Coefficient, Constant, Law
+from nfriction.friction.constant import Constant
+from nfriction.friction.laws import Coefficient, Law
 
 
 def sticky(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:

@@ -13,10 +13,11 @@ begin anew. Each way the result is that of a run that nobody ended.
 import sys
 from collections.abc import Sequence
 
-from nfriction.fitting import fit, fit_by_search
-from nfriction.friction import model_by_name
-from nfriction.reproduction import training
-from nfriction.results import model_info
+from nfriction.evaluation.results import model_info
+from nfriction.fitting.fit import fit
+from nfriction.friction.models import model_by_name
+from nfriction.papers.afem.fit_by_search import fit_by_search
+from nfriction.papers.reproduction import training
 
 
 def train(argv: Sequence[str] | None) -> str:

@@ -15,11 +15,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from nfriction.fitting import fit, fit_adaptive
-from nfriction.fitting.by_class import refine_adaptive
-from nfriction.friction import model_by_name
-from nfriction.reproduction import papers_neuro_fuzzy, training
-from nfriction.results import model_info
+from nfriction.evaluation.results import model_info
+from nfriction.fitting.fit import fit
+from nfriction.friction.models import model_by_name
+from nfriction.papers.afem.fit_adaptive import fit_adaptive
+from nfriction.papers.nffem.refine_adaptive import refine_adaptive
+from nfriction.papers.reproduction import training
+from nfriction.papers.reproduction.procedure import papers_neuro_fuzzy
 
 
 def train(argv: Sequence[str] | None) -> str:

@@ -13,7 +13,7 @@ from nfriction.cli import estimation, names
 from nfriction.cli.console import Parser, Progress, UsageError, check_writable, warn
 
 if TYPE_CHECKING:
-    from nfriction.comparison import InitialStates
+    from nfriction.evaluation.compare import InitialStates
     from nfriction.plant import Plant
     from nfriction.recording import Recording
 
@@ -93,10 +93,10 @@ def run_comparison(
         The exit status: 1 where a model could not be fitted.
     """
     from nfriction.cli import tables
-    from nfriction.comparison import check_recordings, compare
-    from nfriction.parallel import check_jobs
-    from nfriction.results import write_results
-    from nfriction.selection import select
+    from nfriction.evaluation.compare import check_recordings, compare
+    from nfriction.evaluation.cross_validation import select
+    from nfriction.evaluation.parallel import check_jobs
+    from nfriction.evaluation.results import write_results
 
     check_recordings(train, held_out)  # before a choice that takes long
     states = _initial_states(arguments, plant, [*train, *held_out])

@@ -31,7 +31,7 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Simulate, then compare."""
-    from nfriction import twin
+    from nfriction.papers import twin
 
     simulated = twin.make(
         "tlrip",

@@ -8,8 +8,8 @@ from nfriction.cli import estimation, names
 from nfriction.cli.console import Parser, UsageError, check_writable, seconds
 
 if TYPE_CHECKING:
-    from nfriction.friction import FrictionModel
-    from nfriction.modelfile import ModelInfo
+    from nfriction.friction.model import FrictionModel
+    from nfriction.io.model_info import ModelInfo
 
 EXAMPLE = """example:
   nfriction export model.json --to torchscript,c --out artefacts"""
@@ -61,7 +61,7 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Load, then write each artefact."""
-    from nfriction.modelfile import info_of, load
+    from nfriction.io.model_file import load, load_info
 
     wanted = [target for target in arguments.to if target in SIMULATORS]
     if wanted and not arguments.recording:
@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("--into takes one of mjcf and urdf in --to.")
     if len(arguments.cutoff) != 1:
         raise UsageError("--cutoff takes one number.")
-    model, info = load(arguments.model), info_of(arguments.model)
+    model, info = load(arguments.model), load_info(arguments.model)
     check_writable(arguments.out)
     for target in arguments.to:
         if target in SIMULATORS:

@@ -29,10 +29,10 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Fit, write, say how it went."""
     from nfriction.cli.tables import coefficient_table, fit_lines, interval_table
-    from nfriction.fitting import fit
-    from nfriction.friction import model_by_name
-    from nfriction.modelfile import save
-    from nfriction.results import model_info
+    from nfriction.evaluation.results import model_info
+    from nfriction.fitting.fit import fit
+    from nfriction.friction.models import model_by_name
+    from nfriction.io.model_file import save
 
     plant = estimation.read_rig(arguments.rig)
     model = model_by_name(arguments.model)(plant.joints)

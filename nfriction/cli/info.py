@@ -8,8 +8,8 @@ from nfriction.cli import names
 from nfriction.cli.console import Parser
 
 if TYPE_CHECKING:
-    from nfriction.friction import FrictionModel
-    from nfriction.modelfile import ModelInfo
+    from nfriction.friction.model import FrictionModel
+    from nfriction.io.model_info import ModelInfo
 
 EXAMPLE = """example:
   nfriction info runs/mine/models/LFM.json"""
@@ -29,9 +29,9 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Load and print."""
     from nfriction.cli.tables import coefficient_table
-    from nfriction.modelfile import info_of, load
+    from nfriction.io.model_file import load, load_info
 
-    model, info = load(arguments.model), info_of(arguments.model)
+    model, info = load(arguments.model), load_info(arguments.model)
     for what, said in _facts(model, info):
         print(f"{what + ':':14} {said}")
     print(coefficient_table(model, info.joint_names, info.unit))

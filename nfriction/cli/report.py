@@ -24,7 +24,7 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Read, write."""
-    from nfriction.atomic import write_atomically
+    from nfriction.io.atomic import write_atomically
     from nfriction.report import read_run, to_html
 
     if not arguments.folder.is_dir():

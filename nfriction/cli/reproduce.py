@@ -38,7 +38,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Run what is not finished, then print and write everything."""
     from dataclasses import replace
 
-    from nfriction.reproduction import FULL, QUICK, report, reproduce
+    from nfriction.papers.reproduction import report
+    from nfriction.papers.reproduction.running import reproduce
+    from nfriction.papers.reproduction.settings import FULL, QUICK
 
     check_writable(arguments.out)
     settings = replace(QUICK if arguments.quick else FULL, seed=arguments.seed)
@@ -48,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
     report.write_tables(workspace, command=arguments.command_line)
     print(report.text(workspace))
     if not arguments.no_figures:
-        from nfriction.reproduction.figures import draw_all
+        from nfriction.papers.reproduction.figures import draw_all
 
         draw_all(workspace, progress=sys.stderr.isatty())
     print(f"\ntables, models and figures are in {arguments.out}")

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from nfriction.comparison import NO_FRICTION, Comparison, coefficient_sets
-from nfriction.fitting import Fit
-from nfriction.friction import FrictionModel
-from nfriction.modelfile import ModelInfo, describe
-from nfriction.selection import Selection
+from nfriction.evaluation.compare import NO_FRICTION, Comparison, coefficient_sets
+from nfriction.evaluation.cross_validation import Selection
+from nfriction.fitting.result.fit_result import FitResult
+from nfriction.friction.model import FrictionModel
+from nfriction.io.model_info import ModelInfo, describe
 
 LEGEND = (
     "free run: one simulation over the whole recording; windows: simulations restarted so often "
@@ -53,13 +53,13 @@ def _error_table(comparison: Comparison, held_out: bool) -> str:
     return "\n".join(lines)
 
 
-def fit_lines(name: str, fit: Fit) -> str:
+def fit_lines(name: str, fit: FitResult) -> str:
     """How a fit ended and what to be wary of: bounds, lost directions, errors of the model."""
     note = f"; at a bound: {', '.join(fit.at_bounds)}" if fit.at_bounds else ""
     return "\n  - ".join([f"{name}: {fit.status.rstrip('.')}{note}", *fit.warnings])
 
 
-def interval_table(fit: Fit) -> str:
+def interval_table(fit: FitResult) -> str:
     """Values and 95 % intervals of constant coefficients and of the plant's terms; may be empty.
 
     Terms of the plant are deviations: ratios from 1, offsets in SI.

@@ -28,11 +28,11 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Compare, print a table, tell the verdict by the exit status."""
     from nfriction.export import verify_artefact
-    from nfriction.modelfile import info_of, load
+    from nfriction.io.model_file import load, load_info
 
     if not arguments.points:
         raise UsageError("--points must be at least 1.")
-    model, info = load(arguments.model), info_of(arguments.model)
+    model, info = load(arguments.model), load_info(arguments.model)
     verdict = verify_artefact(arguments.artefact, model, info, points=arguments.points)
     head = (
         "compared at",

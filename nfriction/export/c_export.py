@@ -8,14 +8,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from nfriction.atomic import write_atomically
 from nfriction.codegen.emit import Real
 from nfriction.export.c_dialect import ControllerC, bits, is_identifier
 from nfriction.export.c_source import source_of
 from nfriction.export.contract import COEFFICIENT_SLACK, Contract, contract_of
 from nfriction.export.controller import controller_of
-from nfriction.friction import FrictionModel
-from nfriction.modelfile import ModelInfo
+from nfriction.friction.model import FrictionModel
+from nfriction.io.atomic import write_atomically
+from nfriction.io.model_info import ModelInfo
 
 # How much more a controller may err that rounds motions between filter and model.
 ROUNDED = 5.0

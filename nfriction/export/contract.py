@@ -10,15 +10,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nfriction import strict_json
 from nfriction.export.controller import AnyController, controller_of
 from nfriction.export.errors import ContractError, first_line
 from nfriction.export.filtered import FilteredController
 from nfriction.export.parity import COEFFICIENT_SLACK, Parity, compare
 from nfriction.export.points import draw, trials
 from nfriction.export.unfiltered import NOT_FINITE, OUTSIDE, SATURATED, Controller, MemoryController
-from nfriction.friction import FrictionModel
-from nfriction.modelfile import ModelInfo, describe
+from nfriction.friction.model import FrictionModel
+from nfriction.io import strict_json
+from nfriction.io.model_info import ModelInfo, describe
 
 __all__ = [
     "COEFFICIENT_SLACK",

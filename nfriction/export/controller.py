@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 from nfriction.export.filtered import FilteredController
 from nfriction.export.unfiltered import Controller, MemoryController, memory_of
-from nfriction.friction import FrictionModel
-from nfriction.modelfile import ModelInfo
+from nfriction.friction.model import FrictionModel
+from nfriction.io.model_info import ModelInfo
 from nfriction.signals import SecondOrderLowPass
 
 AnyController = Controller | MemoryController | FilteredController

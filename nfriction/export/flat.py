@@ -14,8 +14,9 @@ from torch import Tensor, nn
 from nfriction.export.filtered import FilteredController
 from nfriction.export.flat_numbers import NumberByNumber
 from nfriction.export.flat_tensors import TensorByTensor
-from nfriction.friction import FrictionModel, NeuroFuzzy
-from nfriction.friction.schedules import Schedule
+from nfriction.friction.coefficients import Schedule
+from nfriction.friction.model import FrictionModel
+from nfriction.friction.neurofuzzy import NeuroFuzzy
 
 
 def flattened(model: FrictionModel, *, number_by_number: bool = False) -> FrictionModel:

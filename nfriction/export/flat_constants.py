@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from nfriction.friction import NeuroFuzzy
+from nfriction.friction.neurofuzzy import NeuroFuzzy
 
 
 def constants(schedule: NeuroFuzzy) -> dict[str, Tensor]:

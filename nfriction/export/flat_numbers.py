@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from nfriction.export.flat_constants import constants
-from nfriction.friction import NeuroFuzzy
+from nfriction.friction.neurofuzzy import NeuroFuzzy
 
 # Everywhere in its range some set is within this exponent of full membership: strengths are far
 # from underflow, and need no maximum to be taken out of them.

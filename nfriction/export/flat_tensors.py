@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from nfriction.export.flat_constants import constants
-from nfriction.friction import NeuroFuzzy
+from nfriction.friction.neurofuzzy import NeuroFuzzy
 
 
 class TensorByTensor(nn.Module):

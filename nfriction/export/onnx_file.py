@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from nfriction.atomic import replacing
 from nfriction.export.archive import METADATA
 from nfriction.export.contract import OUTPUTS, Contract, Runner, contract_of, verify
 from nfriction.export.controller import controller_of
@@ -16,8 +15,9 @@ from nfriction.export.errors import ExportError, first_line
 from nfriction.export.onnx_graph import OnnxGraph
 from nfriction.export.program import exported, run_stateful, silent
 from nfriction.export.unfiltered import Controller, MemoryController, for_single_precision
-from nfriction.friction import FrictionModel
-from nfriction.modelfile import ModelInfo
+from nfriction.friction.model import FrictionModel
+from nfriction.io.atomic import replacing
+from nfriction.io.model_info import ModelInfo
 
 # Old enough for runtimes in the field; nothing newer is needed.
 OPSET, IR_VERSION = 18, 8

@@ -12,8 +12,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from nfriction import strict_json
-from nfriction.atomic import replacing
 from nfriction.export.archive import METADATA, contents, repacked
 from nfriction.export.contract import Contract, Runner, contract_of, verify
 from nfriction.export.controller import AnyController, controller_of
@@ -22,8 +20,10 @@ from nfriction.export.filtered import FilteredController
 from nfriction.export.harmless import refuse_harmful_program
 from nfriction.export.points import draw
 from nfriction.export.unfiltered import Controller, MemoryController
-from nfriction.friction import FrictionModel
-from nfriction.modelfile import ModelInfo
+from nfriction.friction.model import FrictionModel
+from nfriction.io import strict_json
+from nfriction.io.atomic import replacing
+from nfriction.io.model_info import ModelInfo
 
 # All that an archive of ours holds.
 _OURS = re.compile(

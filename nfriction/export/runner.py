@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction import apart
 from nfriction.export.archive import contract_of_archive
 from nfriction.export.contract import Contract, ContractError
 from nfriction.export.errors import ExportError
 from nfriction.export.program import open_pt2
 from nfriction.export.script import open_torchscript
+from nfriction.io import sandbox as apart
 
 OPENERS = {".pt": open_torchscript, ".pt2": open_pt2}
 # Processor time [s]: to begin with, and for a sample of a controller with a state.

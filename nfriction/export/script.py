@@ -11,7 +11,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from nfriction.atomic import replacing
 from nfriction.export.archive import METADATA, contents, repacked
 from nfriction.export.contract import Contract, Runner, contract_of, verify
 from nfriction.export.controller import AnyController, controller_of
@@ -20,8 +19,9 @@ from nfriction.export.filtered import FilteredController
 from nfriction.export.flat import shortened
 from nfriction.export.harmless import refuse_harmful_script, refuse_harmful_source
 from nfriction.export.unfiltered import Controller, MemoryController
-from nfriction.friction import FrictionModel
-from nfriction.modelfile import ModelInfo
+from nfriction.friction.model import FrictionModel
+from nfriction.io.atomic import replacing
+from nfriction.io.model_info import ModelInfo
 
 # Largest difference from the model over the largest torque: sums may be taken in another order.
 TOLERANCE = 1e-12

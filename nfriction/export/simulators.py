@@ -13,11 +13,11 @@ import torch
 from scipy.optimize import nnls
 from torch import Tensor
 
-from nfriction.atomic import write_atomically
 from nfriction.export.robot_xml import mjcf_snippet, patched, urdf_snippet
 from nfriction.export.unfiltered import memory_of
-from nfriction.friction import FrictionModel
-from nfriction.modelfile import ModelInfo
+from nfriction.friction.model import FrictionModel
+from nfriction.io.atomic import write_atomically
+from nfriction.io.model_info import ModelInfo
 from nfriction.signals import Motion
 
 Load = Callable[[Tensor, Tensor], Tensor]

@@ -17,9 +17,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from nfriction.friction import Adaptive, Constant, FrictionModel, NeuroFuzzy
-from nfriction.friction.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
-from nfriction.modelfile import ModelInfo
+from nfriction.friction.constant import Constant
+from nfriction.friction.model import FrictionModel
+from nfriction.friction.neurofuzzy import NeuroFuzzy
+from nfriction.io.model_info import ModelInfo
+from nfriction.papers.afem.adaptive import Adaptive
+from nfriction.papers.nffem.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
 
 # Bits of the status.
 OUTSIDE, NOT_FINITE, SATURATED = 1, 2, 4

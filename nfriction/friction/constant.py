@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from nfriction.friction.coefficients import Tabulated
 from nfriction.friction.laws import Law
-from nfriction.friction.schedules import Tabulated
 from nfriction.friction.sensitivity import Sensitivity
 
 

@@ -6,8 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from nfriction.friction.coefficients import Schedule
 from nfriction.friction.laws import Law
-from nfriction.friction.schedules import Schedule
 
 # Velocity over which the sign turns [rad/s]; larger values creep, smaller ones make RK4 unstable.
 V_SMOOTH = 3e-3
@@ -84,7 +84,7 @@ class FrictionModel(nn.Module):
         """Friction torque with coefficients given, as a simulation holds them over a step."""
         return self.law_torque(qd, load, coefficients, self.v_smooth)
 
-    def slope_at_rest(self) -> Tensor:
+    def zero_velocity_damping(self) -> Tensor:
         """Slope of the torque over velocity at rest under unit load [N m s/rad], (joint,).
 
         What decides whether an explicit integrator stays stable near standstill; the steepest,

@@ -6,14 +6,14 @@ from typing import Literal
 from torch import Tensor
 
 from nfriction.friction import laws
-from nfriction.friction.adaptive import Adaptive
-from nfriction.friction.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
+from nfriction.friction.coefficients import Schedule
 from nfriction.friction.constant import Constant
-from nfriction.friction.controller_schedule import RadialBasis
 from nfriction.friction.laws import Law
 from nfriction.friction.model import V_SMOOTH, FrictionModel
 from nfriction.friction.neurofuzzy import PRIOR_SD, NeuroFuzzy
-from nfriction.friction.schedules import Schedule
+from nfriction.papers.afem.adaptive import Adaptive
+from nfriction.papers.nffem.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
+from nfriction.papers.nffem.rbf_coefficients import RadialBasis
 
 
 class ConstantModel(FrictionModel):

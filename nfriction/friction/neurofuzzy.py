@@ -6,9 +6,9 @@ from typing import Any, Final, Literal
 import torch
 from torch import Tensor, nn
 
+from nfriction.friction.coefficients import Schedule
 from nfriction.friction.constant import Constant
 from nfriction.friction.laws import Law
-from nfriction.friction.schedules import Schedule
 from nfriction.friction.sensitivity import FactoredSensitivity
 from nfriction.friction.smooth import fading, fading_slope, soft_positive, soft_positive_inverse
 from nfriction.fuzzy import AnfisRBF

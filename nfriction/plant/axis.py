@@ -87,7 +87,7 @@ class LinearAxis(Plant):
         return torch.ones_like(q)
 
     @torch.no_grad()
-    def mobility(self) -> Tensor:
+    def max_inverse_inertia(self) -> Tensor:
         """1 / mass [1/kg], (*batch, 1); RK4 is stable below 2.785 / (dt * mobility) [N s/m]."""
         return 1 / self.mass
 

@@ -96,7 +96,7 @@ class Plant(nn.Module):
         """Normal load of each joint over its load at rest [-]."""
         raise NotImplementedError(f"{type(self).__name__} does not say what its joints carry.")
 
-    def mobility(self) -> Tensor:
+    def max_inverse_inertia(self) -> Tensor:
         """Largest acceleration per torque of each joint, (*batch, joint)."""
         raise NotImplementedError(f"{type(self).__name__} does not say how mobile it is.")
 

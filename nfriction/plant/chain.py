@@ -328,7 +328,7 @@ class PendulumChain(Plant):
         return slopes.geared(passed_on(tau, qd, gain, loss), by_velocity(tau, qd, loss))
 
     @torch.no_grad()
-    def mobility(self) -> Tensor:
+    def max_inverse_inertia(self) -> Tensor:
         """Largest acceleration of a joint by its own torque, (*batch, joint) [rad/s^2 per N m].
 
         Over poses, the largest diagonal entry of M^-1, times what a gear makes of the torque.

@@ -18,8 +18,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from nfriction import strict_json
-from nfriction.atomic import write_atomically
+from nfriction.io import strict_json
+from nfriction.io.atomic import write_atomically
 from nfriction.plant import robotfile
 from nfriction.plant.axis import LinearAxis
 from nfriction.plant.base import Plant

@@ -11,8 +11,9 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from nfriction.fitting import Fit
-from nfriction.friction import Constant, FrictionModel
+from nfriction.fitting.result.fit_result import FitResult
+from nfriction.friction.constant import Constant
+from nfriction.friction.model import FrictionModel
 from nfriction.plots import style
 from nfriction.signals import Motion
 
@@ -65,7 +66,7 @@ def coefficients_over_time(
     return figure
 
 
-def coefficient_intervals(fits: Mapping[str, Fit], *, width: float | None = None) -> Figure:
+def coefficient_intervals(fits: Mapping[str, FitResult], *, width: float | None = None) -> Figure:
     """Fitted coefficients with their 95 % intervals, a panel a coefficient; joints side by side.
 
     Intervals reach from edge to edge of a panel where the data tell nothing.
@@ -132,7 +133,7 @@ def _along(model: FrictionModel, motion: Motion) -> NDArray[np.float64]:
     return found.expand(len(qd), -1, -1).numpy()
 
 
-def _intervals(found: Fit, name: str, k: int) -> NDArray[np.float64]:
+def _intervals(found: FitResult, name: str, k: int) -> NDArray[np.float64]:
     """Value, lower and upper end of a coefficient of every joint, (3, joint)."""
     schedule = found.model.schedule
     assert isinstance(schedule, Constant)

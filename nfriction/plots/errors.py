@@ -9,10 +9,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from nfriction.comparison import NO_FRICTION, Comparison
+from nfriction.evaluation.compare import NO_FRICTION, Comparison
+from nfriction.evaluation.score import Score
 from nfriction.plots import style
 from nfriction.recording import Recording
-from nfriction.scoring import Score
 
 # Room that a bar and its number need side by side with others [in].
 _BAR = 0.13

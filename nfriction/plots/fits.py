@@ -10,13 +10,13 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from nfriction.fitting.torque import friction_torque
-from nfriction.friction import FrictionModel
+from nfriction.fitting.equation_error import friction_torque
+from nfriction.friction.model import FrictionModel
+from nfriction.optim.least_squares import Step
 from nfriction.plant import Plant
 from nfriction.plots import style
 from nfriction.recording import Recording
 from nfriction.signals import Motion, kalman_smoother
-from nfriction.solve.least_squares import Step
 
 Array = NDArray[np.float64]
 

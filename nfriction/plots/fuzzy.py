@@ -11,8 +11,9 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from nfriction.friction import FrictionModel, NeuroFuzzy
-from nfriction.fuzzy import MamdaniController
+from nfriction.friction.model import FrictionModel
+from nfriction.friction.neurofuzzy import NeuroFuzzy
+from nfriction.papers.controller.mamdani import MamdaniController
 from nfriction.plots import style
 
 Array = NDArray[np.float64]

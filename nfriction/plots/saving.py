@@ -8,8 +8,11 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from nfriction.comparison import Comparison
-from nfriction.friction import Constant, FrictionModel, NeuroFuzzy
+from nfriction.evaluation.compare import Comparison
+from nfriction.evaluation.score import Score
+from nfriction.friction.constant import Constant
+from nfriction.friction.model import FrictionModel
+from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.plots.coefficients import coefficients_over_time
 from nfriction.plots.dark import GROUND, for_dark_screen
 from nfriction.plots.errors import horizon_curve, positions, rmse_bars
@@ -17,7 +20,6 @@ from nfriction.plots.fits import torque_over_velocity
 from nfriction.plots.fuzzy import memberships
 from nfriction.plots.surfaces import coefficient_sections, coefficient_surfaces
 from nfriction.recording import Recording
-from nfriction.scoring import Score
 from nfriction.signals import Motion
 
 DPI = 150

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
-from nfriction.comparison import NO_FRICTION
+from nfriction.evaluation.compare import NO_FRICTION
 
 COLUMN, PAGE = 3.5, 7.0
 """Widths of a figure in a two-column paper [in]: one column, both."""

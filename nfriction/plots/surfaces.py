@@ -12,10 +12,12 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter
 
-from nfriction.fitting.anchors import visits
-from nfriction.fitting.uncertainty import CoefficientUncertainty
-from nfriction.fitting.verdict import NORMAL_95
-from nfriction.friction import Coefficient, FrictionModel, NeuroFuzzy
+from nfriction.fitting.result.identifiability import NORMAL_95
+from nfriction.fitting.result.uncertainty import CoefficientUncertainty
+from nfriction.fitting.strategy.extrapolation_prior import visits
+from nfriction.friction.laws import Coefficient
+from nfriction.friction.model import FrictionModel
+from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.plots import style
 from nfriction.plots.fuzzy import Array, Edges, draw_map, neuro_fuzzy, range_of
 from nfriction.signals import Motion

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from nfriction import formats
-from nfriction.angles import AngleConvention, ConventionLike, Mechanism
+from nfriction.io import formats
+from nfriction.recording.angles import AngleConvention, ConventionLike, Mechanism
 from nfriction.recording.validation import (
     RecordingWarning,
     check_content,
@@ -183,7 +183,7 @@ class Recording:
         starts = self.time[0] + stride * np.arange(int(np.floor(fitting)) + 1)
         return [self.window(start, start + length) for start in starts]
 
-    def convention_on(self, plant: Mechanism) -> AngleConvention:
+    def resolve_convention(self, plant: Mechanism) -> AngleConvention:
         """How this recording of a plant is written: as it says itself, else as the plant says.
 
         Sliding joints have no angles; for them it is the convention that changes nothing.
@@ -210,7 +210,7 @@ class Recording:
             ValueError: neither recording nor plant say how the angles are written, or their units
                 differ.
         """
-        convention = self.convention if plant is None else self.convention_on(plant)
+        convention = self.convention if plant is None else self.resolve_convention(plant)
         if self.unit == "m":
             return self
         if convention is None:

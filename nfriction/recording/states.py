@@ -9,7 +9,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from nfriction import formats
+from nfriction.io import formats
 
 Array = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Iterator
 from importlib import resources
 
-from nfriction.comparison import NO_FRICTION
+from nfriction.evaluation.compare import NO_FRICTION
 from nfriction.report import tables
 from nfriction.report.figures import enlarged, shown
 from nfriction.report.markup import Markup, element, joined

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import torch
 
-from nfriction.friction import FrictionModel, NeuroFuzzy
+from nfriction.friction.model import FrictionModel
+from nfriction.friction.neurofuzzy import NeuroFuzzy
 
 _SPEEDS = {
     1: ("any",),

@@ -8,14 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from nfriction import strict_json
-from nfriction.comparison import Comparison
-from nfriction.friction import MODELS, FrictionModel
-from nfriction.modelfile import ModelFileError, ModelInfo, info_of, load
+from nfriction.evaluation.compare import Comparison
+from nfriction.evaluation.cross_validation import Candidate, Selection
+from nfriction.evaluation.score import RMSE, Score
+from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import MODELS
+from nfriction.io import strict_json
+from nfriction.io.model_content import ModelFileError
+from nfriction.io.model_file import load, load_info
+from nfriction.io.model_info import ModelInfo
 from nfriction.report.entries import UnfitError, mapped, mapping, number, seconds, text, texts
 from nfriction.report.png import Figure, read_figures
-from nfriction.scoring import Rmse, Score
-from nfriction.selection import Candidate, Selection
 
 # Far beyond any run of ours; what is larger is no results file.
 LARGEST_RESULTS = 64 * 2**20
@@ -213,7 +216,7 @@ def _candidate(value: object, where: str) -> Candidate:
     return Candidate("", errors, parameters, entry.get("converged") is True)
 
 
-def _rmse(value: object, where: str, joints: int) -> Rmse:
+def _rmse(value: object, where: str, joints: int) -> RMSE:
     """Errors of a simulation; one that diverged has null for a number."""
     entry = mapping(value, where)
     of_joints = entry.get("joints")
@@ -222,7 +225,7 @@ def _rmse(value: object, where: str, joints: int) -> Rmse:
     errors = [math.inf if e is None else number(e, where) for e in (*of_joints, entry.get("all"))]
     if min(errors) < 0:
         raise UnfitError(f"{where} has a negative error")
-    return Rmse(tuple(errors[:-1]), errors[-1])
+    return RMSE(tuple(errors[:-1]), errors[-1])
 
 
 def _fit(value: object, name: str) -> FitRecord:
@@ -274,7 +277,7 @@ def _models(
             continue
         path = folder / "models" / f"{name}.json"
         try:
-            model, info = load(path), info_of(path)
+            model, info = load(path), load_info(path)
         except ModelFileError as error:
             notes.append(f"{name}: its model file could not be read ({error})")
             continue

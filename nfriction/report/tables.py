@@ -4,11 +4,11 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from nfriction.comparison import NO_FRICTION
-from nfriction.modelfile import ModelInfo, describe
+from nfriction.evaluation.compare import NO_FRICTION
+from nfriction.evaluation.cross_validation import Selection
+from nfriction.io.model_info import ModelInfo, describe
 from nfriction.report.rules import JointRules
 from nfriction.report.run import Run
-from nfriction.selection import Selection
 
 # A positive coefficient at zero is given for 1e-12 of its unit.
 NOTHING = 1.001e-12

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from nfriction.simulation.linearised import Linearised, combined_slopes, gradients, step_back
 from nfriction.simulation.mechanism import Mechanism
-from nfriction.simulation.steps import acceleration
+from nfriction.simulation.rk4 import acceleration
 
 # Samples linearised together, by device: enough that the calls cost little, few enough for the
 # cache or (at some 20 KB each) the memory.

@@ -51,12 +51,12 @@ def combined_slopes(plant: PlantSlopes, by_qd: Tensor, by_load: Tensor, by_c: Te
     own = torque[:, joints:].diagonal().movedim(-1, 0)
     own.add_(by_qd).addcmul_(by_load, plant.load_by_qd)
     found = torque.new_empty(joints, states + by_c.shape[:2].numel(), *by_qd.shape[1:])
-    mobility = -plant.inverse_mass
+    max_inverse_inertia = -plant.inverse_mass
     by_state, by_held = found[:, :states], found[:, states:].unflatten(1, by_c.shape[:2])
-    torch.mul(mobility[:, :1], torque[0], out=by_state)
+    torch.mul(max_inverse_inertia[:, :1], torque[0], out=by_state)
     for j in range(1, joints):
-        by_state.addcmul_(mobility[:, j : j + 1], torque[j])
-    torch.mul(mobility.unsqueeze(2), by_c, out=by_held)
+        by_state.addcmul_(max_inverse_inertia[:, j : j + 1], torque[j])
+    torch.mul(max_inverse_inertia.unsqueeze(2), by_c, out=by_held)
     return found
 
 

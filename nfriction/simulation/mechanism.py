@@ -6,10 +6,11 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from nfriction.compiled import NoFriction
-from nfriction.friction import FrictionModel, Schedule
+from nfriction.friction.coefficients import Schedule
+from nfriction.friction.model import FrictionModel
+from nfriction.simulation.compiled import NoFriction
 from nfriction.simulation.protocols import remembering
-from nfriction.simulation.steps import acceleration
+from nfriction.simulation.rk4 import acceleration
 
 
 class Mechanism(nn.Module):

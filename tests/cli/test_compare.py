@@ -192,7 +192,7 @@ def test_interrupt_outside_a_solver(
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("nfriction.many.fit", stop)
+    monkeypatch.setattr("nfriction.evaluation.fit_many.fit", stop)
     assert compare(bench, bench / "stopped") == 130
     assert capsys.readouterr().err.count("\n") == 1
     assert not list((bench / "stopped").iterdir())

@@ -11,7 +11,7 @@ import pytest
 
 from nfriction import cli, rigs
 from nfriction.cli import estimation
-from nfriction.fitting.constant import WINDOWS
+from nfriction.fitting.strategy.constant import WINDOWS
 from tests.cli.benches import compare, pendulum, results
 
 
@@ -126,7 +126,7 @@ def test_degrees_are_told_once_with_the_option_that_helps(
     def ends(*_: object, **__: object) -> None:
         raise ValueError("enough")
 
-    monkeypatch.setattr("nfriction.comparison.compare", ends)
+    monkeypatch.setattr("nfriction.evaluation.compare.compare", ends)
     words = [str(wheels[0]), "--held-out", str(wheels[1]), "--rig", str(bench / "bench.json")]
     assert cli.main(["compare", *words, "--out", str(bench / "w")]) == 2
     first, second = capsys.readouterr().err.splitlines()

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from nfriction import cli, rigs, twin
+from nfriction import cli, rigs
 from nfriction.cli import demo, names
-from nfriction.friction import MODELS, NCFM
-from nfriction.modelfile import save
+from nfriction.friction.models import MODELS, NCFM
+from nfriction.io.model_file import save
+from nfriction.papers import twin
 from nfriction.plant import robotfile
 from nfriction.version import __version__
 

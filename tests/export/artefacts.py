@@ -3,9 +3,10 @@
 import torch
 from torch import Tensor
 
-from nfriction.friction import Constant, FrictionModel, Law
-from nfriction.friction.laws import LINEAR
-from nfriction.modelfile import ModelInfo
+from nfriction.friction.constant import Constant
+from nfriction.friction.laws import LINEAR, Law
+from nfriction.friction.model import FrictionModel
+from nfriction.io.model_info import ModelInfo
 from tests.friction.samples import randomise
 
 INFO = ModelInfo(

@@ -21,9 +21,11 @@ from nfriction.export.controller import controller_of
 from nfriction.export.errors import ExportError
 from nfriction.export.points import draw
 from nfriction.export.unfiltered import NOT_FINITE, OUTSIDE, SATURATED
-from nfriction.friction import MODELS, Coefficient, FrictionModel, Law
 from nfriction.friction.constant import Constant
-from nfriction.modelfile import ModelInfo
+from nfriction.friction.laws import Coefficient, Law
+from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import MODELS
+from nfriction.io.model_info import ModelInfo
 
 STUBS = Path(__file__).parent / "stubs"
 GCC, GXX = shutil.which("gcc"), shutil.which("g++")

@@ -18,8 +18,8 @@ from nfriction.export.contract import (
 )
 from nfriction.export.controller import controller_of
 from nfriction.export.unfiltered import NOT_FINITE
-from nfriction.friction import LFM
-from nfriction.modelfile import ModelInfo
+from nfriction.friction.models import LFM
+from nfriction.io.model_info import ModelInfo
 from tests.export.artefacts import INFO
 from tests.friction.samples import named_models
 

@@ -10,8 +10,8 @@ from nfriction.export.controller import controller_of
 from nfriction.export.filtered import FilteredController
 from nfriction.export.points import draw
 from nfriction.export.unfiltered import NOT_FINITE, OUTSIDE, SATURATED, Controller, MemoryController
-from nfriction.friction import LFM, NFLFM
-from nfriction.modelfile import ModelInfo
+from nfriction.friction.models import LFM, NFLFM
+from nfriction.io.model_info import ModelInfo
 from nfriction.signals import SecondOrderLowPass
 from tests.export.artefacts import INFO, rising
 from tests.friction.samples import motion, named_models, randomise

@@ -7,8 +7,10 @@ from nfriction.export.controller import controller_of
 from nfriction.export.flat import flattened, shortened
 from nfriction.export.flat_numbers import NumberByNumber, _deepest
 from nfriction.export.flat_tensors import TensorByTensor
-from nfriction.friction import NFLFM, NFNCFM, NFNLFM, FrictionModel, NeuroFuzzy
 from nfriction.friction.laws import NONLINEAR
+from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import NFLFM, NFNCFM, NFNLFM
+from nfriction.friction.neurofuzzy import NeuroFuzzy
 from tests.friction.samples import randomise
 
 JOINTS = 3

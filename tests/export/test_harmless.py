@@ -15,7 +15,7 @@ from nfriction.export.archive import METADATA
 from nfriction.export.harmless import refuse_harmful_program, refuse_harmful_source
 from nfriction.export.program import open_pt2
 from nfriction.export.script import open_torchscript
-from nfriction.friction import LFM
+from nfriction.friction.models import LFM
 from tests.export.artefacts import INFO
 from tests.export.test_program import rewritten
 

@@ -16,9 +16,12 @@ from nfriction.export.contract import compare, run_through, verify
 from nfriction.export.controller import controller_of
 from nfriction.export.points import draw
 from nfriction.export.script import open_torchscript, sample_inputs
-from nfriction.friction import LFM, NFLFM, Coefficient, Constant, FrictionModel, Law, NeuroFuzzy
-from nfriction.friction.laws import TorqueFunction
-from nfriction.modelfile import ModelInfo, parameter_hash
+from nfriction.friction.constant import Constant
+from nfriction.friction.laws import Coefficient, Law, TorqueFunction
+from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import LFM, NFLFM
+from nfriction.friction.neurofuzzy import NeuroFuzzy
+from nfriction.io.model_info import ModelInfo, parameter_hash
 from tests.export.artefacts import INFO, rising
 from tests.friction.samples import QUADRATIC, named_models, randomise
 

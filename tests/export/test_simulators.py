@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from nfriction.export import collapse, mjcf, urdf
-from nfriction.friction import ALFM, LFM, NCFM, NFLFM, NLFM
-from nfriction.modelfile import ModelInfo
+from nfriction.friction.models import ALFM, LFM, NCFM, NFLFM, NLFM
+from nfriction.io.model_info import ModelInfo
 from nfriction.signals import Motion
 from tests.friction.samples import randomise
 

@@ -7,7 +7,7 @@ import pytest
 from nfriction.codegen.build import find_compiler
 from nfriction.export import ContractError, ExportError, c, torchscript, verify_artefact
 from nfriction.export.contract import Contract
-from nfriction.friction import LFM
+from nfriction.friction.models import LFM
 from tests.export.artefacts import INFO
 from tests.friction.samples import named_models, randomise
 

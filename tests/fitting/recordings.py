@@ -4,8 +4,8 @@ import numpy as np
 import torch
 
 from nfriction import LinearAxis, PendulumChain, Recording, rollout
-from nfriction.angles import AngleConvention
-from nfriction.friction import FrictionModel
+from nfriction.friction.model import FrictionModel
+from nfriction.recording.angles import AngleConvention
 from nfriction.signals import quantise
 
 F64 = torch.float64

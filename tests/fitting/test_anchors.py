@@ -5,16 +5,21 @@ import pytest
 import torch
 
 from nfriction import NFLFM
-from nfriction.fitting.anchors import ANCHOR_SD, Anchors, anchors_where_unseen, visits
-from nfriction.fitting.outcome import trajectory_outcome
-from nfriction.fitting.residuals import band_of, local_noise
-from nfriction.fitting.sensitivity import StepJacobian
-from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
-from nfriction.fitting.uncertainty import CoefficientUncertainty
-from nfriction.fitting.verdict import covariance_root
-from nfriction.fitting.windows import Windows
+from nfriction.fitting.data.windows import Windows
+from nfriction.fitting.result.fit_result import trajectory_outcome
+from nfriction.fitting.result.identifiability import covariance_root
+from nfriction.fitting.result.uncertainty import CoefficientUncertainty
+from nfriction.fitting.shooting.autocorrelation import band_of, local_noise
+from nfriction.fitting.shooting.problem import TrajectoryProblem, solve_trajectory
+from nfriction.fitting.shooting.sensitivity import StepJacobian
+from nfriction.fitting.strategy.extrapolation_prior import (
+    ANCHOR_SD,
+    Anchors,
+    anchors_where_unseen,
+    visits,
+)
 from nfriction.signals import Motion
-from nfriction.simulation import integrate
+from nfriction.simulation.rollout import integrate
 from tests.fitting.recordings import F64, pendulum
 
 FASTEST, STRONGEST = 5.0, 100.0

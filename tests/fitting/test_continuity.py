@@ -3,10 +3,10 @@
 import pytest
 
 from nfriction import ALFM, LFM, NFLFM, fit
-from nfriction.fitting import stages
-from nfriction.fitting.constant_start import is_constant_fit
-from nfriction.fitting.trajectory import TrajectoryProblem
-from nfriction.friction import Constant
+from nfriction.fitting.shooting.problem import TrajectoryProblem
+from nfriction.fitting.strategy import continuation as stages
+from nfriction.fitting.strategy.constant_start import is_constant_fit
+from nfriction.friction.constant import Constant
 from tests.fitting.recordings import pendulum, swing
 
 V_SMOOTH = 0.05

@@ -7,8 +7,10 @@ import pytest
 import torch
 
 from nfriction import LFM, NLFM, PendulumChain, Recording, fit, rollout
-from nfriction.blocks import block_errors, leave_blocks_out
-from nfriction.friction import ACVFM, CFM, CVFM, NFCVFM, Constant, FrictionModel
+from nfriction.evaluation.time_blocks import block_errors, leave_blocks_out
+from nfriction.friction.constant import Constant
+from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import ACVFM, CFM, CVFM, NFCVFM
 from nfriction.signals import quantise
 from tests.fitting.recordings import F64, pendulum, swing
 

@@ -8,19 +8,19 @@ import pytest
 import torch
 
 from nfriction import LFM
-from nfriction.fitting.elimination import Layout, eliminated
-from nfriction.fitting.normal_equations import Rows, normal_equations
-from nfriction.fitting.outcome import trajectory_outcome
-from nfriction.fitting.preparation import adjustable_terms, mixing_of
-from nfriction.fitting.stages import Refinement
-from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
-from nfriction.fitting.verdict import (
+from nfriction.fitting.data.inputs import adjustable_terms, mixing_of
+from nfriction.fitting.data.windows import cut_windows
+from nfriction.fitting.result.fit_result import trajectory_outcome
+from nfriction.fitting.result.identifiability import (
     Information,
     information,
     lost_directions,
     standard_deviations,
 )
-from nfriction.fitting.windows import cut_windows
+from nfriction.fitting.shooting.marginalization import Layout, eliminated
+from nfriction.fitting.shooting.normal_equations import Rows, normal_equations
+from nfriction.fitting.shooting.problem import TrajectoryProblem, solve_trajectory
+from nfriction.fitting.strategy.continuation import Refinement
 from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import F64, pendulum, swing
 
@@ -40,7 +40,7 @@ def swings(seconds, length, friction, start, recordings=1, **settings):
     motions = [kalman_smoother(r.time, r.q) for r in made]
     each = settings.get("zero_sd") is not None
     terms = adjustable_terms(plant, made, True, False, False, zeroed_once=not each)
-    mixing = mixing_of(plant, made[0].convention_on(plant))
+    mixing = mixing_of(plant, made[0].resolve_convention(plant))
     search = Refinement(plant, law, made, mixing, terms, **settings)
     return search, cut_windows(made, motions, length)
 
@@ -87,7 +87,7 @@ def test_pieces_do_not_show(piece, monkeypatch):
     p = tame(zero_sd=torch.full((2, 2), 0.05, dtype=F64), jump_sd=(3e-4, 0.01))
     x, sd = p.unknowns.start(), error_sizes(p)
     whole = p.told(x, sd)
-    monkeypatch.setattr("nfriction.fitting.propagation.PIECE", piece)
+    monkeypatch.setattr("nfriction.fitting.shooting.propagation.PIECE", piece)
     parts = p.told(x, sd)
     torch.testing.assert_close(parts.data, whole.data, rtol=1e-8, atol=1e-3)
     torch.testing.assert_close(parts.score, whole.score, rtol=1e-8, atol=1e-3)

@@ -23,13 +23,14 @@ from nfriction import (
     fit,
     rollout,
 )
-from nfriction.fitting.adaptive import fit_adaptive
-from nfriction.fitting.constant import Settings
-from nfriction.fitting.residuals import effective_noise
-from nfriction.fitting.stages import Stage
-from nfriction.fitting.torque import fit_torque
-from nfriction.friction import Constant, FrictionModel
+from nfriction.fitting.equation_error import fit_torque
+from nfriction.fitting.shooting.autocorrelation import effective_noise
+from nfriction.fitting.strategy.constant import Settings
+from nfriction.fitting.strategy.continuation import Stage
+from nfriction.friction.constant import Constant
 from nfriction.friction.laws import STRIBECK
+from nfriction.friction.model import FrictionModel
+from nfriction.papers.afem.fit_adaptive import fit_adaptive
 from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import F64, driven_axis, pendulum, swing
 
@@ -200,7 +201,7 @@ def test_windows_that_are_left_out_are_told(monkeypatch):
     assert found.residual == pytest.approx(alone.residual, rel=0.2)
     # Whatever starts there says it, too.
     for score in (2.0, 0.0):
-        monkeypatch.setattr("nfriction.fitting.holdback.Judgement.score", score)
+        monkeypatch.setattr("nfriction.fitting.strategy.holdout.Judgement.score", score)
         network = NFLFM(2, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2)
         further = fit(network, pendulum(), recording, start=found, windows=(0.5,), max_steps=2)
         assert sum("too long" in told for told in further.warnings) == 1
@@ -437,7 +438,7 @@ def misled(monkeypatch):
         poor = torch.tensor(POOR, dtype=F64)[:, : found.coefficients.shape[1]]
         return replace(found, coefficients=poor)
 
-    monkeypatch.setattr("nfriction.fitting.constant.fit_torque", by_torque)
+    monkeypatch.setattr("nfriction.fitting.strategy.constant.fit_torque", by_torque)
     return asked
 
 
@@ -476,9 +477,11 @@ def test_a_law_that_torques_mislead_starts_anew_on_the_plant_that_it_found(
     found = fitted()
     assert misled[1] is not misled[0]
     assert found.residual == pytest.approx(2 * np.pi / 8192 / 12**0.5, rel=0.2)
-    better = "nfriction.fitting.growing._better_start"
+    better = "nfriction.fitting.strategy.growing._better_start"
     monkeypatch.setattr(better, lambda search, stage, *rest: stage)
-    monkeypatch.setattr("nfriction.fitting.nested.lowest_of", lambda search, own, *rest: own)
+    monkeypatch.setattr(
+        "nfriction.fitting.strategy.multistart.lowest_of", lambda search, own, *rest: own
+    )
     assert fitted().residual > 1.02 * found.residual
 
 
@@ -494,10 +497,12 @@ def test_a_search_in_vain_from_the_simpler_law_leaves_the_model_as_it_was(monkey
             return found
         return replace(found, coefficients=torch.tensor(POOR, dtype=F64))
 
-    monkeypatch.setattr("nfriction.fitting.constant.fit_torque", by_torque)
+    monkeypatch.setattr("nfriction.fitting.strategy.constant.fit_torque", by_torque)
     found = fit(Stribeck(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
     assert simpler
-    monkeypatch.setattr("nfriction.fitting.nested.lowest_of", lambda search, own, *rest: own)
+    monkeypatch.setattr(
+        "nfriction.fitting.strategy.multistart.lowest_of", lambda search, own, *rest: own
+    )
     simpler.clear()
     alone = fit(Stribeck(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
     assert torch.equal(found.model.schedule.values, alone.model.schedule.values)
@@ -514,7 +519,7 @@ def test_a_law_leaves_no_more_over_than_the_simpler_one_in_it(law, monkeypatch):
             return found
         return replace(found, coefficients=0 * found.coefficients + 10.0)
 
-    monkeypatch.setattr("nfriction.fitting.constant.fit_torque", by_torque)
+    monkeypatch.setattr("nfriction.fitting.strategy.constant.fit_torque", by_torque)
     recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH), seconds=2.0)
     simpler, found = (
         fit(of(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5, 1.0), max_steps=8)

@@ -7,11 +7,17 @@ import pytest
 import torch
 
 from nfriction import LFM, NFLFM, fit
-from nfriction.fitting.holdback import FOLDS, Judgement, error_on, judged_windows, shares_by_joint
-from nfriction.fitting.neurofuzzy_start import settle_on, start_at
-from nfriction.fitting.preparation import mixing_of
-from nfriction.fitting.stages import Refinement
-from nfriction.fitting.trajectory import TrajectoryProblem
+from nfriction.fitting.data.inputs import mixing_of
+from nfriction.fitting.shooting.problem import TrajectoryProblem
+from nfriction.fitting.strategy.continuation import Refinement
+from nfriction.fitting.strategy.holdout import (
+    FOLDS,
+    Judgement,
+    error_on,
+    judged_windows,
+    shares_by_joint,
+)
+from nfriction.fitting.strategy.neurofuzzy_start import settle_on, start_at
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from tests.fitting.recordings import F64, pendulum, swing
 
@@ -32,7 +38,7 @@ def refinement(constant):
     joint, found = constant
     model = NFLFM(2, v_smooth=V_SMOOTH, **SMALL)
     start_at(model, found, [joint], found.motions)
-    mixing = mixing_of(pendulum(), joint.convention_on(pendulum()))
+    mixing = mixing_of(pendulum(), joint.resolve_convention(pendulum()))
     return Refinement(pendulum(), model, [joint], mixing, [])
 
 
@@ -171,7 +177,7 @@ def test_a_network_that_does_not_win_is_put_back(constant, monkeypatch, ratio, t
     def error(held_back, problem, vector):
         return ratio if isinstance(problem.friction.schedule, NeuroFuzzy) else 1.0
 
-    monkeypatch.setattr("nfriction.fitting.network.error_on", error)
+    monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.error_on", error)
     model = NFLFM(2, v_smooth=V_SMOOTH, **SMALL)
     kept = fit(model, pendulum(), joint, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
     assert kept.model is model

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nfriction import CVFM, LFM, NFLFM, PendulumChain, Recording, fit
-from nfriction.fitting.misgivings import misgivings
+from nfriction.fitting.data.checks import misgivings
 from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import COUNTS, pendulum, swing
 

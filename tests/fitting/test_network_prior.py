@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from nfriction import LFM, NCFM, NFLFM, NFNCFM, NFStribeck, Stribeck, fit
-from nfriction.fitting.network import PRIOR_SHARES
-from nfriction.fitting.stages import Refinement
-from nfriction.fitting.verdict import Interval
+from nfriction.fitting.result.identifiability import Interval
+from nfriction.fitting.strategy.continuation import Refinement
+from nfriction.fitting.strategy.neurofuzzy import PRIOR_SHARES
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from tests.fitting.recordings import pendulum, swing
 
@@ -43,7 +43,7 @@ def test_the_prior_is_the_one_whose_network_predicts_best(constant, monkeypatch,
         seen.append(schedule.prior_sd)
         return 0.7 - 0.2 * (len(seen) == best + 1)
 
-    monkeypatch.setattr("nfriction.fitting.network.error_on", error)
+    monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.error_on", error)
     model = NFLFM(2, v_smooth=V_SMOOTH, prior_sd=0.6, **SMALL)
     fit(model, pendulum(), recording, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
     assert seen == pytest.approx([0.6 * share for share in PRIOR_SHARES])
@@ -56,7 +56,7 @@ def test_a_law_that_is_not_linear_has_a_network_too(constant):
     settings = {"windows": (0.5,), "fit_plant": False, "max_steps": 8}
     law = fit(Stribeck(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nfriction.fitting.holdback.Judgement.score", 0.0)
+        patch.setattr("nfriction.fitting.strategy.holdout.Judgement.score", 0.0)
         model = NFStribeck(2, v_smooth=V_SMOOTH, **SMALL)
         found = fit(model, pendulum(), recording, start=law, **settings)
     assert found.model is model
@@ -69,7 +69,7 @@ def test_the_plant_stays_about_as_near_to_the_laws_as_that_left_it_open(constant
     settings = {"windows": (0.5,), "max_steps": 4}
     law = fit(NCFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
     open_ = {i.name: i.sd for i in law.intervals}
-    monkeypatch.setattr("nfriction.fitting.holdback.Judgement.score", 0.5)
+    monkeypatch.setattr("nfriction.fitting.strategy.holdout.Judgement.score", 0.5)
 
     def moved() -> float:
         """By how many standard deviations that the law's fit left open, at most."""
@@ -110,7 +110,7 @@ def test_a_plant_is_let_go_only_for_what_windows_held_back_gain(
         return searched(self, problem, vector, *others)
 
     searched = Refinement.search
-    monkeypatch.setattr("nfriction.fitting.network.error_on", error)
+    monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.error_on", error)
     monkeypatch.setattr(Refinement, "search", search)
     model = NFLFM(2, v_smooth=V_SMOOTH, **SMALL)
     fit(model, pendulum(), recording, start=law, **BRIEF)
@@ -137,7 +137,7 @@ def test_a_law_that_diverges_lets_go_of_no_plant(with_plant, monkeypatch):
         return searched(self, problem, *others)
 
     searched = Refinement.search
-    monkeypatch.setattr("nfriction.fitting.network.error_on", error)
+    monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.error_on", error)
     monkeypatch.setattr(Refinement, "search", search)
     fit(NFLFM(2, v_smooth=V_SMOOTH, **SMALL), pendulum(), recording, start=law, **BRIEF)
     free, near, *_ = trained

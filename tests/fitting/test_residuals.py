@@ -3,7 +3,12 @@
 import pytest
 import torch
 
-from nfriction.fitting.residuals import LEAST_ALIKE, band_of, correlation_time, local_noise
+from nfriction.fitting.shooting.autocorrelation import (
+    LEAST_ALIKE,
+    band_of,
+    correlation_time,
+    local_noise,
+)
 
 F64 = torch.float64
 # Motion slower than any of these errors.

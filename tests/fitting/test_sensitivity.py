@@ -6,9 +6,10 @@ import torch
 from nfriction import LFM, NFLFM, LinearAxis
 from nfriction.codegen import NoBackend
 from nfriction.fitting.plant_parameters import adjusted_buffers, plant_parameters
-from nfriction.fitting.sensitivity import CHUNK, StepJacobian, start_slope, step_maps
-from nfriction.friction import MODELS
-from nfriction.simulation import integrate, rk4_step
+from nfriction.fitting.shooting.sensitivity import CHUNK, StepJacobian, start_slope, step_maps
+from nfriction.friction.models import MODELS
+from nfriction.simulation.rk4 import rk4_step
+from nfriction.simulation.rollout import integrate
 from tests.fitting.recordings import F64, pendulum
 
 

@@ -4,11 +4,11 @@ import pytest
 import torch
 
 from nfriction import LFM
-from nfriction.fitting.preparation import mixing_of
-from nfriction.fitting.stages import PATIENCE, SETTLED, Refinement, _Watch
-from nfriction.fitting.windows import cut_windows
+from nfriction.fitting.data.inputs import mixing_of
+from nfriction.fitting.data.windows import cut_windows
+from nfriction.fitting.strategy.continuation import PATIENCE, SETTLED, Refinement, _Watch
+from nfriction.optim.least_squares import Step
 from nfriction.signals import kalman_smoother
-from nfriction.solve.least_squares import Step
 from tests.fitting.recordings import F64, pendulum, swing
 
 
@@ -47,7 +47,7 @@ def short_search():
     plant, model = pendulum(), LFM(2, [[1e-3, 1e-3]] * 2, v_smooth=0.05)
     recording = swing(plant, LFM(2, [[2e-3, 3e-3]] * 2, v_smooth=0.05), seconds=1.0)
     motion = kalman_smoother(recording.time, recording.q)
-    mixing = mixing_of(plant, recording.convention_on(plant))
+    mixing = mixing_of(plant, recording.resolve_convention(plant))
     search = Refinement(plant, model, [recording], mixing, [], max_steps=20)
     return search, search.problem(cut_windows([recording], [motion], 0.5), 1e-3)
 

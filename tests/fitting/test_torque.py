@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from nfriction import Recording
-from nfriction.fitting.torque import EDGE, TorqueFit, fit_torque, friction_torque, prior_sd
-from nfriction.friction import MODELS
+from nfriction.fitting.equation_error import EDGE, TorqueFit, fit_torque, friction_torque, prior_sd
 from nfriction.friction.laws import LINEAR, NONLINEAR, Coefficient, Law
+from nfriction.friction.models import MODELS
 from nfriction.signals import Motion
 from tests.fitting.recordings import pendulum
 

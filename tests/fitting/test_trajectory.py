@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from nfriction import LFM, NFLFM
+from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.plant_parameters import plant_parameters
-from nfriction.fitting.propagation import _carried
-from nfriction.fitting.sensitivity import StepJacobian, StepMaps
-from nfriction.fitting.stages import JUMP_SD
-from nfriction.fitting.trajectory import TrajectoryProblem, solve_trajectory
-from nfriction.fitting.windows import Windows
+from nfriction.fitting.shooting.problem import TrajectoryProblem, solve_trajectory
+from nfriction.fitting.shooting.propagation import _carried
+from nfriction.fitting.shooting.sensitivity import StepJacobian, StepMaps
+from nfriction.fitting.strategy.continuation import JUMP_SD
 from nfriction.signals import Motion
-from nfriction.simulation import integrate
+from nfriction.simulation.rollout import integrate
 from tests.fitting.recordings import F64, pendulum
 
 ABSOLUTE = torch.tensor([[1.0, 0.0], [1.0, 1.0]], dtype=F64)
@@ -122,7 +122,7 @@ def test_pieces_do_not_show(piece, monkeypatch):
     """However many samples are accumulated at a time, the model of the cost is the same."""
     p = problem(bent("NFLFM"), stride=3)
     whole = p.quadratic(point(p))
-    monkeypatch.setattr("nfriction.fitting.propagation.PIECE", piece)
+    monkeypatch.setattr("nfriction.fitting.shooting.propagation.PIECE", piece)
     parts = p.quadratic(point(p))
     torch.testing.assert_close(parts.gradient, whole.gradient, rtol=1e-10, atol=1e-10)
     torch.testing.assert_close(parts.hessian, whole.hessian, rtol=1e-10, atol=1e-10)

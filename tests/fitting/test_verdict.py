@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nfriction.fitting.verdict import (
+from nfriction.fitting.result.identifiability import (
     Information,
     Interval,
     beyond_need,

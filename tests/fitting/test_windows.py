@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from nfriction import Recording
-from nfriction.fitting.windows import cut_windows
+from nfriction.fitting.data.windows import cut_windows
 from nfriction.signals import Motion
 
 

@@ -3,8 +3,18 @@
 import torch
 from torch import Tensor
 
-from nfriction.friction import MODELS, Coefficient, FrictionModel, Law
-from nfriction.friction.laws import COULOMB, COULOMB_VISCOUS, LINEAR, NONLINEAR, STRIBECK, VISCOUS
+from nfriction.friction.laws import (
+    COULOMB,
+    COULOMB_VISCOUS,
+    LINEAR,
+    NONLINEAR,
+    STRIBECK,
+    VISCOUS,
+    Coefficient,
+    Law,
+)
+from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import MODELS
 
 LAWS = (VISCOUS, COULOMB, COULOMB_VISCOUS, LINEAR, NONLINEAR, STRIBECK)
 

@@ -8,11 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from nfriction.friction import Coefficient, Law
 from nfriction.friction.laws import (
     LINEAR,
     NONLINEAR,
     STRIBECK,
+    Coefficient,
+    Law,
     coulomb,
     coulomb_viscous,
     linear,

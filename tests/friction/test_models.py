@@ -3,18 +3,12 @@
 import pytest
 import torch
 
-from nfriction.friction import (
-    LFM,
-    MODELS,
-    NFLFM,
-    NLFM,
-    Constant,
-    FrictionModel,
-    NeuroFuzzy,
-    Schedule,
-    model_by_name,
-)
+from nfriction.friction.coefficients import Schedule
+from nfriction.friction.constant import Constant
 from nfriction.friction.laws import LINEAR, VISCOUS
+from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import LFM, MODELS, NFLFM, NLFM, model_by_name
+from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.friction.sensitivity import Sensitivity
 from tests.friction.samples import QUADRATIC, motion, named_models, normal, quadratic
 
@@ -73,7 +67,7 @@ def test_the_slope_at_rest_is_that_of_differences(name: str) -> None:
     # Of every set of coefficients that may hold at rest, the steepest counts.
     held = model.schedule.rest_coefficients()
     ahead, behind = (model.torque(rest + s, load, held) for s in (step, -step))
-    slope = model.slope_at_rest()
+    slope = model.zero_velocity_damping()
     assert slope.shape == (3,)
     expected = ((ahead - behind) / (2 * step)).detach().reshape(-1, 3).amax(0)
     # Truncation is (step / v_smooth)^2 / 3, and step / v_s where Stribeck's exponent is near 1.
@@ -85,7 +79,7 @@ def test_the_slope_at_rest_is_that_of_differences(name: str) -> None:
 def test_the_slope_of_coulomb_friction_is_its_size_over_the_smoothing() -> None:
     model = LFM(2, [[0.1, 0.5], [0.2, 0.7]], v_smooth=1e-2)
     expected = torch.tensor([0.1 + 0.5e2, 0.2 + 0.7e2], dtype=torch.float64)
-    torch.testing.assert_close(model.slope_at_rest(), expected, rtol=1e-12, atol=0)
+    torch.testing.assert_close(model.zero_velocity_damping(), expected, rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize("make", [Constant, NeuroFuzzy])
@@ -121,7 +115,7 @@ def test_a_schedule_of_ones_own_works_even_without_parameters() -> None:
     model = FrictionModel(VISCOUS, WithoutParameters(VISCOUS, 2))
     qd, qdd, load = motion(30, 2)
     torch.testing.assert_close(model(qd, qdd, load), torch.exp(-qd.abs()) * qd)
-    torch.testing.assert_close(model.slope_at_rest(), torch.ones(2, dtype=torch.float64))
+    torch.testing.assert_close(model.zero_velocity_damping(), torch.ones(2, dtype=torch.float64))
 
 
 def test_held_coefficients_come_in_batches() -> None:

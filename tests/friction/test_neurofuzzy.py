@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.func import functional_call, jacrev
 
-from nfriction.friction import Constant, FrictionModel, NeuroFuzzy
+from nfriction.friction.constant import Constant
 from nfriction.friction.laws import LINEAR, NONLINEAR, STRIBECK, VISCOUS
-from nfriction.friction.neurofuzzy import LEAST_RATIO
+from nfriction.friction.model import FrictionModel
+from nfriction.friction.neurofuzzy import LEAST_RATIO, NeuroFuzzy
 from nfriction.friction.sensitivity import Sensitivity
 from tests.friction.samples import LAWS, QUADRATIC, motion, normal, randomise
 

@@ -5,9 +5,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nfriction.friction import Constant, Law
-from nfriction.friction.laws import LINEAR, NONLINEAR, STRIBECK, VISCOUS
-from nfriction.friction.schedules import SMALLEST
+from nfriction.friction.coefficients import SMALLEST
+from nfriction.friction.constant import Constant
+from nfriction.friction.laws import LINEAR, NONLINEAR, STRIBECK, VISCOUS, Law
 from tests.friction.samples import LAWS, QUADRATIC, motion, normal
 
 every_law = pytest.mark.parametrize("law", [*LAWS, QUADRATIC], ids=lambda law: law.name)

@@ -133,7 +133,7 @@ def test_load_is_one_at_rest_in_line_and_none_at_rest_level() -> None:
 
 
 def test_mobility_gives_the_papers_stability_bounds() -> None:
-    bound = 2.785 / (1e-3 * rigs.tlrip().mobility())
+    bound = 2.785 / (1e-3 * rigs.tlrip().max_inverse_inertia())
     torch.testing.assert_close(bound, torch.tensor([247.0, 77, 77]).double(), rtol=0.01, atol=0)
 
 
@@ -144,8 +144,8 @@ def test_mobility_bounds_random_poses(arm: Any) -> None:
     found = torch.linalg.inv(rig.mass_matrix(q)).diagonal(dim1=-2, dim2=-1).amax(0)
     found = rig.torque_gain * (1.0 + rig.gear_loss) * found
     # The grid's steps of 15 degrees for three angles miss the top by no more than a percent.
-    assert (found <= 1.01 * rig.mobility()).all()
-    assert (found >= 0.8 * rig.mobility()).all()
+    assert (found <= 1.01 * rig.max_inverse_inertia()).all()
+    assert (found >= 0.8 * rig.max_inverse_inertia()).all()
 
 
 @pytest.mark.parametrize("arm", ARMS)
@@ -184,7 +184,7 @@ def test_replaced_buffers_broadcast_over_the_batch(arm: Any) -> None:
         torch.testing.assert_close(batched.bias(q, qd)[p], one.bias(q[p], qd[p]))
         torch.testing.assert_close(batched.load(q, qd)[p], one.load(q[p], qd[p]))
         torch.testing.assert_close(batched.energy(q, qd)[0][p], one.energy(q[p], qd[p])[0])
-        torch.testing.assert_close(batched.mobility()[p], one.mobility())
+        torch.testing.assert_close(batched.max_inverse_inertia()[p], one.max_inverse_inertia())
 
 
 def test_a_single_link_keeps_the_batch() -> None:

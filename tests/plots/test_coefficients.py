@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nfriction import ALFM, LFM, NCFM, NFLFM, Recording, fit, plots, rigs
-from nfriction.fitting.verdict import Interval
+from nfriction.fitting.result.identifiability import Interval
 from nfriction.signals import Motion
 
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from nfriction.evaluation.cross_validation import Candidate, Selection
 from nfriction.report.page import to_html
 from nfriction.report.run import RunError, read_run
-from nfriction.selection import Candidate, Selection
 from tests.report.runs import EVIL, results
 
 CHOICE = Selection(

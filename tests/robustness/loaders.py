@@ -24,7 +24,6 @@ import numpy as np
 import torch
 
 from nfriction import LFM, NFLFM, NLFM, ModelInfo, save
-from nfriction.angles import AngleConvention
 from nfriction.export import onnx, pt2, torchscript
 from nfriction.export.contract import Contract, ContractError, Runner, contract_of, verify
 from nfriction.export.controller import controller_of
@@ -32,12 +31,16 @@ from nfriction.export.errors import ExportError
 from nfriction.export.onnx_file import open_onnx
 from nfriction.export.program import open_pt2
 from nfriction.export.script import open_torchscript
-from nfriction.formats import mdf, mdf_reader
-from nfriction.fuzzy import MamdaniController, load_fis, load_rules
-from nfriction.fuzzy.rulefile import format_rules, parse_rules
-from nfriction.modelfile import ModelFileError, info_of, load, parameter_hash, plant_of
+from nfriction.io.formats import mdf, mdf_reader
+from nfriction.io.model_content import ModelFileError
+from nfriction.io.model_file import load, load_info, load_plant
+from nfriction.io.model_info import parameter_hash
+from nfriction.papers.controller.fis import load_fis
+from nfriction.papers.controller.mamdani import MamdaniController
+from nfriction.papers.controller.rulefile import format_rules, load_rules, parse_rules
 from nfriction.plant import rigfile
 from nfriction.recording import Recording, read_initial_states
+from nfriction.recording.angles import AngleConvention
 from nfriction.report.page import to_html
 from nfriction.report.run import read_run
 from tests.report.runs import results
@@ -444,13 +447,13 @@ def _damage_model(rng: Random, content: bytes) -> bytes:
 
 
 def _read_model(path: Path) -> None:
-    model, info = load(path), info_of(path)
+    model, info = load(path), load_info(path)
     again = save(model, path.with_name("again.json"), info)
     assert parameter_hash(load(again).state_dict()) == parameter_hash(model.state_dict())
     zero = torch.zeros(model.joints, dtype=torch.float64)
     assert bool(model(zero, zero, zero + 1).isfinite().all())
     if info.rig is not None:
-        assert plant_of(path).joints == model.joints
+        assert load_plant(path).joints == model.joints
 
 
 def _contract_samples(_: Path) -> list[bytes]:

@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 
 from nfriction import LFM, ModelInfo, save
-from nfriction.angles import AngleConvention
-from nfriction.atomic import replacing, write_atomically
 from nfriction.export import torchscript
-from nfriction.fuzzy import paper_controller, save_rules
+from nfriction.io.atomic import replacing, write_atomically
+from nfriction.papers.controller.mamdani import paper_controller
+from nfriction.papers.controller.rulefile import save_rules
 from nfriction.plant import rigs
 from nfriction.recording import Recording
+from nfriction.recording.angles import AngleConvention
 
 ROOT = Path(__file__).resolve().parents[2]
 INFO = ModelInfo(

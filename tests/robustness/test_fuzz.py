@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nfriction.formats import limits
-from nfriction.fuzzy import load_rules
+from nfriction.io.formats import limits
+from nfriction.papers.controller.rulefile import load_rules
 from nfriction.plant import rigs
 from nfriction.recording import Recording, read_initial_states
 from tests.robustness.fuzz import fuzz

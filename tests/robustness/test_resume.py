@@ -13,7 +13,7 @@ from random import Random
 
 import pytest
 
-from nfriction.fitting import SearchState
+from nfriction.papers.afem.search import SearchState
 
 ROOT = Path(__file__).resolve().parents[2]
 SEARCH = ["train_constant.py", "--twin", "rtip", "--seconds", "1", "--model", "LFM",
@@ -22,7 +22,7 @@ STAGES = ["train_neurofuzzy.py", "--seconds", "1", "--windows", "0.5", "--max-st
           "--model", "NFNCFM"]  # fmt: skip
 REPRODUCE = """
 import sys
-from nfriction.reproduction import Settings, reproduce
+from nfriction.papers.reproduction import Settings, reproduce
 if __name__ == "__main__":
     reproduce(sys.argv[1], Settings(
         tlrip_seconds=1.0, rtip_seconds=1.0, windows=(0.5,), max_steps=1, network_steps=1,

@@ -6,7 +6,7 @@ from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from nfriction import NFLFM, PendulumChain, rollout
-from nfriction.friction import MODELS
+from nfriction.friction.models import MODELS
 from nfriction.simulation import adjoint
 
 F64 = torch.float64
@@ -43,7 +43,7 @@ class Coupled(nn.Module):
     def torque(self, qd: Tensor, load: Tensor, coefficients: Tensor) -> Tensor:
         return coefficients[..., 0] * qd * (1.0 + 0.1 * load)
 
-    def slope_at_rest(self) -> Tensor:
+    def zero_velocity_damping(self) -> Tensor:
         return torch.full((2,), 1e-3, dtype=F64)
 
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from nfriction import load
-from nfriction.modelfile import info_of
-from nfriction.reproduction import training
+from nfriction.io.model_file import load_info
+from nfriction.papers.reproduction import training
 
 TRAINERS = Path(__file__).resolve().parents[2] / "trainers"
 SCRIPTS = sorted(path.name for path in TRAINERS.glob("train_*.py"))
@@ -115,4 +115,4 @@ def test_a_search_that_is_ended_goes_on_to_the_same_result(tmp_path: Path, how: 
     train(*SEARCH, "--out", folder, "--resume")
     ours, theirs = (load(f / "LFM.json").state_dict() for f in (folder, tmp_path / "whole"))
     assert all((ours[name] == theirs[name]).all() for name in theirs)
-    assert info_of(folder / "LFM.json").fit == info_of(tmp_path / "whole" / "LFM.json").fit
+    assert load_info(folder / "LFM.json").fit == load_info(tmp_path / "whole" / "LFM.json").fit

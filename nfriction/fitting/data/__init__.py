@@ -1,0 +1,1 @@
+"""Recordings as input of a fit: windows and checks."""

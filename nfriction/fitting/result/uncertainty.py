@@ -1,0 +1,59 @@
+"""How far the data leave a schedule's coefficients open, wherever the motion may be."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from nfriction.friction.coefficients import Schedule
+
+# Motions at which derivatives are multiplied out at a time; a network has many parameters.
+PIECE = 500
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CoefficientUncertainty:
+    """Posterior of a schedule's parameters, carried over to its coefficients.
+
+    Linear theory around the fitted parameters, with the plant's terms and the windows' states
+    free besides.
+
+    Attributes:
+        schedule: whose parameters these are.
+        root: R of their covariance R R^T, (parameter, any); rows are infinite where the data tell
+            nothing, zero where nothing was fitted.
+    """
+
+    schedule: Schedule
+    root: Tensor
+
+    @torch.no_grad()
+    def sd(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        """Standard deviation of the coefficients at motions.
+
+        Beyond the trained range it is that at the range's edge: a network fades there, but not for
+        knowing better.
+
+        Args:
+            qd, qdd: joint velocity [rad/s] and acceleration [rad/s^2], (*batch, joint).
+        Returns:
+            In the coefficients' units, (*batch, joint, coefficient).
+        """
+        shape = qd.shape
+        flat = (x.reshape(-1, shape[-1]).split(PIECE) for x in (qd, qdd))
+        found = torch.cat([self._sd(v, a) for v, a in zip(*flat, strict=True)])
+        return found.reshape(*shape, -1)
+
+    def _sd(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        by = self.schedule.sensitivities(*self.schedule.within_range(qd, qdd))
+        slopes, joint = by.parameters, by.joint
+        unknown = torch.isinf(self.root).any(1)
+        root = torch.where(unknown[:, None], 0.0, self.root)
+        columns = []
+        for j in range(qd.shape[-1]):
+            own = (joint == j).nonzero().squeeze(-1)
+            part = slopes[..., own]
+            spread = (part @ root[own]).norm(dim=-1)
+            lost = (part[..., unknown[own]] != 0).any(-1)
+            columns.append(torch.where(lost, torch.inf, spread))
+        return torch.stack(columns, 1)

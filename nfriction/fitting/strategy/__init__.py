@@ -1,0 +1,1 @@
+"""Order of searches: horizons, starts, hold-out."""

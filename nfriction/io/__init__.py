@@ -1,0 +1,1 @@
+"""Files: recordings, model files, atomic writes, sandboxed readers."""

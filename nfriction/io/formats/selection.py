@@ -1,0 +1,245 @@
+"""From a table's columns to a recording's arrays: names, units, numbers."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from nfriction.io.formats.units import canonical_unit, is_unit, slides, to_si
+
+Array = NDArray[np.float64]
+
+OURS = re.compile(r"time|(q|qd|tau)[1-9]\d{0,3}", re.ASCII)
+# What people call a torque, a number and a unit behind it; "torque_on" and "taut" are none.
+_LIKE_TORQUE = re.compile(
+    r"(torque|drehmoment|(?<![a-z])(tau|force))(_(cmd|command|meas|measured))?[\W_]*\d*\s*([\[(].*)?$",
+    re.IGNORECASE,
+)
+
+
+class Source(NamedTuple):
+    """A column of a table and the unit it is said to be in."""
+
+    column: str
+    unit: str | None
+
+
+class Arrays(NamedTuple):
+    """What a table holds of a recording, in SI.
+
+    Attributes:
+        values: time, q; qd where every joint has it; tau where any has, zero for the others.
+        slides: whether positions are said to be lengths; None where nothing is said.
+        remarks: what may be wrong with the choice of columns, and the mend of each.
+    """
+
+    values: dict[str, Array]
+    slides: bool | None
+    remarks: tuple[tuple[str, str], ...] = ()
+
+
+def table_arrays(
+    table: pd.DataFrame, columns: Mapping[str, str] | None = None, *, degrees: bool = False
+) -> Arrays:
+    """Arrays time, q and perhaps qd and tau.
+
+    Args:
+        table: with columns time, q1 …, perhaps qd1 …, tau1 …; others are ignored.
+        columns: the table's name for ours where they differ, perhaps with a unit: "enc_1:deg".
+        degrees: positions and velocities that say no unit are in degrees.
+    Raises:
+        ValueError: a column or unit that is missing, unknown or contradicts another, or a column
+            named for a joint that is not there.
+    """
+    # A table made elsewhere may number its columns.
+    table = table.set_axis([str(name) for name in table.columns], axis=1)
+    columns = {key: str(name) for key, name in (columns or {}).items()}
+    sources = _sources(table, columns)
+    joints = max((int(key[1:]) for key in sources if re.fullmatch(r"q\d+", key)), default=1)
+    # Of a lone q9999 one missing column tells enough.
+    needed = ["time", *(f"q{k + 1}" for k in range(min(joints, len(sources) + 1)))]
+    missing = [key for key in dict.fromkeys((*needed, *columns)) if key not in sources]
+    if missing:
+        raise ValueError(_missing(table, columns, missing))
+    beyond = [key for key in columns if _number(key) > joints]
+    if beyond:
+        raise ValueError(
+            f"`columns` names {', '.join(beyond)}, but the last position is q{joints}; name "
+            f"positions of those joints, too, or drop them."
+        )
+    sources = {key: source for key, source in sources.items() if _number(key) <= joints}
+    arrays = {"time": _column(table, "time", sources["time"])}
+    for key in ("q", "qd", "tau"):
+        group = [sources.get(f"{key}{k + 1}") for k in range(joints)]
+        # A joint without a motor has no torque to log; a velocity that nobody logged is not zero.
+        if all(group) or (key == "tau" and any(group)):
+            stack = [_joint_column(table, key, source, degrees) for source in group]
+            arrays[key] = np.stack(stack, axis=1)
+    said = [s.unit for key, s in sources.items() if re.fullmatch(r"q\d+", key) and s.unit]
+    kinds = {slides(unit) for unit in said}
+    if len(kinds) > 1:
+        raise ValueError(f"positions must all be angles or all be lengths, got {', '.join(said)}.")
+    return Arrays(arrays, kinds.pop() if kinds else None, _remarks(table, sources, joints))
+
+
+def parse_source(spec: str, names: set[str]) -> Source | None:
+    """The column that a specification such as "enc_1" or "enc_1:deg" names, None if not there."""
+    stem, _, unit = spec.rpartition(":")
+    if spec in names:
+        return Source(spec, None)
+    return Source(stem, unit) if stem in names and is_unit(unit) else None
+
+
+def column_numbers(table: pd.DataFrame, column: str) -> Array:
+    """A column as float64; empty cells are NaN, a cell that is no number is named."""
+    cells = table[column].to_numpy(dtype=object, na_value=np.nan)
+    try:
+        return cells.astype(np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        row = next(row for row, cell in enumerate(cells) if not _is_number(cell))
+        shown = repr(cells[row])
+        raise ValueError(
+            f"column {column}, row {row} (counted from 0 below the header) must be a number, "
+            f"got {shown if len(shown) < 80 else shown[:77] + '...'}."
+        ) from error
+
+
+def _sources(table: pd.DataFrame, columns: dict[str, str]) -> dict[str, Source]:
+    """Where each of time, q1 … comes from."""
+    unknown = [key for key in columns if not OURS.fullmatch(key)]
+    if unknown:
+        raise ValueError(
+            f"`columns` maps time, q1 …, qd1 …, tau1 … to the file's names, got keys {unknown}."
+        )
+    names = set(table.columns)
+    aliases = _texts(table, "aliases")
+    mapped = {
+        key: parse_source(spec, names) or parse_source(spec, set(aliases))
+        for key, spec in columns.items()
+    }
+    found = {key: source for key, source in mapped.items() if source is not None}
+    claimed = {aliases.get(s.column, s.column) for s in found.values()}
+    for name in (*names, *aliases):
+        if OURS.fullmatch(name) and name not in columns and aliases.get(name, name) not in claimed:
+            found[name] = Source(name, None)
+    return {key: _known(table, aliases, source) for key, source in found.items()}
+
+
+def _known(table: pd.DataFrame, aliases: dict[str, str], source: Source) -> Source:
+    """A source by the table's own name for it, with the unit that the file says."""
+    column = aliases.get(source.column, source.column)
+    if column in table.attrs.get("repeated", ()) or (table.columns == column).sum() > 1:
+        raise ValueError(f"column {column} is there more than once; rename one of them.")
+    said = _texts(table, "units").get(column)
+    if source.unit and said and not is_unit(said):
+        said = None  # a word of the user's own; what he says counts
+    if source.unit and said and canonical_unit(said) != canonical_unit(source.unit):
+        raise ValueError(
+            f"column {column} is said to be in {source.unit!r}, but the file says {said!r}."
+        )
+    return Source(column, source.unit or said)
+
+
+def _joint_column(table: pd.DataFrame, key: str, source: Source | None, degrees: bool) -> Array:
+    """A joint's numbers in SI, zeros where the table has none."""
+    if source is None:
+        return np.zeros(len(table))
+    return _column(table, key, _default_unit(key, source, degrees))
+
+
+def _number(name: str) -> int:
+    """The last number in a name such as "tau_1 [Nm]", 0 where there is none."""
+    digits = re.search(r"([0-9]{1,4})[^0-9]*$", name)
+    return int(digits[1]) if digits else 0
+
+
+def _remarks(
+    table: pd.DataFrame, sources: dict[str, Source], joints: int
+) -> tuple[tuple[str, str], ...]:
+    """What may be wrong where velocity or torque is not there for every joint."""
+    lacking = {
+        key: [f"{key}{k + 1}" for k in range(joints) if f"{key}{k + 1}" not in sources]
+        for key in ("qd", "tau")
+    }
+    told = []
+    if 0 < len(lacking["qd"]) < joints:
+        finding = f"column {', '.join(lacking['qd'])} is missing, so no measured velocity is read"
+        told.append((finding, "name or drop those of all joints"))
+    free = lacking["tau"]
+    if 0 < len(free) < joints:
+        finding = f"column {', '.join(free)} is missing, so nothing is taken to drive that joint"
+        told.append((finding, f'if something does, name it with columns={{"{free[0]}": "..."}}'))
+    unread = _unread_torques(table, sources) if free else []
+    if unread:
+        own = f"tau{_number(unread[0])}"
+        mend = f'columns={{"{own if own in free else free[0]}": "{unread[0]}"}}'
+        finding = f"column {', '.join(unread[:3])} looks like torque and is not read"
+        told.append((finding, f"if it is, name it with {mend}"))
+    return tuple(told)
+
+
+def _unread_torques(table: pd.DataFrame, sources: dict[str, Source]) -> list[str]:
+    """Columns that look like torque of joints that have none yet."""
+    read = {source.column for source in sources.values()}
+    names = [str(name) for name in table.attrs.get("found", table.columns)]
+    return [
+        name
+        for name in names
+        if name not in read and _LIKE_TORQUE.search(name) and f"tau{_number(name)}" not in sources
+    ]
+
+
+def _default_unit(key: str, source: Source, degrees: bool) -> Source:
+    if not degrees or key not in ("q", "qd"):
+        return source
+    unit = "deg" if key == "q" else "deg/s"
+    if source.unit and canonical_unit(source.unit) != unit:
+        raise ValueError(
+            f"`degrees=True`, but column {source.column} is said to be in {source.unit!r}; "
+            f"drop one of the two."
+        )
+    return Source(source.column, unit)
+
+
+def _column(table: pd.DataFrame, kind: str, source: Source) -> Array:
+    values = column_numbers(table, source.column)
+    if source.unit is None:
+        return values
+    try:
+        return to_si(kind, values, source.unit)
+    except ValueError as error:
+        raise ValueError(f"column {source.column}: {error}") from error
+
+
+def _missing(table: pd.DataFrame, columns: dict[str, str], missing: list[str]) -> str:
+    found = [str(name) for name in table.attrs.get("found", table.columns)]
+    shown = ", ".join(name[:60] for name in found[:30]) + (
+        f" … ({len(found)} in all)" if len(found) > 30 else ""
+    )
+    first = columns.get(missing[0], missing[0])
+    stem, _, unit = first.rpartition(":")
+    note = f" {unit!r} is no unit known." if stem in found and not is_unit(unit) else ""
+    return (
+        f"column {', '.join(columns.get(c, c) for c in missing[:10])} is missing; found "
+        f'{shown}.{note} Name the columns with columns={{"{missing[0]}": "..."}}, a unit after '
+        f'a colon where it is not SI, as in "enc_1:deg".'
+    )
+
+
+def _texts(table: pd.DataFrame, key: str) -> dict[str, str]:
+    """A mapping among a table's attributes, which may come from a foreign file."""
+    given = table.attrs.get(key)
+    return {str(k): str(v) for k, v in given.items()} if isinstance(given, dict) else {}
+
+
+def _is_number(cell: object) -> bool:
+    try:
+        float(cell)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        return False
+    return True

@@ -1,0 +1,200 @@
+"""CSV as loggers write it: any separator, decimal commas, a row of units, odd encodings.
+
+The header decides the separator: a tab if it has one, else a semicolon, else a comma, else blanks.
+Between commas numbers have a decimal point; between other separators a comma in a number is a
+decimal comma, never one of thousands. What does not fit these rules is refused.
+"""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+import re
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+
+import pandas as pd
+
+from nfriction.io.formats.limits import MOST_COLUMNS, most_unpacked, refuse_bomb, refuse_size
+from nfriction.io.formats.units import is_unit
+
+ATTRIBUTES = ("convention", "unit", "names")
+
+_SEPARATORS = ("\t", ";", ",")
+_NAMES = {"\t": "tabs", ";": "semicolons", ",": "commas", " ": "blanks"}
+_COMMA = re.compile(r"\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*", re.ASCII)
+_POINT = re.compile(r"\s*[+-]?\d*\.\d+([eE][+-]?\d+)?\s*", re.ASCII)
+
+
+def read_csv(path: Path, _: object = ()) -> pd.DataFrame:
+    """Table of text cells with decimal points; `attrs` hold comments, units and aliases."""
+    return parse_csv(_decoded(path.read_bytes()))
+
+
+def read_csv_gz(path: Path, _: object = ()) -> pd.DataFrame:
+    with gzip.open(path) as file:
+        content = file.read(most_unpacked(path.stat().st_size) + 1)
+    refuse_bomb(len(content), path.stat().st_size)
+    return parse_csv(_decoded(content))
+
+
+def write_csv(table: pd.DataFrame) -> bytes:
+    comments = [f"# {key}: {table.attrs[key]}\n" for key in ATTRIBUTES if key in table.attrs]
+    return ("".join(comments) + table.to_csv(index=False, lineterminator="\n")).encode()
+
+
+def write_csv_gz(table: pd.DataFrame) -> bytes:
+    # Without the moment of writing, equal recordings make equal files.
+    return gzip.compress(write_csv(table), mtime=0)
+
+
+def parse_csv(text: str) -> pd.DataFrame:
+    """Table of a CSV text.
+
+    Raises:
+        ValueError: no header, rows that do not fit it, or numbers that may be read in two ways.
+    """
+    # Only whole lines are comments: a name such as "enc #1" is none.
+    content = [line for line in io.StringIO(text) if line.strip() and not _is_comment(line)]
+    if not content:
+        raise ValueError("it has no header")
+    lines = content[:3]
+    separator = _separator(lines[0].rstrip("\r\n"), lines[1:])
+    header = next(csv.reader([lines[0]], delimiter=separator, skipinitialspace=True))
+    most = max(len(line.split(None if separator == " " else separator)) for line in lines)
+    if most > MOST_COLUMNS:
+        raise ValueError(f"it has {most} columns, more than {MOST_COLUMNS} are read")
+    table = pd.read_csv(
+        io.StringIO("".join(content)),
+        sep=r"\s+" if separator == " " else separator,
+        # Text, for Python's float() is exact where the parser's own default is not.
+        dtype=str,
+        skipinitialspace=True,
+    )
+    if not isinstance(table.index, pd.RangeIndex):
+        raise ValueError(
+            "its rows have more cells than its header; with decimal commas, cells must be "
+            "separated by semicolons or tabs"
+        )
+    names = [cell.strip() for cell in header]
+    table.columns = _told_apart(str(column).strip() for column in table.columns)
+    # An ending separator makes a last column without name or content.
+    unnamed = [c for c in table.columns if c.startswith("Unnamed: ") and table[c].isna().all()]
+    table = table.drop(columns=unnamed)
+    table, units = _without_units_row(table)
+    if separator != ",":
+        table = _with_decimal_points(table)
+    aliases = {}
+    for column in table.columns:
+        # "time [s]" may also be called "time".
+        told = re.fullmatch(r"(.*\S)\s*(\[[^\[\]]*\]|\([^()]*\))", column)
+        if told and is_unit(told[2]):
+            units.setdefault(column, told[2])
+            if told[1] not in table.columns and told[1] not in aliases:
+                aliases[told[1]] = column
+    repeated = sorted(n for n, count in Counter(names).items() if n and count > 1)
+    table.attrs.update(_comments(text), units=units, aliases=aliases, repeated=repeated)
+    return table
+
+
+def _decoded(content: bytes) -> str:
+    refuse_size(len(content), "bytes")
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return content.decode("utf-16")
+    if b"\0" in content:
+        raise ValueError("it holds NUL bytes and is no text")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        # What older loggers write; every byte is a letter there.
+        return content.decode("latin-1")
+
+
+def _comments(text: str) -> dict[str, str]:
+    """What comment lines before the header say."""
+    found = {}
+    for line in io.StringIO(text):
+        if not _is_comment(line):
+            break
+        key, _, value = line.lstrip()[1:].partition(":")
+        if key.strip() in ATTRIBUTES:
+            found[key.strip()] = value.strip()
+    return found
+
+
+def _is_comment(line: str) -> bool:
+    return line.lstrip().startswith("#")
+
+
+def _separator(header: str, rows: list[str]) -> str:
+    """The separator that the header tells, where the rows beneath do not contradict it."""
+    found = next((s for s in _SEPARATORS if s in header), None)
+    if found is None:
+        # Rows of one cell are a table of one column; blanks separate only what has several.
+        found = " " if len(header.split()) > 1 else ","
+    for row in rows:
+        # A separator that ranks before the header's is none that a number could hold.
+        higher = _SEPARATORS[: _SEPARATORS.index(found)] if found in _SEPARATORS else _SEPARATORS
+        other = next((s for s in higher if s in row and '"' not in row), None)
+        if other is not None and not (found == " " and other == ","):
+            raise ValueError(
+                f"its header is separated by {_NAMES[found]}, its rows by {_NAMES[other]}; "
+                "make both alike"
+            )
+    return found
+
+
+def _with_decimal_points(table: pd.DataFrame) -> pd.DataFrame:
+    """Numbers with a decimal comma rewritten; refused where the file also has decimal points."""
+    commas = {c for c in table.columns if _all_numbers_with(table[c], _COMMA, ",")}
+    if not commas:
+        return table
+    points = [c for c in table.columns if _all_numbers_with(table[c], _POINT, ".")]
+    if points:
+        raise ValueError(
+            f"column {min(commas)} has decimal commas and column {points[0]} decimal points; "
+            "write all numbers alike"
+        )
+    changed = {c: table[c].str.replace(",", ".", regex=False) for c in commas}
+    return table.assign(**changed)
+
+
+def _told_apart(names: Iterable[str]) -> list[str]:
+    """Names of which none is there twice, as pandas makes them before blanks are stripped."""
+    found: dict[str, None] = {}
+    for name in names:
+        own, k = name, 0
+        while own in found:
+            own, k = f"{name}.{k + 1}", k + 1
+        found[own] = None
+    return list(found)
+
+
+def _all_numbers_with(cells: pd.Series, form: re.Pattern[str], sign: str) -> bool:
+    """Whether the cells are numbers and some are written with this decimal sign."""
+    holding = cells[cells.str.contains(sign, regex=False, na=False)]
+    return len(holding) > 0 and bool(holding.str.fullmatch(form).all())
+
+
+def _without_units_row(table: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, str]]:
+    """The table without a row of units under its header, and those units by column."""
+    if table.empty:
+        return table, {}
+    first = {c: str(cell).strip() for c, cell in table.iloc[0].items() if isinstance(cell, str)}
+    if not first or any(_is_number(cell) for cell in first.values()):
+        return table, {}
+    if not any(is_unit(cell) for cell in first.values()):
+        return table, {}
+    silent = {"", "[]", "[-]", "()", "(-)", "-"}
+    units = {str(c): cell for c, cell in first.items() if cell not in silent}
+    return table.iloc[1:].reset_index(drop=True), units
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True

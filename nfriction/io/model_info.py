@@ -1,0 +1,90 @@
+"""What a model file says: the model's form, units, and where it came from."""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nfriction.friction.model import FrictionModel
+from nfriction.version import __version__
+
+FORMAT, SCHEMA = "nfriction model", 1
+
+
+@dataclass(frozen=True)
+class ModelInfo:
+    """What a model file says besides the parameters.
+
+    Attributes:
+        joint_names: in the order of the last axis; empty where joints have no names.
+        unit: of a joint's position, `"rad"` or `"m"`.
+        sample_time: of the recordings it was trained on [s]; None where they differ.
+        input_ranges: smallest and largest trained value of each input by joint,
+            `{"qd": [[low, high], ...], "qdd": ...}`.
+        training_data: digest of each recording, by name.
+        rig: the mechanism's parameters, as `Plant.to_dict` gives them.
+        fit: how the fit ended.
+
+    Raises:
+        ValueError: if the unit is neither.
+    """
+
+    joint_names: Sequence[str] = ()
+    unit: str = "rad"
+    sample_time: float | None = None
+    input_ranges: Mapping[str, Any] = field(default_factory=dict)
+    training_data: Mapping[str, str] = field(default_factory=dict)
+    rig: Mapping[str, Any] | None = None
+    fit: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.unit not in ("rad", "m"):
+            raise ValueError(f'`unit` must be "rad" or "m", got {str(self.unit)[:80]!r}.')
+
+
+def parameter_hash(state: Mapping[str, Tensor]) -> str:
+    """SHA-256 over names, shapes and values of a model's parameters and buffers."""
+    digest = hashlib.sha256()
+    for name in sorted(state):
+        value = state[name].detach().to("cpu", torch.float64).contiguous()
+        digest.update(f"{name}{tuple(value.shape)}".encode())
+        digest.update(value.numpy().tobytes())
+    return digest.hexdigest()
+
+
+def describe(model: FrictionModel, info: ModelInfo) -> dict[str, Any]:
+    """Everything a model file holds except the parameters, as plain JSON.
+
+    Raises:
+        ValueError: if the names of the joints are not one a joint.
+    """
+    if info.joint_names and len(info.joint_names) != model.joints:
+        raise ValueError(
+            f"`joint_names` must name {model.joints} joints, got {list(info.joint_names)}."
+        )
+    return {
+        "format": FORMAT,
+        "schema": SCHEMA,
+        "version": __version__,
+        "model": type(model).__name__,
+        "law": model.law.name,
+        "joints": model.joints,
+        "v_smooth": model.v_smooth,
+        "options": model.options(),
+        "coefficients": [
+            {"name": c.name, "unit": _unit(c.unit, info.unit), "positive": c.positive}
+            for c in model.law.coefficients
+        ],
+        "units": {"qd": f"{info.unit}/s", "qdd": f"{info.unit}/s^2", "load": "-",
+                  "tau_f": _unit("N m", info.unit)},
+        "parameter_hash": parameter_hash(model.state_dict()),
+        **asdict(info),
+    }  # fmt: skip
+
+
+def _unit(revolute: str, position: str) -> str:
+    """A unit for a revolute joint as that for a joint whose position is in `position`."""
+    return revolute if position == "rad" else revolute.replace("N m", "N").replace("rad", "m")

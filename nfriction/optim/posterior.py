@@ -1,0 +1,136 @@
+"""Gauss-Laplace posterior of a least-squares fit with one prior precision per parameter group.
+
+Convention (Foresee and Hagan): E_D = sum e^2 and E_g = sum (w - w0)^2 over group g, without
+halves. Minus the log posterior is beta E_D + sum_g alpha_g E_g, so the noise has the variance
+1 / (2 beta), a parameter of group g the prior variance 1 / (2 alpha_g), the posterior the
+covariance S^-1 / 2 with S = beta J^T J + diag(alpha), and at the maximum of the evidence
+
+    alpha_g = gamma_g / (2 E_g),    beta = (n - gamma) / (2 E_D).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from nfriction.optim.jacobian import NormalEquations
+
+# A group whose prior outweighs its data by this factor is switched off; alpha stops there.
+LARGEST_RATIO = 1e12
+
+
+class Posterior(NamedTuple):
+    """What the data say at given parameters, `alpha` and `beta`.
+
+    Args:
+        covariance: of the parameters, (2 S)^-1, shape (p, p).
+        gamma: effective (well determined) parameters of each group, shape (groups,).
+        log_evidence: log p(data | alpha, beta) in nats, with all its constants.
+        newton_decrement: what a full Gauss-Newton step would gain in log posterior, in nats.
+        parameter_squares: E_g, shape (groups,).
+    """
+
+    covariance: Tensor
+    gamma: Tensor
+    log_evidence: float
+    newton_decrement: float
+    parameter_squares: Tensor
+
+
+def posterior(
+    equations: NormalEquations,
+    offset: Tensor,
+    groups: Tensor,
+    alpha: Tensor,
+    beta: float,
+    samples: int,
+    log_weights: float = 0.0,
+) -> Posterior:
+    """Posterior, effective parameters and log evidence; exact where the model is linear.
+
+    Args:
+        equations: J^T J, J^T e and E_D at the parameters w.
+        offset: w - w0, distance from the prior's centre, shape (p,).
+        groups: group of each parameter, 0 ... groups - 1, shape (p,), int64.
+        alpha: prior precision (halved) of each group, shape (groups,), positive.
+        beta: noise precision (halved), positive.
+        samples: n, how many errors E_D sums.
+        log_weights: sum of the logarithms of the errors' weights.
+    References:
+        D. J. C. MacKay, Neural Computation 4 (1992) 415-472; F. D. Foresee and M. T. Hagan,
+        Gauss-Newton approximation to Bayesian learning, ICNN 1997.
+    """
+    precision = alpha[groups]
+    system = beta * equations.JtJ + precision.diag()
+    scale, factor = factorise(system)
+    inverse = scale[:, None] * torch.cholesky_inverse(factor) * scale
+    slope = beta * equations.Jte + precision * offset
+    squares = group_sums(offset.square(), groups, len(alpha))
+    # The diagonal of S^-1 (beta J^T J) equals 1 - alpha (S^-1)_ii, but keeps its digits where the
+    # prior rules and the difference would be rounding.
+    determined = beta * (inverse * equations.JtJ).sum(1)
+    sizes = group_sums(torch.ones_like(offset), groups, len(alpha))
+    log_determinant = 2 * factor.diagonal().log().sum() - 2 * scale.log().sum()
+    log_evidence = (
+        -beta * equations.squares
+        - alpha @ squares
+        + 0.5 * (samples * math.log(beta / math.pi) + log_weights)
+        + 0.5 * sizes @ alpha.log()
+        - 0.5 * log_determinant
+    )
+    return Posterior(
+        covariance=inverse / 2,
+        gamma=group_sums(determined, groups, len(alpha)).clamp(min=0),
+        log_evidence=float(log_evidence),
+        newton_decrement=float(slope @ (inverse @ slope)),
+        parameter_squares=squares,
+    )
+
+
+def reestimate(
+    known: Posterior,
+    equations: NormalEquations,
+    groups: Tensor,
+    alpha: Tensor,
+    samples: int,
+    largest_beta: float = math.inf,
+) -> tuple[Tensor, float]:
+    """MacKay's fixed-point update: alpha_g = gamma_g / (2 E_g), beta = (n - gamma) / (2 E_D).
+
+    A group that has not left its prior's centre keeps its alpha, for it says nothing yet.
+
+    Args:
+        known: `posterior` at the present alpha and beta.
+        equations, groups, alpha, samples: those it was computed from.
+        largest_beta: limit that a known noise floor sets.
+    Returns:
+        The new alpha, shape (groups,), and beta.
+    """
+    curvature = group_sums(equations.JtJ.diagonal(), groups, len(alpha))
+    beta = float((samples - known.gamma.sum()).clamp(min=1e-3) / (2 * equations.squares))
+    beta = min(beta, largest_beta)
+    limit = LARGEST_RATIO * beta * curvature
+    limit = torch.where(limit > 0, limit, alpha)
+    estimate = torch.minimum(known.gamma / (2 * known.parameter_squares), limit)
+    usable = (known.parameter_squares > 0) & (estimate > 0)
+    return torch.where(usable, estimate, alpha), beta
+
+
+def factorise(system: Tensor) -> tuple[Tensor, Tensor]:
+    """Scale s and lower Cholesky factor L with diag(s) S diag(s) = L L^T of unit diagonal."""
+    scale = system.diagonal().clamp(min=torch.finfo(system.dtype).tiny).rsqrt()
+    scaled = scale[:, None] * system * scale
+    factor, failed = torch.linalg.cholesky_ex(scaled)
+    if failed:
+        # Singular to rounding: lift the eigenvalues by what rounding may have taken from them.
+        lift = 10 * len(system) * torch.finfo(system.dtype).eps
+        factor, _ = torch.linalg.cholesky_ex(scaled + lift * torch.eye(len(system)).to(scaled))
+    return scale, factor
+
+
+def group_sums(values: Tensor, groups: Tensor, count: int) -> Tensor:
+    """Sum of `values` over each group, shape (count,)."""
+    return values.new_zeros(count).index_add_(0, groups, values)

@@ -1,0 +1,1 @@
+"""The two papers' own methods; nothing of the core imports them."""

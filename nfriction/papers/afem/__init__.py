@@ -1,0 +1,1 @@
+"""The papers' adaptive friction models: coefficients by acceleration class."""

@@ -1,0 +1,242 @@
+"""Coefficients by class of acceleration: low, medium, high."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final
+
+import torch
+from torch import Tensor
+
+from nfriction.friction.coefficients import Tabulated
+from nfriction.friction.laws import Law
+from nfriction.friction.sensitivity import Sensitivity
+
+CLASSES = ("low", "medium", "high")
+
+
+def fading_peak(size: Tensor, fading: Tensor | float) -> Tensor:
+    """Causal envelope of a series: `e_k = max(size_k, fading e_(k-1))`.
+
+    Args:
+        size: not negative, (sample, ...).
+        fading: what is left of a peak after one sample, between 0 and 1.
+    """
+    # max of size_i f^(k-i) over i <= k, as a running maximum of logarithms.
+    steps = torch.arange(len(size), dtype=size.dtype, device=size.device)
+    fade = torch.log(torch.as_tensor(fading, dtype=size.dtype, device=size.device)) * steps
+    fade = fade.reshape(-1, *(1,) * (size.ndim - 1))
+    return torch.exp(torch.cummax(torch.log(size) - fade, 0).values + fade)
+
+
+class Adaptive(Tabulated):
+    """Constant coefficients for each class of acceleration and joint.
+
+    The class follows the recent size of the acceleration: the causal envelope of |qdd|, which
+    jumps to a peak at once and fades with a time constant. It changes when the envelope leaves a
+    band around a threshold, so that it cannot chatter there. What is remembered of a joint from
+    sample to sample is the envelope and the class.
+
+    Args:
+        law: the law whose coefficients these are.
+        joints: number of joints.
+        initial: start values in SI, (joint, class, coefficient), or one set for all classes,
+            (joint, coefficient) or (coefficient,).
+        hysteresis: a class is entered at `threshold * (1 + hysteresis)` on the way up and left at
+            `threshold / (1 + hysteresis)` on the way down.
+        time_constant: in which the envelope fades to 1/e [s]. Shorter than half a swing it would
+            fall between two peaks.
+        sample_time: at which the memory is advanced [s]; a fit sets it to the recording's.
+
+    Raises:
+        ValueError: if an option is not positive and finite (the hysteresis may be zero).
+
+    References:
+        TLRIP paper, adaptive friction estimation (AFEM), Table 6.
+    """
+
+    state_size: int = 2
+
+    # An acceleration beyond this many upper thresholds is no more than high: one wild value must
+    # not keep the class for long. Final, so that TorchScript takes it for a constant.
+    ceiling: Final[float] = 4.0
+
+    thresholds: Tensor
+    swing_rate: Tensor
+    fading: Tensor
+    band: Tensor
+
+    def __init__(
+        self,
+        law: Law,
+        joints: int,
+        initial: Tensor | Sequence | None = None,
+        *,
+        hysteresis: float = 0.2,
+        time_constant: float = 2.0,
+        sample_time: float = 1e-3,
+    ) -> None:
+        super().__init__(law, joints, initial, (len(CLASSES),))
+        if not 0 <= hysteresis < math.inf:
+            raise ValueError(f"`hysteresis` must be 0 or more and finite, got {hysteresis}.")
+        if not 0 < time_constant < math.inf:
+            raise ValueError(
+                f"`time_constant` must be positive and finite [s], got {time_constant}."
+            )
+        self.hysteresis = float(hysteresis)
+        self.time_constant = float(time_constant)
+        borders = self.raw.detach().new_tensor([20.0, 100.0])
+        self.register_buffer("thresholds", borders.repeat(joints, 1))
+        self.register_buffer("swing_rate", torch.zeros_like(self.thresholds[:, 0]))
+        # What follows from the options is no state of its own.
+        self.register_buffer("fading", borders.new_zeros(()), persistent=False)
+        band = borders.new_tensor(1.0 + self.hysteresis)
+        self.register_buffer("band", band, persistent=False)
+        self.set_sample_time(sample_time)
+
+    @torch.no_grad()
+    def set_sample_time(self, sample_time: float) -> None:
+        """Set the time between samples [s], from which the envelope's fading follows.
+
+        Raises:
+            ValueError: if it is not positive and finite.
+        """
+        if not 0 < sample_time < math.inf:
+            raise ValueError(f"`sample_time` must be positive and finite [s], got {sample_time}.")
+        self.sample_time = float(sample_time)
+        self.fading.fill_(math.exp(-self.sample_time / self.time_constant))
+
+    @torch.no_grad()
+    def set_classes(
+        self, thresholds: Tensor | Sequence, swing_rate: Tensor | Sequence | None = None
+    ) -> None:
+        """Set where the classes of acceleration meet.
+
+        Args:
+            thresholds: between low and medium, medium and high [rad/s^2], (joint, 2) or (2,).
+            swing_rate: size of acceleration over velocity of each joint [rad/s], (joint,). It
+                tells the envelope of a motion that starts at full speed, where the acceleration
+                happens to be small. Kept where not given (zero at first: not used).
+
+        Raises:
+            ValueError: if thresholds are not positive, finite and ascending, or rates negative.
+        """
+        like = self.thresholds
+        given = torch.as_tensor(thresholds, dtype=like.dtype, device=like.device)
+        if given.shape not in (like.shape, like.shape[1:]):
+            raise ValueError(
+                f"`thresholds` must be (joint, 2) = {tuple(like.shape)} or (2,), got "
+                f"{tuple(given.shape)}."
+            )
+        given = given.expand(like.shape)
+        ascending = (given[:, 0] > 0) & (given[:, 0] <= given[:, 1])
+        if not (ascending & torch.isfinite(given).all(-1)).all():
+            raise ValueError(
+                f"`thresholds` must be positive, finite and ascending [rad/s^2], got "
+                f"{given.tolist()}."
+            )
+        if swing_rate is not None:
+            rate = torch.as_tensor(swing_rate, dtype=like.dtype, device=like.device)
+            if not (torch.isfinite(rate) & (rate >= 0)).all():
+                raise ValueError(f"`swing_rate` must be 0 or more, got {rate.tolist()}.")
+            self.swing_rate.copy_(rate)
+        self.thresholds.copy_(given)
+
+    def initial_state(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        size = torch.sqrt(qdd * qdd + (self.swing_rate * qd) ** 2)
+        envelope = self._envelope(size, torch.zeros_like(size))
+        return torch.stack([envelope, self._count(envelope, self.thresholds)], -1)
+
+    def advance(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
+        envelope = self._envelope(qdd.abs(), self.fading * state.select(-1, 0))
+        # Going up at the band's upper edge, down at its lower one, else staying.
+        at_least = self._count(envelope, self.thresholds * self.band)
+        at_most = self._count(envelope, self.thresholds / self.band)
+        known = torch.minimum(torch.maximum(state.select(-1, 1), at_least), at_most)
+        return torch.stack([envelope, known], -1)
+
+    def _envelope(self, size: Tensor, faded: Tensor) -> Tensor:
+        # A comparison with NaN is false: one lost sample leaves the memory whole.
+        risen = torch.where(size > faded, size, faded)
+        return torch.minimum(risen, self.ceiling * self.thresholds.select(-1, 1))
+
+    def _count(self, envelope: Tensor, borders: Tensor) -> Tensor:
+        """How many of both borders the envelope exceeds: the class."""
+        first = (envelope > borders.select(-1, 0)).to(envelope.dtype)
+        return first + (envelope > borders.select(-1, 1)).to(envelope.dtype)
+
+    def coefficients_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
+        known = state.select(-1, 1).unsqueeze(-1)
+        table = self.table()
+        low, medium, high = table.select(1, 0), table.select(1, 1), table.select(1, 2)
+        return torch.where(known > 1.5, high, torch.where(known > 0.5, medium, low))
+
+    def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        return self.coefficients_from(qd, qdd, self.initial_state(qd, qdd))
+
+    def parameter_names(self, joint_names: Sequence[str]) -> list[str]:
+        return [
+            f"{name} of {joint}, {known}"
+            for joint in joint_names
+            for known in CLASSES
+            for name in self.coefficient_names
+        ]
+
+    def rest_coefficients(self) -> Tensor:
+        return self.table().transpose(0, 1)
+
+    @torch.no_grad()
+    def states(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        # As in the base class, but without a step of torch to every sample.
+        first = torch.sqrt(qdd[:1] ** 2 + (self.swing_rate * qd[:1]) ** 2)
+        size = torch.cat([first, qdd[1:].abs()]).nan_to_num(0.0)
+        # As the envelope never exceeds its ceiling, neither need what goes into it.
+        size = torch.minimum(size, self.ceiling * self.thresholds[:, 1])
+        envelope = fading_peak(size, self.fading)
+        at_least = self._count(envelope, self.thresholds * self.band).T.tolist()
+        at_most = self._count(envelope, self.thresholds / self.band).T.tolist()
+        start = self._count(envelope[0], self.thresholds).tolist()
+        rows = []
+        for known, lower, upper in zip(start, at_least, at_most, strict=True):
+            row = [known]
+            for least, most in zip(lower[1:], upper[1:], strict=True):
+                known = min(max(known, least), most)
+                row.append(known)
+            rows.append(row)
+        return torch.stack([envelope, torch.tensor(rows).T.to(envelope)], -1)
+
+    def classes(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        """Class at every sample of a motion, as a controller would have known it then.
+
+        Args:
+            qd, qdd: the motion, (sample, joint).
+
+        Returns:
+            0 low, 1 medium, 2 high, int64 of shape (sample, joint).
+        """
+        return self.states(qd, qdd)[..., 1].to(torch.int64)
+
+    def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
+        """Derivatives at motions (sample, joint), each sample taken for a first one."""
+        joints, cells, k = self.raw.shape
+        known = self.initial_state(qd, qdd).select(-1, 1)
+        options = torch.arange(cells, dtype=known.dtype, device=known.device)
+        chosen = (known[..., None] == options).to(self.raw.dtype)  # (sample, joint, class)
+        identity = torch.eye(k, dtype=self.raw.dtype, device=self.raw.device)
+        parameters = torch.einsum("sjc,kl->skjcl", chosen, identity).flatten(2)
+        joint = torch.arange(joints, device=self.raw.device).repeat_interleave(cells * k)
+        zero = self.raw.new_zeros(()).expand(*qd.shape, k)
+        return Sensitivity(parameters, joint, zero, zero)
+
+    def options(self) -> dict[str, Any]:
+        return {
+            "hysteresis": self.hysteresis,
+            "time_constant": self.time_constant,
+            "sample_time": self.sample_time,
+        }
+
+    def extra_repr(self) -> str:
+        sets = []
+        for name, row in zip(CLASSES, self.values.mean(0), strict=True):
+            mean = [f"{n}={v:.4g}" for n, v in zip(self.coefficient_names, row, strict=True)]
+            sets.append(f"{name} {', '.join(mean)}")
+        return f"joints={self.joints}, mean of {'; '.join(sets)}"

@@ -1,0 +1,275 @@
+"""Classes of acceleration found in recordings: low, medium, high, joint by joint."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from nfriction.papers.afem.adaptive import CLASSES, Adaptive, fading_peak
+from nfriction.recording import Recording
+from nfriction.signals import Motion
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+# By recording, by joint: (class, start [s], end [s]).
+Intervals = Mapping[str, Mapping[str, Sequence[tuple[str, float, float]]]]
+
+# A windowed peak that varies less than this tells nothing about classes.
+LEAST_VARIATION = 1.5
+# Below this [rad/s^2] a joint does not accelerate; keeps logarithms finite.
+STILL = 1e-6
+# Accelerations below a hundredth of a joint's largest are one class of "nothing happens": a joint
+# that creeps to its rest would else have a class, and all that swings only two.
+DYNAMIC_RANGE = 1e-2
+
+
+@dataclass(frozen=True)
+class AccelerationClasses:
+    """Classes of acceleration along recordings.
+
+    Attributes:
+        thresholds: between low and medium, medium and high [rad/s^2], (joint, 2).
+        labels: class of every sample, 0 to 2, (sample, joint) of each recording.
+        stands_for: class whose coefficients each class takes: itself, or a neighbour where the
+            recordings say too little of it, (joint, class).
+        notes: what was found lacking, in words.
+        recordings: names of the recordings.
+        joints: names of the joints.
+        times: stamps of each recording [s].
+    """
+
+    thresholds: Tensor
+    labels: tuple[Tensor, ...]
+    stands_for: Tensor
+    notes: tuple[str, ...]
+    recordings: tuple[str, ...]
+    joints: tuple[str, ...]
+    times: tuple[Array, ...]
+
+    def intervals(self) -> dict[str, dict[str, list[tuple[str, float, float]]]]:
+        """Time intervals by recording and joint: (class, start, end) [s]."""
+        found: dict[str, dict[str, list[tuple[str, float, float]]]] = {}
+        for name, time, labels in zip(self.recordings, self.times, self.labels, strict=True):
+            found[name] = {}
+            for joint, known in zip(self.joints, labels.T.numpy(), strict=True):
+                edges = [0, *(np.flatnonzero(np.diff(known)) + 1).tolist(), len(known) - 1]
+                found[name][joint] = [
+                    (CLASSES[known[a]], float(time[a]), float(time[b]))
+                    for a, b in pairwise(edges)
+                    if b > a
+                ]
+        return found
+
+    def table(self) -> pd.DataFrame:
+        """Intervals as rows: recording, joint, class, start_s, end_s.
+
+        References:
+            TLRIP paper, Table 6.
+        """
+        import pandas as pd
+
+        rows = [
+            (recording, joint, *interval)
+            for recording, joints in self.intervals().items()
+            for joint, intervals in joints.items()
+            for interval in intervals
+        ]
+        return pd.DataFrame(rows, columns=["recording", "joint", "class", "start_s", "end_s"])
+
+
+def find_classes(
+    schedule: Adaptive,
+    recordings: Sequence[Recording],
+    motions: Sequence[Motion],
+    joints: Sequence[str],
+    *,
+    thresholds: Tensor | Sequence | None = None,
+    intervals: Intervals | None = None,
+    window: float = 1.0,
+    least: float = 0.5,
+) -> AccelerationClasses:
+    """Find classes of acceleration and set the schedule to them.
+
+    The peak of |qdd| within a moving window says how violent the motion is; two thresholds part
+    its logarithm where the variance within the three classes is least (Otsu). The class of each
+    sample is then the one that the schedule would have known there; with given intervals it is
+    theirs, and the thresholds are those that tell these intervals apart best.
+
+    Args:
+        schedule: its thresholds, swing rate and sample time are set.
+        recordings: in joint coordinates.
+        motions: smoothed motion of each recording.
+        joints: names of the joints.
+        thresholds: given ones [rad/s^2], (joint, 2) or (2,), instead of searched ones.
+        intervals: given ones, by recording and joint; what lies outside belongs to the nearest.
+        window: length of the moving window [s], longer than half a swing.
+        least: a class with less data than this takes its neighbour's coefficients [s].
+
+    Raises:
+        ValueError: if no joint's acceleration varies enough to have classes, sample times differ,
+            or intervals name what is not there.
+    """
+    step = _sample_time(recordings)
+    schedule.set_sample_time(step)
+    qdd = [torch.as_tensor(m.qdd, dtype=torch.float64) for m in motions]
+    qd = [torch.as_tensor(m.qd, dtype=torch.float64) for m in motions]
+    rate = torch.cat(qdd).square().mean(0).sqrt() / torch.cat(qd).square().mean(0).sqrt()
+    notes: list[str] = []
+    if intervals is not None:
+        labels = [_labels(intervals, r, joints) for r in recordings]
+        parted = _parting(labels, [fading_peak(a.abs(), schedule.fading) for a in qdd])
+        schedule.set_classes(parted, rate.nan_to_num(0.0, 0.0))
+    else:
+        found = (
+            thresholds if thresholds is not None else _searched(qdd, step, window, joints, notes)
+        )
+        schedule.set_classes(found, rate.nan_to_num(0.0, 0.0))
+        labels = [schedule.classes(v, a) for v, a in zip(qd, qdd, strict=True)]
+    together = torch.cat(labels)
+    seconds = torch.stack([(together == c).sum(0) for c in range(len(CLASSES))], -1) * step
+    return AccelerationClasses(
+        thresholds=schedule.thresholds.clone(),
+        labels=tuple(labels),
+        stands_for=_merged(seconds, least, joints, notes),
+        notes=tuple(notes),
+        recordings=tuple(r.name for r in recordings),
+        joints=tuple(joints),
+        times=tuple(r.time for r in recordings),
+    )
+
+
+def otsu(values: Array, bins: int = 128) -> tuple[float, float]:
+    """Two thresholds that part values into three classes of least variance.
+
+    References:
+        N. Otsu, IEEE Trans. SMC 9 (1979), for three classes.
+    """
+    count, edges = np.histogram(values, bins)
+    centre = 0.5 * (edges[:-1] + edges[1:])
+    weight = np.concatenate([[0], np.cumsum(count)]).astype(np.float64)
+    moment = np.concatenate([[0], np.cumsum(count * centre)])
+    i, j = np.triu_indices(bins, 1)
+    i, j = i[i > 0], j[i > 0]
+
+    def between(a: Any, b: Any) -> Any:
+        held = weight[b] - weight[a]
+        return (moment[b] - moment[a]) ** 2 / np.maximum(held, 1.0)
+
+    spread = between(np.zeros_like(i), i) + between(i, j) + between(j, np.full_like(j, bins))
+    best = spread >= spread.max() * (1 - 1e-12)
+    # Anywhere between two heaps is as good; the middle is farthest from both.
+    low = int(np.median(i[best]))
+    same = best & (i == i[best][np.abs(i[best] - low).argmin()])
+    return float(edges[i[same][0]]), float(edges[int(np.median(j[same]))])
+
+
+def _sample_time(recordings: Sequence[Recording]) -> float:
+    steps = [float(np.median(np.diff(r.time))) for r in recordings]
+    if max(steps) > 1.1 * min(steps):
+        raise ValueError(
+            "recordings fitted by class of acceleration must share one sample time, as the class "
+            f"has a memory of samples; got {min(steps):g} to {max(steps):g} s."
+        )
+    return float(np.median(steps))
+
+
+def _searched(
+    qdd: Sequence[Tensor], step: float, window: float, joints: Sequence[str], notes: list[str]
+) -> list[tuple[float, float]]:
+    from scipy.ndimage import maximum_filter1d  # slow to import
+
+    width = max(1, round(window / step))
+    peaks = np.concatenate([maximum_filter1d(np.abs(a.numpy()), width, axis=0) for a in qdd])
+    highest = np.maximum(peaks.max(0), STILL)
+    peaks = np.maximum(peaks, DYNAMIC_RANGE * highest)
+    varies = highest / peaks.min(0)
+    if (varies < LEAST_VARIATION).all():
+        raise ValueError(
+            "the acceleration hardly varies, so it has no classes: its peak within "
+            f"{window:g} s goes from {peaks.min(0).round(3).tolist()} to "
+            f"{highest.round(3).tolist()} rad/s^2. Give `thresholds` or `intervals`, recordings "
+            "of more varied motion, or fit the constant law."
+        )
+    found = []
+    for j, name in enumerate(joints):
+        if varies[j] < LEAST_VARIATION:
+            notes.append(f"acceleration of {name} hardly varies: it has one class")
+            found.append((2.0 * float(highest[j]), 4.0 * float(highest[j])))
+        else:
+            low, high = otsu(np.log(peaks[:, j]))
+            found.append((float(np.exp(low)), float(np.exp(high))))
+    return found
+
+
+def _labels(intervals: Intervals, recording: Recording, joints: Sequence[str]) -> Tensor:
+    """Class of every sample, from given intervals."""
+    own = intervals.get(recording.name)
+    if own is None or set(own) != set(joints):
+        raise ValueError(
+            f"`intervals` must give {recording.name!r} and its joints {list(joints)}, got "
+            f"{ {name: list(of) for name, of in intervals.items()} }."
+        )
+    columns = []
+    for joint in joints:
+        away = np.full((len(own[joint]), len(recording.time)), np.inf)
+        for row, (known, start, end) in zip(away, own[joint], strict=True):
+            if known not in CLASSES or not end > start:
+                raise ValueError(
+                    f"an interval is (class, start, end) with a class of {CLASSES} and end > "
+                    f"start [s], got {(known, start, end)} for {joint}."
+                )
+            inside = (recording.time >= start) & (recording.time < end)
+            gap = np.maximum(start - recording.time, recording.time - end)
+            row[:] = np.where(inside, -1.0, np.maximum(gap, 0.0))
+        order = np.array([CLASSES.index(known) for known, _, _ in own[joint]])
+        columns.append(torch.as_tensor(order[away.argmin(0)]))
+    return torch.stack(columns, -1)
+
+
+def _parting(labels: Sequence[Tensor], envelopes: Sequence[Tensor]) -> Tensor:
+    """Thresholds of the envelope that agree best with given labels, (joint, 2)."""
+    known, envelope = torch.cat(list(labels)), torch.cat(list(envelopes)).clamp_min(STILL)
+    rows = []
+    for j in range(known.shape[1]):
+        size = envelope[:, j]
+        grid = torch.exp(torch.linspace(float(size.min().log()), float(size.max().log()), 200,
+                                        dtype=size.dtype))  # fmt: skip
+        above = size[:, None] > grid
+        row = []
+        for border in range(2):
+            upper = (known[:, j] > border)[:, None]
+            # Each side counts alike, however long it lasted.
+            wrong = (above & ~upper).sum(0) / (~upper).sum().clamp_min(1) + (~above & upper).sum(
+                0
+            ) / upper.sum().clamp_min(1)
+            row.append(float(grid[int(wrong.argmin())]))
+        rows.append([row[0], max(row)])
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+def _merged(seconds: Tensor, least: float, joints: Sequence[str], notes: list[str]) -> Tensor:
+    """Class whose coefficients each class takes, (joint, class)."""
+    rows = []
+    for name, row in zip(joints, seconds.tolist(), strict=True):
+        enough = [c for c, held in enumerate(row) if held >= least] or [int(np.argmax(row))]
+        taken = []
+        for c, held in enumerate(row):
+            # The nearest class with data, of two the one with more.
+            other = c if c in enough else min(enough, key=lambda e: (abs(e - c), -row[e]))
+            taken.append(other)
+            if other != c:
+                notes.append(
+                    f"{CLASSES[c]} class of {name} has {held:.2g} s of data: takes the "
+                    f"coefficients of {CLASSES[other]}"
+                )
+        rows.append(taken)
+    return torch.tensor(rows)

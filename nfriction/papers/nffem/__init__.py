@@ -1,0 +1,1 @@
+"""The papers' neuro-fuzzy friction models and their training."""

@@ -1,0 +1,200 @@
+"""The papers' own neuro-fuzzy procedure: coefficients by class → fuzzy controller → network."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nfriction.friction.laws import Law
+from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import MODELS, NeuroFuzzyModel
+from nfriction.fuzzy import FuzzySet, RBFNetwork, sets_from_ranges
+from nfriction.optim.evidence_result import EvidenceState
+from nfriction.papers.afem.adaptive import Adaptive
+from nfriction.papers.controller.mamdani import MamdaniController, paper_controller
+from nfriction.papers.controller.rulebase import Rule, RuleBase, Variable
+from nfriction.papers.nffem.rbf_coefficients import RadialBasis
+from nfriction.papers.nffem.train_network import train_on_controller
+from nfriction.signals import Motion
+
+Ranges = list[tuple[float, float]]
+
+# Classes that agree leave an output without a universe; it then is this share of its value wide.
+NARROWEST = 0.01
+
+
+def papers_neuro_fuzzy(
+    adaptive: FrictionModel,
+    motions: Sequence[Motion],
+    *,
+    samples: int = 40_000,
+    units: int = 10,
+    seed: int = 0,
+    callback: Callable[[EvidenceState], bool | None] | None = None,
+    progress: bool = False,
+) -> NeuroFuzzyModel:
+    """The neuro-fuzzy model of an adaptive one, by the papers' procedure.
+
+    The coefficients by class span the outputs of a fuzzy controller with the papers' rules, the
+    motion its inputs; the controller's outputs at `samples` evenly drawn inputs a joint then teach
+    a radial basis network by Bayesian regularisation.
+
+    Args:
+        adaptive: fitted, with coefficients for each class of acceleration.
+        motions: of the recordings behind it, in joint coordinates.
+        samples: a joint.
+        units: of the network.
+        seed: of the samples.
+        callback, progress: see `train_on_controller`.
+
+    Returns:
+        A model of the same law with the network for its schedule, without gradients.
+
+    Raises:
+        ValueError: if the model is not adaptive, or its law has no neuro-fuzzy model.
+
+    References:
+        TLRIP paper, neuro-fuzzy friction estimation (NFFEM).
+    """
+    if not isinstance(adaptive.schedule, Adaptive):
+        raise ValueError(
+            f"the papers' procedure starts from an adaptive model, got {type(adaptive).__name__}."
+        )
+    law, joints = adaptive.law, adaptive.joints
+    controllers = controllers_from_classes(
+        law,
+        adaptive.schedule.values,
+        np.concatenate([m.qd for m in motions]),
+        np.concatenate([m.qdd for m in motions]),
+    )
+    network = RBFNetwork(joints, 2, units, len(law.names))
+    train_on_controller(
+        network, controllers, samples=samples, seed=seed, callback=callback, progress=progress
+    )
+    model = _neuro_fuzzy_class(law)(
+        joints,
+        adaptive.schedule.values.mean(1),
+        v_smooth=adaptive.v_smooth,
+        head_units=units,
+        acceleration="signed",
+        network="rbf",
+    )
+    assert isinstance(model.schedule, RadialBasis)
+    inputs = torch.stack(
+        [torch.stack([end(c) for c in controllers]) for end in (_lower_inputs, _upper_inputs)]
+    )
+    outputs = torch.tensor([[v.universe for v in c.rule_base.outputs] for c in controllers])
+    model.schedule.set_network(network, inputs, outputs.to(inputs).permute(2, 0, 1))
+    return model.requires_grad_(False)
+
+
+def controllers_from_classes(
+    law: Law, coefficients: Tensor, qd: np.ndarray, qdd: np.ndarray
+) -> list[MamdaniController]:
+    """A fuzzy controller a joint, with the papers' rules and the shape of their Table 4.
+
+    The sets lie as in Table 4 (joints 2, 3, 4; more joints take those of joint 2), stretched: of
+    |velocity| to its largest value, of acceleration to its smallest and largest with zero in
+    place, of each coefficient to the span of its classes. The papers' controllers raise a
+    coefficient with the velocity; where ours is smaller for high acceleration than for low, its
+    sets are mirrored. Coefficients of velocity follow the rules of B, all others those of C.
+
+    Args:
+        law: whose coefficients these are.
+        coefficients: low, medium, high, shape (joint, 3, coefficient).
+        qd, qdd: the motion that spans the inputs, (sample, joint).
+
+    References:
+        TLRIP paper, Tables 4 and 5.
+    """
+    controllers = []
+    for joint in range(len(coefficients)):
+        paper = paper_controller(joint + 2 if joint < 3 else 2).rule_base
+        velocity, acceleration = paper.inputs
+        fastest = float(np.abs(qd[:, joint]).max())
+        lowest, highest = float(qdd[:, joint].min()), float(qdd[:, joint].max())
+        inputs = (
+            _variable("velocity", "rad/s", velocity.terms, _stretched(velocity, 0.0, fastest)),
+            _variable(
+                "acceleration", "rad/s^2", acceleration.terms,
+                _stretched(acceleration, lowest, highest),
+            ),
+        )  # fmt: skip
+        kinds = [0 if c.unit.startswith("N m s") else 1 for c in law.coefficients]
+        outputs = []
+        for k, (kind, coefficient) in enumerate(zip(kinds, law.coefficients, strict=True)):
+            classes = coefficients[joint, :, k].tolist()
+            terms, ranges = _spanned(paper.outputs[kind], classes, coefficient.positive)
+            outputs.append(_variable(coefficient.name, coefficient.unit, terms, ranges))
+        rules = tuple(
+            Rule(rule.given, tuple(rule.then[kind] for kind in kinds)) for rule in paper.rules
+        )
+        name = f"{law.name} law, joint {joint + 1}, spanned by its classes"
+        controllers.append(MamdaniController(RuleBase(name, inputs, tuple(outputs), rules)))
+    return controllers
+
+
+def _variable(name: str, unit: str, terms: Sequence[str], ranges: Ranges) -> Variable:
+    universe = (ranges[0][0], ranges[-1][1])
+    return Variable(name, unit, universe, sets_from_ranges(terms, ranges))
+
+
+def _range(term: FuzzySet) -> tuple[float, float]:
+    """The range of Table 4 that a set stands for, see `sets_from_ranges`."""
+    centre, sigma = term.parameters
+    reach = {
+        "left_shoulder": (0.0, 2.0),
+        "gaussian": (-2.0, 2.0),
+        "right_shoulder": (-2.0, 0.0),
+    }[term.shape]
+    return centre + reach[0] * sigma, centre + reach[1] * sigma
+
+
+def _stretched(variable: Variable, low: float, high: float) -> Ranges:
+    """Ranges of a variable's sets with its universe taken to [low, high] and zero left there."""
+    below, above = variable.universe
+    down = low / below if below < 0 else 1.0
+    up = high / above
+    if not (down > 0 and up > 0):
+        raise ValueError(
+            f"the motion spans {variable.name} only from {low:g} to {high:g}; a controller needs "
+            "it on both sides of zero."
+        )
+    return [
+        (a * (down if a < 0 else up), b * (down if b < 0 else up))
+        for a, b in map(_range, variable.sets)
+    ]
+
+
+def _spanned(
+    variable: Variable, classes: Sequence[float], positive: bool
+) -> tuple[list[str], Ranges]:
+    """Terms and ranges of an output whose universe is spanned by the coefficients by class."""
+    low, high = min(classes), max(classes)
+    width = max(high - low, NARROWEST * max(abs(low), abs(high)), 1e-9)
+    middle = 0.5 * (low + high)
+    start = max(0.0, middle - 0.5 * width) if positive else middle - 0.5 * width
+    below, above = variable.universe
+    shares = [((a - below) / (above - below), (b - below) / (above - below))
+              for a, b in map(_range, variable.sets)]  # fmt: skip
+    terms = variable.terms
+    if classes[-1] < classes[0]:
+        shares = [(1.0 - b, 1.0 - a) for a, b in reversed(shares)]
+        terms = terms[::-1]
+    return terms, [(start + width * a, start + width * b) for a, b in shares]
+
+
+def _lower_inputs(controller: MamdaniController) -> Tensor:
+    return controller.lower * controller.si_factor
+
+
+def _upper_inputs(controller: MamdaniController) -> Tensor:
+    return controller.upper * controller.si_factor
+
+
+def _neuro_fuzzy_class(law: Law) -> type[NeuroFuzzyModel]:
+    for model in MODELS.values():
+        if issubclass(model, NeuroFuzzyModel) and model.definition is law:
+            return model
+    raise ValueError(f"there is no neuro-fuzzy model of the law {law.name!r}.")

@@ -1,0 +1,6 @@
+"""Twins: simulated recordings of the papers' rigs, whose own were never published."""
+
+from nfriction.papers.twin.dataset import QUICK_DURATION, Twin, build, make
+from nfriction.papers.twin.releases import names
+
+__all__ = ["QUICK_DURATION", "Twin", "build", "make", "names"]

@@ -1,0 +1,186 @@
+"""Recordings of a simulated rig whose friction no model here can express exactly."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from nfriction.io.atomic import replacing
+from nfriction.io.formats import write_table
+from nfriction.papers.twin.encoder import Encoder, jitter
+from nfriction.papers.twin.mechanics import Links, TrueMotion, simulate
+from nfriction.papers.twin.releases import Split, specification
+from nfriction.plant import PendulumChain, rigs
+from nfriction.recording import MINIMUM_SAMPLES, Recording
+from nfriction.recording.angles import AngleConvention
+
+Array = NDArray[np.float64]
+
+RATE = 1000  # samples a second
+JITTER = 5e-6  # standard deviation of the moment of sampling [s]
+QUICK_DURATION = 10.0  # of recordings for a quick look [s]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Twin:
+    """Recordings of a rig that does not exist, and what is true about them.
+
+    Attributes:
+        name: of the twin.
+        plant: the rig without friction.
+        recordings: by label, in the rig's own convention.
+        splits: by label: to fit on ("train") or to judge by ("held_out").
+        initial_states: by label: q0 and qd0 at the release, exact, in the rig's own convention.
+        truth: by label: the motion before the encoder, in joint coordinates. Never to fit on.
+    """
+
+    name: str
+    plant: PendulumChain
+    recordings: dict[str, Recording]
+    splits: dict[str, Split]
+    initial_states: dict[str, tuple[Array, Array]]
+    truth: dict[str, TrueMotion] = field(repr=False)
+
+    def part(self, split: Split) -> list[Recording]:
+        """The recordings of one split."""
+        return [self.recordings[label] for label, own in self.splits.items() if own == split]
+
+
+def make(
+    name: str, *, seed: int = 0, duration: float | None = None, progress: bool = False
+) -> Twin:
+    """Simulate a twin's recordings in memory.
+
+    Args:
+        name: "tlrip" or "rtip".
+        seed: draws the encoders' errors and the clock's jitter; the motion has no chance in it.
+        duration: of each recording [s]; by default the experiment's own. A shorter twin is the
+            beginning of a longer one.
+        progress: show a progress bar.
+    Raises:
+        ValueError: for an unknown name or a duration of fewer than 8 samples.
+    """
+    specified = specification(name)
+    duration = specified.duration if duration is None else duration
+    samples = round(duration * RATE)
+    if samples < MINIMUM_SAMPLES:
+        raise ValueError(
+            f"`duration` must be at least {MINIMUM_SAMPLES / RATE} s, got {duration}; "
+            f"{QUICK_DURATION:g} s serves for a quick look."
+        )
+    plant = specified.rig()
+    links = Links.of(plant)
+    convention = AngleConvention.of(plant)
+    random = np.random.default_rng([seed, 0])
+    encoders = [Encoder.drawn(random) for _ in plant.joint_names]
+    truth, recordings = {}, {}
+    total = samples // RATE * len(specified.releases)
+    with tqdm(total=total, desc=f"{name} twin", unit="s", disable=not progress) as bar:
+        for index, release in enumerate(specified.releases):
+            motion = simulate(
+                links,
+                specified.friction,
+                tuple(convention.position_to_joint(np.array(release.q)).tolist()),
+                tuple(convention.rate_to_joint(np.array(release.qd)).tolist()),
+                samples=samples,
+                rate=RATE,
+                advance=bar.update,
+            )
+            truth[release.label] = motion
+            random = np.random.default_rng([seed, index + 1])
+            recordings[release.label] = _record(
+                motion, encoders, jitter(random, samples, JITTER), plant, release.label
+            )
+    return Twin(
+        name=name,
+        plant=plant,
+        recordings=recordings,
+        splits={release.label: release.split for release in specified.releases},
+        initial_states={r.label: (np.array(r.q), np.array(r.qd)) for r in specified.releases},
+        truth=truth,
+    )
+
+
+def build(
+    name: str,
+    out: str | os.PathLike[str],
+    *,
+    seed: int = 0,
+    duration: float | None = None,
+    progress: bool = False,
+) -> Twin:
+    """Simulate a twin's recordings and write them to a folder.
+
+    The folder then holds `<label>.csv.gz` for every recording, `recordings.csv` (splits, initial
+    states, digests), `rig.json` and `truth.npz`. Equal arguments give equal bytes.
+
+    Args:
+        name, seed, duration, progress: as for `make`.
+        out: the folder; made where it is missing, files of these names are replaced.
+    """
+    folder = Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    twin = make(name, seed=seed, duration=duration, progress=progress)
+    for label, recording in twin.recordings.items():
+        recording.write(folder / _file(label))
+    rigs.write(twin.plant, folder / "rig.json")
+    arrays = {
+        f"{label}_{key}": getattr(motion, key)
+        for label, motion in twin.truth.items()
+        for key in ("q", "qd", "tau_f")
+    }
+    # Not compressed: the last bits of floats do not shrink, and trying takes longest of all.
+    with replacing(folder / "truth.npz") as unfinished, unfinished.open("wb") as file:
+        np.savez(file, **arrays)
+    write_table(_overview(twin), folder / "recordings.csv")
+    return twin
+
+
+def _record(
+    motion: TrueMotion,
+    encoders: list[Encoder],
+    late: Array,
+    plant: PendulumChain,
+    label: str,
+) -> Recording:
+    """What the rig's computer logs of a motion; its stamps are those of an even clock."""
+    convention = AngleConvention.of(plant)
+    late = late[:, None]
+    moved = motion.q + late * (motion.qd + 0.5 * late * motion.qdd)
+    position = convention.position_from_joint(moved)
+    return Recording(
+        time=np.arange(len(position)) / RATE,
+        q=np.stack([e.read(q) for e, q in zip(encoders, position.T, strict=True)], axis=1),
+        names=plant.joint_names,
+        convention=convention,
+        name=label,
+    )
+
+
+def _overview(twin: Twin) -> pd.DataFrame:
+    rows = []
+    for label, recording in twin.recordings.items():
+        q0, qd0 = twin.initial_states[label]
+        rows.append(
+            {
+                "id": label,
+                "file": _file(label),
+                "split": twin.splits[label],
+                "n": len(recording),
+                "duration_s": recording.duration,
+                **{f"q0_{k + 1}": value for k, value in enumerate(q0)},
+                **{f"qd0_{k + 1}": value for k, value in enumerate(qd0)},
+                "digest": recording.digest(),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def _file(label: str) -> str:
+    return f"{label}.csv.gz"

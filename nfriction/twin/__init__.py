@@ -1,6 +1,0 @@
-"""Twins: simulated recordings of the papers' rigs, whose own were never published."""
-
-from nfriction.twin.dataset import QUICK_DURATION, Twin, build, make
-from nfriction.twin.releases import names
-
-__all__ = ["QUICK_DURATION", "Twin", "build", "make", "names"]

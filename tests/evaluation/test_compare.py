@@ -1,0 +1,239 @@
+"""Comparisons: every model fitted and scored, tables with names, results as plain JSON."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from nfriction import LFM, NFLFM, compare
+from nfriction.cli.tables import error_tables, verdict
+from nfriction.evaluation.compare import Comparison, coefficient_summary
+from nfriction.evaluation.score import RMSE, Score
+from nfriction.friction.models import ALFM
+from nfriction.signals import kalman_smoother
+from tests.fitting.recordings import pendulum, swing
+
+MODEL = LFM(2, [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]], v_smooth=0.05)
+A, B = (swing(pendulum(), MODEL, seconds=1.5, start=s, name=n)
+        for s, n in (((1.6, 0.8), "a"), ((2.0, 0.2), "b")))  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def comparison():
+    stages = []
+    found = compare(pendulum(), ["NCFM", "LFM", "NCFM"], [A], [B], horizons=(0.5, 1.0),
+                    on_stage=stages.append, windows=(0.5,), max_steps=3)  # fmt: skip
+    return found, stages
+
+
+def test_tables_have_a_row_a_model_and_a_column_a_joint(comparison):
+    found, stages = comparison
+    for horizon in (None, "0.5", "1"):
+        for held_out in (True, False):
+            table = found.table(horizon, held_out=held_out)
+            assert list(table.index) == ["no friction", "NCFM", "LFM"]
+            assert list(table.columns) == [*found.joint_names, "all"]
+            assert (table > 0).all().all()
+    assert found.horizons() == ["0.5", "1"]
+    saved = found.improvement()
+    assert (saved.loc["no friction"] == 0).all()
+    assert (saved.loc["LFM"] > 0).all()
+    assert stages[:2] == ["fit NCFM", "fit LFM"]
+
+
+def test_it_tells_in_a_few_lines_who_is_best(comparison):
+    found, _ = comparison
+    head, *rows = repr(found).splitlines()
+    assert head.endswith("held-out recordings, best: LFM")
+    table = found.table()
+    assert rows[0].split()[-1] == "all"
+    for row, (name, errors) in zip(rows[2:], table.iterrows(), strict=True):
+        assert row.startswith(name)
+        assert float(row.split()[-1]) == pytest.approx(1e3 * errors["all"], rel=1e-3)
+    told = repr(dataclasses.replace(found, failed={"ALFM": "no classes"}, held_out={}))
+    assert "training recordings, best: None" in told
+    assert told.endswith("not fitted: ALFM: no classes")
+
+
+def test_one_name_and_one_recording_need_no_list():
+    settings = {"horizons": (0.5,), "windows": (0.5,), "max_steps": 1}
+    one = compare(pendulum(), "NCFM", A, B, **settings)
+    many = compare(pendulum(), ["NCFM"], [A], [B], **settings)
+    assert one.to_dict() == many.to_dict()
+
+
+def test_what_could_not_be_fitted_is_kept_with_its_reason(comparison):
+    found, _ = comparison
+    assert "failed" not in found.to_dict()
+    assert dataclasses.replace(found, failed={"ALFM": "x"}).to_dict()["failed"] == {"ALFM": "x"}
+
+
+def test_its_frame_has_every_error_once(comparison):
+    found, _ = comparison
+    table = found.to_frame()
+    keys = ["model", "recording", "kind", "horizon", "joint"]
+    assert list(table.columns) == [*keys, "rmse [rad]"]
+    assert not table.duplicated(keys).any()
+    # models × kinds × (free run and two horizons) × (joints and all)
+    assert len(table) == 3 * 2 * 3 * 3
+    metres = dataclasses.replace(found, unit="m").to_frame()
+    assert "rmse [m]" in metres.columns
+
+
+def test_results_are_plain_json_with_the_names_others_rely_on(comparison):
+    found, _ = comparison
+    data = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+    assert data["units"] == "rad"
+    lfm = data["models"]["LFM"]
+    assert set(lfm["coefficients"]) == {"B", "C"}
+    for kind, name in (("held_out", "b"), ("train", "a")):
+        scores = lfm[kind][name]
+        assert set(scores["windows"]) == {"0.5", "1"}
+        for rmse in (scores["free_run"], *scores["windows"].values()):
+            assert len(rmse["joints"]) == 2
+            mean = sum(x * x for x in rmse["joints"]) / 2
+            assert rmse["all"] == pytest.approx(mean**0.5)
+    assert "coefficients" not in data["models"]["no friction"]
+
+
+def test_names_must_tell_recordings_apart():
+    with pytest.raises(ValueError, match="a repeats; rename one"):
+        compare(pendulum(), ["NCFM"], [A], [dataclasses.replace(B, name="a")])
+    unnamed = [dataclasses.replace(r, name="") for r in (A, B)]
+    with pytest.raises(ValueError, match=r"different names, the empty one repeats; .*`name`"):
+        compare(pendulum(), ["NCFM"], *unnamed)
+    with pytest.raises(ValueError, match="at least one"):
+        compare(pendulum(), [], [A])
+    with pytest.raises(ValueError, match="there are"):
+        compare(pendulum(), ["NOPE"], [A])
+
+
+def test_a_recording_is_not_judged_by_under_another_name_either():
+    for name in ("a", "copy"):
+        with pytest.raises(ValueError, match=rf"{name}: trained on and held out; .*not seen"):
+            compare(pendulum(), ["NCFM"], [A], [B, dataclasses.replace(A, name=name)])
+
+
+def test_a_held_out_recording_without_torque_is_named_where_those_of_training_have_it():
+    driven = dataclasses.replace(A, tau=np.full_like(A.q, 1e-3))
+    with pytest.warns(UserWarning, match=r"no torque is recorded in b, unlike"):
+        compare(pendulum(), "NCFM", driven, B, horizons=(0.5,), windows=(0.5,), max_steps=1)
+
+
+def test_without_held_out_recordings_there_is_no_such_table(comparison):
+    found = compare(pendulum(), ["NCFM"], [A], horizons=(0.5,), windows=(0.5,), max_steps=1)
+    assert found.table(held_out=False).shape == (2, 3)
+    with pytest.raises(ValueError, match="held_out"):
+        found.table()
+    assert set(found.to_dict()["models"]) == {"no friction", "NCFM"}
+
+
+def test_no_friction_is_judged_on_the_plant_as_given(comparison):
+    found, _ = comparison
+    other = compare(pendulum(), ["LFM"], [A], [B], horizons=(0.5,), windows=(0.5,), max_steps=2)
+    for kind in ("train", "held_out"):
+        (before,), (after,) = (getattr(c, kind)["no friction"] for c in (found, other))
+        assert before.free_run == after.free_run
+        assert before.windows["0.5"] == after.windows["0.5"]
+
+
+def test_every_recording_is_smoothed_once(monkeypatch):
+    smoothed = []
+
+    def counting(time, q, **settings):
+        smoothed.append(len(time))
+        return kalman_smoother(time, q, **settings)
+
+    for user in ("comparison", "scoring", "fitting.preparation"):
+        monkeypatch.setattr(f"nfriction.{user}.kalman_smoother", counting)
+    compare(pendulum(), ["NCFM", "LFM"], [A], [B], windows=(0.5,), max_steps=1)
+    assert len(smoothed) == 2
+
+
+def test_recordings_too_short_for_a_window_are_named(comparison):
+    found, _ = comparison
+    assert found.too_short() == found.too_short(held_out=False) == {}
+    asked = dataclasses.replace(found, horizons_asked=(1.0, 2.0))
+    assert asked.too_short() == {"2": {"b": pytest.approx(1.5)}}
+    # A window length that one kind of recording lacks is still there for the other.
+    shorter = {n: [dataclasses.replace(s, windows={}) for s in of] for n, of in found.train.items()}
+    mixed = dataclasses.replace(found, train=shorter)
+    assert mixed.horizons() == mixed.horizons(held_out=False) == []
+    assert mixed.horizons(held_out=True) == ["0.5", "1"]
+
+
+def scored(found: Comparison, count: float | None = None, **errors: float) -> Comparison:
+    """A comparison in which these were the errors of free runs, and that of one count at the start.
+
+    Errors are of each of two recordings; the count's is of the first, and twice that of the second.
+    """
+    held_out = {
+        name.replace("_", " "): [
+            Score(
+                recording, RMSE((e, e), e), {},
+                None if count is None else RMSE((0.0, 0.0), k * count),
+                np.zeros(1), np.zeros((1, 2)), np.inf,
+            )
+            for k, recording in enumerate("bc", 1)
+        ]
+        for name, e in errors.items()
+    }  # fmt: skip
+    return dataclasses.replace(found, held_out=held_out)
+
+
+def judged(found: Comparison, **errors: float) -> str | None:
+    """The best of a comparison in which these were the errors of free runs."""
+    return scored(found, **errors).best()
+
+
+def test_best_is_the_least_error_and_of_equals_the_simplest(comparison):
+    found, _ = comparison
+    assert found.to_dict()["best"]["model"] == found.best() == "LFM"
+    assert judged(found, no_friction=3.0, NCFM=2.0, LFM=1.0) == "LFM"
+    assert judged(found, no_friction=3.0, LFM=1.0, NCFM=1.0005) == "NCFM"
+    assert judged(found, no_friction=3.0, LFM=1.0, NCFM=1.002) == "LFM"
+    assert judged(found, no_friction=1.0, NCFM=1.0, LFM=2.0) == "no friction"
+    assert judged(found, no_friction=np.inf, NCFM=np.inf, LFM=4.0) == "LFM"
+    assert judged(found, no_friction=np.inf, NCFM=np.inf, LFM=np.inf) is None
+    alone = dataclasses.replace(found, held_out={})
+    assert alone.best() is None
+    assert alone.to_dict()["best"] is None
+
+
+def test_models_within_the_floor_of_the_best_are_not_told_apart(comparison):
+    found, _ = comparison
+    errors = {"no_friction": 5.0, "NCFM": 2.0, "LFM": 1.0}
+    assert scored(found, **errors).alike() == ("LFM",)
+    assert "cannot be told" not in verdict(scored(found, **errors))
+    # Without a floor equal errors say nothing of it, as those of a network that kept its law.
+    equal = scored(found, no_friction=5.0, NCFM=1.0, LFM=1.0)
+    assert equal.alike() == (equal.best(),)
+    near, far = scored(found, 0.7, **errors), scored(found, 0.6, **errors)
+    # Over both recordings root 2.5 of it: 1.1 and 0.95.
+    assert near.floor() == pytest.approx(0.7 * 2.5**0.5)
+    assert near.floor("joint1") == 0
+    assert near.alike() == ("NCFM", "LFM")
+    assert far.alike() == ("LFM",)
+    assert near.best() == far.best() == "LFM"
+    assert near.to_dict()["best"]["alike"] == ["NCFM", "LFM"]
+    assert "told from NCFM; the simplest of them is NCFM" in verdict(near)
+    assert "floor of the free run: 1107," in error_tables(near)
+    assert verdict(far).count("\n") == 0
+    all_alike = scored(found, 10.0, **errors)
+    assert all_alike.alike() == ("no friction", "NCFM", "LFM")
+    assert scored(found, np.inf, **errors).floor() is None
+    assert dataclasses.replace(found, held_out={}).alike() == ()
+
+
+def test_coefficients_that_follow_the_motion_say_what_they_hold_for():
+    assert coefficient_summary(LFM(2, [3.0, 4.0])) == {
+        "B": pytest.approx([3.0, 3.0]),
+        "C": pytest.approx([4.0, 4.0]),
+    }
+    adaptive = coefficient_summary(ALFM(1, [[[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]]))
+    assert [adaptive[known]["C"] for known in ("low", "medium", "high")] == [
+        pytest.approx([2.0]), pytest.approx([4.0]), pytest.approx([6.0])
+    ]  # fmt: skip
+    fuzzy = coefficient_summary(NFLFM(1, [3.0, 4.0]))
+    assert fuzzy["at_rest"] == {n: pytest.approx(v) for n, v in fuzzy["reference"].items()}

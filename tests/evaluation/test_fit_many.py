@@ -1,0 +1,112 @@
+"""Many fits: an order that lets most go at once, results that do not depend on how many did."""
+
+import logging
+from itertools import permutations
+from typing import Any
+
+import pytest
+import torch
+
+from nfriction import Recording, fit
+from nfriction.evaluation import fit_many as many
+from nfriction.evaluation.fit_many import Data, fit_models, rounds, starts
+from nfriction.fitting.result.fit_result import FitResult
+from nfriction.friction.models import MODELS, model_by_name
+from nfriction.signals import kalman_smoother
+from tests.cli.benches import pendulum, swing
+
+QUICK: dict[str, Any] = {"windows": (0.5,), "max_steps": 1, "drag": False}
+
+
+@pytest.fixture(scope="module")
+def data() -> Data:
+    recording = swing("a", 1.5)
+    joint = recording.joint_coordinates(pendulum())
+    return Data([recording], [kalman_smoother(joint.time, joint.q)])
+
+
+@pytest.mark.parametrize("names", [list(MODELS), list(MODELS)[::-1], ["NFLFM", "ALFM"], ["LFM"]])
+def test_every_start_is_there_before_it_is_needed(names: list[str]) -> None:
+    origin = starts(names)
+    fitted: set[str | None] = {None}
+    for group in rounds(origin):
+        assert {origin[name] for name in group} <= fitted
+        fitted |= set(group)
+    assert fitted == {None, *names}
+
+
+def test_networks_and_classes_start_from_the_constant_fit_of_their_law() -> None:
+    for names in permutations(("NCFM", "LFM", "NFLFM", "ALFM")):
+        origin = starts(names)
+        assert origin["NFLFM"] == origin["ALFM"] == "LFM"
+        first, second = sorted(("NCFM", "LFM"), key=names.index)
+        assert origin[first] is None
+        assert origin[second] == first
+    assert starts(["NFLFM", "NCFM"]) == {"NFLFM": "NCFM", "NCFM": None}
+    # All models at once take three rounds, not one to each.
+    assert len(list(rounds(starts(list(MODELS))))) == 3
+
+
+def same(one: FitResult, other: FitResult) -> bool:
+    """Whether two fits are the same to the last bit."""
+    pairs = zip(one.model.state_dict().values(), other.model.state_dict().values(), strict=True)
+    return one.to_dict() == other.to_dict() and all(torch.equal(a, b) for a, b in pairs)
+
+
+# A network's law must be known again in another process: laws are told by identity.
+CASES = [
+    pytest.param(["NCFM", "LFM"], {"method": "torque"}, marks=pytest.mark.slow),
+    pytest.param(["LFM", "NFLFM"], QUICK, marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize(("names", "settings"), CASES)
+def test_results_do_not_depend_on_the_number_of_processes(
+    data: Data, names: list[str], settings: dict[str, Any]
+) -> None:
+    pytest.importorskip("joblib")
+    for jobs in (1, 2):
+        found = fit_models(pendulum(), names, {"x": data, "y": data}, jobs=jobs, **settings)
+        fits = {part: of.found for part, of in found.items()}
+        assert list(fits) == ["x", "y"]
+        assert all(list(of) == names for of in fits.values())
+        for name in names:
+            assert same(fits["x"][name], fits["y"][name])
+            assert type(fits["x"][name].model) is model_by_name(name)
+            assert fits["x"][name].motions == tuple(data.motions)
+        if jobs == 1:
+            alone = fits["x"]
+    assert all(same(alone[name], fits["x"][name]) for name in names)
+
+
+def test_a_model_that_fails_loses_no_other(
+    data: Data, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    started: dict[str, FitResult | None] = {}
+
+    def fragile(model: Any, plant: Any, recordings: list[Recording], **settings: Any) -> FitResult:
+        name = type(model).__name__
+        started[name] = settings["start"]
+        if name == "LFM":
+            raise ValueError("the data say nothing")
+        return fit(model, plant, recordings, method="torque")
+
+    monkeypatch.setattr(many, "fit", fragile)
+    with caplog.at_level(logging.INFO, "nfriction"):
+        found, failed = fit_models(pendulum(), ["NCFM", "LFM", "NLFM"], {"fit": data})["fit"]
+    assert list(found) == ["NCFM", "NLFM"]
+    assert failed == {"LFM": "the data say nothing"}
+    assert "fit LFM failed: the data say nothing" in caplog.messages
+    assert sum("converged: linear" in message for message in caplog.messages) == 2
+    assert started["NCFM"] is None
+    assert started["NLFM"] is not None
+    with pytest.raises(ValueError, match="the data say nothing"):
+        fit_models(pendulum(), ["LFM"], {"fit": data})
+
+
+def test_what_cannot_cross_to_other_processes_is_refused(data: Data) -> None:
+    pytest.importorskip("joblib")
+    with pytest.raises(ValueError, match="on_stage"):
+        fit_models(pendulum(), ["LFM"], {"fit": data}, jobs=2, callback=lambda *_: None)
+    with pytest.raises(ValueError, match="there are NCFM"):
+        fit_models(pendulum(), ["XFM"], {"fit": data})

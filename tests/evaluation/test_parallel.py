@@ -1,0 +1,139 @@
+"""Work in parallel processes: the same results, told here, errors with a name, a clean end."""
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+
+from nfriction.evaluation import parallel
+from tests.cli.benches import pendulum, swing
+
+logger = logging.getLogger("nfriction.tests")
+
+
+def whereabouts(number: float) -> tuple[float, int, int]:
+    return 2 * number, os.getpid(), torch.get_num_threads()
+
+
+def complain(what: str) -> None:
+    logger.warning("%s is wrong", what)
+    logger.debug("nobody asked for this")
+    warnings.warn(f"{what} is odd", UserWarning, stacklevel=1)
+
+
+def fail(what: str) -> None:
+    raise ZeroDivisionError(what)
+
+
+@pytest.fixture(params=[1, 2])
+def jobs(request: pytest.FixtureRequest) -> int:
+    if request.param > 1:
+        pytest.importorskip("joblib")
+    return request.param
+
+
+def test_every_piece_is_done_on_one_thread(jobs: int) -> None:
+    pieces = {f"piece {k}": (float(k),) for k in range(4)}
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        found = dict(parallel.done(whereabouts, pieces, jobs=jobs))
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+    assert {label: value for label, (value, _, _) in found.items()} == {
+        f"piece {k}": 2.0 * k for k in range(4)
+    }
+    assert {threads for _, _, threads in found.values()} == {1}
+    processes = {process for _, process, _ in found.values()}
+    assert (processes == {os.getpid()}) == (jobs == 1)
+
+
+def test_the_caller_is_told_what_is_done(jobs: int) -> None:
+    told: list[str] = []
+    pieces = {"a": (1.0,), "b": (2.0,)}
+    list(parallel.done(whereabouts, pieces, jobs=jobs, on_stage=told.append))
+    if jobs == 1:
+        assert told == ["a", "b"]
+    else:
+        assert told[0] == "a | b"
+        assert {line.split()[0] for line in told[1:]} == {"a", "b"}
+        assert told[-1].endswith("done, 0 of 2 left")
+
+
+def test_logs_and_warnings_reach_this_process(jobs: int, caplog: pytest.LogCaptureFixture) -> None:
+    pieces = {"a": ("the first",), "b": ("the second",)}
+    with caplog.at_level(logging.INFO, "nfriction"), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        list(parallel.done(complain, pieces, jobs=jobs))
+    assert sorted(caplog.messages) == ["the first is wrong", "the second is wrong"]
+    assert sorted(str(w.message) for w in caught) == ["the first is odd", "the second is odd"]
+
+
+def test_an_error_names_its_piece_and_keeps_its_kind(jobs: int) -> None:
+    with pytest.raises(ZeroDivisionError, match=r"^fit LFM: by naught$"):
+        list(parallel.done(fail, {"fit LFM": ("by naught",)}, jobs=jobs))
+    with pytest.raises(ZeroDivisionError, match=r"^[ab]: naught$"):
+        list(parallel.done(fail, {"a": ("naught",), "b": ("naught",)}, jobs=jobs))
+
+
+def test_the_callers_backend_does_the_work() -> None:
+    """Such as a Dask cluster's; threads of this process are told apart as easily."""
+    joblib = pytest.importorskip("joblib")
+    with joblib.parallel_config(backend="threading"):
+        found = dict(parallel.done(whereabouts, {"a": (1.0,), "b": (2.0,)}, jobs=2))
+    assert {process for _, process, _ in found.values()} == {os.getpid()}
+
+
+def test_what_cannot_be_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ValueError, match="at least 1, or -1"):
+        parallel.check_jobs(0)
+    monkeypatch.setitem(sys.modules, "joblib", None)
+    parallel.check_jobs(1)
+    with pytest.raises(ImportError, match=r"pip install nfriction\[parallel\]"):
+        parallel.check_jobs(2)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt", reason="Windows sends no SIGINT to a group of processes")
+def test_ctrl_c_ends_every_process_at_once(tmp_path: Path) -> None:
+    """As a terminal does, the signal goes to the workers too, whose solvers would survive it."""
+    pytest.importorskip("joblib")
+    from nfriction import rigs
+
+    rigs.write(pendulum(), tmp_path / "rig.json")
+    swing("a", 1.5).write(tmp_path / "a.csv")
+    words = ["compare", "a.csv", "--rig", "rig.json", "--models", "NCFM,NLFM,Stribeck", "--out",
+             "out", "--max-steps", "100000", "--jobs", "2", "--log-file", "log"]  # fmt: skip
+    process = subprocess.Popen(
+        [sys.executable, "-m", "nfriction", *words], cwd=tmp_path, text=True,
+        start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])},
+    )  # fmt: skip
+    log = tmp_path / "log"
+    while not (log.exists() and "fit NLFM | fit Stribeck" in log.read_text()):
+        assert process.poll() is None
+        time.sleep(0.1)
+    time.sleep(1.0)  # the workers start
+    os.killpg(process.pid, signal.SIGINT)
+    said = process.communicate(timeout=60)[1]
+    assert process.returncode == 130
+    assert said.startswith("nfriction: interrupted (fit NLFM | fit Stribeck)")
+    assert said.count("\n") == 1
+    # Nobody of the session is left to be told anything.
+    for _ in range(50):
+        try:
+            os.killpg(process.pid, 0)
+        except ProcessLookupError:
+            break
+        time.sleep(0.1)
+    else:
+        pytest.fail("a worker is still there")
+    assert not list((tmp_path / "out").iterdir())

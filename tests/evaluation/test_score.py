@@ -1,0 +1,157 @@
+"""Scores: near the encoder's noise for the true model, honest for a diverging one."""
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from nfriction import LFM, PendulumChain, score
+from nfriction.evaluation.score import RMSE, improvement_table, rmse_table
+from nfriction.friction.constant import Constant
+from nfriction.friction.laws import Coefficient, Law
+from nfriction.friction.model import FrictionModel
+from tests.fitting.recordings import pendulum, swing
+
+MODEL = LFM(2, [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]], v_smooth=0.05)
+QUANTUM = 2 * np.pi / 8192
+SETTINGS = {"start": (2.8, 0.3), "seconds": 4.0}
+
+
+def plant(quantum=QUANTUM) -> PendulumChain:
+    return pendulum(position_quantum=quantum)
+
+
+@pytest.mark.parametrize("convention", ["relative,upright", "absolute,hanging"])
+def test_the_true_model_is_as_good_as_the_encoder(convention):
+    """Started at the given state, in the recording's convention, only rounding is left."""
+    recording = swing(plant(), MODEL, convention=convention, **SETTINGS)
+    q0 = recording.convention.position_from_joint(np.array(SETTINGS["start"]))
+    found = score(plant(), MODEL, recording, initial_state=(q0, np.zeros(2)))
+    assert found.free_run.all == pytest.approx(QUANTUM / 12**0.5, rel=0.3)
+    np.testing.assert_allclose(found.simulated, recording.q, atol=2 * QUANTUM)
+    wrong = score(plant(), MODEL, recording, initial_state=(q0 + 0.1, np.zeros(2)))
+    assert wrong.free_run.all > 10 * found.free_run.all
+    assert all(w.all < 10 * QUANTUM for w in found.windows.values())
+    assert found.diverged_at == np.inf
+
+
+@pytest.mark.filterwarnings("ignore:.*has gaps")
+def test_simulations_start_anew_behind_a_gap():
+    """The true model stays as good as the encoder, however long the recording paused."""
+    whole = swing(plant(), MODEL, **SETTINGS)
+    keep = (whole.time < 1.5) | (whole.time > 1.9)
+    gapped = replace(whole, time=whole.time[keep], q=whole.q[keep])
+    found = score(plant(), MODEL, gapped, horizons=(0.5, 1.0))
+    assert found.free_run.all < 20 * QUANTUM
+    assert all(w.all < 20 * QUANTUM for w in found.windows.values())
+    assert len(found.simulated) == len(gapped.time)
+
+
+def test_angles_are_written_as_the_plant_says_unless_the_recording_says_otherwise():
+    """An encoder log that says nothing, on a rig that writes absolute angles from hanging."""
+    hanging = pendulum(convention=("absolute", "hanging"), position_quantum=QUANTUM)
+    said = swing(plant(), MODEL, convention="absolute,hanging", seconds=1.0)
+    unsaid = replace(said, convention=None)
+    q0 = said.convention.position_from_joint(np.array([1.6, 0.8]))
+    start = {"initial_state": (q0, np.zeros(2))}
+    found = [score(hanging, MODEL, r, **start) for r in (said, unsaid)]
+    assert found[0].free_run == found[1].free_run
+    assert found[0].windows == found[1].windows
+    assert found[1].free_run.all < QUANTUM
+    # What a recording says counts, whatever the plant says.
+    assert score(plant(), MODEL, said, **start).free_run == found[0].free_run
+    assert score(plant(), MODEL, unsaid, **start).free_run.all > 0.1
+
+
+def test_metres_are_not_scored_as_angles():
+    recording = replace(swing(plant(), MODEL, seconds=0.5), unit="m")
+    with pytest.raises(ValueError, match="swing is in m, the plant's joints are in rad"):
+        score(plant(), MODEL, recording)
+
+
+def test_friction_too_steep_to_simulate_is_diverged_and_said(caplog):
+    recording = swing(plant(), MODEL, seconds=1.0)
+    nan = LFM(2, [1e-3, 1e-3], v_smooth=0.05)
+    with torch.no_grad():
+        nan.schedule.raw[0, 0] = torch.nan
+    for model, told in (
+        (LFM(2, [1e-3, 1e3], v_smooth=1e-3), r"swing: friction needs \d+ integration steps"),
+        (nan, "no finite slope"),
+    ):
+        caplog.clear()
+        found = score(plant(), model, recording, horizons=(0.5,))
+        assert found.free_run.all == found.windows["0.5"].all == found.floor.all == np.inf
+        assert found.diverged_at == 0.0
+        assert found.simulated.shape == recording.q.shape
+        assert json.dumps(found.to_dict(), allow_nan=False)
+        assert re.search(told, caplog.text)
+
+
+def test_joints_and_all_are_one_sum_of_squares():
+    error = np.random.default_rng(0).normal(size=(3, 50, 2)) * [1.0, 3.0]
+    rmse = RMSE.of(error)
+    assert rmse.all == pytest.approx(np.sqrt(np.mean(error**2)))
+    np.testing.assert_allclose(rmse.joints, np.sqrt(np.mean(error**2, axis=(0, 1))))
+    recording = swing(plant(), MODEL, seconds=1.0)
+    found = score(plant(), None, recording, horizons=()).free_run
+    assert found.all == pytest.approx(np.sqrt(np.mean(np.square(found.joints))))
+
+
+def test_windows_are_those_that_fit(monkeypatch):
+    """9.98 s are two windows of 5 s, nine hundredths of a second do not count as lost."""
+    starts = {}
+
+    def counted(plant, friction, q0, *rest, **settings):
+        steps = settings["sample_time"]
+        starts[round(float(steps.sum(-1).max()))] = len(q0)
+        return original(plant, friction, q0, *rest, **settings)
+
+    import nfriction.evaluation.score as scoring
+
+    original = scoring.rollout
+    recording = swing(plant(), MODEL, seconds=9.98, sample_time=4e-3, start=(1.0, 0.0))
+    monkeypatch.setattr(scoring, "rollout", counted)
+    found = score(plant(), MODEL, recording, horizons=(2.0, 5.0, 20.0))
+    assert list(found.windows) == ["2", "5"]
+    assert starts[5] == 2
+    assert starts[2] == 5
+
+
+def test_the_floor_scales_with_the_encoder_s_count():
+    recording = swing(plant(), MODEL, seconds=1.0, start=(1.0, 0.0))
+    floors = [score(plant(q), MODEL, recording, horizons=()).floor for q in (1e-5, 2e-5)]
+    assert floors[1].all == pytest.approx(2 * floors[0].all, rel=1e-2)  # chaos is not linear
+    assert score(pendulum(), MODEL, recording, horizons=()).floor is None
+
+
+def test_divergence_is_infinite_and_null():
+    explode = Law("explode", (Coefficient("b", "N m s/rad", positive=False),),
+                  lambda qd, load, c, v_smooth: c[..., 0] * qd)  # fmt: skip
+    model = FrictionModel(explode, Constant(explode, 2, [-5.0]), 1.0)
+    recording = swing(plant(), MODEL, seconds=1.0)
+    found = score(plant(), model, recording, horizons=(0.5,))
+    assert found.free_run.all == np.inf
+    assert 0 < found.diverged_at < 1.0
+    plain = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+    assert plain["free_run"] == {"joints": [None, None], "all": None}
+    assert plain["diverged_at"] == pytest.approx(found.diverged_at)
+    good = score(plant(), MODEL, recording, horizons=(0.5,))
+    table = rmse_table({"bad": [found], "good": [good]})
+    assert np.isinf(table[0]).all()
+    assert np.isnan(improvement_table(table)[0]).all()
+
+
+def test_tables_are_root_mean_squares_and_percentages():
+    recording = swing(plant(), MODEL, seconds=1.0)
+    scores = [score(plant(), m, recording, horizons=(0.5,)) for m in (None, MODEL)]
+    table = rmse_table({"none": [scores[0], scores[1]], "model": [scores[1], scores[1]]}, "0.5")
+    a, b = (s.windows["0.5"].all for s in scores)
+    assert table[0, -1] == pytest.approx(np.sqrt((a**2 + b**2) / 2))
+    assert table[1, -1] == pytest.approx(b)
+    saved = improvement_table(table)
+    np.testing.assert_allclose(saved[0], 0.0, atol=1e-12)
+    assert saved[1, -1] == pytest.approx(100 * (1 - table[1, -1] / table[0, -1]))
+    assert not torch.is_grad_enabled() or MODEL.schedule.raw.grad is None

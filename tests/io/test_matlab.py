@@ -1,0 +1,192 @@
+"""MATLAB files of version 5: variables, structs, cells, ControlDesk's records, damage."""
+
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.sparse
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.io import loadmat, savemat
+
+from nfriction.io.formats.matlab import read_version_5
+from nfriction.recording import Recording
+
+TIME = np.arange(40) / 1000
+Q = np.random.default_rng(0).normal(size=(40, 2)) / 7
+
+
+def read(folder: Path, content: dict[str, Any], **settings: Any) -> Recording:
+    savemat(folder / "run.mat", content, do_compression=True)
+    return Recording.read(folder / "run.mat", **settings)
+
+
+def structs(*elements: dict[str, Any]) -> np.ndarray:
+    """A 1 x n array of structs."""
+    array = np.empty((1, len(elements)), dtype=[(name, object) for name in elements[0]])
+    for k, element in enumerate(elements):
+        for name, value in element.items():
+            array[0, k][name] = value
+    return array
+
+
+def controldesk(**axes: Any) -> dict[str, Any]:
+    """As ControlDesk writes: one variable, X and Y arrays of structs, names in quotes."""
+    y = [
+        {"Name": f'"Model Root/enc {k + 1}/Out1"', "Type": "double", "Data": Q[None, :, k],
+         "Unit": "", "XIndex": 1}
+        for k in range(2)
+    ]  # fmt: skip
+    x = {"Name": "HostService", "Type": "double", "Data": TIME[None], "Unit": "s"}
+    return {"run_001": {"X": structs(x), "Y": structs(*y), "Description": {"General": "test"}}}
+
+
+@pytest.mark.parametrize("rows", [True, False])
+def test_plain_variables_either_way_round(tmp_path: Path, rows: bool) -> None:
+    turn = (lambda x: x) if rows else np.transpose
+    back = read(tmp_path, {"time": TIME, "q": turn(Q), "tau": turn(2 * Q), "remark": "fine"})
+    assert np.array_equal(back.q, Q)
+    assert back.tau is not None
+    assert np.array_equal(back.tau, 2 * Q)
+    assert back.name == "run"
+
+
+@pytest.mark.parametrize(
+    ("content", "columns"),
+    [
+        ({"data": {"t": TIME * 1e3, "Y": {"a": np.rad2deg(Q[:, 0]), "b": np.rad2deg(Q[:, 1])}}},
+         {"time": "data.t:ms", "q1": "data.Y.a:deg", "q2": "data.Y.b:deg"}),
+        ({"t": TIME, "enc": Q}, {"time": "t", "q1": "enc[0]", "q2": "enc[1]"}),
+        ({"log": structs({"v": TIME}, {"v": Q[:, 0]}, {"v": Q[:, 1]})},
+         {"time": "log[0].v", "q1": "log[1].v", "q2": "log[2].v"}),
+    ],
+)  # fmt: skip
+def test_paths_lead_into_structs(
+    tmp_path: Path, content: dict[str, Any], columns: dict[str, str]
+) -> None:
+    back = read(tmp_path, content, columns=columns)
+    # Degrees and back: three roundings.
+    np.testing.assert_allclose(back.q, Q, rtol=6e-16)
+    np.testing.assert_allclose(back.time, TIME, rtol=4e-16)
+
+
+@pytest.mark.parametrize("prefix", ["", "run_001.Y."])
+def test_controldesk_records_are_read_by_name(tmp_path: Path, prefix: str) -> None:
+    columns = {f"q{k}": f"{prefix}Model Root/enc {k}/Out1" for k in (1, 2)}
+    back = read(tmp_path, controldesk(), columns=columns)
+    assert np.array_equal(back.q, Q)
+    assert np.array_equal(back.time, TIME)
+    inside = {"time": "run_001.X.Data", "q1": "run_001.Y[1].Data"}
+    assert np.array_equal(read(tmp_path, controldesk(), columns=inside).q[:, 0], Q[:, 1])
+
+
+def test_a_name_that_two_signals_bear_leads_nowhere(tmp_path: Path) -> None:
+    content = controldesk() | {"run_002": controldesk()["run_001"]}
+    with pytest.raises(ValueError, match="Model Root/enc 1/Out1 is missing; found run_001"):
+        read(tmp_path, content, columns={"q1": "Model Root/enc 1/Out1"})
+
+
+def test_what_cannot_be_a_recording_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="column time, q1 is missing; found a, b"):
+        read(tmp_path, {"a": TIME, "b": TIME})
+    with pytest.raises(ValueError, match="different numbers of samples: q1 20, time 40"):
+        read(tmp_path, {"time": TIME, "q1": Q[:20, 0]})
+    (tmp_path / "old.mat").write_bytes(b"\0" * 300)
+    with pytest.raises(ValueError, match=r"old\.mat.*no MATLAB file of version 5 or 7\.3"):
+        Recording.read(tmp_path / "old.mat")
+
+
+def test_every_kind_of_value_is_what_scipy_reads(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    kinds = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8")
+    content: dict[str, Any] = {k: (50 * rng.random((3, 4, 2))).astype(k) for k in kinds}
+    content |= {"flag": rng.random((2, 5)) > 0.5, "text": "Übung", "empty": np.zeros((0, 3)),
+                "one": 7.0, "cell": np.array([[1.5, "b"], [np.arange(3), "d"]], dtype=object),
+                "deep": {"a": {"b": {"c": np.arange(9.0)}}}}  # fmt: skip
+    for packed in (True, False):
+        path = tmp_path / "run.mat"
+        savemat(path, content, do_compression=packed)
+        ours, theirs = read_version_5(path.read_bytes()), loadmat(path)
+        for key in (*kinds, "flag", "empty", "one"):
+            assert np.array_equal(ours[key], theirs[key]), key
+            assert key == "flag" or ours[key].dtype == theirs[key].dtype
+        assert ours["text"] == theirs["text"][0]
+        for mine, his in zip(ours["cell"], theirs["cell"].ravel(order="F"), strict=True):
+            assert mine == his[0] if isinstance(mine, str) else np.array_equal(mine, his)
+        assert np.array_equal(ours["deep"]["a"]["b"]["c"][0], np.arange(9.0))
+
+
+@pytest.mark.parametrize("skipped", [scipy.sparse.eye(3).tocsc(), np.ones(3) * 1j])
+def test_what_is_no_signal_is_passed_over(tmp_path: Path, skipped: Any) -> None:
+    assert np.array_equal(read(tmp_path, {"s": skipped, "time": TIME, "q": Q}).q, Q)
+
+
+def test_what_unpacks_to_far_more_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    savemat(tmp_path / "run.mat", {"time": np.zeros(10**6)}, do_compression=True)
+    assert (tmp_path / "run.mat").stat().st_size < 20_000
+    monkeypatch.setattr("nfriction.io.formats.limits.LARGEST", 10**6)
+    with pytest.raises(ValueError, match="unpacked bytes, more than 1000000 are read"):
+        Recording.read(tmp_path / "run.mat")
+
+
+def element(kind: int, content: bytes) -> bytes:
+    return struct.pack("<II", kind, len(content)) + content + bytes(-len(content) % 8)
+
+
+@pytest.mark.parametrize(
+    ("shape", "message"),
+    [
+        (element(9, struct.pack("<dd", 2.0, 1.0)), "contradicts itself"),
+        (element(5, struct.pack("<ii", -2, -1)), "contradicts itself"),
+    ],
+)
+@pytest.mark.parametrize("kind", [1, 6])
+def test_shapes_that_are_none_are_refused(
+    tmp_path: Path, shape: bytes, kind: int, message: str
+) -> None:
+    flags = element(6, struct.pack("<II", kind, 0))
+    array = flags + shape + element(1, b"q1") + element(9, struct.pack("<dd", 1.0, 2.0))
+    refused(tmp_path, element(14, array), message)
+
+
+def test_a_packed_variable_of_a_few_bytes_is_refused(tmp_path: Path) -> None:
+    packed = zlib.compress(b"abc")
+    refused(tmp_path, struct.pack("<II", 15, len(packed)) + packed, "cut short")
+
+
+def refused(folder: Path, content: bytes, message: str) -> None:
+    header = b"x" * 124 + struct.pack("<H", 0x0100) + b"IM"
+    (folder / "run.mat").write_bytes(header + content)
+    with pytest.raises(ValueError, match=rf"run\.mat.*{message}"):
+        Recording.read(folder / "run.mat")
+
+
+@settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    compressed=st.booleans(),
+    edits=st.lists(st.tuples(st.floats(0, 1), st.integers(0, 255)), max_size=3),
+    share=st.floats(0.5, 1),
+)
+@pytest.mark.filterwarnings("ignore")
+def test_damaged_files_are_read_or_refused(
+    tmp_path: Path, compressed: bool, edits: list[tuple[float, int]], share: float
+) -> None:
+    path = tmp_path / "run.mat"
+    savemat(path, {"time": TIME, "q": Q, "s": {"a": [1.0, "b"]}}, do_compression=compressed)
+    content = bytearray(path.read_bytes())
+    for place, value in edits:
+        content[int(place * (len(content) - 1))] = value
+    path.write_bytes(content[: int(share * len(content))])
+    refused: ValueError | None = None
+    try:
+        back = Recording.read(path)
+    except ValueError as error:
+        refused = error
+    assert str(path) in str(refused) if refused else np.isfinite(back.q).all()

@@ -1,0 +1,80 @@
+"""Work in a process of its own: what it gives, what it says, and how it perishes."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from nfriction.io import sandbox as apart
+
+WORK = """
+import os, pathlib, sys, tempfile, time
+from nfriction import apart
+
+def work(asked, folder):
+    {body}
+
+def main():
+    apart.serve(work, refusals=(KeyError,), room=2**33)
+"""
+Run = Callable[..., Path]
+posix = pytest.mark.skipif(sys.platform == "win32", reason="signals and limits of POSIX")
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Runs a module of the given body; gives the folder of its results."""
+    monkeypatch.syspath_prepend(tmp_path)
+    folder = tmp_path / "results"
+    folder.mkdir()
+
+    def start(body: str, seconds: float = 60.0, **asked: object) -> Path:
+        (tmp_path / "works_apart.py").write_text(WORK.format(body=body))
+        apart.run("works_apart", asked, folder, seconds=seconds)
+        return folder
+
+    return start
+
+
+def test_results_lie_in_the_folder(run: Run) -> None:
+    folder = run('(folder / "out").write_text(asked["what"])', what="Lösung")
+    assert (folder / "out").read_text() == "Lösung"
+
+
+def test_temporary_files_lie_there_too(run: Run) -> None:
+    folder = run('open(tempfile.mkstemp()[1], "w").write("left behind")')
+    assert len(list(folder.iterdir())) == 1
+
+
+def test_a_refusal_is_passed_on(run: Run) -> None:
+    with pytest.raises(apart.RefusedError, match="no such channel"):
+        run('raise KeyError("no such channel")')
+
+
+@posix
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ("os.abort()", "SIGABRT"),
+        ("os.kill(os.getpid(), 11)", "SIGSEGV"),
+        ("sys.exit(3)", "exit status 3"),
+        ("raise RuntimeError('lost')", "RuntimeError: lost"),
+        ("bytearray(2**34)", "MemoryError"),
+    ],
+)
+def test_how_it_perished_is_told(run: Run, body: str, said: str) -> None:
+    with pytest.raises(apart.PerishedError, match=said):
+        run(body)
+
+
+@posix
+def test_processor_time_is_bounded(run: Run) -> None:
+    with pytest.raises(apart.PerishedError, match="does not come to an end"):
+        run("while True: pass", seconds=1.0)
+
+
+def test_waiting_is_bounded(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(apart, "BUSY", 3.0)
+    with pytest.raises(apart.PerishedError, match="does not come to an end"):
+        run("time.sleep(600)", seconds=1.0)

@@ -1,0 +1,22 @@
+"""JSON of strangers: finite numbers only."""
+
+import pytest
+
+from nfriction.io import strict_json
+
+
+def test_what_is_json_is_read() -> None:
+    assert strict_json.parse(b'{"a": [1, 2.5, null, "NaN"]}') == {"a": [1, 2.5, None, "NaN"]}
+    assert strict_json.parse('{"a": 1, "a": 2}', lambda pairs: {"n": len(pairs)}) == {"n": 2}
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999", "-1e999"])
+def test_numbers_are_finite(number: str) -> None:
+    with pytest.raises(ValueError, match=f"numbers must be finite, .*{number}"):
+        strict_json.parse(f'{{"a": [{number}]}}')
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1,]", '{"a" 1}'])
+def test_what_is_no_json_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="line 1"):
+        strict_json.parse(text)

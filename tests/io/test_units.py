@@ -1,0 +1,53 @@
+"""Units: every spelling leads to SI, and nothing else passes for a unit."""
+
+import math
+
+import numpy as np
+import pytest
+
+from nfriction.io.formats.units import is_unit, slides, to_si
+
+
+@pytest.mark.parametrize(
+    ("kind", "unit", "value"),
+    [
+        ("time", "s", 1.0),
+        ("time", "[ms]", 1e-3),
+        ("time", "µs", 1e-6),
+        ("time", "us", 1e-6),
+        ("q", "deg", math.pi / 180),
+        ("q", "(°)", math.pi / 180),
+        ("q", "rev", 2 * math.pi),
+        ("q", "counts/8192", 2 * math.pi / 8192),
+        ("q", "mm", 1e-3),
+        ("qd", "rpm", 2 * math.pi / 60),
+        ("qd", "deg/s", math.pi / 180),
+        ("tau", "mNm", 1e-3),
+        ("tau", "Nm", 1.0),
+        ("tau", "N m", 1.0),
+    ],
+)
+def test_one_of_a_unit_in_si(kind: str, unit: str, value: float) -> None:
+    assert is_unit(unit)
+    # Two roundings: the factor's and the quotient's.
+    np.testing.assert_allclose(to_si(kind, np.array([1.0, -3.0]), unit), [value, -3 * value], 4e-16)
+
+
+def test_milliseconds_are_exact() -> None:
+    stamps = np.arange(5000)
+    assert np.array_equal(to_si("time", stamps * 1.0, "ms"), [float(f"{k}e-3") for k in stamps])
+
+
+@pytest.mark.parametrize(
+    ("kind", "unit"),
+    [("time", "deg"), ("q", "ms"), ("q", "deg/s"), ("qd", "counts/8192"), ("tau", "m"),
+     ("q", "counts/0"), ("q", "counts/"), ("q", "gon"), ("q", "")],
+)  # fmt: skip
+def test_a_unit_of_another_kind_is_refused(kind: str, unit: str) -> None:
+    with pytest.raises(ValueError, match=f"is no unit of {kind}; known are"):
+        to_si(kind, np.ones(2), unit)
+
+
+def test_lengths_are_told_from_angles() -> None:
+    assert [u for u in ("m", "mm", "[mm]", "deg", "rad", "counts/4") if slides(u)] == [
+        "m", "mm", "[mm]"]  # fmt: skip

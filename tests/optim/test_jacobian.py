@@ -1,0 +1,133 @@
+"""Laws of the chunked per-sample Jacobians and normal equations."""
+
+from collections.abc import Mapping
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from nfriction.optim.jacobian import (
+    flatten,
+    normal_equations,
+    per_sample_jacobian,
+    sum_of_squares,
+    trainable,
+    unflatten,
+)
+from tests.optim.networks import AnalyticRadialBasis, Linear, RadialBasis, Tanh, noise
+
+
+def test_flatten_and_unflatten_are_inverse_and_ordered() -> None:
+    parameters = trainable(RadialBasis())
+    vector = flatten(parameters)
+    assert vector.shape == (52,)
+    assert torch.equal(vector[:20].view(10, 2), parameters["centres"])
+    back = unflatten(vector, parameters)
+    assert list(back) == list(parameters)
+    assert all(torch.equal(back[name], parameters[name]) for name in parameters)
+    with pytest.raises(ValueError, match=r"\(52,\)"):
+        unflatten(vector[1:], parameters)
+
+
+def test_jacobian_is_the_one_of_reverse_differentiation_sample_by_sample() -> None:
+    model, x = RadialBasis(), noise(0, 7, 2)
+    J = per_sample_jacobian(model, trainable(model), x)
+    assert J.shape == (7, 2, 52)
+    for i in range(7):
+        for k in range(2):
+            gradient = torch.autograd.grad(model(x[i : i + 1])[0, k], list(model.parameters()))
+            expected = torch.cat([g.flatten() for g in gradient])
+            torch.testing.assert_close(J[i, k], expected, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("chunk", [1, 3, 10, 1000])
+def test_chunks_and_a_written_jacobian_change_nothing(chunk: int) -> None:
+    model, x, y = AnalyticRadialBasis(), noise(0, 10, 2), noise(1, 10, 2)
+    plain, parameters = RadialBasis(), trainable(model)
+    # Other values than the module's own: the written Jacobian must follow the argument.
+    parameters = {name: value + 0.1 for name, value in parameters.items()}
+    J = per_sample_jacobian(plain, parameters, x)
+    close = {"rtol": 1e-12, "atol": 1e-13}
+    torch.testing.assert_close(per_sample_jacobian(model, parameters, x, chunk), J, **close)
+    weights = noise(2, 10).square()
+    for candidate in (plain, model):
+        got = normal_equations(candidate, parameters, x, y, weights, chunk)
+        rows = weights.sqrt()[:, None, None] * J
+        error = weights.sqrt()[:, None] * (torch.func.functional_call(plain, parameters, (x,)) - y)
+        rows, error = rows.reshape(20, 52), error.flatten()
+        torch.testing.assert_close(got.JtJ, rows.T @ rows, **close)
+        torch.testing.assert_close(got.Jte, rows.T @ error, **close)
+        torch.testing.assert_close(got.squares, error @ error, **close)
+        cheap = sum_of_squares(candidate, parameters, x, y, weights)
+        torch.testing.assert_close(cheap, got.squares, **close)
+
+
+def test_written_jacobian_of_the_tanh_network_is_right() -> None:
+    model, x = Tanh(3, seed=0), noise(0, 9)
+    automatic = per_sample_jacobian(
+        lambda values, inputs: torch.func.functional_call(model, dict(values), (inputs,)),
+        trainable(model),
+        x,
+    )
+    written = per_sample_jacobian(model, trainable(model), x)
+    torch.testing.assert_close(written, automatic, rtol=1e-12, atol=1e-14)
+
+
+def test_function_of_a_dictionary_serves_like_a_module() -> None:
+    def function(parameters: Mapping[str, Tensor], x: Tensor) -> Tensor:
+        return parameters["gain"] * torch.sin(parameters["rate"] * x)
+
+    parameters = {"gain": torch.tensor(2.0).double(), "rate": torch.tensor(3.0).double()}
+    x = noise(0, 5)
+    J = per_sample_jacobian(function, parameters, x)
+    expected = torch.stack([torch.sin(3 * x), 2 * x * torch.cos(3 * x)], -1)[:, None]
+    torch.testing.assert_close(J, expected, rtol=1e-14, atol=1e-15)
+
+
+def test_frozen_parameters_have_no_column() -> None:
+    model = RadialBasis()
+    model.centres.requires_grad_(False)
+    parameters = trainable(model)
+    assert "centres" not in parameters
+    whole = per_sample_jacobian(RadialBasis(), trainable(RadialBasis()), noise(0, 4, 2))
+    part = per_sample_jacobian(model, parameters, noise(0, 4, 2))
+    torch.testing.assert_close(part, whole[:, :, 20:], rtol=1e-14, atol=0)
+
+
+def test_weights_of_single_errors_scale_their_rows() -> None:
+    model, x, y = RadialBasis(), noise(0, 6, 2), noise(1, 6, 2)
+    weights = torch.zeros(6, 2).double()
+    weights[2, 1] = 4.0
+    row = 2 * per_sample_jacobian(model, trainable(model), x)[2, 1]
+    got = normal_equations(model, trainable(model), x, y, weights)
+    torch.testing.assert_close(got.JtJ, torch.outer(row, row), rtol=1e-13, atol=1e-15)
+
+
+def test_memory_stays_bounded_on_a_long_recording() -> None:
+    sizes = []
+
+    class Watched(AnalyticRadialBasis):
+        def jacobian(self, x: Tensor) -> Tensor:
+            sizes.append(len(x))
+            return super().jacobian(x)
+
+    model = Watched()
+    normal_equations(model, trainable(model), noise(0, 40_000, 2), noise(1, 40_000, 2))
+    assert sum(sizes) == 40_000
+    # Ten intermediates of the size of a chunk's Jacobian are below 100 MB.
+    assert max(sizes) * 2 * 52 * 8 * 10 < 100e6
+
+
+def test_misfits_are_refused_at_the_border() -> None:
+    model, x = Linear(2), noise(0, 5, 2)
+    parameters = trainable(model)
+    with pytest.raises(ValueError, match="must agree"):
+        normal_equations(model, parameters, x, noise(1, 5, 1))
+    with pytest.raises(ValueError, match="number of samples"):
+        normal_equations(model, parameters, x, noise(1, 4))
+    with pytest.raises(ValueError, match="weights"):
+        normal_equations(model, parameters, x, noise(1, 5), torch.ones(4))
+    with pytest.raises(ValueError, match="negative"):
+        normal_equations(model, parameters, x, noise(1, 5), -torch.ones(5).double())
+    with pytest.raises(ValueError, match="no samples"):
+        per_sample_jacobian(nn.Linear(2, 1), parameters, x[:0])

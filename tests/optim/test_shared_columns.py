@@ -1,0 +1,165 @@
+"""Laws of normal equations from columns that outputs share, on the layers that offer them."""
+
+from collections.abc import Mapping
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from nfriction.fuzzy import Anfis, AnfisRBF, RBFNetwork
+from nfriction.optim import shared_columns
+from nfriction.optim.evidence import bayesian_regularisation
+from nfriction.optim.jacobian import (
+    NormalEquations,
+    normal_equations,
+    per_sample_jacobian,
+    trainable,
+)
+from nfriction.optim.shared_columns import shares_columns
+from tests.optim.networks import F64, RadialBasis, noise
+
+LAYERS = {
+    "anfis": lambda g: Anfis(g, 2, [3, 2], 2),
+    "zero order": lambda g: Anfis(g, 2, [3, 3], 2, order=0),
+    "bells": lambda g: Anfis(g, 2, [2, 3], 2, kind="bell"),
+    "interpretable": lambda g: Anfis(g, 2, [3, 3], 2, interpretable=True),
+    "interpretable bells": lambda g: Anfis(g, 2, [3, 2], 2, kind="bell", interpretable=True),
+    "network": lambda g: RBFNetwork(g, units=4),
+}
+
+
+def shaken(module: nn.Module) -> nn.Module:
+    with torch.no_grad():
+        for seed, p in enumerate(module.parameters()):
+            p.add_(0.3 * noise(seed, *p.shape))
+    return module
+
+
+def frozen_first(module: nn.Module) -> nn.Module:
+    next(module.parameters()).requires_grad_(False)
+    return module
+
+
+def automatic(model: nn.Module) -> object:
+    """The same function, of which nothing but its values is known."""
+    return lambda values, x: torch.func.functional_call(model, dict(values), (x,))
+
+
+def assert_same(got: NormalEquations, wanted: NormalEquations) -> None:
+    for ours, theirs in zip(got, wanted, strict=True):
+        size = float(theirs.abs().max())
+        torch.testing.assert_close(ours, theirs, rtol=1e-11, atol=1e-11 * size)
+
+
+@pytest.mark.parametrize("groups", [1, 2])
+@pytest.mark.parametrize("kind", [*LAYERS, "head"])
+def test_written_jacobians_are_those_of_reverse_differentiation(kind: str, groups: int) -> None:
+    build = LAYERS.get(kind, lambda g: AnfisRBF(g, 2, [3, 2], 2, units=3))
+    network, x = shaken(build(groups)), noise(0, 20, groups, 2)
+    parameters = trainable(network)
+    wanted = torch.func.jacrev(
+        lambda values: torch.func.functional_call(network, values, (x,)).flatten(1)
+    )(parameters)
+    joined = torch.cat([block.flatten(2) for block in wanted.values()], -1)
+    torch.testing.assert_close(network.jacobian(x), joined, rtol=1e-12, atol=1e-12)
+    # What the solver asks for: other values than the module's own, and some of them frozen.
+    parameters = trainable(frozen_first(network))
+    offset = {name: value + 0.1 for name, value in parameters.items()}
+    written = per_sample_jacobian(network, offset, x)
+    plain = per_sample_jacobian(automatic(network), offset, x)
+    torch.testing.assert_close(written, plain, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("weighted", ["not", "by sample", "by error"])
+@pytest.mark.parametrize("groups", [1, 3])
+@pytest.mark.parametrize("kind", LAYERS)
+def test_columns_give_the_normal_equations_of_the_whole_jacobian(
+    kind: str, groups: int, weighted: str
+) -> None:
+    layer = shaken(LAYERS[kind](groups))
+    assert shares_columns(layer)
+    x, y = noise(0, 101, groups, 2), noise(1, 101, groups, 2)
+    weights = {"not": None, "by sample": noise(2, 101).square(), "by error": noise(3, *y.shape)}
+    weight = weights[weighted]
+    weight = None if weight is None else weight.abs()
+    for module in (layer, frozen_first(layer)):
+        offset = {name: value + 0.1 for name, value in trainable(module).items()}
+        wanted = normal_equations(automatic(module), offset, x, y, weight)
+        # Chunks that do not divide the samples, and all at once.
+        for chunk in (33, None):
+            assert_same(normal_equations(module, offset, x, y, weight, chunk), wanted)
+
+
+def test_regularisation_takes_the_columns_where_they_are_offered() -> None:
+    calls = 0
+
+    class Watched(RBFNetwork):
+        def jacobian_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
+            nonlocal calls
+            calls += 1
+            return super().jacobian_columns(x, out)
+
+        def jacobian(self, x: Tensor) -> Tensor:
+            raise AssertionError("the whole Jacobian was asked for")
+
+    x = noise(0, 200, 1, 2)
+    y = torch.stack([x[..., 0] ** 2, x.prod(-1)], -1) + 0.1 * noise(1, 200, 1, 2)
+    ours, plain = Watched(1, units=3), RBFNetwork(1, units=3)
+    fit = bayesian_regularisation(ours, x, y, max_steps=15)
+    assert calls >= 16
+
+    class Plain(nn.Module):
+        """Hides what the network offers beyond its outputs."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.network = plain
+
+        def forward(self, x: Tensor) -> Tensor:
+            return self.network(x)
+
+    same = bayesian_regularisation(Plain(), x, y, max_steps=15)
+    # Rounding, grown over 15 steps of a nonlinear search.
+    assert fit.log_evidence == pytest.approx(same.log_evidence, rel=1e-6)
+    torch.testing.assert_close(fit.w, same.w, rtol=1e-5, atol=1e-6)
+
+
+def test_the_columns_of_a_long_recording_stay_in_bounded_memory() -> None:
+    sizes: list[int] = []
+
+    class Watched(RBFNetwork):
+        def jacobian_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
+            sizes.append(len(x))
+            return super().jacobian_columns(x, out)
+
+    network = Watched(1)
+    normal_equations(network, trainable(network), noise(0, 50_000, 1, 2), noise(1, 50_000, 1, 2))
+    assert sum(sizes) == 50_000
+    assert max(sizes) * (10 + 1 + 40 + 2) <= shared_columns.CHUNK_ENTRIES
+
+
+def test_misfits_and_modules_without_columns() -> None:
+    network, x = RBFNetwork(1, units=3), noise(0, 9, 1, 2)
+    with pytest.raises(ValueError, match="must agree"):
+        normal_equations(network, trainable(network), x, noise(1, 9, 1, 3))
+    assert not shares_columns(RadialBasis())
+    assert not shares_columns(AnfisRBF(1, 2, [2, 2], 1))
+
+
+def test_units_far_from_every_sample_cost_no_more() -> None:
+    # Numbers that underflow are fifty times as slow; a unit 24 widths away is as good as none.
+    network, x = RBFNetwork(1, units=5), noise(0, 200, 1, 2)
+    with torch.no_grad():
+        network.log_widths.fill_(-9.0)
+        said = network.activations(x)
+    tiny = torch.finfo(F64).tiny
+    assert (said.square() >= tiny).all()
+    assert said.min() < 1e-100
+
+
+def test_mapping_is_enough_for_functions() -> None:
+    def function(values: Mapping[str, Tensor], x: Tensor) -> Tensor:
+        return values["a"] * x
+
+    found = normal_equations(function, {"a": torch.ones((), dtype=F64)}, noise(0, 5), noise(1, 5))
+    torch.testing.assert_close(found.JtJ[0, 0], noise(0, 5).square().sum(), rtol=1e-14, atol=0)

@@ -1,0 +1,159 @@
+"""Adaptive fits recover coefficients by class and never serve worse than the constant law."""
+
+import pytest
+import torch
+
+from nfriction import LFM, NFLFM, fit
+from nfriction.evaluation.score import score
+from nfriction.fitting.plant_parameters import plant_parameters
+from nfriction.fitting.shooting.sensitivity import StepJacobian
+from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import ALFM
+from nfriction.papers.afem.classes import find_classes
+from nfriction.papers.afem.fit_adaptive import fit_adaptive
+from nfriction.papers.afem.labelled import Labelled, LabelledProblem
+from nfriction.signals import kalman_smoother
+from tests.fitting.recordings import F64, pendulum, swing
+from tests.fitting.test_trajectory import ABSOLUTE, point, windows
+
+V_SMOOTH = 0.05
+THRESHOLDS = [[30.0, 90.0], [60.0, 200.0]]
+# Joint, class, coefficient: viscous friction grows with the class, dry friction falls.
+TRUTH = [
+    [[1e-3, 4.5e-3], [2e-3, 3.5e-3], [4e-3, 2e-3]],
+    [[8e-4, 2.2e-3], [1.5e-3, 1.5e-3], [2.5e-3, 1e-3]],
+]
+
+
+def true_model():
+    model = ALFM(2, TRUTH, v_smooth=V_SMOOTH, sample_time=2e-3)
+    model.schedule.set_classes(THRESHOLDS)
+    return model.requires_grad_(False)
+
+
+@pytest.fixture(scope="module")
+def case():
+    """Training and held-out swings, their motions and the constant fit."""
+    plant = pendulum()
+    train = [swing(plant, true_model(), seconds=6.0, start=start, name=name)
+             for name, start in (("a", (2.6, 0.2)), ("b", (0.9, -0.5)))]  # fmt: skip
+    held = swing(plant, true_model(), seconds=6.0, start=(1.2, 0.6), name="c")
+    motions = [kalman_smoother(r.time, r.q) for r in train]
+    constant = fit(LFM(2, v_smooth=V_SMOOTH), plant, train, fit_plant=False, windows=(1.0,),
+                   motions=motions)  # fmt: skip
+    return plant, train, held, motions, constant
+
+
+def fitted(case, model=None, **settings):
+    plant, train, _, motions, constant = case
+    return fit_adaptive(
+        model or ALFM(2, v_smooth=V_SMOOTH), plant, train, fit_plant=False, windows=(1.0,),
+        start=constant, motions=motions, **settings,
+    )  # fmt: skip
+
+
+def classes_of(model, case):
+    plant, train, _, motions, _ = case
+    return find_classes(model.schedule, train, motions, plant.joint_names, thresholds=THRESHOLDS)
+
+
+def test_coefficients_by_class_are_recovered(case):
+    plant, _, held, _, constant = case
+    model = ALFM(2, v_smooth=V_SMOOTH)
+    found = fitted(case, model, classes=classes_of(model, case), prior_sd=3.0)
+    # What matters of a class is its friction at the speeds that it has.
+    true, speeds = torch.tensor(TRUTH, dtype=F64), torch.tensor([[2.0, 4.0, 8.0]] * 2, dtype=F64)
+    for factor in (0.7, 1.4):
+        ours, exact = (
+            v[..., 0] * factor * speeds + v[..., 1] for v in (model.schedule.values, true)
+        )
+        torch.testing.assert_close(ours, exact, rtol=0.05, atol=0)
+    assert found.model is model
+    assert found.converged
+    assert found.residual < 0.3 * constant.residual
+    ours, flat = (score(plant, m, held) for m in (model, constant.model))
+    assert max(ours.free_run.joints) < 0.5 * max(flat.free_run.joints)
+    for mine, other in zip(ours.windows["2"].joints, flat.windows["2"].joints, strict=True):
+        assert mine < other
+
+
+def test_an_ordinary_fit_finds_the_classes_itself(case):
+    plant, train, _, motions, constant = case
+    model = ALFM(2, v_smooth=V_SMOOTH)
+    found = fit(model, plant, train, fit_plant=False, windows=(1.0,), start=constant,
+                motions=motions)  # fmt: skip
+    assert found.residual < 0.8 * constant.residual
+    assert not any(p.requires_grad for p in model.parameters())
+    assert model.schedule.sample_time == pytest.approx(2e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["pattern", "sqp"])
+def test_searches_improve_on_the_constant_law_too(case, method):
+    plant, _, held, _, constant = case
+    model = ALFM(2, v_smooth=V_SMOOTH)
+    found = fitted(case, model, method=method, max_evaluations=600, threads=1, seed=1,
+                   classes=classes_of(model, case))  # fmt: skip
+    assert "constant law is kept" not in found.status
+    assert score(plant, model, held).free_run.all < score(plant, constant.model, held).free_run.all
+
+
+def test_without_a_difference_between_classes_the_constant_law_stays(case):
+    """A tight prior holds every class at the constant law; nothing may get worse."""
+    constant = case[-1]
+    model = ALFM(2, v_smooth=V_SMOOTH)
+    found = fitted(case, model, prior_sd=1e-6, max_steps=3)
+    flat = constant.model.schedule.values[:, None].expand(2, 3, 2)
+    torch.testing.assert_close(model.schedule.values, flat, rtol=1e-3, atol=1e-8)
+    assert found.residual <= constant.residual * (1 + 1e-9)
+
+
+def test_coefficients_that_serve_worse_are_not_taken(case, monkeypatch):
+    constant = case[-1]
+    monkeypatch.setattr("nfriction.papers.afem.settling.PositionError.residuals",
+                        lambda self, vector: torch.full((1, 1, 2), 1e9, dtype=F64))  # fmt: skip
+    model = ALFM(2, v_smooth=V_SMOOTH)
+    found = fitted(case, model, max_steps=1)
+    flat = constant.model.schedule.values[:, None].expand(2, 3, 2)
+    torch.testing.assert_close(model.schedule.values, flat, rtol=1e-12, atol=0)
+    assert "constant law is kept" in found.status
+    assert found.residual == constant.residual
+
+
+@pytest.mark.parametrize("substeps", [1, 2])
+def test_gradient_by_class_against_finite_differences(substeps):
+    plant, model = pendulum(), ALFM(2, v_smooth=0.1)
+    one = torch.ones(2, 2, dtype=F64)
+    given = FrictionModel(model.law, Labelled(model, 4e-3 * one, 1e-3 * one), 0.1)
+    terms = plant_parameters(plant, driven=(0, 1), largest_torque=0.1)
+    of = windows()
+    classes = (torch.arange(of.tau.numel()).reshape(of.tau.shape) // 7 % 3).to(F64)
+    p = LabelledProblem(StepJacobian(plant, given, terms), of, 1e-3, ABSOLUTE, substeps=substeps,
+                        classes=classes)  # fmt: skip
+    x = point(p)
+    gradient = p.quadratic(x).gradient
+    for i in range(p.unknowns.shared_count):
+        step = torch.zeros_like(x)
+        step[i] = 1e-6
+        slope = (p.cost(x + step) - p.cost(x - step)) / 2e-6
+        assert float(gradient[i]) == pytest.approx(float(slope), rel=2e-4, abs=1e-2)
+    # Every class of both joints had a say.
+    assert (gradient[: p.unknowns.friction_count].abs() > 1e-6).all()
+
+
+def test_what_does_not_fit_is_refused(case):
+    plant, train, _, motions, constant = case
+    with pytest.raises(ValueError, match="no adaptive model"):
+        fit_adaptive(NFLFM(2), plant, train)
+    with pytest.raises(ValueError, match="not to torques"):
+        fit(ALFM(2), plant, train, method="torque")
+    with pytest.raises(ValueError, match="method"):
+        fitted(case, method="simplex")
+    with pytest.raises(ValueError, match="seed"):
+        fitted(case, seed=1)
+    model = ALFM(2, v_smooth=V_SMOOTH)
+    classes = classes_of(model, case)
+    with pytest.raises(ValueError, match="other recordings"):
+        fit_adaptive(model, plant, train[:1], classes=classes, start=constant, motions=motions[:1])
+    with pytest.raises(ValueError, match="another model"):
+        fitted(case, classes=classes)

@@ -1,0 +1,129 @@
+"""The papers' network as a schedule: what it gives, in rollouts, files and artefacts."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from nfriction import export, load, rigs, rollout, save
+from nfriction.friction.models import NFLFM, NFNLFM
+from nfriction.fuzzy import RBFNetwork
+from nfriction.papers.nffem.rbf_coefficients import RadialBasis
+
+JOINTS = 3
+
+
+def network(seed: int = 0) -> tuple[RBFNetwork, Tensor, Tensor]:
+    """A network with its universes; some of its outputs lie beyond theirs."""
+    random = torch.Generator().manual_seed(seed)
+    made = RBFNetwork(JOINTS, 2, 10, 2).requires_grad_(False)
+    made.init_range(torch.tensor([0.0, -100.0]), torch.tensor([10.0, 100.0]), seed)
+    weight = torch.randn(made.output_weight.shape, generator=random, dtype=torch.float64)
+    made.output_weight.copy_(0.01 * weight)
+    made.output_bias.fill_(0.02)
+    inputs = torch.tensor([[0.0, -100.0], [10.0, 100.0]], dtype=torch.float64)
+    outputs = torch.tensor([[0.01, 0.005], [0.03, 0.04]], dtype=torch.float64)
+    return made, inputs[:, None].expand(2, JOINTS, 2), outputs[:, None].expand(2, JOINTS, 2)
+
+
+def model(acceleration: str = "signed") -> NFLFM:
+    made = NFLFM(JOINTS, network="rbf", acceleration=acceleration).requires_grad_(False)
+    schedule(made).set_network(*network())
+    return made
+
+
+def schedule(of: NFLFM) -> RadialBasis:
+    assert isinstance(of.schedule, RadialBasis)
+    return of.schedule
+
+
+def motions(count: int = 50, seed: int = 0) -> tuple[Tensor, Tensor]:
+    random = torch.Generator().manual_seed(seed)
+    qd, qdd = torch.randn(2, count, JOINTS, generator=random, dtype=torch.float64)
+    return 6.0 * qd, 60.0 * qdd
+
+
+def test_an_untrained_model_is_the_constant_law() -> None:
+    values = torch.tensor([[0.01, 0.02, 0.03, 0.04, 1.0]] * 2, dtype=torch.float64)
+    made = NFNLFM(2, values, network="rbf")
+    qd = torch.linspace(-5, 5, 20, dtype=torch.float64).reshape(10, 2)
+    torch.testing.assert_close(made.coefficients(qd, 10 * qd), values.expand(10, 2, 5))
+
+
+def test_coefficients_are_the_network_clamped_to_its_universe() -> None:
+    made, (own, _, outputs) = model(), network()
+    qd, qdd = motions()
+    inside = torch.stack([qd.abs().clamp(max=10.0), qdd.clamp(-100.0, 100.0)], -1)
+    expected = own(inside).clamp(outputs[0], outputs[1])
+    torch.testing.assert_close(made.coefficients(qd, qdd), expected)
+    assert not torch.equal(own(inside), expected)  # the clamp was put to the test
+
+
+def test_acceleration_along_the_motion_makes_both_ways_of_turning_alike() -> None:
+    made = model("along_motion")
+    qd, qdd = motions()
+    torch.testing.assert_close(made.coefficients(-qd, -qdd), made.coefficients(qd, qdd))
+    signed = model()
+    assert not torch.allclose(signed.coefficients(-qd, -qdd), signed.coefficients(qd, qdd))
+
+
+def test_compiled_rollouts_equal_eager_ones() -> None:
+    plant, made = rigs.tlrip(), model()
+    q0 = torch.tensor([1.0, 0.2, 0.3], dtype=torch.float64)
+    runs = [
+        rollout(plant, made, q0, 0 * q0, sample_time=1e-3, steps=200, backend=backend).q
+        for backend in ("auto", "torch")
+    ]
+    # Sums taken in another order, over 200 steps.
+    torch.testing.assert_close(*runs, rtol=0, atol=1e-12)
+
+
+def test_files_and_torchscript_keep_the_model(tmp_path: Path) -> None:
+    made = model("along_motion")
+    again = load(save(made, tmp_path / "model.json"))
+    for a, b in zip(made.state_dict().values(), again.state_dict().values(), strict=True):
+        assert torch.equal(a, b)
+    # Compares the artefact with the model before it takes its place.
+    assert export.torchscript(again, tmp_path / "model.pt").exists()
+
+
+@pytest.mark.parametrize("acceleration", ["signed", "along_motion"])
+def test_sensitivities_are_the_derivatives(acceleration: str) -> None:
+    made = schedule(model(acceleration))
+    qd, qdd = motions(8)
+    found = made.sensitivities(qd, qdd)
+    own = made.parameter_vector()
+    by_vector = torch.zeros(len(qd), JOINTS, 2, len(own), dtype=torch.float64)
+    for p in range(len(own)):
+        step = torch.zeros_like(own)
+        step[p] = 1e-6
+        ends = []
+        for vector in (own + step, own - step):
+            made.set_parameter_vector(vector)
+            ends.append(made(qd, qdd))
+        by_vector[..., p] = (ends[0] - ends[1]) / 2e-6
+    made.set_parameter_vector(own)
+    acts = torch.nn.functional.one_hot(found.joint, JOINTS).T.to(own)
+    expected = found.parameters[:, None] * acts[None, :, None]
+    # Central differences of a step of 1e-6 keep some nine digits.
+    torch.testing.assert_close(by_vector, expected, rtol=1e-6, atol=1e-8)
+    h = 1e-6
+    for slope, (a, b) in ((found.qd, (h, 0.0)), (found.qdd, (0.0, h))):
+        numeric = (made(qd + a, qdd + b) - made(qd - a, qdd - b)) / (2 * h)
+        torch.testing.assert_close(numeric, slope, rtol=1e-5, atol=1e-9)
+
+
+def test_bad_networks_are_refused() -> None:
+    made = schedule(model())
+    own, inputs, outputs = network()
+    with pytest.raises(ValueError, match="units=10"):
+        made.set_network(RBFNetwork(JOINTS, 2, 5, 2), inputs, outputs)
+    with pytest.raises(ValueError, match="lower <= upper"):
+        made.set_network(own, inputs.flip(0), outputs)
+    with pytest.raises(ValueError, match="positive by physics"):
+        made.set_network(own, inputs, outputs - 0.02)
+    with pytest.raises(ValueError, match="network"):
+        NFLFM(JOINTS, network="other")
+    with pytest.raises(ValueError, match="acceleration"):
+        NFLFM(JOINTS, network="rbf", acceleration="other")

@@ -1,0 +1,129 @@
+"""Stages: their order, and that a run that was killed goes on where it was."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from nfriction.papers.reproduction import tables
+from nfriction.papers.reproduction.running import _ready, reproduce
+from nfriction.papers.reproduction.settings import Settings
+from nfriction.papers.reproduction.stages import Stage, run_stage, stages
+from nfriction.papers.reproduction.workspace import Workspace
+
+TINY = Settings(
+    tlrip_seconds=2.0,
+    rtip_seconds=1.0,
+    windows=(0.5,),
+    max_steps=1,
+    controller_samples=200,
+    search_horizon=0.5,
+    search_evaluations=40,
+    torchscript=False,
+)
+
+
+def test_every_stage_can_be_reached() -> None:
+    every = stages()
+    done: set[str] = set()
+    while len(done) < len(every):
+        waiting = {n: s for n, s in every.items() if n not in done}
+        ready = _ready(waiting, ())
+        assert ready
+        for name in ready:
+            assert set(every[name].needs) <= done
+        done |= set(ready)
+
+
+def test_a_stage_waits_for_what_is_running() -> None:
+    first, second = Stage("a", (), dict), Stage("b", ("a",), dict)
+    assert _ready({"a": first, "b": second}, ()) == ["a"]
+    assert _ready({"b": second}, ["a"]) == []
+    assert _ready({"b": second}, ()) == ["b"]
+
+
+def test_at_least_one_stage_at_a_time(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="jobs"):
+        reproduce(tmp_path, TINY, jobs=0)
+
+
+def test_a_constant_model_is_fitted_judged_and_kept(tmp_path: Path) -> None:
+    workspace = Workspace(tmp_path, TINY)
+    for name in ("twin-tlrip", "NCFM"):
+        run_stage(workspace, name)
+    found = workspace.found("NCFM")
+    assert {s["split"] for s in found["scores"].values()} == {"train", "held_out"}
+    for score in found["scores"].values():
+        # Constant coefficients do not ask what drives them.
+        assert score["measured_drive"] == score["free_run"]
+        assert max(score["free_run"]["joints"]) < 0.5
+    assert workspace.model("NCFM").exists()
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="processes are looked up in /proc")
+def test_workers_end_with_a_killed_caller(tmp_path: Path) -> None:
+    script = tmp_path / "run.py"
+    script.write_text(
+        "import os, signal, sys\n"
+        "from concurrent.futures import ProcessPoolExecutor\n"
+        "from multiprocessing import get_context\n"
+        "from nfriction.papers.reproduction.running import _end_with_the_caller\n"
+        "if __name__ == '__main__':\n"
+        "    pool = ProcessPoolExecutor(\n"
+        "        1, mp_context=get_context('spawn'), initializer=_end_with_the_caller\n"
+        "    )\n"
+        "    print(pool.submit(os.getpid).result(), flush=True)\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    said = tmp_path / "said.txt"
+    with said.open("w") as file:
+        caller = subprocess.Popen([sys.executable, str(script)], stdout=file)
+    assert caller.wait(timeout=120) == -signal.SIGKILL
+    worker = int(said.read_text())
+    try:
+        deadline = time.monotonic() + 60
+        while _runs(worker):
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(worker, signal.SIGKILL)
+
+
+def _runs(process: int) -> bool:
+    try:
+        status = Path(f"/proc/{process}/stat").read_text()
+    except OSError:
+        return False
+    return status.rpartition(")")[2].split()[0] != "Z"
+
+
+@pytest.mark.slow
+def test_a_run_that_is_killed_goes_on_where_it_was(tmp_path: Path) -> None:
+    script = tmp_path / "run.py"
+    script.write_text(
+        "import sys\n"
+        "from nfriction.papers.reproduction import Settings, reproduce\n"
+        f"if __name__ == '__main__':\n    reproduce(sys.argv[1], {TINY!r}, jobs=2)\n"
+    )
+    folder = tmp_path / "out"
+    process = subprocess.Popen([sys.executable, str(script), str(folder)], start_new_session=True)
+    deadline = time.monotonic() + 240
+    while len(list(folder.glob("stages/NLFM.json"))) < 1:
+        assert time.monotonic() < deadline
+        assert process.poll() is None
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    workspace = Workspace(folder, TINY)
+    done = {n: workspace.found(n) for n in stages() if workspace.result(n) is not None}
+    assert 0 < len(done) < len(stages())
+    subprocess.run([sys.executable, str(script), str(folder)], check=True)
+    for name, result in done.items():
+        assert workspace.found(name) == result  # its seconds too: it was not run again
+    assert len(tables.table_10(workspace)) == 13

@@ -1,0 +1,114 @@
+"""Tables from results: their arithmetic, and the order that the papers claim."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from nfriction.papers.reproduction import printed, report, tables
+from nfriction.papers.reproduction.settings import QUICK
+from nfriction.papers.reproduction.stages import LAWS, SECOND_PAPER, stages
+from nfriction.papers.reproduction.workspace import Workspace
+
+EVERY = [name for name in stages() if not name.startswith("twin")]
+
+
+def entry(error: float | None, split: str) -> dict[str, Any]:
+    scales = (1.0, 2.0, 3.0)
+    joints = [None if error is None else error * k for k in scales]
+    of = {"joints": joints, "all": error}
+    driven = {"joints": [None if e is None else 0.5 * e for e in joints], "all": error}
+    return {"split": split, "free_run": of, "measured_drive": driven, "windows": {"1": of}}
+
+
+def workspace(folder: Path, errors: Mapping[str, float | None]) -> Workspace:
+    """Every stage finished, with errors by model (1 by default) on one of two held-out runs."""
+    made = Workspace(folder, QUICK)
+    for name in stages():
+        names = printed.SECOND_COEFFICIENTS.get(name.removeprefix("rtip-"), {})
+        made.finish(
+            name,
+            {
+                "scores": {
+                    "a": entry(9.0, "train"),
+                    "b": entry(errors.get(name, 1.0), "held_out"),
+                    "c": entry(0.0, "held_out"),
+                },
+                "coefficients": {k: [1.0, 2.0, 3.0] for k in names},
+            },
+        )
+    return made
+
+
+def test_an_error_over_recordings_is_their_root_mean_square(tmp_path: Path) -> None:
+    found = tables.rmse(workspace(tmp_path, {"NCFM": 2.0}), ["NCFM"])
+    np.testing.assert_allclose(found.loc["NCFM"], np.array([2.0, 4.0, 6.0]) / np.sqrt(2))
+    train = tables.rmse(workspace(tmp_path, {}), ["NCFM"], split="train")
+    np.testing.assert_allclose(train.loc["NCFM"], [9.0, 18.0, 27.0])
+
+
+def test_what_diverged_is_infinitely_wrong(tmp_path: Path) -> None:
+    made = workspace(tmp_path, {"NFLFM": None})
+    assert np.isinf(tables.rmse(made, ["NFLFM"]).to_numpy()).all()
+    assert not tables.order(made).holds
+
+
+def test_table_10_stands_beside_the_print(tmp_path: Path) -> None:
+    made = workspace(tmp_path, {})
+    table, measured = tables.table_10(made), tables.table_10(made, "measured_drive")
+    assert len(table) == 13
+    for name, row in printed.TABLE_10.items():
+        assert tuple(table["printed"].loc[name]) == row
+    assert table["printed"].loc["LFM"].isna().all()
+    pd.testing.assert_frame_equal(2 * measured["ours"], table["ours"])
+
+
+def test_table_11_is_what_is_saved(tmp_path: Path) -> None:
+    table = tables.table_11(workspace(tmp_path, {"NFLFM": 0.25}))
+    np.testing.assert_allclose(table["ours"].loc["NFLFM against ALFM"], 75.0)
+    np.testing.assert_allclose(table["ours"].loc["ANCFM against NCFM"], 0.0, atol=1e-12)
+    theirs = printed.TABLE_10
+    expected = 100 * (1 - np.array(theirs["NFLFM"]) / np.array(theirs["ALFM"]))
+    np.testing.assert_allclose(table["printed"].loc["NFLFM against ALFM"], expected)
+
+
+def test_the_second_papers_tables(tmp_path: Path) -> None:
+    made = workspace(tmp_path, dict.fromkeys(SECOND_PAPER, 3.0))
+    for law in LAWS:
+        table = tables.second_coefficients(made, law)
+        assert list(table.index) == list(printed.SECOND_COEFFICIENTS[law])
+        assert tuple(table["ours"].iloc[0]) == (1.0, 2.0, 3.0)
+    assert tuple(tables.second_table_4(made)["printed"].loc["LFM"]) == (0.0049, 0.0065, 0.0079)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_the_order_is_broken_only_where_it_is(tmp_path: Path, law: str) -> None:
+    errors = {law: 3.0, f"A{law}": 2.0, f"NF{law}": 1.0}
+    nine = {name: errors.get(name, 2.5) for name in tables.NINE}
+    found = tables.order(workspace(tmp_path, nine))
+    assert found.holds
+    assert set(found.best.values()) == {f"NF{law}"}
+    tied = tables.order(workspace(tmp_path, nine | {f"A{law}": 1.0}))
+    assert tied.holds
+    assert set(tied.best.values()) == {f"A{law} = NF{law}"}
+    worse = tables.order(workspace(tmp_path, nine | {f"A{law}": 4.0}))
+    assert len(worse.broken) == 3  # on every joint
+    assert all(f"A{law}" in text for text in worse.broken)
+
+
+def test_everything_is_written_and_said(tmp_path: Path) -> None:
+    made = workspace(tmp_path, {"NFNLFM": 0.5, "LFM": None})
+    written = report.write_tables(made, command="a command")
+    assert all(path.stat().st_size for path in written)
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert set(results["stages"]) == set(stages())
+    long = pd.read_csv(tmp_path / "rmse.csv")
+    # Models, recordings, kinds of error (two drives and one window), joints and all of them.
+    assert len(long) == len(EVERY) * 3 * 3 * 4
+    said = report.text(made)
+    for name in (*tables.NINE, "Table 11", "Table IV", "on every joint: "):
+        assert name in said

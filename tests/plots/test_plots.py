@@ -1,0 +1,355 @@
+"""Figures show the very numbers given, with units, and no text that overlaps or is cut off."""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
+
+from nfriction import plots
+from nfriction.evaluation.compare import NO_FRICTION, Comparison
+from nfriction.evaluation.score import RMSE, Score
+from nfriction.fitting.fit import fit
+from nfriction.friction.models import LFM, MODELS, NCFM, NFLFM, NFNCFM, NFNLFM, NLFM
+from nfriction.optim.least_squares import Step
+from nfriction.papers.controller.mamdani import paper_controller
+from nfriction.plant import LinearAxis, rigs
+from nfriction.plots import style
+from nfriction.recording import Recording
+from nfriction.signals import Motion
+
+NAMES = (NO_FRICTION, "NCFM", "LFM", "NFLFM")
+
+
+def swing(joints: int, unit: str = "rad", name: str = "swing") -> Recording:
+    time = np.linspace(0.0, 2.0, 101)
+    q = 0.3 * np.stack([np.cos((3 + j) * time) for j in range(joints)], -1)
+    return Recording(time, q, unit=unit, name=name)
+
+
+def score_of(
+    recording: Recording, error: float, *, lost: bool = False, floor: bool = True
+) -> Score:
+    """A score whose free run is off by a growing error; a lost one ends in NaN at 1 s."""
+    simulated = recording.q + error * np.linspace(0.0, 1.0, len(recording))[:, None]
+    if lost:
+        simulated[50:] = np.nan
+    free_run = RMSE.of(simulated - recording.q)
+    windows = {h: RMSE.of(s * (simulated - recording.q)) for h, s in (("1", 0.5), ("2", 0.8))}
+    floors = RMSE.of(np.full((2, recording.joints), 1e-3)) if floor else None
+    end = 1.0 if lost else np.inf
+    return Score(recording.name, free_run, windows, floors, recording.time, simulated, end)
+
+
+def scores_of(
+    recording: Recording, *, lost: Sequence[str] = (), floor: bool = True
+) -> dict[str, Score]:
+    return {
+        name: score_of(recording, 0.1 * 4.0**-k, lost=name in lost, floor=floor)
+        for k, name in enumerate(NAMES)
+    }
+
+
+def comparison_of(recording: Recording, *, held_out: bool = True, **options) -> Comparison:
+    scores = {name: [s] for name, s in scores_of(recording, **options).items()}
+    sides = ({}, scores) if held_out else (scores, {})
+    return Comparison({}, *sides, unit=recording.unit, joint_names=recording.names)
+
+
+def assert_tidy(figure: Figure) -> None:
+    """No axis with its labels, title or legend runs into another's, or over the edge."""
+    figure.draw_without_rendering()
+    boxes = [(ax, box) for ax in figure.axes if ax.get_visible() for box in parts(ax)]
+    boxes += [(text, text.get_window_extent()) for text in (*figure.texts, *figure.legends)]
+    # A pixel of slack; parts of one panel may touch.
+    boxes = [(owner, box.padded(-1.0)) for owner, box in boxes]
+    for _, box in boxes:
+        assert box.x0 >= 0
+        assert box.x1 <= figure.bbox.x1
+        assert box.y0 >= 0
+        assert box.y1 <= figure.bbox.y1
+    pairs = itertools.combinations(boxes, 2)
+    assert not any(a.overlaps(b) for (one, a), (other, b) in pairs if one is not other)
+
+
+def parts(ax: Axes) -> list[Bbox]:
+    found = [axis.get_tightbbox() for axis in (ax.xaxis, ax.yaxis)]
+    found += [text.get_window_extent() for text in (ax.title, *ax.texts) if text.get_text()]
+    return [ax.get_window_extent(), *(box for box in found if box is not None)]
+
+
+def texts(ax: Axes) -> list[str]:
+    return [t.get_text() for t in ax.texts]
+
+
+@pytest.mark.parametrize(
+    ("joints", "unit", "lost"), [(1, "rad", ()), (4, "rad", ("NCFM",)), (1, "m", NAMES)]
+)
+def test_positions_show_the_measurement_the_simulations_and_their_difference(joints, unit, lost):
+    recording = swing(joints, unit)
+    scores = scores_of(recording, lost=lost)
+    figure = plots.positions(recording, scores)
+    assert len(figure.axes) == 2 * joints
+    for j, (above, below) in enumerate(zip(figure.axes[::2], figure.axes[1::2], strict=True)):
+        assert above.get_ylabel() == f"joint{j + 1} [{unit}]"
+        factor = {f"error [{unit}]": 1.0, f"error [m{unit}]": 1e3}[below.get_ylabel()]
+        measured, *simulated = (line.get_ydata() for line in above.lines)
+        np.testing.assert_array_equal(measured, recording.q[:, j])
+        for shown, error, score in zip(simulated, below.lines, scores.values(), strict=True):
+            np.testing.assert_array_equal(shown, score.simulated[:, j])
+            expected = score.simulated[:, j] - recording.q[:, j]
+            np.testing.assert_allclose(error.get_ydata() / factor, expected, rtol=1e-12)
+    labels = [t.get_text() for t in figure.legends[0].get_texts()]
+    assert sum("diverged at 1 s" in label for label in labels) == len(lost)
+    assert_tidy(figure)
+
+
+def test_an_error_that_diverged_does_not_set_the_scale():
+    recording = swing(1)
+    scores = scores_of(recording) | {"LFM": score_of(recording, 1e9, lost=True)}
+    assert max(plots.positions(recording, scores).axes[1].get_ylim()) < 200  # mrad
+
+
+def test_positions_of_another_recording_are_refused():
+    with pytest.raises(ValueError, match="this very recording"):
+        plots.positions(swing(2), scores_of(swing(1)))
+    with pytest.raises(ValueError, match="empty"):
+        plots.positions(swing(1), {})
+
+
+@pytest.mark.parametrize("unit", ["rad", "m"])
+@pytest.mark.parametrize("spread", [2.0, 100.0])
+def test_bars_are_as_high_as_the_errors(unit, spread):
+    table = pd.DataFrame(
+        [[1e-3, 2e-3], [1e-3 * spread, np.inf]], index=["LFM", "NCFM"], columns=["joint1", "all"]
+    )
+    figure = plots.rmse_bars(table, unit)
+    ax = figure.axes[0]
+    assert ax.get_ylabel() == f"position RMSE [m{unit}]"
+    assert ax.get_yscale() == ("log" if spread > style.LOG_FROM else "linear")
+    tops = [[p.get_y() + p.get_height() for p in bars] for bars in ax.containers]
+    expected = np.minimum(1e3 * table.to_numpy(), ax.get_ylim()[1])
+    np.testing.assert_allclose(tops, expected, rtol=1e-12)
+    assert texts(ax).count("diverged") == 1
+    assert_tidy(figure)
+
+
+def test_bars_hold_every_model_of_four_joints_and_runs_that_all_diverged():
+    columns = ["arm", "joint2", "joint3", "joint4", "all"]
+    many = pd.DataFrame(0.02, index=[NO_FRICTION, *MODELS], columns=columns)
+    assert_tidy(plots.rmse_bars(many, "rad"))
+    ax = plots.rmse_bars(many * np.inf, "rad").axes[0]
+    assert texts(ax).count("diverged") == many.size
+    with pytest.raises(ValueError, match="empty"):
+        plots.rmse_bars(many.iloc[:0], "rad")
+
+
+@pytest.mark.parametrize("held_out", [True, False])
+@pytest.mark.parametrize("unit", ["rad", "m"])
+def test_horizon_curve_is_the_table_of_each_horizon_over_a_floor(held_out, unit):
+    comparison = comparison_of(swing(2, unit), held_out=held_out)
+    figure = plots.horizon_curve(comparison)
+    ax = figure.axes[0]
+    assert [t.get_text() for t in ax.get_xticklabels()] == ["1 s", "2 s", "free run"]
+    assert ax.get_ylabel() == f"position RMSE [m{unit}]"
+    for k, horizon in enumerate(("1", "2", None)):
+        expected = 1e3 * comparison.table(horizon, held_out=held_out)["all"]
+        shown = [line.get_ydata()[k] for line in ax.lines]
+        np.testing.assert_allclose(shown, expected, rtol=1e-12)
+    (band,) = ax.collections
+    np.testing.assert_allclose(band.get_paths()[0].vertices[:, 1].max(), 1.0)  # 1e-3 rad in mrad
+    assert_tidy(figure)
+
+
+def test_horizon_curve_names_what_diverged_and_draws_no_floor_where_none_is_known():
+    figure = plots.horizon_curve(comparison_of(swing(1), lost=("NCFM",), floor=False))
+    ax = figure.axes[0]
+    assert set(texts(ax)) == {"diverged"}
+    assert not ax.collections
+    assert_tidy(figure)
+
+
+def axis_data(law: NCFM | LFM | NLFM, mass: float = 2.0) -> tuple[LinearAxis, Recording, Motion]:
+    """A carriage whose force is that of its motion and of a friction law, exactly."""
+    time = np.linspace(0.0, 3.0, 1501)
+    sine, cosine = (f(4 * time)[:, None] for f in (np.sin, np.cos))
+    q, qd, qdd = 0.2 * sine, 0.8 * cosine, -3.2 * sine
+    velocity = torch.as_tensor(qd)
+    with torch.no_grad():
+        friction = law(velocity, torch.zeros_like(velocity), torch.ones_like(velocity)).numpy()
+    recording = Recording(time, q, tau=mass * qdd + friction, unit="m", name="push/1 µ")
+    return LinearAxis(mass), recording, Motion(time, q, qd, qdd)
+
+
+def test_torque_of_the_motion_lies_on_the_law_that_made_it():
+    law = LFM(1, [3.0, 5.0])
+    plant, recording, motion = axis_data(law)
+    figure = plots.torque_over_velocity(plant, {"LFM": law}, [recording], [motion])
+    (ax,) = figure.axes
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("joint velocity [m/s]", "friction force [N]")
+    dots, line, medians = ax.lines
+    velocity = torch.as_tensor(line.get_xdata())[:, None]
+    expected = law(velocity, 0 * velocity, torch.ones_like(velocity)).detach()[:, 0]
+    np.testing.assert_allclose(line.get_ydata(), expected, rtol=1e-12)
+    for shown in (dots, medians):
+        x, y = shown.get_data()
+        clear = np.abs(x) > 0.05  # away from the sign's passage, inside which a line has corners
+        np.testing.assert_allclose(y[clear], np.interp(x, *line.get_data())[clear], rtol=1e-3)
+    assert_tidy(figure)
+
+
+def test_every_joint_has_its_panel_of_torques():
+    plant = rigs.multiarm_triple()
+    recording = swing(3)
+    models = {"NCFM": NCFM(3), "NFLFM": NFLFM(3)}
+    figure = plots.torque_over_velocity(plant, models, [recording])
+    assert [ax.get_title() for ax in figure.axes] == list(plant.joint_names)
+    assert all(ax.get_ylabel().startswith("friction torque [") for ax in figure.axes)
+    assert_tidy(figure)
+
+
+@pytest.mark.parametrize(("joints", "unit"), [(1, "m"), (4, "rad")])
+def test_coefficient_maps_show_the_schedule_where_there_are_data(joints, unit):
+    model = NFLFM(joints)
+    start = model.schedule.parameter_vector()
+    noise = torch.randn(len(start), generator=torch.Generator().manual_seed(1), dtype=start.dtype)
+    model.schedule.set_parameter_vector(start + 0.1 * noise)
+    slow = np.linspace(0.0, 3.0, 400)[:, None].repeat(joints, 1)
+    motion = Motion(slow[:, 0], slow, -slow, 0 * slow)
+    figure = plots.coefficient_surfaces(model, [motion], unit=unit)
+    maps = [ax for ax in figure.axes if ax.get_label() != "<colorbar>"]
+    bars = [ax for ax in figure.axes if ax.get_label() == "<colorbar>"]
+    assert len(maps) == 2 * joints
+    assert figure.get_supylabel() == f"acceleration along motion [{unit}/s²]"
+    torque = "N m" if unit == "rad" else "N"
+    assert bars[-1].get_ylabel() == f"$C$ [m{torque}]"
+    for k, j in itertools.product(range(2), range(joints)):
+        mesh = maps[j * 2 + k if joints > 2 else k].collections[0]
+        grid = mesh.get_coordinates()
+        qd, qdd = (torch.as_tensor(0.5 * (grid[1:, 1:, i] + grid[:-1, :-1, i])) for i in range(2))
+        expected = model.schedule(
+            qd[..., None].expand(-1, -1, joints), qdd[..., None].expand(-1, -1, joints)
+        )[..., j, k].detach()
+        shown = mesh.get_array()
+        seen = ~np.ma.getmaskarray(shown)
+        np.testing.assert_allclose(shown[seen], 1e3 * expected.numpy()[seen], rtol=1e-9)
+        assert seen[qd < 3.0].any()
+        assert not seen[(qd > 5.0) | (qdd.abs() > 30.0)].any()  # no data within a twentieth
+    assert_tidy(figure)
+
+
+def test_map_of_a_constant_coefficient_is_tidy():
+    assert_tidy(plots.coefficient_surfaces(NFNCFM(1)))
+
+
+@pytest.mark.slow
+def test_maps_of_five_coefficients_of_four_joints_are_tidy():
+    assert_tidy(plots.coefficient_surfaces(NFNLFM(4)))
+
+
+@pytest.mark.parametrize("joints", [1, 4])
+def test_memberships_are_gaussians_in_si(joints):
+    before, after = NFNCFM(joints), NFNCFM(joints)
+    after.schedule.set_range(torch.full((joints,), 8.0), torch.tensor([-50.0, 90.0]))
+    figure = plots.memberships(after, before)
+    centres, widths = (x.detach().numpy() for x in after.schedule.network.anfis.sets())
+    for j, i in itertools.product(range(joints), range(2)):
+        ax = figure.axes[2 * j + i]
+        low, span = ((0.0, 8.0), (-50.0, 140.0))[i]
+        assert len(ax.lines) == 10
+        for term, line in enumerate(ax.lines[5:], 5 * i):
+            x, y = line.get_data()
+            middle, sigma = low + span * centres[j, term], span * widths[j, term]
+            np.testing.assert_allclose(y, np.exp(-0.5 * ((x - middle) / sigma) ** 2), atol=1e-9)
+    labels = [ax.get_xlabel() for ax in figure.axes[-2:]]
+    assert labels == ["|velocity| [rad/s]", "acceleration along motion [rad/s²]"]
+    assert_tidy(figure)
+
+
+def test_only_neuro_fuzzy_models_have_sets_and_maps():
+    for draw in (plots.memberships, plots.coefficient_surfaces):
+        with pytest.raises(ValueError, match="LFM with a Constant schedule"):
+            draw(LFM(2))
+        with pytest.raises(ValueError, match="joint_names"):
+            draw(NFLFM(2), joint_names=["one"])
+    with pytest.raises(ValueError, match="before"):
+        plots.memberships(NFLFM(2), NFLFM(2, terms=(3, 5)))
+
+
+def test_convergence_takes_numbers_and_steps():
+    costs = [1e4, 1e2, 1.0]
+    steps = [Step(cost, 1e-3, 0.0) for cost in costs]
+    figure = plots.convergence({"0.5 s windows": costs, "2 s windows": steps})
+    for line in figure.axes[0].lines:
+        np.testing.assert_array_equal(line.get_ydata(), costs)
+    assert figure.axes[0].get_yscale() == "log"
+    assert_tidy(figure)
+    evidence = plots.convergence([-3.0, -2.0], quantity="log evidence [nat]").axes[0]
+    assert (evidence.get_yscale(), evidence.get_ylabel()) == ("linear", "log evidence [nat]")
+    with pytest.raises(ValueError, match="no finite value"):
+        plots.convergence([])
+
+
+def test_controller_map_is_the_controller_in_si():
+    controller = paper_controller(2)
+    figure = plots.controller_surface(controller, points=9)
+    maps = [ax for ax in figure.axes if ax.get_label() != "<colorbar>"]
+    assert maps[0].get_xlabel() == "velocity [rad/s]"
+    for k, ax in enumerate(maps):
+        mesh = ax.collections[0]
+        qd, qdd = (torch.as_tensor(x) for x in np.moveaxis(mesh.get_coordinates(), -1, 0))
+        expected = 1e3 * controller(qd, qdd)[..., k].numpy()
+        np.testing.assert_allclose(mesh.get_array(), expected, rtol=1e-9)
+    assert_tidy(figure)
+
+
+@given(st.floats(1e-6, 1e6), st.sampled_from(["rad", "m", "N m s/rad"]))
+def test_a_prefix_says_the_factor(size, unit):
+    factor, label = style.scaled(unit, [size, np.inf, np.nan])
+    assert label.removesuffix(unit) == {1.0: "", 1e3: "m", 1e6: "µ"}[factor]
+    assert factor == 1.0 or 0.2 <= factor * size <= 200.0 * (1 + 1e-12) or size < 2e-4
+
+
+def rc_params() -> dict:
+    # Reading the backend would itself choose one.
+    return {key: mpl.rcParams[key] for key in mpl.rcParams if key != "backend"}
+
+
+def test_save_all_writes_every_figure_and_leaves_matplotlib_alone(tmp_path):
+    plant, recording, motion = axis_data(NCFM(1, [3.0]))
+    held_out = swing(1, "m", name="held")
+    found = fit(NCFM(1), plant, recording, method="torque", motions=[motion])
+    fits = {"NCFM": found, "NFNCFM": replace(found, model=NFNCFM(1))}
+    train, held = (
+        {n: [score_of(r, 0.01)] for n in (NO_FRICTION, *fits)} for r in (recording, held_out)
+    )
+    before = rc_params()
+    comparison = Comparison(fits, train, held, "m", plant.joint_names)
+    files = plots.save_all(comparison, [recording, held_out], tmp_path / "figures")
+    expected = {
+        "rmse_train", "horizons_train", "positions_train_push_1_µ", "rmse_held_out",
+        "horizons_held_out", "positions_held_out_held", "torque_over_velocity",
+        "over_time_viscous", "coefficients_NFNCFM", "sections_NFNCFM", "memberships_NFNCFM",
+    }  # fmt: skip
+    assert {f.name for f in files} == {f"{n}{of}.png" for n in expected for of in ("", ".dark")}
+    assert all(f.read_bytes().startswith(b"\x89PNG") for f in files)
+    assert rc_params() == before
+    only_train = plots.save_all(replace(comparison, fits={}, held_out={}), [], tmp_path)
+    assert not any("held_out" in f.name or "positions" in f.name for f in only_train)
+    with pytest.raises(ValueError, match="not in the comparison"):
+        plots.save_all(comparison, [swing(1, "m", name="other")], tmp_path)
+
+
+def test_all_models_are_told_apart_by_marker_and_by_dashes():
+    looks = [style.looks(MODELS)[name] for name in MODELS]
+    assert len({(look.line["color"], look.marker["marker"]) for look in looks}) == len(MODELS)
+    assert len({(look.line["color"], str(look.line["linestyle"])) for look in looks}) == len(MODELS)

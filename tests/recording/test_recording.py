@@ -1,0 +1,619 @@
+"""Recordings: round trips through every format, windows, validation, the real files."""
+
+import gzip
+import io
+import sys
+import warnings
+import zipfile
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from nfriction.recording import Recording, RecordingWarning, read_initial_states
+from nfriction.recording.angles import AngleConvention
+
+ENDINGS = [".csv", ".csv.gz", ".parquet", ".npz"]
+
+
+@dataclass
+class Rig:
+    """As much of a plant as a recording asks for."""
+
+    convention: tuple[str, str]
+    first_link: int
+    unit: str = "rad"
+
+
+def swing(n: int = 60, joints: int = 2, **settings: object) -> Recording:
+    """A recording whose numbers have all their digits."""
+    rng = np.random.default_rng(0)
+    time = np.cumsum(rng.uniform(0.8e-3, 1.2e-3, n))
+    q, qd, tau = rng.normal(size=(3, n, joints)).cumsum(axis=1) / 300
+    return Recording(time, q, tau=tau, qd=qd, **settings)  # type: ignore[arg-type]
+
+
+# --- files -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize("joints", [1, 3, 11])
+def test_what_is_written_reads_back_equal(tmp_path: Path, ending: str, joints: int) -> None:
+    recording = swing(
+        joints=joints,
+        convention=AngleConvention("absolute", "hanging"),
+        names=tuple(f"link {k}" for k in range(joints)),
+    )
+    recording.write(tmp_path / f"run{ending}")
+    back = Recording.read(tmp_path / f"run{ending}")
+    assert back.digest() == recording.digest()
+    assert back.name == "run"
+    assert [path.name for path in tmp_path.iterdir()] == [f"run{ending}"]
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_optional_columns_and_unit_survive(tmp_path: Path, ending: str) -> None:
+    full = swing()
+    axis = Recording(full.time, full.q, tau=full.tau, unit="m")
+    axis.write(tmp_path / f"axis{ending}")
+    back = Recording.read(tmp_path / f"axis{ending}")
+    assert back.qd is None
+    assert back.unit == "m"
+    assert back.digest() == axis.digest()
+
+
+def test_pandas_round_trip() -> None:
+    recording = swing(convention=AngleConvention("absolute"))
+    assert Recording.from_pandas(recording.to_pandas()).digest() == recording.digest()
+
+
+def test_arguments_override_the_file(tmp_path: Path) -> None:
+    swing(convention=AngleConvention("absolute", "hanging")).write(tmp_path / "run.csv")
+    back = Recording.read(tmp_path / "run.csv", convention="relative,upright", unit="m", name="a")
+    assert (back.convention, back.unit, back.name) == (AngleConvention(), "m", "a")
+
+
+def test_degrees_are_converted_at_the_border() -> None:
+    recording = swing()
+    table = recording.to_pandas()
+    for column in ("q1", "q2", "qd1", "qd2"):
+        table[column] = np.rad2deg(table[column])
+    back = Recording.from_pandas(table, degrees=True)
+    # Two roundings, to degrees and back.
+    np.testing.assert_allclose(back.q, recording.q, rtol=1e-15)
+    assert back.qd is not None
+    np.testing.assert_allclose(back.qd, recording.qd, rtol=1e-15)
+    assert np.array_equal(back.tau, recording.tau)
+    with pytest.raises(ValueError, match="`degrees=True` needs angles"):
+        Recording.from_pandas(table, degrees=True, unit="m")
+
+
+def test_columns_map_names_and_swap_and_shift() -> None:
+    recording = swing()
+    table = recording.to_pandas().rename(columns={"time": "t", "q1": "enc_1"})
+    back = Recording.from_pandas(table, columns={"time": "t", "q1": "enc_1"})
+    assert back.digest() == recording.digest()
+    swapped = Recording.from_pandas(recording.to_pandas(), columns={"q1": "q2", "q2": "q1"})
+    assert np.array_equal(swapped.q, recording.q[:, ::-1])
+    shifted = recording.to_pandas().rename(columns={"q1": "q2", "q2": "q3"})
+    renumbered = Recording.from_pandas(shifted, columns={"q1": "q2", "q2": "q3"})
+    assert np.array_equal(renumbered.q, recording.q)
+
+
+def test_extra_columns_are_ignored_and_a_partial_velocity_left_out() -> None:
+    recording = swing()
+    table = recording.to_pandas().drop(columns=["qd1"])
+    table["remark"] = "fine"
+    with pytest.warns(RecordingWarning, match="column qd1 is missing, so no measured velocity"):
+        back = Recording.from_pandas(table)
+    assert back.qd is None
+    assert np.array_equal(back.q, recording.q)
+    assert np.array_equal(back.tau, recording.tau)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("columns", [{}, {"tau2": "tau2"}])
+def test_a_joint_without_torque_beside_a_driven_one_is_undriven_and_said(
+    tmp_path: Path, columns: dict[str, str]
+) -> None:
+    """As of an acrobot, whose one motor is between its links."""
+    recording = swing()
+    table = recording.to_pandas().drop(columns=["tau1"])
+    said = r"'run': column tau1 is missing, so nothing .*columns=\{\"tau1\": \"\.\.\.\"\}"
+    with pytest.warns(RecordingWarning, match=said):
+        back = Recording.from_pandas(table, columns=columns, name="run")
+    table.to_csv(tmp_path / "run.csv", index=False)
+    with pytest.warns(RecordingWarning, match=said):
+        read = Recording.read(tmp_path / "run.csv", columns=columns)
+    assert recording.tau is not None
+    for found in (back, read):
+        assert found.tau is not None
+        assert not found.tau[:, 0].any()
+        assert np.array_equal(found.tau[:, 1], recording.tau[:, 1])
+
+
+@pytest.mark.parametrize(
+    ("name", "joints", "own"),
+    [
+        ("tau", 1, "tau1"), ("tau", 2, "tau1"), ("Tau1", 1, "tau1"), ("tau_2", 2, "tau2"),
+        ("torque1", 2, "tau1"), ("motorTorque2 [Nm]", 2, "tau2"), ("tau0", 1, "tau1"),
+    ],
+)  # fmt: skip
+def test_a_column_that_looks_like_torque_is_not_left_out_without_a_word(
+    name: str, joints: int, own: str
+) -> None:
+    table = swing(joints=joints).to_pandas().filter(regex="time|q")
+    table[name] = 1.0
+    with pytest.warns(RecordingWarning, match="looks like torque and is not read") as said:
+        assert Recording.from_pandas(table).tau is None
+    assert len(said) == 1
+    assert f'columns={{"{own}": "{name}"}}' in str(said[0].message)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # Who has named all torques knows what else there is.
+        Recording.from_pandas(table, columns={f"tau{k + 1}": name for k in range(joints)})
+        Recording.from_pandas(table.rename(columns={name: "torque_on"}))
+
+
+def test_named_columns_must_be_there_and_of_joints_that_are() -> None:
+    table = swing().to_pandas()
+    with pytest.raises(ValueError, match="column motor is missing; found time"):
+        Recording.from_pandas(table, columns={"tau1": "motor"})
+    with pytest.raises(ValueError, match="names tau3, but the last position is q2"):
+        Recording.from_pandas(table, columns={"tau3": "tau1"})
+
+
+def test_foreign_csv_with_blanks_and_byte_order_mark(tmp_path: Path) -> None:
+    rows = "".join(f"{k / 1000}, {k / 7!r}\r\n" for k in range(20))
+    (tmp_path / "a.csv").write_bytes(("\ufefftime, q1\r\n" + rows).encode())
+    back = Recording.read(tmp_path / "a.csv")
+    assert np.array_equal(back.q[:, 0], np.arange(20) / 7)
+
+
+def test_compressed_files_do_not_depend_on_the_moment(tmp_path: Path) -> None:
+    swing().write(tmp_path / "a.csv.gz")
+    swing().write(tmp_path / "b.csv.gz")
+    assert (tmp_path / "a.csv.gz").read_bytes() == (tmp_path / "b.csv.gz").read_bytes()
+
+
+def test_a_failed_write_leaves_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "run.csv"
+    swing().write(path)
+    before = path.read_bytes()
+
+    def full(*_: object) -> None:
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr("nfriction.io.formats.files.os.replace", full)
+    with pytest.raises(OSError, match="no space"):
+        swing(n=30).write(path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+# --- broken files ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ending", [".csv.gz", ".parquet", ".npz"])
+@pytest.mark.parametrize("share", [0.02, 0.5, 0.9, 0.99])
+def test_truncated_files_are_named(tmp_path: Path, ending: str, share: float) -> None:
+    path = tmp_path / f"run{ending}"
+    swing(n=500).write(path)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(ValueError, match=rf"run{ending}.*truncated"):
+        Recording.read(path)
+
+
+def test_absent_and_empty_and_unknown_files(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"no recording at .*lost\.csv"):
+        Recording.read(tmp_path / "lost.csv")
+    with pytest.raises(ValueError, match=r"run\.doc.*must end in one of \.csv"):
+        Recording.read(tmp_path / "run.doc")
+    for ending in ENDINGS:
+        (tmp_path / f"empty{ending}").touch()
+        with pytest.raises(ValueError, match="is empty"):
+            Recording.read(tmp_path / f"empty{ending}")
+
+
+def test_pickled_objects_are_never_loaded(tmp_path: Path) -> None:
+    np.savez(tmp_path / "run.npz", time=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(ValueError, match="none of numbers or text"):
+        Recording.read(tmp_path / "run.npz")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("time,q1\n", "at least 8 samples, got 0"),
+        ("t,q1\n0,0\n", "column time is missing; found t, q1.*columns="),
+        ("time,q1,q3\n0,0,0\n", "column q2 is missing"),
+        ("time,angle\n0,0\n", "column q1 is missing; found time, angle"),
+        ("time,q1\n0,0\n1,zero\n", "column q1, row 1 .*got 'zero'"),
+        ("time,q1\n0,0\n1,2,3\n", "ragged"),
+        ("time,q1\n0,0,1\n1,2,3\n", "more cells than its header"),
+        ("# unit: deg\ntime,q1\n" + "0,0\n" * 9, "`unit` must be 'rad' or 'm', got 'deg'"),
+        ("# convention: odd\ntime,q1\n" + "0,0\n" * 9, "angle convention"),
+        ("time,q1,q2\n" + "".join(f"{k},0,0\n" for k in range(9)) + "9,0\n", "`q2` .*sample 9"),
+    ],
+)
+def test_malformed_csv(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "run.csv.gz"
+    path.write_bytes(gzip.compress(text.encode()))
+    with pytest.raises(ValueError, match=message) as caught:
+        Recording.read(path)
+    assert "run.csv.gz" in str(caught.value)
+
+
+def test_parquet_without_pyarrow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    swing().write(tmp_path / "run.parquet")
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(ImportError, match=r"pip install nfriction\[parquet\]"):
+        Recording.read(tmp_path / "run.parquet")
+
+
+def test_an_array_that_claims_more_than_it_has_is_refused(tmp_path: Path) -> None:
+    header = io.BytesIO()
+    claim = {"descr": "<f8", "fortran_order": False, "shape": (10**15,)}
+    np.lib.format.write_array_header_1_0(header, claim)  # type: ignore[arg-type]
+    with zipfile.ZipFile(tmp_path / "run.npz", "w") as archive:
+        archive.writestr("q1.npy", header.getvalue() + bytes(80))
+    with pytest.raises(ValueError, match=r"run\.npz.*80 bytes, which do not fit its shape"):
+        Recording.read(tmp_path / "run.npz")
+
+
+def test_files_go_to_folders_that_are_made(tmp_path: Path) -> None:
+    recording = Recording(np.arange(9.0) / 100, np.zeros((9, 1)))
+    recording.write(tmp_path / "a" / "b" / "run.csv")
+    assert Recording.read(tmp_path / "a" / "b" / "run.csv").digest() == recording.digest()
+
+
+def test_tables_from_elsewhere_may_number_or_repeat_their_columns() -> None:
+    time, q = np.arange(20) / 1000, np.arange(20) / 50
+    numbered = pd.DataFrame({0: time, 1: q})
+    for columns in ({"time": "0", "q1": "1"}, {"time": 0, "q1": 1}):
+        found = Recording.from_pandas(numbered, columns=columns)  # type: ignore[arg-type]
+        assert np.array_equal(found.q[:, 0], q)
+    assert list(numbered.columns) == [0, 1]
+    repeated = pd.DataFrame(np.stack([time, q, q], axis=1), columns=["time", "q1", "q1"])
+    with pytest.raises(ValueError, match="column q1 is there more than once"):
+        Recording.from_pandas(repeated)
+
+
+# --- validation ------------------------------------------------------------------------------
+
+
+def changed(**parts: object) -> Recording:
+    recording = swing()
+    arrays = {key: getattr(recording, key).copy() for key in ("time", "q", "tau", "qd")}
+    return Recording(**(arrays | parts))  # type: ignore[arg-type]
+
+
+def poked(shape: tuple[int, ...], index: tuple[int, ...], value: float) -> np.ndarray:
+    array = np.zeros(shape)
+    array[index] = value
+    return array
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"q": np.zeros(60)}, r"`q` must be \(time, joint\), got shape \(60,\).*q\[:, None\]"),
+        ({"q": [[0.0, 1.0], [2.0]]}, "`q` must be a rectangular array"),
+        ({"q": poked((60, 2), (7, 1), np.nan)}, "`q2` must be finite, got nan at sample 7"),
+        ({"tau": poked((60, 2), (9, 0), np.inf)}, "`tau1` must be finite, got inf at sample 9"),
+        ({"tau": np.zeros((60, 1))}, r"`tau` must be shaped like `q` \(60, 2\)"),
+        ({"qd": np.zeros((59, 2))}, "`qd` must be shaped like"),
+        ({"time": np.arange(59.0)}, "as many samples"),
+        ({"time": poked((60,), (0,), np.nan)}, "`time` must be finite"),
+        ({"time": np.repeat(np.arange(30.0), 2)}, r"`time` must increase.*sample 1 \(30 such"),
+        ({"time": -np.arange(60.0)}, "`time` must increase"),
+        ({"time": poked((60,), (1,), 0.5)}, r"got 0\.5 then 0\.0 s at sample 2 .*sort the rows"),
+        (
+            {"time": 1.7e9 + np.repeat(np.arange(30.0), 2)},
+            r"got 1700000000\.0 then 1700000000\.0 s .*with more digits, or count from",
+        ),
+        ({"names": ("a",)}, "`names` must name each of 2 joints once"),
+        ({"names": ("a", "a")}, "once"),
+        ({"names": ("a", "b,c")}, "free of commas"),
+        ({"unit": "deg"}, "`unit` must be 'rad' or 'm'"),
+    ],
+)
+def test_bad_arrays_are_refused(parts: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        changed(**parts)
+
+
+def test_too_few_samples() -> None:
+    assert len(swing()[:8]) == 8
+    with pytest.raises(ValueError, match="at least 8 samples, got 7"):
+        swing()[:7]
+
+
+def test_tensors_are_taken_without_a_word() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        recording = Recording(torch.arange(20) / 100, torch.ones(20, 1))  # type: ignore[arg-type]
+    assert recording.q.dtype == np.float64
+
+
+def test_arrays_are_copies_and_read_only() -> None:
+    q = np.zeros((60, 2))
+    recording = changed(q=q)
+    q[0] = 1
+    assert recording.q[0, 0] == 0
+    with pytest.raises(ValueError, match="read-only"):
+        recording.q[0] = 1
+
+
+def test_milliseconds_are_noticed() -> None:
+    recording = swing()
+    with pytest.warns(RecordingWarning, match="milliseconds"):
+        Recording(recording.time * 1e3, recording.q)
+
+
+def test_gaps_are_noticed_and_jitter_is_not() -> None:
+    time = np.arange(100) / 100
+    jitter = np.random.default_rng(0).uniform(-4e-3, 4e-3, 100)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Recording(time + jitter, np.zeros((100, 1)))
+    with pytest.warns(RecordingWarning, match=r"'a': `time` has gaps \(2\), .* 2\.01 s at 1\.39 s"):
+        Recording(time + 1.0 * (time >= 0.2) + 2.0 * (time >= 0.4), np.zeros((100, 1)), name="a")
+
+
+def test_a_mask_leaves_samples_out_and_what_was_told_is_not_told_again() -> None:
+    time = np.arange(100) / 100
+    columns = {"tau": 2.0 * time[:, None], "qd": 3.0 * time[:, None]}
+    recording = Recording(time, time[:, None], **columns, convention="relative,upright", name="a")
+    keep = (time < 0.3) | (time > 0.6)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        part = recording[keep]
+        again = part[:60].joint_coordinates()
+    assert part.name == "a"
+    for key in ("time", "q", "tau", "qd"):
+        np.testing.assert_array_equal(getattr(part, key), getattr(recording, key)[keep])
+    assert part.spans == [(0, 29), (30, len(part) - 1)]
+    assert len(again) == 60
+    assert recording[pd.Series(keep)].digest() == part.digest()
+    for wrong in (keep[:50], np.arange(10), True):
+        with pytest.raises(TypeError, match=r"100 times True or False, got .* of shape"):
+            recording[wrong]
+
+
+def test_whirling_angles_are_not_taken_for_degrees_or_wrapped() -> None:
+    time = np.arange(2000) * 1e-3
+    whirling = 25.0 * time[:, None]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Recording(time, whirling)
+    with pytest.warns(RecordingWarning) as said:
+        Recording(time, np.remainder(whirling, 2 * np.pi))
+    assert not any("degrees" in str(warning.message) for warning in said)
+
+
+@pytest.mark.parametrize("low", [0.0, -np.pi])
+@pytest.mark.parametrize("sample_time", [1e-3, 0.05])
+def test_wrapped_angles_are_noticed_and_their_joint_is_named(
+    low: float, sample_time: float
+) -> None:
+    """The second joint of two goes round, up to a quarter of a turn to a sample."""
+    time = np.arange(400) * sample_time
+    q = np.stack([np.sin(time), 25.0 * time]).T
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Recording(time, q)
+    wrapped = np.remainder(q - low, 2 * np.pi) + low
+    with pytest.warns(RecordingWarning, match=r"'a': `q` of elbow looks wrapped .*numpy\.unwrap"):
+        Recording(time, np.stack([q[:, 0], wrapped[:, 1]]).T, names=("hip", "elbow"), name="a")
+
+
+def test_what_jumps_by_a_turn_for_other_reasons_is_not_taken_for_wrapped() -> None:
+    time = np.arange(400) * 1e-2
+    turn = 2 * np.pi * (time >= 2)[:, None]
+    # Steps of the degrees grow to a turn of 2π and beyond.
+    degrees = 180 * np.sin(6 * time)[:, None]
+    assert np.abs(np.diff(degrees, axis=0)).max() > 3 * np.pi
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        warnings.filterwarnings("error", message=".*wrapped")
+        Recording(time, degrees)
+        Recording(time + 5.0 * (time >= 2), turn)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Recording(time, turn, unit="m")
+
+
+# --- cutting ---------------------------------------------------------------------------------
+
+
+def test_windows_share_their_borders_and_cover_the_record() -> None:
+    time = np.arange(1001) * 1e-3 + 5.0
+    recording = Recording(time, np.sin(time)[:, None], name="sine")
+    windows = recording.windows(0.1)
+    assert [len(window) for window in windows] == [101] * 10
+    for before, after in pairwise(windows):
+        assert before.time[-1] == after.time[0]
+    assert windows[-1].time[-1] == time[-1]
+    assert len(recording.windows(0.3)) == 3
+    assert len(recording.windows(0.3, stride=0.1)) == 8
+    assert recording.windows(2.0) == []
+    with pytest.raises(ValueError, match="positive"):
+        recording.windows(0.0)
+
+
+def test_slices_keep_everything_else() -> None:
+    recording = swing(names=("a", "b"), convention=AngleConvention("absolute"), name="run")
+    part = recording[10:40:2]
+    assert np.array_equal(part.time, recording.time[10:40:2])
+    assert np.array_equal(part.tau, recording.tau[10:40:2])  # type: ignore[index]
+    assert (part.names, part.convention, part.name) == (("a", "b"), recording.convention, "run")
+    with pytest.raises(TypeError, match="slice of samples"):
+        recording[3]  # type: ignore[index]
+
+
+def test_irregular_stamps_are_kept_and_told() -> None:
+    assert not swing().is_uniform
+    time = np.round(np.arange(100) / 700, 6)
+    assert Recording(time, np.zeros((100, 1))).is_uniform
+    text = repr(swing(name="run"))
+    assert all(part in text for part in ("'run'", "samples=60", "irregular", "'tau'", "joint2"))
+
+
+def test_digest_sees_content_and_nothing_else() -> None:
+    base = swing().digest()
+    assert swing(name="other").digest() == base
+    assert len(base) == 64
+    q = swing().q.copy()
+    q[3, 1] = np.nextafter(q[3, 1], 1)
+    others = [
+        changed(q=q),
+        changed(tau=None),
+        changed(names=("a", "b")),
+        changed(unit="m"),
+        changed(convention=AngleConvention("absolute")),
+    ]
+    assert len({base, *(other.digest() for other in others)}) == 6
+
+
+def test_joint_coordinates() -> None:
+    recording = swing(joints=3, convention=AngleConvention("absolute", "hanging"))
+    on_arm = Rig(("relative", "upright"), 1)
+    joint = recording.joint_coordinates(on_arm)
+    assert joint.convention == AngleConvention()
+    assert np.array_equal(joint.q[:, 0], recording.q[:, 0])
+    np.testing.assert_allclose(joint.q[:, 1], recording.q[:, 1] + np.pi, atol=1e-15)
+    np.testing.assert_allclose(joint.qd[:, 2], recording.qd[:, 2] - recording.qd[:, 1])  # type: ignore[index]
+    assert np.array_equal(joint.tau, recording.tau)  # type: ignore[arg-type]
+    assert joint.joint_coordinates(on_arm).digest() == joint.digest()
+    axis = changed(unit="m", convention=AngleConvention("absolute", "hanging"))
+    assert axis.joint_coordinates() is axis
+
+
+def test_metres_are_no_angles_of_a_plant() -> None:
+    turns, slides = (Rig(("relative", "upright"), 0, unit) for unit in ("rad", "m"))
+    for unit, plant in (("m", turns), ("rad", slides)):
+        recording = swing(unit=unit, name="run")
+        said = rf"run is in {unit}, the plant's joints are in .*`unit='{plant.unit}'`"
+        with pytest.raises(ValueError, match=said):
+            recording.resolve_convention(plant)
+        with pytest.raises(ValueError, match=said):
+            recording.joint_coordinates(plant)
+
+
+def test_what_a_recording_does_not_say_the_plant_says() -> None:
+    hanging = Rig(("absolute", "hanging"), 0)
+    said = swing(convention="absolute,hanging")
+    unsaid = replace(said, convention=None)
+    assert unsaid.convention is None
+    assert unsaid.resolve_convention(hanging) == said.convention
+    assert unsaid.joint_coordinates(hanging).digest() == said.joint_coordinates().digest()
+    # What it says itself is stronger.
+    assert said.resolve_convention(Rig(("relative", "upright"), 0)) == said.convention
+    with pytest.raises(ValueError, match="does not say how its angles are written; give the plant"):
+        unsaid.joint_coordinates()
+    assert unsaid.digest() != said.digest()
+    assert "that of the plant" in repr(unsaid)
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_convention_that_is_not_said_stays_so(tmp_path: Path, ending: str) -> None:
+    swing().write(tmp_path / f"run{ending}")
+    back = Recording.read(tmp_path / f"run{ending}")
+    assert back.convention is None
+    assert back.digest() == swing().digest()
+    assert Recording.from_pandas(swing().to_pandas()).convention is None
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        "absolute,hanging",
+        ("absolute", "hanging"),
+        ["hanging", "absolute"],
+        AngleConvention("absolute", "hanging"),
+        Rig(("absolute", "hanging"), 0),
+    ],
+)
+def test_a_convention_is_said_in_many_ways(tmp_path: Path, given: Any) -> None:
+    swing().write(tmp_path / "run.csv")
+    expected = AngleConvention("absolute", "hanging")
+    assert Recording.read(tmp_path / "run.csv", convention=given).convention == expected
+    assert Recording.from_pandas(swing().to_pandas(), convention=given).convention == expected
+    assert swing(convention=given).convention == expected
+
+
+@pytest.mark.parametrize("given", ["", "sideways", (), ("absolute", 3), 7, object(), True])
+def test_a_wrong_convention_is_refused_at_once(given: Any) -> None:
+    # Before the file is looked for.
+    with pytest.raises(ValueError, match="an angle convention is"):
+        Recording.read("absent.csv", convention=given)
+    with pytest.raises(ValueError, match="an angle convention is"):
+        swing(convention=given)
+
+
+# --- the real files --------------------------------------------------------------------------
+
+
+def test_real_files_read_silently_and_their_degrees_are_noticed(data_dir: Path) -> None:
+    paths = [p for p in sorted(data_dir.glob("*/*.csv*")) if p.name != "recordings.csv"]
+    assert paths
+    for path in paths:
+        unit = "m" if path.parent.name == "emps" else "rad"
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            recording = Recording.read(path, unit=unit)  # type: ignore[arg-type]
+        table = pd.read_csv(path)
+        assert len(recording) == len(table)
+        np.testing.assert_allclose(recording.q[:, -1], table[f"q{recording.joints}"], rtol=1e-12)
+        assert (recording.tau is not None) == ("tau1" in table)
+        if unit == "rad":
+            with pytest.warns(RecordingWarning, match="degrees"):
+                Recording(recording.time, np.rad2deg(recording.q))
+
+
+def test_initial_states_of_the_real_sets(data_dir: Path) -> None:
+    multiarm = read_initial_states(data_dir / "multiarm_pendulum" / "recordings.csv")
+    assert {key: len(q0) for key, (q0, _) in multiarm.items() if key.endswith("b0")} == {
+        "single_b0": 1,
+        "double_b0": 2,
+        "triple_b0": 3,
+    }
+    for table in data_dir.glob("*/recordings.csv"):
+        for key, (q0, qd0) in read_initial_states(table).items():
+            path = next(table.parent.glob(f"{key}.csv*"))
+            recording = Recording.read(path)
+            assert q0.shape == qd0.shape == (recording.joints,)
+            # A state belongs to the first sample: within a few counts of it.
+            assert np.abs(q0 - recording.q[0]).max() < 3e-3
+
+
+def test_initial_states_name_their_faults(tmp_path: Path) -> None:
+    path = tmp_path / "recordings.csv"
+    path.write_text("id,q0_1\na,0.5\n")
+    with pytest.raises(ValueError, match=r"lacks columns qd0_1;"):
+        read_initial_states(path)
+    path.write_text(f"id,q0_1,qd0_1,q0_{'1' * 5000}\na,0.5,0,1\n")
+    assert list(read_initial_states(path)) == ["a"]
+    path.write_text("id,q0_1,qd0_1\n,0.5,0\n")
+    with pytest.raises(ValueError, match="row 1 has no id"):
+        read_initial_states(path)
+    path.write_text("id,q0_1,qd0_1,q0_2,qd0_2\na,0.5,0,1,\n")
+    with pytest.raises(ValueError, match="finite q0 and qd0 of the same joints"):
+        read_initial_states(path)
+    path.write_text("id,q0_1,qd0_1,q0_2,qd0_2\na,0.5,0,inf,inf\n")
+    with pytest.raises(ValueError, match="with finite q0"):
+        read_initial_states(path)
+    path.write_text("qd0_10,q0_2,id,q0_10,qd0_2\n4,1,a,3,2\n,7,b,,8\n")
+    states = read_initial_states(path)
+    assert [list(part) for part in states["a"]] == [[1, 3], [2, 4]]
+    assert [list(part) for part in states["b"]] == [[7], [8]]
+    for label, parts in read_initial_states(path, degrees=True).items():
+        np.testing.assert_allclose(np.rad2deg(parts), states[label], rtol=4e-16)

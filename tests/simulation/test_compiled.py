@@ -1,0 +1,213 @@
+"""The cache of compiled rollouts: one structure compiles once, and never serves another."""
+
+import functools
+import logging
+
+import pytest
+import torch
+
+from nfriction import LFM, NFLFM, PendulumChain, codegen, rollout
+from nfriction.friction.constant import Constant
+from nfriction.friction.laws import LINEAR, Law, linear
+from nfriction.friction.model import FrictionModel
+from nfriction.simulation import compiled
+
+F64 = torch.float64
+CHAIN = PendulumChain([0.3, 0.2], [0.2, 0.15])
+Q0 = torch.tensor([2.2, 0.6], dtype=F64)
+QD0 = torch.tensor([3.0, -2.0], dtype=F64)
+
+
+@pytest.fixture
+def compilations(monkeypatch):
+    """An empty cache, and a list that grows with every compilation."""
+    made = []
+
+    def compile_rollout(*args, **settings):
+        made.append(args)
+        return original(*args, **settings)
+
+    original = codegen.compile_rollout
+    monkeypatch.setattr(codegen, "compile_rollout", compile_rollout)
+    monkeypatch.setattr(compiled, "_cache", type(compiled._cache)())
+    return made
+
+
+def both(model, plant=CHAIN, **settings):
+    """Compiled and eager end of a short run; they must agree."""
+    ends = [
+        rollout(plant, model, Q0, QD0, steps=40, gradients=False, backend=b, **settings).q
+        for b in ("auto", "torch")
+    ]
+    torch.testing.assert_close(*ends, rtol=0, atol=1e-12)
+    return ends[0]
+
+
+def test_one_structure_compiles_once_and_follows_its_values(compilations):
+    model = LFM(2, [1e-3, 2e-3], v_smooth=0.05)
+    first = both(model)
+    model.schedule.set_coefficients([2e-2, 1e-2])
+    changed = both(model)
+    other = both(LFM(2, [1e-3, 2e-3], v_smooth=0.05), PendulumChain([0.1, 0.2], [0.3, 0.1]))
+    assert len(compilations) == 1
+    assert not torch.allclose(first, changed, atol=1e-6)
+    assert not torch.allclose(first, other, atol=1e-6)
+    # The first model's values are back, though another one came between.
+    model.schedule.set_coefficients([1e-3, 2e-3])
+    torch.testing.assert_close(both(model), first, rtol=0, atol=1e-15)
+    assert len(compilations) == 1
+
+
+def test_replaced_buffers_are_honoured(compilations):
+    model = LFM(2, [1e-3, 2e-3], v_smooth=0.05)
+    first = both(model)
+    lighter = both(model, CHAIN.replace(gravity_moment=0.5 * CHAIN.gravity_moment))
+    assert len(compilations) == 1
+    assert not torch.allclose(first, lighter, atol=1e-4)
+    # Drag is left out of the code while it is zero, so it needs code of its own.
+    both(model, CHAIN.replace(drag_quadratic=torch.tensor([0.5, 0.5], dtype=F64)))
+    assert len(compilations) == 2
+
+
+def half(qd, load, coefficients, v_smooth):
+    return 0.5 * linear(qd, load, coefficients, v_smooth)
+
+
+def scaled(qd, load, coefficients, v_smooth, factor):
+    return factor * linear(qd, load, coefficients, v_smooth)
+
+
+def test_what_is_baked_in_recompiles(compilations):
+    def model(torque, v_smooth=0.05):
+        law = Law("user", LINEAR.coefficients, torque)
+        return FrictionModel(law, Constant(law, 2, [1e-2, 1e-2]), v_smooth)
+
+    ends = [
+        both(model(linear)),
+        both(model(linear, 0.5)),
+        both(model(half, 0.5)),
+        both(model(functools.partial(scaled, factor=0.25), 0.5)),
+        both(model(functools.partial(scaled, factor=4.0), 0.5)),
+    ]
+    assert len(compilations) == len(ends)
+    for i, a in enumerate(ends):
+        for b in ends[i + 1 :]:
+            assert not torch.allclose(a, b, rtol=0, atol=1e-8)
+
+
+def test_tables_that_are_no_buffers_are_told_apart(compilations):
+    class Table(torch.nn.Module):
+        joints = 2
+
+        def __init__(self, *entries):
+            super().__init__()
+            self.table = [torch.tensor(entries, dtype=F64)]
+
+        def coefficients(self, qd, qdd):
+            return self.table[0].expand(2, 2)
+
+        def torque(self, qd, load, coefficients):
+            return coefficients[..., 0] * qd + coefficients[..., 1] * torch.tanh(qd)
+
+        def zero_velocity_damping(self):
+            return self.table[0].sum().expand(2)
+
+    model = Table(1e-3, 1e-3)
+    both(model)
+    both(Table(1e-3, 1e-3))
+    assert len(compilations) == 1
+    model.table[0].mul_(10.0)  # in place: the same object, other values
+    both(model)
+    assert len(compilations) == 2
+
+
+def test_motion_dependent_models_of_different_terms_are_apart(compilations):
+    both(NFLFM(2, terms=(2, 2), head_units=2))
+    both(NFLFM(2, terms=(3, 2), head_units=2))
+    both(NFLFM(2, terms=(2, 2), head_units=2, acceleration="signed"))
+    assert len(compilations) == 3
+
+
+def test_old_structures_are_forgotten(compilations, monkeypatch):
+    monkeypatch.setattr(compiled, "KEPT", 1)
+    both(LFM(2, v_smooth=0.1))
+    both(LFM(2, v_smooth=0.2))
+    both(LFM(2, v_smooth=0.1))
+    assert len(compilations) == 3
+    assert len(compiled._cache) == 1
+
+
+def test_without_a_backend_eager_torch_serves_and_says_so_once(compilations, monkeypatch, caplog):
+    def nothing(backend):
+        raise codegen.NoBackend("no compiler and no numba")
+
+    monkeypatch.setattr("nfriction.codegen.build.choose", nothing)
+    with caplog.at_level(logging.WARNING, "nfriction"):
+        both(LFM(2, v_smooth=0.05))
+        both(LFM(2, v_smooth=0.05))
+    assert caplog.text.count("eager torch") == 1
+    with pytest.raises(codegen.NoBackend):
+        rollout(CHAIN, LFM(2, v_smooth=0.05), Q0, QD0, steps=5, gradients=False, backend="c")
+
+
+@pytest.mark.slow
+def test_each_executor_serves_where_the_ones_before_it_are_hidden(
+    compilations, monkeypatch, tmp_path, caplog
+):
+    """The C compiler, then numba: the public call goes on and ends at the same place."""
+    monkeypatch.setenv("NFRICTION_CACHE", str(tmp_path / "cache"))
+    first = both(LFM(2, v_smooth=0.05))
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    compiled._cache.clear()
+    second = both(LFM(2, v_smooth=0.05))
+    assert [c.backend for c in compiled._cache.values()] == ["numba"]
+    monkeypatch.setattr("importlib.util.find_spec", lambda name, *rest: None)
+    compiled._cache.clear()
+    third = both(LFM(2, v_smooth=0.05))
+    assert list(compiled._cache.values()) == [None]
+    assert "eager torch" in caplog.text
+    torch.testing.assert_close(second, first, rtol=0, atol=1e-12)
+    torch.testing.assert_close(third, first, rtol=0, atol=1e-12)
+
+
+def test_an_operation_without_scalar_form_falls_back_unless_asked_by_name(compilations):
+    def torque(qd, load, coefficients, v_smooth):
+        return coefficients[..., 0] * torch.special.i0(qd * 0.1) * torch.tanh(qd)
+
+    law = Law("bessel", LINEAR.coefficients, torque)
+    model = FrictionModel(law, Constant(law, 2, [1e-3, 1e-3]))
+    both(model)
+    with pytest.raises(codegen.UnsupportedOperation, match="i0"):
+        rollout(CHAIN, model, Q0, QD0, steps=5, gradients=False, backend="c")
+
+
+def test_single_precision_and_plain_objects_run_in_torch(compilations):
+    both(LFM(2, v_smooth=0.05).float())
+
+    class Nothing:
+        joints = 2
+
+        def coefficients(self, qd, qdd):
+            return torch.zeros(2, 1, dtype=F64)
+
+        def torque(self, qd, load, coefficients):
+            return torch.zeros_like(qd)
+
+        def zero_velocity_damping(self):
+            return torch.zeros(2, dtype=F64)
+
+    torch.testing.assert_close(both(Nothing()), both(None), rtol=0, atol=1e-12)
+    assert len(compilations) == 1
+    for model in (LFM(2, v_smooth=0.05).float(), Nothing()):
+        with pytest.raises(codegen.CodegenError, match="compiled"):
+            rollout(CHAIN, model, Q0, QD0, steps=5, gradients=False, backend="c")
+
+
+def test_a_batch_of_plants_runs(compilations):
+    """Buffers with a batch of their own broadcast against the states, compiled or not."""
+    factor = torch.tensor([0.5, 1.0], dtype=F64)[:, None]
+    plant = CHAIN.replace(gravity_moment=factor * CHAIN.gravity_moment)
+    together = both(LFM(2, v_smooth=0.05), plant)
+    assert together.shape == (2, 41, 2)
+    torch.testing.assert_close(together[1], both(LFM(2, v_smooth=0.05)), rtol=0, atol=1e-12)

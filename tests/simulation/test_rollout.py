@@ -1,0 +1,496 @@
+"""Rollouts: order, energy, passivity, agreement of all executors, gradients, honest errors."""
+
+import logging
+import re
+from itertools import pairwise
+
+import pytest
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from nfriction import LFM, NFLFM, LinearAxis, PendulumChain, rollout
+from nfriction.friction.constant import Constant
+from nfriction.friction.laws import Coefficient, Law
+from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import MODELS
+from nfriction.papers.afem.adaptive import Adaptive
+from nfriction.simulation.rk4 import required_substeps, stability_limit
+
+F64 = torch.float64
+CHAIN = PendulumChain([0.3, 0.2], [0.2, 0.15], inertia=[1e-3, 4e-4])
+Q0 = torch.tensor([2.2, 0.6], dtype=F64)
+QD0 = torch.tensor([0.5, -0.3], dtype=F64)
+MOVING = (torch.tensor([2.2, 0.6], dtype=F64), torch.tensor([4.0, -3.0], dtype=F64))
+
+
+def quadratic_drag(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
+    return coefficients[..., 0] * qd * qd.abs() + coefficients[..., 1] * load * qd
+
+
+DRAG = Law("drag", (Coefficient("D", "N m s^2/rad^2"), Coefficient("L", "N m s/rad")),
+           quadratic_drag)  # fmt: skip
+
+
+def smooth_model() -> FrictionModel:
+    """Friction without a steep passage, so that RK4 shows its order."""
+    return LFM(2, [2e-3, 1e-3], v_smooth=2.0)
+
+
+def named_model(name: str) -> FrictionModel:
+    # A signed coefficient of zero would have no scale, and a network's offset move everything.
+    initial = [1e-3, 1e-3, 1e-3, 1e-3, 1.0] if name == "NFNLFM" else None
+    model = MODELS[name](2, initial, v_smooth=0.05)
+    generator = torch.Generator().manual_seed(3)
+    if isinstance(model.schedule, Adaptive):
+        # Classes far apart, and a memory short enough to change them within a thousand steps.
+        model = MODELS[name](2, v_smooth=0.05, time_constant=0.1, sample_time=5e-4)
+        with torch.no_grad():
+            model.schedule.raw.add_(
+                0.7 * torch.randn(model.schedule.raw.shape, generator=generator, dtype=F64)
+            )
+        model.schedule.set_classes([[30.0, 70.0], [40.0, 120.0]])
+    elif not isinstance(model.schedule, Constant):
+        # A network that really bends the coefficients.
+        vector = model.schedule.parameter_vector()
+        model.schedule.set_parameter_vector(
+            0.1 * torch.randn(vector.shape, generator=generator, dtype=F64)
+        )
+    return model
+
+
+def run(model, q0=Q0, qd0=QD0, plant=CHAIN, **settings):
+    return rollout(plant, model, q0, qd0, **({"gradients": False} | settings))
+
+
+# Laws of motion
+
+
+@pytest.mark.parametrize("friction", [False, True])
+def test_order_of_convergence_is_four(friction):
+    # A law without load, whose absolute value has kinks.
+    model = MODELS["NLFM"](2, [1e-4, 1e-3, 2e-3, 1e-3, 0.5], v_smooth=2.0) if friction else None
+
+    def end(steps):
+        out = run(model, sample_time=0.8 / steps, steps=steps, backend="c")
+        return torch.cat([out.q[-1], 0.1 * out.qd[-1]])
+
+    exact = end(12800)
+    errors = [float((end(n) - exact).norm()) for n in (400, 800, 1600)]
+    slopes = [torch.log2(torch.tensor(a / b)).item() for a, b in pairwise(errors)]
+    assert slopes == pytest.approx([4.0, 4.0], abs=0.25)
+
+
+def test_frictionless_energy_is_kept():
+    out = run(None, sample_time=1e-3, steps=2000)
+    energy = sum(CHAIN.energy(out.q, out.qd))
+    assert float((energy - energy[0]).abs().max()) < 1e-7 * float(energy.abs().max())
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_passive_friction_never_adds_energy(name):
+    model = named_model(name) if name != "NFNLFM" else MODELS[name](2, v_smooth=0.05)
+    if name == "ANLFM":
+        with torch.no_grad():
+            model.schedule.raw[..., 0] = 0.0  # f_o pushes, so it is no dissipation
+    out = run(model, *MOVING, sample_time=1e-3, steps=1000)
+    energy = sum(CHAIN.energy(out.q, out.qd))
+    assert float(energy.diff().max()) < 1e-9  # rounding and the integrator's own error
+    assert float(energy[-1]) < float(energy[0]) - 1e-4
+
+
+def test_a_force_on_an_axis_against_the_closed_form():
+    """m qdd = u - b qd from rest: qd = u/b (1 - exp(-b t / m))."""
+    axis, b, u = LinearAxis(2.0), 3.0, 1.5
+    model = MODELS["NCFM"](1, [b])
+    tau = torch.full((500, 1), u, dtype=F64)
+    out = run(model, torch.zeros(1, dtype=F64), torch.zeros(1, dtype=F64), axis, tau=tau)
+    exact = u / b * (1 - torch.exp(-b / 2.0 * out.time))
+    torch.testing.assert_close(out.qd[:, 0], exact, rtol=1e-10, atol=1e-12)
+
+
+# Shapes, batches, options
+
+
+def test_shapes_times_and_the_first_acceleration():
+    out = run(smooth_model(), sample_time=2e-3, steps=10)
+    assert out.q.shape == out.qd.shape == out.qdd.shape == (11, 2)
+    torch.testing.assert_close(out.time, 2e-3 * torch.arange(11, dtype=F64))
+    zero = torch.zeros(2, dtype=F64)
+    torch.testing.assert_close(out.qdd[0], CHAIN.forward_dynamics(Q0, QD0, zero))
+    assert not bool(out.diverged)
+
+
+@pytest.mark.parametrize("backend", ["torch", "c"])
+def test_a_batch_equals_single_runs(backend):
+    generator = torch.Generator().manual_seed(0)
+    q0, qd0 = torch.randn(2, 2, 3, 2, generator=generator, dtype=F64)
+    tau = 1e-2 * torch.randn(3, 30, 2, generator=generator, dtype=F64)
+    together = run(smooth_model(), q0, qd0, tau=tau, backend=backend)
+    assert together.q.shape == (2, 3, 31, 2)
+    assert together.diverged_at.shape == (2, 3)
+    for i in range(2):
+        for j in range(3):
+            one = run(smooth_model(), q0[i, j], qd0[i, j], tau=tau[j], backend=backend)
+            for name in ("q", "qd", "qdd"):
+                got = getattr(together, name)[i, j]
+                torch.testing.assert_close(got, getattr(one, name), rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize("backend", ["torch", "c"])
+def test_torques_or_steps_alone_may_bring_the_batch(backend):
+    tau = torch.tensor([0.0, 0.01, 0.02], dtype=F64)[:, None, None].expand(3, 20, 2)
+    out = run(smooth_model(), tau=tau, backend=backend)
+    assert out.q.shape == (3, 21, 2)
+    torch.testing.assert_close(out.q[1], run(smooth_model(), tau=tau[1]).q, rtol=1e-13, atol=1e-13)
+    step = torch.tensor([[1e-3] * 5, [2e-3] * 5], dtype=F64)
+    out = run(smooth_model(), sample_time=step, backend=backend)
+    assert out.time.shape == (2, 6)
+    torch.testing.assert_close(out.q[1], run(smooth_model(), sample_time=step[1]).q)
+
+
+# Eager torch takes a second or more for a thousand steps, so the default run has one of each kind.
+OFTEN = ("LFM", "ALFM", "NFLFM", "user")
+NAMES = [n if n in OFTEN else pytest.param(n, marks=pytest.mark.slow) for n in (*MODELS, "user")]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_torch_and_c_agree(name):
+    model = FrictionModel(DRAG, Constant(DRAG, 2), 1.0) if name == "user" else named_model(name)
+    eager, c = (
+        run(model, *MOVING, sample_time=5e-4, steps=1000, backend=backend)
+        for backend in ("torch", "c")
+    )
+    for field in ("q", "qd"):
+        torch.testing.assert_close(getattr(c, field), getattr(eager, field), rtol=0, atol=1e-12)
+    # An acceleration is a velocity's difference over a step, and rounds as such.
+    torch.testing.assert_close(c.qdd, eager.qdd, rtol=1e-10, atol=1e-9)
+
+
+def recorded(steps: int) -> dict:
+    """All that a recording of two runs may bring: torques, irregular stamps, a measured motion."""
+    generator = torch.Generator().manual_seed(5)
+
+    def random(*shape: int, scale: float) -> Tensor:
+        return scale * torch.randn(*shape, generator=generator, dtype=F64)
+
+    return {
+        "tau": random(2, steps, 2, scale=0.05),
+        "sample_time": 3e-4 + 4e-4 * torch.rand(2, steps, generator=generator, dtype=F64),
+        "drive": "measured",
+        "measured": (random(2, steps, 2, scale=3.0), random(2, steps, 2, scale=60.0)),
+    }
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*MODELS, "user"])
+def test_c_and_numba_agree(name):
+    model = FrictionModel(DRAG, Constant(DRAG, 2), 1.0) if name == "user" else named_model(name)
+    for given in ({"sample_time": 5e-4, "steps": 1000}, recorded(1000)):
+        c, numba = (run(model, *MOVING, backend=backend, **given) for backend in ("c", "numba"))
+        torch.testing.assert_close(numba.q, c.q, rtol=0, atol=1e-12)
+        torch.testing.assert_close(numba.qd, c.qd, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_torque_drag_irregular_stamps_and_a_measured_drive_agree(name):
+    model = FrictionModel(DRAG, Constant(DRAG, 2), 1.0) if name == "user" else named_model(name)
+    plant = CHAIN.replace(drag_quadratic=torch.tensor([0.02, 0.01], dtype=F64))
+    given = recorded(200 if name in OFTEN else 1000)
+    eager, c = (run(model, *MOVING, plant, backend=b, **given) for b in ("torch", "c"))
+    torch.testing.assert_close(c.q, eager.q, rtol=0, atol=1e-12)
+    torch.testing.assert_close(c.qd, eager.qd, rtol=0, atol=1e-12)
+    undriven = run(model, *MOVING, plant, backend="c", tau=given["tau"],
+                   sample_time=given["sample_time"])  # fmt: skip
+    assert torch.equal(undriven.q, c.q) == isinstance(model.schedule, Constant)
+
+
+class Reads(TorchDispatchMode):
+    """Counts how often a tensor's value is asked for, which makes a GPU wait."""
+
+    def __init__(self):
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
+        waits = ("aten::_local_scalar_dense", "aten::nonzero", "aten::equal", "aten::masked_select")
+        self.count += operation.name().split(".")[0] in waits
+        return operation(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_no_value_is_asked_for_within_the_loop(name):
+    counts = []
+    for steps in (3, 9):
+        with Reads() as reads:
+            run(named_model(name), *MOVING, sample_time=5e-4, steps=steps, backend="torch")
+        counts.append(reads.count)
+    assert counts[0] == counts[1] > 0
+
+
+@pytest.mark.parametrize("backend", ["torch", "c"])
+@pytest.mark.parametrize("name", ["LFM", "NFLFM"])
+def test_substeps_are_finer_steps(backend, name):
+    """With coefficients held anew at every substep, substeps are nothing but shorter steps."""
+    tau = 0.02 * torch.sin(torch.arange(40, dtype=F64))[:, None].expand(40, 2)
+    fine = run(named_model(name), tau=tau.repeat_interleave(3, 0), sample_time=1e-3 / 3,
+               backend=backend)  # fmt: skip
+    out = run(named_model(name), tau=tau, sample_time=1e-3, substeps=3, backend=backend)
+    for field in ("q", "qd", "qdd"):
+        torch.testing.assert_close(
+            getattr(out, field), getattr(fine, field)[::3], rtol=1e-11, atol=1e-11
+        )
+
+
+@pytest.mark.parametrize("backend", ["torch", "c"])
+def test_irregular_stamps_reach_the_same_place(backend):
+    """The motion belongs to time, not to samples: other stamps, same end."""
+    generator = torch.Generator().manual_seed(1)
+    step = 5e-4 + 1e-3 * torch.rand(150, generator=generator, dtype=F64)
+    out = run(smooth_model(), sample_time=step, backend=backend)
+    even = run(smooth_model(), sample_time=float(step.sum()) / 150, steps=150, backend=backend)
+    torch.testing.assert_close(out.time[-1], even.time[-1])
+    torch.testing.assert_close(out.q[-1], even.q[-1], rtol=0, atol=1e-9)
+
+
+def test_the_simulated_motion_as_measured_one_gives_itself():
+    model = named_model("NFLFM")
+    free = run(model, *MOVING, steps=60)
+    measured = (free.qd[:-1], free.qdd[:-1])
+    for backend in ("torch", "c"):
+        driven = run(model, *MOVING, steps=60, drive="measured", measured=measured, backend=backend)
+        torch.testing.assert_close(driven.q, free.q, rtol=0, atol=1e-13)
+    slow = tuple(torch.zeros_like(m) for m in measured)
+    other = run(model, *MOVING, steps=60, drive="measured", measured=slow)
+    assert not torch.allclose(other.q, free.q, atol=1e-8)
+
+
+@pytest.mark.parametrize("backend", [pytest.param("torch", marks=pytest.mark.slow), "c"])
+def test_a_memory_advances_once_a_sample(backend):
+    """Substeps refine the integration; the class changes at samples only, as in a controller."""
+    seen = []
+
+    class Watched(Adaptive):
+        def advance(self, qd, qdd, state):
+            seen.append(1)
+            return super().advance(qd, qdd, state)
+
+    model = named_model("ALFM")
+    fine = run(model, *MOVING, sample_time=5e-4, steps=300, substeps=2, backend=backend)
+    model.schedule.__class__ = Watched
+    watched = run(model, *MOVING, sample_time=5e-4, steps=300, substeps=2, backend="torch")
+    assert len(seen) == 299
+    torch.testing.assert_close(watched.q, fine.q, rtol=0, atol=1e-12)
+    known = model.schedule.classes(fine.qd, fine.qdd)
+    assert len(known.unique()) > 1
+
+
+@pytest.mark.parametrize("backend", [pytest.param("torch", marks=pytest.mark.slow), "c"])
+def test_a_motion_goes_on_with_what_it_remembers(backend):
+    """Cut in two with the memory handed over, a run is the uncut one."""
+    model = named_model("ALFM")
+    settings = {"sample_time": 5e-4, "backend": backend}
+    whole = run(model, *MOVING, steps=400, **settings)
+    # The acceleration that a restart knows at first is another, so its class must not count.
+    states = model.schedule.states(whole.qd, whole.qdd)
+    rest = run(model, whole.q[200], whole.qd[200], steps=200, memory=states[200], **settings)
+    torch.testing.assert_close(rest.q, whole.q[200:], rtol=0, atol=1e-12)
+    other = states[200].clone()
+    other[:, 0], other[:, 1] = 4 * model.schedule.thresholds[:, 1], 2.0
+    lost = run(model, whole.q[200], whole.qd[200], steps=200, memory=other, **settings)
+    assert not torch.allclose(lost.q, whole.q[200:], rtol=0, atol=1e-9)
+    two = torch.stack([states[200], other])
+    both = run(model, whole.q[200], whole.qd[200], steps=200, memory=two, **settings)
+    torch.testing.assert_close(both.q, torch.stack([rest.q, lost.q]), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("backend", [pytest.param("torch", marks=pytest.mark.slow), "c"])
+def test_a_measured_motion_drives_the_memory_too(backend):
+    model = named_model("ALFM")
+    settings = {"sample_time": 5e-4, "steps": 300, "backend": backend}
+    free = run(model, *MOVING, **settings)
+    measured = (free.qd[:-1], free.qdd[:-1])
+    same = run(model, *MOVING, drive="measured", measured=measured, **settings)
+    torch.testing.assert_close(same.q, free.q, rtol=0, atol=1e-13)
+    calm = tuple(torch.zeros_like(m) for m in measured)
+    other = run(model, *MOVING, drive="measured", measured=calm, **settings)
+    low = LFM(2, model.schedule.values[:, 0], v_smooth=0.05)
+    torch.testing.assert_close(other.q, run(low, *MOVING, **settings).q, rtol=0, atol=1e-12)
+    assert not torch.allclose(other.q, free.q, atol=1e-6)
+
+
+def test_a_memory_made_for_other_samples_is_warned_of(caplog):
+    with caplog.at_level(logging.WARNING, "nfriction"):
+        run(named_model("ALFM"), sample_time=5e-4, steps=2)
+        assert not caplog.records
+        run(named_model("ALFM"), sample_time=2e-3, steps=2)
+    assert "set_sample_time" in caplog.text
+
+
+def test_a_memory_must_fit_the_model():
+    with pytest.raises(ValueError, match="leave it out"):
+        run(smooth_model(), steps=2, memory=torch.zeros(2, 2))
+    for wrong in (torch.zeros(2, 3), torch.full((2, 2), torch.nan)):
+        with pytest.raises(ValueError, match="memory"):
+            run(named_model("ALFM"), steps=2, memory=wrong)
+
+
+def test_gradients_reach_every_class_that_was_there():
+    model = named_model("ALFM")
+    out = rollout(CHAIN, model, *MOVING, sample_time=5e-4, steps=60)
+    out.q.sum().backward()
+    slope = model.schedule.raw.grad
+    known = model.schedule.classes(out.qd.detach()[:-1], out.qdd.detach()[:-1])
+    for joint in range(2):
+        for c in range(3):
+            assert bool(slope[joint, c].any()) == bool((known[:, joint] == c).any())
+
+
+def test_threads_change_nothing():
+    q0 = Q0 + torch.linspace(0, 1, 9, dtype=F64)[:, None]
+    one, four = (run(smooth_model(), q0, steps=50, threads=n) for n in (1, 4))
+    assert torch.equal(one.q, four.q)
+
+
+# Divergence and stability
+
+
+@pytest.mark.parametrize("backend", ["torch", "c"])
+def test_divergence_is_reported_with_its_time(backend, caplog):
+    """Negative viscosity b feeds an axis: qd grows by exp(b/m t) and passes 1e6 at a known time."""
+    explode = Law("explode", (Coefficient("b", "N s/m", positive=False),),
+                  lambda qd, load, c, v_smooth: c[..., 0] * qd)  # fmt: skip
+    model = FrictionModel(explode, Constant(explode, 1, [-100.0]), 1.0)
+    qd0 = torch.tensor([[1.0], [0.0]], dtype=F64)
+    with caplog.at_level(logging.WARNING, "nfriction"):
+        out = run(model, torch.zeros(1, dtype=F64), qd0, LinearAxis(1.0), steps=300,
+                  backend=backend)  # fmt: skip
+    assert out.diverged.tolist() == [True, False]
+    at = float(torch.log(torch.tensor(1e6))) / 100
+    assert float(out.diverged_at[0]) == pytest.approx(at, abs=1.1e-3)
+    lost = out.time >= out.diverged_at[0]
+    for x in (out.q, out.qd, out.qdd):
+        assert torch.isnan(x[0, lost]).all()
+        assert torch.isfinite(x[0, ~lost]).all()
+        assert torch.isfinite(x[1]).all()
+    assert "diverged" in caplog.text
+
+
+@pytest.mark.parametrize("substeps", [1, 2])
+def test_too_steep_friction_is_refused_and_the_message_mends_it(substeps):
+    coefficients = [1e-3, 5e-2]
+    model = LFM(2, coefficients, v_smooth=1e-3)
+    with pytest.raises(ValueError, match="too steep") as caught:
+        run(model, steps=5, substeps=substeps)
+    said = re.search(r"substeps=(\d+) or v_smooth >= (\S+)", str(caught.value))
+    assert said is not None
+    assert int(said[1]) == required_substeps(CHAIN, model, 1e-3) > substeps
+    run(model, steps=5, substeps=int(said[1]))
+    with pytest.raises(ValueError, match="too steep"):
+        run(model, steps=5, substeps=int(said[1]) - 1)
+    run(LFM(2, coefficients, v_smooth=float(said[2])), steps=5, substeps=substeps)
+
+
+def test_the_stability_limit_is_where_rk4_turns_unstable():
+    """An axis with viscous friction just below the limit dies out, just above it grows."""
+    axis = LinearAxis(0.5)
+    limit = float(stability_limit(axis, 1e-3))
+    assert required_substeps(axis, MODELS["NCFM"](1, [limit]), 1e-3) == 1
+    start = torch.zeros(1, dtype=F64), torch.ones(1, dtype=F64)
+    ends = []
+    for factor in (0.99, 1.0):
+        model = MODELS["NCFM"](1, [factor * limit])
+        ends.append(float(run(model, *start, axis, steps=500).qd[-1].abs()))
+    assert ends[0] < 0.1
+    assert ends[1] == pytest.approx(1.0, abs=0.2)
+    with pytest.raises(ValueError, match="too steep"):
+        run(MODELS["NCFM"](1, [1.01 * limit]), *start, axis, steps=5)
+
+
+# Gradients
+
+
+def test_gradients_of_a_short_rollout():
+    model = smooth_model()
+
+    def end(q0, qd0, raw):
+        functional = torch.func.functional_call
+
+        class Bound(torch.nn.Module):
+            joints = 2
+
+            def coefficients(self, qd, qdd):
+                return functional(model.schedule, {"raw": raw}, (qd, qdd))
+
+            def torque(self, qd, load, coefficients):
+                return model.torque(qd, load, coefficients)
+
+            def zero_velocity_damping(self):
+                return model.zero_velocity_damping()
+
+        out = rollout(CHAIN, Bound(), q0, qd0, sample_time=0.01, steps=5, gradients=True)
+        return out.q, out.qd
+
+    raw = model.schedule.raw.detach().clone().requires_grad_()
+    inputs = (Q0.clone().requires_grad_(), QD0.clone().requires_grad_(), raw)
+    assert torch.autograd.gradcheck(end, inputs)
+
+
+def test_gradients_reach_the_parameters_of_model_and_plant():
+    model = NFLFM(2, v_smooth=0.5)
+    moment = CHAIN.gravity_moment.clone().requires_grad_()
+    plant = CHAIN.replace(gravity_moment=moment)
+    rollout(plant, model, Q0, QD0, steps=5).q.sum().backward()
+    assert moment.grad is not None
+    assert float(moment.grad.abs().sum()) > 0
+    assert float(model.schedule.network.anfis.consequents.grad.abs().sum()) > 0
+
+
+def test_gradients_are_recorded_where_asked_for_and_affordable(monkeypatch):
+    monkeypatch.setattr("nfriction.simulation.rollout.GRADIENT_STEPS", 20)
+    model = smooth_model()
+    assert rollout(CHAIN, model, Q0, QD0, steps=20).q.requires_grad
+    assert not rollout(CHAIN, model, Q0, QD0, steps=21).q.requires_grad
+    assert rollout(CHAIN, model, Q0, QD0, steps=21, gradients=True).q.requires_grad
+    assert not rollout(CHAIN, model, Q0, QD0, steps=5, gradients=False).q.requires_grad
+    with torch.no_grad():
+        assert not rollout(CHAIN, model, Q0, QD0, steps=5).q.requires_grad
+    assert not rollout(CHAIN, None, Q0, QD0, steps=5).q.requires_grad
+    assert rollout(CHAIN, None, Q0.clone().requires_grad_(), QD0, steps=5).q.requires_grad
+    with pytest.raises(ValueError, match="gradients"):
+        rollout(CHAIN, model, Q0, QD0, steps=5, gradients=True, backend="c")
+
+
+# Errors
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({}, "number of steps"),
+        ({"steps": 5, "tau": torch.zeros(4, 2)}, "number of steps"),
+        ({"steps": 5, "sample_time": torch.full((6,), 1e-3)}, "number of steps"),
+        ({"steps": 0}, "at least 1"),
+        ({"steps": 5, "sample_time": -1e-3}, "positive"),
+        ({"steps": 5, "sample_time": float("nan")}, "finite"),
+        ({"steps": 5, "substeps": 0}, "substeps"),
+        ({"steps": 5, "q0": torch.tensor([torch.nan, 0.0])}, "`q0` must be finite"),
+        ({"steps": 5, "qd0": torch.tensor([torch.inf, 0.0])}, "`qd0` must be finite"),
+        ({"steps": 5, "q0": torch.zeros(3)}, "2 joints"),
+        ({"steps": 5, "q0": torch.zeros(())}, "2 joints"),
+        ({"tau": torch.zeros(5, 3)}, "`tau` must be"),
+        ({"tau": torch.full((5, 2), torch.nan)}, "`tau` must be finite"),
+        ({"steps": 5, "model": LFM(3)}, "3"),
+        ({"steps": 5, "drive": "measured"}, "measured"),
+        ({"steps": 5, "drive": "mesured"}, "measured"),
+        ({"steps": 5, "measured": (torch.zeros(5, 2),) * 2}, "measured"),
+        ({"steps": 5, "drive": "measured", "measured": (torch.zeros(6, 2),) * 2}, "a step"),
+        ({"steps": 5, "drive": "measured", "measured": (torch.full((5, 2), torch.nan),) * 2},
+         "finite"),
+        ({"steps": 5, "backend": "fortran"}, "backend"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_refused_with_the_rule(settings, message):
+    given = {"model": smooth_model()} | settings
+    with pytest.raises(ValueError, match=message):
+        run(**given)

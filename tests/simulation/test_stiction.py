@@ -1,0 +1,145 @@
+"""Friction that stops a joint and holds it."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+from nfriction import ALFM, CVFM, LFM, LinearAxis, PendulumChain, codegen, rollout, score
+from nfriction.simulation import stiction as sticking
+from tests.fitting.recordings import F64, pendulum, swing
+
+DRY = 2.0
+
+
+def slide(force: float, *, v0: float = 0.0, steps: int = 1000, **settings):
+    """A sliding axis of 4 kg with dry friction of 2 N under a constant force."""
+    axis, model = LinearAxis(4.0), CVFM(1, [DRY, 0.0], v_smooth=1e-3)
+    tau = torch.full((steps, 1), force, dtype=F64)
+    q0, qd0 = torch.zeros(1, dtype=F64), torch.full((1,), v0, dtype=F64)
+    return rollout(axis, model, q0, qd0, tau, sample_time=1e-3,
+                   **{"scheme": "stop", "gradients": False} | settings)  # fmt: skip
+
+
+def test_a_sliding_mass_stops_where_mechanics_says_and_stays():
+    """v0^2 m / (2 F) = 0.16 m, after 0.8 s."""
+    run = slide(0.0, v0=0.4, substeps=10)
+    assert float(run.q[-1, 0]) == pytest.approx(0.4**2 * 4.0 / (2 * DRY), rel=1e-3)
+    stopped = run.qd[:, 0].abs() < 1e-12
+    assert bool(stopped[805:].all())
+    assert not bool(stopped[:795].any())
+    assert float(run.q[-1, 0]) == float(run.q[810, 0])
+
+
+@pytest.mark.parametrize(
+    ("force", "moved"), [(1.9, 0.0), (-1.9, 0.0), (2.5, 0.0625), (-2.5, -0.0625)]
+)
+def test_a_force_below_breakaway_moves_nothing(force, moved):
+    assert float(slide(force, substeps=10).q[-1, 0]) == pytest.approx(moved, abs=1e-5)
+
+
+def test_a_smooth_sign_creeps_where_it_ought_to_rest():
+    model, plant = CVFM(1, [0.1, 1e-3], v_smooth=0.01), PendulumChain([0.5], [0.3])
+    q0 = torch.tensor([math.pi + 0.05], dtype=F64)
+    start = {"q0": q0, "qd0": torch.zeros(1, dtype=F64), "sample_time": 1e-3, "steps": 500}
+    settings = {**start, "gradients": False}
+    held = rollout(plant, model, **settings, scheme="stop")
+    crept = rollout(plant, model, **settings, substeps=4)
+    assert bool((held.q == held.q[0]).all())
+    assert float((crept.q[-1] - crept.q[0]).abs()) > 1e-3
+
+
+def test_two_joints_come_to_rest_and_lose_energy_all_the_way():
+    plant, model = pendulum(), LFM(2, [[4e-3, 6e-2], [2e-3, 2e-2]], v_smooth=0.01)
+    q0, zero = torch.tensor([math.pi + 0.6, 0.4], dtype=F64), torch.zeros(2, dtype=F64)
+    run = rollout(plant, model, q0, zero, sample_time=1e-3, steps=4000, substeps=4, scheme="stop",
+                  gradients=False)  # fmt: skip
+    energy = sum(plant.energy(run.q, run.qd))
+    assert float(energy.diff().max()) < 1e-5
+    assert float(run.qd[-1].abs().max()) < 1e-5
+    # It rests where friction holds it, off its balance.
+    assert float(plant.gravity(run.q[-1]).abs().max()) > 1e-3
+
+
+def test_shorter_steps_come_nearer_to_the_smooth_solution_while_joints_move():
+    plant, model = pendulum(), LFM(2, [[4e-3, 3e-3], [2e-3, 1e-3]], v_smooth=0.01)
+    q0, zero = torch.tensor([2.0, 0.4], dtype=F64), torch.zeros(2, dtype=F64)
+    settings = {"sample_time": 1e-3, "steps": 300, "gradients": False}
+    exact = rollout(plant, model, q0, zero, substeps=20, **settings).q
+    errors = [
+        float((rollout(plant, model, q0, zero, substeps=n, scheme="stop", **settings).q - exact)
+              .abs().max())
+        for n in (4, 8, 16)
+    ]  # fmt: skip
+    assert errors[2] < 2e-3
+    for coarse, fine in pairwise(errors):
+        assert fine < 0.7 * coarse
+
+
+@pytest.mark.parametrize("torque", [0.0, 0.4])
+def test_gears_lose_what_they_lose_in_smooth_steps(torque):
+    """Driven, and back-driven by what swings against friction alone."""
+    plant = pendulum(armature=[1e-3, 1e-3]).replace(
+        gear_loss=torch.tensor([0.2, 0.4], dtype=F64)
+    )  # fmt: skip
+    model = CVFM(2, [[0.05, 1e-3], [0.03, 1e-3]], v_smooth=1e-2)
+    steps = 300
+    tau = torch.full((steps, 2), torque, dtype=F64) * torch.linspace(-1, 1, steps)[:, None]
+    start = torch.tensor([math.pi + 1.5, -0.8], dtype=F64), torch.zeros(2, dtype=F64)
+    settings = {"sample_time": 1e-3, "gradients": False}
+    smooth = rollout(plant, model, *start, tau, substeps=8, **settings).q
+    stopped = rollout(plant, model, *start, tau, substeps=8, scheme="stop", **settings).q
+    lossless = plant.replace(gear_loss=torch.zeros(2, dtype=F64))
+    free = rollout(lossless, model, *start, tau, substeps=8, scheme="stop", **settings).q
+    off = float((stopped - smooth).abs().max())
+    assert off < 0.01
+    assert float((free - stopped).abs().max()) > 5 * off
+
+
+def test_eager_torch_serves_where_nothing_compiles(monkeypatch, caplog):
+    compiled = slide(2.5, v0=-0.1, steps=200)
+
+    def refuse(*_):
+        raise codegen.CodegenError("no compiler")
+
+    monkeypatch.setattr(sticking.codegen, "compile_function", refuse)
+    eager = slide(2.5, v0=-0.1, steps=200)
+    assert "slowly: no compiler" in caplog.text
+    torch.testing.assert_close(eager.q, compiled.q, rtol=0, atol=1e-12)
+    torch.testing.assert_close(eager.qd, compiled.qd, rtol=0, atol=1e-12)
+
+
+def test_a_batch_is_its_members():
+    plant, model = pendulum(), LFM(2, [4e-3, 3e-2], v_smooth=0.01)
+    q0 = torch.tensor([[2.0, 0.4], [3.0, -0.4], [3.5, 0.0]], dtype=F64)
+    settings = {"sample_time": 1e-3, "steps": 50, "scheme": "stop", "gradients": False}
+    both = rollout(plant, model, q0, torch.zeros_like(q0), **settings)
+    assert both.q.shape == (3, 51, 2)
+    for k in range(3):
+        one = rollout(plant, model, q0[k], torch.zeros(2, dtype=F64), **settings)
+        torch.testing.assert_close(both.q[k], one.q, rtol=0, atol=1e-12)
+
+
+def test_what_it_cannot_do_is_refused():
+    with pytest.raises(ValueError, match=r"`scheme` must be one of .*got 'euler'"):
+        slide(0.0, scheme="euler")
+    with pytest.raises(ValueError, match="has no gradients"):
+        slide(0.0, gradients=True)
+    plant, zero = pendulum(), torch.zeros(2, dtype=F64)
+    with pytest.raises(ValueError, match="needs a friction model"):
+        rollout(plant, None, zero, zero, steps=2, scheme="stop")
+    with pytest.raises(ValueError, match="with a memory"):
+        rollout(plant, ALFM(2), zero, zero, steps=2, scheme="stop", gradients=False)
+
+
+def test_a_score_may_take_it():
+    """Friction with a sign as sharp as here would take a hundred steps of the smooth scheme."""
+    truth = LFM(2, [[4e-3, 3e-2], [2e-3, 1e-2]], v_smooth=0.02)
+    recording = swing(pendulum(), truth, seconds=1.0)
+    sharp = LFM(2, [[4e-3, 3e-2], [2e-3, 1e-2]], v_smooth=1e-6)
+    told = score(pendulum(), sharp, recording, horizons=(0.5,), scheme="stop")
+    assert np.isfinite(told.free_run.all)
+    assert told.free_run.all < 0.01
+    assert told.windows["0.5"].all < 0.01
