@@ -37,8 +37,6 @@ MAY_USE_PAPERS = {"papers", "cli"}
 # Imports of the papers' classes that are still to be replaced by methods of `Schedule`.
 STILL_USE_PAPERS = {
     "nfriction/plots/fuzzy.py",
-    "nfriction/evaluation/compare.py",
-    "nfriction/export/unfiltered.py",
     "nfriction/friction/models.py",
     "nfriction/fitting/fit.py",
 }

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from nfriction.evaluation.compare import NO_FRICTION, Comparison, coefficient_sets
+from nfriction.evaluation.compare import NO_FRICTION, Comparison
 from nfriction.evaluation.cross_validation import Selection
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction.model import FrictionModel
@@ -113,7 +113,7 @@ def coefficient_table(model: FrictionModel, joint_names: Sequence[str], unit: st
     """Coefficients by joint with their units, and by what they hold for where that differs."""
     described = describe(model, ModelInfo(unit=unit))["coefficients"]
     joints = list(joint_names) or [f"joint{k + 1}" for k in range(model.joints)]
-    sets = coefficient_sets(model)
+    sets = model.schedule.coefficient_sets()
     rows = {
         joint if label == "always" else f"{joint}, {label.replace('_', ' ')}": values[k].tolist()
         for k, joint in enumerate(joints)

@@ -6,17 +6,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from torch import Tensor
 
 from nfriction.evaluation.fit_many import Data, fit_models
 from nfriction.evaluation.score import HORIZONS, Score, improvement_table, rmse_table, score
 from nfriction.fitting.data.inputs import warn_of_undriven
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction.constant import Constant
 from nfriction.friction.model import FrictionModel
-from nfriction.friction.neurofuzzy import NeuroFuzzy
-from nfriction.papers.afem.adaptive import CLASSES, Adaptive
-from nfriction.papers.nffem.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion, kalman_smoother
@@ -299,29 +294,12 @@ def check_recordings(train: Sequence[Recording], held_out: Sequence[Recording]) 
         )
 
 
-def coefficient_sets(model: FrictionModel) -> dict[str, Tensor]:
-    """The coefficients that tell a model, (joint, coefficient) each, by what they hold for.
-
-    `"always"` of a constant model; of an adaptive one those of each class of acceleration; of a
-    neuro-fuzzy one those `"at_rest"`, and the constant `"reference"` from which it deviates.
-    """
-    schedule = model.schedule
-    sets = schedule.rest_coefficients().detach()
-    if isinstance(schedule, Constant):
-        return {"always": sets}
-    if isinstance(schedule, Adaptive | AdaptiveNeuroFuzzy):
-        return dict(zip(CLASSES, sets, strict=True))
-    if isinstance(schedule, NeuroFuzzy):
-        return {"at_rest": sets, "reference": schedule.reference_coefficients().detach()}
-    return {"at_rest": sets}
-
-
 def coefficient_summary(model: FrictionModel) -> dict[str, Any]:
     """Coefficients by name, a value a joint; by set first where a model has several."""
     names = model.schedule.coefficient_names
     summary = {
         label: {name: values[:, k].tolist() for k, name in enumerate(names)}
-        for label, values in coefficient_sets(model).items()
+        for label, values in model.schedule.coefficient_sets().items()
     }
     return summary.get("always", summary)
 

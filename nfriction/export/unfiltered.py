@@ -17,12 +17,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from nfriction.friction.constant import Constant
 from nfriction.friction.model import FrictionModel
-from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.io.model_info import ModelInfo
-from nfriction.papers.afem.adaptive import Adaptive
-from nfriction.papers.nffem.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
 
 # Bits of the status.
 OUTSIDE, NOT_FINITE, SATURATED = 1, 2, 4
@@ -58,7 +54,7 @@ class _Contracted(nn.Module):
         self.model = copy.deepcopy(model).to("cpu", torch.float64).eval().requires_grad_(False)
         self.joints = model.joints
         self.coefficient_count = len(model.law.names)
-        self.clamps = not _knows_its_range(model)
+        self.clamps = not getattr(model.schedule, "handles_range", False)
         ranges = dict((info or ModelInfo()).input_ranges)
         for name in ("qd", "qdd"):
             lower, upper = _range(name, ranges.get(name), model.joints)
@@ -224,12 +220,6 @@ def for_single_precision(
 def memory_of(model: FrictionModel) -> int:
     """Numbers a joint that the model's schedule carries from sample to sample."""
     return int(getattr(model.schedule, "state_size", 0))
-
-
-def _knows_its_range(model: FrictionModel) -> bool:
-    """Whether the schedule itself sees to inputs outside its range."""
-    own = isinstance(model.schedule, Constant | Adaptive | AdaptiveNeuroFuzzy | NeuroFuzzy)
-    return bool(getattr(model.schedule, "bounded", own))
 
 
 def _range(name: str, given: object, joints: int) -> tuple[Tensor, Tensor]:

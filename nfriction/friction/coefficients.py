@@ -8,7 +8,7 @@ shape (*batch, joint) -> (*batch, joint, coefficient). Fits see it through `para
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -35,7 +35,16 @@ class Schedule(nn.Module, ABC):
         state_size: numbers a joint that the schedule carries from one sample to the next. At
             every sample a simulation or controller calls `advance` (`initial_state` at the
             first), then `coefficients_from`, and holds these coefficients until the next.
+        follows_motion: False where the coefficients are constants.
+        handles_range: True where the schedule itself handles inputs outside its trained range;
+            exports clamp the inputs of any other.
+        fit_strategy: function that fits such coefficients, as `"module:function"`; it takes a
+            `nfriction.fitting.fit.FitTask`.
     """
+
+    follows_motion: ClassVar[bool] = True
+    handles_range: ClassVar[bool] = False
+    fit_strategy: ClassVar[str] = ""
 
     joints: int
     coefficient_names: list[str]
@@ -97,6 +106,14 @@ class Schedule(nn.Module, ABC):
         rest = torch.zeros(self.joints, dtype=like.dtype, device=like.device)
         coefficients: Tensor = self(rest, torch.zeros_like(rest))
         return coefficients
+
+    def coefficient_sets(self) -> dict[str, Tensor]:
+        """Coefficients that describe the model, (joint, coefficient) each, by where they apply.
+
+        `"always"` of constants, one set per class of an adaptive model, `"at_rest"` and the
+        constant `"reference"` of a neuro-fuzzy one.
+        """
+        return {"at_rest": self.rest_coefficients().detach()}
 
     @abstractmethod
     def parameter_vector(self) -> Tensor:

@@ -21,6 +21,9 @@ class Constant(Tabulated):
             `Tabulated`.
     """
 
+    follows_motion = False
+    handles_range = True
+
     def __init__(self, law: Law, joints: int, initial: Tensor | Sequence | None = None) -> None:
         super().__init__(law, joints, initial)
         # Of the fit under way, and no part of the model.
@@ -28,6 +31,9 @@ class Constant(Tabulated):
 
     def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
         return self.table()
+
+    def coefficient_sets(self) -> dict[str, Tensor]:
+        return {"always": self.values}
 
     def prior(self) -> tuple[Tensor, Tensor]:
         vector = self.parameter_vector()

@@ -49,6 +49,8 @@ class NeuroFuzzy(Schedule):
     reach: Final[float] = 0.5  # how far beyond its trained range the network counts, in ranges
     turn: Final[float] = 3e-3  # where qdd sgn(qd) turns, in units of the velocity's range
 
+    handles_range = True
+
     reference: Tensor
     scale: Tensor
     velocity_range: Tensor
@@ -124,6 +126,9 @@ class NeuroFuzzy(Schedule):
     def reference_coefficients(self) -> Tensor:
         """Coefficients of the constant law from which the network deviates, in SI."""
         return self._coefficients(self.reference)
+
+    def coefficient_sets(self) -> dict[str, Tensor]:
+        return super().coefficient_sets() | {"reference": self.reference_coefficients().detach()}
 
     @torch.no_grad()
     def set_reference(

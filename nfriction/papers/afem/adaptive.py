@@ -55,6 +55,7 @@ class Adaptive(Tabulated):
     """
 
     state_size: int = 2
+    handles_range = True
 
     # An acceleration beyond this many upper thresholds is no more than high: one wild value must
     # not keep the class for long. Final, so that TorchScript takes it for a constant.
@@ -185,6 +186,9 @@ class Adaptive(Tabulated):
         return self.table().transpose(0, 1)
 
     @torch.no_grad()
+    def coefficient_sets(self) -> dict[str, Tensor]:
+        return dict(zip(CLASSES, self.rest_coefficients().detach(), strict=True))
+
     def states(self, qd: Tensor, qdd: Tensor) -> Tensor:
         # As in the base class, but without a step of torch to every sample.
         first = torch.sqrt(qdd[:1] ** 2 + (self.swing_rate * qd[:1]) ** 2)

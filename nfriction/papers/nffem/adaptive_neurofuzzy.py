@@ -13,7 +13,7 @@ from nfriction.friction.sensitivity import FactoredSensitivity
 from nfriction.friction.smooth import soft_positive_inverse
 from nfriction.fuzzy.membership import HALF_WIDTH_OF_GAUSSIAN
 from nfriction.fuzzy.placement import crossing_half_widths
-from nfriction.papers.afem.adaptive import Adaptive
+from nfriction.papers.afem.adaptive import CLASSES, Adaptive
 
 # Powers of an even spacing from zero by which sets of velocity and acceleration are placed.
 VELOCITY_POWER, ACCELERATION_POWER = 3, 2
@@ -42,6 +42,7 @@ class AdaptiveNeuroFuzzy(Schedule):
     """
 
     state_size: int = 2
+    handles_range = True
     # Final, so that TorchScript takes it for a constant.
     least_ratio: Final[float] = LEAST_RATIO
 
@@ -137,6 +138,9 @@ class AdaptiveNeuroFuzzy(Schedule):
 
     def states(self, qd: Tensor, qdd: Tensor) -> Tensor:
         return self.adaptive.states(qd, qdd)
+
+    def coefficient_sets(self) -> dict[str, Tensor]:
+        return dict(zip(CLASSES, self.rest_coefficients().detach(), strict=True))
 
     def rest_coefficients(self) -> Tensor:
         rest = torch.zeros_like(self.adaptive.swing_rate)

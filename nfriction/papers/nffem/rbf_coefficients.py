@@ -32,7 +32,7 @@ class RadialBasis(Schedule):
         TLRIP paper, neuro-fuzzy friction estimation (2-10-2 network a joint).
     """
 
-    bounded = True  # clamps its inputs to its range itself, which exports ask
+    handles_range = True
 
     # Final, so that TorchScript takes it for a constant.
     turn: Final[float] = 3e-3  # where qdd sgn(qd) turns, in units of the velocity's universe
