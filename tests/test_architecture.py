@@ -233,3 +233,112 @@ def test_errors_are_caught_by_name() -> None:
 def test_the_version_is_told_once() -> None:
     told = re.search(r'^version = "(.*)"$', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
     assert told is None or told[1] == nfriction.__version__
+
+
+# Size of the house. A reader has to know all of it; whoever adds a file looks for one to remove.
+MOST_LINES, MOST_LINES_OF_THE_CORE, MOST_FILES, MOST_FILES_OF_A_FOLDER = 26_500, 21_000, 150, 12
+# The nine files that explain how a recording becomes a scored model, in the order of the README.
+STORY = (
+    *("friction/laws.py", "friction/coefficients.py", "friction/models.py"),
+    *("simulation/rk4.py", "simulation/rollout.py"),
+    *("fitting/fit.py", "fitting/shooting/problem.py", "optim/levenberg_marquardt.py"),
+    "evaluation/score.py",
+)
+MOST_LINES_OF_THE_STORY = 1_800
+MOST_FLOORS_OF_FITTING = 8
+# Entry points whose options are keywords of their own; everything else takes eight arguments.
+MOST_ARGUMENTS = 8
+MAY_TAKE_MORE = 5
+SCHEDULES = {
+    *("Schedule", "Tabulated", "Constant", "NeuroFuzzy", "Adaptive"),
+    *("AdaptiveNeuroFuzzy", "RadialBasis"),
+}
+MOST_TESTS_FOR_CONTROLLERS = 3
+
+
+def lines(path: Path) -> int:
+    return len(path.read_text(encoding="utf-8").splitlines())
+
+
+def test_the_house_stays_small() -> None:
+    of_papers = sum(lines(path) for path in modules() if part(path) == "papers")
+    total = sum(map(lines, modules()))
+    assert total <= MOST_LINES
+    assert total - of_papers <= MOST_LINES_OF_THE_CORE
+    assert len(modules()) <= MOST_FILES
+
+
+def test_a_folder_can_be_surveyed() -> None:
+    folders = {path.parent for path in modules()}
+    held = {f: [p for p in f.glob("*.py") if p.name != "__init__.py"] for f in folders}
+    report(
+        [
+            f"{folder.relative_to(ROOT)}: {len(files)} files"
+            for folder, files in held.items()
+            if len(files) > MOST_FILES_OF_A_FOLDER
+        ]
+    )
+
+
+def test_the_story_is_short_and_named_in_the_readme() -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    report([f"{name} is not in the README" for name in STORY if f"`{name}`" not in readme])
+    assert sum(lines(PACKAGE / name) for name in STORY) <= MOST_LINES_OF_THE_STORY
+
+
+def test_fitting_has_few_floors() -> None:
+    """A floor is a module's longest chain of imports within `fitting`."""
+    names = {
+        ".".join(p.relative_to(ROOT).with_suffix("").parts): p
+        for p in (PACKAGE / "fitting").rglob("*.py")
+        if p.name != "__init__.py"
+    }
+
+    @cache
+    def floor(name: str) -> int:
+        below = {n.rsplit(".", 1)[0] for n in imported(names[name])} | set(imported(names[name]))
+        return 1 + max((floor(n) for n in below & names.keys() - {name}), default=0)
+
+    assert max(map(floor, names)) <= MOST_FLOORS_OF_FITTING
+
+
+def test_functions_take_few_arguments() -> None:
+    found = []
+    for path in modules():
+        for node in ast.walk(tree(path)):
+            if isinstance(node, ast.FunctionDef):
+                given = node.args.posonlyargs + node.args.args + node.args.kwonlyargs
+                count = sum(a.arg not in ("self", "cls") for a in given)
+                if count > MOST_ARGUMENTS:
+                    found.append(f"{path.relative_to(ROOT)}:{node.lineno} {node.name}: {count}")
+    assert len(found) <= MAY_TAKE_MORE, "\n" + "\n".join(found)
+
+
+def type_tests(path: Path) -> Iterator[tuple[int, set[str]]]:
+    """Lines of `isinstance`, each with the names of the classes asked for."""
+    for node in ast.walk(tree(path)):
+        if isinstance(node, ast.Call) and dotted(node.func) == "isinstance":
+            named = (dotted(n) for n in ast.walk(node.args[1]))
+            yield node.lineno, {name.rsplit(".", 1)[-1] for name in named if name}
+
+
+def test_schedules_are_not_asked_for_their_type() -> None:
+    report(
+        [
+            f"{path.relative_to(ROOT)}:{line} {', '.join(sorted(names & SCHEDULES))}"
+            for path in modules()
+            if part(path) != "friction"
+            for line, names in type_tests(path)
+            if names & SCHEDULES
+        ]
+    )
+
+
+def test_controllers_are_hardly_asked_for_their_type() -> None:
+    found = [
+        f"{path.relative_to(ROOT)}:{line}"
+        for path in (PACKAGE / "export").rglob("*.py")
+        for line, names in type_tests(path)
+        if any("Controller" in name for name in names)
+    ]
+    assert len(found) <= MOST_TESTS_FOR_CONTROLLERS, "\n" + "\n".join(found)

@@ -1,0 +1,102 @@
+"""Prose lint: docstrings, messages, comments and documents in the field's standard terms."""
+
+import ast
+import io
+import re
+import tokenize
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "nfriction"
+SOURCES = sorted(
+    path
+    for folder in ("nfriction", "trainers", "datasets", "examples", "benchmarks")
+    for path in (ROOT / folder).rglob("*.py")
+)
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+
+# A docstring begins with a verb or a noun phrase, not with a relative clause used as a noun.
+RELATIVE_LEAD = re.compile(
+    r"^(What|Whatever|Whether|Which|Who|Whoever|Whose|How|Where|By how|Of|Those (of|that))\b"
+)
+# Habits of the house that a native engineer stumbles on, each with the standard term.
+HABITS = {
+    r"\b(is|are|was|were|be|been) told\b": "shown, estimated, reported",
+    r"\b(tells?|told) (of|nothing|apart|more|less|how|what|which|whether|that|one|them|it|small)\b": (
+        "show, separate, estimate, report"
+    ),
+    r"\b(data|fit|run|recording|torque|file|message|sheet|number)s? (can(not)? )?tells?\b": "show",
+    r"\b(left|leaves?|leaving) over\b": "residual",
+    r"\bmak(e|es|ing) up for\b|\bmade up for\b": "compensate",
+    r"\bheld back\b": "hold-out",
+    r"\bas it looks\b": "auto",
+    r"\bas good as\b": "practically",
+    r"\bg(ives?|ave|iving) way\b": "is replaced by",
+    r"\bserves?\b": "is used, works",
+    r"\bstands? (for|beside|behind|in|on|at|among|there|above)\b": "is, means, is listed",
+    r"\bmisgivings?\b": "warnings",
+    r"\bharmless\b": "allowed",
+    r"\bmend(s|ed|ing)?\b": "fix",
+    r"\bearns? its place\b": "helps",
+    r"\bbeside other\b": "compared with other",
+}
+ANY_HABIT = re.compile("|".join(f"(?:{h})" for h in HABITS), re.IGNORECASE)
+
+
+def docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    kinds = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    for node in ast.walk(tree):
+        if isinstance(node, kinds) and (text := ast.get_docstring(node)):
+            yield getattr(node, "lineno", 1), text
+
+
+def prose_of(path: Path) -> Iterator[tuple[int, str]]:
+    """Lines of prose: of a document all outside code blocks, of a module comments and strings."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".md":
+        code = False
+        for number, line in enumerate(text.splitlines(), 1):
+            code ^= line.lstrip().startswith("```")
+            if not code:
+                yield number, line
+        return
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type in (tokenize.COMMENT, tokenize.STRING):
+            for offset, line in enumerate(token.string.splitlines()):
+                yield token.start[0] + offset, line
+
+
+def report(found: list[str]) -> None:
+    assert not found, f"{len(found)} places\n" + "\n".join(found)
+
+
+def test_docstrings_begin_with_a_verb_or_a_noun() -> None:
+    report(
+        [
+            f"{path.relative_to(ROOT)}:{line}: {text.splitlines()[0]}"
+            for path in SOURCES
+            for line, text in docstrings(ast.parse(path.read_text(encoding="utf-8")))
+            if RELATIVE_LEAD.match(text)
+        ]
+    )
+
+
+@pytest.mark.parametrize("paths", [SOURCES, DOCUMENTS], ids=["modules", "documents"])
+def test_prose_uses_standard_terms(paths: list[Path]) -> None:
+    report(
+        [
+            f"{path.relative_to(ROOT)}:{line}: {text.strip()}"
+            for path in paths
+            for line, text in prose_of(path)
+            if ANY_HABIT.search(text)
+        ]
+    )
+
+
+def test_comments_give_reasons_on_enough_lines() -> None:
+    lines = [line for path in PACKAGE.rglob("*.py") for line in path.read_text().splitlines()]
+    commented = sum(line.lstrip().startswith("#") or "  # " in line for line in lines)
+    assert commented >= 0.04 * len(lines), f"{commented} of {len(lines)} lines"
