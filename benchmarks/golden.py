@@ -102,7 +102,7 @@ def torques(_: Path) -> Iterator[Row]:
     qdd, load = 90.0 * torch.cos(t + 2 * joint), 1.0 + torch.cos(3 * t + joint).abs()
     for name, model in stored_models():
         with torch.no_grad():
-            yield Row(name, flat(model(qd, qdd, load)), 11)
+            yield Row(name, flat(model(qd, qdd, load)), 12)
 
 
 def rollouts(_: Path) -> Iterator[Row]:
