@@ -1,7 +1,7 @@
 """Golden numbers: what the library computes, held against what it computed before.
 
     python benchmarks/golden.py                          # quick cases, under a minute
-    python benchmarks/golden.py --slow --data DATA       # all of them, about half an hour
+    python benchmarks/golden.py --slow --data DATA       # all of them, some ten minutes
     python benchmarks/golden.py --only fits triple       # some, slow or not
     python benchmarks/golden.py --list
     python benchmarks/golden.py --write --only CASE ...  # records; say in the commit why
@@ -363,7 +363,7 @@ def judged(row: Row, golden: Value | None) -> tuple[str, str, str, str]:
 def shown(value: Value, digits: int) -> str:
     if isinstance(value, list):
         return f"{len(value)} values"
-    return value if isinstance(value, str) else f"{value:.{digits}g}"
+    return value if isinstance(value, str) else f"{value:#.{digits}g}".rstrip(".")
 
 
 def read() -> dict[str, dict[str, Value]]:
