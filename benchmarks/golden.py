@@ -207,8 +207,11 @@ def driven(data: Path) -> Iterator[Row]:
     folder = data / "dfki_double_pendulum"
     *train, test = (str(folder / f"C1_{t}.csv.gz") for t in (143339, 143601, 143747, 144003))
     states = str(folder / "recordings.csv")
-    return compared("compare", *train, TEST_RECORDINGS, test, "--rig", "dfki-C1",
-                    "--models", "CFM,CVFM", INITIAL_STATES, states)  # fmt: skip
+    for row in compared("compare", *train, TEST_RECORDINGS, test, "--rig", "dfki-C1",
+                        "--models", "CFM,CVFM", INITIAL_STATES, states):  # fmt: skip
+        # Dry friction makes this search a rough one: rounding in another back end moves the errors
+        # of CVFM by 0.2 mrad.
+        yield row if row.name.startswith("no friction") else row._replace(digits=2)
 
 
 def tour(_: Path) -> Iterator[Row]:
