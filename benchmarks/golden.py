@@ -49,7 +49,7 @@ from nfriction import (
     rigs,
     rollout,
 )
-from nfriction import twin as twins
+from nfriction.papers import twin as twins
 
 PROGRAM = (sys.executable, "-m", "nfriction")
 TEST_RECORDINGS, INITIAL_STATES = "--held-out", "--initial-states"
