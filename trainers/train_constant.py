@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 from nfriction.evaluation.results import model_info
 from nfriction.fitting.fit import fit
-from nfriction.friction.models import model_by_name
+from nfriction.friction.registry import model_by_name
 from nfriction.papers.afem.fit_by_search import fit_by_search
 from nfriction.papers.reproduction import training
 

@@ -17,7 +17,7 @@ from typing import Any
 
 from nfriction.evaluation.results import model_info
 from nfriction.fitting.fit import fit
-from nfriction.friction.models import model_by_name
+from nfriction.friction.registry import model_by_name
 from nfriction.papers.afem.fit_adaptive import fit_adaptive
 from nfriction.papers.nffem.refine_adaptive import refine_adaptive
 from nfriction.papers.reproduction import training

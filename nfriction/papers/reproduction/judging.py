@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from nfriction.evaluation.score import RMSE, score
-from nfriction.friction.constant import Constant
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.coefficients import Constant
+from nfriction.friction.models import FrictionModel
 from nfriction.papers.reproduction.workspace import Array, Bench
 from nfriction.plant import PendulumChain
 from nfriction.recording import Recording

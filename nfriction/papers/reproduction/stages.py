@@ -15,8 +15,8 @@ from nfriction.evaluation.results import model_info
 from nfriction.export import ExportError, torchscript
 from nfriction.fitting.fit import fit
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction.model import FrictionModel
-from nfriction.friction.models import model_by_name
+from nfriction.friction.models import FrictionModel
+from nfriction.friction.registry import model_by_name
 from nfriction.io.model_file import load, load_info, save
 from nfriction.io.model_info import ModelInfo
 from nfriction.papers import twin

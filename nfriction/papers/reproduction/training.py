@@ -17,7 +17,7 @@ from tqdm import tqdm
 from nfriction.evaluation.score import Score, score
 from nfriction.export import torchscript
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.io.atomic import write_atomically
 from nfriction.io.model_file import save
 from nfriction.io.model_info import ModelInfo
