@@ -17,9 +17,9 @@ from nfriction.evaluation.score import score
 from nfriction.evaluation.time_blocks import Block, at_found_zeros, leave_blocks_out
 from nfriction.fitting.fit import Zeroed, fit
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction.constant import Constant
-from nfriction.friction.model import FrictionModel
-from nfriction.friction.models import model_by_name
+from nfriction.friction.coefficients import Constant
+from nfriction.friction.models import FrictionModel
+from nfriction.friction.registry import model_by_name
 from nfriction.plant import Plant
 
 State = tuple[NDArray[np.float64], NDArray[np.float64]]

@@ -37,11 +37,10 @@ MAY_USE_PAPERS = {"papers", "cli"}
 # Imports of the papers' classes that are still to be replaced by methods of `Schedule`.
 STILL_USE_PAPERS = {
     "nfriction/plots/fuzzy.py",
-    "nfriction/friction/models.py",
     "nfriction/fitting/fit.py",
 }
 # Only command lines talk to a person: the program's, and the one that scripts share.
-MAY_PRINT = ("cli/", "papers/twin/command.py")
+MAY_PRINT = ("cli/", "papers/twin/dataset.py")
 # TorchScript is deprecated upstream; it has one home. Asking whether one is being scripted is no
 # use of it: a module elsewhere may have to.
 MAY_SCRIPT = {"export"}

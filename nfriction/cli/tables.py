@@ -8,7 +8,7 @@ import pandas as pd
 from nfriction.evaluation.compare import NO_FRICTION, Comparison
 from nfriction.evaluation.cross_validation import Selection
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.io.model_info import ModelInfo, describe
 
 LEGEND = (

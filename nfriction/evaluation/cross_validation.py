@@ -19,7 +19,7 @@ from nfriction.evaluation.time_blocks import (
 )
 from nfriction.fitting.data.inputs import zeroed_each
 from nfriction.fitting.strategy.holdout import LEAST_ERROR
-from nfriction.friction.models import model_by_name
+from nfriction.friction.registry import model_by_name
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 

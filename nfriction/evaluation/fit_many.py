@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 from nfriction.evaluation import parallel
 from nfriction.fitting.fit import fit
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction.models import ConstantModel, model_by_name
+from nfriction.friction.models import ConstantModel
+from nfriction.friction.registry import model_by_name
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion

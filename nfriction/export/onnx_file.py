@@ -15,7 +15,7 @@ from nfriction.export.errors import ExportError, first_line
 from nfriction.export.onnx_graph import OnnxGraph
 from nfriction.export.program import exported, run_stateful, silent
 from nfriction.export.unfiltered import Controller, MemoryController, for_single_precision
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.io.atomic import replacing
 from nfriction.io.model_info import ModelInfo
 

@@ -20,7 +20,7 @@ from nfriction.export.filtered import FilteredController
 from nfriction.export.harmless import refuse_harmful_program
 from nfriction.export.points import draw
 from nfriction.export.unfiltered import Controller, MemoryController
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.io import strict_json
 from nfriction.io.atomic import replacing
 from nfriction.io.model_info import ModelInfo

@@ -19,7 +19,7 @@ from nfriction.export.filtered import FilteredController
 from nfriction.export.flat import shortened
 from nfriction.export.harmless import refuse_harmful_script, refuse_harmful_source
 from nfriction.export.unfiltered import Controller, MemoryController
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.io.atomic import replacing
 from nfriction.io.model_info import ModelInfo
 

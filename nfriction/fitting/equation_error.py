@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nfriction.friction.laws import Law
-from nfriction.friction.model import V_SMOOTH, FrictionModel
+from nfriction.friction.models import V_SMOOTH, FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
@@ -113,7 +113,7 @@ def fit_torque(
             f"{names}: too few samples, {len(qd)} are left {EDGE:g} s away from the ends for "
             f"{len(law.coefficients)} coefficients a joint; record for longer."
         )
-    searched = [c.search for c in law.coefficients if not c.linear]
+    searched = [c.initial_grid for c in law.coefficients if not c.linear]
     candidates = [_linear_fit(law, qd, load, torque, v_smooth, dict(zip(
         (i for i, c in enumerate(law.coefficients) if not c.linear), values, strict=True)))
         for values in itertools.product(*searched)]  # fmt: skip
@@ -165,7 +165,7 @@ def prior_sd(law: Law, torque: TorqueFit) -> Tensor:
     Returns:
         (joint, coefficient); infinite where the law expects nothing.
     """
-    shares = torque.torque.new_tensor([c.share for c in law.coefficients])
+    shares = torque.torque.new_tensor([c.prior_scale for c in law.coefficients])
     # Of a light mechanism's torque most is what inertia terms and smoothing leave over.
     left = torque.torque.square() - torque.residual.square()
     told = torch.maximum(left.clamp_min(0.0).sqrt(), LEAST_TOLD * torque.torque).clamp_min(1e-9)

@@ -13,7 +13,7 @@ from nfriction.fitting.strategy.constant_start import constant_start
 from nfriction.fitting.strategy.continuation import JUMP_SD, Callback
 from nfriction.fitting.strategy.encoder_eccentricity import may_be_eccentric
 from nfriction.fitting.strategy.neurofuzzy import fit_network
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.afem.fit_adaptive import fit_adaptive

@@ -1,4 +1,4 @@
-"""Sensitivities: how the coefficients of a law move with a schedule's parameters and the motion."""
+"""Sensitivities: derivatives of a law's coefficients by a schedule's parameters and the motion."""
 
 from dataclasses import dataclass
 
@@ -10,14 +10,14 @@ from torch import Tensor
 class Sensitivity:
     """Derivatives of the coefficients at given motions.
 
-    A parameter acts on one joint's coefficients only, which `joint` names, so the derivative with
-    respect to the parameters needs no joint axis.
+    A parameter acts on one joint's coefficients only, so the derivative by the parameters needs no
+    joint axis.
 
     Attributes:
-        parameters: with respect to the parameter vector, (sample, coefficient, parameter).
+        parameters: by the parameter vector, (sample, coefficient, parameter).
         joint: the joint that each parameter acts on, (parameter,).
-        qd: with respect to the joint's own velocity, (sample, joint, coefficient).
-        qdd: with respect to the joint's own acceleration, (sample, joint, coefficient).
+        qd: by the joint's own velocity, (sample, joint, coefficient).
+        qdd: by the joint's own acceleration, (sample, joint, coefficient).
     """
 
     parameters: Tensor
@@ -25,28 +25,28 @@ class Sensitivity:
     qd: Tensor
     qdd: Tensor
 
-    def pulled(self, held: Tensor) -> Tensor:
-        """Derivatives by the parameters of what depends on the coefficients at many samples.
+    def contract(self, cotangent: Tensor) -> Tensor:
+        """Derivatives by the parameters of quantities that depend on the coefficients.
 
         Args:
-            held: derivatives by the coefficients, (block, row, sample, joint, coefficient); the
-                blocks' samples are those of this sensitivity, one block after the other.
+            cotangent: derivatives by the coefficients at many samples, (block, row, sample, joint,
+                coefficient); the blocks' samples are those of this sensitivity, in order.
 
         Returns:
             Shape (block, row, parameter).
         """
-        blocks, rows, samples, joints, k = held.shape
+        blocks, rows, samples, joints, k = cotangent.shape
         by_parameter = self.parameters.reshape(blocks, samples * k, -1)
-        found = held.new_empty(blocks, rows, len(self.joint))
+        found = cotangent.new_empty(blocks, rows, len(self.joint))
         for joint in range(joints):
             own = (self.joint == joint).nonzero().squeeze(-1)
-            found[..., own] = held[..., joint, :].flatten(2) @ by_parameter[..., own]
+            found[..., own] = cotangent[..., joint, :].flatten(2) @ by_parameter[..., own]
         return found
 
 
 @dataclass(frozen=True)
 class FactoredSensitivity:
-    """The same of a schedule whose outputs share features, which are then never multiplied out.
+    """The same for a schedule whose outputs share features: kept as factors, never multiplied out.
 
     Parameters come in groups, each laid out as (joint, output, feature).
 
@@ -75,10 +75,10 @@ class FactoredSensitivity:
             rows.append(joints.repeat_interleave(mix.shape[-1] * features.shape[-1]))
         return torch.cat(rows)
 
-    def pulled(self, held: Tensor) -> Tensor:
+    def contract(self, cotangent: Tensor) -> Tensor:
         """As in `Sensitivity`."""
-        blocks, rows, samples = held.shape[:3]
-        by_sample = held.permute(0, 2, 3, 1, 4)
+        blocks, rows, samples = cotangent.shape[:3]
+        by_sample = cotangent.permute(0, 2, 3, 1, 4)
         found = []
         for mix, features in self.factors:
             mixed = by_sample @ mix.unflatten(0, (blocks, samples))

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nfriction.friction.model import FrictionModel
-from nfriction.friction.models import MODELS, model_by_name
+from nfriction.friction.models import FrictionModel
+from nfriction.friction.registry import model_by_name, model_names
 from nfriction.io.atomic import write_atomically
 from nfriction.io.model_content import ModelFileError, checksum_of, read_model_file, short
 from nfriction.io.model_info import ModelInfo, describe
@@ -122,10 +122,10 @@ def load_plant(path: str | Path) -> Plant:
 
 def _named_model(path: str | Path, content: Mapping[str, Any]) -> FrictionModel:
     name = content["model"]
-    if name not in MODELS:
+    if name not in model_names():
         raise ModelFileError(
-            f"{path}: {short(name)} is none of the named models ({', '.join(MODELS)}); make the "
-            "model yourself and pass it as `into`."
+            f"{path}: {short(name)} is none of the named models ({', '.join(model_names())}); make "
+            "the model yourself and pass it as `into`."
         )
     try:
         return model_by_name(name)(

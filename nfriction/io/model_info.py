@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.version import __version__
 
 FORMAT, SCHEMA = "nfriction model", 1

@@ -12,8 +12,8 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction.constant import Constant
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.coefficients import Constant
+from nfriction.friction.models import FrictionModel
 from nfriction.plots import style
 from nfriction.signals import Motion
 

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 
 from nfriction.evaluation.compare import Comparison
 from nfriction.evaluation.score import Score
-from nfriction.friction.constant import Constant
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.coefficients import Constant
+from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.plots.coefficients import coefficients_over_time
 from nfriction.plots.dark import GROUND, for_dark_screen

@@ -16,7 +16,7 @@ from nfriction.fitting.result.identifiability import NORMAL_95
 from nfriction.fitting.result.uncertainty import CoefficientUncertainty
 from nfriction.fitting.strategy.extrapolation_prior import visits
 from nfriction.friction.laws import Coefficient
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.plots import style
 from nfriction.plots.fuzzy import Array, Edges, draw_map, neuro_fuzzy, range_of

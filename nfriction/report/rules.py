@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import torch
 
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 
 _SPEEDS = {
@@ -98,7 +98,7 @@ def rules_in_words(model: FrictionModel, joint_names: Sequence[str] = ()) -> lis
         v, a = (c.clamp(0.0, 1.0).T for c in centres)
         grid = [v.repeat_interleave(counts[1], 0), a.repeat(counts[0], 1)]
         found = schedule.network(torch.stack(grid, -1))
-        values = schedule._coefficients(schedule.reference + found)
+        values = schedule.to_coefficients(schedule.reference + found)
     described = []
     for j, joint in enumerate(names):
         span = (upper - lower)[:, j]

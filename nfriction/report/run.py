@@ -11,8 +11,8 @@ import numpy as np
 from nfriction.evaluation.compare import Comparison
 from nfriction.evaluation.cross_validation import Candidate, Selection
 from nfriction.evaluation.score import RMSE, Score
-from nfriction.friction.model import FrictionModel
-from nfriction.friction.models import MODELS
+from nfriction.friction.models import FrictionModel
+from nfriction.friction.registry import model_names
 from nfriction.io import strict_json
 from nfriction.io.model_content import ModelFileError
 from nfriction.io.model_file import load, load_info
@@ -273,7 +273,7 @@ def _models(
     found: dict[str, tuple[FrictionModel, ModelInfo]] = {}
     notes = []
     for name in fits:
-        if name not in MODELS:
+        if name not in model_names():
             continue
         path = folder / "models" / f"{name}.json"
         try:

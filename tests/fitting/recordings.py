@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from nfriction import LinearAxis, PendulumChain, Recording, rollout
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.recording.angles import AngleConvention
 from nfriction.signals import quantise
 

@@ -6,7 +6,7 @@ from nfriction import ALFM, LFM, NFLFM, fit
 from nfriction.fitting.shooting.problem import TrajectoryProblem
 from nfriction.fitting.strategy import continuation as stages
 from nfriction.fitting.strategy.constant_start import is_constant_fit
-from nfriction.friction.constant import Constant
+from nfriction.friction.coefficients import Constant
 from tests.fitting.recordings import pendulum, swing
 
 V_SMOOTH = 0.05

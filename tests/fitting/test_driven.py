@@ -8,9 +8,9 @@ import torch
 
 from nfriction import LFM, NLFM, PendulumChain, Recording, fit, rollout
 from nfriction.evaluation.time_blocks import block_errors, leave_blocks_out
-from nfriction.friction.constant import Constant
-from nfriction.friction.model import FrictionModel
-from nfriction.friction.models import ACVFM, CFM, CVFM, NFCVFM
+from nfriction.friction.coefficients import Constant
+from nfriction.friction.models import CFM, CVFM, NFCVFM, FrictionModel
+from nfriction.papers.afem.models import ACVFM
 from nfriction.signals import quantise
 from tests.fitting.recordings import F64, pendulum, swing
 

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.func import functional_call, jacrev
 
-from nfriction.friction.constant import Constant
+from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import LINEAR, NONLINEAR, STRIBECK, VISCOUS
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import LEAST_RATIO, NeuroFuzzy
 from nfriction.friction.sensitivity import Sensitivity
 from tests.friction.samples import LAWS, QUADRATIC, motion, normal, randomise
@@ -248,7 +248,7 @@ def test_factored_sensitivities_are_pulled_as_if_multiplied_out() -> None:
     found = schedule.sensitivities(qd, qdd)
     whole = Sensitivity(found.parameters, found.joint, found.qd, found.qdd)
     held = torch.randn(3, 4, 2, 2, 5, generator=torch.Generator().manual_seed(3), dtype=qd.dtype)
-    torch.testing.assert_close(found.pulled(held), whole.pulled(held), rtol=1e-12, atol=1e-14)
+    torch.testing.assert_close(found.contract(held), whole.contract(held), rtol=1e-12, atol=1e-14)
 
 
 def central(function: Callable[[Tensor], Tensor], x: Tensor, step: float) -> Tensor:

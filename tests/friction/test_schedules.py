@@ -5,8 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nfriction.friction.coefficients import SMALLEST
-from nfriction.friction.constant import Constant
+from nfriction.friction.coefficients import SMALLEST, Constant
 from nfriction.friction.laws import LINEAR, NONLINEAR, STRIBECK, VISCOUS, Law
 from tests.friction.samples import LAWS, QUADRATIC, motion, normal
 
@@ -104,8 +103,8 @@ def test_bounds_keep_what_is_not_fitted_and_the_sign_of_the_rest(law: Law) -> No
             assert (upper[:, k] == torch.inf).all()
         elif c.fitted:  # free well beyond what is tried, but not without end
             assert (lower[:, k] > 0).all()
-            assert (lower[:, k] < min(c.search)).all()
-            assert (upper[:, k] > max(c.search)).all()
+            assert (lower[:, k] < min(c.initial_grid)).all()
+            assert (upper[:, k] > max(c.initial_grid)).all()
             assert torch.isfinite(upper[:, k]).all()
         else:
             assert torch.equal(lower[:, k], schedule.values[:, k])

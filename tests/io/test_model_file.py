@@ -12,10 +12,9 @@ import pytest
 import torch
 
 from nfriction import PendulumChain, __version__, rollout, score
-from nfriction.friction.constant import Constant
+from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
-from nfriction.friction.model import FrictionModel
-from nfriction.friction.models import LFM, NCFM, NFLFM, NFNLFM, NLFM
+from nfriction.friction.models import LFM, NCFM, NFLFM, NFNLFM, NLFM, FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.io.model_content import ModelFileError, read_model_file
 from nfriction.io.model_file import load, load_info, load_plant, save

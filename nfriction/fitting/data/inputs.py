@@ -14,8 +14,8 @@ from torch import Tensor
 from nfriction.fitting.data.windows import begins_still
 from nfriction.fitting.plant_parameters import PlantParameter, plant_parameters
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction.constant import Constant
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.coefficients import Constant
+from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Step
 from nfriction.plant import LinearAxis, PendulumChain, Plant
 from nfriction.recording import Recording

@@ -22,8 +22,8 @@ from nfriction.fitting.result.identifiability import (
 from nfriction.fitting.result.uncertainty import CoefficientUncertainty
 from nfriction.fitting.shooting.autocorrelation import band_of, effective_noise, local_noise
 from nfriction.fitting.shooting.problem import TrajectoryProblem
-from nfriction.friction.constant import Constant
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.coefficients import Constant
+from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import LeastSquaresResult
 from nfriction.plant import Plant
 from nfriction.signals import Motion, count_seen

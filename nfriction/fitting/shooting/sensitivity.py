@@ -18,7 +18,7 @@ from torch import Tensor
 
 from nfriction import codegen
 from nfriction.fitting.plant_parameters import PlantParameter, adjusted_buffers
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.friction.sensitivity import FactoredSensitivity, Sensitivity
 from nfriction.plant import Plant
 from nfriction.simulation.rk4 import rk4_step
@@ -207,7 +207,7 @@ def _compose(
     )
     steps = (x.unflatten(0, (samples // block, block)) for x in (by_state, by_held, by_plant))
     state, held, plant = _chained(*steps)
-    return state, slope.pulled(held.unflatten(-1, (joints, k)).transpose(1, 2)), plant
+    return state, slope.contract(held.unflatten(-1, (joints, k)).transpose(1, 2)), plant
 
 
 def _chained(state: Tensor, held: Tensor, plant: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -24,8 +24,8 @@ from nfriction.fitting.strategy.continuation import JUMP_SD, Callback, Refinemen
 from nfriction.fitting.strategy.encoder_eccentricity import may_be_eccentric, richer_by_evidence
 from nfriction.fitting.strategy.growing import through_windows
 from nfriction.fitting.strategy.multistart import from_simpler
-from nfriction.friction.constant import Constant
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.coefficients import Constant
+from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
@@ -118,7 +118,7 @@ def fit_constant(
     stage, left_out = through_windows(
         search, settings.windows, vector, motions, None if linear else by_torque
     )
-    if (law := model.law.simpler) is not None and stage.result.status != "stopped":
+    if (law := model.law.nested_law) is not None and stage.result.status != "stopped":
         simpler = FrictionModel(law, Constant(law, model.joints), model.v_smooth)
         _set_by_torque(simpler, begun, joint, motions)
         stage, left_out = from_simpler(

@@ -7,8 +7,8 @@ from nfriction.fitting.data.checks import as_it_looks, misgivings
 from nfriction.fitting.data.inputs import in_joint_coordinates, zeros_serve
 from nfriction.fitting.result.fit_result import Continuity, FitResult
 from nfriction.fitting.strategy.constant import Settings, fit_constant
-from nfriction.friction.constant import Constant
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.coefficients import Constant
+from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion

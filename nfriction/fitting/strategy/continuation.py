@@ -14,8 +14,8 @@ from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.fitting.shooting.problem import TrajectoryProblem, solve_trajectory
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.extrapolation_prior import Anchors
-from nfriction.friction.constant import Constant
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.coefficients import Constant
+from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import LeastSquaresResult, Status, Step
 from nfriction.optim.levenberg_marquardt import FULL
 from nfriction.plant import Plant

@@ -12,7 +12,7 @@ from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.strategy.continuation import LEAST_NOISE, Refinement, Stage, flat, least
 from nfriction.fitting.strategy.growing import through_windows
 from nfriction.friction.laws import Law
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.signals import Motion
 
@@ -126,7 +126,7 @@ def _lifted(law: Law, simpler: Tensor, shapes: Tensor) -> Tensor:
     """
     linear = torch.tensor([c.linear for c in law.coefficients])
     lifted = torch.where(linear, 0.0, shapes)
-    lifted[:, [law.names.index(name) for name in law.shared]] = simpler
+    lifted[:, [law.names.index(name) for name in law.nested_coefficients]] = simpler
     return lifted
 
 

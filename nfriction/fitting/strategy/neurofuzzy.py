@@ -26,7 +26,7 @@ from nfriction.fitting.strategy.continuation import JUMP_SD, Refinement, Stage, 
 from nfriction.fitting.strategy.extrapolation_prior import anchors_where_unseen
 from nfriction.fitting.strategy.holdout import WORTH, Judgement, error_on, judged_windows
 from nfriction.fitting.strategy.neurofuzzy_start import settle_on, start_at
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.plant import Plant
 from nfriction.recording import Recording

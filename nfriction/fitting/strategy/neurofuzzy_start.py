@@ -9,7 +9,7 @@ from torch import Tensor
 from nfriction.fitting.data.inputs import constant_schedule
 from nfriction.fitting.equation_error import natural_scale
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.recording import Recording
 from nfriction.signals import Motion

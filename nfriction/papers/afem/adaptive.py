@@ -14,7 +14,7 @@ from nfriction.friction.sensitivity import Sensitivity
 CLASSES = ("low", "medium", "high")
 
 
-def fading_peak(size: Tensor, fading: Tensor | float) -> Tensor:
+def peak_envelope(size: Tensor, fading: Tensor | float) -> Tensor:
     """Causal envelope of a series: `e_k = max(size_k, fading e_(k-1))`.
 
     Args:
@@ -195,7 +195,7 @@ class Adaptive(Tabulated):
         size = torch.cat([first, qdd[1:].abs()]).nan_to_num(0.0)
         # As the envelope never exceeds its ceiling, neither need what goes into it.
         size = torch.minimum(size, self.ceiling * self.thresholds[:, 1])
-        envelope = fading_peak(size, self.fading)
+        envelope = peak_envelope(size, self.fading)
         at_least = self._count(envelope, self.thresholds * self.band).T.tolist()
         at_most = self._count(envelope, self.thresholds / self.band).T.tolist()
         start = self._count(envelope[0], self.thresholds).tolist()

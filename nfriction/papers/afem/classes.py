@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nfriction.papers.afem.adaptive import CLASSES, Adaptive, fading_peak
+from nfriction.papers.afem.adaptive import CLASSES, Adaptive, peak_envelope
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
@@ -126,7 +126,7 @@ def find_classes(
     notes: list[str] = []
     if intervals is not None:
         labels = [_labels(intervals, r, joints) for r in recordings]
-        parted = _parting(labels, [fading_peak(a.abs(), schedule.fading) for a in qdd])
+        parted = _parting(labels, [peak_envelope(a.abs(), schedule.fading) for a in qdd])
         schedule.set_classes(parted, rate.nan_to_num(0.0, 0.0))
     else:
         found = (

@@ -23,7 +23,7 @@ from nfriction.fitting.shooting.problem import solve_trajectory
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.constant import Settings
 from nfriction.fitting.strategy.constant_start import constant_start
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Step
 from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.afem.classes import AccelerationClasses

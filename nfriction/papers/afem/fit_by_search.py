@@ -20,9 +20,8 @@ from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.fitting.strategy.constant import Settings, fit_by_torque
 from nfriction.fitting.strategy.constant_start import constant_start
-from nfriction.friction.coefficients import Tabulated
-from nfriction.friction.constant import Constant
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.coefficients import Constant, Tabulated
+from nfriction.friction.models import FrictionModel
 from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.afem.classes import AccelerationClasses
 from nfriction.papers.afem.labelled import driving_classes, labelled_model

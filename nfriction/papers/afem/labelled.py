@@ -11,7 +11,7 @@ from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.equation_error import natural_scale
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.shooting.problem import TrajectoryProblem
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.afem.classes import AccelerationClasses
 from nfriction.plant import Plant

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.data.windows import Windows
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.simulation.compiled import integrate_compiled
 from nfriction.simulation.rollout import integrate

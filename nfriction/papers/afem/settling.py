@@ -10,7 +10,7 @@ from torch import Tensor
 from nfriction.fitting.data.inputs import constant_schedule
 from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
 from nfriction.papers.afem.classes import AccelerationClasses, find_classes
 from nfriction.papers.afem.labelled import Labelled

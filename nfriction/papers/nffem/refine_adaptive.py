@@ -14,7 +14,7 @@ from nfriction.fitting.shooting.problem import TrajectoryProblem, solve_trajecto
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.holdout import FOLDS, cut_for_folds, shares_by_joint
 from nfriction.fitting.strategy.neurofuzzy_start import range_of
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Step
 from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.nffem.adaptive_neurofuzzy import AdaptiveNeuroFuzzy

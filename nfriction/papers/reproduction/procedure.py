@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from nfriction.friction.laws import Law
-from nfriction.friction.model import FrictionModel
-from nfriction.friction.models import MODELS, NeuroFuzzyModel
+from nfriction.friction.models import FrictionModel, NeuroFuzzyModel
+from nfriction.friction.registry import model_by_name, model_names
 from nfriction.fuzzy import FuzzySet, RBFNetwork, sets_from_ranges
 from nfriction.optim.evidence_result import EvidenceState
 from nfriction.papers.afem.adaptive import Adaptive
@@ -194,7 +194,7 @@ def _upper_inputs(controller: MamdaniController) -> Tensor:
 
 
 def _neuro_fuzzy_class(law: Law) -> type[NeuroFuzzyModel]:
-    for model in MODELS.values():
+    for model in map(model_by_name, model_names()):
         if issubclass(model, NeuroFuzzyModel) and model.definition is law:
             return model
     raise ValueError(f"there is no neuro-fuzzy model of the law {law.name!r}.")

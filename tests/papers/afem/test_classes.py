@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from nfriction import Recording
-from nfriction.friction.models import ALFM
 from nfriction.papers.afem.classes import find_classes, otsu
+from nfriction.papers.afem.models import ALFM
 from nfriction.signals import Motion
 
 STEP = 2e-3

@@ -7,11 +7,11 @@ from nfriction import LFM, NFLFM, fit
 from nfriction.evaluation.score import score
 from nfriction.fitting.plant_parameters import plant_parameters
 from nfriction.fitting.shooting.sensitivity import StepJacobian
-from nfriction.friction.model import FrictionModel
-from nfriction.friction.models import ALFM
+from nfriction.friction.models import FrictionModel
 from nfriction.papers.afem.classes import find_classes
 from nfriction.papers.afem.fit_adaptive import fit_adaptive
 from nfriction.papers.afem.labelled import Labelled, LabelledProblem
+from nfriction.papers.afem.models import ALFM
 from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import F64, pendulum, swing
 from tests.fitting.test_trajectory import ABSOLUTE, point, windows

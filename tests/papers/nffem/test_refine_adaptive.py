@@ -8,7 +8,7 @@ from nfriction.evaluation.score import score
 from nfriction.fitting.shooting.problem import TrajectoryProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.friction.laws import LINEAR
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.papers.afem.fit_adaptive import fit_adaptive
 from nfriction.papers.nffem.refine_adaptive import refine_adaptive
