@@ -9,7 +9,7 @@ import torch
 from nfriction.evaluation.results import model_info
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.identifiability import Interval
-from nfriction.io.atomic import replacing
+from nfriction.io.atomic import atomic_write
 from nfriction.io.model_file import load, load_info, load_plant, save
 from nfriction.recording import Recording
 from nfriction.signals import Motion
@@ -26,7 +26,7 @@ def save_fit(found: FitResult, path: Path, recordings: Sequence[Recording]) -> N
         recordings: those fitted.
     """
     names, values, bounds = zip(*found.plant_terms, strict=True) if found.plant_terms else ((),) * 3
-    with replacing(path.with_suffix(".npz")) as temporary, temporary.open("wb") as file:
+    with atomic_write(path.with_suffix(".npz")) as temporary, temporary.open("wb") as file:
         np.savez(
             file,
             residuals=found._residuals.numpy(),

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from nfriction.io.atomic import replacing, write_atomically
+from nfriction.io.atomic import atomic_write, write_atomically
 from nfriction.papers.reproduction.settings import Settings
 from nfriction.plant import PendulumChain, rigs
 from nfriction.recording import Recording, read_initial_states
@@ -83,7 +83,7 @@ class Workspace:
 
     def write_arrays(self, stage: str, arrays: Mapping[str, Array]) -> None:
         """Keep arrays beside a stage's result; to be called before `finish`."""
-        with replacing(self._file(stage, "npz")) as temporary, temporary.open("wb") as file:
+        with atomic_write(self._file(stage, "npz")) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
 
     def arrays(self, stage: str) -> dict[str, Array]:
