@@ -25,9 +25,8 @@ RELATIVE_LEAD = re.compile(
 # Habits of the house that a native engineer stumbles on, each with the standard term.
 HABITS = {
     r"\b(is|are|was|were|be|been) told\b": "shown, estimated, reported",
-    r"\b(tells?|told) (of|nothing|apart|more|less|how|what|which|whether|that|one|them|it|small)\b": (
-        "show, separate, estimate, report"
-    ),
+    r"\b(tells?|told) (of|nothing|apart|more|less|how|what|which|whether|that)\b": "show, separate",
+    r"\b(tells?|told) (one|them|it|small)\b": "show, separate",
     r"\b(data|fit|run|recording|torque|file|message|sheet|number)s? (can(not)? )?tells?\b": "show",
     r"\b(left|leaves?|leaving) over\b": "residual",
     r"\bmak(e|es|ing) up for\b|\bmade up for\b": "compensate",

@@ -230,7 +230,7 @@ def at_zeros(
         return list(recordings), tuple(motions)
     mixing = mixing_of(plant, recordings[0].resolve_convention(plant)).numpy()
     off = [np.array(zero) for zero in zeros]
-    shifted = [r.derived(q=r.q + mixing @ z) for r, z in zip(recordings, off, strict=True)]
+    shifted = [r._replace(q=r.q + mixing @ z) for r, z in zip(recordings, off, strict=True)]
     return shifted, tuple(replace(m, q=m.q + z) for m, z in zip(motions, off, strict=True))
 
 

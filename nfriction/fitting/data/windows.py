@@ -98,7 +98,7 @@ def cut_windows(
         raise ValueError(f"`length` must be positive [s], got {length}.")
     pieces = []
     for place, (recording, motion) in enumerate(zip(recordings, motions, strict=True)):
-        for first, last in recording.spans:
+        for first, last in recording.segments:
             span = recording.time[last] - recording.time[first]
             count = max(1, int(span / length + 0.5))
             if count > last - first:
