@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from single_shooting import single_shooting
 
 from nfriction import Recording, rigs
+from nfriction.evaluation.cross_validation import TimeBlock, blocked_k_fold, with_fitted_offsets
 from nfriction.evaluation.score import score
-from nfriction.evaluation.time_blocks import Block, at_found_zeros, leave_blocks_out
 from nfriction.fitting.fit import Zeroed, fit
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction.coefficients import Constant
@@ -84,7 +84,7 @@ class Fold(NamedTuple):
     """What is fitted, and what is left out; with blocks, one of every recording that is fitted."""
 
     fitted: list[Recording]
-    left: list[Left] | list[Block]
+    left: list[Left] | list[TimeBlock]
 
 
 def folds(data: Path, of: Set, blocks: int) -> list[Fold]:
@@ -96,9 +96,9 @@ def folds(data: Path, of: Set, blocks: int) -> list[Fold]:
                  [Left(left, first_state(data, of, left))])
             for k, left in enumerate(recordings)
         ]  # fmt: skip
-    splits = [leave_blocks_out(of.plant(), r, blocks) for r in recordings]
+    splits = [blocked_k_fold(of.plant(), r, blocks) for r in recordings]
     return [
-        Fold([row[k].seen.recording for row in splits], [row[k].unseen for row in splits])
+        Fold([row[k].train.recording for row in splits], [row[k].test for row in splits])
         for k in range(blocks)
     ]
 
@@ -148,7 +148,7 @@ def real(
                 before = nearest_fit(fits, model)
                 fits.append(fit(model, plant, fold.fitted, start=before, zeroed=of.zeroed,
                                 motions=before.motions if before else None))  # fmt: skip
-                left = fold.left if blocks == 1 else at_found_zeros(fits[-1], fold.left)
+                left = fold.left if blocks == 1 else with_fitted_offsets(fits[-1], fold.left)
                 rows[m].add(start, fits[-1].plant, model, left)
             # The peer knows no gaps and one zero for all.
             whole = [r[a : b + 1] for r in fold.fitted for a, b in r.segments]
@@ -179,7 +179,7 @@ class Row:
         start: float,
         plant: Plant,
         model: FrictionModel,
-        left: Sequence[Left] | Sequence[Block],
+        left: Sequence[Left] | Sequence[TimeBlock],
     ) -> None:
         """Count the time since the start, and judge what was found in it."""
         self.spent += time.process_time() - start

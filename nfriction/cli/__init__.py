@@ -69,7 +69,8 @@ def make_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
     parser = Parser(
         prog="nfriction",
-        description="Learn joint friction from encoder recordings, prove it by simulation.",
+        description="Identify joint friction from encoder logs, and check it by simulating "
+        "recordings the fit never saw.",
     )
     parser.add_argument("--version", action="version", version=f"nfriction {__version__}")
     commands = parser.add_subparsers(metavar="COMMAND")

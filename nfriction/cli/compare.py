@@ -1,4 +1,4 @@
-"""`nfriction compare`: fit models, score them, write and show what came out."""
+"""`nfriction compare`: fit models, score them, write and print the results."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from nfriction.recording import Recording
 
 EXAMPLE = """example:
-  nfriction compare run1.csv run2.csv --held-out run3.csv --rig rig.json \\
+  nfriction compare run1.csv run2.csv --test run3.csv --rig rig.json \\
       --models NCFM,LFM,NFLFM --out runs/mine"""
 
 
@@ -29,10 +29,14 @@ def add(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
         description="Fit friction models to recordings and score each by simulating recordings "
         "that no fit has seen.",
     )  # fmt: skip
-    parser.add_argument("train", nargs="+", type=names.file, metavar="TRAIN",
-                        help="recordings to fit, with columns time, q1, ... "
-                        "(.csv, .parquet or .npz)")  # fmt: skip
-    parser.add_argument("--held-out", nargs="+", type=names.file, default=[], metavar="TEST",
+    parser.add_argument(
+        "train",
+        nargs="+",
+        type=names.file,
+        metavar="TRAIN",
+        help=f"recordings to fit, with columns time, q1, ... ({names.FORMATS})",
+    )
+    parser.add_argument("--test", nargs="+", type=names.file, default=[], metavar="TEST",
                         help="recordings to judge by, which no fit sees")  # fmt: skip
     add_comparison_options(parser)
     estimation.add_options(parser)
@@ -48,14 +52,14 @@ def add_comparison_options(parser: argparse.ArgumentParser) -> None:
                         help="table with columns id, q0_1, qd0_1, ... of the recordings' initial "
                         "states (default: estimated from each recording)")  # fmt: skip
     parser.add_argument("--select", action="store_true",
-                        help="also say which model the training recordings alone would choose, "
-                        "by simulating blocks of them left out of the fits")  # fmt: skip
+                        help="also choose a model on the training recordings alone, by "
+                        "cross-validation over blocks of time")  # fmt: skip
     parser.add_argument("--no-figures", action="store_true", help="draw no figures")
     parser.add_argument("--jobs", type=jobs, default=1, metavar="N",
                         help="fits at the same time, each in a process of its own; -1 for one to "
-                        "each core (takes joblib; the results are the same)")  # fmt: skip
+                        "each core (needs joblib; the results are the same)")  # fmt: skip
     parser.add_argument("--log-file", type=Path, metavar="FILE",
-                        help="append what is done, when and with what result")  # fmt: skip
+                        help="append a log of stages, times and results")  # fmt: skip
 
 
 def jobs(text: str) -> int:
@@ -74,16 +78,16 @@ def jobs(text: str) -> int:
 def run(arguments: argparse.Namespace) -> int:
     """Read, then compare."""
     plant = estimation.read_rig(arguments.rig)
-    paths = [*arguments.train, *arguments.held_out]
+    paths = [*arguments.train, *arguments.test]
     recordings = estimation.read_recordings(paths, plant, arguments)
-    train, held_out = recordings[: len(arguments.train)], recordings[len(arguments.train) :]
-    return run_comparison(plant, train, held_out, arguments, estimation.fit_settings(arguments))
+    train, test = recordings[: len(arguments.train)], recordings[len(arguments.train) :]
+    return run_comparison(plant, train, test, arguments, estimation.fit_settings(arguments))
 
 
 def run_comparison(
     plant: Plant,
     train: list[Recording],
-    held_out: list[Recording],
+    test: list[Recording],
     arguments: argparse.Namespace,
     settings: dict[str, Any],
 ) -> int:
@@ -98,27 +102,22 @@ def run_comparison(
     from nfriction.evaluation.parallel import check_jobs
     from nfriction.evaluation.results import write_results
 
-    check_recordings(train, held_out)  # before a choice that takes long
-    states = _initial_states(arguments, plant, [*train, *held_out])
+    check_recordings(train, test)  # before a choice that takes long
+    states = _initial_states(arguments, plant, [*train, *test])
     check_writable(arguments.out)
     check_jobs(arguments.jobs)
     selection = None
-    with _log(arguments.log_file) as logger, Progress() as progress:
-
-        def stage(what: str) -> None:
-            logger.info(what)
-            progress.stage(what)
-
-        settings = settings | {"on_stage": stage, "on_step": progress.step, "jobs": arguments.jobs}
+    with _log(arguments.log_file) as logger, Progress(logger) as progress:
+        settings = settings | {"progress": progress, "jobs": arguments.jobs}
         logger.info(arguments.command_line)
         if arguments.select:
             selection = select(plant, arguments.models, train, **settings)
         comparison = compare(
-            plant, arguments.models, train, held_out, initial_states=states, **settings
+            plant, arguments.models, train, test, initial_states=states, **settings
         )
-        stage("write results and figures")
+        progress.stage("write results and figures")
         write_results(
-            comparison, train, held_out, arguments.out, selection=selection,
+            comparison, train, test, arguments.out, selection=selection,
             command=arguments.command_line, figures=not arguments.no_figures,
         )  # fmt: skip
         logger.info(tables.verdict(comparison))
@@ -155,7 +154,7 @@ def _log(path: Path | None) -> Iterator[logging.Logger]:
     package.addHandler(handler)
     package.setLevel(logging.INFO)
     for shown, level in console.items():
-        shown.setLevel(max(level, logging.WARNING))  # the console is told no more than else
+        shown.setLevel(max(level, logging.WARNING))  # the console shows no more than without it
     try:
         yield package
     finally:
@@ -171,7 +170,7 @@ def _initial_states(
     plant: Plant,
     recordings: Sequence[Recording],
 ) -> InitialStates | None:
-    """States of these recordings; says which have none and so start from their smoothed motion."""
+    """States of these recordings; warns of those that start from their smoothed motion."""
     from nfriction.recording import read_initial_states
 
     path = arguments.initial_states

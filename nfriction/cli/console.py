@@ -1,6 +1,7 @@
 """What a person meets at the console: errors and warnings in a line, progress, Ctrl-C."""
 
 import argparse
+import logging
 import math
 import os
 import re
@@ -145,12 +146,12 @@ def interruptible() -> Iterator[None]:
 
 
 class Progress:
-    """One bar for a whole run: what is being done, and steps taken."""
+    """One bar for a whole run: stages, which are also logged, and steps taken."""
 
-    def __init__(self) -> None:
+    def __init__(self, logger: logging.Logger | None = None) -> None:
         from tqdm import tqdm
 
-        self._what = "start"
+        self._what, self._logger = "start", logger
         self._bar = tqdm(unit=" steps", disable=not sys.stderr.isatty(), leave=False)
 
     def __enter__(self) -> "Progress":
@@ -162,8 +163,10 @@ class Progress:
             error.args = (f"({self._what}); no file was left half-written",)
 
     def stage(self, what: str) -> None:
-        """Say what is done from here on."""
+        """Begin a stage."""
         self._check()
+        if self._logger is not None:
+            self._logger.info(what)
         self._what = what
         self._bar.set_description(what)
 

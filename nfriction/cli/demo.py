@@ -39,9 +39,9 @@ def run(arguments: argparse.Namespace) -> int:
         duration=arguments.seconds,
         progress=sys.stderr.isatty(),
     )
-    plant, train, held_out = simulated.plant, simulated.part("train"), simulated.part("held_out")
+    plant, train, test = simulated.plant, simulated.part("train"), simulated.part("held_out")
     print(
         f"simulated the papers' rig with friction unknown to every model: {len(train)} recordings "
-        f"of {arguments.seconds:g} s to train on, {len(held_out)} held out"
+        f"of {arguments.seconds:g} s to train on, {len(test)} to test on"
     )
-    return run_comparison(plant, train, held_out, arguments, {"fit_plant": False})
+    return run_comparison(plant, train, test, arguments, {"fit_plant": False})

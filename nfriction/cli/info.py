@@ -1,4 +1,4 @@
-"""`nfriction info`: what a model file says."""
+"""`nfriction info`: describe a model file."""
 
 import argparse
 from collections.abc import Iterator, Mapping
@@ -18,9 +18,9 @@ EXAMPLE = """example:
 def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
     """Register the command."""
     parser = commands.add_parser(
-        "info", parents=[common], help="tell what a model file says", epilog=EXAMPLE,
-        description="Tell what a model file says: model, joints, coefficients, trained ranges, how "
-        "the fit ended, rig.",
+        "info", parents=[common], help="describe a model file", epilog=EXAMPLE,
+        description="Describe a model file: model, joints, coefficients, trained ranges, status of "
+        "the fit, rig.",
     )  # fmt: skip
     parser.add_argument("model", type=names.file, metavar="MODEL", help="model file")
     parser.set_defaults(run=run)

@@ -13,6 +13,7 @@ RIGS = (
     "tlrip", "rtip", "multiarm-single", "multiarm-double", "multiarm-triple",
     "dfki-A0", "dfki-C0", "dfki-C1", "emps", "xl330",
 )  # fmt: skip
+FORMATS = "CSV, TSV, TXT, Parquet, NPZ, MAT, HDF5 or MDF4"
 RIG_FILES = (".json", ".toml", ".urdf", ".xml", ".mjcf")
 DEFAULT_MODELS = "NCFM,LFM,NLFM,NFLFM"
 

@@ -13,8 +13,8 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
     """Register the command."""
     parser = commands.add_parser(
         "report", parents=[common], help="write a page of a comparison's folder", epilog=EXAMPLE,
-        description="Write what compare or demo left in a folder as one HTML file that needs "
-        "nothing else: tables that sort, figures that zoom, rules in words, verdicts.",
+        description="Write the folder of compare or demo as one self-contained HTML file: tables "
+        "that sort, figures that zoom, fuzzy rules, verdicts.",
     )  # fmt: skip
     parser.add_argument("folder", type=Path, metavar="RUN", help="folder of compare or demo")
     parser.add_argument("--out", type=Path, metavar="FILE",

@@ -11,8 +11,7 @@ from nfriction.cli.console import Parser, check_writable, count
 EXAMPLE = """example:
   nfriction reproduce --quick --out runs/papers
 
-A run that was ended, by Ctrl-C or by force, goes on where it was when it is started again with the
-same options."""
+An interrupted run resumes where it left off when it is started again with the same options."""
 
 
 def add(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
@@ -26,7 +25,7 @@ def add(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/papers"), help="folder to write")
     parser.add_argument("--quick", action="store_true",
                         help="recordings of 10 s and shorter searches: two minutes instead of "
-                        "half an hour on two cores")  # fmt: skip
+                        "about a quarter of an hour on two cores")  # fmt: skip
     parser.add_argument("--seed", type=count, default=0,
                         help="of the encoders' errors and of the searches")  # fmt: skip
     parser.add_argument("--jobs", type=count, default=2, help="models trained at a time")

@@ -1,26 +1,30 @@
-"""Compare friction models: fit each on training recordings, score it on those held out."""
+"""Compare friction models: fit each to training recordings, score it on test recordings."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 
-from nfriction.evaluation.fit_many import Data, fit_models
-from nfriction.evaluation.score import HORIZONS, Score, improvement_table, rmse_table, score
+from nfriction.evaluation.parallel import Data, Progress, fit_models
+from nfriction.evaluation.score import HORIZONS, Score, score
 from nfriction.fitting.data.inputs import warn_of_undriven
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
-from nfriction.signals import Motion, kalman_smoother
+from nfriction.signals import kalman_smoother
 
 NO_FRICTION = "no friction"
-JUDGED_BY = "free-run RMSE over all joints and held-out recordings"
-# Errors that agree to three digits do not tell two models apart.
+JUDGED_BY = "free-run RMSE over all joints and test recordings"
+SCHEMA = 2
+"""Of `results.json`; the first had no number, and `held_out` where it now says `test`."""
+# Models whose errors agree to three digits are tied.
 TIE = 1e-3
 InitialStates = Mapping[str, tuple[np.ndarray, np.ndarray]]
+Part = Literal["train", "test"]
+PART_NAMES: dict[Part, str] = {"test": "test recordings", "train": "training recordings"}
 
 
 @dataclass(frozen=True, repr=False)
@@ -29,7 +33,7 @@ class Comparison:
 
     Attributes:
         fits: by model name.
-        train, held_out: scores by model name, then recording, `"no friction"` among them.
+        train, test: scores by model name, then recording, `"no friction"` among them.
         unit: of the errors, `"rad"` or `"m"`.
         joint_names: columns of the tables.
         horizons_asked: window lengths that were to be scored [s].
@@ -38,58 +42,75 @@ class Comparison:
 
     fits: dict[str, FitResult]
     train: dict[str, list[Score]]
-    held_out: dict[str, list[Score]]
+    test: dict[str, list[Score]]
     unit: str
     joint_names: tuple[str, ...]
     horizons_asked: tuple[float, ...] = ()
     failed: dict[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        """Which model predicts best, and the free-run errors by model and joint."""
-        held_out = bool(self.held_out)
-        kind = "held-out" if held_out else "training"
-        table = 1e3 * self.table(held_out=held_out)
+        """The best model, and the free-run errors by model and joint."""
+        part: Part = "test" if self.test else "train"
+        table = 1e3 * self.table(part=part)
         table.index.name = f"[m{self.unit}]"
-        lines = [f"Comparison by free-run RMSE over {kind} recordings, best: {self.best()}"]
+        lines = [f"Comparison by free-run RMSE over {PART_NAMES[part]}, best: {self.best()}"]
         lines += table.to_string(float_format=lambda x: f"{x:.4g}").splitlines()
         lines += [f"not fitted: {name}: {why}" for name, why in self.failed.items()]
         return "\n".join(lines)
 
-    def scores(self, *, held_out: bool = True) -> dict[str, list[Score]]:
-        """Scores of a kind by model name.
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """`"test"` and `"train"`, as far as recordings of them were scored."""
+        return tuple(part for part in PART_NAMES if getattr(self, part))
+
+    def scores(self, part: Part = "test") -> dict[str, list[Score]]:
+        """Scores on the recordings of a part by model name.
 
         Raises:
-            ValueError: if no recording of the kind was scored.
+            ValueError: if no recording of the part was scored.
         """
-        scores = self.held_out if held_out else self.train
-        if not scores:
-            raise ValueError("no recording of this kind was scored; see `held_out`.")
+        if part not in self.parts:
+            raise ValueError(f"no {part} recording was scored; give some as `{part}`.")
+        scores: dict[str, list[Score]] = getattr(self, part)
         return scores
 
-    def table(self, horizon: str | None = None, *, held_out: bool = True) -> pd.DataFrame:
-        """Position error by model and joint, over all recordings of a kind (as Table 10)."""
-        scores = self.scores(held_out=held_out)
-        columns = [*self.joint_names, "all"]
-        rmse = rmse_table(scores, horizon)
-        return pd.DataFrame(rmse, index=pd.Index(list(scores), name="model"), columns=columns)
+    def table(self, horizon: str | None = None, *, part: Part = "test") -> pd.DataFrame:
+        """Position error by model and joint: root mean square over the recordings of a part.
 
-    def improvement(self, horizon: str | None = None, *, held_out: bool = True) -> pd.DataFrame:
-        """Error saved against no friction, in percent (as Table 11)."""
-        table = self.table(horizon, held_out=held_out)
-        return pd.DataFrame(
-            improvement_table(table.to_numpy()), index=table.index, columns=table.columns
-        )
+        Args:
+            horizon: window length as in `Score.windows`; None for the free run.
+            part: `"test"` or `"train"`.
 
-    def horizons(self, *, held_out: bool | None = None) -> list[str]:
-        """Window lengths that every recording has; of a kind, or by default of both."""
-        kinds = (self.train, self.held_out)
-        of = kinds if held_out is None else (kinds[held_out],)
-        scores = [s for kind in of for many in kind.values() for s in many]
+        References:
+            TLRIP paper, Table 10.
+        """
+        scores, columns = self.scores(part), [*self.joint_names, "all"]
+        rows = {}
+        for model, of_model in scores.items():
+            errors = [s.free_run if horizon is None else s.windows[horizon] for s in of_model]
+            square = np.mean(np.square([[*e.joints, e.all] for e in errors]), axis=0)
+            rows[model] = np.sqrt(square)
+        return pd.DataFrame.from_dict(rows, orient="index", columns=columns).rename_axis("model")
+
+    def improvement(self, horizon: str | None = None, *, part: Part = "test") -> pd.DataFrame:
+        """Error reduction against the first model, no friction [%]; NaN where both diverged.
+
+        References:
+            TLRIP paper, Table 11.
+        """
+        table = self.table(horizon, part=part)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return 100.0 * (1.0 - table / table.iloc[0])
+
+    def horizons(self, part: Part | None = None) -> list[str]:
+        """Window lengths that every recording has; of a part, or by default of both."""
+        parts = tuple(PART_NAMES) if part is None else (part,)
+        scores = [s for p in parts for of_model in getattr(self, p).values() for s in of_model]
         return [h for h in scores[0].windows if all(h in s.windows for s in scores)]
 
-    def too_short(self, *, held_out: bool = True) -> dict[str, dict[str, float]]:
+    def too_short(self, part: Part = "test") -> dict[str, dict[str, float]]:
         """Recordings too short for a window length: duration [s] by length and recording."""
-        scores = next(iter(self.scores(held_out=held_out).values()))
+        scores = next(iter(self.scores(part).values()))
         found = {
             f"{h:g}": {
                 s.recording: float(s.time[-1] - s.time[0])
@@ -101,57 +122,60 @@ class Comparison:
         return {horizon: short for horizon, short in found.items() if short}
 
     def to_frame(self) -> pd.DataFrame:
-        """Every error as one row: model, recording, kind, horizon, joint, rmse with its unit."""
+        """Every error as one row: model, recording, part, horizon, joint, rmse with its unit."""
         rows = [
-            (model, s.recording, kind, horizon, joint, value)
-            for kind, scores in (("train", self.train), ("held out", self.held_out))
-            for model, of_model in scores.items()
+            (model, s.recording, part, horizon, joint, value)
+            for part in reversed(PART_NAMES)
+            for model, of_model in getattr(self, part).items()
             for s in of_model
             for horizon, rmse in (("free run", s.free_run), *s.windows.items())
             for joint, value in zip(
                 (*self.joint_names, "all"), (*rmse.joints, rmse.all), strict=True
             )
         ]
-        keys = ["model", "recording", "kind", "horizon", "joint"]
+        keys = ["model", "recording", "part", "horizon", "joint"]
         return pd.DataFrame(rows, columns=[*keys, f"rmse [{self.unit}]"])
 
     def best(self) -> str | None:
-        """What predicts the held-out recordings best, `"no friction"` included.
+        """The model that predicts the test recordings best, `"no friction"` included.
 
         Judged by the free run over all joints and recordings; of those that are equal within a
-        thousandth, the one with the fewest parameters. None where nothing was held out, or every
-        free run diverged.
+        thousandth, the one with the fewest parameters. None where there is no test recording, or
+        every free run diverged.
         """
-        if not self.held_out:
+        if not self.test:
             return None
         rmse = self.table()["all"]
         if not np.isfinite(rmse.min()):
             return None
         return min(rmse.index[rmse <= (1 + TIE) * rmse.min()], key=self._parameters)
 
-    def floor(self, column: str = "all", *, held_out: bool = True) -> float | None:
-        """What one encoder count at the start makes of the free run: less tells no models apart.
+    def floor(self, column: str = "all", *, part: Part = "test") -> float | None:
+        """Free-run error caused by one encoder count in the initial state.
+
+        Smaller differences between models are not meaningful.
 
         Args:
             column: joint of the tables, or `"all"`.
-            held_out: over which recordings.
+            part: over which recordings.
 
         Returns:
             Root mean square over them [rad or m], of the model with the least error; None where
             the count is not known or a simulation diverged.
         """
-        scores, free_run = self.scores(held_out=held_out), self.table(held_out=held_out)[column]
-        named = free_run.drop(NO_FRICTION, errors="ignore")
-        floors = [s.floor for s in scores[str((free_run if named.empty else named).idxmin())]]
+        free_run = self.table(part=part)[column]
+        models = free_run.drop(NO_FRICTION, errors="ignore")
+        nearest = str((free_run if models.empty else models).idxmin())
+        floors = [s.floor for s in self.scores(part)[nearest]]
         place = [*self.joint_names, "all"].index(column)
         values = [np.nan if f is None else [*f.joints, f.all][place] for f in floors]
         floor = float(np.sqrt(np.mean(np.square(values))))
         return floor if np.isfinite(floor) else None
 
-    def alike(self) -> tuple[str, ...]:
-        """The best and all within the floor of it, `"no friction"` among them, simplest first.
+    def indistinguishable(self) -> tuple[str, ...]:
+        """The best and all models within the floor of it, `"no friction"` among them.
 
-        The best alone where there is no floor; empty where there is no best.
+        Simplest first. The best alone where there is no floor; empty where there is no best.
         """
         best = self.best()
         if best is None:
@@ -167,25 +191,26 @@ class Comparison:
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON: coefficients, scores, how each fit ended, and which model is best."""
         models: dict[str, Any] = {}
-        for name in self.held_out or self.train:
+        for name in self.test or self.train:
             models[name] = {
-                "held_out": {s.recording: s.to_dict() for s in self.held_out.get(name, [])},
-                "train": {s.recording: s.to_dict() for s in self.train.get(name, [])},
+                part: {s.recording: s.to_dict() for s in getattr(self, part).get(name, [])}
+                for part in PART_NAMES
             }
             if name in self.fits:
-                found = self.fits[name]
+                fit = self.fits[name]
                 models[name] |= {
-                    "coefficients": coefficient_summary(found.model),
-                    "fit": found.to_dict(),
-                }
+                    "coefficients": coefficient_summary(fit.model), "fit": fit.to_dict()
+                }  # fmt: skip
         best, judged = self.best(), None
         if best is not None:
-            alike = list(self.alike())
-            judged = {"model": best, "by": JUDGED_BY, "floor": self.floor(), "alike": alike}
-        failed = {"failed": dict(self.failed)} if self.failed else {}
+            judged = {
+                "model": best, "by": JUDGED_BY, "floor": self.floor(),
+                "indistinguishable": list(self.indistinguishable()),
+            }  # fmt: skip
         return {
+            "schema": SCHEMA,
             "models": models,
-            **failed,
+            **({"failed": dict(self.failed)} if self.failed else {}),
             "best": judged,
             "units": self.unit,
             "joints": list(self.joint_names),
@@ -196,12 +221,11 @@ def compare(
     plant: Plant,
     models: str | Sequence[str],
     train: Recording | Sequence[Recording],
-    held_out: Recording | Sequence[Recording] = (),
+    test: Recording | Sequence[Recording] = (),
     *,
     initial_states: InitialStates | None = None,
     horizons: Sequence[float] = HORIZONS,
-    on_stage: Callable[[str], None] | None = None,
-    on_step: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
     jobs: int = 1,
     **fit_settings: Any,
 ) -> Comparison:
@@ -215,95 +239,92 @@ def compare(
         models: names of models, the simplest first: constant laws start from its plant terms,
             an adaptive or neuro-fuzzy model from the constant fit of its law.
         train: recordings to fit, or one.
-        held_out: recordings to judge by, or one; never seen by a fit.
+        test: recordings to judge by, or one; never seen by a fit.
         initial_states: q0 and qd0 by recording name, in the recording's convention.
         horizons: window lengths of the scores [s].
-        on_stage, on_step: told what is being done, for a progress display; steps only of
-            searches in this process.
+        progress: receives what is being done; steps only of searches in this process.
         jobs: fits at the same time, each in a process of its own; -1 for one to each core. The
-            result does not depend on it. Above 1 it takes joblib, whose `parallel_config`
+            result does not depend on it. Above 1 it needs joblib, whose `parallel_config`
             chooses another backend, such as a Dask cluster.
         fit_settings: see `fit`.
 
     Raises:
-        ValueError: if a recording is both trained on and held out, or names are not unique.
+        ValueError: if a recording is in both parts, or names are not unique.
         ImportError: if `jobs` needs joblib and it is not installed.
         ValueError, ArithmeticError, RuntimeError: if no model could be fitted; where only some
-            could not, `failed` tells why.
+            could not, `failed` has the reasons.
     """
     models = [models] if isinstance(models, str) else models
-    train, held_out = (
-        [given] if isinstance(given, Recording) else list(given) for given in (train, held_out)
+    train, test = (
+        [given] if isinstance(given, Recording) else list(given) for given in (train, test)
     )
     if not models or not train:
         raise ValueError("at least one model and one training recording are needed.")
-    check_recordings(train, held_out)
-    warn_of_undriven([*train, *held_out])
-    # Smoothed once, for all fits and scores.
-    moved = [[_motion(plant, r) for r in kind] for kind in (train, held_out)]
+    check_recordings(train, test)
+    warn_of_undriven([*train, *test])
+    progress = progress or Progress()
+    parts = {"train": _smoothed(plant, train), "test": _smoothed(plant, test)}
     fits, failed = fit_models(
-        plant, models, {"fit": Data(train, moved[0])}, jobs=jobs, on_stage=on_stage,
-        on_step=on_step, **fit_settings,
-    )["fit"]  # fmt: skip
-    say = on_stage or (lambda _: None)
-    scored: tuple[dict[str, list[Score]], dict[str, list[Score]]] = ({}, {})
+        plant, models, {"fit": parts["train"]}, jobs=jobs, progress=progress, **fit_settings
+    )["fit"]
+    scores: dict[str, dict[str, list[Score]]] = {"train": {}, "test": {}}
     states = initial_states or {}
     for name in (NO_FRICTION, *fits):
+        progress.stage(f"score {name}")
         found = fits.get(name)
-        say(f"score {name}")
-        for scores, recordings, motions in zip(scored, (train, held_out), moved, strict=True):
-            if recordings:
-                scores[name] = [
+        for part, data in parts.items():
+            if data.recordings:
+                scores[part][name] = [
                     score(
-                        found.plant if found else plant,
-                        found.model if found else None,
-                        recording,
-                        motion=motion,
-                        initial_state=states.get(recording.name),
-                        horizons=horizons,
+                        found.plant if found else plant, found.model if found else None, recording,
+                        motion=motion, initial_state=states.get(recording.name), horizons=horizons,
                     )
-                    for recording, motion in zip(recordings, motions, strict=True)
-                ]
+                    for recording, motion in zip(*data, strict=True)
+                ]  # fmt: skip
     return Comparison(
-        fits, *scored, unit=plant.unit, joint_names=tuple(plant.joint_names),
+        fits, **scores, unit=plant.unit, joint_names=tuple(plant.joint_names),
         horizons_asked=tuple(horizons), failed=failed,
     )  # fmt: skip
 
 
-def check_recordings(train: Sequence[Recording], held_out: Sequence[Recording]) -> None:
-    """Whether recordings can be told apart, and those to judge by are none that a fit sees.
+def check_recordings(train: Sequence[Recording], test: Sequence[Recording]) -> None:
+    """Require distinct names, and test recordings that no fit sees.
 
     Raises:
-        ValueError: names that repeat, or a recording both trained on and held out, whatever its
-            names.
+        ValueError: names that repeat, or a recording in both parts, whatever its names.
     """
     trained = {recording.digest() for recording in train}
-    seen = [r.name or "a recording" for r in held_out if r.digest() in trained]
+    seen = [r.name or "a recording" for r in test if r.digest() in trained]
     if seen:
         raise ValueError(
-            f"{', '.join(seen)}: trained on and held out; a model is judged by recordings it has "
-            f"not seen."
+            f"{', '.join(seen)}: both trained on and tested on; a model is judged by recordings it "
+            f"has not seen."
         )
-    names = [r.name for r in (*train, *held_out)]
-    repeated = sorted({n for n in names if names.count(n) > 1})
+    names = [r.name for r in (*train, *test)]
+    repeated = sorted({n or "the empty one" for n in names if names.count(n) > 1})
     if repeated:
-        told = ", ".join(n or "the empty one" for n in repeated)
         raise ValueError(
-            f"recordings must have different names, {told} repeats; rename one, in Python by the "
-            f"`name` of `Recording`."
+            f"recordings must have different names, {', '.join(repeated)} repeats; rename one, in "
+            f"Python by the `name` of `Recording`."
         )
+
+
+def coefficients_by_set(model: FrictionModel) -> dict[str, dict[str, list[float]]]:
+    """Coefficients by where they apply and by name, a value a joint."""
+    names = model.schedule.coefficient_names
+    return {
+        label: {name: values[:, k].tolist() for k, name in enumerate(names)}
+        for label, values in model.schedule.coefficient_sets().items()
+    }
 
 
 def coefficient_summary(model: FrictionModel) -> dict[str, Any]:
     """Coefficients by name, a value a joint; by set first where a model has several."""
-    names = model.schedule.coefficient_names
-    summary = {
-        label: {name: values[:, k].tolist() for k, name in enumerate(names)}
-        for label, values in model.schedule.coefficient_sets().items()
-    }
-    return summary.get("always", summary)
+    sets = coefficients_by_set(model)
+    return sets.get("always", sets)
 
 
-def _motion(plant: Plant, recording: Recording) -> Motion:
-    joint = recording.joint_coordinates(plant)
-    return kalman_smoother(joint.time, joint.q)
+def _smoothed(plant: Plant, recordings: Sequence[Recording]) -> Data:
+    """Recordings with their motions, smoothed once for all fits and scores."""
+    joint = [recording.joint_coordinates(plant) for recording in recordings]
+    return Data(recordings, [kalman_smoother(r.time, r.q) for r in joint])

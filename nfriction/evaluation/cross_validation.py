@@ -1,38 +1,54 @@
-"""Choice of a law on training data alone, by cross-validation over blocks of time."""
+"""Choose a law on training data alone, by cross-validation over blocks of time."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from nfriction.evaluation.fit_many import Data, Fits, fit_models
-from nfriction.evaluation.time_blocks import (
-    Block,
-    Split,
-    block_errors,
-    leave_blocks_out,
-    longest_stretch,
-)
-from nfriction.fitting.data.inputs import zeroed_each
+from nfriction.evaluation.parallel import Data, Fits, Progress, fit_models
+from nfriction.evaluation.score import score
+from nfriction.fitting.data.inputs import at_zeros, zeroed_each
+from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.strategy.holdout import LEAST_ERROR
 from nfriction.friction.registry import model_by_name
 from nfriction.plant import Plant
 from nfriction.recording import Recording
+from nfriction.signals import Motion, kalman_smoother
+
+# Relative difference of errors that counts as none.
+TOLERANCE = 0.02
+# Fewer samples say nothing about a law.
+SHORTEST_BLOCK = 100
+
+
+class TimeBlock(NamedTuple):
+    """A part of a recording, with its motion in joint coordinates."""
+
+    recording: Recording
+    motion: Motion
+
+
+class Fold(NamedTuple):
+    """A block of a recording to test on, and the rest of it to train on."""
+
+    test: TimeBlock
+    train: TimeBlock
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """How one model fared on blocks that it had not seen.
+    """Errors of one model on blocks that its fits had not seen.
 
     Attributes:
         name: of the model.
         errors: root mean square position error of each block [rad or m], infinite where the model
             diverged or could not be fitted; blocks in the same order for all candidates.
-        parameters: how many numbers a fit varies in the friction model.
+        parameters: number of fitted parameters of the friction model.
         converged: whether every fold's fit converged.
     """
 
@@ -49,7 +65,7 @@ class Candidate:
 
 @dataclass(frozen=True, repr=False)
 class Selection:
-    """Models compared by cross-validation, and the one to take.
+    """Models compared by cross-validation, and the one to choose.
 
     Attributes:
         chosen: name of the model.
@@ -66,7 +82,7 @@ class Selection:
     unit: str
 
     def __repr__(self) -> str:
-        """What is chosen and why, and how all candidates fared."""
+        """The choice, its reason, and the errors of all candidates."""
         return f"Selection of {self.chosen}: {self.reason}\n{self.to_frame().to_string()}"
 
     def to_frame(self) -> pd.DataFrame:
@@ -76,7 +92,7 @@ class Selection:
         return pd.DataFrame.from_dict(rows, orient="index", columns=columns)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON; a diverged block has no number."""
+        """Plain JSON; a diverged block has null for a number."""
         return {
             "chosen": self.chosen,
             "reason": self.reason,
@@ -84,8 +100,8 @@ class Selection:
             "units": self.unit,
             "candidates": {
                 c.name: {
-                    "error": _finite(c.error),
-                    "blocks": [_finite(e) for e in c.errors],
+                    "error": c.error if math.isfinite(c.error) else None,
+                    "blocks": [e if math.isfinite(e) else None for e in c.errors],
                     "parameters": c.parameters,
                     "converged": c.converged,
                 }
@@ -101,9 +117,7 @@ def select(
     *,
     folds: int = 3,
     horizon: float = 5.0,
-    tolerance: float = 0.02,
-    on_stage: Callable[[str], None] | None = None,
-    on_step: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
     jobs: int = 1,
     **fit_settings: Any,
 ) -> Selection:
@@ -111,21 +125,19 @@ def select(
 
     Every recording is cut into as many blocks of time as there are folds. Each fold leaves one
     block of every recording out, fits all models to the rest and simulates the blocks left out;
-    where encoders were zeroed anew for each recording, with the zeros that the rest showed. A
-    model with fewer parameters is preferred where its error cannot be told from the least one:
-    within `tolerance`, or within the standard error of the difference over blocks, both of their
-    mean squares and of the logarithms: one block of violent motion must not hide that it is worse
-    on all others.
+    where encoders were zeroed anew for each recording, with the offsets estimated from the rest. A
+    model with fewer parameters is preferred where its error is statistically tied with the least
+    one: within 2 %, or within the standard error of the difference over blocks, both of their mean
+    squares and of the logarithms: one block of violent motion must not hide that it is worse on
+    all others.
 
     Args:
         plant: the mechanism as given.
         models: names of models, simple ones first.
-        recordings: what may be trained on.
+        recordings: training recordings.
         folds: at least 2.
         horizon: length of the simulations [s]; a block where that is shorter.
-        tolerance: relative difference of errors that counts as none.
-        on_stage, on_step, jobs: as in `compare`; fits of different folds never wait for each
-            other.
+        progress, jobs: as in `compare`; fits of different folds never wait for each other.
         fit_settings: see `fit`.
 
     Returns:
@@ -141,46 +153,90 @@ def select(
             f"{len(models)} models, {len(recordings)} recordings and {folds} folds."
         )
     names = list(dict.fromkeys(models))
-    splits = [leave_blocks_out(plant, recording, folds) for recording in recordings]
+    by_recording = [blocked_k_fold(plant, recording, folds) for recording in recordings]
     if fit_settings.get("zeroed", "auto") == "auto":
         # Blocks no longer show where their recording began.
         each = zeroed_each(plant, recordings)
         fit_settings["zeroed"] = "each" if each else "once"
-    horizon = min(horizon, *(longest_stretch(s.unseen.recording) for row in splits for s in row))
-    seen, unseen = _folds(splits, folds)
-    fits = fit_models(
-        plant, names, seen, jobs=jobs, on_stage=on_stage, on_step=on_step, **fit_settings
+    horizon = min(
+        horizon, *(longest_segment(f.test.recording) for row in by_recording for f in row)
     )
-    candidates = tuple(_candidate(plant, name, fits, unseen, horizon) for name in names)
-    return Selection(*choose(candidates, tolerance, plant.unit), candidates, horizon, plant.unit)
-
-
-def _folds(
-    splits: Sequence[list[Split]], folds: int
-) -> tuple[dict[str, Data], dict[str, list[Block]]]:
-    """What each fold's fits see of every recording, and what they do not."""
-    seen, unseen = {}, {}
-    for fold in range(folds):
-        label = f"fold {fold + 1} of {folds}: fit"
+    train, test = {}, {}
+    for k in range(folds):
+        label = f"fold {k + 1} of {folds}: fit"
         # Staggered, so that no fold lacks the same stretch of every recording.
-        chosen = [row[(fold + i) % folds] for i, row in enumerate(splits)]
-        unseen[label] = [split.unseen for split in chosen]
-        left = [split.seen for split in chosen]
-        seen[label] = Data([b.recording for b in left], [b.motion for b in left])
-    return seen, unseen
+        chosen = [row[(k + i) % folds] for i, row in enumerate(by_recording)]
+        test[label] = [fold.test for fold in chosen]
+        left = [fold.train for fold in chosen]
+        train[label] = Data([b.recording for b in left], [b.motion for b in left])
+    fits = fit_models(plant, names, train, jobs=jobs, progress=progress, **fit_settings)
+    candidates = tuple(_candidate(plant, name, fits, test, horizon) for name in names)
+    return Selection(*choose(candidates, plant.unit), candidates, horizon, plant.unit)
+
+
+def blocked_k_fold(plant: Plant, recording: Recording, count: int) -> list[Fold]:
+    """Folds of a recording, each with one of `count` blocks of time to test on.
+
+    Blocks share their end samples with the rest. The whole recording is smoothed once: a block's
+    ends are then as well known as its middle.
+
+    Raises:
+        ValueError: if the blocks would have fewer than 100 samples.
+    """
+    if len(recording) < SHORTEST_BLOCK * count:
+        raise ValueError(
+            f"{recording.name or 'a recording'} has {len(recording)} samples, too few for "
+            f"{count} blocks of at least {SHORTEST_BLOCK}; give fewer folds or longer recordings."
+        )
+    joint = recording.joint_coordinates(plant)
+    motion = kalman_smoother(joint.time, joint.q)
+    index = np.arange(len(recording))
+    folds = []
+    for first, last in pairwise(np.linspace(0, index[-1], count + 1).astype(int)):
+        inside = (first <= index) & (index <= last)
+        # A block at an end of the recording leaves no lone sample behind.
+        rest = ((index <= first) & (first > 0)) | ((last <= index) & (last < index[-1]))
+        folds.append(Fold(*(TimeBlock(recording[m], _part(motion, m)) for m in (inside, rest))))
+    return folds
+
+
+def _part(motion: Motion, mask: NDArray[np.bool_]) -> Motion:
+    return Motion(motion.time[mask], motion.q[mask], motion.qd[mask], motion.qdd[mask])
+
+
+def longest_segment(recording: Recording) -> float:
+    """Duration of the longest segment without a gap [s]."""
+    return max(float(recording.time[b] - recording.time[a]) for a, b in recording.segments)
+
+
+def with_fitted_offsets(found: FitResult, blocks: Sequence[TimeBlock]) -> list[TimeBlock]:
+    """Blocks with the encoder offsets that a fit found in the rest, one block a recording."""
+    recordings, motions = at_zeros(
+        found.zeros, found.plant, [b.recording for b in blocks], [b.motion for b in blocks]
+    )
+    return [TimeBlock(*pair) for pair in zip(recordings, motions, strict=True)]
+
+
+def block_errors(found: FitResult, blocks: Sequence[TimeBlock], horizon: float) -> list[float]:
+    """Root mean square position error of simulations of `horizon` seconds over each block."""
+    return [
+        score(found.plant, found.model, block.recording, motion=block.motion, horizons=(horizon,))
+        .windows[f"{horizon:g}"].all
+        for block in with_fitted_offsets(found, blocks)
+    ]  # fmt: skip
 
 
 def _candidate(
     plant: Plant,
     name: str,
     fits: Mapping[str, Fits],
-    unseen: Mapping[str, list[Block]],
+    test: Mapping[str, list[TimeBlock]],
     horizon: float,
 ) -> Candidate:
     """A model judged on the blocks that its fits have not seen."""
     errors: list[float] = []
     converged = True
-    for label, blocks in unseen.items():
+    for label, blocks in test.items():
         found = fits[label].found.get(name)
         converged &= found is not None and found.converged
         errors += block_errors(found, blocks, horizon) if found else [math.inf] * len(blocks)
@@ -188,49 +244,46 @@ def _candidate(
     return Candidate(name, tuple(errors), parameters, converged)
 
 
-def choose(
-    candidates: Sequence[Candidate], tolerance: float = 0.02, unit: str = "rad"
-) -> tuple[str, str]:
-    """The model with the fewest parameters whose error cannot be told from the least.
+def choose(candidates: Sequence[Candidate], unit: str = "rad") -> tuple[str, str]:
+    """The model with the fewest parameters that is statistically tied with the best.
 
     Args:
         candidates: with errors of the same blocks.
-        tolerance: relative difference of errors that counts as none.
         unit: of the errors.
 
     Returns:
         Its name, and why, in a sentence.
     """
 
-    def told(candidate: Candidate) -> str:
+    def error(candidate: Candidate) -> str:
         return f"{1e3 * candidate.error:.3g} m{unit}"
 
     best = min(candidates, key=lambda c: c.error)
     if not math.isfinite(best.error):
         simplest = min(candidates, key=lambda c: c.parameters)
         return simplest.name, "every model diverged on a block left out; the simplest is taken."
-    alike = [c for c in candidates if _alike(c, best, tolerance)]
-    chosen = min(alike, key=lambda c: (c.parameters, c.error))
+    tied = [c for c in candidates if _indistinguishable(c, best)]
+    chosen = min(tied, key=lambda c: (c.parameters, c.error))
     if chosen is not best:
         return chosen.name, (
-            f"its error on blocks left out, {told(chosen)}, cannot be told from the least, "
-            f"{told(best)} of {best.name}, and it has fewer parameters "
+            f"its error on blocks left out, {error(chosen)}, is statistically tied with the least, "
+            f"{error(best)} of {best.name}, and it has fewer parameters "
             f"({chosen.parameters} against {best.parameters})."
         )
     others = sorted((c for c in candidates if c is not best), key=lambda c: c.error)
     if not others:
         return best.name, "it is the only model."
     return best.name, (
-        f"its error on blocks left out, {told(best)}, is the least; {others[0].name} follows "
-        f"with {told(others[0])}."
+        f"its error on blocks left out, {error(best)}, is the least; {others[0].name} follows "
+        f"with {error(others[0])}."
     )
 
 
-def _alike(one: Candidate, best: Candidate, tolerance: float) -> bool:
-    """Whether two errors differ by no more than their blocks make them."""
+def _indistinguishable(one: Candidate, best: Candidate) -> bool:
+    """Whether two errors differ by no more than the scatter over their blocks."""
     if not math.isfinite(one.error):
         return False
-    if one.error <= (1 + tolerance) * best.error:
+    if one.error <= (1 + TOLERANCE) * best.error:
         return True
     squares = np.square([one.errors, best.errors])
     logarithms = np.log(squares.clip(min=LEAST_ERROR**2))
@@ -242,7 +295,3 @@ def _within_error(difference: NDArray[np.float64]) -> bool:
     n = len(difference)
     error = float(difference.std(ddof=1)) / math.sqrt(n) if n > 1 else 0.0
     return float(difference.mean()) <= error
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""An estimator as scikit-learn's users expect one: recordings in, a friction model learnt."""
+"""A scikit-learn estimator: recordings in, a friction model out."""
 
 import copy
 import inspect
@@ -14,39 +14,56 @@ from numpy.typing import ArrayLike, NDArray
 from nfriction.evaluation.score import score
 from nfriction.fitting.fit import fit
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.fitting.strategy.constant import WINDOWS
-from nfriction.friction.coefficients import Constant
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.registry import model_by_name
 from nfriction.plant import Plant
 from nfriction.recording import Recording, Unit
 from nfriction.signals import kalman_smoother
 
+try:
+    from sklearn.base import BaseEstimator
+except ImportError:
+
+    class BaseEstimator:  # type: ignore[no-redef]
+        """Says what is missing as soon as an estimator is made."""
+
+        def __new__(cls, *_: object, **__: object) -> "BaseEstimator":
+            raise ImportError(
+                f"{cls.__name__} needs scikit-learn: `pip install nfriction[sklearn]`; "
+                "`nfriction.fit` and `nfriction.select` do not."
+            )
+
+
 Array = NDArray[np.float64]
 # One recording, or its table with columns time, q1, ... as `Recording.from_pandas` takes it.
 Sample = Recording | pd.DataFrame
+# Settings of `fit` that are no matter of one call.
+SETTINGS = {
+    name: parameter
+    for name, parameter in inspect.signature(fit).parameters.items()
+    if parameter.kind is parameter.KEYWORD_ONLY and name not in ("start", "motions", "callback")
+}
 
 
-class FrictionEstimator:
-    """Learn the friction of a mechanism from recordings of its motion.
+class FrictionEstimator(BaseEstimator):
+    """Estimate the friction of a mechanism from recordings of its motion.
 
     A sample is a whole recording, so cross-validation leaves out recordings: `X` is a list of
-    them. It needs nothing of scikit-learn and works with its `clone`, `cross_val_score`,
-    `GridSearchCV` and pipelines' last steps.
+    them. `clone`, `cross_val_score`, `GridSearchCV` and pipelines take it.
 
     Args:
         plant: the mechanism.
-        model: name of a friction model, or one to start from, which stays as it is.
-        method, windows, fit_plant, drag, eccentricity, zeroed, continuity, max_steps: see
-            `nfriction.fit`.
+        model: name of a friction model, or one to start from, which stays unchanged.
         horizon: length of the simulations by which `score` judges [s].
+        fit_settings: keyword arguments of `nfriction.fit`, such as `drag=False`; each is a
+            parameter of the estimator, for grids, too.
 
     Attributes:
-        fit_: the `FitResult` with its verdict; read `fit_.status` and `fit_.warnings`.
+        fit_: the `FitResult`; read `fit_.status` and `fit_.warnings`.
         model_: the fitted friction model, a torch module; for `nfriction.save` and exports.
         plant_: the plant with its adjusted terms.
         coef_: coefficients of a constant law, (joint, coefficient), SI.
-        coef_names_: what they are called.
+        coef_names_: their names.
         n_joints_: number of joints.
 
     Examples:
@@ -60,37 +77,27 @@ class FrictionEstimator:
         plant: Plant | None = None,
         model: str | FrictionModel = "LFM",
         *,
-        method: str = "trajectory",
-        windows: Sequence[float] = WINDOWS,
-        fit_plant: bool = True,
-        drag: bool | None = None,
-        eccentricity: bool | None = False,
-        zeroed: str = "auto",
-        continuity: str = "free",
-        max_steps: int = 30,
         horizon: float = 5.0,
+        **fit_settings: Any,
     ) -> None:
-        # As scikit-learn asks: kept as given, looked at by `fit`.
+        # Kept as given and checked by `fit`, as scikit-learn requires.
         self.plant = plant
         self.model = model
-        self.method = method
-        self.windows = windows
-        self.fit_plant = fit_plant
-        self.drag = drag
-        self.eccentricity = eccentricity
-        self.zeroed = zeroed
-        self.continuity = continuity
-        self.max_steps = max_steps
         self.horizon = horizon
+        unknown = set(fit_settings) - set(SETTINGS)
+        if unknown:
+            raise TypeError(f"`fit` has no setting {', '.join(sorted(unknown))}.")
+        for name, parameter in SETTINGS.items():
+            setattr(self, name, fit_settings.get(name, parameter.default))
 
     fit_: FitResult
 
     def fit(self, X: Sample | Sequence[Sample], y: object = None) -> "FrictionEstimator":
-        """Learn from recordings.
+        """Estimate from recordings.
 
         Args:
             X: recordings, or tables with columns time, q1, ... (see `Recording.from_pandas`).
-            y: ignored; what is to be predicted is in the recordings.
+            y: ignored; positions to be predicted are in the recordings.
 
         Returns:
             This estimator.
@@ -104,9 +111,7 @@ class FrictionEstimator:
             model: FrictionModel = model_by_name(self.model)(self.plant.joints)
         else:
             model = copy.deepcopy(self.model)
-        settings = self.get_params()
-        for own in ("plant", "model", "horizon"):
-            del settings[own]
+        settings = {name: getattr(self, name) for name in SETTINGS}
         self.fit_ = fit(model, self.plant, _recordings(X, self.plant), **settings)
         return self
 
@@ -129,12 +134,12 @@ class FrictionEstimator:
     @property
     def coef_(self) -> Array:
         schedule = self._fitted.model.schedule
-        if not isinstance(schedule, Constant):
+        if schedule.follows_motion:
             raise AttributeError(
                 f"the coefficients of {type(self.model_).__name__} follow the motion; ask "
                 "`model_.coefficients(qd, qdd)`."
             )
-        return schedule.values.detach().numpy().copy()
+        return schedule.coefficient_sets()["always"].numpy().copy()
 
     def predict(
         self,
@@ -152,7 +157,7 @@ class FrictionEstimator:
 
         Returns:
             The torque of `M(q) qdd + bias(q, qd) + tau_f = tau` [N m; N of a sliding axis],
-            (sample, joint). Coefficients with a memory follow the samples in their order.
+            (sample, joint). Coefficients with a state follow the samples in their order.
 
         Raises:
             ValueError: if it is not fitted, or shapes do not fit.
@@ -168,10 +173,10 @@ class FrictionEstimator:
             else:
                 velocity = self._rows(X, "X")
                 acceleration, loads = (
-                    velocity.new_full(velocity.shape, value)
+                    torch.full_like(velocity, default)
                     if given is None
                     else self._rows(given, name, len(velocity))
-                    for given, name, value in ((qdd, "qdd", 0.0), (load, "load", 1.0))
+                    for given, name, default in ((qdd, "qdd", 0.0), (load, "load", 1.0))
                 )
             if model.state_size:
                 states = model.schedule.states(velocity, acceleration)
@@ -180,15 +185,12 @@ class FrictionEstimator:
             return model(velocity, acceleration, loads).numpy()
 
     def simulate(self, recording: Sample) -> pd.DataFrame:
-        """The motion that the model predicts from a recording's start and torques.
-
-        Args:
-            recording: what was measured.
+        """The motion that the model predicts from a recording's initial state and torques.
 
         Returns:
             Table with columns time [s], q1, ... in the recording's convention and unit, a row a
-            sample, NaN from where the simulation diverged: `Recording.to_pandas` of what was
-            measured has the same columns.
+            sample, NaN from where the simulation diverged: `Recording.to_pandas` of the
+            recording has the same columns.
         """
         (given,) = _recordings(recording, self.plant_)
         run = score(self.plant_, self.model_, given, horizons=())
@@ -213,50 +215,8 @@ class FrictionEstimator:
             errors.append(found.windows[f"{horizon:g}"].all)
         return -math.sqrt(sum(e * e for e in errors) / len(errors))
 
-    def get_params(self, deep: bool = True) -> dict[str, Any]:
-        """Constructor arguments by name."""
-        return {name: getattr(self, name) for name in _parameters()}
-
-    def set_params(self, **params: Any) -> "FrictionEstimator":
-        """Change constructor arguments.
-
-        Raises:
-            ValueError: for a name that is none.
-        """
-        known = list(_parameters())
-        unknown = sorted(set(params) - set(known))
-        if unknown:
-            raise ValueError(
-                f"no parameter is called {', '.join(unknown)}; there are {', '.join(known)}."
-            )
-        for name, value in params.items():
-            setattr(self, name, value)
-        return self
-
-    def __repr__(self) -> str:
-        plant = getattr(self.plant, "name", "") or type(self.plant).__name__
-        model = self.model if isinstance(self.model, str) else type(self.model).__name__
-        changed = [
-            f"{name}={value!r}"
-            for name, value in self.get_params().items()
-            if name not in ("plant", "model") and repr(value) != repr(_parameters()[name])
-        ]
-        fitted = f"  # {self.fit_.status}" if hasattr(self, "fit_") else ""
-        return f"FrictionEstimator({', '.join([f'<{plant}>', repr(model), *changed])}){fitted}"
-
     def __sklearn_is_fitted__(self) -> bool:
         return hasattr(self, "fit_")
-
-    def __sklearn_tags__(self) -> Any:
-        # Only scikit-learn asks, so it is there.
-        from sklearn.utils import InputTags, Tags, TargetTags
-
-        return Tags(
-            estimator_type=None,
-            target_tags=TargetTags(required=False),
-            input_tags=InputTags(two_d_array=False),
-            non_deterministic=False,
-        )
 
     @property
     def _fitted(self) -> FitResult:
@@ -275,14 +235,13 @@ class FrictionEstimator:
         return values
 
 
-def _parameters() -> dict[str, Any]:
-    """Constructor arguments and their defaults."""
-    signature = inspect.signature(FrictionEstimator.__init__)
-    return {name: p.default for name, p in signature.parameters.items() if name != "self"}
+# scikit-learn reads an estimator's parameters off its constructor.
+_own = list(inspect.signature(FrictionEstimator.__init__).parameters.values())[:-1]
+FrictionEstimator.__init__.__signature__ = inspect.Signature([*_own, *SETTINGS.values()])  # type: ignore[attr-defined]
 
 
 def _recordings(X: object, plant: Plant) -> list[Recording]:
-    """Recordings of what a user gives for them; a table that says no unit is in the plant's."""
+    """Recordings of any accepted form; a table without a unit is in the plant's."""
     many = [X] if isinstance(X, Recording | pd.DataFrame) else X
     if not isinstance(many, Sequence | np.ndarray) or not len(many):
         raise ValueError(f"recordings are needed, one or a list of them, got {X!r}.")

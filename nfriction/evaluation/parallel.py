@@ -1,70 +1,180 @@
-"""Pieces of independent work: one after the other, or in parallel processes by joblib.
+"""Fit many models at the same time: an order that lets most run at once, in joblib's processes.
 
-Which processes is joblib's business: its own on this machine, or those of a cluster where the
-caller says so, `with joblib.parallel_config(backend="dask"):`. What a piece logs and warns of is
-told here, as if it had been done here, and every piece has one thread, wherever it is done.
+Which processes is joblib's choice: its own on this machine, or those of a cluster where the caller
+says so, `with joblib.parallel_config(backend="dask"):`. Logs and warnings of a task come back with
+its result and are reported here, and every task has one thread wherever it runs, so the results do
+not depend on the number of processes.
 """
 
 import logging
+import logging.handlers
 import signal
 import textwrap
 import threading
+import time
 import uuid
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
-from typing import Any, Generic, TypeVar
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field, replace
+from queue import SimpleQueue
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import torch
 
+from nfriction.fitting.fit import fit
+from nfriction.fitting.result.fit_result import FitResult
+from nfriction.friction.models import ConstantModel
+from nfriction.friction.registry import model_by_name
+from nfriction.plant import Plant
+from nfriction.recording import Recording
+from nfriction.signals import Motion
+
+logger = logging.getLogger(__name__)
+
 T = TypeVar("T")
-# As `warnings.warn_explicit` keeps what it has shown.
-_Registry = dict[str | tuple[str, type[Warning], int], int]
-
-# Tells this process from those that work for it.
+# Identifies this process; a task that finds another value runs elsewhere.
 _HERE = uuid.uuid4().hex
-_LOGGER = logging.getLogger("nfriction")
+_PACKAGE = logging.getLogger("nfriction")
 
 
-@dataclass
-class _Told:
-    """What a piece of work logged and warned of."""
+class Progress:
+    """Receives what is being done; this one ignores it."""
 
-    records: list[logging.LogRecord] = field(default_factory=list)
-    warned: list[warnings.WarningMessage] = field(default_factory=list)
+    def stage(self, what: str) -> None:
+        """Begin a stage."""
 
-    def tell(self, shown: _Registry) -> None:
-        """Tell it here; `shown` remembers what need not be told twice."""
-        for record in self.records:
-            logger = logging.getLogger(record.name)
-            if logger.isEnabledFor(record.levelno):
-                logger.handle(record)
-        for w in self.warned:
-            warnings.warn_explicit(str(w.message), w.category, w.filename, w.lineno, registry=shown)
+    def step(self, stage: str) -> None:
+        """Count a step of a search that runs in this process."""
 
 
-@dataclass(frozen=True)
-class _Piece(Generic[T]):
-    """Work to be done in some process."""
+class Data(NamedTuple):
+    """Recordings, and their smoothed motions in joint coordinates."""
 
-    label: str
-    work: Callable[..., T]
-    arguments: tuple[Any, ...]
-    home: str
-    level: int
+    recordings: Sequence[Recording]
+    motions: Sequence[Motion]
 
-    def __call__(self) -> tuple[str, T, _Told]:
-        told = _Told()
-        with ExitStack() as stack:
-            stack.enter_context(one_thread())
-            if self.home != _HERE:
-                stack.enter_context(_listening(told, self.level))
-            return self.label, _named(self.label, self.work, self.arguments), told
+
+class Fits(NamedTuple):
+    """Fits by model, in the order asked for, and why a model has none."""
+
+    found: dict[str, FitResult]
+    failed: dict[str, str]
+
+
+def fit_models(
+    plant: Plant,
+    models: Sequence[str],
+    parts: Mapping[str, Data],
+    *,
+    jobs: int = 1,
+    progress: Progress | None = None,
+    **fit_settings: Any,
+) -> dict[str, Fits]:
+    """Fit every model to every part of the data.
+
+    Fits of a level start from those of the levels before and are independent of each other, so
+    the result is the same however many processes share the work. A model that cannot be fitted
+    does not stop the others.
+
+    Args:
+        plant: the mechanism as given.
+        models: names of models.
+        parts: data by the label of the work on them, such as "fit".
+        jobs: number of processes, each on one thread; -1 for one to each core.
+        progress: receives what is being done.
+        fit_settings: see `nfriction.fit`.
+
+    Returns:
+        Fits by part.
+
+    Raises:
+        ValueError: if there is no such model, or a setting cannot be sent to other processes.
+        ImportError: if `jobs` needs joblib and it is not installed.
+        ValueError, ArithmeticError, RuntimeError: the first model's error where all failed.
+    """
+    check_jobs(jobs)
+    if jobs != 1 and fit_settings.get("callback") is not None:
+        raise ValueError("`callback` cannot be called from other processes; with `jobs` above 1 "
+                         "use `progress`.")  # fmt: skip
+    progress = progress or Progress()
+    if jobs == 1:
+        step = progress.step
+        fit_settings = {"callback": lambda stage, _: step(stage)} | fit_settings
+    names = list(dict.fromkeys(models))
+    fits: dict[tuple[str, str], FitResult] = {}
+    errors: dict[tuple[str, str], Exception] = {}
+    origin = warm_starts(names)
+    for level in dependency_levels(origin):
+        labels = {f"{part} {name}": (part, name) for part in parts for name in level}
+        tasks = {
+            label: (name, plant, parts[part], fits.get((part, origin[name] or "")), fit_settings)
+            for label, (part, name) in labels.items()
+        }
+        for label, (result, seconds) in as_completed(_fit, tasks, jobs=jobs, progress=progress):
+            part, name = labels[label]
+            if isinstance(result, Exception):
+                errors[part, name] = result
+                logger.warning("%s failed: %s", label, result)
+                continue
+            # A result from another process has copies of the motions.
+            fits[part, name] = replace(result, motions=tuple(parts[part].motions))
+            logger.info("%s: %s (%.3g s)", label, result.status, seconds)
+    if not fits:
+        raise next(iter(errors.values()))
+    return {
+        part: Fits(
+            {name: fits[part, name] for name in names if (part, name) in fits},
+            {name: str(errors[part, name]) for name in names if (part, name) in errors},
+        )
+        for part in parts
+    }
+
+
+def warm_starts(models: Sequence[str]) -> dict[str, str | None]:
+    """The model from whose fit each begins, None for none.
+
+    Constant laws begin with the plant's terms of the first of them, all others with the constant
+    fit of their own law, or of the first where that is not asked for.
+
+    Raises:
+        ValueError: if there is no such model.
+    """
+    kinds = {name: model_by_name(name) for name in models}
+    constant = {n: k.definition for n, k in kinds.items() if issubclass(k, ConstantModel)}
+    first = next(iter(constant), None)
+    origin: dict[str, str | None] = {}
+    for name, kind in kinds.items():
+        own = next((n for n, law in constant.items() if law == kind.definition), first)
+        origin[name] = None if name == first else first if own == name else own
+    return origin
+
+
+def dependency_levels(origin: Mapping[str, str | None]) -> Iterator[list[str]]:
+    """Names in groups: each begins from a fit of an earlier group, or from nothing."""
+    fitted: set[str | None] = {None}
+    while len(fitted) <= len(origin):
+        ready = [n for n, start in origin.items() if start in fitted and n not in fitted]
+        yield ready
+        fitted |= set(ready)
+
+
+def _fit(
+    name: str, plant: Plant, data: Data, start: FitResult | None, settings: dict[str, Any]
+) -> tuple[FitResult | Exception, float]:
+    """A fit or its error, and the time it took [s]."""
+    begun = time.perf_counter()
+    model = model_by_name(name)(plant.joints)
+    result: FitResult | Exception
+    try:
+        result = fit(model, plant, data.recordings, motions=data.motions, start=start, **settings)
+    except (ValueError, ArithmeticError, RuntimeError) as error:
+        result = error
+    return result, time.perf_counter() - begun
 
 
 def check_jobs(jobs: int) -> None:
-    """Refuse a number of processes that means nothing, or that needs a library not there.
+    """Require a number of processes that makes sense, and joblib where there are several.
 
     Raises:
         ValueError: if it is 0.
@@ -81,53 +191,88 @@ def check_jobs(jobs: int) -> None:
             ) from error
 
 
-def done(
+def as_completed(
     work: Callable[..., T],
-    pieces: Mapping[str, tuple[Any, ...]],
+    tasks: Mapping[str, tuple[Any, ...]],
     *,
     jobs: int = 1,
-    on_stage: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> Iterator[tuple[str, T]]:
-    """Do independent pieces of work and give each as it is finished.
+    """Run independent tasks and yield each result as it is finished.
 
     Args:
-        work: a function; for more than one process it must be found by its name.
-        pieces: its arguments by the label of each piece.
-        jobs: at most so many processes; -1 for one to each core. In this process where it is 1,
-            or where there is one piece.
-        on_stage: told what is being done.
+        work: a function; for more than one process it must be importable by its name.
+        tasks: its arguments by the label of each task.
+        jobs: number of processes; -1 for one to each core. The tasks run in this process where it
+            is 1, or where there is one task.
+        progress: receives the labels.
 
     Yields:
         Label and result; in order where `jobs` is 1, else as they come.
 
     Raises:
         ImportError: if joblib is needed and not installed.
-        ValueError, RuntimeError, ...: the first error of a piece, its message preceded by the
-            label. Pieces not finished by then are given up.
+        ValueError, RuntimeError, ...: the first error of a task, its message preceded by the
+            label. Tasks not finished by then are abandoned.
     """
     check_jobs(jobs)
-    say = on_stage or (lambda _: None)
-    if jobs == 1 or len(pieces) < 2:
-        for label, arguments in pieces.items():
-            say(label)
-            yield _Piece(label, work, arguments, _HERE, logging.NOTSET)()[:2]
+    progress = progress or Progress()
+    level = _PACKAGE.getEffectiveLevel()
+    calls = [Task(label, work, given, _HERE, level) for label, given in tasks.items()]
+    if jobs == 1 or len(calls) < 2:
+        for task in calls:
+            progress.stage(task.label)
+            yield task()[:2]
         return
     from joblib import Parallel, delayed
 
-    level = _LOGGER.getEffectiveLevel()
-    calls = [
-        delayed(_Piece(label, work, arguments, _HERE, level))()
-        for label, arguments in pieces.items()
-    ]
-    say(textwrap.shorten(" | ".join(pieces), 60, placeholder=" ..."))
-    shown: _Registry = {}
+    progress.stage(textwrap.shorten(" | ".join(tasks), 60, placeholder=" ..."))
+    shown: dict[Any, int] = {}
     pool = Parallel(n_jobs=min(jobs, len(calls)), batch_size=1, return_as="generator_unordered")
-    with _deaf_to_interrupts():
-        coming = pool(calls)
-    for finished, (label, value, told) in enumerate(coming, 1):
-        told.tell(shown)
-        say(f"{label} done, {len(calls) - finished} of {len(calls)} left")
+    with _ignore_sigint():
+        results = pool(delayed(task)() for task in calls)
+    for finished, (label, value, log) in enumerate(results, 1):
+        log.replay(shown)
+        progress.stage(f"{label} done, {len(calls) - finished} of {len(calls)} left")
         yield label, value
+
+
+@dataclass
+class TaskLog:
+    """Log records and warnings of a task."""
+
+    records: list[logging.LogRecord] = field(default_factory=list)
+    warned: list[warnings.WarningMessage] = field(default_factory=list)
+
+    def replay(self, shown: dict[Any, int]) -> None:
+        """Report them here; `shown` is the registry of warnings that were shown."""
+        for record in self.records:
+            logger = logging.getLogger(record.name)
+            if logger.isEnabledFor(record.levelno):
+                logger.handle(record)
+        for w in self.warned:
+            warnings.warn_explicit(str(w.message), w.category, w.filename, w.lineno, registry=shown)
+
+
+@dataclass(frozen=True)
+class Task(Generic[T]):
+    """Work that some process does, on one thread."""
+
+    label: str
+    work: Callable[..., T]
+    arguments: tuple[Any, ...]
+    home: str
+    level: int
+
+    def __call__(self) -> tuple[str, T, TaskLog]:
+        log = TaskLog()
+        captured = nullcontext() if self.home == _HERE else _capture_logs(log, self.level)
+        with one_thread(), captured:
+            try:
+                return self.label, self.work(*self.arguments), log
+            except (ValueError, TypeError, LookupError, ArithmeticError, RuntimeError) as error:
+                error.args = (f"{self.label}: {error}", *error.args[1:])
+                raise
 
 
 @contextmanager
@@ -141,60 +286,40 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _named(label: str, work: Callable[..., T], arguments: tuple[Any, ...]) -> T:
-    """The result, or the work's error with the label before its message."""
+@contextmanager
+def _capture_logs(log: TaskLog, level: int) -> Iterator[None]:
+    """Collect the log records of this thread and the warnings of the block."""
+    queue: SimpleQueue[logging.LogRecord] = SimpleQueue()
+    # It puts records into a form that can be sent to another process.
+    handler = logging.handlers.QueueHandler(queue)
+    thread = threading.get_ident()
+    handler.addFilter(lambda record: record.thread == thread)
+    before = _PACKAGE.level
+    _PACKAGE.addHandler(handler)
+    _PACKAGE.setLevel(level)
     try:
-        return work(*arguments)
-    except (ValueError, TypeError, LookupError, ArithmeticError, RuntimeError) as error:
-        error.args = (f"{label}: {error}", *error.args[1:])
-        raise
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            yield
+    finally:
+        _PACKAGE.removeHandler(handler)
+        _PACKAGE.setLevel(before)
+    log.warned += caught
+    log.records += [queue.get() for _ in range(queue.qsize())]
 
 
 @contextmanager
-def _deaf_to_interrupts() -> Iterator[None]:
-    """Processes begun in the block never hear a Ctrl-C.
+def _ignore_sigint() -> Iterator[None]:
+    """Child processes started here ignore Ctrl-C, which a terminal sends to all of them.
 
-    It reaches every process of a terminal. The one that asked for the work ends the others, whose
-    solvers would take it for a wish to stop early.
+    The parent terminates them; their solvers would take it for a wish to stop early.
     """
     before = signal.getsignal(signal.SIGINT)
     if before is None or threading.current_thread() is not threading.main_thread():
-        yield  # not for Python, or not for this thread to change
+        yield  # set outside Python, or not for this thread to change
         return
-    # What is ignored stays so in processes begun now, whatever they run.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-class _Collector(logging.Handler):
-    """Keeps what its own thread logs, in a form that travels."""
-
-    def __init__(self, into: list[logging.LogRecord]) -> None:
-        super().__init__()
-        self.into = into
-        self.thread = threading.get_ident()
-
-    def emit(self, record: logging.LogRecord) -> None:
-        if record.thread == self.thread:
-            record.msg, record.args = record.getMessage(), None
-            record.exc_info = None
-            self.into.append(record)
-
-
-@contextmanager
-def _listening(told: _Told, level: int) -> Iterator[None]:
-    """Collect what the block logs and warns of."""
-    collector, before = _Collector(told.records), _LOGGER.level
-    _LOGGER.addHandler(collector)
-    _LOGGER.setLevel(level)
-    try:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            yield
-        told.warned += caught
-    finally:
-        _LOGGER.removeHandler(collector)
-        _LOGGER.setLevel(before)

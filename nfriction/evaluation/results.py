@@ -1,4 +1,4 @@
-"""What a comparison leaves in its folder: tables, results, models, artefacts and figures."""
+"""Write a comparison's folder: tables, results, models, artefacts and figures."""
 
 import json
 import logging
@@ -21,9 +21,9 @@ from nfriction.recording import Recording
 logger = logging.getLogger(__name__)
 
 RESULTS, TABLE = "results.json", "table.csv"
-# Sample times that differ by host clocks, and not by what was set.
-ALIKE = 1.05
-# What a run may have written, and a later one remove: in its own folders, no way out of them.
+# Largest ratio of sample times that differ by the clocks of hosts, and not by what was set.
+CLOCKS = 1.05
+# Files that a run may have written and a later one removes: in its own folders, no way out of them.
 OURS = re.compile(r"table\.csv|models/\w+\.(json|pt)|figures/\w[\w.-]*\.png")
 
 
@@ -37,13 +37,15 @@ def digests(recordings: Sequence[Recording]) -> dict[str, str]:
 
 
 def model_info(fit: FitResult, recordings: Sequence[Recording]) -> ModelInfo:
-    """What a model file should say of a fit to these recordings."""
+    """Entries of a model file that describe a fit to these recordings."""
     qd = np.concatenate([m.qd for m in fit.motions])
     qdd = np.concatenate([m.qdd for m in fit.motions])
+    times = sorted(r.sample_time for r in recordings)
     return ModelInfo(
         joint_names=tuple(fit.plant.joint_names),
         unit=fit.plant.unit,
-        sample_time=_common_sample_time(recordings),
+        # Of several sample times, a controller's is not known.
+        sample_time=times[len(times) // 2] if times[-1] <= CLOCKS * times[0] else None,
         input_ranges={
             "qd": np.stack([qd.min(0), qd.max(0)], -1).tolist(),
             "qdd": np.stack([qdd.min(0), qdd.max(0)], -1).tolist(),
@@ -54,16 +56,10 @@ def model_info(fit: FitResult, recordings: Sequence[Recording]) -> ModelInfo:
     )
 
 
-def _common_sample_time(recordings: Sequence[Recording]) -> float | None:
-    """The middle one where all are much the same; of several, a controller's is not known."""
-    times = sorted(float(r.sample_time) for r in recordings)
-    return times[len(times) // 2] if times[-1] <= ALIKE * times[0] else None
-
-
 def write_results(
     comparison: Comparison,
     train: Sequence[Recording],
-    held_out: Sequence[Recording],
+    test: Sequence[Recording],
     folder: str | Path,
     *,
     selection: Selection | None = None,
@@ -73,27 +69,27 @@ def write_results(
     """Write `table.csv`, `results.json`, the models with their TorchScript, and figures.
 
     `results.json` lists the files. Those that an earlier run listed there are removed, so that
-    what is in the folder afterwards is of this run, or the user's own.
+    the folder afterwards holds files of this run, and the user's own.
 
     Args:
         comparison: fits and scores.
-        train, held_out: the recordings behind them.
-        folder: made where it is not there.
-        selection: what the training recordings alone would choose, if that was asked.
-        command: what would make the same results again.
+        train, test: the recordings behind them.
+        folder: made where it does not exist.
+        selection: the choice on the training recordings alone, if there is one.
+        command: reproduces the results.
         figures: draw them.
 
     Returns:
-        What was written.
+        The files written.
     """
     folder = Path(folder)
     results = comparison.to_dict() | {
         "selection": None if selection is None else selection.to_dict(),
         "command": command,
-        "recordings": {"train": digests(train), "held_out": digests(held_out)},
+        "recordings": {"train": digests(train), "test": digests(test)},
     }
 
-    def tell(files: Iterable[Path]) -> Path:
+    def write_index(files: Iterable[Path]) -> Path:
         own = {"files": sorted({path.relative_to(folder).as_posix() for path in files})}
         text = json.dumps(results | own, indent=1, allow_nan=False)
         return write_atomically(folder / RESULTS, text.encode())
@@ -101,30 +97,32 @@ def write_results(
     earlier = files_of(folder)
     models = {name: folder / "models" / f"{name}.json" for name in comparison.fits}
     table = write_atomically(folder / TABLE, comparison.to_frame().to_csv(index=False).encode())
-    # Told before they are there: what an interrupt leaves, the next run knows for ours.
-    tell([*earlier, table, *models.values(), *(m.with_suffix(".pt") for m in models.values())])
+    # Listed before they exist: if this run is interrupted, the next one knows its files.
+    write_index(
+        [*earlier, table, *models.values(), *(m.with_suffix(".pt") for m in models.values())]
+    )
     written = [table]
     for name, path in models.items():
         written += _write_model(comparison.fits[name], path, train)
     for path in set(earlier) - set(written):
         path.unlink(missing_ok=True)
-    told = tell(written)
+    index = write_index(written)
     if figures:
         from nfriction import plots  # matplotlib takes half a second that other commands save
 
         (folder / "figures").mkdir(exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".") as unfinished:
-            drawn = plots.save_all(comparison, [*train, *held_out], unfinished)
+            drawn = plots.save_all(comparison, [*train, *test], unfinished)
             places = [folder / "figures" / path.name for path in drawn]
-            tell([*written, *places])
+            write_index([*written, *places])
             written += [path.replace(to) for path, to in zip(drawn, places, strict=True)]
-    return [told, *written]
+    return [index, *written]
 
 
 def files_of(folder: Path) -> list[Path]:
-    """What an earlier run wrote into a folder besides its `results.json`, as far as that tells.
+    """Files that an earlier run listed in its `results.json`.
 
-    Only such names as a run writes are taken from it: it may be anybody's file.
+    Only names that a run writes count, because the file may be anybody's.
     """
     try:
         content = json.loads((folder / RESULTS).read_text(encoding="utf-8"))

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from nfriction.friction.laws import Law
 from nfriction.friction.sensitivity import FactoredSensitivity, Sensitivity
+from nfriction.fuzzy.rules import FuzzyRules
 
 # Smallest value of a positive coefficient: far below the resolution of any torque sensor.
 SMALLEST = 1e-12
@@ -114,6 +115,10 @@ class Schedule(nn.Module, ABC):
         constant `"reference"` of a neuro-fuzzy one.
         """
         return {"at_rest": self.rest_coefficients().detach()}
+
+    def fuzzy_rules(self) -> FuzzyRules | None:
+        """Fuzzy sets and rules of the coefficients; None of a schedule without them."""
+        return None
 
     @abstractmethod
     def parameter_vector(self) -> Tensor:

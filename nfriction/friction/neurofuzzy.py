@@ -10,6 +10,7 @@ from nfriction.friction.coefficients import Constant, Schedule
 from nfriction.friction.laws import Law
 from nfriction.friction.sensitivity import FactoredSensitivity
 from nfriction.fuzzy import AnfisRBF
+from nfriction.fuzzy.rules import FuzzyRules
 
 # A coefficient below a thousandth of its scale starts there: from zero it could not rise.
 LEAST_RATIO = 1e-3
@@ -153,6 +154,25 @@ class NeuroFuzzy(Schedule):
 
     def coefficient_sets(self) -> dict[str, Tensor]:
         return super().coefficient_sets() | {"reference": self.reference_coefficients().detach()}
+
+    @torch.no_grad()
+    def fuzzy_rules(self) -> FuzzyRules:
+        lower = torch.stack([torch.zeros_like(self.velocity_range), self.acceleration_lower], -1)
+        upper = torch.stack([self.velocity_range, self.acceleration_upper], -1)
+        centres, widths = (x.split(self.terms, -1) for x in self.network.anfis.sets())
+        # Every pair of centres is a sample, velocity's slower, all joints at once.
+        v, a = (c.clamp(0.0, 1.0).T for c in centres)
+        pairs = [v.repeat_interleave(self.terms[1], 0), a.repeat(self.terms[0], 1)]
+        found = self.to_coefficients(self.reference + self.network(torch.stack(pairs, -1)))
+        span = (upper - lower)[..., None]
+        return FuzzyRules(
+            lower,
+            upper,
+            tuple(lower[:, i, None] + span[:, i] * c for i, c in enumerate(centres)),
+            tuple(span[:, i] * w for i, w in enumerate(widths)),
+            found.transpose(0, 1),
+            self.along_motion,
+        )
 
     @torch.no_grad()
     def set_reference(

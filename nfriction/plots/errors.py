@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from nfriction.evaluation.compare import NO_FRICTION, Comparison
+from nfriction.evaluation.compare import NO_FRICTION, Comparison, Part
 from nfriction.evaluation.score import Score
 from nfriction.plots import style
 from nfriction.recording import Recording
@@ -126,7 +126,7 @@ def rmse_bars(table: pd.DataFrame, unit: str, *, width: float | None = None) -> 
 def horizon_curve(
     comparison: Comparison,
     *,
-    held_out: bool | None = None,
+    part: Part | None = None,
     column: str = "all",
     width: float = style.COLUMN,
 ) -> Figure:
@@ -137,15 +137,15 @@ def horizon_curve(
 
     Args:
         comparison: fits and scores.
-        held_out: which recordings; default those held out where there are any.
+        part: `"test"` or `"train"`; default test recordings where there are any.
         column: joint of the tables, or `"all"`.
         width: of the figure [in].
     """
-    held_out = bool(comparison.held_out) if held_out is None else held_out
+    part = part or comparison.parts[0]
     horizons = [*comparison.horizons(), None]
-    tables = [comparison.table(horizon, held_out=held_out)[column] for horizon in horizons]
+    tables = [comparison.table(horizon, part=part)[column] for horizon in horizons]
     values = np.stack([table.to_numpy(dtype=np.float64) for table in tables], -1)
-    floor = comparison.floor(column, held_out=held_out)
+    floor = comparison.floor(column, part=part)
     shown = values[np.isfinite(values)]
     factor, unit = style.scaled(comparison.unit, shown)
     figure, axes = style.panels(1, 1, width, 2.2)

@@ -9,7 +9,6 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from nfriction.evaluation.compare import Comparison
-from nfriction.evaluation.score import Score
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
@@ -30,7 +29,7 @@ def save_all(
 ) -> list[Path]:
     """Write every figure of a comparison as PNG, and as `NAME.dark.png` for a dark screen.
 
-    `rmse_*` and `horizons_*` for training and held-out recordings, `positions_*` for each
+    `rmse_*` and `horizons_*` for test and training recordings, `positions_*` for each
     recording given, `torque_over_velocity`, `over_time_*` for each law of which a model follows the
     motion, and for each neuro-fuzzy model `coefficients_*`, `sections_*` and `memberships_*`.
 
@@ -45,7 +44,9 @@ def save_all(
     Raises:
         ValueError: if a recording is not among those compared.
     """
-    scored = {s.recording for of in _kinds(comparison).values() for s in next(iter(of.values()))}
+    scored = {
+        s.recording for p in comparison.parts for s in next(iter(comparison.scores(p).values()))
+    }
     for recording in recordings:
         if recording.name not in scored:
             raise ValueError(
@@ -70,23 +71,18 @@ def save_all(
     return written
 
 
-def _kinds(comparison: Comparison) -> dict[str, dict[str, list[Score]]]:
-    kinds = {"train": comparison.train, "held_out": comparison.held_out}
-    return {kind: scores for kind, scores in kinds.items() if scores}
-
-
 def _figures(
     comparison: Comparison, recordings: Sequence[Recording]
 ) -> Iterator[tuple[str, Figure]]:
     """Name and figure, one after the other, so that only one is in memory."""
-    for kind, scores in _kinds(comparison).items():
-        held_out = kind == "held_out"
-        yield f"rmse_{kind}", rmse_bars(comparison.table(held_out=held_out), comparison.unit)
-        yield f"horizons_{kind}", horizon_curve(comparison, held_out=held_out)
+    for part in comparison.parts:
+        scores = comparison.scores(part)
+        yield f"rmse_{part}", rmse_bars(comparison.table(part=part), comparison.unit)
+        yield f"horizons_{part}", horizon_curve(comparison, part=part)
         for recording in recordings:
             of = {m: s for m, many in scores.items() for s in many if s.recording == recording.name}
             if of:
-                yield f"positions_{kind}_{recording.name}", positions(recording, of)
+                yield f"positions_{part}_{recording.name}", positions(recording, of)
     if not comparison.fits:
         return
     last = list(comparison.fits.values())[-1]

@@ -3,10 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import torch
-
 from nfriction.friction.models import FrictionModel
-from nfriction.friction.neurofuzzy import NeuroFuzzy
 
 _SPEEDS = {
     1: ("any",),
@@ -24,7 +21,7 @@ class Term:
 
     Attributes:
         name: in words.
-        centre, width: where it holds fully and its standard deviation, in SI.
+        centre, width: its middle and its standard deviation, in SI.
     """
 
     name: str
@@ -34,7 +31,7 @@ class Term:
 
 @dataclass(frozen=True)
 class Rule:
-    """One rule: the terms that it asks for, and the coefficients where these hold fully.
+    """One rule: its terms, and the coefficients where these hold fully.
 
     Attributes:
         velocity, acceleration: names of the terms.
@@ -56,7 +53,7 @@ class Rule:
 
     @property
     def condition(self) -> str:
-        """What it asks for, in words."""
+        """The rule's premise in words."""
         return f"IF velocity is {self.velocity} AND acceleration is {self.acceleration}"
 
 
@@ -83,34 +80,24 @@ def rules_in_words(model: FrictionModel, joint_names: Sequence[str] = ()) -> lis
     Raises:
         ValueError: if the names are not one a joint.
     """
-    schedule = model.schedule
-    if not isinstance(schedule, NeuroFuzzy):
+    fuzzy = model.schedule.fuzzy_rules()
+    if fuzzy is None:
         return []
     names = list(joint_names) or [f"joint{k + 1}" for k in range(model.joints)]
     if len(names) != model.joints:
         raise ValueError(f"`joint_names` must be {model.joints} names, got {names}.")
-    lower = torch.stack([torch.zeros_like(schedule.velocity_range), schedule.acceleration_lower])
-    upper = torch.stack([schedule.velocity_range, schedule.acceleration_upper])
-    counts = list(schedule.terms)
-    with torch.no_grad():
-        centres, widths = (x.split(counts, -1) for x in schedule.network.anfis.sets())
-        # Every pair of centres is a sample, velocity's slower, all joints at once.
-        v, a = (c.clamp(0.0, 1.0).T for c in centres)
-        grid = [v.repeat_interleave(counts[1], 0), a.repeat(counts[0], 1)]
-        found = schedule.network(torch.stack(grid, -1))
-        values = schedule.to_coefficients(schedule.reference + found)
     described = []
     for j, joint in enumerate(names):
-        span = (upper - lower)[:, j]
-        at = [(lower[i, j] + span[i] * centres[i][j]).tolist() for i in range(2)]
-        sigma = [(span[i] * widths[i][j]).tolist() for i in range(2)]
-        speeds = tuple(map(Term, _speed_names(at[0]), at[0], sigma[0]))
-        accelerations = tuple(
-            map(Term, _acceleration_names(at[1], schedule.along_motion), at[1], sigma[1])
+        (speeds, speed_widths), (accelerations, widths) = (
+            (c[j].tolist(), w[j].tolist()) for c, w in zip(fuzzy.centres, fuzzy.widths, strict=True)
         )
-        pairs = [(x.name, y.name) for x in speeds for y in accelerations]
-        rules = [Rule(*p, tuple(r)) for p, r in zip(pairs, values[:, j].tolist(), strict=True)]
-        described.append(JointRules(joint, speeds, accelerations, tuple(rules)))
+        v = tuple(map(Term, _speed_names(speeds), speeds, speed_widths))
+        named = _acceleration_names(accelerations, fuzzy.along_motion)
+        a = tuple(map(Term, named, accelerations, widths))
+        pairs = [(x.name, y.name) for x in v for y in a]
+        values = fuzzy.coefficients[j].tolist()
+        rules = [Rule(*pair, tuple(of)) for pair, of in zip(pairs, values, strict=True)]
+        described.append(JointRules(joint, v, a, tuple(rules)))
     return described
 
 
@@ -134,7 +121,7 @@ def _size(rank: int) -> str:
 
 
 def _in_order(centres: Sequence[float], names: Sequence[str]) -> list[str]:
-    """Names from the lowest centre to the highest, given back in the order of the centres."""
+    """Names from the lowest centre to the highest, in the order of the centres."""
     order = sorted(range(len(centres)), key=lambda k: centres[k])
     named = dict(zip(order, names, strict=True))
     return [named[k] for k in range(len(centres))]

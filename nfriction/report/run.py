@@ -1,14 +1,14 @@
-"""Read what a comparison left in its folder, trusting none of it."""
+"""Read a comparison's folder without trusting any of it."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from nfriction.evaluation.compare import Comparison
+from nfriction.evaluation.compare import Comparison, Part
 from nfriction.evaluation.cross_validation import Candidate, Selection
 from nfriction.evaluation.score import RMSE, Score
 from nfriction.friction.models import FrictionModel
@@ -16,23 +16,30 @@ from nfriction.friction.registry import model_names
 from nfriction.io import strict_json
 from nfriction.io.model_file import ModelFileError, load, load_info
 from nfriction.io.model_info import ModelInfo
-from nfriction.report.entries import UnfitError, mapped, mapping, number, seconds, text, texts
-from nfriction.report.png import Figure, read_figures
+from nfriction.report.figures import Figure, read_figures
 
-# Far beyond any run of ours; what is larger is no results file.
+# Far above any run of ours; a larger file is no results file.
 LARGEST_RESULTS = 64 * 2**20
+# Squares of smaller numbers are finite.
+LARGEST_NUMBER = 10**100
+
+T = TypeVar("T")
 
 
 class RunError(ValueError):
-    """A folder is not one that a comparison wrote, or it is damaged."""
+    """The folder is not one that a comparison wrote, or it is damaged."""
+
+
+class _EntryError(ValueError):
+    """An entry of the results file has another form."""
 
 
 @dataclass(frozen=True)
 class FitRecord:
-    """How a fit ended, as `Fit.to_dict` tells; what an older version left out is empty.
+    """How a fit ended, from `FitResult.to_dict`; entries that an older version lacks are empty.
 
     Attributes:
-        intervals: 95 % interval by parameter, infinite where the data tell nothing.
+        intervals: 95 % interval by parameter, infinite where unidentifiable.
         plant: adjusted terms of the plant by name.
     """
 
@@ -49,23 +56,24 @@ class FitRecord:
 
 @dataclass(frozen=True)
 class Run:
-    """A comparison as its folder tells it.
+    """A comparison as read from its folder.
 
     Attributes:
         folder: as it was given.
         comparison: the scores, without simulated positions and without fits.
         fits: how each fit ended, by model.
-        coefficients: by model, then by what they hold for (`"always"` for a constant model),
+        coefficients: by model, then by where they apply (`"always"` for a constant model),
             then by name: a value a joint.
-        best: name of the best model, None where nothing was held out.
-        judged_by: what it was judged by.
-        alike: it and all that cannot be told from it, simplest first; of older versions none.
-        command: what made the results.
-        recordings: digest by name of those trained on (`"train"`) and `"held_out"`.
-        models: models and what their files say; those that could be read.
+        best: name of the best model, None where there was no test recording.
+        judged_by: criterion of the verdict.
+        indistinguishable: the best and all models tied with it, simplest first; of older versions
+            none.
+        command: reproduces the results.
+        recordings: digest by name of the `"train"` and `"test"` recordings.
+        models: models and the information of their files; those that could be read.
         figures: in the order of their names.
-        notes: what could not be read, a sentence each.
-        selection: what the training recordings alone would choose, where that was asked.
+        notes: a sentence on everything that could not be read.
+        selection: the choice on the training recordings alone, where there is one.
     """
 
     folder: Path
@@ -75,12 +83,12 @@ class Run:
     best: str | None
     judged_by: str
     command: str
-    recordings: dict[str, dict[str, str]]
+    recordings: dict[Part, dict[str, str]]
     models: dict[str, tuple[FrictionModel, ModelInfo]]
     figures: tuple[Figure, ...]
     notes: tuple[str, ...]
     selection: Selection | None = None
-    alike: tuple[str, ...] = ()
+    indistinguishable: tuple[str, ...] = ()
 
 
 def read_run(folder: str | Path) -> Run:
@@ -104,49 +112,45 @@ def read_run(folder: str | Path) -> Run:
     except (ValueError, RecursionError) as error:
         raise RunError(f"{path}: is no JSON, or cut short ({error}).") from error
     try:
-        return _run(folder, mapping(content, "the file"))
-    except UnfitError as error:
+        return _run(folder, _mapping(content, "the file"))
+    except _EntryError as error:
         raise RunError(f"{path}: not results of a comparison: {error}.") from error
 
 
 def _run(folder: Path, content: Mapping[str, Any]) -> Run:
-    joints = texts(content.get("joints"), "`joints`")
+    old = "schema" not in content
+    keys: dict[Part, str] = {"train": "train", "test": "held_out" if old else "test"}
+    joints = _texts(content.get("joints"), "`joints`")
     unit = content.get("units")
     if unit not in ("rad", "m"):
-        raise UnfitError('`units` must be "rad" or "m"')
-    entries = mapped(content.get("models"), "`models`", mapping)
+        raise _EntryError('`units` must be "rad" or "m"')
+    entries = _each(content.get("models"), "`models`", _mapping)
     if not joints or not entries:
-        raise UnfitError("it has no joints or no models")
-    scores = {
-        kind: {
-            name: _scores(entry.get(kind, {}), f"{name}, {kind}", len(joints))
+        raise _EntryError("it has no joints or no models")
+    scores: dict[Part, dict[str, list[Score]]] = {}
+    for part, key in keys.items():
+        of = {
+            name: _scores(entry.get(key, {}), f"{name}, {key}", len(joints))
             for name, entry in entries.items()
         }
-        for kind in ("train", "held_out")
-    }
-    for kind, of in scores.items():
         # Tables pool the recordings of a model, so all must have been scored on the same.
-        forms = {tuple((s.recording, *s.windows) for s in many) for many in of.values()}
-        if len(forms) > 1:
-            raise UnfitError(f"its models were scored on different recordings ({kind})")
+        if len({tuple((s.recording, *s.windows) for s in many) for many in of.values()}) > 1:
+            raise _EntryError(f"its models were scored on different recordings ({key})")
+        scores[part] = {name: many for name, many in of.items() if many}
+    if not any(scores.values()):
+        raise _EntryError("it has no scores")
     fits = {n: _fit(e["fit"], n) for n, e in entries.items() if "fit" in e}
-    train, held_out = ({n: s for n, s in of.items() if s} for of in scores.values())
-    if not train and not held_out:
-        raise UnfitError("it has no scores")
     models, notes = _models(folder, fits, len(joints))
     figures, unread = read_figures(folder / "figures")
-    best = mapping(content.get("best") or {}, "`best`")
-    if best and text(best.get("model"), "`best`") not in entries:
-        raise UnfitError("its best model is none of its models")
+    best = _mapping(content.get("best") or {}, "`best`")
+    if best and _text(best.get("model"), "`best`") not in entries:
+        raise _EntryError("its best model is none of its models")
+    recordings = _mapping(content.get("recordings", {}), "`recordings`")
+    failed = _each(content.get("failed", {}), "`failed`", _text)
     return Run(
         folder=folder,
         comparison=Comparison(
-            {},
-            train,
-            held_out,
-            unit,
-            joints,
-            failed=mapped(content.get("failed", {}), "`failed`", text),
+            {}, scores["train"], scores["test"], unit=unit, joint_names=joints, failed=failed
         ),
         fits=fits,
         coefficients={
@@ -155,35 +159,48 @@ def _run(folder: Path, content: Mapping[str, Any]) -> Run:
             if "coefficients" in e
         },
         best=best.get("model"),
-        judged_by=text(best.get("by", ""), "`best`"),
-        command=text(content.get("command", ""), "`command`"),
+        judged_by=_text(best.get("by", ""), "`best`"),
+        command=_text(content.get("command", ""), "`command`"),
         recordings={
-            kind: mapped(digests, "`recordings`", text)
-            for kind, digests in mapping(content.get("recordings", {}), "`recordings`").items()
+            part: _each(recordings.get(key, {}), "`recordings`", _text)
+            for part, key in keys.items()
         },
         models=models,
         figures=figures,
         notes=(*notes, *unread),
         selection=_selection(content.get("selection"), unit),
-        alike=texts(best.get("alike", []), "`best`"),
+        indistinguishable=_texts(best.get("alike" if old else "indistinguishable", []), "`best`"),
     )
 
 
 def _scores(value: object, where: str, joints: int) -> list[Score]:
-    nothing = np.zeros(0)
+    def rmse(value: object, at: str) -> RMSE:
+        """Errors of a simulation; one that diverged has null for a number."""
+        entry = _mapping(value, at)
+        of_joints = entry.get("joints")
+        if not isinstance(of_joints, list) or len(of_joints) != joints:
+            raise _EntryError(f"{at} needs an error for each of {joints} joints")
+        errors = [_error(e, at) for e in (*of_joints, entry.get("all"))]
+        if min(errors) < 0:
+            raise _EntryError(f"{at} has a negative error")
+        return RMSE(tuple(errors[:-1]), errors[-1])
+
     found = []
-    for recording, entry in mapped(value, where, mapping).items():
+    for recording, entry in _each(value, where, _mapping).items():
         at = f"{where}, {recording}"
-        windows = mapped(entry.get("windows", {}), at, lambda v, w: _rmse(v, w, joints))
+        windows = _each(entry.get("windows", {}), at, rmse)
         for horizon in windows:
-            seconds(horizon, at)
+            try:
+                float(horizon)
+            except ValueError:
+                raise _EntryError(f"{at} has windows of {horizon!r} seconds") from None
         floor = entry.get("floor")
-        diverged_at = entry.get("diverged_at")
         found.append(
             Score(
-                recording, _rmse(entry.get("free_run"), at, joints), windows,
-                None if floor is None else _rmse(floor, at, joints), nothing, nothing,
-                math.inf if diverged_at is None else number(diverged_at, at),
+                recording, rmse(entry.get("free_run"), at), windows,
+                None if floor is None else rmse(floor, at),
+                time=np.zeros(0), simulated=np.zeros(0),
+                diverged_at=_error(entry.get("diverged_at"), at),
             )
         )  # fmt: skip
     return found
@@ -193,87 +210,71 @@ def _selection(value: object, unit: str) -> Selection | None:
     if value is None:
         return None
     where = "`selection`"
-    entry = mapping(value, where)
-    candidates = mapped(entry.get("candidates"), where, _candidate)
-    chosen = text(entry.get("chosen"), where)
+    entry = _mapping(value, where)
+    candidates = _each(entry.get("candidates"), where, _candidate)
+    chosen = _text(entry.get("chosen"), where)
     if chosen not in candidates:
-        raise UnfitError(f"{where} chose none of its candidates")
+        raise _EntryError(f"{where} chose none of its candidates")
     return Selection(
-        chosen, text(entry.get("reason", ""), where),
+        chosen, _text(entry.get("reason", ""), where),
         tuple(replace(c, name=name) for name, c in candidates.items()),
-        number(entry.get("horizon"), where), unit,
+        _number(entry.get("horizon"), where), unit,
     )  # fmt: skip
 
 
 def _candidate(value: object, where: str) -> Candidate:
-    entry = mapping(value, where)
+    entry = _mapping(value, where)
     blocks = entry.get("blocks")
     if not isinstance(blocks, list) or not blocks:
-        raise UnfitError(f"{where} needs the error of each block")
-    errors = tuple(math.inf if e is None else number(e, where) for e in blocks)
-    parameters = int(number(entry.get("parameters"), where))
+        raise _EntryError(f"{where} needs the error of each block")
+    errors = tuple(_error(e, where) for e in blocks)
+    parameters = int(_number(entry.get("parameters"), where))
     return Candidate("", errors, parameters, entry.get("converged") is True)
 
 
-def _rmse(value: object, where: str, joints: int) -> RMSE:
-    """Errors of a simulation; one that diverged has null for a number."""
-    entry = mapping(value, where)
-    of_joints = entry.get("joints")
-    if not isinstance(of_joints, list) or len(of_joints) != joints:
-        raise UnfitError(f"{where} needs an error for each of {joints} joints")
-    errors = [math.inf if e is None else number(e, where) for e in (*of_joints, entry.get("all"))]
-    if min(errors) < 0:
-        raise UnfitError(f"{where} has a negative error")
-    return RMSE(tuple(errors[:-1]), errors[-1])
-
-
 def _fit(value: object, name: str) -> FitRecord:
-    entry, where = mapping(value, f"fit of {name}"), f"fit of {name}"
-    return FitRecord(
-        status=text(entry.get("status", "unknown"), where),
-        converged=entry.get("converged") is True,
-        residual=number(entry.get("residual", math.nan), where),
-        residual_unit=text(entry.get("residual_unit", ""), where),
-        at_bounds=texts(entry.get("at_bounds", []), where),
-        warnings=texts(entry.get("warnings", []), where),
-        lost=texts(entry.get("lost", []), where),
-        plant=mapped(entry.get("plant", {}), where, number),
-        intervals=mapped(entry.get("intervals", {}), where, _interval),
+    where = f"fit of {name}"
+    entry = _mapping(value, where)
+    at_bounds, warnings, lost = (
+        _texts(entry.get(key, []), where) for key in ("at_bounds", "warnings", "lost")
     )
+    return FitRecord(
+        status=_text(entry.get("status", "unknown"), where),
+        converged=entry.get("converged") is True,
+        residual=_number(entry.get("residual", math.nan), where),
+        residual_unit=_text(entry.get("residual_unit", ""), where),
+        at_bounds=at_bounds, warnings=warnings, lost=lost,
+        plant=_each(entry.get("plant", {}), where, _number),
+        intervals=_each(entry.get("intervals", {}), where, _interval),
+    )  # fmt: skip
 
 
 def _interval(value: object, where: str) -> tuple[float, float]:
     if not isinstance(value, list) or len(value) != 2:
-        raise UnfitError(f"an interval of {where} needs two ends")
+        raise _EntryError(f"an interval of {where} needs two ends")
     low, high = value
-    return (
-        -math.inf if low is None else number(low, where),
-        math.inf if high is None else number(high, where),
-    )
+    return -math.inf if low is None else _number(low, where), _error(high, where)
 
 
 def _coefficients(value: object, name: str, joints: int) -> dict[str, dict[str, tuple[float, ...]]]:
-    where = f"coefficients of {name}"
-    entry = mapping(value, where)
-    sets = entry if all(isinstance(v, dict) for v in entry.values()) else {"always": entry}
-
     def values(given: object, at: str) -> tuple[float, ...]:
         if not isinstance(given, list) or len(given) != joints:
-            raise UnfitError(f"{at} need a value for each of {joints} joints")
-        return tuple(number(x, at) for x in given)
+            raise _EntryError(f"{at} need a value for each of {joints} joints")
+        return tuple(_number(x, at) for x in given)
 
-    return {label: mapped(of, where, values) for label, of in sets.items()}
+    where = f"coefficients of {name}"
+    entry = _mapping(value, where)
+    sets = entry if all(isinstance(v, dict) for v in entry.values()) else {"always": entry}
+    return {label: _each(of, where, values) for label, of in sets.items()}
 
 
 def _models(
     folder: Path, fits: Mapping[str, FitRecord], joints: int
 ) -> tuple[dict[str, tuple[FrictionModel, ModelInfo]], list[str]]:
-    """Models whose files can be read; of names that are ours, so that no path is made of others."""
+    """Models whose files can be read; of our own names, so that no path is made of others."""
     found: dict[str, tuple[FrictionModel, ModelInfo]] = {}
     notes = []
-    for name in fits:
-        if name not in model_names():
-            continue
+    for name in (name for name in fits if name in model_names()):
         path = folder / "models" / f"{name}.json"
         try:
             model, info = load(path), load_info(path)
@@ -285,3 +286,39 @@ def _models(
             continue
         found[name] = (model, info)
     return found, notes
+
+
+def _mapping(value: object, where: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise _EntryError(f"{where} must be an object")
+    return value
+
+
+def _each(value: object, where: str, read: Callable[[Any, str], T]) -> dict[str, T]:
+    return {key: read(entry, f"{where}, {key}") for key, entry in _mapping(value, where).items()}
+
+
+def _text(value: object, where: str) -> str:
+    if not isinstance(value, str):
+        raise _EntryError(f"{where} must be text")
+    return value
+
+
+def _texts(value: object, where: str) -> tuple[str, ...]:
+    if not isinstance(value, list):
+        raise _EntryError(f"{where} must be a list of texts")
+    return tuple(_text(v, where) for v in value)
+
+
+def _number(value: object, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise _EntryError(f"{where} must be a number")
+    # An int may be too large for a comparison with floats.
+    if abs(value) > LARGEST_NUMBER:
+        raise _EntryError(f"{where} is too large a number")
+    return float(value)
+
+
+def _error(value: object, where: str) -> float:
+    """A number that JSON writes as null where it is infinite."""
+    return math.inf if value is None else _number(value, where)

@@ -35,7 +35,7 @@ def swing(name: str, start: float) -> Recording:
 
 def compare(bench: Path, out: Path, *more: str, models: str = "NCFM") -> int:
     """`nfriction compare` of the bench's recordings, quickly."""
-    files = [str(bench / "a.csv.gz"), "--held-out", str(bench / "b.csv")]
+    files = [str(bench / "a.csv.gz"), "--test", str(bench / "b.csv")]
     rig = ["--rig", str(bench / "bench.json"), "--models", models, "--out", str(out)]
     return cli.main(["compare", *files, *rig, *QUICK, *more])
 

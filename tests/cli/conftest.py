@@ -11,7 +11,7 @@ from tests.cli.benches import compare, pendulum, swing
 
 @pytest.fixture(scope="session")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a rig, a recording to train on and one held out."""
+    """A folder with a rig, a recording to train on and one to test on."""
     folder = tmp_path_factory.mktemp("bench")
     rigs.write(pendulum(), folder / "bench.json")
     swing("a", 1.5).write(folder / "a.csv.gz")

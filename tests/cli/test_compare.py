@@ -24,20 +24,18 @@ def test_compare_writes_the_promised_schema(compared: Path) -> None:
     assert list(found["models"]) == ["no friction", "NCFM", "LFM"]
     for name, model in found["models"].items():
         assert ("coefficients" in model) == (name != "no friction")
-        for kind, recording in (("train", "a"), ("held_out", "b")):
+        for kind, recording in (("train", "a"), ("test", "b")):
             score = model[kind][recording]
             assert list(score["windows"]) == ["1"]  # 2 and 5 s do not fit into a second
             for rmse in (score["free_run"], *score["windows"].values()):
                 assert rmse["all"] == pytest.approx(np.sqrt(np.mean(np.square(rmse["joints"]))))
     assert "compare" in found["command"]
     assert found["best"]["model"] == "LFM"
-    assert "held-out" in found["best"]["by"]
+    assert "test" in found["best"]["by"]
 
 
 def test_friction_predicts_better_than_none(compared: Path) -> None:
-    error = {
-        n: m["held_out"]["b"]["free_run"]["all"] for n, m in results(compared)["models"].items()
-    }
+    error = {n: m["test"]["b"]["free_run"]["all"] for n, m in results(compared)["models"].items()}
     assert error["LFM"] < error["NCFM"] < error["no friction"]
 
 
@@ -46,7 +44,7 @@ def test_table_holds_the_errors_of_the_results(compared: Path) -> None:
     models = results(compared)["models"]
     of = table[(table.horizon == "free run") & (table.joint == "all") & (table.recording == "b")]
     for row in of.itertuples():
-        assert row[-1] == models[row.model]["held_out"]["b"]["free_run"]["all"]
+        assert row[-1] == models[row.model]["test"]["b"]["free_run"]["all"]
     assert set(of.model) == set(models)
 
 
@@ -66,7 +64,7 @@ def test_models_load_and_scripts_need_torch_alone(compared: Path) -> None:
 
 def test_figures_are_drawn_and_nothing_unfinished_stays(compared: Path) -> None:
     drawn = {path.stem for path in (compared / "figures").glob("*.png")}
-    assert {"rmse_held_out", "positions_held_out_b", "torque_over_velocity"} <= drawn
+    assert {"rmse_test", "positions_test_b", "torque_over_velocity"} <= drawn
     assert not list(compared.rglob(".*"))
 
 
@@ -84,11 +82,11 @@ def test_verdict_names_the_winner_and_its_file(
     out = bench / "told"
     assert compare(bench, out, "--no-figures", models="NCFM,LFM") == 0
     said = capsys.readouterr().out
-    assert "best on held-out recordings: LFM" in said
+    assert "best on test recordings: LFM" in said
     (file,) = re.findall(r"its model file: (.*)", said)
     assert Path(file).is_file()
     coefficients = results(out)["models"]["LFM"]["coefficients"]
-    told = said.partition("coefficients of LFM\n")[2]
+    told = said.partition("Coefficients of LFM\n")[2]
     header, row, *_ = told.splitlines()
     assert re.split(r"\s{2,}", header.strip()) == ["B [N m s/rad]", "C [N m]"]
     values = [float(word) for word in row.split()[1:]]
@@ -98,13 +96,13 @@ def test_verdict_names_the_winner_and_its_file(
     assert said.splitlines()[-1] == f"results and models are in {out}"
 
 
-def test_without_held_out_recordings_there_is_no_verdict(
+def test_without_test_recordings_there_is_no_verdict(
     bench: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = [str(bench / "a.csv.gz"), "--rig", str(bench / "bench.json"), "--models", "NCFM"]
     quick = ["--max-steps", "1", "--windows", "0.5", "--no-figures", "--out", str(bench / "alone")]
     assert cli.main(["compare", *words, *quick]) == 0
-    assert "no verdict: nothing was held out" in capsys.readouterr().out
+    assert "no verdict: there was no test recording" in capsys.readouterr().out
     assert results(bench / "alone")["best"] is None
 
 
@@ -118,7 +116,7 @@ def test_initial_states_are_used_and_missing_ones_named(
     plain, off = (results(out)["models"]["NCFM"] for out in (compared, bench / "s"))
     assert off["train"] == plain["train"]
     # The run starts 0.1 rad off and so ends about as far off.
-    assert off["held_out"]["b"]["free_run"]["all"] > 0.03
+    assert off["test"]["b"]["free_run"]["all"] > 0.03
 
 
 def test_plant_given_adjusts_nothing_and_drag_adds_terms(bench: Path) -> None:
@@ -157,7 +155,7 @@ def test_warnings_and_intervals_of_fits_are_told(
     for name in ("NCFM", "LFM"):
         for warning in fits[name]["fit"]["warnings"]:
             assert f"\n  - {warning}" in said
-    table = said.partition("95 % intervals")[2]
+    table = said.partition("95 % confidence intervals")[2]
     for name, (low, high) in fits[best]["fit"]["intervals"].items():
         (row,) = (line for line in table.splitlines() if line.startswith(f"{name} "))
         words = row.removeprefix(name).split()[1:]
@@ -192,7 +190,7 @@ def test_interrupt_outside_a_solver(
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("nfriction.evaluation.fit_many.fit", stop)
+    monkeypatch.setattr("nfriction.evaluation.parallel.fit", stop)
     assert compare(bench, bench / "stopped") == 130
     assert capsys.readouterr().err.count("\n") == 1
     assert not list((bench / "stopped").iterdir())
@@ -222,7 +220,7 @@ def test_the_log_tells_what_was_done_and_the_console_no_more(
     lines = log.read_text().splitlines()
     # The second run is told below the first.
     assert sum("nfriction compare" in line for line in lines) == 2
-    for told in ("fit NCFM", "fit NCFM: ", "score NCFM", "best on held-out recordings: NCFM"):
+    for told in ("fit NCFM", "fit NCFM: ", "score NCFM", "best on test recordings: NCFM"):
         assert sum(line.split("INFO ")[1].startswith(told) for line in lines) >= 2
     assert all(re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} (INFO|WARNING) ", x) for x in lines)
     assert "INFO" not in capsys.readouterr().err
@@ -245,20 +243,20 @@ def test_a_model_that_cannot_be_fitted_is_told_beside_the_others(
 def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["demo", "--seconds", "1", "--models", "NCFM", "--out", str(tmp_path), "--no-figures"]
     assert cli.main(words) == 0
-    assert "2 held out" in capsys.readouterr().out
+    assert "2 to test on" in capsys.readouterr().out
     assert list(results(tmp_path)["models"]) == ["no friction", "NCFM"]
 
 
 @pytest.mark.slow
-def test_triple_pendulum_held_out(data_dir: Path, tmp_path: Path) -> None:
+def test_triple_pendulum_test(data_dir: Path, tmp_path: Path) -> None:
     """Half of the card's experiment: viscous friction leaves 11.6 mrad in 10 s, 6.1 mrad in 5 s."""
     data = data_dir / "multiarm_pendulum"
-    words = [str(data / "triple_b0.csv.gz"), "--held-out", str(data / "triple_b2.csv.gz")]
+    words = [str(data / "triple_b0.csv.gz"), "--test", str(data / "triple_b2.csv.gz")]
     words += ["--rig", "multiarm-triple", "--initial-states", str(data / "recordings.csv")]
     # As on the card: no air drag.
     words += ["--models", "NCFM,LFM", "--no-drag", "--no-figures", "--out", str(tmp_path)]
     assert cli.main(["compare", *words]) == 0
-    found = {n: m["held_out"]["triple_b2"] for n, m in results(tmp_path)["models"].items()}
+    found = {n: m["test"]["triple_b2"] for n, m in results(tmp_path)["models"].items()}
     for name in ("NCFM", "LFM"):
         pairs = zip(found[name]["free_run"]["joints"], found["no friction"]["free_run"]["joints"],
                     strict=True)  # fmt: skip

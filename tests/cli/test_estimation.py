@@ -60,22 +60,22 @@ def test_what_is_not_given_is_left_to_the_fit() -> None:
         ("log.xlsx", b"0", ".parquet"),
     ],
 )  # fmt: skip
-@pytest.mark.parametrize("held_out", [False, True])
+@pytest.mark.parametrize("as_test", [False, True])
 def test_files_that_are_no_recordings(
-    bench: Path, failing, name: str, content: bytes | None, said: str, held_out: bool
+    bench: Path, failing, name: str, content: bytes | None, said: str, as_test: bool
 ) -> None:
     if content is not None:
         (bench / name).write_bytes(content)
-    files = [bench / "a.csv.gz", "--held-out", bench / name] if held_out else [bench / name]
+    files = [bench / "a.csv.gz", "--test", bench / name] if as_test else [bench / name]
     line = failing("compare", *files, "--rig", bench / "bench.json", "--out", bench / "bad")
     assert said in line
     assert name in line
 
 
-def test_held_out_means_unseen(bench: Path, failing) -> None:
+def test_test_recordings_are_unseen(bench: Path, failing) -> None:
     (bench / "copy.csv.gz").write_bytes((bench / "a.csv.gz").read_bytes())
     for other in ("a.csv.gz", "copy.csv.gz"):
-        words = ["compare", bench / "a.csv.gz", "--held-out", bench / other]
+        words = ["compare", bench / "a.csv.gz", "--test", bench / other]
         assert "not seen" in failing(*words, "--rig", bench / "bench.json", "--out", bench / "bad")
 
 
@@ -91,9 +91,7 @@ def rewritten(bench: Path, folder: Path, change, header: Sequence[str]) -> Path:
 
 def errors(out: Path) -> list[float]:
     model = results(out)["models"]["NCFM"]
-    return [
-        model[kind][name]["free_run"]["all"] for kind, name in (("held_out", "b"), ("train", "a"))
-    ]
+    return [model[kind][name]["free_run"]["all"] for kind, name in (("test", "b"), ("train", "a"))]
 
 
 @pytest.mark.parametrize(
@@ -127,7 +125,7 @@ def test_degrees_are_told_once_with_the_option_that_helps(
         raise ValueError("enough")
 
     monkeypatch.setattr("nfriction.evaluation.compare.compare", ends)
-    words = [str(wheels[0]), "--held-out", str(wheels[1]), "--rig", str(bench / "bench.json")]
+    words = [str(wheels[0]), "--test", str(wheels[1]), "--rig", str(bench / "bench.json")]
     assert cli.main(["compare", *words, "--out", str(bench / "w")]) == 2
     first, second = capsys.readouterr().err.splitlines()
     assert first.startswith("nfriction: warning: wheel, cart: positions look like degrees")
@@ -186,6 +184,6 @@ def test_a_robot_description_is_as_good_as_a_rig_file(bench: Path, compared: Pat
     assert compare(bench, bench / "robot", *rig, models="NCFM,LFM") == 0
     ours, theirs = (results(out)["models"] for out in (bench / "robot", compared))
     for model in ("NCFM", "LFM"):
-        mine, other = (m[model]["held_out"]["b"]["free_run"]["all"] for m in (ours, theirs))
+        mine, other = (m[model]["test"]["b"]["free_run"]["all"] for m in (ours, theirs))
         # The rig file knows the encoder's noise besides, which the fit does not ask for.
         assert mine == pytest.approx(other, rel=1e-6)

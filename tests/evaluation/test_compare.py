@@ -9,6 +9,7 @@ import pytest
 from nfriction import LFM, NFLFM, compare
 from nfriction.cli.tables import error_tables, verdict
 from nfriction.evaluation.compare import Comparison, coefficient_summary
+from nfriction.evaluation.parallel import Progress
 from nfriction.evaluation.score import RMSE, Score
 from nfriction.papers.afem.models import ALFM
 from nfriction.signals import kalman_smoother
@@ -19,19 +20,27 @@ A, B = (swing(pendulum(), MODEL, seconds=1.5, start=s, name=n)
         for s, n in (((1.6, 0.8), "a"), ((2.0, 0.2), "b")))  # fmt: skip
 
 
+class Stages(Progress):
+    def __init__(self):
+        self.told = []
+
+    def stage(self, what):
+        self.told.append(what)
+
+
 @pytest.fixture(scope="module")
 def comparison():
-    stages = []
+    stages = Stages()
     found = compare(pendulum(), ["NCFM", "LFM", "NCFM"], [A], [B], horizons=(0.5, 1.0),
-                    on_stage=stages.append, windows=(0.5,), max_steps=3)  # fmt: skip
+                    progress=stages, windows=(0.5,), max_steps=3)  # fmt: skip
     return found, stages
 
 
 def test_tables_have_a_row_a_model_and_a_column_a_joint(comparison):
     found, stages = comparison
     for horizon in (None, "0.5", "1"):
-        for held_out in (True, False):
-            table = found.table(horizon, held_out=held_out)
+        for part in ("train", "test"):
+            table = found.table(horizon, part=part)
             assert list(table.index) == ["no friction", "NCFM", "LFM"]
             assert list(table.columns) == [*found.joint_names, "all"]
             assert (table > 0).all().all()
@@ -39,19 +48,19 @@ def test_tables_have_a_row_a_model_and_a_column_a_joint(comparison):
     saved = found.improvement()
     assert (saved.loc["no friction"] == 0).all()
     assert (saved.loc["LFM"] > 0).all()
-    assert stages[:2] == ["fit NCFM", "fit LFM"]
+    assert stages.told[:2] == ["fit NCFM", "fit LFM"]
 
 
 def test_it_tells_in_a_few_lines_who_is_best(comparison):
     found, _ = comparison
     head, *rows = repr(found).splitlines()
-    assert head.endswith("held-out recordings, best: LFM")
+    assert head.endswith("test recordings, best: LFM")
     table = found.table()
     assert rows[0].split()[-1] == "all"
     for row, (name, errors) in zip(rows[2:], table.iterrows(), strict=True):
         assert row.startswith(name)
         assert float(row.split()[-1]) == pytest.approx(1e3 * errors["all"], rel=1e-3)
-    told = repr(dataclasses.replace(found, failed={"ALFM": "no classes"}, held_out={}))
+    told = repr(dataclasses.replace(found, failed={"ALFM": "no classes"}, test={}))
     assert "training recordings, best: None" in told
     assert told.endswith("not fitted: ALFM: no classes")
 
@@ -72,7 +81,7 @@ def test_what_could_not_be_fitted_is_kept_with_its_reason(comparison):
 def test_its_frame_has_every_error_once(comparison):
     found, _ = comparison
     table = found.to_frame()
-    keys = ["model", "recording", "kind", "horizon", "joint"]
+    keys = ["model", "recording", "part", "horizon", "joint"]
     assert list(table.columns) == [*keys, "rmse [rad]"]
     assert not table.duplicated(keys).any()
     # models × kinds × (free run and two horizons) × (joints and all)
@@ -87,7 +96,7 @@ def test_results_are_plain_json_with_the_names_others_rely_on(comparison):
     assert data["units"] == "rad"
     lfm = data["models"]["LFM"]
     assert set(lfm["coefficients"]) == {"B", "C"}
-    for kind, name in (("held_out", "b"), ("train", "a")):
+    for kind, name in (("test", "b"), ("train", "a")):
         scores = lfm[kind][name]
         assert set(scores["windows"]) == {"0.5", "1"}
         for rmse in (scores["free_run"], *scores["windows"].values()):
@@ -111,20 +120,20 @@ def test_names_must_tell_recordings_apart():
 
 def test_a_recording_is_not_judged_by_under_another_name_either():
     for name in ("a", "copy"):
-        with pytest.raises(ValueError, match=rf"{name}: trained on and held out; .*not seen"):
+        with pytest.raises(ValueError, match=rf"{name}: both trained on and tested on; .*not seen"):
             compare(pendulum(), ["NCFM"], [A], [B, dataclasses.replace(A, name=name)])
 
 
-def test_a_held_out_recording_without_torque_is_named_where_those_of_training_have_it():
+def test_a_test_recording_without_torque_is_named_where_those_of_training_have_it():
     driven = dataclasses.replace(A, tau=np.full_like(A.q, 1e-3))
     with pytest.warns(UserWarning, match=r"no torque is recorded in b, unlike"):
         compare(pendulum(), "NCFM", driven, B, horizons=(0.5,), windows=(0.5,), max_steps=1)
 
 
-def test_without_held_out_recordings_there_is_no_such_table(comparison):
+def test_without_test_recordings_there_is_no_such_table(comparison):
     found = compare(pendulum(), ["NCFM"], [A], horizons=(0.5,), windows=(0.5,), max_steps=1)
-    assert found.table(held_out=False).shape == (2, 3)
-    with pytest.raises(ValueError, match="held_out"):
+    assert found.table(part="train").shape == (2, 3)
+    with pytest.raises(ValueError, match="test"):
         found.table()
     assert set(found.to_dict()["models"]) == {"no friction", "NCFM"}
 
@@ -132,7 +141,7 @@ def test_without_held_out_recordings_there_is_no_such_table(comparison):
 def test_no_friction_is_judged_on_the_plant_as_given(comparison):
     found, _ = comparison
     other = compare(pendulum(), ["LFM"], [A], [B], horizons=(0.5,), windows=(0.5,), max_steps=2)
-    for kind in ("train", "held_out"):
+    for kind in ("train", "test"):
         (before,), (after,) = (getattr(c, kind)["no friction"] for c in (found, other))
         assert before.free_run == after.free_run
         assert before.windows["0.5"] == after.windows["0.5"]
@@ -153,14 +162,14 @@ def test_every_recording_is_smoothed_once(monkeypatch):
 
 def test_recordings_too_short_for_a_window_are_named(comparison):
     found, _ = comparison
-    assert found.too_short() == found.too_short(held_out=False) == {}
+    assert found.too_short() == found.too_short("train") == {}
     asked = dataclasses.replace(found, horizons_asked=(1.0, 2.0))
     assert asked.too_short() == {"2": {"b": pytest.approx(1.5)}}
     # A window length that one kind of recording lacks is still there for the other.
     shorter = {n: [dataclasses.replace(s, windows={}) for s in of] for n, of in found.train.items()}
     mixed = dataclasses.replace(found, train=shorter)
-    assert mixed.horizons() == mixed.horizons(held_out=False) == []
-    assert mixed.horizons(held_out=True) == ["0.5", "1"]
+    assert mixed.horizons() == mixed.horizons("train") == []
+    assert mixed.horizons("test") == ["0.5", "1"]
 
 
 def scored(found: Comparison, count: float | None = None, **errors: float) -> Comparison:
@@ -168,7 +177,7 @@ def scored(found: Comparison, count: float | None = None, **errors: float) -> Co
 
     Errors are of each of two recordings; the count's is of the first, and twice that of the second.
     """
-    held_out = {
+    test = {
         name.replace("_", " "): [
             Score(
                 recording, RMSE((e, e), e), {},
@@ -179,7 +188,7 @@ def scored(found: Comparison, count: float | None = None, **errors: float) -> Co
         ]
         for name, e in errors.items()
     }  # fmt: skip
-    return dataclasses.replace(found, held_out=held_out)
+    return dataclasses.replace(found, test=test)
 
 
 def judged(found: Comparison, **errors: float) -> str | None:
@@ -196,7 +205,7 @@ def test_best_is_the_least_error_and_of_equals_the_simplest(comparison):
     assert judged(found, no_friction=1.0, NCFM=1.0, LFM=2.0) == "no friction"
     assert judged(found, no_friction=np.inf, NCFM=np.inf, LFM=4.0) == "LFM"
     assert judged(found, no_friction=np.inf, NCFM=np.inf, LFM=np.inf) is None
-    alone = dataclasses.replace(found, held_out={})
+    alone = dataclasses.replace(found, test={})
     assert alone.best() is None
     assert alone.to_dict()["best"] is None
 
@@ -204,26 +213,29 @@ def test_best_is_the_least_error_and_of_equals_the_simplest(comparison):
 def test_models_within_the_floor_of_the_best_are_not_told_apart(comparison):
     found, _ = comparison
     errors = {"no_friction": 5.0, "NCFM": 2.0, "LFM": 1.0}
-    assert scored(found, **errors).alike() == ("LFM",)
-    assert "cannot be told" not in verdict(scored(found, **errors))
+    assert scored(found, **errors).indistinguishable() == ("LFM",)
+    assert "tied" not in verdict(scored(found, **errors))
     # Without a floor equal errors say nothing of it, as those of a network that kept its law.
     equal = scored(found, no_friction=5.0, NCFM=1.0, LFM=1.0)
-    assert equal.alike() == (equal.best(),)
+    assert equal.indistinguishable() == (equal.best(),)
     near, far = scored(found, 0.7, **errors), scored(found, 0.6, **errors)
     # Over both recordings root 2.5 of it: 1.1 and 0.95.
     assert near.floor() == pytest.approx(0.7 * 2.5**0.5)
     assert near.floor("joint1") == 0
-    assert near.alike() == ("NCFM", "LFM")
-    assert far.alike() == ("LFM",)
+    assert near.indistinguishable() == ("NCFM", "LFM")
+    assert far.indistinguishable() == ("LFM",)
     assert near.best() == far.best() == "LFM"
-    assert near.to_dict()["best"]["alike"] == ["NCFM", "LFM"]
-    assert "told from NCFM; the simplest of them is NCFM" in verdict(near)
-    assert "floor of the free run: 1107," in error_tables(near)
+    assert near.to_dict()["best"]["indistinguishable"] == ["NCFM", "LFM"]
+    assert "statistically tied with NCFM (" in verdict(near)
+    assert verdict(near).endswith("; the simplest of them is NCFM")
+    assert "floor of the free run (one encoder count in the initial state): 1107" in error_tables(
+        near
+    )
     assert verdict(far).count("\n") == 0
     all_alike = scored(found, 10.0, **errors)
-    assert all_alike.alike() == ("no friction", "NCFM", "LFM")
+    assert all_alike.indistinguishable() == ("no friction", "NCFM", "LFM")
     assert scored(found, np.inf, **errors).floor() is None
-    assert dataclasses.replace(found, held_out={}).alike() == ()
+    assert dataclasses.replace(found, test={}).indistinguishable() == ()
 
 
 def test_coefficients_that_follow_the_motion_say_what_they_hold_for():

@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 
 from nfriction import LFM, NCFM, fit
-from nfriction.evaluation.cross_validation import Candidate, Selection, choose, select
-from nfriction.evaluation.time_blocks import leave_blocks_out
+from nfriction.evaluation.cross_validation import (
+    Candidate,
+    Selection,
+    blocked_k_fold,
+    choose,
+    select,
+)
 from nfriction.recording import RecordingWarning
 from tests.fitting.recordings import pendulum, swing
 
@@ -78,7 +83,7 @@ def test_a_model_that_fails_in_a_fold_counts_as_diverged(monkeypatch):
             raise ValueError("nothing to be learnt")
         return by_torque(model, *args, motions=motions, **settings)
 
-    monkeypatch.setattr("nfriction.evaluation.fit_many.fit", fragile)
+    monkeypatch.setattr("nfriction.evaluation.parallel.fit", fragile)
     recording = swing(pendulum(), NCFM(2, [[2e-3], [1e-3]]), seconds=1.0)
     found = select(pendulum(), ["NCFM", "LFM"], [recording], folds=2)
     assert found.chosen == "NCFM"
@@ -89,13 +94,13 @@ def test_a_model_that_fails_in_a_fold_counts_as_diverged(monkeypatch):
 
 def test_blocks_cover_a_recording_and_share_their_ends_with_the_rest():
     recording = swing(pendulum(), LFM(2, [1e-3, 1e-3], v_smooth=0.05), seconds=1.0)
-    splits = leave_blocks_out(pendulum(), recording, 3)
-    blocks = [split.unseen for split in splits]
+    folds = blocked_k_fold(pendulum(), recording, 3)
+    blocks = [fold.test for fold in folds]
     assert blocks[0].recording.time[0] == recording.time[0]
     assert blocks[-1].recording.time[-1] == recording.time[-1]
     for before, after in pairwise(blocks):
         assert before.recording.time[-1] == after.recording.time[0]
-    for k, (block, rest) in enumerate(splits):
+    for k, (block, rest) in enumerate(folds):
         shared = np.intersect1d(block.recording.time, rest.recording.time)
         assert len(shared) == (2 if k == 1 else 1)
         assert len(rest.recording) + len(block.recording) == len(recording) + len(shared)
@@ -133,7 +138,7 @@ def test_a_fold_sees_nothing_of_what_it_is_judged_by(monkeypatch):
 def test_recordings_with_gaps_are_judged_by_what_fits_between_them(monkeypatch):
     whole = swing(pendulum(), NCFM(2, [[2e-3], [1e-3]]), seconds=2.0)
     recording = whole[(whole.time < 0.4) | (whole.time > 0.8)]
-    monkeypatch.setattr("nfriction.evaluation.fit_many.fit", by_torque)
+    monkeypatch.setattr("nfriction.evaluation.parallel.fit", by_torque)
     found = select(pendulum(), ["NCFM"], [recording], folds=2)
     assert found.horizon < 0.8
     assert all(map(math.isfinite, found.candidates[0].errors))
@@ -143,7 +148,7 @@ def test_what_is_left_of_a_recording_is_no_reason_to_warn():
     recording = swing(pendulum(), NCFM(2, [[1e-3]] * 2), seconds=1.0)
     with warnings.catch_warnings():
         warnings.simplefilter("error", RecordingWarning)
-        middle = leave_blocks_out(pendulum(), recording, 3)[1].seen
+        middle = blocked_k_fold(pendulum(), recording, 3)[1].train
         assert len(middle.recording.joint_coordinates(pendulum()).segments) == 2
 
 

@@ -2,6 +2,8 @@
 
 import dataclasses
 import inspect
+import subprocess
+import sys
 
 import numpy as np
 import pandas as pd
@@ -11,6 +13,8 @@ import torch
 from nfriction import ALFM, LFM, NCFM, LinearAxis, Recording, fit, score
 from nfriction.evaluation.estimators import FrictionEstimator
 from tests.fitting.recordings import driven_axis, pendulum, swing
+
+pytest.importorskip("sklearn")
 
 TRUE = [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]]
 STARTS = ((1.6, 0.8), (2.0, 0.2), (1.2, -0.5))
@@ -130,13 +134,17 @@ def test_parameters_are_kept_as_given_and_told() -> None:
     plant, windows = pendulum(name="rig"), [0.5]
     estimator = FrictionEstimator(plant, "NLFM", windows=windows)
     names = list(inspect.signature(FrictionEstimator).parameters)
-    assert list(estimator.get_params()) == names
+    assert set(estimator.get_params()) == set(names) > {"plant", "model", "horizon", "max_steps"}
     assert estimator.get_params()["plant"] is plant
     assert estimator.get_params()["windows"] is windows
-    assert estimator.set_params(model="LFM", drag=True) is estimator
-    assert repr(estimator) == "FrictionEstimator(<rig>, 'LFM', windows=[0.5], drag=True)"
-    with pytest.raises(ValueError, match="no parameter is called law; there are plant, model"):
+    assert estimator.set_params(model="CFM", drag=True) is estimator
+    for said in ("drag=True", "model='CFM'", "windows=[0.5]", "rig"):
+        assert said in repr(estimator)
+    assert "max_steps" not in repr(estimator)
+    with pytest.raises(ValueError, match="Invalid parameter 'law'"):
         estimator.set_params(law="LFM")
+    with pytest.raises(TypeError, match="`fit` has no setting law"):
+        FrictionEstimator(plant, law="LFM")
 
 
 def test_misuse_is_told(recordings: list[Recording]) -> None:
@@ -149,6 +157,24 @@ def test_misuse_is_told(recordings: list[Recording]) -> None:
     for wrong in (recordings[0].q, [recordings[0].q], [], "a.csv"):
         with pytest.raises(ValueError, match=r"a sample is a Recording|recordings are needed"):
             FrictionEstimator(pendulum()).fit(wrong)
+
+
+def test_without_scikit_learn_the_library_works_and_the_estimator_says_what_it_needs() -> None:
+    code = """
+import sys
+sys.modules["sklearn"] = None
+import nfriction
+nfriction.compare, nfriction.FrictionEstimator
+try:
+    nfriction.FrictionEstimator()
+except ImportError as error:
+    assert "pip install nfriction[sklearn]" in str(error), error
+else:
+    raise AssertionError
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+    loaded = "import sys, nfriction; nfriction.compare; assert 'sklearn' not in sys.modules"
+    subprocess.run([sys.executable, "-c", loaded], check=True)
 
 
 def test_clones_search_grids_and_are_cross_validated(recordings: list[Recording]) -> None:

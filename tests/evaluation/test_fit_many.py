@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from nfriction import Recording, fit
-from nfriction.evaluation import fit_many as many
-from nfriction.evaluation.fit_many import Data, fit_models, rounds, starts
+from nfriction.evaluation import parallel
+from nfriction.evaluation.parallel import Data, dependency_levels, fit_models, warm_starts
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction.registry import model_by_name, model_names
 from nfriction.signals import kalman_smoother
@@ -29,9 +29,9 @@ def data() -> Data:
     "names", [list(model_names()), list(model_names())[::-1], ["NFLFM", "ALFM"], ["LFM"]]
 )
 def test_every_start_is_there_before_it_is_needed(names: list[str]) -> None:
-    origin = starts(names)
+    origin = warm_starts(names)
     fitted: set[str | None] = {None}
-    for group in rounds(origin):
+    for group in dependency_levels(origin):
         assert {origin[name] for name in group} <= fitted
         fitted |= set(group)
     assert fitted == {None, *names}
@@ -39,14 +39,14 @@ def test_every_start_is_there_before_it_is_needed(names: list[str]) -> None:
 
 def test_networks_and_classes_start_from_the_constant_fit_of_their_law() -> None:
     for names in permutations(("NCFM", "LFM", "NFLFM", "ALFM")):
-        origin = starts(names)
+        origin = warm_starts(names)
         assert origin["NFLFM"] == origin["ALFM"] == "LFM"
         first, second = sorted(("NCFM", "LFM"), key=names.index)
         assert origin[first] is None
         assert origin[second] == first
-    assert starts(["NFLFM", "NCFM"]) == {"NFLFM": "NCFM", "NCFM": None}
+    assert warm_starts(["NFLFM", "NCFM"]) == {"NFLFM": "NCFM", "NCFM": None}
     # All models at once take three rounds, not one to each.
-    assert len(list(rounds(starts(list(model_names()))))) == 3
+    assert len(list(dependency_levels(warm_starts(list(model_names()))))) == 3
 
 
 def same(one: FitResult, other: FitResult) -> bool:
@@ -93,7 +93,7 @@ def test_a_model_that_fails_loses_no_other(
             raise ValueError("the data say nothing")
         return fit(model, plant, recordings, method="torque")
 
-    monkeypatch.setattr(many, "fit", fragile)
+    monkeypatch.setattr(parallel, "fit", fragile)
     with caplog.at_level(logging.INFO, "nfriction"):
         found, failed = fit_models(pendulum(), ["NCFM", "LFM", "NLFM"], {"fit": data})["fit"]
     assert list(found) == ["NCFM", "NLFM"]
@@ -108,7 +108,7 @@ def test_a_model_that_fails_loses_no_other(
 
 def test_what_cannot_cross_to_other_processes_is_refused(data: Data) -> None:
     pytest.importorskip("joblib")
-    with pytest.raises(ValueError, match="on_stage"):
+    with pytest.raises(ValueError, match="progress"):
         fit_models(pendulum(), ["LFM"], {"fit": data}, jobs=2, callback=lambda *_: None)
     with pytest.raises(ValueError, match="there are NCFM"):
         fit_models(pendulum(), ["XFM"], {"fit": data})

@@ -44,7 +44,7 @@ def test_every_piece_is_done_on_one_thread(jobs: int) -> None:
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     try:
-        found = dict(parallel.done(whereabouts, pieces, jobs=jobs))
+        found = dict(parallel.as_completed(whereabouts, pieces, jobs=jobs))
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(before)
@@ -58,8 +58,10 @@ def test_every_piece_is_done_on_one_thread(jobs: int) -> None:
 
 def test_the_caller_is_told_what_is_done(jobs: int) -> None:
     told: list[str] = []
+    progress = parallel.Progress()
+    progress.stage = told.append  # type: ignore[method-assign]
     pieces = {"a": (1.0,), "b": (2.0,)}
-    list(parallel.done(whereabouts, pieces, jobs=jobs, on_stage=told.append))
+    list(parallel.as_completed(whereabouts, pieces, jobs=jobs, progress=progress))
     if jobs == 1:
         assert told == ["a", "b"]
     else:
@@ -72,23 +74,23 @@ def test_logs_and_warnings_reach_this_process(jobs: int, caplog: pytest.LogCaptu
     pieces = {"a": ("the first",), "b": ("the second",)}
     with caplog.at_level(logging.INFO, "nfriction"), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        list(parallel.done(complain, pieces, jobs=jobs))
+        list(parallel.as_completed(complain, pieces, jobs=jobs))
     assert sorted(caplog.messages) == ["the first is wrong", "the second is wrong"]
     assert sorted(str(w.message) for w in caught) == ["the first is odd", "the second is odd"]
 
 
 def test_an_error_names_its_piece_and_keeps_its_kind(jobs: int) -> None:
     with pytest.raises(ZeroDivisionError, match=r"^fit LFM: by naught$"):
-        list(parallel.done(fail, {"fit LFM": ("by naught",)}, jobs=jobs))
+        list(parallel.as_completed(fail, {"fit LFM": ("by naught",)}, jobs=jobs))
     with pytest.raises(ZeroDivisionError, match=r"^[ab]: naught$"):
-        list(parallel.done(fail, {"a": ("naught",), "b": ("naught",)}, jobs=jobs))
+        list(parallel.as_completed(fail, {"a": ("naught",), "b": ("naught",)}, jobs=jobs))
 
 
 def test_the_callers_backend_does_the_work() -> None:
     """Such as a Dask cluster's; threads of this process are told apart as easily."""
     joblib = pytest.importorskip("joblib")
     with joblib.parallel_config(backend="threading"):
-        found = dict(parallel.done(whereabouts, {"a": (1.0,), "b": (2.0,)}, jobs=2))
+        found = dict(parallel.as_completed(whereabouts, {"a": (1.0,), "b": (2.0,)}, jobs=2))
     assert {process for _, process, _ in found.values()} == {os.getpid()}
 
 

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from nfriction import LFM, PendulumChain, score
-from nfriction.evaluation.score import RMSE, improvement_table, rmse_table
+from nfriction.evaluation.compare import Comparison
+from nfriction.evaluation.score import RMSE, Score
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.models import FrictionModel
@@ -139,19 +140,24 @@ def test_divergence_is_infinite_and_null():
     assert plain["free_run"] == {"joints": [None, None], "all": None}
     assert plain["diverged_at"] == pytest.approx(found.diverged_at)
     good = score(plant(), MODEL, recording, horizons=(0.5,))
-    table = rmse_table({"bad": [found], "good": [good]})
-    assert np.isinf(table[0]).all()
-    assert np.isnan(improvement_table(table)[0]).all()
+    table = tables({"bad": [found], "good": [good]})
+    assert np.isinf(table.table().loc["bad"]).all()
+    assert np.isnan(table.improvement().loc["bad"]).all()
+
+
+def tables(scores: dict[str, list[Score]]) -> Comparison:
+    return Comparison({}, {}, scores, unit="rad", joint_names=("joint1", "joint2"))
 
 
 def test_tables_are_root_mean_squares_and_percentages():
     recording = swing(plant(), MODEL, seconds=1.0)
     scores = [score(plant(), m, recording, horizons=(0.5,)) for m in (None, MODEL)]
-    table = rmse_table({"none": [scores[0], scores[1]], "model": [scores[1], scores[1]]}, "0.5")
+    both = tables({"none": [scores[0], scores[1]], "model": [scores[1], scores[1]]})
+    table = both.table("0.5").to_numpy()
     a, b = (s.windows["0.5"].all for s in scores)
     assert table[0, -1] == pytest.approx(np.sqrt((a**2 + b**2) / 2))
     assert table[1, -1] == pytest.approx(b)
-    saved = improvement_table(table)
+    saved = both.improvement("0.5").to_numpy()
     np.testing.assert_allclose(saved[0], 0.0, atol=1e-12)
     assert saved[1, -1] == pytest.approx(100 * (1 - table[1, -1] / table[0, -1]))
     assert not torch.is_grad_enabled() or MODEL.schedule.raw.grad is None

@@ -60,9 +60,9 @@ def scores_of(
     }
 
 
-def comparison_of(recording: Recording, *, held_out: bool = True, **options) -> Comparison:
+def comparison_of(recording: Recording, *, part: str = "test", **options) -> Comparison:
     scores = {name: [s] for name, s in scores_of(recording, **options).items()}
-    sides = ({}, scores) if held_out else (scores, {})
+    sides = ({}, scores) if part == "test" else (scores, {})
     return Comparison({}, *sides, unit=recording.unit, joint_names=recording.names)
 
 
@@ -154,16 +154,16 @@ def test_bars_hold_every_model_of_four_joints_and_runs_that_all_diverged():
         plots.rmse_bars(many.iloc[:0], "rad")
 
 
-@pytest.mark.parametrize("held_out", [True, False])
+@pytest.mark.parametrize("part", ["test", "train"])
 @pytest.mark.parametrize("unit", ["rad", "m"])
-def test_horizon_curve_is_the_table_of_each_horizon_over_a_floor(held_out, unit):
-    comparison = comparison_of(swing(2, unit), held_out=held_out)
+def test_horizon_curve_is_the_table_of_each_horizon_over_a_floor(part, unit):
+    comparison = comparison_of(swing(2, unit), part=part)
     figure = plots.horizon_curve(comparison)
     ax = figure.axes[0]
     assert [t.get_text() for t in ax.get_xticklabels()] == ["1 s", "2 s", "free run"]
     assert ax.get_ylabel() == f"position RMSE [m{unit}]"
     for k, horizon in enumerate(("1", "2", None)):
-        expected = 1e3 * comparison.table(horizon, held_out=held_out)["all"]
+        expected = 1e3 * comparison.table(horizon, part=part)["all"]
         shown = [line.get_ydata()[k] for line in ax.lines]
         np.testing.assert_allclose(shown, expected, rtol=1e-12)
     (band,) = ax.collections
@@ -327,25 +327,25 @@ def rc_params() -> dict:
 
 def test_save_all_writes_every_figure_and_leaves_matplotlib_alone(tmp_path):
     plant, recording, motion = axis_data(NCFM(1, [3.0]))
-    held_out = swing(1, "m", name="held")
+    unseen = swing(1, "m", name="unseen")
     found = fit(NCFM(1), plant, recording, method="torque", motions=[motion])
     fits = {"NCFM": found, "NFNCFM": replace(found, model=NFNCFM(1))}
-    train, held = (
-        {n: [score_of(r, 0.01)] for n in (NO_FRICTION, *fits)} for r in (recording, held_out)
+    train, test = (
+        {n: [score_of(r, 0.01)] for n in (NO_FRICTION, *fits)} for r in (recording, unseen)
     )
     before = rc_params()
-    comparison = Comparison(fits, train, held, "m", plant.joint_names)
-    files = plots.save_all(comparison, [recording, held_out], tmp_path / "figures")
+    comparison = Comparison(fits, train, test, "m", plant.joint_names)
+    files = plots.save_all(comparison, [recording, unseen], tmp_path / "figures")
     expected = {
-        "rmse_train", "horizons_train", "positions_train_push_1_µ", "rmse_held_out",
-        "horizons_held_out", "positions_held_out_held", "torque_over_velocity",
+        "rmse_train", "horizons_train", "positions_train_push_1_µ", "rmse_test",
+        "horizons_test", "positions_test_unseen", "torque_over_velocity",
         "over_time_viscous", "coefficients_NFNCFM", "sections_NFNCFM", "memberships_NFNCFM",
     }  # fmt: skip
     assert {f.name for f in files} == {f"{n}{of}.png" for n in expected for of in ("", ".dark")}
     assert all(f.read_bytes().startswith(b"\x89PNG") for f in files)
     assert rc_params() == before
-    only_train = plots.save_all(replace(comparison, fits={}, held_out={}), [], tmp_path)
-    assert not any("held_out" in f.name or "positions" in f.name for f in only_train)
+    only_train = plots.save_all(replace(comparison, fits={}, test={}), [], tmp_path)
+    assert not any("test" in f.name or "positions" in f.name for f in only_train)
     with pytest.raises(ValueError, match="not in the comparison"):
         plots.save_all(comparison, [swing(1, "m", name="other")], tmp_path)
 

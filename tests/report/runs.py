@@ -14,7 +14,7 @@ JOINTS = ["a<b>", "second"]
 
 
 def errors(scale: float | None) -> dict[str, Any]:
-    """An error of two joints, as `Rmse.to_dict` writes it; None diverged."""
+    """An error of two joints, as `RMSE.to_dict` writes it; None diverged."""
     return {"joints": [scale, scale], "all": scale}
 
 
@@ -43,7 +43,7 @@ def results() -> dict[str, Any]:
     recordings = [EVIL, "calm"]
     models: dict[str, Any] = {
         name: {
-            "held_out": {recordings[0]: score(scale)},
+            "test": {recordings[0]: score(scale)},
             "train": {recordings[1]: score(scale)},
         }
         for name, scale in scales.items()
@@ -58,12 +58,18 @@ def results() -> dict[str, Any]:
     sets = {label: {"B": [1e-3, 2e-3], "C": [1e-3, 1e-2]} for label in ("at_rest", "reference")}
     models["NFLFM"] |= {"fit": fit(intervals={}), "coefficients": sets}
     return {
+        "schema": 2,
         "models": models,
-        "best": {"model": "LFM", "by": "free-run RMSE", "alike": [EVIL, "LFM"], "floor": 1e-3},
+        "best": {
+            "model": "LFM",
+            "by": "free-run RMSE",
+            "indistinguishable": [EVIL, "LFM"],
+            "floor": 1e-3,
+        },
         "units": "rad",
         "joints": JOINTS,
         "command": f"nfriction compare {EVIL}",
-        "recordings": {"train": {"calm": "ab" * 32}, "held_out": {EVIL: "cd" * 32}},
+        "recordings": {"train": {"calm": "ab" * 32}, "test": {EVIL: "cd" * 32}},
     }
 
 
@@ -86,7 +92,7 @@ def write(folder: Path, content: dict[str, Any] | None = None) -> Path:
     save(LFM(2, [2e-3, 1e-2]), folder / "models" / "LFM.json", info)
     save(neuro_fuzzy(), folder / "models" / "NFLFM.json", info)
     (folder / "figures").mkdir(exist_ok=True)
-    for name, size in (("rmse_held_out", (4, 2)), ("rmse_held_out.dark", (4, 2)),
+    for name, size in (("rmse_test", (4, 2)), ("rmse_test.dark", (4, 2)),
                        ("positions_train_calm", (8, 2))):  # fmt: skip
         figure = Figure(figsize=size, facecolor="black" if "dark" in name else "white")
         figure.subplots().plot([0, 1])

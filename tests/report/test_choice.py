@@ -27,7 +27,7 @@ def test_the_choice_is_read_back_and_shown(tmp_path: Path) -> None:
     run = read_run(folder(tmp_path, selection=CHOICE.to_dict()))
     assert run.selection == CHOICE
     page = to_html(run)
-    assert "Choice by training data alone" in page
+    assert "Model selection (training data only)" in page
     assert "2 s simulations" in page
     assert EVIL not in page
 
@@ -37,7 +37,7 @@ def test_without_a_choice_there_is_no_section(tmp_path: Path) -> None:
         (tmp_path / str(k)).mkdir()
         run = read_run(folder(tmp_path / str(k), **none))
         assert run.selection is None
-        assert "Choice by training data alone" not in to_html(run)
+        assert "Model selection (training data only)" not in to_html(run)
 
 
 def test_a_model_that_failed_is_told(tmp_path: Path) -> None:

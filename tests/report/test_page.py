@@ -7,9 +7,8 @@ from html.parser import HTMLParser
 
 import pytest
 
+from nfriction.evaluation.tables import Table, error_table
 from nfriction.report import read_run, to_html
-from nfriction.report.markup import Markup, element, joined
-from nfriction.report.tables import error_table, number
 from tests.report.runs import EVIL, write
 
 
@@ -80,7 +79,7 @@ def test_a_dark_screen_gets_the_dark_twin(page, tmp_path):
     assert len(page.all("figure")) == 2  # the twin is no figure of its own
     assert [figure.get("class") for figure in page.all("figure")] == [None, "wide"]
     folder = write(tmp_path)
-    (folder / "figures" / "rmse_held_out.png").unlink()
+    (folder / "figures" / "rmse_test.png").unlink()
     alone = Page(to_html(read_run(folder)))
     assert len(alone.all("figure")) == 2
     assert not alone.all("source")
@@ -102,37 +101,28 @@ def test_what_a_reader_of_the_screen_needs(page):
 def test_verdicts_warnings_and_rules_are_told(page):
     text = " ".join("".join(page.text).split())
     for said in (
-        "LFM predicts the recordings best that no fit has seen: 100 mrad, where no friction "
-        "leaves 2000.",
-        f"it cannot be told from {EVIL}. The simplest of them is {EVIL}.",
+        "LFM predicts the test recordings best: 100 mrad, where no friction leaves 2000.",
+        f"it is statistically tied with {EVIL}; the simplest of them is {EVIL}.",
         "Not converged.",
-        "The data cannot tell: f_a with f_v.",
+        "Not identifiable: f_a with f_v.",
         "At a bound: f_b.",
         "IF velocity is slow AND acceleration is about zero THEN",
         "diverged",
         "nfriction export",
-        "trained on",
+        "training recording",
     ):
         assert said in text
     assert text.count("At a bound") == 1
 
 
 def test_the_least_error_of_a_column_is_marked_and_a_diverged_one_never(tmp_path):
-    table = error_table(read_run(write(tmp_path)), "held_out")
-    marked = {(row[0].text, k) for row in table.rows for k, cell in enumerate(row) if cell.best}
+    table = error_table(read_run(write(tmp_path)).comparison, "test")
+    marked = {(r[0], k) for r in table.rows for k in range(len(r)) if table.is_marked(r, k)}
     assert marked == {("LFM", k) for k in range(1, 5)}
-    (lost,) = (row for row in table.rows if row[0].text == "NLFM")
-    assert [cell.text for cell in lost[1:5]] == ["diverged"] * 4
-    saved = {row[0].text: row[-1].value for row in table.rows}
+    (lost,) = (row for row in table.rows if row[0] == "NLFM")
+    assert [table.text(value) for value in lost[1:5]] == ["diverged"] * 4
+    saved = {row[0]: row[-1] for row in table.rows}
     assert saved["LFM"] == pytest.approx(95.0)
-
-
-def test_markup_is_never_escaped_twice_nor_text_left_raw():
-    inner = element("b", "a < b")
-    assert inner == "<b>a &lt; b</b>"
-    assert element("p", inner, " & c") == "<p><b>a &lt; b</b> &amp; c</p>"
-    assert element("td", title='"', class_=None, hidden=True) == '<td title="&quot;" hidden></td>'
-    assert isinstance(joined(inner), Markup)
 
 
 @pytest.mark.parametrize(
@@ -141,4 +131,4 @@ def test_markup_is_never_escaped_twice_nor_text_left_raw():
      (math.nan, "n/a"), (0.0, "0"), (1e-12, "0"), (2e-6, "2e-06")],
 )  # fmt: skip
 def test_numbers_read_plainly(value, text):
-    assert number(value).text == text
+    assert Table("", (), ()).text(value) == text

@@ -25,7 +25,7 @@ def test_a_run_is_what_its_files_say(folder):
     assert run.comparison.table()["all"]["LFM"] == pytest.approx(0.1)
     assert run.comparison.scores()["NLFM"][0].diverged_at == 0.5
     assert {f.name for f in run.figures} == {
-        "positions_train_calm", "rmse_held_out", "rmse_held_out.dark"}  # fmt: skip
+        "positions_train_calm", "rmse_test", "rmse_test.dark"}  # fmt: skip
     assert (run.figures[0].width, run.figures[0].height) == (800, 200)
     assert any("NLFM" in note for note in run.notes)  # its model file is not there
 
@@ -34,12 +34,12 @@ def test_a_damaged_model_or_figure_is_said_and_does_not_stop_the_report(tmp_path
     folder = write(tmp_path)
     path = folder / "models" / "LFM.json"
     path.write_bytes(path.read_bytes()[:-20])
-    (folder / "figures" / "rmse_held_out.png").write_text("<svg onload=alert(1)>")
+    (folder / "figures" / "rmse_test.png").write_text("<svg onload=alert(1)>")
     run = read_run(folder)
     assert "LFM" not in run.models
     said = " ".join(run.notes)
     assert "LFM" in said
-    assert "rmse_held_out.png: not a PNG file" in said
+    assert "rmse_test.png: not a PNG file" in said
     assert "<svg" not in to_html(run)
 
 
@@ -69,8 +69,8 @@ def test_truncated_results_are_refused(tmp_path, keep):
         (("joints",), [], "no joints"),
         (("joints",), ["only one"], "each of 1 joints"),
         (("models",), [], "models"),
-        (("models", "LFM", "held_out"), {}, "different recordings"),
-        (("models", "LFM", "held_out"), {"x": {"free_run": {"joints": [1]}}}, "each of 2"),
+        (("models", "LFM", "test"), {}, "different recordings"),
+        (("models", "LFM", "test"), {"x": {"free_run": {"joints": [1]}}}, "each of 2"),
         (("models", "LFM", "fit"), "good", "fit of LFM"),
         (("models", "LFM", "fit", "warnings"), "none", "list of texts"),
         (("models", "LFM", "fit", "intervals"), {"B": [1]}, "two ends"),
@@ -103,6 +103,21 @@ def paths(value: object, at: tuple = ()) -> list[tuple]:
         else enumerate(value) if isinstance(value, list) else ()
     )  # fmt: skip
     return [at, *(p for key, child in children for p in paths(child, (*at, key)))]
+
+
+def test_results_of_the_first_schema_are_read(tmp_path):
+    """They had `held_out` for `test` and `alike` for `indistinguishable`, and no number."""
+    content = results()
+    del content["schema"]
+    for of in (*content["models"].values(), content["recordings"]):
+        of["held_out"] = of.pop("test")
+    content["best"]["alike"] = content["best"].pop("indistinguishable")
+    today, then = read_run(write(tmp_path / "2")), read_run(write(tmp_path / "1", content))
+    assert then.comparison.to_dict() == today.comparison.to_dict()
+    assert (then.recordings, then.indistinguishable) == (today.recordings, today.indistinguishable)
+    figures = tmp_path / "1" / "figures"
+    (figures / "rmse_test.png").rename(figures / "rmse_held_out.png")
+    assert "by model and joint, test recordings" in to_html(read_run(tmp_path / "1"))
 
 
 JUNK = st.sampled_from([None, True, "x", -1, 1e400, 10**400, [], {}, [[]], {"joints": {}}])

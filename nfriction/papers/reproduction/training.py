@@ -74,7 +74,7 @@ def checkpoints(given: argparse.Namespace, **settings: object) -> Workspace:
     made = Settings(
         seed=given.seed, windows=tuple(given.windows), max_steps=given.max_steps,
         network_steps=given.max_steps, fit_plant=given.plant == "fit",
-        origin=json.dumps(options, default=str, sort_keys=True), **settings,
+        origin=json.dumps(options, default=str, sort_keys=True), **settings,  # type: ignore[arg-type]
     )  # fmt: skip
     folder = given.out / "checkpoints"
     workspace = Workspace(folder, made, progress=sys.stderr.isatty())

@@ -1,0 +1,147 @@
+"""Tables of comparisons and fits as rows, which the command line prints and the report draws."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import zip_longest
+
+from nfriction.evaluation.compare import NO_FRICTION, PART_NAMES, Comparison, Part
+from nfriction.evaluation.cross_validation import Selection
+from nfriction.friction.models import FrictionModel
+from nfriction.io.model_info import ModelInfo, describe
+
+Value = str | float
+Sets = Mapping[str, Mapping[str, Sequence[float]]]
+# A positive coefficient at its bound is 1e-12 of its unit.
+ZERO = 1.001e-12
+
+
+@dataclass(frozen=True)
+class Table:
+    """A caption, column headings, and rows whose first value names the row.
+
+    Attributes:
+        caption: without a full stop.
+        columns: headings; a comma separates a group of columns from the column's own name.
+        rows: text and numbers.
+        infinite: word for an infinite number.
+        marked: places of columns of which the least number is marked.
+    """
+
+    caption: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Value, ...], ...]
+    infinite: str = "unknown"
+    marked: tuple[int, ...] = ()
+
+    def text(self, value: Value) -> str:
+        """A value to four digits; "n/a" for NaN."""
+        if isinstance(value, str):
+            return value
+        if abs(value) <= ZERO:
+            return "0"
+        if math.isnan(value):
+            return "n/a"
+        if math.isinf(value):
+            return self.infinite
+        return f"{value:.0f}" if 1e3 <= abs(value) < 1e7 else f"{value:.4g}"
+
+    def is_numeric(self, column: int) -> bool:
+        """Whether every value of a column is a number."""
+        return column > 0 and not any(isinstance(row[column], str) for row in self.rows)
+
+    def is_marked(self, row: Sequence[Value], column: int) -> bool:
+        """Whether a row has the least number of a column, and that is finite."""
+        if column not in self.marked:
+            return False
+        least = min(float(other[column]) for other in self.rows)
+        return math.isfinite(least) and row[column] == least
+
+    def __str__(self) -> str:
+        """Lines of text, a group of columns named once above its own."""
+        heads = list(zip_longest(*(c.split(", ", 1) for c in self.columns[1:]), fillvalue=""))
+        if len(heads) == 2:
+            above, own = heads
+            pairs = zip(above, ("", *above), strict=False)
+            heads = [tuple("" if group == before else group for group, before in pairs), own]
+        lines = [("", *head) for head in heads]
+        lines += [tuple(self.text(value) for value in row) for row in self.rows]
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        just = [str.rjust if self.is_numeric(k) else str.ljust for k in range(len(widths))]
+        printed = ("  ".join(j(v, w) for j, v, w in zip(just, line, widths, strict=True))
+                   for line in lines)  # fmt: skip
+        return "\n".join([self.caption, *(line.rstrip() for line in printed)])
+
+
+def error_table(comparison: Comparison, part: Part) -> Table:
+    """Position errors by model over all recordings of a part, and the reduction by friction."""
+    free = 1e3 * comparison.table(part=part)
+    if len(comparison.joint_names) == 1:
+        free = free[["all"]]
+    columns = {f"free run, {name}": free[name].tolist() for name in free}
+    for horizon in comparison.horizons(part):
+        error = 1e3 * comparison.table(horizon, part=part)["all"]
+        columns[f"windows, {horizon} s"] = error.tolist()
+    marked = tuple(range(1, len(columns) + 1))
+    if free.index[0] == NO_FRICTION:
+        columns["error reduction, %"] = comparison.improvement(part=part)["all"].tolist()
+    rows = zip(map(str, free.index), *columns.values(), strict=True)
+    caption = f"Position RMSE [m{comparison.unit}] over {PART_NAMES[part]}"
+    return Table(caption, ("model", *columns), tuple(rows), "diverged", marked)
+
+
+def selection_table(selection: Selection) -> Table:
+    """Error of each model on blocks of the training recordings that its fits had not seen."""
+    rows = tuple(
+        (c.name, 1e3 * c.error, float(c.parameters), "yes" if c.converged else "no")
+        for c in selection.candidates
+    )
+    return Table(
+        f"Position RMSE [m{selection.unit}] of {selection.horizon:.3g} s simulations over blocks "
+        "left out",
+        ("model", "error", "parameters", "all fits converged"), rows, "diverged", (1,),
+    )  # fmt: skip
+
+
+def coefficient_table(
+    model: str, joints: Sequence[str], sets: Sets, units: Mapping[str, str]
+) -> Table:
+    """Coefficients by joint, and by where they apply if they follow the motion.
+
+    Args:
+        model: its name.
+        joints: names.
+        sets: by where they apply (`"always"` of constants), then by name: a value a joint.
+        units: by name of the coefficient, as far as they are known.
+    """
+    names = list(next(iter(sets.values()), {}))
+    follows = list(sets) != ["always"]
+    rows: list[tuple[Value, ...]] = []
+    for j, joint in enumerate(joints):
+        for label, of in sets.items():
+            values = [of[name][j] if name in of else math.nan for name in names]
+            rows.append((joint, *([label.replace("_", " ")] if follows else []), *values))
+    heads = [f"{name} [{units[name]}]" if name in units else name for name in names]
+    caption = f"Coefficients of {model}" + (" (they follow the motion)" if follows else "")
+    return Table(caption, ("joint", *(["applies"] if follows else []), *heads), tuple(rows))
+
+
+def interval_table(model: str, intervals: Sequence[tuple[str, float, float, float]]) -> Table:
+    """95 % confidence intervals.
+
+    Args:
+        model: its name.
+        intervals: parameter, value, lower and upper end.
+    """
+    return Table(
+        f"95 % confidence intervals of {model} (plant terms as relative change from the rig's, "
+        "offsets in SI)",
+        ("parameter", "value", "from", "to"),
+        tuple(intervals),
+    )
+
+
+def coefficient_units(model: FrictionModel, unit: str) -> dict[str, str]:
+    """Unit of each coefficient for positions in `unit`."""
+    described = describe(model, ModelInfo(unit=unit))
+    return {c["name"]: c["unit"] for c in described["coefficients"]}
