@@ -180,7 +180,7 @@ def test_a_model_of_ones_own_fills_a_model_of_the_same_kind(tmp_path: Path) -> N
     assert load(path, into=fresh) is fresh
     inputs = motion(20, 2)
     assert torch.equal(fresh(*inputs), model(*inputs))
-    with pytest.raises(ModelFileError, match="make the model yourself and pass it as `into`"):
+    with pytest.raises(ModelFileError, match="create the model yourself and pass it as `into`"):
         load(path)
 
 
