@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from nfriction.friction.laws import Law
-from nfriction.friction.sensitivity import FactoredSensitivity, Sensitivity
+from nfriction.friction.sensitivity import Sensitivity
 from nfriction.fuzzy.rules import FuzzyRules
 
 # Smallest value of a positive coefficient: far below the resolution of any torque sensor.
@@ -142,12 +142,10 @@ class Schedule(nn.Module, ABC):
         return torch.zeros_like(vector), torch.full_like(vector, torch.inf)
 
     @abstractmethod
-    def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity | FactoredSensitivity:
+    def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
         """Derivatives of the coefficients at motions of shape (sample, joint)."""
 
-    def sensitivities_from(
-        self, qd: Tensor, qdd: Tensor, state: Tensor
-    ) -> Sensitivity | FactoredSensitivity:
+    def sensitivities_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Sensitivity:
         """Derivatives of `coefficients_from` at a fixed hidden state (sample, joint, state)."""
         return self.sensitivities(qd, qdd)
 
@@ -298,12 +296,11 @@ class Constant(Tabulated):
         self._prior_sd = sd.tolist()
 
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
-        joints, k = self.raw.shape
-        samples = qd.shape[0]
-        identity = torch.eye(k, dtype=self.raw.dtype, device=self.raw.device).repeat(1, joints)
-        zero = self.raw.new_zeros(()).expand(samples, joints, k)
-        joint = torch.arange(joints, device=self.raw.device).repeat_interleave(k)
-        return Sensitivity(identity.expand(samples, -1, -1), joint, zero, zero)
+        k = self.raw.shape[-1]
+        identity = torch.eye(k, dtype=self.raw.dtype, device=self.raw.device)
+        zero = self.raw.new_zeros(()).expand(*qd.shape, k)
+        one = self.raw.new_ones(()).expand(*qd.shape, 1)
+        return Sensitivity(((identity.expand(*qd.shape, k, k), one),), zero, zero)
 
     def extra_repr(self) -> str:
         columns = [f"{v:.4g}" for v in self.values.mean(0)]

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from nfriction.friction.coefficients import Constant, Schedule
 from nfriction.friction.laws import Law
-from nfriction.friction.sensitivity import FactoredSensitivity
+from nfriction.friction.sensitivity import Sensitivity
 from nfriction.fuzzy import AnfisRBF
 from nfriction.fuzzy.rules import FuzzyRules
 
@@ -280,7 +280,7 @@ class NeuroFuzzy(Schedule):
         vector = self.parameter_vector()
         return torch.zeros_like(vector), torch.full_like(vector, self.prior_sd)
 
-    def sensitivities(self, qd: Tensor, qdd: Tensor) -> FactoredSensitivity:
+    def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
         return self.residual_sensitivities(self.reference, qd, qdd)
 
     @torch.no_grad()
@@ -328,9 +328,7 @@ class NeuroFuzzy(Schedule):
         return by_x + self.network(x)[..., None] * slope[..., None, :]
 
     @torch.no_grad()
-    def residual_sensitivities(
-        self, reference: Tensor, qd: Tensor, qdd: Tensor
-    ) -> FactoredSensitivity:
+    def residual_sensitivities(self, reference: Tensor, qd: Tensor, qdd: Tensor) -> Sensitivity:
         """Derivatives of `residual_coefficients` at a fixed reference."""
         anfis, head = self.network.anfis, self.network.head
         x, weight = self._clamped_inputs(qd, qdd)
@@ -345,7 +343,7 @@ class NeuroFuzzy(Schedule):
         # The rules' outputs are inputs of the head, too.
         by_y = head.input_jacobian(both)[:, :, x.shape[-1] :].permute(3, 0, 1, 2)
         by_qd, by_qdd = self.slopes(qd, qdd, coefficients)
-        return FactoredSensitivity(
+        return Sensitivity(
             (
                 (by_u[..., None] * (own + by_y), anfis.regressors(x)),
                 (by_u[..., None] * own, head.activations(both)),

@@ -19,7 +19,7 @@ from torch import Tensor
 from nfriction import codegen
 from nfriction.fitting.plant_parameters import PlantParameter, adjusted_buffers
 from nfriction.friction.models import FrictionModel
-from nfriction.friction.sensitivity import FactoredSensitivity, Sensitivity
+from nfriction.friction.sensitivity import Sensitivity
 from nfriction.plant import Plant
 from nfriction.simulation.rk4 import rk4_step
 from nfriction.simulation.rollout import Rollout
@@ -188,7 +188,7 @@ def step_maps(
 
 
 def _compose(
-    slope: Sensitivity | FactoredSensitivity, derivative: Tensor, block: int, plant_count: int
+    slope: Sensitivity, derivative: Tensor, block: int, plant_count: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Close the loop from the state through the coefficients, and chain the steps of blocks."""
     samples, joints = slope.qd.shape[:2]

@@ -221,15 +221,15 @@ class Adaptive(Tabulated):
 
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
         """Derivatives at motions (sample, joint), each sample taken for a first one."""
-        joints, cells, k = self.raw.shape
+        _, cells, k = self.raw.shape
         known = self.initial_state(qd, qdd).select(-1, 1)
         options = torch.arange(cells, dtype=known.dtype, device=known.device)
         chosen = (known[..., None] == options).to(self.raw.dtype)  # (sample, joint, class)
         identity = torch.eye(k, dtype=self.raw.dtype, device=self.raw.device)
-        parameters = torch.einsum("sjc,kl->skjcl", chosen, identity).flatten(2)
-        joint = torch.arange(joints, device=self.raw.device).repeat_interleave(cells * k)
+        by_cell = torch.einsum("sjc,kl->sjkcl", chosen, identity).flatten(3)
         zero = self.raw.new_zeros(()).expand(*qd.shape, k)
-        return Sensitivity(parameters, joint, zero, zero)
+        one = self.raw.new_ones(()).expand(*qd.shape, 1)
+        return Sensitivity(((by_cell, one),), zero, zero)
 
     def options(self) -> dict[str, Any]:
         return {

@@ -29,6 +29,7 @@ from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.afem.classes import AccelerationClasses
 from nfriction.papers.afem.fit_by_search import fit_by_search
 from nfriction.papers.afem.labelled import LabelledProblem, driving_classes, labelled_model
+from nfriction.papers.afem.search import SearchOptions
 from nfriction.papers.afem.settling import PRIOR_SD, adopt_classes, settled
 from nfriction.plant import Plant
 from nfriction.recording import Recording
@@ -101,8 +102,8 @@ def fit_adaptive(
     if method != "gauss-newton":
         settings = {"horizon": length, "prior_sd": prior_sd, **search_settings}
         found = fit_by_search(
-            model, plant, given, method=method, start=replace(constant, zeros=()), motions=moved,
-            classes=classes, **settings,
+            model, plant, given, options=SearchOptions(method, **settings), motions=moved,
+            start=replace(constant, zeros=()), classes=classes,
         )  # fmt: skip
         return replace(found, motions=raw, zeros=constant.zeros, left_out=constant.left_out)
     if search_settings:

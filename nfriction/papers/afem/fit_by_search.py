@@ -1,7 +1,6 @@
 """Coefficients, constant or by class, by direct search of the position error of a simulation."""
 
 from collections.abc import Sequence
-from typing import get_args
 
 import torch
 from torch import Tensor
@@ -29,12 +28,11 @@ from nfriction.papers.afem.position_error import PositionError
 from nfriction.papers.afem.search import (
     Box,
     Callback,
-    SearchMethod,
-    SearchState,
+    SearchOptions,
     available_threads,
     search,
 )
-from nfriction.papers.afem.settling import PRIOR_SD, adopt_classes, settled
+from nfriction.papers.afem.settling import adopt_classes, settled
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
@@ -45,19 +43,11 @@ def fit_by_search(
     plant: Plant,
     recordings: Recording | Sequence[Recording],
     *,
-    method: SearchMethod = "pattern",
-    horizon: float | None = 2.0,
+    options: SearchOptions = SearchOptions(),  # noqa: B008
     start: FitResult | None = None,
     motions: Sequence[Motion] | None = None,
     classes: AccelerationClasses | None = None,
-    prior_sd: float = PRIOR_SD,
-    max_evaluations: int = 5000,
-    tolerance: float = 1e-4,
-    seed: int = 0,
-    threads: int | None = None,
-    state: SearchState | None = None,
     callback: Callback | None = None,
-    progress: bool = False,
 ) -> FitResult:
     """Fit constant or adaptive coefficients by direct search of the simulation's position error.
 
@@ -65,17 +55,12 @@ def fit_by_search(
         model: a model with constant or adaptive coefficients; changed in place.
         plant: the mechanism as given; where `start` is given, as it left it.
         recordings: one or several.
-        method: `"pattern"` search or `"sqp"`.
-        horizon: length of the simulated windows [s], restarted from the smoothed motion; None
-            simulates each recording in one run, as the papers do. After seconds of chaotic motion
-            that is a criterion of luck.
+        options: method, windows and limits.
         start: fit to start from; of the constant law for an adaptive model. By default the
             constant coefficients that the torques imply (adaptive: the trajectory fit).
         motions: smoothed motions in joint coordinates.
         classes: of an adaptive model, from `find_classes`; found here by default.
-        prior_sd: of an adaptive model, see `fit_adaptive`.
-        max_evaluations, tolerance, seed, state, callback, progress: see `search`.
-        threads: candidates are shared out among this many; all processors by default.
+        callback: called after every iteration; True stops.
 
     Returns:
         The fit.
@@ -88,8 +73,6 @@ def fit_by_search(
         Second paper: NCFM by sequential quadratic programming, LFM and NLFM by pattern search,
         on 80 s; TLRIP paper, AFEM.
     """
-    if method not in get_args(SearchMethod):
-        raise ValueError(f"`method` must be one of {get_args(SearchMethod)}, got {method!r}.")
     schedule = model.schedule
     if not isinstance(schedule, Constant | Adaptive):
         raise ValueError(
@@ -103,18 +86,18 @@ def fit_by_search(
     if isinstance(schedule, Adaptive):
         constant = constant_start(model, plant, given, moved, start, Settings())
         classes = adopt_classes(schedule, classes, joint, moved, plant)
-        varied = labelled_model(model, constant, joint, moved, prior_sd)
+        varied = labelled_model(model, constant, joint, moved, options.prior_sd)
     else:
         constant = start or fit_by_torque(model, plant, given, moved)
         schedule.set_coefficients(constant_schedule(constant.model).values)
         varied = model
     span = max(float(r.time[-1] - r.time[0]) for r in joint)
-    cut = cut_windows(joint, moved, span if horizon is None else horizon)
+    cut = cut_windows(joint, moved, span if options.horizon is None else options.horizon)
     error = PositionError(
         constant.plant, varied, cut, mixing_of(plant, given[0].resolve_convention(plant)),
         substeps=substeps_of(plant, varied, joint),
         drive=None if classes is None else driving_classes(classes, cut),
-        threads=threads or available_threads(),
+        threads=options.threads or available_threads(),
     )  # fmt: skip
     box = _box(varied, constant, joint, moved)
     first = error.residuals(varied.schedule.parameter_vector())
@@ -125,10 +108,7 @@ def fit_by_search(
         data = error.mean_square(vectors) * (error.values / noise**2)
         return 0.5 * (data + ((vectors - mean) / sd).square().sum(-1))
 
-    result = search(
-        cost, box, method, max_evaluations=max_evaluations, tolerance=tolerance, seed=seed,
-        state=state, callback=callback, progress=progress,
-    )  # fmt: skip
+    result = search(cost, box, options, callback)
     assert isinstance(varied.schedule, Tabulated)
     varied.schedule.set_parameter_vector(result.vector)
     names = varied.schedule.parameter_names(plant.joint_names)

@@ -1,6 +1,6 @@
-"""Direct search of a cost within bounds: pattern search or sequential quadratic programming.
+"""Direct search of a cost within bounds, the papers' way: pattern search or SQP.
 
-The papers' way. Every poll, and every gradient, is one batch of candidates.
+Every poll, and every gradient, is one batch of candidates.
 """
 
 from __future__ import annotations
@@ -8,32 +8,33 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.papers.afem.pattern_search import PatternSearch, PatternState
+from nfriction.papers.afem.pattern_search import PatternSearch, PatternState, VariableScaling
 
 SearchMethod = Literal["pattern", "sqp"]
 # Forward differences of a smooth simulation: half the digits.
 DIFFERENCE = 1e-6
-# What a candidate that diverges costs in a gradient, against the start: finite, but beyond all.
+# Cost of a diverged candidate in a gradient, relative to the start: finite, but beyond all others.
 DIVERGED = 1e6
+# Stands in for zero as the lower bound of a logarithmic variable.
+TINY = 1e-300
 
 
 @dataclass(frozen=True)
 class SearchState:
-    """Where a search stands, in plain types, to go on from there.
+    """An unfinished search in plain types, to resume it.
 
     Attributes:
         method: `"pattern"` or `"sqp"`.
         vector: best parameter vector.
         value: its cost.
         evaluations: candidates simulated so far.
-        pattern: all that a pattern search needs to go on bit for bit; None for SQP, which goes on
-            from the vector.
+        pattern: resumes a pattern search bit for bit; None for SQP, which restarts at the vector.
     """
 
     method: SearchMethod
@@ -55,6 +56,44 @@ class SearchState:
 
 
 @dataclass(frozen=True)
+class SearchOptions:
+    """Settings of a search.
+
+    Attributes:
+        method: `"pattern"` search or `"sqp"`.
+        horizon: length of the simulated windows [s], restarted from the smoothed motion; None
+            simulates each recording in one run, as the papers do. After seconds of chaotic motion
+            that is a criterion of luck.
+        prior_sd: of an adaptive model, see `fit_adaptive`.
+        max_evaluations: limit of candidates simulated.
+        tolerance: change relative to the scales (pattern) or the cost (SQP) that ends the search.
+        seed: of the pattern's rotations.
+        threads: candidates are divided among this many; all processors by default.
+        state: of an earlier search, to resume it.
+        progress: show a bar (pattern search).
+
+    Raises:
+        ValueError: if there is no such method.
+    """
+
+    method: SearchMethod = "pattern"
+    horizon: float | None = 2.0
+    prior_sd: float = 0.5
+    max_evaluations: int = 5000
+    tolerance: float = 1e-4
+    seed: int = 0
+    threads: int | None = None
+    state: SearchState | None = None
+    progress: bool = False
+
+    def __post_init__(self) -> None:
+        if self.method not in get_args(SearchMethod):
+            raise ValueError(
+                f"`method` must be one of {get_args(SearchMethod)}, got {self.method!r}."
+            )
+
+
+@dataclass(frozen=True)
 class SearchResult:
     """Outcome of a search: the best vector, and in words why it ended there."""
 
@@ -63,7 +102,6 @@ class SearchResult:
     converged: bool
     message: str
     iterations: int
-    state: SearchState
 
 
 @dataclass(frozen=True)
@@ -84,99 +122,71 @@ class Box:
 
     @property
     def free(self) -> Tensor:
+        """Variables that the search may change, bool."""
         return self.lower < self.upper
 
     def whole(self, part: Tensor) -> Tensor:
-        """Vectors (m, parameter) from their free variables (m, free)."""
-        vectors = self.start.expand(len(part), -1).clone()
-        vectors[:, self.free] = part
+        """Vectors (..., parameter) from their free variables (..., free)."""
+        vectors = self.start.expand(*part.shape[:-1], -1).clone()
+        vectors[..., self.free] = part
         return vectors
 
+    def scaling(self) -> VariableScaling:
+        """Of the free variables."""
+        free, log = self.free, self.logarithmic
+        lower = torch.where(log, self.lower.clamp_min(TINY), self.lower)
+        return VariableScaling.build(
+            self.start[free], lower[free], self.upper[free], self.scale[free], log[free]
+        )
 
-Callback = Callable[[SearchState], bool | None]
+
+Cost = Callable[[Tensor], Tensor]
+Callback = Callable[[SearchState], "bool | None"]
 
 
 def search(
-    cost: Callable[[Tensor], Tensor],
-    box: Box,
-    method: SearchMethod,
-    *,
-    max_evaluations: int = 5000,
-    tolerance: float = 1e-4,
-    seed: int = 0,
-    state: SearchState | None = None,
-    callback: Callback | None = None,
-    progress: bool = False,
+    cost: Cost, box: Box, options: SearchOptions, callback: Callback | None = None
 ) -> SearchResult:
     """Minimise a cost within bounds by pattern search or sequential quadratic programming.
 
     Args:
         cost: values (m,) of candidates (m, parameter).
         box: start, bounds and scales.
-        method: `"pattern"` or `"sqp"`.
-        max_evaluations: limit of candidates simulated.
-        tolerance: change relative to the scales (pattern) or the cost (SQP) that ends the search.
-        seed: of the pattern's rotations.
-        state: of an earlier search, to go on from.
-        callback: told after every iteration; True stops.
-        progress: show a bar (pattern search).
+        options: method, limits and the state to resume.
+        callback: called after every iteration; True stops.
 
     Raises:
         ValueError: if the state is another search's.
     """
-    if state is not None and (state.method != method or len(state.vector) != len(box.start)):
+    state = options.state
+    if state is not None and (state.method, len(state.vector)) != (options.method, len(box.start)):
         raise ValueError(
             f"`state` is of {state.method!r} with {len(state.vector)} parameters, the search is "
-            f"{method!r} with {len(box.start)}."
+            f"{options.method!r} with {len(box.start)}."
         )
-    if method == "sqp":
-        return _sqp(cost, box, max_evaluations, tolerance, state, callback)
-    return _pattern(cost, box, max_evaluations, tolerance, seed, state, callback, progress)
+    method = _sqp if options.method == "sqp" else _pattern
+    return method(cost, box, options, callback or (lambda _: None))
 
 
-def _pattern(
-    cost: Callable[[Tensor], Tensor],
-    box: Box,
-    max_evaluations: int,
-    tolerance: float,
-    seed: int,
-    state: SearchState | None,
-    callback: Callback | None,
-    progress: bool,
-) -> SearchResult:
-    settings = PatternSearch(
-        max_evaluations=max_evaluations, mesh_tolerance=tolerance, rotate=True, speculate=True,
-        seed=seed,
-    )  # fmt: skip
-    best: tuple[float, Tensor] = (np.inf, box.start)
+def _pattern(cost: Cost, box: Box, options: SearchOptions, callback: Callback) -> SearchResult:
+    scaling, state = box.scaling(), options.state
 
-    def objective(part: Tensor) -> Tensor:
-        nonlocal best
-        vectors = box.whole(part)
-        values = cost(vectors)
-        least = int(values.nan_to_num(np.inf, np.inf).argmin())
-        if values[least] < best[0]:
-            best = float(values[least]), vectors[least]
-        return values
-
-    def told(at: PatternState) -> bool | None:
-        return None if callback is None else callback(_state_of(at))
-
-    def _state_of(at: PatternState) -> SearchState:
+    def step(at: PatternState) -> bool | None:
+        best = box.whole(scaling.from_unit(scaling.tensor(at.x)))
         kept = PatternState.from_dict(at.to_dict())
-        return SearchState("pattern", best[1].tolist(), best[0], at.evaluations, kept)
+        return callback(SearchState("pattern", best.tolist(), at.value, at.evaluations, kept))
 
-    if state is not None:
-        best = state.value, torch.tensor(state.vector, dtype=box.start.dtype)
-    free = box.free
-    result = settings.minimise(
-        objective, box.start[free], lower=box.lower[free], upper=box.upper[free],
-        scale=box.scale[free], logarithmic=box.logarithmic[free].tolist(),
-        state=None if state is None else state.pattern, callback=told, progress=progress,
+    result = PatternSearch(
+        max_evaluations=options.max_evaluations, mesh_tolerance=options.tolerance, rotate=True,
+        speculate=True, seed=options.seed, progress=options.progress,
+    ).minimise(
+        lambda part: cost(box.whole(part)), box.start[box.free], lower=scaling.lower,
+        upper=scaling.upper, scale=scaling.scale, logarithmic=scaling.logarithmic,
+        state=None if state is None else state.pattern, callback=step,
     )  # fmt: skip
     return SearchResult(
-        best[1], best[0], result.converged, result.message, result.iterations,
-        _state_of(result.state),
+        box.whole(result.x), result.value, result.converged, result.message,
+        result.state.iterations,
     )  # fmt: skip
 
 
@@ -184,74 +194,52 @@ class _StoppedError(Exception):
     """Leaves SciPy's loop."""
 
 
-def _sqp(
-    cost: Callable[[Tensor], Tensor],
-    box: Box,
-    max_evaluations: int,
-    tolerance: float,
-    state: SearchState | None,
-    callback: Callback | None,
-) -> SearchResult:
+def _sqp(cost: Cost, box: Box, options: SearchOptions, callback: Callback) -> SearchResult:
     """SciPy's SLSQP with forward differences, every gradient one batch of candidates."""
     from scipy.optimize import minimize  # slow to import
 
-    free = box.free
-    log, scale = box.logarithmic[free], box.scale[free]
-
-    def inner(x: Tensor) -> Tensor:
-        return torch.where(log, x.clamp_min(1e-300).log10(), x) / scale
-
-    def outer(u: Tensor) -> Tensor:
-        x = torch.where(log, 10.0 ** (u * scale), u * scale)
-        return box.whole(x.clamp(box.lower[free], box.upper[free]))
-
+    scaling, state = box.scaling(), options.state
+    lower, upper = scaling.to_unit(scaling.lower), scaling.to_unit(scaling.upper)
     start = box.start if state is None else torch.tensor(state.vector, dtype=box.start.dtype)
-    least, best = np.inf, start
+    least, best, iterations = np.inf, start, 0
     evaluations = 0 if state is None else state.evaluations
-    iterations = 0
     reference = float(cost(start[None])[0])
 
-    def values(u: Tensor) -> Tensor:
+    def value_and_gradient(u: np.ndarray) -> tuple[float, np.ndarray]:
         nonlocal least, best, evaluations
-        vectors = outer(u)
-        found = cost(vectors).nan_to_num(np.inf, np.inf)
-        evaluations += len(vectors)
-        at = int(found.argmin())
-        if found[at] < least:
-            least, best = float(found[at]), vectors[at]
-        # In units of the start, so that the tolerance is relative.
-        return (found / reference).clamp_max(DIVERGED)
-
-    def both(u: np.ndarray) -> tuple[float, np.ndarray]:
         point = torch.as_tensor(u)
         # Backward at an upper bound, where forward would not move.
         step = torch.where(point + DIFFERENCE > upper, -DIFFERENCE, DIFFERENCE)
-        found = values(torch.cat([point[None], point + torch.diag(step)]))
-        return float(found[0]), ((found[1:] - found[0]) / step).numpy()
+        vectors = box.whole(scaling.from_unit(torch.cat([point[None], point + torch.diag(step)])))
+        values = cost(vectors).nan_to_num(np.inf, np.inf)
+        evaluations += len(vectors)
+        at = int(values.argmin())
+        if values[at] < least:
+            least, best = float(values[at]), vectors[at]
+        # In units of the start, so that the tolerance is relative.
+        values = (values / reference).clamp_max(DIVERGED)
+        return float(values[0]), ((values[1:] - values[0]) / step).numpy()
 
-    def current() -> SearchState:
-        return SearchState("sqp", best.tolist(), least, evaluations)
-
-    def told(xk: np.ndarray) -> None:
+    def step(xk: np.ndarray) -> None:
         nonlocal iterations
         iterations += 1
-        if evaluations >= max_evaluations or (callback is not None and callback(current())):
+        at = SearchState("sqp", best.tolist(), least, evaluations)
+        if evaluations >= options.max_evaluations or callback(at):
             raise _StoppedError
 
-    lower, upper = inner(box.lower[free]), inner(box.upper[free])
-    bounds = list(zip(lower.tolist(), upper.tolist(), strict=True))
-    options: Any = {"ftol": 1e-2 * tolerance, "maxiter": 1000}
+    settings: Any = {"ftol": 1e-2 * options.tolerance, "maxiter": 1000}
     try:
         end = minimize(
-            both, inner(start[free]).numpy(), jac=True, method="SLSQP", bounds=bounds,
-            callback=told, options=options,
+            value_and_gradient, scaling.to_unit(start[box.free]).numpy(), jac=True, method="SLSQP",
+            bounds=list(zip(lower.tolist(), upper.tolist(), strict=True)), callback=step,
+            options=settings,
         )  # fmt: skip
         converged, message = bool(end.success), str(end.message)
     except _StoppedError:
         converged, message = False, "Stopped by the callback or the limit of evaluations."
     except KeyboardInterrupt:
         converged, message = False, "Interrupted; the best point found is kept."
-    return SearchResult(best, least, converged, message, iterations, current())
+    return SearchResult(best, least, converged, message, iterations)
 
 
 def available_threads() -> int:

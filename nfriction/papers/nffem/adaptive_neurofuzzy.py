@@ -9,7 +9,7 @@ from torch import Tensor
 from nfriction.friction.coefficients import Schedule
 from nfriction.friction.laws import Law
 from nfriction.friction.neurofuzzy import LEAST_RATIO, NeuroFuzzy, smooth_relu_inverse
-from nfriction.friction.sensitivity import FactoredSensitivity
+from nfriction.friction.sensitivity import Sensitivity
 from nfriction.fuzzy.membership import HALF_WIDTH_OF_GAUSSIAN
 from nfriction.fuzzy.placement import crossing_half_widths
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
@@ -166,11 +166,11 @@ class AdaptiveNeuroFuzzy(Schedule):
         """Of the network: zero, where the adaptive schedule is all there is."""
         return self.deviation.prior()
 
-    def sensitivities(self, qd: Tensor, qdd: Tensor) -> FactoredSensitivity:
+    def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
         """Derivatives at motions (sample, joint), each sample taken for a first one."""
         return self.sensitivities_from(qd, qdd, self.initial_state(qd, qdd))
 
-    def sensitivities_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> FactoredSensitivity:
+    def sensitivities_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Sensitivity:
         reference = self._lifted(self.adaptive.coefficients_from(qd, qdd, state)).detach()
         return self.deviation.residual_sensitivities(reference, qd, qdd)
 

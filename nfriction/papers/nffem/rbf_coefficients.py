@@ -145,7 +145,6 @@ class RadialBasis(Schedule):
         free = ((y > self.output_lower) & (y < self.output_upper)).to(y.dtype)
         moving = ((x > self.input_lower) & (x < self.input_upper)).to(y.dtype)
         own = torch.eye(y.shape[-1], dtype=y.dtype, device=y.device)
-        layer = torch.einsum("sjk,ko,sju->skjou", free, own, self.network.regressors(x))
         by_input = self.network.input_jacobian(x).permute(3, 0, 1, 2)
         by_speed, by_qdd = (by_input * free[..., None] * moving[:, :, None]).unbind(-1)
         by_qd = by_speed * qd.sign()[..., None]
@@ -154,13 +153,7 @@ class RadialBasis(Schedule):
             sign = torch.tanh(qd / turn)
             by_qd = by_qd + by_qdd * (qdd * (1.0 - sign * sign) / turn)[..., None]
             by_qdd = by_qdd * sign[..., None]
-        joint = torch.arange(self.joints, device=qd.device)
-        return Sensitivity(
-            layer.flatten(2),
-            joint.repeat_interleave(layer[0, 0, 0].numel()),
-            by_qd,
-            by_qdd,
-        )
+        return Sensitivity(((free[..., None] * own, self.network.regressors(x)),), by_qd, by_qdd)
 
     def options(self) -> dict[str, Any]:
         return {

@@ -24,7 +24,7 @@ from nfriction.papers import twin
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
 from nfriction.papers.afem.fit_adaptive import fit_adaptive
 from nfriction.papers.afem.fit_by_search import fit_by_search
-from nfriction.papers.afem.search import SearchMethod
+from nfriction.papers.afem.search import SearchMethod, SearchOptions
 from nfriction.papers.nffem.refine_adaptive import refine_adaptive
 from nfriction.papers.reproduction.procedure import papers_neuro_fuzzy
 from nfriction.papers.reproduction.workspace import Array, Bench, Workspace, smoothed
@@ -147,11 +147,13 @@ def fit_searched(
 ) -> FitResult:
     """A model fitted by a search on the simulated position, resumed where it was interrupted."""
     settings, law = workspace.settings, name.removeprefix("rtip-")
+    options = SearchOptions(
+        method, settings.search_horizon, max_evaluations=settings.search_evaluations,
+        seed=settings.seed, threads=threads, state=workspace.search_state(name),
+    )  # fmt: skip
     return workspace.fit(name, bench, lambda step: fit_by_search(
-        model_by_name(law)(bench.plant.joints), bench.plant, bench.train, method=method,
-        horizon=settings.search_horizon, max_evaluations=settings.search_evaluations,
-        seed=settings.seed, threads=threads, start=start, motions=bench.train_motions,
-        state=workspace.search_state(name), callback=workspace.keep_search(name, step),
+        model_by_name(law)(bench.plant.joints), bench.plant, bench.train, options=options,
+        start=start, motions=bench.train_motions, callback=workspace.keep_search(name, step),
     ))  # fmt: skip
 
 
