@@ -12,7 +12,7 @@ from nfriction.friction.neurofuzzy import LEAST_RATIO, PRIOR_SD, NeuroFuzzy
 from nfriction.friction.sensitivity import FactoredSensitivity
 from nfriction.friction.smooth import soft_positive_inverse
 from nfriction.fuzzy.membership import HALF_WIDTH_OF_GAUSSIAN
-from nfriction.fuzzy.placement import crossing_half_widths
+from nfriction.fuzzy.partition import crossing_half_widths
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
 
 # Powers of an even spacing from zero by which sets of velocity and acceleration are placed.

@@ -10,7 +10,7 @@ from nfriction.friction.laws import Law
 from nfriction.friction.model import FrictionModel
 from nfriction.friction.models import MODELS, NeuroFuzzyModel
 from nfriction.fuzzy import FuzzySet, RBFNetwork, sets_from_ranges
-from nfriction.optim.evidence_result import EvidenceState
+from nfriction.optim.evidence import EvidenceState
 from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.controller.mamdani import MamdaniController, paper_controller
 from nfriction.papers.controller.rulebase import Rule, RuleBase, Variable
