@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from nfriction.papers.controller.mamdani import MamdaniController
-from nfriction.papers.controller.rulebase import Variable
+from nfriction.papers.controller.rules import Variable
 from nfriction.plots import style
 from nfriction.recording import Recording
 from nfriction.signals import Motion
