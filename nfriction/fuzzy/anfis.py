@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from nfriction.fuzzy.grouped import LinearOutputModule, ridge, to_columns, to_rows
+from nfriction.fuzzy.grouped import LinearOutputModule, input_range, ridge, to_columns, to_rows
 from nfriction.fuzzy.membership import HALF_WIDTH_OF_GAUSSIAN, log_bell, log_gaussian
 from nfriction.fuzzy.partition import (
     FreePartition,
@@ -359,22 +359,10 @@ class Anfis(LinearOutputModule):
         self.consequents.copy_(weights.mT.reshape(self.consequents.shape))
 
     def _range(
-        self,
-        lower: Range,
-        upper: Range,
-        allow_equal: bool = False,
+        self, lower: Range, upper: Range, *, allow_equal: bool = False
     ) -> tuple[Tensor, Tensor]:
-        like = self.consequents.detach()
-        low = torch.as_tensor(lower, dtype=like.dtype, device=like.device)
-        high = torch.as_tensor(upper, dtype=like.dtype, device=like.device)
-        low, high = low.expand(self.groups, self.inputs), high.expand(self.groups, self.inputs)
-        sound = (high >= low) if allow_equal else (high > low)
-        if not bool((sound & torch.isfinite(high - low)).all()):
-            raise ValueError(
-                f"every input needs a finite range with `lower` < `upper`, got {low.tolist()} and "
-                f"{high.tolist()}; an input that never varies should be left out."
-            )
-        return low, high
+        like = self.consequents.detach().new_empty(self.groups, self.inputs)
+        return input_range(lower, upper, like, allow_equal=allow_equal)
 
     def _pack(self, name: str, pieces: Sequence[Tensor]) -> Tensor:
         shapes = [tuple(piece.shape) for piece in pieces]

@@ -3,17 +3,17 @@
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from nfriction.fuzzy.anfis import Anfis
-from nfriction.fuzzy.grouped import GroupedModule
-from nfriction.fuzzy.rbf import RBFHead
+from nfriction.fuzzy.grouped import GroupedModule, input_range
+from nfriction.fuzzy.rbf import RBFNetwork
 
 
 class AnfisRBF(GroupedModule):
     """ANFIS layer plus an RBF head on [inputs, ANFIS outputs] that adds a correction.
 
-    The ANFIS carries the fit, the head refines it; a fresh head is zero.
+    The ANFIS carries the fit, the head refines it; the output of a fresh head is zero.
 
     Args:
         groups, inputs, terms, outputs, order, kind, interpretable: of the layer, see `Anfis`.
@@ -47,7 +47,9 @@ class AnfisRBF(GroupedModule):
             interpretable=interpretable,
             dtype=dtype,
         )
-        self.head = RBFHead(groups, inputs + outputs, units, outputs, seed=seed, dtype=dtype)
+        self.head = RBFNetwork(groups, inputs + outputs, units, outputs, seed=seed, dtype=dtype)
+        # A fresh head changes nothing.
+        nn.init.zeros_(self.head.output_weight)
 
     def forward(self, x: Tensor) -> Tensor:
         """Outputs, shape (*batch, groups, outputs), of inputs (*batch, groups, inputs)."""
@@ -62,10 +64,9 @@ class AnfisRBF(GroupedModule):
             seed: of the head's centres.
         """
         self.anfis.init_grid(lower, upper)
-        like = self.anfis.consequents.detach()
-        ones = like.new_ones(self.groups, self.outputs)
-        ends = (torch.as_tensor(x, dtype=like.dtype, device=like.device) for x in (lower, upper))
-        low, high = (end.expand(self.groups, self.inputs) for end in ends)
+        centres = self.head.centres[:, 0].detach()
+        low, high = input_range(lower, upper, centres[:, : self.inputs])
+        ones = torch.ones_like(centres[:, self.inputs :])
         self.head.init_range(torch.cat([low, -ones], 1), torch.cat([high, ones], 1), seed)
 
     @torch.no_grad()

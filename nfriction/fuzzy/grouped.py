@@ -5,7 +5,7 @@ samples), so that every kernel is vectorised over them.
 """
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -21,6 +21,31 @@ def to_columns(x: Tensor) -> Tensor:
 def to_rows(columns: Tensor, like: Tensor) -> Tensor:
     """(groups, size, samples) → (*batch, groups, size) with the batch of `like`."""
     return columns.movedim(-1, 0).reshape(like.shape[:-1] + columns.shape[1:2])
+
+
+def input_range(
+    lower: float | Sequence[float] | Tensor,
+    upper: float | Sequence[float] | Tensor,
+    like: Tensor,
+    *,
+    allow_equal: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """Bounds of every input, broadcast to `like` (groups, inputs).
+
+    Raises:
+        ValueError: bounds that are not finite or do not ascend.
+    """
+    low, high = (
+        torch.as_tensor(end, dtype=like.dtype, device=like.device).expand_as(like)
+        for end in (lower, upper)
+    )
+    sound = (high >= low) if allow_equal else (high > low)
+    if not bool((sound & torch.isfinite(high - low)).all()):
+        raise ValueError(
+            f"every input needs a finite range with `lower` < `upper`, got {low.tolist()} and "
+            f"{high.tolist()}; an input that never varies should be left out."
+        )
+    return low, high
 
 
 class GroupedModule(nn.Module):

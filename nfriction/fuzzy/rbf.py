@@ -1,11 +1,11 @@
-"""Radial basis functions: the paper's 2-10-2 network, and the head on an ANFIS layer."""
+"""Radial basis functions, such as the paper's 2-10-2 network."""
 
 from typing import Final
 
 import torch
 from torch import Tensor, nn
 
-from nfriction.fuzzy.grouped import LinearOutputModule, ridge, to_columns, to_rows
+from nfriction.fuzzy.grouped import LinearOutputModule, input_range, ridge, to_columns, to_rows
 
 # Orthogonal least squares takes so many evenly thinned candidates and samples.
 _CANDIDATES, _SAMPLES = 500, 5000
@@ -166,14 +166,10 @@ class RBFNetwork(LinearOutputModule):
             lower, upper: range of each input, broadcastable to (groups, inputs).
             seed: of the draw.
         """
-        like = self.centres[:, 0].detach()
-        ends = (torch.as_tensor(x, dtype=like.dtype, device=like.device) for x in (lower, upper))
-        low, high = (end.expand_as(like).unsqueeze(1) for end in ends)
-        span = high - low
-        if not bool(((span > 0) & torch.isfinite(span)).all()):
-            raise ValueError("every input needs a finite range with `lower` < `upper`.")
+        low, high = input_range(lower, upper, self.centres[:, 0].detach())
+        low, span = low.unsqueeze(1), (high - low).unsqueeze(1)
         random = torch.Generator().manual_seed(seed)
-        drawn = torch.rand(self.centres.shape, generator=random, dtype=torch.float64).to(like)
+        drawn = torch.rand(self.centres.shape, generator=random, dtype=torch.float64).to(low)
         self.centres.copy_(low + span * drawn)
         self.log_widths.copy_((0.5 * span).log().expand_as(self.centres))
 
@@ -242,23 +238,6 @@ class RBFNetwork(LinearOutputModule):
                 f"vary, got {len(samples)} samples with spreads {spread.tolist()}."
             )
         return samples
-
-
-class RBFHead(RBFNetwork):
-    """An RBF network that begins as zero: adding it to a model changes nothing at the start."""
-
-    def __init__(
-        self,
-        groups: int,
-        inputs: int,
-        units: int = 10,
-        outputs: int = 2,
-        *,
-        seed: int = 0,
-        dtype: torch.dtype = torch.float64,
-    ) -> None:
-        super().__init__(groups, inputs, units, outputs, seed=seed, dtype=dtype)
-        nn.init.zeros_(self.output_weight)
 
 
 def _kmeans(samples: Tensor, units: int, seed: int) -> Tensor:
