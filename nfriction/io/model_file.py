@@ -6,7 +6,8 @@ A file is checked for form, size and damage before a model is made of it; no cod
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -100,14 +101,15 @@ def load(path: str | Path, into: FrictionModel | None = None) -> FrictionModel:
         ModelFileError: the file is absent, damaged, of another schema, or of another model.
     """
     content = read_model_file(path)
-    model = _named_model(path, content) if into is None else into
-    _check_same_model(path, content, model)
-    given, expected = content["state"], model.state_dict()
-    if given.keys() != expected.keys():
-        odd = sorted(given.keys() ^ expected.keys())
-        raise ModelFileError(f"{path}: parameters are missing or not the model's: {_short(odd)}.")
-    state = {name: _parameter(path, name, given[name], value) for name, value in expected.items()}
-    _check_finite(path, model, state)
+    with _naming(path):
+        model = _named_model(content) if into is None else into
+        _check_same_model(content, model)
+        given, expected = content["state"], model.state_dict()
+        if given.keys() != expected.keys():
+            odd = sorted(given.keys() ^ expected.keys())
+            raise ValueError(f"parameters are missing or not the model's: {_short(odd)}.")
+        state = {name: _parameter(name, given[name], value) for name, value in expected.items()}
+        _check_torque(model, state)
     model.load_state_dict(state)
     return model.requires_grad_(False) if into is None else model
 
@@ -119,10 +121,8 @@ def load_info(path: str | Path) -> ModelInfo:
         ModelFileError: the file is absent or damaged.
     """
     content = read_model_file(path)
-    try:
+    with _naming(path):
         return ModelInfo(**{f.name: content[f.name] for f in fields(ModelInfo)})
-    except ValueError as error:
-        raise ModelFileError(f"{path}: {error}") from error
 
 
 def load_plant(path: str | Path) -> Plant:
@@ -133,22 +133,23 @@ def load_plant(path: str | Path) -> Plant:
     """
     content = read_model_file(path)
     rig, joints = content["rig"], content["joints"]
-    if rig is None:
-        raise ModelFileError(
-            f"{path}: does not describe the mechanism; save with "
-            "`ModelInfo(rig=plant.to_dict())` to include it."
-        )
-    mass = rig.get("mass")
-    # The matrices of a chain grow with the square of its links.
-    if isinstance(mass, list) and len(mass) > joints:
-        raise ModelFileError(f"{path}: `rig` has {len(mass)} masses, the model {joints} joints.")
-    try:
-        plant = from_dict(rig)
-    except _UNFIT as error:
-        raise ModelFileError(f"{path}: `rig` is no mechanism ({_short(error)}).") from error
-    if plant.joints != joints:
-        raise ModelFileError(f"{path}: `rig` has {plant.joints} joints, the model {joints}.")
-    return plant
+    with _naming(path):
+        if rig is None:
+            raise ValueError(
+                "does not describe the mechanism; save with "
+                "`ModelInfo(rig=plant.to_dict())` to include it."
+            )
+        mass = rig.get("mass")
+        # The matrices of a chain grow with the square of its links.
+        if isinstance(mass, list) and len(mass) > joints:
+            raise ValueError(f"`rig` has {len(mass)} masses, the model {joints} joints.")
+        try:
+            plant = from_dict(rig)
+        except _UNFIT as error:
+            raise ValueError(f"`rig` is no mechanism ({_short(error)}).") from error
+        if plant.joints != joints:
+            raise ValueError(f"`rig` has {plant.joints} joints, the model {joints}.")
+        return plant
 
 
 def read_model_file(path: str | Path) -> dict[str, Any]:
@@ -158,43 +159,62 @@ def read_model_file(path: str | Path) -> dict[str, Any]:
         ModelFileError: it is no sound model file.
     """
     path = Path(path)
-    size, content = _read_json(path)
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise ModelFileError(f"{path}: not a model file of nfriction.")
-    if content.get("schema") != SCHEMA:
-        raise ModelFileError(
-            f"{path}: schema {_short(content.get('schema'))} is not {SCHEMA}; another version "
-            "wrote it."
-        )
-    for key, kind in _ENTRIES.items():
-        value = content.get(key)
-        # JSON's true is an int to Python.
-        if key not in content or not isinstance(value, kind) or isinstance(value, bool):
-            raise ModelFileError(f"{path}: `{key}` is missing or of the wrong type.")
-    if content.pop("checksum") != _checksum(content):
-        raise ModelFileError(f"{path}: the checksum does not match; damaged or edited.")
-    _check_sizes(path, content, size)
-    _check_names(path, content)
-    _check_depth(path, [v for k, v in content.items() if k != "state"])
+    with _naming(path):
+        if path.exists() and not path.is_file():
+            raise ValueError("not a file.")
+        size = path.stat().st_size
+        if size > LARGEST_FILE:
+            raise ValueError(f"{size} bytes are too many for a model file.")
+        try:
+            content = strict_json.parse(path.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise ValueError(f"not a model file, or cut short ({error}).") from error
+        if not isinstance(content, dict) or content.get("format") != FORMAT:
+            raise ValueError("not a model file of nfriction.")
+        if content.get("schema") != SCHEMA:
+            raise ValueError(
+                f"schema {_short(content.get('schema'))} is not {SCHEMA}; another version wrote it."
+            )
+        for key, kind in _ENTRIES.items():
+            value = content.get(key)
+            # JSON's true is an int to Python.
+            if key not in content or not isinstance(value, kind) or isinstance(value, bool):
+                raise ValueError(f"`{key}` is missing or of the wrong type.")
+        if content.pop("checksum") != _checksum(content):
+            raise ValueError("the checksum does not match; damaged or edited.")
+        _check_sizes(content, size)
+        _check_names(content)
+        _check_depth([v for k, v in content.items() if k != "state"])
     return content
 
 
-def _named_model(path: str | Path, content: Mapping[str, Any]) -> FrictionModel:
-    name = content["model"]
-    if name not in model_names():
-        raise ModelFileError(
-            f"{path}: {_short(name)} is none of the named models ({', '.join(model_names())}); "
-            "create the model yourself and pass it as `into`."
-        )
+@contextmanager
+def _naming(path: str | Path) -> Iterator[None]:
+    """Raise errors of the block as `ModelFileError` with the file's name."""
     try:
-        return model_by_name(name)(
-            content["joints"], v_smooth=content["v_smooth"], **content["options"]
-        )
+        yield
+    except FileNotFoundError:
+        raise ModelFileError(f"{path}: no such file.") from None
+    except OSError as error:
+        raise ModelFileError(f"{path}: cannot be read ({error.strerror}).") from error
+    except RecursionError:
+        raise ModelFileError(f"{path}: nested too deeply for a model file.") from None
     except (ValueError, TypeError) as error:
         raise ModelFileError(f"{path}: {error}") from error
 
 
-def _check_same_model(path: str | Path, content: Mapping[str, Any], model: FrictionModel) -> None:
+def _named_model(content: Mapping[str, Any]) -> FrictionModel:
+    name = content["model"]
+    if name not in model_names():
+        raise ValueError(
+            f"{_short(name)} is none of the named models ({', '.join(model_names())}); create "
+            "the model yourself and pass it as `into`."
+        )
+    make = model_by_name(name)
+    return make(content["joints"], v_smooth=content["v_smooth"], **content["options"])
+
+
+def _check_same_model(content: Mapping[str, Any], model: FrictionModel) -> None:
     names = [c.get("name") if isinstance(c, dict) else None for c in content["coefficients"]]
     pairs = {
         "law": (content["law"], model.law.name),
@@ -205,30 +225,30 @@ def _check_same_model(path: str | Path, content: Mapping[str, Any], model: Frict
     }
     for key, (ours, theirs) in pairs.items():
         if ours != theirs:
-            raise ModelFileError(
-                f"{path}: `{key}` is {_short(ours)} in the file, {_short(theirs)} in the model."
+            raise ValueError(
+                f"`{key}` is {_short(ours)} in the file, {_short(theirs)} in the model."
             )
 
 
-def _check_finite(path: str | Path, model: FrictionModel, state: Mapping[str, Tensor]) -> None:
+def _check_torque(model: FrictionModel, state: Mapping[str, Tensor]) -> None:
     """Refuse finite parameters whose exponentials overflow."""
     qd, qdd, load = torch.tensor([[0.0, 0.5], [0.0, 0.0], [1.0, 1.0]], dtype=torch.float64)
     inputs = tuple(x[:, None].expand(-1, model.joints) for x in (qd, qdd, load))
     with torch.no_grad():
         torque = torch.func.functional_call(model, dict(state), inputs)
     if not torque.isfinite().all():
-        raise ModelFileError(f"{path}: with its parameters the model gives no finite torque.")
+        raise ValueError("with its parameters the model gives no finite torque.")
 
 
-def _parameter(path: str | Path, name: str, given: Any, expected: Tensor) -> Tensor:
+def _parameter(name: str, given: Any, expected: Tensor) -> Tensor:
     try:
         value = torch.tensor(given, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise ModelFileError(f"{path}: parameter `{name}` is no array of numbers.") from error
+        raise ValueError(f"parameter `{name}` is no array of numbers.") from error
     if value.shape != expected.shape or not torch.isfinite(value).all():
-        raise ModelFileError(
-            f"{path}: parameter `{name}` must be finite of shape {tuple(expected.shape)}, got "
-            f"shape {tuple(value.shape)}."
+        raise ValueError(
+            f"parameter `{name}` must be finite of shape {tuple(expected.shape)}, got shape "
+            f"{tuple(value.shape)}."
         )
     return value
 
@@ -244,48 +264,27 @@ def _short(value: object) -> str:
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
-def _read_json(path: Path) -> tuple[int, Any]:
-    try:
-        if path.exists() and not path.is_file():
-            raise ModelFileError(f"{path}: not a file.")
-        size = path.stat().st_size
-        if size > LARGEST_FILE:
-            raise ModelFileError(f"{path}: {size} bytes are too many for a model file.")
-        text = path.read_text(encoding="utf-8")
-        return size, strict_json.parse(text)
-    except FileNotFoundError:
-        raise ModelFileError(f"{path}: no such file.") from None
-    except OSError as error:
-        raise ModelFileError(f"{path}: cannot be read ({error.strerror}).") from error
-    except RecursionError:
-        raise ModelFileError(f"{path}: nested too deeply for a model file.") from None
-    except ModelFileError:
-        raise
-    except ValueError as error:
-        raise ModelFileError(f"{path}: not a model file, or cut short ({error}).") from error
-
-
-def _check_names(path: Path, content: Mapping[str, Any]) -> None:
+def _check_names(content: Mapping[str, Any]) -> None:
     names, digests, step = (content[k] for k in ("joint_names", "training_data", "sample_time"))
     if not all(isinstance(n, str) for n in names) or len(names) not in (0, content["joints"]):
-        raise ModelFileError(f"{path}: `joint_names` must be {content['joints']} texts, or none.")
+        raise ValueError(f"`joint_names` must be {content['joints']} texts, or none.")
     if not all(isinstance(digest, str) for digest in digests.values()):
-        raise ModelFileError(f"{path}: `training_data` must map names to digests.")
+        raise ValueError("`training_data` must map names to digests.")
     if step is not None and not 0 < step < 1e6:
-        raise ModelFileError(f"{path}: `sample_time` must be positive seconds, got {_short(step)}.")
+        raise ValueError(f"`sample_time` must be positive seconds, got {_short(step)}.")
 
 
-def _check_depth(path: Path, content: list[Any]) -> None:
+def _check_depth(content: list[Any]) -> None:
     """Refuse content nested too deeply to be copied and written again."""
     for _ in range(DEEPEST):
         nested = [value for value in content if isinstance(value, (dict, list))]
         parts = [v.values() if isinstance(v, dict) else v for v in nested]
         content = [value for part in parts for value in part]
     if content:
-        raise ModelFileError(f"{path}: nested too deeply for a model file.")
+        raise ValueError("nested too deeply for a model file.")
 
 
-def _check_sizes(path: Path, content: Mapping[str, Any], size: int) -> None:
+def _check_sizes(content: Mapping[str, Any], size: int) -> None:
     """Refuse networks larger than the file, before they take memory."""
     joints, options = content["joints"], content["options"]
     terms = options.get("terms", [])
@@ -294,4 +293,4 @@ def _check_sizes(path: Path, content: Mapping[str, Any], size: int) -> None:
     sound = all(isinstance(n, int) and not isinstance(n, bool) and n > 0 for n in sizes)
     # Each rule and each unit has at least one number in the file.
     if not sound or joints > MOST_JOINTS or joints * max(sizes[1], math.prod(terms)) > size:
-        raise ModelFileError(f"{path}: a network of sizes {_short(sizes)} is refused.")
+        raise ValueError(f"a network of sizes {_short(sizes)} is refused.")

@@ -37,7 +37,7 @@ from nfriction.io.model_file import ModelFileError, load, load_info, load_plant
 from nfriction.io.model_info import parameter_hash
 from nfriction.papers.controller.fis import load_fis
 from nfriction.papers.controller.mamdani import MamdaniController
-from nfriction.papers.controller.rulefile import format_rules, load_rules, parse_rules
+from nfriction.papers.controller.rules import format_rules, load_rules, parse_rules
 from nfriction.plant import rigfile
 from nfriction.recording import Recording, read_initial_states
 from nfriction.recording.angles import AngleConvention

@@ -17,7 +17,7 @@ from nfriction import LFM, ModelInfo, save
 from nfriction.export import torchscript
 from nfriction.io.atomic import atomic_write, write_atomically
 from nfriction.papers.controller.mamdani import paper_controller
-from nfriction.papers.controller.rulefile import save_rules
+from nfriction.papers.controller.rules import save_rules
 from nfriction.plant import rigs
 from nfriction.recording import Recording
 from nfriction.recording.angles import AngleConvention

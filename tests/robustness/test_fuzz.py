@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from nfriction.io.formats import files
-from nfriction.papers.controller.rulefile import load_rules
+from nfriction.papers.controller.rules import load_rules
 from nfriction.plant import rigs
 from nfriction.recording import Recording, read_initial_states
 from tests.robustness.fuzz import fuzz

@@ -20,7 +20,7 @@ from nfriction.io.atomic import atomic_write
 from nfriction.io.model_file import load
 from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.controller.mamdani import paper_controller
-from nfriction.papers.controller.rulebase import Variable
+from nfriction.papers.controller.rules import Variable
 from nfriction.papers.reproduction import tables
 from nfriction.papers.reproduction.stages import ADAPTIVE, LAWS, NEURO_FUZZY, SECOND_PAPER
 from nfriction.papers.reproduction.workspace import Array, Workspace
