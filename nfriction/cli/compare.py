@@ -99,13 +99,11 @@ def run_comparison(
     from nfriction.cli import tables
     from nfriction.evaluation.compare import check_recordings, compare
     from nfriction.evaluation.cross_validation import select
-    from nfriction.evaluation.parallel import check_jobs
     from nfriction.evaluation.results import write_results
 
     check_recordings(train, test)  # before a choice that takes long
     states = _initial_states(arguments, plant, [*train, *test])
     check_writable(arguments.out)
-    check_jobs(arguments.jobs)
     selection = None
     with _log(arguments.log_file) as logger, Progress(logger) as progress:
         settings = settings | {"progress": progress, "jobs": arguments.jobs}
