@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from nfriction.evaluation.compare import Comparison, Part
+from nfriction.evaluation.compare import SCHEMA, Comparison, Part
 from nfriction.evaluation.cross_validation import Candidate, Selection
 from nfriction.evaluation.score import RMSE, Score
 from nfriction.friction.model import FrictionModel
@@ -119,7 +119,10 @@ def read_run(folder: str | Path) -> Run:
 
 
 def _run(folder: Path, content: Mapping[str, Any]) -> Run:
-    old = "schema" not in content
+    schema = _number(content.get("schema", 1), "`schema`")
+    if schema > SCHEMA:
+        raise _EntryError(f"its schema {schema:g} is newer than {SCHEMA}; update nfriction")
+    old = schema < 2
     keys: dict[Part, str] = {"train": "train", "test": "held_out" if old else "test"}
     joints = _texts(content.get("joints"), "`joints`")
     unit = content.get("units")

@@ -119,7 +119,7 @@ def model_groups(workspace: Workspace, joint: int) -> Figure:
         TLRIP paper, Figs. 11 to 13.
     """
     bench = workspace.bench("tlrip")
-    recording = next(r for r in bench.held_out if r.name == SHOWN)
+    recording = next(r for r in bench.test if r.name == SHOWN)
     kinds: Mapping[str, tuple[str, ...]] = {
         "constant": tuple(LAWS),
         "adaptive": ADAPTIVE,
@@ -149,7 +149,7 @@ def second_positions(workspace: Workspace, law: str) -> Figure:
         RTIP paper, Figs. 5 to 7.
     """
     bench = workspace.bench("rtip")
-    recording = next(r for r in bench.held_out if r.name == SECOND_SHOWN)
+    recording = next(r for r in bench.test if r.name == SECOND_SHOWN)
     simulated = workspace.arrays(f"rtip-{law}")[SECOND_SHOWN]
     return positions(recording, {law: _score(recording, simulated)})
 

@@ -22,14 +22,14 @@ COUNTS = 8192
 def judge(
     bench: Bench, plant: PendulumChain, model: FrictionModel
 ) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Position errors on every recording by name, and simulated positions of those held out.
+    """Position errors on every recording by name, and simulated positions of the test recordings.
 
     The coefficients are driven by the simulated motion, which is honest, and also by the measured
     one, as in the papers; with constant coefficients the two are the same.
     """
     scores: dict[str, Any] = {}
     simulated: dict[str, Array] = {}
-    for split, recordings in (("train", bench.train), ("held_out", bench.held_out)):
+    for split, recordings in (("train", bench.train), ("test", bench.test)):
         for recording in recordings:
             state = bench.states[recording.name]
             found = score(
@@ -45,7 +45,7 @@ def judge(
                 driven = driven_by_measurement(plant, model, recording, state)
             entry["measured_drive"] = RMSE.of(driven - recording.q).to_dict()
             scores[recording.name] = entry
-            if split == "held_out":
+            if split == "test":
                 simulated[recording.name] = found.simulated
                 simulated[f"{recording.name}_measured_drive"] = driven
     return scores, simulated

@@ -49,7 +49,7 @@ def text(workspace: Workspace) -> str:
     """All tables beside the printed ones, and whether the papers' order of models holds."""
     settings = workspace.settings
     titles = {
-        "table_10": "Table 10: position RMSE [mrad] on held-out releases, free runs of "
+        "table_10": "Table 10: position RMSE [mrad] on test releases, free runs of "
         f"{settings.tlrip_seconds:g} s, coefficients driven by the simulated motion",
         "table_10_measured_drive": "Table 10 again, coefficients driven by the measured motion as "
         "in the paper [mrad]",
@@ -57,7 +57,7 @@ def text(workspace: Workspace) -> str:
         "second_table_i": "second paper, Table I: NCFM by sequential quadratic programming",
         "second_table_ii": "second paper, Table II: LFM by pattern search",
         "second_table_iii": "second paper, Table III: NLFM by pattern search",
-        "second_table_iv": "second paper, Table IV: position RMSE [mrad] on held-out releases, "
+        "second_table_iv": "second paper, Table IV: position RMSE [mrad] on test releases, "
         f"free runs of {settings.rtip_seconds:g} s",
     }
     parts = []

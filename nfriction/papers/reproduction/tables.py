@@ -53,7 +53,7 @@ def rmse(
     workspace: Workspace,
     models: Sequence[str],
     *,
-    split: str = "held_out",
+    split: str = "test",
     drive: Drive = "free_run",
 ) -> pd.DataFrame:
     """Position RMSE over all recordings of a split, a row a model, a column a joint [rad]."""
@@ -66,7 +66,7 @@ def rmse(
 
 
 def table_10(workspace: Workspace, drive: Drive = "free_run") -> pd.DataFrame:
-    """Position RMSE of every model on held-out releases, beside the paper's.
+    """Position RMSE of every model on test releases, beside the paper's.
 
     References:
         TLRIP paper, Table 10.
@@ -123,7 +123,7 @@ def second_coefficients(workspace: Workspace, law: str) -> pd.DataFrame:
     return _beside(ours, printed.SECOND_COEFFICIENTS[law])
 
 
-def second_table_4(workspace: Workspace, split: str = "held_out") -> pd.DataFrame:
+def second_table_4(workspace: Workspace, split: str = "test") -> pd.DataFrame:
     """Position RMSE on the second paper's rig, beside the paper's.
 
     References:
@@ -135,7 +135,7 @@ def second_table_4(workspace: Workspace, split: str = "held_out") -> pd.DataFram
 
 
 def order(workspace: Workspace) -> Order:
-    """Whether the papers' order of models holds on held-out releases, joint by joint."""
+    """Whether the papers' order of models holds on test releases, joint by joint."""
     return order_of(rmse(workspace, NINE))
 
 

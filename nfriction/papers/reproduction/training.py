@@ -65,14 +65,14 @@ class Data:
 
     Attributes:
         plant: the mechanism.
-        train, held_out: recordings; files given are all trained on.
+        train, test: recordings; files given are all trained on.
         motions: smoothed motions of `train`.
         states: exact q0 and qd0 of a twin's recordings.
     """
 
     plant: Plant
     train: list[Recording]
-    held_out: list[Recording]
+    test: list[Recording]
     motions: list[Motion]
     states: dict[str, Any]
 
@@ -115,7 +115,7 @@ class Training:
                 given.twin, seed=given.seed, duration=given.seconds, progress=sys.stderr.isatty()
             )
             plant: Plant = made.plant
-            train, held_out = made.part("train"), made.part("held_out")
+            train, test = made.part("train"), made.part("test")
             states: dict[str, Any] = dict(made.initial_states)
         else:
             if given.rig is None:
@@ -123,14 +123,14 @@ class Training:
             plant = rigs.by_name(given.rig) if given.rig in rigs.names() else rigs.read(given.rig)
             convention = AngleConvention.parse(given.angles or ",".join(plant.convention))
             unit: Literal["rad", "m"] = "m" if plant.unit == "m" else "rad"
-            train, held_out, states = [], [], {}
+            train, test, states = [], [], {}
             for path in given.recordings:
                 train.append(
                     Recording.read(path, degrees=given.degrees, convention=convention, unit=unit)
                 )
         joint = [r.joint_coordinates(plant) for r in train]
         motions = [kalman_smoother(r.time, r.q) for r in joint]
-        return Data(plant, train, held_out, motions, states)
+        return Data(plant, train, test, motions, states)
 
     def stage(self, name: str, data: Data, make: Callable[[Tell], FitResult]) -> FitResult:
         """The fit of a stage: read where it is finished, made and kept where not.
@@ -185,7 +185,7 @@ class Training:
         torchscript(model, path.with_suffix(".pt"), info)
         lines = [f"{name}: {info.fit.get('status', 'made')}"]
         motions = dict(zip((r.name for r in data.train), data.motions, strict=True))
-        for kind, recordings in (("trained on", data.train), ("held out", data.held_out)):
+        for kind, recordings in (("train", data.train), ("test", data.test)):
             for recording in recordings:
                 found = score(
                     plant or data.plant, model, recording,

@@ -25,14 +25,14 @@ class Bench:
 
     Attributes:
         plant: the rig without friction.
-        train, held_out: recordings to fit on and to judge by.
+        train, test: recordings to fit on and to judge by.
         states: q0 and qd0 at the release by recording, exact.
         motions: smoothed motion by recording, in joint coordinates.
     """
 
     plant: PendulumChain
     train: list[Recording]
-    held_out: list[Recording]
+    test: list[Recording]
     states: dict[str, tuple[Array, Array]]
     motions: dict[str, Motion]
 
@@ -102,7 +102,7 @@ class Workspace:
         assert isinstance(plant, PendulumChain)
         convention = ",".join(plant.convention)
         recordings: dict[str, Recording] = {}
-        parts: dict[str, list[Recording]] = {"train": [], "held_out": []}
+        parts: dict[str, list[Recording]] = {"train": [], "test": []}
         for row in pd.read_csv(folder / "recordings.csv", dtype=str).to_dict("records"):
             recording = Recording.read(folder / row["file"], convention=convention)
             recordings[row["id"]] = recording
@@ -113,7 +113,7 @@ class Workspace:
             for name, r in recordings.items()
         }
         states = read_initial_states(folder / "recordings.csv")
-        return Bench(plant, parts["train"], parts["held_out"], states, motions)
+        return Bench(plant, parts["train"], parts["test"], states, motions)
 
     def _file(self, stage: str, suffix: str) -> Path:
         return self.folder / "stages" / f"{stage}.{suffix}"
