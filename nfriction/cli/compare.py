@@ -147,17 +147,12 @@ def _log(path: Path | None) -> Iterator[logging.Logger]:
         return
     handler = logging.FileHandler(path, encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
-    console = {shown: shown.level for shown in logging.getLogger().handlers}
     before = package.level
     package.addHandler(handler)
     package.setLevel(logging.INFO)
-    for shown, level in console.items():
-        shown.setLevel(max(level, logging.WARNING))  # the console shows no more than without it
     try:
         yield package
     finally:
-        for shown, level in console.items():
-            shown.setLevel(level)
         package.setLevel(before)
         package.removeHandler(handler)
         handler.close()

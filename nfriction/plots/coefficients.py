@@ -160,20 +160,11 @@ def coefficient_sections(
 ) -> Figure:
     """Coefficients of a neuro-fuzzy model over |velocity|, at three accelerations.
 
-    Args:
-        model: a neuro-fuzzy model.
-        motions: smoothed motions in joint coordinates; lines are faint where they never came
-            near.
-        uncertainty: of its fit (`FitResult.uncertainty`): bars are 95 % intervals.
-        joint_names: for the titles.
-        unit: of a position, `"rad"` or `"m"`.
-        width: of the figure [in].
+    Arguments and errors are those of `coefficient_surfaces`. Lines are faint where the motions
+    never came near, bars are 95 % intervals.
 
     Returns:
         A panel a joint and fitted coefficient; a joint's accelerations are in its title.
-
-    Raises:
-        ValueError: if the model has no fuzzy rules.
     """
     rules, coefficients = fuzzy_rules(model), _fitted(model)
     names = style.joint_labels(joint_names, model.joints)
