@@ -35,9 +35,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     settings = QUICK if arguments.quick else {"fit_plant": False}
     simulated = twin.make("tlrip", duration=1.0 if arguments.quick else 10.0)
-    rig, train, held_out = simulated.plant, simulated.part("train"), simulated.part("held_out")
+    rig, train, test = simulated.plant, simulated.part("train"), simulated.part("test")
     if arguments.quick:
-        train, held_out = train[:2], held_out[:1]
+        train, test = train[:2], test[:1]
     arguments.out.mkdir(parents=True, exist_ok=True)
 
     with ExitStack() as stack:
@@ -59,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"LFM fitted to each recording alone\n{table.T}\n")
 
         models = ["NCFM", "LFM"] if arguments.quick else ["NCFM", "LFM", "NLFM", "NFLFM"]
-        comparison = compare(rig, models, train, held_out, jobs=-1, **settings)
+        comparison = compare(rig, models, train, test, jobs=-1, **settings)
         comparison.to_frame().to_csv(arguments.out / "comparison.csv", index=False)
         print(comparison)
         print(f"fitted on {len(client.scheduler_info()['workers'])} workers")

@@ -88,7 +88,9 @@ def _run(arguments: argparse.Namespace) -> int:
     from nfriction.codegen import CodegenError
     from nfriction.export import ExportError
 
-    logging.basicConfig(format="nfriction: %(levelname)s: %(message)s", level=logging.WARNING)
+    console = logging.StreamHandler()
+    console.setLevel(logging.WARNING)  # a log file may hold more
+    logging.basicConfig(format="nfriction: %(levelname)s: %(message)s", handlers=[console])
     # Several threads make small tensors up to 100 times slower.
     torch.set_num_threads(1)
     try:

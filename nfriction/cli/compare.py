@@ -99,13 +99,11 @@ def run_comparison(
     from nfriction.cli import tables
     from nfriction.evaluation.compare import check_recordings, compare
     from nfriction.evaluation.cross_validation import select
-    from nfriction.evaluation.parallel import check_jobs
     from nfriction.evaluation.results import write_results
 
     check_recordings(train, test)  # before a choice that takes long
     states = _initial_states(arguments, plant, [*train, *test])
     check_writable(arguments.out)
-    check_jobs(arguments.jobs)
     selection = None
     with _log(arguments.log_file) as logger, Progress(logger) as progress:
         settings = settings | {"progress": progress, "jobs": arguments.jobs}
@@ -149,17 +147,12 @@ def _log(path: Path | None) -> Iterator[logging.Logger]:
         return
     handler = logging.FileHandler(path, encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
-    console = {shown: shown.level for shown in logging.getLogger().handlers}
     before = package.level
     package.addHandler(handler)
     package.setLevel(logging.INFO)
-    for shown, level in console.items():
-        shown.setLevel(max(level, logging.WARNING))  # the console shows no more than without it
     try:
         yield package
     finally:
-        for shown, level in console.items():
-            shown.setLevel(level)
         package.setLevel(before)
         package.removeHandler(handler)
         handler.close()

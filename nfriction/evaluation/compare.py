@@ -110,16 +110,13 @@ class Comparison:
 
     def too_short(self, part: Part = "test") -> dict[str, dict[str, float]]:
         """Recordings too short for a window length: duration [s] by length and recording."""
-        scores = next(iter(self.scores(part).values()))
-        found = {
-            f"{h:g}": {
-                s.recording: float(s.time[-1] - s.time[0])
-                for s in scores
-                if f"{h:g}" not in s.windows
-            }
-            for h in self.horizons_asked
-        }
-        return {horizon: short for horizon, short in found.items() if short}
+        found: dict[str, dict[str, float]] = {}
+        for scored in next(iter(self.scores(part).values())):
+            for horizon in (f"{h:g}" for h in self.horizons_asked):
+                if horizon not in scored.windows:
+                    duration = float(scored.time[-1] - scored.time[0])
+                    found.setdefault(horizon, {})[scored.recording] = duration
+        return found
 
     def to_frame(self) -> pd.DataFrame:
         """Every error as one row: model, recording, part, horizon, joint, rmse with its unit."""

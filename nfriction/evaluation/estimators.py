@@ -48,8 +48,7 @@ SETTINGS = {
 class FrictionEstimator(BaseEstimator):
     """Estimate the friction of a mechanism from recordings of its motion.
 
-    A sample is a whole recording, so cross-validation leaves out recordings: `X` is a list of
-    them. `clone`, `cross_val_score`, `GridSearchCV` and pipelines take it.
+    A sample is a whole recording, so `X` is a list and cross-validation leaves out recordings.
 
     Args:
         plant: the mechanism.
@@ -142,10 +141,7 @@ class FrictionEstimator(BaseEstimator):
         return schedule.coefficient_sets()["always"].numpy().copy()
 
     def predict(
-        self,
-        X: Sample | ArrayLike,
-        qdd: ArrayLike | None = None,
-        load: ArrayLike | None = None,
+        self, X: Sample | ArrayLike, qdd: ArrayLike | None = None, load: ArrayLike | None = None
     ) -> Array:
         """Friction torque along a motion.
 
@@ -225,6 +221,7 @@ class FrictionEstimator(BaseEstimator):
         return self.fit_
 
     def _rows(self, given: ArrayLike, name: str, samples: int | None = None) -> torch.Tensor:
+        """Values as a tensor (sample, joint)."""
         values = torch.tensor(np.asarray(given, dtype=np.float64))
         count = len(values) if samples is None and values.ndim else samples
         if values.shape != (count, self.n_joints_):

@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from queue import SimpleQueue
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 
@@ -102,32 +102,36 @@ def fit_models(
         step = progress.step
         fit_settings = {"callback": lambda stage, _: step(stage)} | fit_settings
     names = list(dict.fromkeys(models))
-    fits: dict[tuple[str, str], FitResult] = {}
-    errors: dict[tuple[str, str], Exception] = {}
+    results = {part: Fits({}, {}) for part in parts}
+    errors: list[Exception] = []
     origin = warm_starts(names)
     for level in dependency_levels(origin):
         labels = {f"{part} {name}": (part, name) for part in parts for name in level}
         tasks = {
-            label: (name, plant, parts[part], fits.get((part, origin[name] or "")), fit_settings)
+            label: (name, plant, parts[part], results[part].found.get(origin[name] or ""),
+                    fit_settings)
             for label, (part, name) in labels.items()
-        }
+        }  # fmt: skip
         for label, (result, seconds) in as_completed(_fit, tasks, jobs=jobs, progress=progress):
             part, name = labels[label]
             if isinstance(result, Exception):
-                errors[part, name] = result
+                errors.append(result)
+                results[part].failed[name] = str(result)
                 logger.warning("%s failed: %s", label, result)
                 continue
             # A result from another process has copies of the motions.
-            fits[part, name] = replace(result, motions=tuple(parts[part].motions))
+            found = replace(result, motions=tuple(parts[part].motions))
+            results[part].found[name] = found
             logger.info("%s: %s (%.3g s)", label, result.status, seconds)
-    if not fits:
-        raise next(iter(errors.values()))
+    if not any(of.found for of in results.values()):
+        raise errors[0]
+    # Results came as they were finished.
     return {
         part: Fits(
-            {name: fits[part, name] for name in names if (part, name) in fits},
-            {name: str(errors[part, name]) for name in names if (part, name) in errors},
+            {name: of.found[name] for name in names if name in of.found},
+            {name: of.failed[name] for name in names if name in of.failed},
         )
-        for part in parts
+        for part, of in results.items()
     }
 
 
@@ -203,26 +207,23 @@ def as_completed(
     Args:
         work: a function; for more than one process it must be importable by its name.
         tasks: its arguments by the label of each task.
-        jobs: number of processes; -1 for one to each core. The tasks run in this process where it
-            is 1, or where there is one task.
+        jobs: number of processes; the tasks run in this one where it is 1, or there is one task.
         progress: receives the labels.
 
     Yields:
         Label and result; in order where `jobs` is 1, else as they come.
 
     Raises:
-        ImportError: if joblib is needed and not installed.
         ValueError, RuntimeError, ...: the first error of a task, its message preceded by the
             label. Tasks not finished by then are abandoned.
     """
-    check_jobs(jobs)
     progress = progress or Progress()
     level = _PACKAGE.getEffectiveLevel()
-    calls = [Task(label, work, given, _HERE, level) for label, given in tasks.items()]
+    calls = [(label, work, arguments, _HERE, level) for label, arguments in tasks.items()]
     if jobs == 1 or len(calls) < 2:
-        for task in calls:
-            progress.stage(task.label)
-            yield task()[:2]
+        for call in calls:
+            progress.stage(call[0])
+            yield _run(*call)[:2]
         return
     from joblib import Parallel, delayed
 
@@ -230,7 +231,7 @@ def as_completed(
     shown: dict[Any, int] = {}
     pool = Parallel(n_jobs=min(jobs, len(calls)), batch_size=1, return_as="generator_unordered")
     with _ignore_sigint():
-        results = pool(delayed(task)() for task in calls)
+        results = pool(delayed(_run)(*call) for call in calls)
     for finished, (label, value, log) in enumerate(results, 1):
         log.replay(shown)
         progress.stage(f"{label} done, {len(calls) - finished} of {len(calls)} left")
@@ -254,25 +255,17 @@ class TaskLog:
             warnings.warn_explicit(str(w.message), w.category, w.filename, w.lineno, registry=shown)
 
 
-@dataclass(frozen=True)
-class Task(Generic[T]):
-    """Work that some process does, on one thread."""
-
-    label: str
-    work: Callable[..., T]
-    arguments: tuple[Any, ...]
-    home: str
-    level: int
-
-    def __call__(self) -> tuple[str, T, TaskLog]:
-        log = TaskLog()
-        captured = nullcontext() if self.home == _HERE else _capture_logs(log, self.level)
-        with one_thread(), captured:
-            try:
-                return self.label, self.work(*self.arguments), log
-            except (ValueError, TypeError, LookupError, ArithmeticError, RuntimeError) as error:
-                error.args = (f"{self.label}: {error}", *error.args[1:])
-                raise
+def _run(
+    label: str, work: Callable[..., T], arguments: tuple[Any, ...], home: str, level: int
+) -> tuple[str, T, TaskLog]:
+    """Run a task on one thread; `home` is the process that asks, `level` that of its logs."""
+    log = TaskLog()
+    with one_thread(), nullcontext() if home == _HERE else _capture_logs(log, level):
+        try:
+            return label, work(*arguments), log
+        except (ValueError, TypeError, LookupError, ArithmeticError, RuntimeError) as error:
+            error.args = (f"{label}: {error}", *error.args[1:])
+            raise
 
 
 @contextmanager

@@ -1,11 +1,9 @@
 """Score a model: simulate a recording with it and measure the position error.
 
-This is the last chapter of the story: a recording was smoothed, a model was fitted to some of
-them, and here it is judged by simulating others from nothing but their initial state and torques.
-One simulation over the whole recording is the *free run*; *windows* are simulations of 1, 2 and 5 s
-that are restarted from the measured motion, because in a chaotic mechanism a free run amplifies
-the error of its initial state more than that of the model. Errors are in the recording's own
-coordinates and unit.
+A model that was fitted to some recordings is judged by others, simulated from nothing but their
+initial state and torques. One simulation over the whole recording is the *free run*; *windows* are
+simulations of 1, 2 and 5 s restarted from the measured motion, because in a chaotic mechanism the
+free run amplifies the error of its initial state more than that of the model.
 """
 
 import logging
@@ -70,8 +68,8 @@ class Score:
 
     Attributes:
         recording: name of the recording.
-        free_run: error of one simulation over the whole recording from its initial state; behind
-            a gap in time it restarts from the smoothed motion.
+        free_run: error of one simulation from the initial state; behind a gap in time it restarts
+            from the smoothed motion.
         windows: error of simulations restarted from the recording, by horizon [s].
         floor: error of the free run caused by initial positions that are off by one encoder count:
             differences between models below it are not meaningful. None where the count is unknown.
@@ -162,14 +160,9 @@ def score(
         q, _ = simulate(motion.q[starts], motion.qd[starts], samples[:, :-1], state)
         error = convention.position_from_joint(q, first_link) - recording.q[samples]
         windows[f"{horizon:g}"] = RMSE.of(error)
+    free_run = RMSE.of(simulated[0] - recording.q)
     return Score(
-        recording=recording.name,
-        free_run=RMSE.of(simulated[0] - recording.q),
-        windows=windows,
-        floor=floor,
-        time=recording.time,
-        simulated=simulated[0],
-        diverged_at=float(diverged_at),
+        recording.name, free_run, windows, floor, recording.time, simulated[0], float(diverged_at)
     )
 
 

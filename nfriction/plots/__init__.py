@@ -1,12 +1,15 @@
 """Figures from results, as matplotlib figures that need no display: `figure.savefig(path)`."""
 
-from nfriction.plots.coefficients import coefficient_intervals, coefficients_over_time
-from nfriction.plots.dark import for_dark_screen
-from nfriction.plots.errors import horizon_curve, positions, rmse_bars
-from nfriction.plots.fits import convergence, torque_over_velocity
+from nfriction.plots.coefficients import (
+    coefficient_sections,
+    coefficient_surfaces,
+    coefficients_over_time,
+)
+from nfriction.plots.comparison import horizon_curve, positions, rmse_bars
+from nfriction.plots.fits import coefficient_intervals, convergence, torque_over_velocity
 from nfriction.plots.fuzzy import controller_surface, memberships
 from nfriction.plots.saving import save_all
-from nfriction.plots.surfaces import coefficient_sections, coefficient_surfaces
+from nfriction.plots.style import for_dark_screen
 
 __all__ = [
     "coefficient_intervals",

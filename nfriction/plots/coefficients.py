@@ -1,21 +1,37 @@
-"""Figures of coefficients: along a motion, and with the intervals that a fit claims."""
+"""Figures of coefficients that follow the motion: over time, as maps, and as sections of these."""
 
-import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, gaussian_filter
 
-from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction.coefficients import Constant
+from nfriction.fitting.result.identifiability import NORMAL_95
+from nfriction.fitting.result.uncertainty import CoefficientUncertainty
+from nfriction.friction.laws import Coefficient
 from nfriction.friction.models import FrictionModel
+from nfriction.fuzzy.rules import FuzzyRules
 from nfriction.plots import style
+from nfriction.plots.fuzzy import draw_map, fuzzy_rules, input_labels
 from nfriction.signals import Motion
+
+Array = NDArray[np.float64]
+Edges = tuple[Array, Array]
+
+CELLS = 60
+"""Cells of a map along each axis."""
+NEAR = 3
+"""Cells around a sample that count as seen: a twentieth of the range."""
+VAGUE = 0.5
+"""Standard deviation, as a share of the coefficient's mean size, at which a map is half faded."""
+_FIRST, _BESIDE, _APART = 2, 2, 10  # cells, of error bars
+_LEAST = 0.15  # opacity of seen but uncertain cells; nothing is drawn where nothing was seen
+_UNDER, _OVER = "#101010", "#fefefe"  # none of the palette's, which turn for a dark screen
+_UNSEEN: dict[str, Any] = {"linewidth": 0.6, "alpha": 0.5}
 
 
 def coefficients_over_time(
@@ -43,86 +59,27 @@ def coefficients_over_time(
         raise ValueError(f"`models` must be one or several of one law, got {sorted(laws)}.")
     first = next(iter(models.values()))
     names = style.joint_labels(joint_names, first.joints)
-    along = {name: _along(model, motion) for name, model in models.items()}
-    rows, columns = len(first.law.coefficients), first.joints
-    figure, axes = style.panels(rows, columns, width, 0.4 + 1.25 * rows, sharex=True)
+    along = [_along(model, motion) for model in models.values()]
+    rows = len(first.law.coefficients)
+    figure, axes = style.panels(rows, first.joints, width, 0.4 + 1.25 * rows, sharex=True)
     looks = style.looks(models)
     for k, coefficient in enumerate(first.law.coefficients):
         for j, ax in enumerate(axes[k]):
-            values = [found[:, j, k] for found in along.values()]
-            factor, label = style.scaled(style.sliding(coefficient.unit, unit), values)
+            values = np.stack([found[:, j, k] for found in along])
+            values = style.coefficient_axis(ax, coefficient, unit, values) * values
             for name, value in zip(models, values, strict=True):
-                ax.plot(motion.time, factor * value, **looks[name].line)
-            both = np.concatenate(values) * factor
-            ax.set_ylim(style.padded(float(both.min()), float(both.max())))
-            ax.yaxis.set_major_locator(MaxNLocator(4))
+                ax.plot(motion.time, value, **looks[name].line)
+            ax.set_ylim(style.padded(float(values.min()), float(values.max())))
             ax.margins(x=0.01)
-            ax.set_ylabel(f"{style.symbol(coefficient.name)} [{label}]")
             if k == 0:
                 style.title(ax, names[j])
     for ax in axes[-1]:
         ax.set_xlabel("time [s]")
-    style.legend(figure, [Line2D([], [], **looks[name].line) for name in models], list(models))
+    style.legend(figure, [looks[name].handle for name in models], list(models))
     return figure
 
 
-def coefficient_intervals(fits: Mapping[str, FitResult], *, width: float | None = None) -> Figure:
-    """Fitted coefficients with their 95 % intervals, a panel a coefficient; joints side by side.
-
-    Intervals reach from edge to edge of a panel where the data tell nothing.
-
-    Args:
-        fits: of models with constant coefficients of one law, by name: of other recordings, say.
-        width: of the figure [in].
-
-    Raises:
-        ValueError: if there is no such fit, or one is of another law.
-    """
-    laws = {found.model.law.name for found in fits.values()}
-    constant = all(isinstance(found.model.schedule, Constant) for found in fits.values())
-    if len(laws) != 1 or not constant:
-        raise ValueError(
-            f"`fits` must be of constant coefficients of one law, got laws {sorted(laws)}."
-        )
-    first = next(iter(fits.values()))
-    joints, law = first.plant.joint_names, first.model.law
-    columns = min(len(law.coefficients), 3)
-    rows = -(-len(law.coefficients) // columns)
-    width = width or (style.COLUMN if columns < 3 else style.PAGE)
-    figure, axes = style.panels(rows, columns, width, 0.2 + 1.7 * rows)
-    looks = style.looks(fits)
-    panels: list[Axes] = axes.ravel().tolist()
-    for ax in panels[len(law.coefficients) :]:
-        ax.set_visible(False)
-    for k, (ax, coefficient) in enumerate(zip(panels, law.coefficients, strict=False)):
-        ends = {name: _intervals(found, coefficient.name, k) for name, found in fits.items()}
-        known = np.concatenate([e.ravel() for e in ends.values()])
-        known = known[np.isfinite(known)]
-        low, high = style.padded(float(known.min()), float(known.max()), 0.1)
-        unit = style.sliding(coefficient.unit, first.plant.unit)
-        factor, label = style.scaled(unit, [low, high])
-        for m, (name, of) in enumerate(ends.items()):
-            x = np.arange(len(joints)) + 0.6 * ((m + 0.5) / len(fits) - 0.5)
-            value, bottom, top = (factor * np.clip(e, low, high) for e in of)
-            ax.errorbar(
-                x, value, [value - bottom, top - value], capsize=2, elinewidth=1.0,
-                **looks[name].line | {"linestyle": ""}, **looks[name].marker,
-            )  # fmt: skip
-        ax.set_ylim(factor * low, factor * high)
-        ax.set_xlim(-0.6, len(joints) - 0.4)
-        ax.set_xticks(range(len(joints)), joints)
-        ax.grid(False, axis="x")
-        ax.yaxis.set_major_locator(MaxNLocator(4))
-        ax.set_ylabel(f"{style.symbol(coefficient.name)} [{label}]")
-    if len(fits) > 1:
-        handles = [
-            Line2D([], [], **looks[n].line | {"linestyle": ""}, **looks[n].marker) for n in fits
-        ]
-        style.legend(figure, handles, list(fits))
-    return figure
-
-
-def _along(model: FrictionModel, motion: Motion) -> NDArray[np.float64]:
+def _along(model: FrictionModel, motion: Motion) -> Array:
     """Coefficients at every sample, (sample, joint, coefficient)."""
     qd, qdd = torch.tensor(motion.qd), torch.tensor(motion.qdd)
     with torch.no_grad():
@@ -133,14 +90,219 @@ def _along(model: FrictionModel, motion: Motion) -> NDArray[np.float64]:
     return found.expand(len(qd), -1, -1).numpy()
 
 
-def _intervals(found: FitResult, name: str, k: int) -> NDArray[np.float64]:
-    """Value, lower and upper end of a coefficient of every joint, (3, joint)."""
-    schedule = found.model.schedule
-    assert isinstance(schedule, Constant)
-    told = {i.name: (i.low, i.high) for i in found.intervals}
-    rows = []
-    for joint, value in zip(
-        found.plant.joint_names, schedule.values.detach()[:, k].tolist(), strict=True
-    ):
-        rows.append((value, *told.get(f"{name} of {joint}", (-math.inf, math.inf))))
-    return np.array(rows).T
+def coefficient_surfaces(
+    model: FrictionModel,
+    motions: Sequence[Motion] | None = None,
+    *,
+    uncertainty: CoefficientUncertainty | None = None,
+    joint_names: Sequence[str] | None = None,
+    unit: str = "rad",
+    width: float | None = None,
+) -> Figure:
+    """Coefficients of a neuro-fuzzy model as maps over |velocity| and acceleration.
+
+    Args:
+        model: a neuro-fuzzy model.
+        motions: smoothed motions in joint coordinates. White lines enclose 50 % and 90 % of their
+            samples; where they never came near, the map is hatched.
+        uncertainty: of its fit (`FitResult.uncertainty`). A map fades into the hatching as its
+            standard deviation grows, about by half where that is half of the coefficient's mean
+            size.
+        joint_names: for the titles.
+        unit: of a position, `"rad"` or `"m"`.
+        width: of the figure [in].
+
+    Returns:
+        A map a joint and fitted coefficient.
+
+    Raises:
+        ValueError: if the model has no fuzzy rules.
+    """
+    rules, coefficients = fuzzy_rules(model), _fitted(model)
+    names = style.joint_labels(joint_names, model.joints)
+    # The fewer of the two stand side by side: the maps with their bars need the room.
+    across = model.joints <= len(coefficients)
+    rows, columns = sorted((model.joints, len(coefficients)), reverse=True)
+    share = "col" if across else "row"
+    figure, axes = style.panels(
+        rows, columns, width or (style.COLUMN if columns == 1 else style.PAGE), 0.7 + 1.5 * rows,
+        sharex=share, sharey=share,
+    )  # fmt: skip
+    for j, maps in enumerate(axes.T if across else axes):
+        edges = _edges(rules, j)
+        middles = _middles(edges)
+        values, sd = _on_grid(model, uncertainty, j, *middles)
+        counts = None if motions is None else _visits(rules, motions, j)
+        seen = None if counts is None else _near(counts)
+        for ax, (k, coefficient) in zip(maps, coefficients, strict=True):
+            opacity = None if sd is None else _opacity(values[..., k], sd[..., k], seen)
+            label = (coefficient.name, style.sliding(coefficient.unit, unit))
+            draw_map(ax, edges, values[..., k], label=label, seen=seen, opacity=opacity)
+            if counts is not None:
+                _density_lines(ax, middles, counts)
+            style.title(ax, names[j])
+            # Ranges differ between joints, so every map has its own.
+            ax.tick_params(labelbottom=True, labelleft=True)
+    velocity, acceleration = input_labels(rules, unit)
+    figure.supxlabel(velocity, fontsize=style.LABEL, color=style.INK)
+    figure.supylabel(acceleration, fontsize=style.LABEL, color=style.INK)
+    return figure
+
+
+def coefficient_sections(
+    model: FrictionModel,
+    motions: Sequence[Motion] | None = None,
+    *,
+    uncertainty: CoefficientUncertainty | None = None,
+    joint_names: Sequence[str] | None = None,
+    unit: str = "rad",
+    width: float | None = None,
+) -> Figure:
+    """Coefficients of a neuro-fuzzy model over |velocity|, at three accelerations.
+
+    Arguments and errors are those of `coefficient_surfaces`. Lines are faint where the motions
+    never came near, bars are 95 % intervals.
+
+    Returns:
+        A panel a joint and fitted coefficient; a joint's accelerations are in its title.
+    """
+    rules, coefficients = fuzzy_rules(model), _fitted(model)
+    names = style.joint_labels(joint_names, model.joints)
+    rows, columns = model.joints, len(coefficients)
+    figure, axes = style.panels(
+        rows, columns, width or (style.COLUMN if columns == 1 else style.PAGE), 0.4 + 1.5 * rows,
+        sharex="row",
+    )  # fmt: skip
+    levels = ("negative", "none", "positive")
+    if rules.along_motion:
+        levels = ("braking", "steady", "speeding up")
+    looks = style.looks(levels)
+    for j, panels in enumerate(axes):
+        edges = _edges(rules, j)
+        speed, accelerations = _middles(edges)[0], _levels(edges[1])
+        values, sd = _on_grid(model, uncertainty, j, speed, np.array(accelerations))
+        seen = np.ones((len(levels), CELLS), dtype=bool)
+        if motions is not None:
+            row = np.searchsorted(edges[1], accelerations) - 1
+            seen = _near(_visits(rules, motions, j))[np.clip(row, 0, CELLS - 1)]
+        at = ", ".join(f"{float(f'{a:.2g}'):g}" for a in accelerations).replace("-", "−")
+        style.title(panels[0], f"{names[j]}, at {at} {unit}/s²")
+        for ax, (k, coefficient) in zip(panels, coefficients, strict=True):
+            factor = style.coefficient_axis(ax, coefficient, unit, values[..., k])
+            value = factor * values[..., k]
+            reach = 0.0 * value if sd is None else factor * NORMAL_95 * sd[..., k]
+            for n, level in enumerate(levels):
+                line = looks[level].line
+                _line(ax, speed, value[n], seen[n], line)
+                if sd is not None:
+                    some = slice(_FIRST + n * _BESIDE, None, _APART)  # side by side
+                    ax.errorbar(
+                        speed[some], value[n, some], reach[n, some], fmt="none",
+                        ecolor=line["color"], elinewidth=0.9, capsize=1.5, capthick=0.9,
+                    )  # fmt: skip
+            _limit(ax, value, reach, coefficient.positive)
+            ax.set_xlim(0.0, edges[0][-1])
+    for ax in axes[-1]:
+        ax.set_xlabel(input_labels(rules, unit)[0])
+    style.legend(figure, [looks[level].handle for level in levels], list(levels))
+    return figure
+
+
+def _fitted(model: FrictionModel) -> list[tuple[int, Coefficient]]:
+    """Coefficients that are fitted, with their places; the others are the same everywhere."""
+    return [(k, c) for k, c in enumerate(model.law.coefficients) if c.fitted]
+
+
+def _edges(rules: FuzzyRules, joint: int) -> Edges:
+    """Edges of cells over the trained range of velocity and of acceleration."""
+    velocity, acceleration = (
+        np.linspace(float(rules.lower[joint, i]), float(rules.upper[joint, i]), CELLS + 1)
+        for i in range(2)
+    )
+    return velocity, acceleration
+
+
+def _middles(edges: Edges) -> Edges:
+    return 0.5 * (edges[0][1:] + edges[0][:-1]), 0.5 * (edges[1][1:] + edges[1][:-1])
+
+
+def _levels(edges: Array) -> list[float]:
+    """Three accelerations, about zero where there are both signs."""
+    low, high = float(edges[0]), float(edges[-1])
+    middle, step = 0.5 * (low + high), 0.25 * (high - low)
+    if low < 0 < high:
+        middle, step = 0.0, 0.5 * min(-low, high)
+    return [middle - step, middle, middle + step]
+
+
+def _on_grid(
+    model: FrictionModel,
+    uncertainty: CoefficientUncertainty | None,
+    joint: int,
+    speed: Array,
+    acceleration: Array,
+) -> tuple[Array, Array | None]:
+    """Coefficients and their standard deviation, (acceleration, speed, coefficient)."""
+    qd, qdd = (
+        torch.as_tensor(np.ascontiguousarray(x))[..., None].expand(*x.shape, model.joints)
+        for x in np.meshgrid(speed, acceleration)
+    )
+    with torch.no_grad():
+        values = model.schedule(qd, qdd)[:, :, joint].numpy()
+    return values, None if uncertainty is None else uncertainty.sd(qd, qdd)[:, :, joint].numpy()
+
+
+def _visits(rules: FuzzyRules, motions: Sequence[Motion], joint: int) -> Array:
+    """Samples in each cell (acceleration, speed), those outside the range in the edge's."""
+    qd, qdd = (np.concatenate([getattr(m, of)[:, joint] for m in motions]) for of in ("qd", "qdd"))
+    if rules.along_motion:
+        qdd = np.where(qd < 0, -qdd, qdd)
+    speeds, accelerations = _edges(rules, joint)
+    speed = np.minimum(np.abs(qd), speeds[-1])
+    acceleration = np.clip(qdd, accelerations[0], accelerations[-1])
+    return np.histogram2d(acceleration, speed, [accelerations, speeds])[0]
+
+
+def _near(counts: Array) -> NDArray[np.bool_]:
+    """Cells in or near which there are samples."""
+    return np.asarray(binary_dilation(counts > 0, iterations=NEAR), dtype=bool)
+
+
+def _line(ax: Axes, x: Array, y: Array, seen: NDArray[np.bool_], look: dict[str, Any]) -> None:
+    """A line that is faint where nothing was seen."""
+    ax.plot(x, np.where(seen, y, np.nan), **look)
+    if not seen.all():
+        # The two share a point wherever they meet.
+        unseen = ~seen | ~np.roll(seen, 1) | ~np.roll(seen, -1)
+        ax.plot(x, np.where(unseen, y, np.nan), **look | _UNSEEN)
+
+
+def _limit(ax: Axes, values: Array, reach: Array, positive: bool) -> None:
+    """Limits that hold the bars, unless these would hide the lines."""
+    low, high = float(values.min()), float(values.max())
+    most = max(high - low, abs(low), abs(high)) or 1.0
+    bottom = max(float((values - reach).min()), low - most, 0.0 if positive else -np.inf)
+    ax.set_ylim(*style.padded(bottom, min(float((values + reach).max()), high + most)))
+    if positive:
+        ax.set_ylim(bottom=max(ax.get_ylim()[0], 0.0))
+
+
+def _opacity(value: Array, sd: Array, seen: NDArray[np.bool_] | None) -> Array:
+    """How firmly a map is drawn: 1 where all is known, about half at a deviation of `VAGUE`."""
+    among = np.abs(value) if seen is None or not seen.any() else np.abs(value[seen])
+    size = float(among.mean()) or 1.0
+    return _LEAST + (1.0 - _LEAST) / (1.0 + (sd / (VAGUE * size)) ** 4)
+
+
+def _density_lines(ax: Axes, middles: Edges, counts: Array) -> None:
+    """Lines around the densest cells that hold half and nine tenths of the samples."""
+    smooth = gaussian_filter(counts, 2.5)
+    falling = np.sort(smooth.ravel())[::-1]
+    held = np.cumsum(falling) / falling.sum()
+    levels = sorted({float(falling[np.searchsorted(held, share)]) for share in (0.5, 0.9)})
+    if levels[0] <= 0 or levels[-1] >= falling[0]:
+        return  # all in one cell: no line would enclose anything
+    dashes = ["--", "-"][-len(levels) :]
+    # Dark below, so that the lines stand out on light and dark parts of the map alike.
+    for colour, width in ((_UNDER, 1.4), (_OVER, 0.7)):
+        ax.contour(*middles, smooth, levels, colors=colour, linewidths=width, linestyles=dashes)

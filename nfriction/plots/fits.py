@@ -1,16 +1,17 @@
-"""Figures of a fit: torque over velocity against what the motion implies, and its convergence."""
+"""Figures of fits: torque over velocity, coefficients with their intervals, convergence."""
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from nfriction.fitting.equation_error import friction_torque
+from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Step
 from nfriction.plant import Plant
@@ -32,7 +33,7 @@ def torque_over_velocity(
     *,
     width: float | None = None,
 ) -> Figure:
-    """Friction torque of each law over velocity, a panel a joint, over what the motion implies.
+    """Friction torque of each law over velocity, a panel a joint, over that of the motion.
 
     Lines are at the load at rest and without acceleration; dots are `tau - M qdd - bias` along the
     recordings, with their median in bins of equally many samples.
@@ -50,16 +51,17 @@ def torque_over_velocity(
         parts = [friction_torque(plant, r, m) for r, m in zip(joint, motions, strict=True)]
         qd = torch.cat([p[0] for p in parts]).numpy()
         torque = torch.cat([p[2] for p in parts]).numpy()
-    figure, axes, columns = _joint_grid(plant.joints, width)
+    columns = min(plant.joints, 3) if plant.joints != 4 else 2
+    figure, axes = style.panel_each(plant.joints, columns, width, 2.0)
     looks = style.looks(models)
-    torque_unit = style.sliding("N m", plant.unit)
     for k, ax in enumerate(axes):
         grid = _velocities(qd[:, k])
-        lines = {name: _law(model, grid, k) for name, model in models.items()}
-        middle = _binned_median(qd[:, k], torque[:, k])
+        lines = {name: _torque(model, grid, k) for name, model in models.items()}
+        bins = np.array_split(np.argsort(qd[:, k]), min(_BINS, len(qd)))
+        middle = [np.array([np.median(x[b, k]) for b in bins]) for x in (qd, torque)]
         # The dots scatter far beyond any friction; the laws and most medians set the limits.
         extremes = np.concatenate([*lines.values(), np.quantile(middle[1], [0.05, 0.95])])
-        factor, unit = style.scaled(torque_unit, extremes)
+        factor, unit = style.scaled(style.sliding("N m", plant.unit), extremes)
         some = np.linspace(0, len(qd) - 1, min(_POINTS, len(qd))).astype(int)
         ax.plot(
             qd[some, k], factor * torque[some, k], ".", color=style.FAINT, markersize=2.0,
@@ -73,13 +75,58 @@ def torque_over_velocity(
         style.title(ax, plant.joint_names[k])
         ax.set_ylabel(f"friction {'torque' if plant.unit == 'rad' else 'force'} [{unit}]")
         if k + columns >= plant.joints:
-            ax.set_xlabel(f"joint velocity [{style.velocity_unit(plant.unit)}]")
+            ax.set_xlabel(f"joint velocity [{plant.unit}/s]")
     handles = [
         Line2D([], [], linestyle="", marker=".", color=style.FAINT),
         Line2D([], [], linestyle="", marker="o", color=style.INK, markersize=2.2),
-        *(Line2D([], [], **looks[name].line) for name in models),
+        *(looks[name].handle for name in models),
     ]
     style.legend(figure, handles, ["from the motion", "its median", *models])
+    return figure
+
+
+def coefficient_intervals(fits: Mapping[str, FitResult], *, width: float | None = None) -> Figure:
+    """Fitted coefficients with their 95 % intervals, a panel a coefficient; joints side by side.
+
+    Intervals of unidentifiable coefficients reach from edge to edge of a panel.
+
+    Args:
+        fits: of models with constant coefficients of one law, by name: of other recordings, say.
+        width: of the figure [in].
+
+    Raises:
+        ValueError: if there is no such fit, or one is of another law.
+    """
+    laws = {found.model.law.name for found in fits.values()}
+    if len(laws) != 1 or any(found.model.schedule.follows_motion for found in fits.values()):
+        raise ValueError(
+            f"`fits` must be of constant coefficients of one law, got laws {sorted(laws)}."
+        )
+    first = next(iter(fits.values()))
+    joints, law = first.plant.joint_names, first.model.law
+    columns = min(len(law.coefficients), 3)
+    width = width or (style.COLUMN if columns < 3 else style.PAGE)
+    figure, axes = style.panel_each(len(law.coefficients), columns, width, 1.7)
+    looks = {name: {**look.line, "linestyle": "", **look.marker}
+             for name, look in style.looks(fits).items()}  # fmt: skip
+    for k, (ax, coefficient) in enumerate(zip(axes, law.coefficients, strict=True)):
+        ends = {name: _intervals(found, coefficient.name, k) for name, found in fits.items()}
+        known = np.concatenate([e.ravel() for e in ends.values()])
+        known = known[np.isfinite(known)]
+        low, high = style.padded(float(known.min()), float(known.max()), 0.1)
+        factor = style.coefficient_axis(ax, coefficient, first.plant.unit, [low, high])
+        for m, (name, of) in enumerate(ends.items()):
+            x = np.arange(len(joints)) + 0.6 * ((m + 0.5) / len(fits) - 0.5)
+            value, bottom, top = (factor * np.clip(e, low, high) for e in of)
+            ax.errorbar(
+                x, value, [value - bottom, top - value], capsize=2, elinewidth=1.0, **looks[name]
+            )
+        ax.set_ylim(factor * low, factor * high)
+        ax.set_xlim(-0.6, len(joints) - 0.4)
+        ax.set_xticks(range(len(joints)), joints)
+        ax.grid(False, axis="x")
+    if len(fits) > 1:
+        style.legend(figure, [Line2D([], [], **looks[name]) for name in fits], list(fits))
     return figure
 
 
@@ -93,11 +140,11 @@ def convergence(
 
     Args:
         history: values before each step, or a solver's `Step`s; by name to compare several.
-        quantity: what they are, with its unit.
+        quantity: label of the values, with their unit.
         width: of the figure [in].
 
     Raises:
-        ValueError: if there is nothing to show.
+        ValueError: if there is no finite value.
     """
     named = history if isinstance(history, Mapping) else {"": history}
     curves = {
@@ -105,14 +152,14 @@ def convergence(
         for name, steps in named.items()
     }
     values = np.concatenate([np.zeros(0), *curves.values()])
-    if not np.isfinite(values).any():
+    finite = values[np.isfinite(values)]
+    if not finite.size:
         raise ValueError("`history` has no finite value; give the cost at each step.")
     figure, axes = style.panels(1, 1, width, 2.3)
     ax = axes[0, 0]
     looks = style.looks(curves)
     for name, curve in curves.items():
         ax.plot(np.arange(len(curve)), curve, **looks[name].line, marker=".", markersize=4)
-    finite = values[np.isfinite(values)]
     if finite.min() > 0 and style.spread(finite) > style.LOG_FROM:
         ax.set_yscale("log")
     else:
@@ -125,17 +172,6 @@ def convergence(
     return figure
 
 
-def _joint_grid(joints: int, width: float | None) -> tuple[Figure, list[Axes], int]:
-    """A panel a joint, up to three side by side; what is left over of the grid is blank."""
-    columns = min(joints, 3) if joints != 4 else 2
-    rows = -(-joints // columns)
-    width = width or (style.COLUMN if columns == 1 else style.PAGE)
-    figure, axes = style.panels(rows, columns, width, 0.2 + 2.0 * rows)
-    for ax in axes.flat[joints:]:
-        ax.set_visible(False)
-    return figure, list(axes.flat[:joints]), columns
-
-
 def _velocities(qd: Array) -> Array:
     """The range of the data, dense about zero, where laws turn over a few thousandths."""
     low, high = float(qd.min()), float(qd.max())
@@ -144,7 +180,7 @@ def _velocities(qd: Array) -> Array:
     return grid[(grid >= low) & (grid <= high)]
 
 
-def _law(model: FrictionModel, qd: Array, joint: int) -> Array:
+def _torque(model: FrictionModel, qd: Array, joint: int) -> Array:
     """Torque of one joint over its velocity, at the load at rest and without acceleration."""
     velocity = torch.as_tensor(qd)[:, None].expand(-1, model.joints)
     with torch.no_grad():
@@ -152,7 +188,11 @@ def _law(model: FrictionModel, qd: Array, joint: int) -> Array:
     return torque[:, joint].numpy()
 
 
-def _binned_median(x: Array, y: Array) -> tuple[Array, Array]:
-    """Medians of x and y in bins of equally many samples of ascending x."""
-    bins = np.array_split(np.argsort(x), min(_BINS, len(x)))
-    return np.array([np.median(x[b]) for b in bins]), np.array([np.median(y[b]) for b in bins])
+def _intervals(found: FitResult, name: str, k: int) -> Array:
+    """Value, lower and upper end of a coefficient of every joint, (3, joint)."""
+    ends = {i.name: (i.low, i.high) for i in found.intervals}
+    values = found.model.schedule.coefficient_sets()["always"][:, k].tolist()
+    return np.array([
+        (value, *ends.get(f"{name} of {joint}", (-math.inf, math.inf)))
+        for joint, value in zip(found.plant.joint_names, values, strict=True)
+    ]).T  # fmt: skip

@@ -1,7 +1,7 @@
 """Write the figures that a comparison yields."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,17 +9,16 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from nfriction.evaluation.compare import Comparison
-from nfriction.friction.coefficients import Constant
-from nfriction.friction.models import FrictionModel
-from nfriction.friction.neurofuzzy import NeuroFuzzy
-from nfriction.plots.coefficients import coefficients_over_time
-from nfriction.plots.dark import GROUND, for_dark_screen
-from nfriction.plots.errors import horizon_curve, positions, rmse_bars
+from nfriction.plots.coefficients import (
+    coefficient_sections,
+    coefficient_surfaces,
+    coefficients_over_time,
+)
+from nfriction.plots.comparison import horizon_curve, positions, rmse_bars
 from nfriction.plots.fits import torque_over_velocity
 from nfriction.plots.fuzzy import memberships
-from nfriction.plots.surfaces import coefficient_sections, coefficient_surfaces
+from nfriction.plots.style import DARK_GROUND, for_dark_screen
 from nfriction.recording import Recording
-from nfriction.signals import Motion
 
 DPI = 150
 
@@ -65,7 +64,7 @@ def save_all(
             path = folder / f"{stem}_{count}.png"
         figure.savefig(path, dpi=DPI)
         shade = path.with_suffix(".dark.png")
-        for_dark_screen(figure, ground=GROUND).savefig(shade, dpi=DPI)
+        for_dark_screen(figure, ground=DARK_GROUND).savefig(shade, dpi=DPI)
         figure.clear()
         written += [path, shade]
     return written
@@ -86,37 +85,25 @@ def _figures(
     if not comparison.fits:
         return
     last = list(comparison.fits.values())[-1]
-    order = [s.recording for s in next(iter(comparison.train.values()))]
     moved = last.motions
     if last.zeros:
         moved = tuple(replace(m, q=m.q + z) for m, z in zip(moved, last.zeros, strict=True))
+    order = [s.recording for s in next(iter(comparison.train.values()))]
     trained = dict(zip(order, moved, strict=True))
     given = [r for r in recordings if r.name in trained]
-    joints = comparison.joint_names
     models = {name: found.model for name, found in comparison.fits.items()}
     if given:
         motions = [trained[r.name] for r in given]
         yield "torque_over_velocity", torque_over_velocity(last.plant, models, given, motions)
-    yield from _over_time(models, last.motions[0], joints, comparison.unit)
+    labels: dict[str, Any] = {"joint_names": comparison.joint_names, "unit": comparison.unit}
+    for law in dict.fromkeys(model.law.name for model in models.values()):
+        of_law = {name: model for name, model in models.items() if model.law.name == law}
+        # Constants along the motion are worth a figure beside coefficients that follow it.
+        if any(model.schedule.follows_motion for model in of_law.values()):
+            yield f"over_time_{law}", coefficients_over_time(of_law, last.motions[0], **labels)
     for name, found in comparison.fits.items():
-        if isinstance(found.model.schedule, NeuroFuzzy):
-            labels: dict[str, Any] = {"joint_names": joints, "unit": comparison.unit}
+        if found.model.schedule.fuzzy_rules() is not None:
             known = labels | {"motions": last.motions, "uncertainty": found.uncertainty}
             yield f"coefficients_{name}", coefficient_surfaces(found.model, **known)
             yield f"sections_{name}", coefficient_sections(found.model, **known)
             yield f"memberships_{name}", memberships(found.model, **labels)
-
-
-def _over_time(
-    models: Mapping[str, FrictionModel], motion: Motion, joints: Sequence[str], unit: str
-) -> Iterator[tuple[str, Figure]]:
-    """Coefficients of each law of which a model follows the motion, beside its constant ones."""
-    by_law: dict[str, dict[str, FrictionModel]] = {}
-    for name, model in models.items():
-        by_law.setdefault(model.law.name, {})[name] = model
-    for law, of in by_law.items():
-        if not all(isinstance(model.schedule, Constant) for model in of.values()):
-            yield (
-                f"over_time_{law}",
-                coefficients_over_time(of, motion, joint_names=joints, unit=unit),
-            )

@@ -1,4 +1,4 @@
-"""How every figure looks: sizes, colours, units; no global matplotlib state is touched."""
+"""Sizes, colours, units and labels of every figure; no global matplotlib state is touched."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -8,16 +8,22 @@ from typing import Any
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.collections import Collection
+from matplotlib.colors import to_hex, to_rgba
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
 from nfriction.evaluation.compare import NO_FRICTION
+from nfriction.friction.laws import Coefficient
 
 COLUMN, PAGE = 3.5, 7.0
 """Widths of a figure in a two-column paper [in]: one column, both."""
 
 INK, GRID, FAINT = "#222222", "#dddddd", "#8c8c8c"
+UNSEEN, HATCH, BAND = "#f2f2f2", "#c4c4c4", "#bbbbbb"  # grounds of maps without data; the floor
 LABEL, SMALL, TINY = 8.0, 7.0, 6.0  # sizes of text [pt]
 # Okabe and Ito's palette without its yellow (too pale for lines) and black (text).
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#5D3A9B")
@@ -29,6 +35,23 @@ _HATCHES = ("", "////", "....", "\\\\\\\\")
 MAP = "viridis"
 LOG_FROM = 30.0
 """Ratio of the largest value to the smallest beyond which an axis is logarithmic."""
+DARK_GROUND = "#14171b"
+# Each keeps its hue and is light enough on the dark ground; white grounds become clear.
+_ON_DARK = {
+    "#ffffff": "none",
+    INK: "#e7eaee",
+    GRID: "#39414b",
+    FAINT: "#8f98a3",
+    str(MEASURED["color"]): "#6b7480",
+    "#000000": "#e7eaee",
+    "#0072b2": "#4aa8e0",
+    "#d55e00": "#ff8a3d",
+    "#009e73": "#2fc79a",
+    "#5d3a9b": "#b79bef",
+    BAND: "#5a626d",
+    UNSEEN: "#1e2329",
+    HATCH: "#454d58",
+}
 
 
 def panels(
@@ -40,6 +63,18 @@ def panels(
     for ax in axes.flat:
         dress(ax)
     return figure, axes
+
+
+def panel_each(
+    count: int, columns: int, width: float | None, height: float
+) -> tuple[Figure, list[Axes]]:
+    """A grid of panels of a height, as many as asked for; the rest of the grid is blank."""
+    rows = -(-count // columns)
+    width = width or (PAGE if columns > 1 else COLUMN)
+    figure, axes = panels(rows, columns, width, 0.2 + height * rows)
+    for ax in axes.flat[count:]:
+        ax.set_visible(False)
+    return figure, list(axes.flat[:count])
 
 
 def dress(ax: Axes) -> None:
@@ -57,13 +92,6 @@ def dress(ax: Axes) -> None:
         axis.get_offset_text().set(fontsize=SMALL, color=INK)
 
 
-def bare(ax: Axes) -> None:
-    """A frame all round and no grid, for maps."""
-    ax.grid(False)
-    for spine in ax.spines.values():
-        spine.set_visible(True)
-
-
 def legend(figure: Figure, handles: Iterable[Artist], labels: Sequence[str]) -> None:
     """A legend above all panels, in as many columns as fit; the figure grows by its height."""
     longest = max(len(label) for label in labels)
@@ -75,21 +103,30 @@ def legend(figure: Figure, handles: Iterable[Artist], labels: Sequence[str]) -> 
     artists = list(handles)
     figure.set_figheight(figure.get_figheight() + 0.05 + 0.15 * rows)
     figure.legend(
-        [artists[k] for k in order],
-        [labels[k] for k in order],
-        loc="outside upper center",
-        ncols=columns,
-        frameon=False,
-        fontsize=SMALL,
-        labelcolor=INK,
-        handlelength=2.4,
+        [artists[k] for k in order], [labels[k] for k in order], loc="outside upper center",
+        ncols=columns, frameon=False, fontsize=SMALL, labelcolor=INK, handlelength=2.4,
         columnspacing=1.2,
-    )
+    )  # fmt: skip
 
 
 def title(ax: Axes, text: str) -> None:
     """A panel's title, in the size of its labels."""
     ax.set_title(text, fontsize=LABEL, color=INK)
+
+
+def coefficient_axis(ax: Axes, coefficient: Coefficient, position: str, values: Any) -> float:
+    """Label the y axis with a coefficient; the factor from SI to the unit of the label.
+
+    Args:
+        ax: the panel.
+        coefficient: of a law.
+        position: unit of a position, `"rad"` or `"m"`.
+        values: that will be shown, any shape.
+    """
+    factor, unit = scaled(sliding(coefficient.unit, position), values)
+    ax.set_ylabel(f"{symbol(coefficient.name)} [{unit}]")
+    ax.yaxis.set_major_locator(MaxNLocator(4))
+    return factor
 
 
 def log_axis(ax: Axes, bottom: float, top: float) -> None:
@@ -105,17 +142,22 @@ def log_axis(ax: Axes, bottom: float, top: float) -> None:
 
 @dataclass(frozen=True)
 class Look:
-    """How a model is drawn, the same in every figure of a comparison.
+    """Options by which a model is drawn, the same in every figure of a comparison.
 
     Attributes:
-        line: options of a line.
-        marker: further options of a line with points.
-        bar: options of a bar.
+        line: of a line.
+        marker: further ones of a line with points.
+        bar: of a bar.
     """
 
     line: dict[str, Any]
     marker: dict[str, Any]
     bar: dict[str, Any]
+
+    @property
+    def handle(self) -> Line2D:
+        """A line for the legend."""
+        return Line2D([], [], **self.line)
 
 
 def looks(names: Iterable[str]) -> dict[str, Look]:
@@ -123,11 +165,9 @@ def looks(names: Iterable[str]) -> dict[str, Look]:
     models = [name for name in names if name != NO_FRICTION]
     found = {NO_FRICTION: _look(FAINT, (0, (2.5, 2.5)), "x", "xxxx")}
     for k, name in enumerate(models):
-        found[name] = _look(*(cycle[k % len(cycle)] for cycle in _CYCLES))
+        cycles: tuple[Sequence[Any], ...] = (COLOURS, _DASHES, _MARKERS, _HATCHES)
+        found[name] = _look(*(cycle[k % len(cycle)] for cycle in cycles))
     return found
-
-
-_CYCLES: tuple[tuple[Any, ...], ...] = (COLOURS, _DASHES, _MARKERS, _HATCHES)
 
 
 def _look(colour: str, dashes: Any, marker: str, hatch: str) -> Look:
@@ -143,7 +183,7 @@ def scaled(unit: str, values: Any) -> tuple[float, str]:
 
     Args:
         unit: SI unit, `"rad"`, `"N m s/rad"`, `"-"` ...
-        values: what will be shown, any shape; what is not finite does not count.
+        values: that will be shown, any shape; infinite ones and NaN do not count.
     """
     sizes = np.abs(np.asarray(values, dtype=np.float64))
     largest = float(np.max(sizes, where=np.isfinite(sizes), initial=0.0))
@@ -155,11 +195,6 @@ def scaled(unit: str, values: Any) -> tuple[float, str]:
 def sliding(unit: str, position: str) -> str:
     """A revolute joint's unit as it reads for positions in `"rad"` or `"m"`."""
     return unit if position == "rad" else unit.replace("N m", "N").replace("rad", position)
-
-
-def velocity_unit(position: str) -> str:
-    """Unit of a velocity, for positions in `"rad"` or `"m"`."""
-    return f"{position}/s"
 
 
 def symbol(name: str) -> str:
@@ -193,3 +228,47 @@ def padded(low: float, high: float, share: float = 0.05) -> tuple[float, float]:
     """Limits a little wider than the values, and never empty."""
     margin = share * (high - low) or 0.05 * abs(high) or 1.0
     return low - margin, high + margin
+
+
+def for_dark_screen(figure: Figure, *, ground: str = "none") -> Figure:
+    """Change a figure's colours, in place, to be read on a dark screen.
+
+    Colours of models keep their hue, maps stay as they are.
+
+    Args:
+        figure: one of ours; colours outside our palette stay.
+        ground: behind it, clear by default (`style.DARK_GROUND` fits the report's page).
+
+    Returns:
+        The same figure; save it with `figure.savefig(path)`.
+    """
+    for artist in figure.findobj():
+        if isinstance(artist, Collection):
+            if artist.get_array() is None:
+                artist.set_facecolor([_on_dark(c) for c in artist.get_facecolor()])
+                artist.set_edgecolor([_on_dark(c) for c in artist.get_edgecolor()])
+        elif isinstance(artist, Patch):
+            face, edge = artist.get_facecolor(), artist.get_edgecolor()
+            artist.set_facecolor(_on_dark(face))
+            # The white seams of hatched bars stay visible as seams of the ground.
+            seam = to_hex(edge) == "#ffffff" and artist.get_hatch()
+            artist.set_edgecolor(DARK_GROUND if seam else _on_dark(edge))
+        else:
+            for part in ("color", "markerfacecolor", "markeredgecolor"):
+                colour = getattr(artist, f"get_{part}", lambda: "none")()
+                if not (isinstance(colour, str) and colour in ("none", "auto")):
+                    getattr(artist, f"set_{part}")(_on_dark(colour))
+    for ax in figure.axes:
+        # Ticks that are drawn later take their colours from here.
+        ax.tick_params(which="both", colors=_ON_DARK[INK], grid_color=_ON_DARK[GRID])
+    figure.patch.set_facecolor(ground)
+    return figure
+
+
+def _on_dark(colour: Any) -> Any:
+    """The colour for a dark ground, as opaque as it was; unknown ones stay."""
+    rgba = to_rgba(colour)
+    if rgba[3] == 0:
+        return "none"
+    found = _ON_DARK.get(to_hex(rgba))
+    return colour if found is None else (found if found == "none" else to_rgba(found, rgba[3]))

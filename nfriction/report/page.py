@@ -100,10 +100,11 @@ def _fit(run: Run, name: str) -> dict[str, Any]:
     """How a fit ended, its warnings and its tables."""
     fit, joints = run.fits[name], run.comparison.joint_names
     warnings = [*fit.warnings]
-    for what, of in (("At a bound", fit.at_bounds), ("Not identifiable", fit.lost)):
-        # Most fits say so themselves, and say more.
-        if of and not any(warning.startswith(what) for warning in warnings):
-            warnings.append(f"{what}: {'; '.join(of)}.")
+    for what, names in (("At a bound", fit.at_bounds), ("Not identifiable", fit.lost)):
+        # Most fits warn of them, and say more.
+        silent = [name for name in names if not any(name in warning for warning in fit.warnings)]
+        if silent:
+            warnings.append(f"{what}: {'; '.join(silent)}.")
     tables = []
     sets = run.coefficients.get(name, {})
     if sets:
@@ -113,7 +114,11 @@ def _fit(run: Run, name: str) -> dict[str, Any]:
         for coefficient, values in sets.get("always", {}).items()
         for joint, value in zip(joints, values, strict=True)
     }
-    intervals = [(what, known.get(what, math.nan), *ends) for what, ends in fit.intervals.items()]
+    intervals = [
+        # An open end is infinite, whichever it is.
+        (what, known.get(what, math.nan), low if math.isfinite(low) else -math.inf, high)
+        for what, (low, high) in fit.intervals.items()
+    ]
     if intervals:
         tables.append(interval_table(name, intervals))
     return {

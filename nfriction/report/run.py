@@ -1,16 +1,18 @@
 """Read a comparison's folder without trusting any of it."""
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
-from nfriction.evaluation.compare import Comparison, Part
+from nfriction.evaluation.compare import SCHEMA, Comparison, Part
 from nfriction.evaluation.cross_validation import Candidate, Selection
-from nfriction.evaluation.score import RMSE, Score
+from nfriction.evaluation.score import Score
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.registry import model_names
 from nfriction.io import strict_json
@@ -23,7 +25,7 @@ LARGEST_RESULTS = 64 * 2**20
 # Squares of smaller numbers are finite.
 LARGEST_NUMBER = 10**100
 
-T = TypeVar("T")
+Coefficients = dict[str, dict[str, tuple[float, ...]]]
 
 
 class RunError(ValueError):
@@ -39,19 +41,19 @@ class FitRecord:
     """How a fit ended, from `FitResult.to_dict`; entries that an older version lacks are empty.
 
     Attributes:
-        intervals: 95 % interval by parameter, infinite where unidentifiable.
+        intervals: 95 % interval by parameter, infinity for an open end.
         plant: adjusted terms of the plant by name.
     """
 
-    status: str
-    converged: bool
-    residual: float
-    residual_unit: str
-    at_bounds: tuple[str, ...]
-    warnings: tuple[str, ...]
-    lost: tuple[str, ...]
-    plant: dict[str, float]
-    intervals: dict[str, tuple[float, float]]
+    status: str = "unknown"
+    converged: bool = False
+    residual: float = math.nan
+    residual_unit: str = ""
+    at_bounds: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    lost: tuple[str, ...] = ()
+    plant: dict[str, float] = field(default_factory=dict)
+    intervals: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -79,16 +81,16 @@ class Run:
     folder: Path
     comparison: Comparison
     fits: dict[str, FitRecord]
-    coefficients: dict[str, dict[str, dict[str, tuple[float, ...]]]]
+    coefficients: dict[str, Coefficients]
     best: str | None
     judged_by: str
+    indistinguishable: tuple[str, ...]
     command: str
     recordings: dict[Part, dict[str, str]]
     models: dict[str, tuple[FrictionModel, ModelInfo]]
     figures: tuple[Figure, ...]
     notes: tuple[str, ...]
-    selection: Selection | None = None
-    indistinguishable: tuple[str, ...] = ()
+    selection: Selection | None
 
 
 def read_run(folder: str | Path) -> Run:
@@ -112,160 +114,115 @@ def read_run(folder: str | Path) -> Run:
     except (ValueError, RecursionError) as error:
         raise RunError(f"{path}: is no JSON, or cut short ({error}).") from error
     try:
-        return _run(folder, _mapping(content, "the file"))
+        return _run(folder, _read(dict[str, Any], content, "the file"))
     except _EntryError as error:
         raise RunError(f"{path}: not results of a comparison: {error}.") from error
 
 
-def _run(folder: Path, content: Mapping[str, Any]) -> Run:
-    old = "schema" not in content
-    keys: dict[Part, str] = {"train": "train", "test": "held_out" if old else "test"}
-    joints = _texts(content.get("joints"), "`joints`")
+def _run(folder: Path, content: dict[str, Any]) -> Run:
+    schema = _read(float, content.get("schema", 1), "`schema`")
+    if schema > SCHEMA:
+        raise _EntryError(f"its schema {schema:g} is newer than {SCHEMA}; update nfriction")
+    keys: dict[Part, str] = {"train": "train", "test": "test" if schema > 1 else "held_out"}
+    joints = _read(tuple[str, ...], content.get("joints"), "`joints`")
     unit = content.get("units")
     if unit not in ("rad", "m"):
         raise _EntryError('`units` must be "rad" or "m"')
-    entries = _each(content.get("models"), "`models`", _mapping)
+    entries = _read(dict[str, dict[str, Any]], content.get("models"), "`models`")
     if not joints or not entries:
         raise _EntryError("it has no joints or no models")
-    scores: dict[Part, dict[str, list[Score]]] = {}
-    for part, key in keys.items():
-        of = {
-            name: _scores(entry.get(key, {}), f"{name}, {key}", len(joints))
-            for name, entry in entries.items()
-        }
-        # Tables pool the recordings of a model, so all must have been scored on the same.
-        if len({tuple((s.recording, *s.windows) for s in many) for many in of.values()}) > 1:
-            raise _EntryError(f"its models were scored on different recordings ({key})")
-        scores[part] = {name: many for name, many in of.items() if many}
+    scores = {part: _scores(entries, key, len(joints)) for part, key in keys.items()}
     if not any(scores.values()):
         raise _EntryError("it has no scores")
-    fits = {n: _fit(e["fit"], n) for n, e in entries.items() if "fit" in e}
+    best = _read(dict[str, Any], content.get("best") or {}, "`best`")
+    if best and _read(str, best.get("model"), "`best`") not in entries:
+        raise _EntryError("its best model is none of its models")
+    tied = best.get("indistinguishable" if schema > 1 else "alike", [])
+    recordings = _read(dict[str, dict[str, str]], content.get("recordings", {}), "`recordings`")
+    fits = {n: _read(FitRecord, e["fit"], f"fit of {n}") for n, e in entries.items() if "fit" in e}
     models, notes = _models(folder, fits, len(joints))
     figures, unread = read_figures(folder / "figures")
-    best = _mapping(content.get("best") or {}, "`best`")
-    if best and _text(best.get("model"), "`best`") not in entries:
-        raise _EntryError("its best model is none of its models")
-    recordings = _mapping(content.get("recordings", {}), "`recordings`")
-    failed = _each(content.get("failed", {}), "`failed`", _text)
+    failed = _read(dict[str, str], content.get("failed", {}), "`failed`")
     return Run(
         folder=folder,
-        comparison=Comparison(
-            {}, scores["train"], scores["test"], unit=unit, joint_names=joints, failed=failed
-        ),
+        comparison=Comparison({}, scores["train"], scores["test"], unit, joints, failed=failed),
         fits=fits,
         coefficients={
-            n: _coefficients(e["coefficients"], n, len(joints))
-            for n, e in entries.items()
-            if "coefficients" in e
+            name: _coefficients(entry["coefficients"], f"coefficients of {name}", len(joints))
+            for name, entry in entries.items()
+            if "coefficients" in entry
         },
         best=best.get("model"),
-        judged_by=_text(best.get("by", ""), "`best`"),
-        command=_text(content.get("command", ""), "`command`"),
-        recordings={
-            part: _each(recordings.get(key, {}), "`recordings`", _text)
-            for part, key in keys.items()
-        },
+        judged_by=_read(str, best.get("by", ""), "`best`"),
+        indistinguishable=_read(tuple[str, ...], tied, "`best`"),
+        command=_read(str, content.get("command", ""), "`command`"),
+        recordings={part: recordings.get(key, {}) for part, key in keys.items()},
         models=models,
         figures=figures,
         notes=(*notes, *unread),
         selection=_selection(content.get("selection"), unit),
-        indistinguishable=_texts(best.get("alike" if old else "indistinguishable", []), "`best`"),
     )
 
 
-def _scores(value: object, where: str, joints: int) -> list[Score]:
-    def rmse(value: object, at: str) -> RMSE:
-        """Errors of a simulation; one that diverged has null for a number."""
-        entry = _mapping(value, at)
-        of_joints = entry.get("joints")
-        if not isinstance(of_joints, list) or len(of_joints) != joints:
-            raise _EntryError(f"{at} needs an error for each of {joints} joints")
-        errors = [_error(e, at) for e in (*of_joints, entry.get("all"))]
-        if min(errors) < 0:
-            raise _EntryError(f"{at} has a negative error")
-        return RMSE(tuple(errors[:-1]), errors[-1])
-
-    found = []
-    for recording, entry in _each(value, where, _mapping).items():
-        at = f"{where}, {recording}"
-        windows = _each(entry.get("windows", {}), at, rmse)
-        for horizon in windows:
-            try:
-                float(horizon)
-            except ValueError:
-                raise _EntryError(f"{at} has windows of {horizon!r} seconds") from None
-        floor = entry.get("floor")
-        found.append(
-            Score(
-                recording, rmse(entry.get("free_run"), at), windows,
-                None if floor is None else rmse(floor, at),
-                time=np.zeros(0), simulated=np.zeros(0),
-                diverged_at=_error(entry.get("diverged_at"), at),
+def _scores(
+    entries: Mapping[str, Mapping[str, Any]], key: str, joints: int
+) -> dict[str, list[Score]]:
+    found: dict[str, list[Score]] = {}
+    nothing = np.zeros(0)
+    for name, entry in entries.items():
+        where = f"{name}, {key}"
+        found[name] = [
+            _read_record(
+                Score, {"windows": {}, "diverged_at": None, "floor": None} | of,
+                f"{where}, {recording}", recording=recording, time=nothing, simulated=nothing,
             )
-        )  # fmt: skip
-    return found
+            for recording, of in _read(dict[str, dict], entry.get(key, {}), where).items()
+        ]  # fmt: skip
+        for score in found[name]:
+            for rmse in filter(None, (score.free_run, score.floor, *score.windows.values())):
+                if len(rmse.joints) != joints:
+                    raise _EntryError(f"{where} needs an error for each of {joints} joints")
+                if min(*rmse.joints, rmse.all) < 0:
+                    raise _EntryError(f"{where} has a negative error")
+            for horizon in score.windows:
+                try:
+                    float(horizon)
+                except ValueError:
+                    raise _EntryError(f"{where} has windows of {horizon!r} seconds") from None
+    # Tables pool the recordings of a model, so all must have been scored on the same.
+    if len({tuple((s.recording, *s.windows) for s in many) for many in found.values()}) > 1:
+        raise _EntryError(f"its models were scored on different recordings ({key})")
+    return {name: many for name, many in found.items() if many}
 
 
-def _selection(value: object, unit: str) -> Selection | None:
+def _selection(value: Any, unit: str) -> Selection | None:
     if value is None:
         return None
     where = "`selection`"
-    entry = _mapping(value, where)
-    candidates = _each(entry.get("candidates"), where, _candidate)
-    chosen = _text(entry.get("chosen"), where)
-    if chosen not in candidates:
-        raise _EntryError(f"{where} chose none of its candidates")
-    return Selection(
-        chosen, _text(entry.get("reason", ""), where),
-        tuple(replace(c, name=name) for name, c in candidates.items()),
-        _number(entry.get("horizon"), where), unit,
+    entry = _read(dict[str, Any], value, where)
+    candidates = tuple(
+        _read_record(Candidate, {"converged": False} | of, where, name=name,
+                     errors=_read(tuple[float, ...], of.get("blocks"), where))
+        for name, of in _read(dict[str, dict], entry.get("candidates"), where).items()
     )  # fmt: skip
-
-
-def _candidate(value: object, where: str) -> Candidate:
-    entry = _mapping(value, where)
-    blocks = entry.get("blocks")
-    if not isinstance(blocks, list) or not blocks:
+    if not all(candidate.errors for candidate in candidates):
         raise _EntryError(f"{where} needs the error of each block")
-    errors = tuple(_error(e, where) for e in blocks)
-    parameters = int(_number(entry.get("parameters"), where))
-    return Candidate("", errors, parameters, entry.get("converged") is True)
+    if entry.get("chosen") not in [candidate.name for candidate in candidates]:
+        raise _EntryError(f"{where} chose none of its candidates")
+    if entry.get("horizon") is None:
+        raise _EntryError(f"{where} has no `horizon`")
+    known = {"candidates": candidates, "unit": unit}
+    selection: Selection = _read_record(Selection, {"reason": ""} | entry, where, **known)
+    return selection
 
 
-def _fit(value: object, name: str) -> FitRecord:
-    where = f"fit of {name}"
-    entry = _mapping(value, where)
-    at_bounds, warnings, lost = (
-        _texts(entry.get(key, []), where) for key in ("at_bounds", "warnings", "lost")
-    )
-    return FitRecord(
-        status=_text(entry.get("status", "unknown"), where),
-        converged=entry.get("converged") is True,
-        residual=_number(entry.get("residual", math.nan), where),
-        residual_unit=_text(entry.get("residual_unit", ""), where),
-        at_bounds=at_bounds, warnings=warnings, lost=lost,
-        plant=_each(entry.get("plant", {}), where, _number),
-        intervals=_each(entry.get("intervals", {}), where, _interval),
-    )  # fmt: skip
-
-
-def _interval(value: object, where: str) -> tuple[float, float]:
-    if not isinstance(value, list) or len(value) != 2:
-        raise _EntryError(f"an interval of {where} needs two ends")
-    low, high = value
-    return -math.inf if low is None else _number(low, where), _error(high, where)
-
-
-def _coefficients(value: object, name: str, joints: int) -> dict[str, dict[str, tuple[float, ...]]]:
-    def values(given: object, at: str) -> tuple[float, ...]:
-        if not isinstance(given, list) or len(given) != joints:
-            raise _EntryError(f"{at} need a value for each of {joints} joints")
-        return tuple(_number(x, at) for x in given)
-
-    where = f"coefficients of {name}"
-    entry = _mapping(value, where)
+def _coefficients(value: Any, where: str, joints: int) -> Coefficients:
+    entry = _read(dict[str, Any], value, where)
     sets = entry if all(isinstance(v, dict) for v in entry.values()) else {"always": entry}
-    return {label: _each(of, where, values) for label, of in sets.items()}
+    found: Coefficients = _read(Coefficients, sets, where)
+    if any(len(values) != joints for of in found.values() for values in of.values()):
+        raise _EntryError(f"{where} need a value for each of {joints} joints")
+    return found
 
 
 def _models(
@@ -288,37 +245,51 @@ def _models(
     return found, notes
 
 
-def _mapping(value: object, where: str) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise _EntryError(f"{where} must be an object")
+def _read(kind: Any, value: Any, where: str) -> Any:
+    """A JSON value as a type, such as `dict[str, float]`; null is an infinite number.
+
+    Raises:
+        _EntryError: if it is of another type.
+    """
+    origin, of = typing.get_origin(kind), typing.get_args(kind)
+    if kind is Any:
+        return value
+    if origin is types.UnionType:
+        return None if value is None else _read(of[0], value, where)
+    if origin is tuple:
+        if not isinstance(value, list):
+            raise _EntryError(f"{where} must be a list")
+        if of[-1] is not ... and len(value) != len(of):
+            raise _EntryError(f"{where} needs {len(of)} values")
+        return tuple(_read(of[0], entry, where) for entry in value)
+    if kind is dict or origin is dict or is_dataclass(kind):
+        if not isinstance(value, dict):
+            raise _EntryError(f"{where} must be an object")
+        if is_dataclass(kind):
+            return _read_record(kind, value, where)
+        return {k: _read(of[1], v, f"{where}, {k}") for k, v in value.items()} if of else value
+    if kind in (float, int):
+        if value is None and kind is float:
+            return math.inf
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise _EntryError(f"{where} must be a number")
+        # An int may be too large for a comparison with floats.
+        if abs(value) > LARGEST_NUMBER:
+            raise _EntryError(f"{where} is too large a number")
+        return kind(value)
+    if not isinstance(value, kind):
+        raise _EntryError(f"{where} must be {'text' if kind is str else 'true or false'}")
     return value
 
 
-def _each(value: object, where: str, read: Callable[[Any, str], T]) -> dict[str, T]:
-    return {key: read(entry, f"{where}, {key}") for key, entry in _mapping(value, where).items()}
-
-
-def _text(value: object, where: str) -> str:
-    if not isinstance(value, str):
-        raise _EntryError(f"{where} must be text")
-    return value
-
-
-def _texts(value: object, where: str) -> tuple[str, ...]:
-    if not isinstance(value, list):
-        raise _EntryError(f"{where} must be a list of texts")
-    return tuple(_text(v, where) for v in value)
-
-
-def _number(value: object, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise _EntryError(f"{where} must be a number")
-    # An int may be too large for a comparison with floats.
-    if abs(value) > LARGEST_NUMBER:
-        raise _EntryError(f"{where} is too large a number")
-    return float(value)
-
-
-def _error(value: object, where: str) -> float:
-    """A number that JSON writes as null where it is infinite."""
-    return math.inf if value is None else _number(value, where)
+def _read_record(kind: Any, entry: Mapping[str, Any], where: str, **known: Any) -> Any:
+    """A dataclass from the entries of its fields' names, and from fields that are known."""
+    types_of = typing.get_type_hints(kind)
+    for of in fields(kind):
+        if of.name in known:
+            continue
+        if of.name in entry:
+            known[of.name] = _read(types_of[of.name], entry[of.name], f"{where}, {of.name}")
+        elif of.default is MISSING and of.default_factory is MISSING:
+            raise _EntryError(f"{where} has no `{of.name}`")
+    return kind(**known)

@@ -117,7 +117,7 @@ def test_ctrl_c_ends_every_process_at_once(tmp_path: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "nfriction", *words], cwd=tmp_path, text=True,
         start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])},
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])},
     )  # fmt: skip
     log = tmp_path / "log"
     while not (log.exists() and "fit NLFM | fit Stribeck" in log.read_text()):

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from nfriction import NFLFM, plots
-from nfriction.plots import dark, style
+from nfriction.plots import style
 from nfriction.signals import Motion
 
 
@@ -21,7 +21,7 @@ def luminance(colour: object) -> float:
 
 def contrast(colour: object) -> float:
     """Against the ground (WCAG 2)."""
-    one, other = sorted((luminance(colour), luminance(dark.GROUND)))
+    one, other = sorted((luminance(colour), luminance(style.DARK_GROUND)))
     return (other + 0.05) / (one + 0.05)
 
 

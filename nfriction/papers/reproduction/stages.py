@@ -244,7 +244,7 @@ def judge(bench: Bench, model: FrictionModel) -> tuple[dict[str, Any], dict[str,
             driven = driven_by_measurement(bench, model, recording)
         error = RMSE.of(driven - recording.q).to_dict()
         scores[name] = found.to_dict() | {"split": split, "measured_drive": error}
-        if split == "held_out":
+        if split == "test":
             simulated |= {name: found.simulated, f"{name}_measured_drive": driven}
     return scores, simulated
 

@@ -1,4 +1,4 @@
-"""Figures of how far simulated positions lie from measured ones."""
+"""Figures of position errors: along recordings, by model and joint, by horizon."""
 
 from collections.abc import Mapping
 
@@ -23,11 +23,11 @@ def positions(
 ) -> Figure:
     """Measured against simulated position, a pair of panels a joint: position, error below.
 
-    A panel spans what was measured, and the errors of models that did not diverge, up to half of
-    that; what lies beyond, such as a simulation without friction, is cut off.
+    A panel spans the measured range, and the errors of models that did not diverge, up to half of
+    that; larger ones, such as of a simulation without friction, are cut off.
 
     Args:
-        recording: what was measured, in its own convention and unit.
+        recording: the measured motion, in its own convention and unit.
         scores: scores on this very recording by model name, simulated positions included.
         width: of the figure [in].
 
@@ -47,7 +47,7 @@ def positions(
         2 * joints, 1, width, 0.4 + 1.7 * joints, sharex=True, height_ratios=[1.5, 1] * joints
     )
     looks = style.looks(scores)
-    # Errors that diverge or know of no friction would leave nothing to see of the others.
+    # Errors that diverge or ignore friction would hide all others.
     whole = {n for n, s in scores.items() if not np.isfinite(s.diverged_at)} or set(scores)
     whole = whole - {NO_FRICTION} or whole
     for joint, name in enumerate(recording.names):
@@ -71,8 +71,7 @@ def positions(
             ax.margins(x=0.01)
     axes[-1, 0].set_xlabel("time [s]")
     figure.align_ylabels(axes[:, 0])
-    handles = [Line2D([], [], **style.MEASURED)]
-    handles += [Line2D([], [], **looks[name].line) for name in scores]
+    handles = [Line2D([], [], **style.MEASURED), *(looks[name].handle for name in scores)]
     style.legend(figure, handles, ["measured", *(_label(n, s) for n, s in scores.items())])
     return figure
 
@@ -132,8 +131,8 @@ def horizon_curve(
 ) -> Figure:
     """Position error over the length of the simulation, by model.
 
-    The band at the free run is what one encoder count at the start does to the best model: below
-    it, differences between models mean nothing.
+    The band at the free run is the effect of one encoder count in the initial state on the best
+    model: differences between models below it are not meaningful.
 
     Args:
         comparison: fits and scores.
@@ -172,7 +171,7 @@ def horizon_curve(
         )  # fmt: skip
     if floor is not None:
         ends = [x[-1] - 0.3, x[-1] + 0.3]
-        band = ax.fill_between(ends, bottom, factor * floor, color="#bbbbbb", alpha=0.6, lw=0)
+        band = ax.fill_between(ends, bottom, factor * floor, color=style.BAND, alpha=0.6, lw=0)
         handles.append(band)
         models = [*models, "one encoder count"]
     ax.set_xlim(-0.3, x[-1] + 0.3)
