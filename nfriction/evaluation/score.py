@@ -112,8 +112,8 @@ def score(
         initial_state: q0 and qd0 of the free run in the recording's convention, (joint,) each;
             default from the smoothed motion.
         horizons: lengths of windows [s]; those longer than the recording are left out.
-        scheme: of the integration, see `rollout`; `"stop"` where joints come to rest off their
-            balance, which a smoothed sign lets creep back.
+        scheme: of the integration, see `rollout`; `"time_stepping"` where joints come to rest
+            off their balance, which a smoothed sign lets creep back.
 
     Returns:
         Errors in the recording's coordinates and unit.
@@ -125,7 +125,7 @@ def score(
     if initial_state is not None:
         q0 = convention.position_to_joint(np.asarray(initial_state[0]), first_link)
         qd0 = convention.rate_to_joint(np.asarray(initial_state[1]), first_link)
-    if scheme == "stop":
+    if scheme == "time_stepping":
         substeps: int | None = max(1, math.ceil(recording.longest_step / STOP_STEP))
     else:
         substeps = _substeps(plant, friction, recording.longest_step, recording.name)
@@ -198,7 +198,7 @@ def _simulate(
     with torch.no_grad():
         run = rollout(
             plant, friction, torch.tensor(q0), torch.tensor(qd0), torque,
-            sample_time=torch.tensor(step), substeps=substeps, scheme=scheme, memory=memory,
+            sample_time=torch.tensor(step), substeps=substeps, scheme=scheme, hidden_state=memory,
         )  # fmt: skip
     return run.q.numpy(), run.diverged_at.numpy()
 

@@ -87,9 +87,9 @@ class LinearAxis(Plant):
         return torch.ones_like(q)
 
     @torch.no_grad()
-    def max_inverse_inertia(self) -> Tensor:
-        """1 / mass [1/kg], (*batch, 1); RK4 is stable below 2.785 / (dt * mobility) [N s/m]."""
-        return 1 / self.mass
+    def decay_rate(self, damping: Tensor) -> Tensor:
+        """Decay of the velocity under a friction slope [N s/m] of shape (*batch, 1), [1/s]."""
+        return (damping.clamp(min=0.0).to(self.mass) / self.mass).amax(-1)
 
     def extra_repr(self) -> str:
         """Name, mass and offset."""

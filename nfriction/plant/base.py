@@ -96,9 +96,9 @@ class Plant(nn.Module):
         """Normal load of each joint over its load at rest [-]."""
         raise NotImplementedError(f"{type(self).__name__} does not say what its joints carry.")
 
-    def max_inverse_inertia(self) -> Tensor:
-        """Largest acceleration per torque of each joint, (*batch, joint)."""
-        raise NotImplementedError(f"{type(self).__name__} does not say how mobile it is.")
+    def decay_rate(self, damping: Tensor) -> Tensor:
+        """Fastest decay of velocities [1/s] that slopes (*batch, joint) of friction can cause."""
+        raise NotImplementedError(f"{type(self).__name__} does not say how fast friction acts.")
 
     def replace(self, **buffers: Tensor) -> Self:
         """A shallow copy with some buffers swapped; this plant stays as it is.

@@ -19,7 +19,7 @@ from nfriction.plant.coordinates import (
 )
 from nfriction.plant.drag import drag_forces
 from nfriction.plant.encoder import Turned, true_angle
-from nfriction.plant.gear import by_velocity, delivered, demanded, passed_on, refuse_powered
+from nfriction.plant.gear import delivered, demanded, refuse_powered
 from nfriction.plant.inertia import inertia_tensors
 from nfriction.plant.linear import Matrix, dot, entries, multiply, solve, stack, stack_matrix
 from nfriction.plant.planar import (
@@ -32,8 +32,7 @@ from nfriction.plant.planar import (
     pose_of,
     static_moment,
 )
-from nfriction.plant.poses import refuse_indefinite, turning_poses
-from nfriction.plant.slopes import PlantSlopes, planar_slopes
+from nfriction.plant.poses import fastest_mode, refuse_indefinite
 
 # Of gravity [m/s^2]: loads are told in weights.
 WEIGHTLESS = 1e-6
@@ -306,39 +305,26 @@ class PendulumChain(Plant):
         load = (self.load_lever * rate * rate - angle.cos()).abs()
         return torch.cat([torch.ones_like(load[..., :1]), load], -1) if self.first_link else load
 
-    def has_slopes(self) -> bool:
-        """Whether `slopes` knows all terms of this chain; what a subclass adds it does not."""
-        more = self.first_link or self.has_drag or self.has_eccentricity
-        return type(self) is PendulumChain and not more
-
     @torch.no_grad()
-    def slopes(self, q: Tensor, qd: Tensor, qdd: Tensor) -> PlantSlopes:
-        """Derivatives of `inverse_dynamics` and `load` at a motion (*batch, joint)."""
-        gain, loss = self.torque_gain, self.gear_loss
-        if self.has_gear:
-            shape = torch.broadcast_shapes(q.shape, gain.shape, loss.shape)
-            q, qd, qdd = (x.expand(shape) for x in (q, qd, qdd))
-        geometry = self._geometry(q)
-        moment, lever = self.gravity_moment.unbind(-1), self.load_lever.unbind(-1)
-        mass = self._mass(geometry)
-        slopes = planar_slopes(geometry.pose, geometry.coupling, mass, moment, lever, qd, qdd)
-        if not self.has_gear:
-            return slopes
-        tau = self.inverse_dynamics(q, qd, qdd)
-        return slopes.geared(passed_on(tau, qd, gain, loss), by_velocity(tau, qd, loss))
+    def decay_rate(self, damping: Tensor) -> Tensor:
+        """Fastest decay of velocities that joint friction can cause in any pose [1/s].
 
-    @torch.no_grad()
-    def max_inverse_inertia(self) -> Tensor:
-        """Largest acceleration of a joint by its own torque, (*batch, joint) [rad/s^2 per N m].
+        The largest eigenvalue of M^-1 D over a grid of poses, of at most 5 degrees for one or two
+        turning angles and coarser for more, with D the slopes of friction over velocity, times
+        what a gear makes of the torque. Negative slopes count as zero, which bounds it from above.
 
-        Over poses, the largest diagonal entry of M^-1, times what a gear makes of the torque.
-
-        Explicit RK4 stays stable while a friction curve is flatter than 2.785 / (dt * mobility).
-        Searched on a grid of at most 5 degrees for one or two turning angles, coarser for more.
+        Args:
+            damping: slope of each joint's friction torque [N m s/rad], (*batch, joint).
+        Returns:
+            Shape (*batch,), the largest over all values of a plant with batches of buffers.
         """
-        inverse = torch.linalg.inv(self.mass_matrix(turning_poses(self.joints).to(self.armature)))
-        most = self.torque_gain * (1.0 + self.gear_loss)
-        return (most * inverse.diagonal(dim1=-2, dim2=-1)).amax(-2)
+        effective = damping.clamp(min=0.0)
+        if not effective.isfinite().all():
+            return effective.amax(-1)
+        rows = effective.reshape(-1, self.joints).to(self.armature)
+        gear = self.torque_gain * (1.0 + self.gear_loss)
+        found = [fastest_mode(self, gear * row) for row in rows]
+        return torch.stack(found).reshape(damping.shape[:-1])
 
     def extra_repr(self) -> str:
         """Name, links, arm and what is switched on."""

@@ -29,13 +29,6 @@ def passed_on(torque: Tensor, qd: Tensor, gain: Tensor, loss: Tensor) -> Tensor:
     return gain * (1.0 - loss * torque.sign() * torch.tanh(qd / TURN))
 
 
-def by_velocity(tau: Tensor, qd: Tensor, loss: Tensor) -> Tensor:
-    """Derivative of the torque demanded, `tau`, by the joint's own velocity."""
-    sense = torch.tanh(qd / TURN)
-    turning = loss * tau.abs() * (1.0 - sense * sense) / TURN
-    return turning / (1.0 - loss * tau.sign() * sense)
-
-
 def refuse_powered(buffers: Mapping[str, Tensor]) -> None:
     """Refuse gears that would give power, or turn a torque round.
 

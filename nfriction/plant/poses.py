@@ -1,9 +1,68 @@
-"""What holds for the mass matrix over all poses of a chain."""
+"""Bounds on the mass matrix over all poses of a chain."""
 
 import math
+from typing import Any
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
+
+
+class _Poses:
+    """M^-1 of a chain over a grid of poses.
+
+    Attributes:
+        values: of the chain's buffers, which it belongs to.
+        inverse: M^-1, (batch, pose, joint, joint).
+        squares: its squared entries, flat.
+    """
+
+    def __init__(self, plant: Any, values: Tensor) -> None:
+        mass = plant.mass_matrix(turning_poses(plant.joints).to(values))
+        self.values = values
+        self.inverse = torch.linalg.inv(mass).reshape(-1, *mass.shape[-3:])
+        self.squares = self.inverse.square().flatten(-2)
+        self._damping: Tensor | None = None
+        self._rate = values.new_zeros(())
+
+    def fastest_mode(self, damping: Tensor) -> Tensor:
+        """Largest eigenvalue of M^-1 D, with D diagonal, (batch, 1, joint), and not negative."""
+        if self._damping is None or not torch.equal(damping, self._damping):
+            self._damping, self._rate = damping, self._largest(damping.mT * damping)
+        return self._rate
+
+    def _largest(self, products: Tensor) -> Tensor:
+        """The eigenvalue for products of the entries of D, (batch, joint, joint)."""
+        # D^1/2 M^-1 D^1/2 has the same eigenvalues, and is symmetric: its Frobenius norm bounds
+        # them, so that few poses need theirs.
+        bound = (self.squares @ products.flatten(-2).unsqueeze(-1)).squeeze(-1)
+        scale = products.sqrt().expand(len(bound), -1, -1)
+        inverse = self.inverse.expand(len(bound), -1, -1, -1)
+
+        def largest(where: Tensor) -> Tensor:
+            batch, pose = where.nonzero(as_tuple=True)
+            return torch.linalg.eigvalsh(inverse[batch, pose] * scale[batch]).amax()
+
+        least = largest(bound == bound.amax())
+        return largest(bound >= (least * (1 - 1e-9)).square())
+
+
+# Kept, as every rollout asks and the grid costs as much as thousands of compiled steps.
+_poses: WeakKeyDictionary[Any, _Poses] = WeakKeyDictionary()
+
+
+def fastest_mode(plant: Any, damping: Tensor) -> Tensor:
+    """Largest eigenvalue of M^-1 D over a grid of poses [1/s].
+
+    Args:
+        plant: the chain.
+        damping: diagonal of D, not negative [N m s/rad], (joint,) or (*batch of the plant, joint).
+    """
+    values = torch.cat([buffer.reshape(-1) for buffer in plant.buffers()])
+    known = _poses.get(plant)
+    if known is None or not torch.equal(known.values, values):
+        known = _poses[plant] = _Poses(plant, values)
+    return known.fastest_mode(damping.reshape(-1, 1, plant.joints))
 
 
 def turning_poses(joints: int) -> Tensor:
