@@ -17,8 +17,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from nfriction.plant.linear import Matrix, dot
-from nfriction.plant.planar import Pose
+from nfriction.plant.dynamics import Matrix, Pose, dot
 
 
 @dataclass(frozen=True)

@@ -10,31 +10,39 @@ from torch import Tensor
 
 from nfriction.plant.arm import Arm, ArmTerms, arm_terms, with_arm_bias, with_arm_mass
 from nfriction.plant.base import Plant, check_keys, number, vector
-from nfriction.plant.coordinates import (
-    absolute,
-    joint_forces,
-    joint_matrix,
-    link_forces,
-    relative,
-)
 from nfriction.plant.drag import drag_forces
-from nfriction.plant.encoder import Turned, true_angle
-from nfriction.plant.gear import delivered, demanded, refuse_powered
-from nfriction.plant.inertia import inertia_tensors
-from nfriction.plant.linear import Matrix, dot, entries, multiply, solve, stack, stack_matrix
-from nfriction.plant.planar import (
+from nfriction.plant.dynamics import (
+    Matrix,
     Pose,
+    absolute,
     add_centrifugal,
     add_rotors,
     coupling_constants,
+    dot,
+    entries,
     gravity_forces,
+    joint_forces,
+    joint_matrix,
+    link_forces,
+    multiply,
     planar_mass,
     pose_of,
+    relative,
+    solve,
+    stack,
+    stack_matrix,
     static_moment,
 )
-from nfriction.plant.poses import fastest_mode, refuse_indefinite
+from nfriction.plant.gears import (
+    EncoderCorrection,
+    check_gear,
+    correct_encoder,
+    joint_torque,
+    motor_torque,
+)
+from nfriction.plant.inertia import fastest_mode, inertia_tensors, require_positive_definite
 
-# Of gravity [m/s^2]: loads are told in weights.
+# Least gravity [m/s^2], as loads are in units of a link's weight.
 WEIGHTLESS = 1e-6
 
 
@@ -195,7 +203,7 @@ class PendulumChain(Plant):
             "armature": rotor.tolist() if self.has_armature else None,
         }
         aligned = self.mass_matrix(rotor.new_zeros(self.joints))
-        refuse_indefinite(self.inertia_coupling, aligned[first:, first:])
+        require_positive_definite(self.inertia_coupling, aligned[first:, first:])
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         """Mass matrix M(q) [kg m^2].
@@ -238,15 +246,16 @@ class PendulumChain(Plant):
         """
         self._check(q=q, qd=qd, tau=tau)
         if self.has_eccentricity:
-            turned = self._turned(q)
-            return turned.reading(qd, self._accelerate(turned.angle, turned.slope * qd, tau))
+            corrected = self._corrected(q)
+            qdd = self._accelerate(corrected.angle, corrected.slope * qd, tau)
+            return corrected.read_acceleration(qd, qdd)
         return self._accelerate(q, qd, tau)
 
     def _accelerate(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
         """True accelerations at true angles and rates."""
         geometry = self._geometry(q)
         if self.has_gear:
-            tau = delivered(tau, qd, self.torque_gain, self.gear_loss)
+            tau = joint_torque(tau, qd, self.torque_gain, self.gear_loss)
         force = link_forces((tau + self.torque_offset).unbind(-1), self.first_link)
         bias = self._bias(geometry, qd)
         rhs = [f - h for f, h in zip(force, bias, strict=True)]
@@ -264,14 +273,15 @@ class PendulumChain(Plant):
         """
         self._check(q=q, qd=qd, qdd=qdd)
         if self.has_eccentricity:
-            turned = self._turned(q)
-            q, qd, qdd = turned.angle, turned.slope * qd, turned.acceleration(qd, qdd)
+            corrected = self._corrected(q)
+            true_qdd = corrected.true_acceleration(qd, qdd)
+            q, qd, qdd = corrected.angle, corrected.slope * qd, true_qdd
         geometry = self._geometry(q)
         inertial = multiply(self._mass(geometry), absolute(qdd.unbind(-1), self.first_link))
         force = [f + h for f, h in zip(inertial, self._bias(geometry, qd), strict=True)]
         torque = stack(joint_forces(force, self.first_link)) - self.torque_offset
         if self.has_gear:
-            torque = demanded(torque, qd, self.torque_gain, self.gear_loss)
+            torque = motor_torque(torque, qd, self.torque_gain, self.gear_loss)
         return torque
 
     def energy(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
@@ -348,15 +358,15 @@ class PendulumChain(Plant):
         self.has_gear = self.has_gear or bool({"torque_gain", "gear_loss"} & set(names))
         self._slender = self._slender and "inertia_tensor" not in names
 
-    def _turned(self, q: Tensor) -> Turned:
-        return true_angle(q, self.encoder_zero, self.encoder_cosine, self.encoder_sine)
+    def _corrected(self, q: Tensor) -> EncoderCorrection:
+        return correct_encoder(q, self.encoder_zero, self.encoder_cosine, self.encoder_sine)
 
     def _true(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
         """True angles and rates of what the encoders read."""
         if not self.has_eccentricity:
             return q, qd
-        turned = self._turned(q)
-        return turned.angle, turned.slope * qd
+        corrected = self._corrected(q)
+        return corrected.angle, corrected.slope * qd
 
     def _geometry(self, q: Tensor) -> _Geometry:
         pose = pose_of((q + self.angle_offset).unbind(-1)[self.first_link :])
@@ -397,7 +407,7 @@ class PendulumChain(Plant):
     @classmethod
     def _check_buffers(cls, values: Mapping[str, Tensor]) -> None:
         super()._check_buffers(values)
-        refuse_powered(values)
+        check_gear(values)
 
     @classmethod
     def _parse(cls, given: dict[str, Any]) -> dict[str, Any]:
@@ -405,7 +415,3 @@ class PendulumChain(Plant):
             return given
         check_keys("arm", given["arm"], ("inertia", "length"))
         return given | {"arm": Arm(**{k: number(k, v) for k, v in given["arm"].items()})}
-
-
-def _numbers(values: object) -> Any:
-    return torch.as_tensor(values, dtype=torch.float64).tolist()

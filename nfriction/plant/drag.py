@@ -10,8 +10,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from nfriction.plant.linear import dot
-from nfriction.plant.planar import Pose
+from nfriction.plant.dynamics import Pose, dot
 
 _TINY = 1e-30  # keeps 0/0 away where a whole link is at rest; its numerators are cubic in v
 
