@@ -20,8 +20,8 @@ class LinearAxis(Plant):
     Attributes:
         mass: (1,) [kg].
         torque_offset: (1,) [N].
-        asymmetry: by how much the drive and guide resist more one way than the other, (1,) [N s/m];
-            zero unless `replace` sets it. With viscous friction B they are passive up to B.
+        asymmetry: difference in viscous resistance between the two directions, (1,) [N s/m]; zero
+            unless `replace` sets it. With viscous friction B it is passive up to B.
     """
 
     kind = "axis"
@@ -55,7 +55,7 @@ class LinearAxis(Plant):
         return torch.broadcast_tensors(self.mass, q)[0].unsqueeze(-1)
 
     def bias(self, q: Tensor, qd: Tensor) -> Tensor:
-        """What depends on the direction of motion [N], (*batch, 1)."""
+        """Force that depends on the direction of motion [N], (*batch, 1)."""
         self._check(q=q, qd=qd)
         return self.asymmetry * qd.abs() + torch.zeros_like(q)
 

@@ -42,6 +42,7 @@ from nfriction.plant.gears import (
 )
 from nfriction.plant.inertia import fastest_mode, inertia_tensors, require_positive_definite
 
+_PER_JOINT = ("angle_offset", "encoder_cosine", "encoder_sine", "gear_loss", "torque_offset")
 # Least gravity [m/s^2], as loads are in units of a link's weight.
 WEIGHTLESS = 1e-6
 
@@ -55,13 +56,12 @@ class _Geometry(NamedTuple):
 class PendulumChain(Plant):
     """Frictionless equations of motion M(q) qdd + bias(q, qd) = tau + torque_offset.
 
-    Behind gears, tau is what they deliver of the drives' torque.
-
     Joint coordinates: with a free arm, column 0 is its angle about the vertical; the first link
     is measured from upright, each further one relative to the link before. Friction is not part
-    of a plant (a rollout subtracts it from tau); air drag is, once `replace` sets it. So are
-    eccentric encoders: all methods then take and give what the encoders read, except that
-    `mass_matrix`, `bias` and `gravity` are those over the true angles at that reading.
+    of a plant (a rollout subtracts it from tau). Air drag, gears and eccentric encoders are, once
+    `replace` sets them: with gears, tau is the torque at the joint; with eccentric encoders, inputs
+    and outputs are encoder angles, except that `mass_matrix`, `bias` and `gravity` are those over
+    the true angles at that reading.
 
     Args:
         mass: of each link [kg].
@@ -81,9 +81,9 @@ class PendulumChain(Plant):
         gravity_moment: g b_i, (links,) [N m].
         armature: (joints,) [kg m^2].
         angle_offset: added to q before the geometry is evaluated, (joints,) [rad].
-        encoder_cosine, encoder_sine: eccentricity of the encoders, see `encoder`, (joints,) [rad].
-        torque_gain, gear_loss: what becomes of tau before it reaches the joints, see `gear`,
-            (joints,) [-]. Friction is told in the drives' torque, as a controller commands it.
+        encoder_cosine, encoder_sine: eccentricity of the encoders, see `gears`, (joints,) [rad].
+        torque_gain, gear_loss: from the motor's torque to the joint's, see `gears`, (joints,) [-].
+            Friction is expressed at the motor side, as a controller commands it.
         torque_offset: added to tau at the joints, (joints,) [N m].
         drag_linear, drag_quadratic: k1 [N s/m^2], k2 [N s^2/m^3] per link.
         length: (links,) [m].
@@ -141,8 +141,7 @@ class PendulumChain(Plant):
         gravity = number("gravity", gravity, positive=True)
         if gravity < WEIGHTLESS:
             raise ValueError(f"`gravity` must be at least {WEIGHTLESS:g} m/s^2, got {gravity:g}.")
-        links = len(m)
-        first = 1 if arm else 0
+        links, first = len(m), int(arm is not None)
         super().__init__(
             first + links,
             joint_names=joint_names,
@@ -159,30 +158,28 @@ class PendulumChain(Plant):
                        self.joints)  # fmt: skip
         if (rotor < 0).any():
             raise ValueError(f"`armature` must not be negative, got {rotor.tolist()}.")
-        moment = static_moment(m, size, centre)
-        zero = torch.zeros(links, dtype=torch.float64)
-        self.register_buffer("inertia_coupling", coupling_constants(m, size, centre, tensors[:, 2]))
-        self.register_buffer("gravity_moment", gravity * moment)
-        self.register_buffer("armature", rotor)
-        self.register_buffer("angle_offset", torch.zeros_like(rotor))
-        self.register_buffer("encoder_cosine", torch.zeros_like(rotor))
-        self.register_buffer("encoder_sine", torch.zeros_like(rotor))
+        buffers = {
+            "inertia_coupling": coupling_constants(m, size, centre, tensors[:, 2]),
+            "gravity_moment": gravity * static_moment(m, size, centre),
+            "armature": rotor,
+            **{name: torch.zeros_like(rotor) for name in _PER_JOINT},
+            "torque_gain": torch.ones_like(rotor),
+            "drag_linear": torch.zeros_like(m),
+            "drag_quadratic": torch.zeros_like(m),
+            "length": size,
+            "load_lever": centre / gravity,
+        }
+        if arm:
+            buffers["arm_inertia"] = m.sum() * arm.length**2 + arm.inertia
+            buffers["arm_lever"] = m.new_tensor(arm.length / gravity)
+            buffers["inertia_tensor"] = tensors
+        for key, value in buffers.items():
+            self.register_buffer(key, value)
         hanging = torch.ones_like(rotor)
         hanging[first] = -1.0
         self.register_buffer("encoder_zero", hanging, persistent=False)
-        self.register_buffer("torque_gain", torch.ones_like(rotor))
-        self.register_buffer("gear_loss", torch.zeros_like(rotor))
-        self.register_buffer("torque_offset", torch.zeros_like(rotor))
-        self.register_buffer("drag_linear", zero)
-        self.register_buffer("drag_quadratic", zero.clone())
-        self.register_buffer("length", size)
-        self.register_buffer("load_lever", centre / gravity)
-        if arm:
-            self.register_buffer("arm_inertia", m.sum() * arm.length**2 + arm.inertia)
-            self.register_buffer("arm_lever", m.new_tensor(arm.length / gravity))
-            self.register_buffer("inertia_tensor", tensors)
-        # What is not there costs nothing: Python flags, settled here and by `replace`, never in a
-        # step.
+        # Absent terms cost nothing: they are Python flags, set here and by `replace`, never
+        # tested by value within a step.
         self.has_armature = bool(rotor.any())
         self.has_gear = False
         self.has_drag = False
@@ -229,9 +226,8 @@ class PendulumChain(Plant):
     def gravity(self, q: Tensor) -> Tensor:
         """The gravity part of the bias [N m], (*batch, joint): the potential's gradient."""
         self._check(q=q)
-        force = gravity_forces(
-            self._geometry(self._true(q, q)[0]).pose, self.gravity_moment.unbind(-1)
-        )
+        pose = self._geometry(self._true(q, q)[0]).pose
+        force = gravity_forces(pose, self.gravity_moment.unbind(-1))
         own = [torch.zeros_like(force[0])] * self.first_link
         return stack(joint_forces([*own, *force], self.first_link))
 
@@ -259,7 +255,7 @@ class PendulumChain(Plant):
         force = link_forces((tau + self.torque_offset).unbind(-1), self.first_link)
         bias = self._bias(geometry, qd)
         rhs = [f - h for f, h in zip(force, bias, strict=True)]
-        # Every acceleration hangs on every input, so all share one shape: no broadcast needed.
+        # Every acceleration depends on every input, so all share one shape without broadcasting.
         return torch.stack(relative(solve(self._mass(geometry), rhs), self.first_link), -1)
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:

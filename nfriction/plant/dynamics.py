@@ -186,11 +186,7 @@ def add_centrifugal(
 def coupling_constants(mass: Tensor, length: Tensor, com: Tensor, inertia: Tensor) -> Tensor:
     """Constants a_ij = L_i b_j (i < j), a_ii = m_i l_i^2 + (later masses) L_i^2 + Izz_i [kg m^2].
 
-    Args:
-        mass, length, com: per link [kg, m, m]; `length` joint to joint, `com` joint to mass centre.
-        inertia: about the mass centre and the joint axis [kg m^2].
-    Returns:
-        Shape (links, links).
+    Per link: m `mass`, L `length` joint to joint, l `com` joint to mass centre, Izz `inertia`.
     """
     off_diagonal = torch.outer(length, static_moment(mass, length, com)).triu(1)
     diagonal = mass * com**2 + _mass_beyond(mass) * length**2 + inertia

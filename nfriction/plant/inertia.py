@@ -10,8 +10,6 @@ from torch import Tensor
 
 from nfriction.plant.base import vector
 
-COLUMNS = ("Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
-
 
 def inertia_tensors(inertia: object, links: int) -> Tensor:
     """Inertia about the mass centre as rows (Ixx, Iyy, Izz, Ixy, Ixz, Iyz) [kg m^2].
@@ -22,11 +20,7 @@ def inertia_tensors(inertia: object, links: int) -> Tensor:
     Args:
         inertia: None (point masses), one Izz per link (slender rods: Iyy = Izz, Ixx = 0), or
             (links, 6) numbers in the order above.
-        links: how many rows.
-    Returns:
-        float64 tensor of shape (links, 6).
-    Raises:
-        ValueError: for another shape.
+        links: number of rows.
     Warns:
         UserWarning: where no rigid body has such an inertia.
     """
@@ -43,15 +37,15 @@ def inertia_tensors(inertia: object, links: int) -> Tensor:
         rows[:, 1] = rows[:, 2] = vector("inertia", given, links)
     else:
         raise ValueError(
-            f"`inertia` must be None, ({links},) for Izz per link or ({links}, 6) for {COLUMNS}, "
-            f"got shape {tuple(given.shape)}."
+            f"`inertia` must be None, ({links},) for Izz per link or ({links}, 6) for "
+            f"(Ixx, Iyy, Izz, Ixy, Ixz, Iyz), got shape {tuple(given.shape)}."
         )
     _warn_impossible(rows)
     return rows
 
 
 def _warn_impossible(rows: Tensor) -> None:
-    """A body's principal inertias are not negative, and none exceeds the sum of the others."""
+    """Warn unless principal inertias are >= 0 and obey the triangle inequality."""
     xx, yy, zz, xy, xz, yz = rows.unbind(-1)
     matrix = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).reshape(-1, 3, 3)
     small, middle, large = torch.linalg.eigvalsh(matrix).unbind(-1)
@@ -106,7 +100,7 @@ class _Poses:
         return largest(bound >= (least * (1 - 1e-9)).square())
 
 
-# Kept, as every rollout asks and the grid costs as much as thousands of compiled steps.
+# Kept, as every rollout needs them and the grid costs as much as thousands of compiled steps.
 _poses: WeakKeyDictionary[Any, _Poses] = WeakKeyDictionary()
 
 
@@ -134,7 +128,11 @@ def configuration_grid(joints: int) -> Tensor:
         return torch.zeros(1, 1)
     count = min(72, max(4, 4 * int(20_000 ** (1 / turning) / 4)))
     axis = torch.arange(count, dtype=torch.float64) * (math.tau / count)
-    poses = torch.cartesian_prod(*[axis] * turning).reshape(-1, turning)
+    if turning > 7:  # four angles for each would be too many: some of these poses at random
+        chosen = torch.randint(4, (2_000, turning), generator=torch.Generator().manual_seed(0))
+        poses = axis[chosen]
+    else:
+        poses = torch.cartesian_prod(*[axis] * turning).reshape(-1, turning)
     return torch.nn.functional.pad(poses, (1, 0))
 
 

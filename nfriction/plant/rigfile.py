@@ -28,7 +28,7 @@ from nfriction.plant.chain import PendulumChain
 _KINDS: dict[str, type[PendulumChain] | type[LinearAxis]] = {
     plant.kind: plant for plant in (PendulumChain, LinearAxis)
 }
-# Far beyond any rig; a chain's matrices take memory with the square of its links.
+# Far beyond any rig; the memory of a chain's matrices grows with the square of its links.
 LARGEST_FILE, MOST_LINKS, LARGEST_NUMBER = 2**20, 100, 1e30
 _TEXTS, _LISTS_OF_TEXT, _TABLES = (
     ("kind", "name"),

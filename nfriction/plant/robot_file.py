@@ -27,7 +27,7 @@ GRAVITY = np.array([0.0, 0.0, -9.81])
 """URDF has none; its world has z up (REP 103) [m/s^2]."""
 
 _HINGES = ("revolute", "continuous")
-# What makes many bodies of a line, or reads other files as descriptions.
+# Elements that generate many bodies, or read other files as descriptions.
 _NO_CHAIN = ("replicate", "composite", "flexcomp", "attach", "plugin", "extension", "include")
 
 
@@ -35,14 +35,11 @@ def read_robot(path: str | Path) -> PendulumChain:
     """The chain of a URDF or MJCF, with joint names and coordinates as the file has them.
 
     Serial chains of hinges with parallel, horizontal axes are read, alone or on an arm that turns
-    about the vertical. What is fixed to a link counts as part of it. Rotor inertias are MJCF's
+    about the vertical. Bodies fixed to a link count as part of it. Rotor inertias are MJCF's
     `armature`; friction, limits, contacts and actuators are left out.
 
-    Args:
-        path: of the file; its root element tells which of the two it is.
-
     Raises:
-        ValueError: for another mechanism, naming the joint and the rule, or no such file.
+        ValueError: for another mechanism, naming the joint and the rule, or an invalid file.
         OSError: if it cannot be read.
         ImportError: for an MJCF where MuJoCo is not installed.
     """
@@ -58,11 +55,7 @@ def read_robot(path: str | Path) -> PendulumChain:
 
 
 def parse_xml(path: Path, *, comments: bool = False) -> Element:
-    """The root of an XML file that declares nothing of its own.
-
-    Args:
-        path: of the file.
-        comments: keep them as elements.
+    """The root of an XML file, with its `comments` as elements if asked for.
 
     Raises:
         ValueError: if it is too large, not UTF-8, no XML, or declares a document type.
@@ -87,15 +80,8 @@ def parse_xml(path: Path, *, comments: bool = False) -> Element:
 def urdf_links(robot: Element) -> list[HingedLink]:
     """The hinged links of a robot, with what is fixed to them.
 
-    Its root link stands on the ground. Limits, friction and transmissions are not read: friction
-    is no part of a plant.
-
-    Args:
-        robot: the file's root element.
-
-    Raises:
-        ValueError: for links or joints that are no tree of hinges and fixed joints, or numbers
-            that are none.
+    Its root link is the ground. Limits, friction and transmissions are not read: friction is no
+    part of a plant.
     """
     links = _named(robot, "link")
     children: dict[str, list[Element]] = {name: [] for name in links}
@@ -224,17 +210,8 @@ def _link(joint: Element, end: str, name: str, links: dict[str, Element]) -> str
 def mjcf_links(path: Path, root: Element) -> tuple[list[HingedLink], Array, str]:
     """The hinged links of an MJCF at its reference pose, its gravity [m/s^2], and its name.
 
-    Damping, friction loss, limits, contacts and actuators are not read: friction is no part of a
-    plant.
-
-    Args:
-        path: of the file, in whose folder its meshes lie.
-        root: its root element.
-
-    Raises:
-        ValueError: for what MuJoCo refuses, and for joints that are no hinges, springs, tendons,
-            equalities, or a medium that brakes.
-        ImportError: where MuJoCo is not installed.
+    Read by MuJoCo's own compiler, which knows default classes, geoms and meshes. Damping, friction
+    loss, limits, contacts and actuators are not read: friction is no part of a plant.
     """
     for element in root.iter():
         name = element.get("name", "")
@@ -301,7 +278,7 @@ def _at_reference(path: Path, mujoco: Any) -> tuple[Any, Any]:
 
 
 def _refuse_more_than_hinges(model: Any, mujoco: Any) -> None:
-    """Refuse what acts on a chain and is no part of our equations."""
+    """Refuse forces on a chain that are no part of the equations of motion."""
     for joint in range(model.njnt):
         name = model.joint(joint).name
         kind = mujoco.mjtJoint(model.jnt_type[joint])
