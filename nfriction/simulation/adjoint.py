@@ -107,56 +107,33 @@ class _Rollout(torch.autograd.Function):
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
         # Unpacking refuses tensors that were changed in place since the forward pass.
         q, qd, qdd, q0, _, tau, *_ = ctx.saved_tensors
-        sweep = _Sweep(ctx.system, q, wants_tau=ctx.needs_input_grad[4])
-        by_start = sweep.run(_by_time(torch.cat([q, qd, qdd], -1)),
-                             _by_time(torch.cat(cotangents, -1)))  # fmt: skip
-        by_tau = sweep.by_tau.movedim(0, -2).sum_to_size(tau.shape) if sweep.wants_tau else None
+        sweep = _Sweep(ctx.system, q.shape[:-2])
+        states, pulls = torch.cat([q, qd, qdd], -1), torch.cat(cotangents, -1)
+        by_start = sweep.run(*(x.movedim(-2, 0).contiguous() for x in (states, pulls)))
+        by_tau = sweep.by_tau.movedim(0, -2).sum_to_size(tau.shape)
         return None, None, *(x.sum_to_size(q0.shape) for x in by_start), by_tau, *sweep.by_tensor
 
 
-def _by_time(x: Tensor) -> Tensor:
-    """A series (*batch, step, width) as (step, *batch, width), also in memory."""
-    return x.movedim(-2, 0).contiguous()
-
-
-@dataclass(frozen=True)
-class _Steps:
-    """Consecutive steps, linearised; a state is q, qd and qdd in one.
-
-    Attributes:
-        after: states after each step with their graph, (step, *batch, state).
-        jacobian: of these by the states before, (step, *batch, state, state).
-        cotangent: filled by the sweep, shaped as `after`.
-    """
-
-    after: Tensor
-    jacobian: Tensor
-    cotangent: Tensor
-
-
 class _Sweep:
-    """One reverse sweep; gradients gather in `by_tau` and `by_tensor`."""
+    """One reverse sweep over states (q, qd, qdd); gradients gather in `by_tau` and `by_tensor`."""
 
-    def __init__(self, system: _System, q: Tensor, wants_tau: bool) -> None:
-        self.plant, self.friction = system.plant, system.friction
-        self.substeps, self.tensors = system.inputs.substeps, system.tensors
-        batch = q.shape[:-2]
-
+    def __init__(self, system: _System, batch: torch.Size) -> None:
         def series(x: Tensor) -> Tensor:
             return x.detach().expand(*batch, *x.shape[-2:]).movedim(-2, 0)
 
-        self.tau, self.step = series(system.inputs.tau), series(system.inputs.step[..., None])
-        self.measured = [series(x) for x in system.inputs.measured or ()]
-        self.wants_tau = wants_tau
-        self.by_tau = torch.zeros_like(self.tau) if wants_tau else self.tau
+        self.plant, self.friction, self.tensors = system.plant, system.friction, system.tensors
+        inputs = system.inputs
+        self.substeps, self.tau = inputs.substeps, series(inputs.tau)
+        self.step = series(inputs.step[..., None]) / inputs.substeps
+        self.measured = [series(x) for x in inputs.measured or ()]
+        self.by_tau = torch.zeros_like(self.tau)
         self.by_tensor = [torch.zeros_like(t) for t in self.tensors]
 
     def run(self, states: Tensor, cotangents: Tensor) -> tuple[Tensor, Tensor]:
         """Gradients by the initial position and velocity, each (*batch, joint).
 
         Args:
-            states: (step + 1, *batch, state).
-            cotangents: of these.
+            states, cotangents: (steps + 1, *batch, 3 joint).
         """
         # A step that diverges passes nothing back, but its numbers would turn zeros into NaN.
         alive = torch.isfinite(states[1:]).all(-1, keepdim=True)
@@ -170,41 +147,40 @@ class _Sweep:
         by_q, by_qd, by_qdd = carried.chunk(3, -1)
         with torch.enable_grad():
             q, qd, _ = (x.detach().requires_grad_() for x in states[0].chunk(3, -1))
-            tau = self.tau[0].detach().requires_grad_(self.wants_tau)
-            first = self.plant.forward_dynamics(q, qd, tau)
-        more_q, more_qd, *rest = _pulled(first, [q, qd, *self._wanted(tau)], by_qdd)
-        self._gather(slice(0, 1), rest)
-        return by_q + more_q, by_qd + more_qd
+            tau = self.tau[:1].detach().requires_grad_()
+            first = self.plant.forward_dynamics(q, qd, tau[0])
+        by_start = _pulled(first, [q, qd], by_qdd, retain=True)
+        self._gather(slice(0, 1), first, tau, by_qdd)
+        return by_q + by_start[0], by_qd + by_start[1]
 
-    def _wanted(self, tau: Tensor) -> list[Tensor]:
-        return [*([tau] if self.wants_tau else []), *self.tensors]
-
-    def _gather(self, part: slice, found: list[Tensor]) -> None:
-        if self.wants_tau:
-            self.by_tau[part] += found.pop(0)
+    def _gather(self, part: slice, output: Tensor, tau: Tensor, cotangent: Tensor) -> None:
+        by_tau, *found = _pulled(output, [tau, *self.tensors], cotangent)
+        self.by_tau[part] += by_tau
         for total, more in zip(self.by_tensor, found, strict=True):
             total += more
 
     def _chunk(self, part: slice, states: Tensor, cotangents: Tensor, carried: Tensor) -> Tensor:
         """Carry the cotangent of the state after these samples to that before them."""
-        tau = self.tau[part].detach().requires_grad_(self.wants_tau)
-        pieces: list[_Steps] = []
+        tau = self.tau[part].detach().requires_grad_()
+        pieces = []
         for _ in range(self.substeps):
-            pieces.append(self._linearised(part, states, tau))
-            states = pieces[-1].after.detach()
+            after, jacobian = self._linearised(part, states, tau)
+            pieces.append((after, jacobian, torch.empty_like(states)))
+            states = after.detach()
         for k in reversed(range(len(states))):
-            for piece in reversed(pieces):
-                piece.cotangent[k] = carried
-                carried = (carried.unsqueeze(-2) @ piece.jacobian[k]).squeeze(-2)
+            for _, jacobian, pull in reversed(pieces):
+                pull[k] = carried
+                carried = (carried.unsqueeze(-2) @ jacobian[k]).squeeze(-2)
             carried = carried + cotangents[k]
-        for piece in pieces:
-            self._gather(part, _pulled(piece.after, self._wanted(tau), piece.cotangent))
+        for after, _, pull in pieces:
+            self._gather(part, after, tau, pull)
         return carried
 
     @torch.enable_grad()
-    def _linearised(self, part: slice, states: Tensor, tau: Tensor) -> _Steps:
+    def _linearised(self, part: slice, states: Tensor, tau: Tensor) -> tuple[Tensor, Tensor]:
+        """States after each step with their graph, and their Jacobians by the states before."""
         q, qd, qdd = states.chunk(3, -1)
-        joints, h = q.shape[-1], self.step[part] / self.substeps
+        joints, h = q.shape[-1], self.step[part]
         driven = [x[part] for x in self.measured] or [
             x.detach().requires_grad_() for x in (qd, qdd)
         ]
@@ -233,16 +209,12 @@ class _Sweep:
         jacobian = torch.cat(
             runge_kutta(tangent, unit[..., :joints, :], unit[..., joints:, :], h[..., None]), -2
         )
-        return _Steps(after, jacobian, torch.empty_like(states))
+        return after, jacobian
 
     def _stage_jacobians(
         self, stages: Sequence[tuple[Tensor, Tensor]], tau: Tensor, held: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Of the stages' accelerations by (q, qd) and by all coefficients.
-
-        Returns:
-            Shape (stage, step, *batch, joint, 2 joint) and (..., joint, joint coefficient).
-        """
+        """Of the stages' accelerations by (q, qd) and all coefficients, (stage, ..., joint, _)."""
         q, qd = (torch.stack(x).requires_grad_() for x in zip(*stages, strict=True))
         c = held.expand(4, *held.shape).contiguous().requires_grad_()
         rates = acceleration(self.plant, self.friction, q, qd, tau, c)
