@@ -112,7 +112,7 @@ def rollouts(_: Path) -> Iterator[Row]:
     for name, model in stored_models():
         yield Row(name, end_state(tlrip, model), 11)
     given = dict(stored_models())
-    yield Row("LFM, dry friction stops", end_state(tlrip, given["LFM"], scheme="stop"), 11)
+    yield Row("LFM, dry friction stops", end_state(tlrip, given["LFM"], scheme="time_stepping"), 11)
     yield Row("LFM, eager torch", end_state(tlrip, given["LFM"], steps=200, backend="torch"), 11)
     torque = 0.2 * torch.sin(torch.arange(6000.0, dtype=torch.float64)).reshape(2000, 3)
     yield Row("LFM, driven", end_state(tlrip, given["LFM"], tau=torque), 11)

@@ -115,8 +115,8 @@ def score(
         initial_state: q0 and qd0 of the free run in the recording's convention, (joint,) each;
             default from the smoothed motion.
         horizons: lengths of windows [s]; those longer than the recording are skipped.
-        scheme: of the integration, see `rollout`; `"stop"` where joints come to rest off their
-            balance, which a smoothed sign lets creep back.
+        scheme: of the integration, see `rollout`; `"time_stepping"` where joints come to rest
+            off their balance, which a smoothed sign lets creep back.
 
     Returns:
         Errors in the recording's coordinates and unit.
@@ -176,7 +176,7 @@ class _Simulator:
         self.scheme: Scheme = scheme
         self.step = np.diff(recording.time)
         self.substeps: int | None = math.ceil(recording.longest_step / STOP_STEP)
-        if scheme != "stop":
+        if scheme != "time_stepping":
             self.substeps = _substeps(plant, friction, recording)
 
     def __call__(
@@ -192,7 +192,7 @@ class _Simulator:
             run = rollout(
                 self.plant, self.friction, torch.tensor(q0), torch.tensor(qd0), tau,
                 sample_time=torch.tensor(self.step[samples]), substeps=self.substeps,
-                scheme=self.scheme, memory=memory,
+                scheme=self.scheme, hidden_state=memory,
             )  # fmt: skip
         return run.q.numpy(), run.diverged_at.numpy()
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 from xml.sax.saxutils import quoteattr
 
-from nfriction.plant.robotfile import parse_xml
+from nfriction.plant.robot_file import parse_xml
 
 
 def mjcf_snippet(

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from pkgutil import resolve_name
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -37,6 +37,9 @@ class FrictionModel(nn.Module):
         >>> model(qd, torch.zeros_like(qd), torch.ones_like(qd))
         tensor([0.0030, 0.0030, 0.0030], dtype=torch.float64, grad_fn=<AddBackward0>)
     """
+
+    # A joint's coefficients follow that joint's own motion alone, as schedules promise.
+    joint_wise: ClassVar[bool] = True
 
     def __init__(self, law: Law, schedule: Schedule, v_smooth: float = V_SMOOTH) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""The rotating arm that carries a chain: its numbers and its terms in the equations of motion.
+"""The rotating arm that carries a chain: its parameters and its terms in the equations of motion.
 
 With th1 the arm's angle about the vertical and phi_i the absolute link angles:
 
@@ -8,7 +8,8 @@ With th1 the arm's angle about the vertical and phi_i the absolute link angles:
     h1 = 2 th1' sum_i e_i phi_i' + sum_i (L1 b_i s_i - Ixz_i s_i - Iyz_i c_i) phi_i'^2
     h_i gains -e_i th1'^2
 
-where k_ij = a_ij except k_ii = a_ii - (Izz_i + Ixx_i - Iyy_i), which vanishes for slender rods.
+where J0 is the arm with the links' masses at its end, and k_ij = a_ij except k_ii = a_ii -
+(Izz_i + Ixx_i - Iyy_i), a difference that vanishes for slender rods.
 """
 
 from collections.abc import Sequence
@@ -17,8 +18,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from nfriction.plant.linear import Matrix, dot
-from nfriction.plant.planar import Pose
+from nfriction.plant.dynamics import Matrix, Pose, dot
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Arm:
 
 
 class ArmTerms(NamedTuple):
-    """What the arm adds to the equations: mass entries M11, M1i and the gradient e_i [kg m^2]."""
+    """Mass entries M11, M1i, gradient e_i and factors of phi_i'^2 in h1 of an arm [kg m^2]."""
 
     own: Tensor
     cross: list[Tensor]
@@ -58,14 +58,9 @@ def arm_terms(
     lever: Sequence[Tensor],
     tensor: Matrix | None,
 ) -> ArmTerms:
-    """Evaluate M11, M1i, e_i and the factors of phi_i'^2 in h1.
+    """Evaluate the arm's terms; `own_inertia` is J0 and `lever` L1 b_i [kg m^2].
 
-    Args:
-        pose: of the links.
-        coupling: a_ij [kg m^2].
-        own_inertia: J0, the arm with the links' masses at its end [kg m^2].
-        lever: L1 b_i [kg m^2].
-        tensor: rows (Ixx, Iyy, Izz, Ixy, Ixz, Iyz) per link [kg m^2]; None for slender rods.
+    `tensor` has rows (Ixx, Iyy, Izz, Ixy, Ixz, Iyz) per link [kg m^2]; None for slender rods.
     """
     sin, cos = pose.sin, [angle.cos() for angle in pose.angle]
     size = len(sin)
@@ -90,7 +85,7 @@ def arm_terms(
 
 
 def with_arm_mass(links: Matrix, terms: ArmTerms) -> Matrix:
-    """The links' mass matrix with the arm's row and column put before it."""
+    """The links' mass matrix preceded by the arm's row and column."""
     rows = [[side, *row] for side, row in zip(terms.cross, links, strict=True)]
     return [[terms.own, *terms.cross], *rows]
 
@@ -102,7 +97,7 @@ def with_arm_bias(
     rate: Sequence[Tensor],
     rate_squared: Sequence[Tensor],
 ) -> list[Tensor]:
-    """The links' bias with the arm's rotation in it, and the arm's own bias put before it."""
+    """The links' bias with the arm's rotation in it, preceded by the arm's own bias."""
     own = 2 * arm_rate * dot(terms.slope, rate) + dot(terms.lever, rate_squared)
     spin = arm_rate * arm_rate
     return [own, *(h - e * spin for h, e in zip(links, terms.slope, strict=True))]

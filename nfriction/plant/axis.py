@@ -20,8 +20,8 @@ class LinearAxis(Plant):
     Attributes:
         mass: (1,) [kg].
         torque_offset: (1,) [N].
-        asymmetry: by how much the drive and guide resist more one way than the other, (1,) [N s/m];
-            zero unless `replace` sets it. With viscous friction B they are passive up to B.
+        asymmetry: difference in viscous resistance between the two directions, (1,) [N s/m]; zero
+            unless `replace` sets it. With viscous friction B it is passive up to B.
     """
 
     kind = "axis"
@@ -55,7 +55,7 @@ class LinearAxis(Plant):
         return torch.broadcast_tensors(self.mass, q)[0].unsqueeze(-1)
 
     def bias(self, q: Tensor, qd: Tensor) -> Tensor:
-        """What depends on the direction of motion [N], (*batch, 1)."""
+        """Force that depends on the direction of motion [N], (*batch, 1)."""
         self._check(q=q, qd=qd)
         return self.asymmetry * qd.abs() + torch.zeros_like(q)
 
@@ -87,9 +87,9 @@ class LinearAxis(Plant):
         return torch.ones_like(q)
 
     @torch.no_grad()
-    def max_inverse_inertia(self) -> Tensor:
-        """1 / mass [1/kg], (*batch, 1); RK4 is stable below 2.785 / (dt * mobility) [N s/m]."""
-        return 1 / self.mass
+    def decay_rate(self, damping: Tensor) -> Tensor:
+        """Decay of the velocity under a friction slope [N s/m] of shape (*batch, 1), [1/s]."""
+        return (damping.clamp(min=0.0).to(self.mass) / self.mass).amax(-1)
 
     def extra_repr(self) -> str:
         """Name, mass and offset."""

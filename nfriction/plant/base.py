@@ -1,7 +1,7 @@
-"""What every plant shares: names and conventions, swapping buffers, plain numbers in and out.
+"""Base class of plants: names and conventions, replaced buffers, conversion to plain numbers.
 
 A plant is a module whose buffers are the constants of M(q) qdd + bias(q, qd) = tau +
-torque_offset, where tau is what gears deliver if there are any.
+torque_offset, with tau the torque at the joints, behind gears if there are any.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Plant(nn.Module):
     Args:
         joints: number of joints.
         joint_names: one per joint; None for joint1, joint2, ...
-        name: what the mechanism is called in tables and files.
+        name: of the mechanism, in tables and files.
         unit: of a position, "rad" or "m".
         convention: of the angles in its recordings' columns, ("relative" | "absolute",
             "upright" | "hanging"). The methods here always take relative angles from upright.
@@ -78,11 +78,11 @@ class Plant(nn.Module):
         """Acceleration; the same as `forward_dynamics`, so that a plant can be exported."""
         return self.forward_dynamics(q, qd, tau)
 
-    # Each mechanism has its own; without an equation it is none.
+    # Equations of motion, defined by each mechanism.
 
     def gravity(self, q: Tensor) -> Tensor:
         """The gravity part of the bias."""
-        raise NotImplementedError(f"{type(self).__name__} does not say what gravity does to it.")
+        raise NotImplementedError(f"{type(self).__name__} has no gravity term.")
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
         """Acceleration at a state under joint torques."""
@@ -94,11 +94,11 @@ class Plant(nn.Module):
 
     def load(self, q: Tensor, qd: Tensor) -> Tensor:
         """Normal load of each joint over its load at rest [-]."""
-        raise NotImplementedError(f"{type(self).__name__} does not say what its joints carry.")
+        raise NotImplementedError(f"{type(self).__name__} has no joint loads.")
 
-    def max_inverse_inertia(self) -> Tensor:
-        """Largest acceleration per torque of each joint, (*batch, joint)."""
-        raise NotImplementedError(f"{type(self).__name__} does not say how mobile it is.")
+    def decay_rate(self, damping: Tensor) -> Tensor:
+        """Fastest decay of velocities [1/s] that slopes (*batch, joint) of friction can cause."""
+        raise NotImplementedError(f"{type(self).__name__} has no bound on decay rates.")
 
     def replace(self, **buffers: Tensor) -> Self:
         """A shallow copy with some buffers swapped; this plant stays as it is.
@@ -125,12 +125,16 @@ class Plant(nn.Module):
                     f"`{name}` must have shape (*batch, {', '.join(map(str, trailing))}), "
                     f"got {tuple(value.shape)}."
                 )
-        clone = copy.copy(self)
-        clone._buffers = {**self._buffers, **buffers}
+        values = {**own, **buffers}
         for name, value in buffers.items():
-            # A module names a tensor but once, and each buffer is to be found by its own name.
-            if sum(value is other for other in clone._buffers.values()) > 1:
-                clone._buffers[name] = value.view_as(value)
+            # A module lists each tensor once, but each buffer must be found by its own name.
+            if sum(value is other for other in values.values()) > 1:
+                values[name] = value.view_as(value)
+        # A deep copy takes from its memo what is to be shared, or to take the original's place.
+        shared = (*self.parameters(), *(v for v in vars(self).values() if not isinstance(v, dict)))
+        memo: dict[int, Any] = {id(v): v for v in shared}
+        memo |= {id(own[name]): value for name, value in values.items()}
+        clone = copy.deepcopy(self, memo)
         clone._note_replaced(buffers)
         return clone
 
@@ -156,7 +160,7 @@ class Plant(nn.Module):
         }
         data = {key: value for key, value in data.items() if value is not None}
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # whoever built this plant has seen them
+            warnings.simplefilter("ignore")  # shown when this plant was built
             fresh = dict(self.from_dict(data).named_buffers())
         changed = {
             name: value.tolist()
@@ -198,7 +202,7 @@ class Plant(nn.Module):
 def check_keys(
     what: str, data: Mapping[str, Any], required: Collection[str], optional: Collection[str] = ()
 ) -> None:
-    """Refuse a table that lacks a required key or holds one nobody reads."""
+    """Refuse a table with missing or unknown keys."""
     missing = [key for key in required if key not in data]
     unknown = [key for key in data if key not in {*required, *optional}]
     if missing or unknown:

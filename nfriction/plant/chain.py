@@ -10,32 +10,40 @@ from torch import Tensor
 
 from nfriction.plant.arm import Arm, ArmTerms, arm_terms, with_arm_bias, with_arm_mass
 from nfriction.plant.base import Plant, check_keys, number, vector
-from nfriction.plant.coordinates import (
-    absolute,
-    joint_forces,
-    joint_matrix,
-    link_forces,
-    relative,
-)
 from nfriction.plant.drag import drag_forces
-from nfriction.plant.encoder import Turned, true_angle
-from nfriction.plant.gear import by_velocity, delivered, demanded, passed_on, refuse_powered
-from nfriction.plant.inertia import inertia_tensors
-from nfriction.plant.linear import Matrix, dot, entries, multiply, solve, stack, stack_matrix
-from nfriction.plant.planar import (
+from nfriction.plant.dynamics import (
+    Matrix,
     Pose,
+    absolute,
     add_centrifugal,
     add_rotors,
     coupling_constants,
+    dot,
+    entries,
     gravity_forces,
+    joint_forces,
+    joint_matrix,
+    link_forces,
+    multiply,
     planar_mass,
     pose_of,
+    relative,
+    solve,
+    stack,
+    stack_matrix,
     static_moment,
 )
-from nfriction.plant.poses import refuse_indefinite, turning_poses
-from nfriction.plant.slopes import PlantSlopes, planar_slopes
+from nfriction.plant.gears import (
+    EncoderCorrection,
+    check_gear,
+    correct_encoder,
+    joint_torque,
+    motor_torque,
+)
+from nfriction.plant.inertia import fastest_mode, inertia_tensors, require_positive_definite
 
-# Of gravity [m/s^2]: loads are told in weights.
+_PER_JOINT = ("angle_offset", "encoder_cosine", "encoder_sine", "gear_loss", "torque_offset")
+# Least gravity [m/s^2], as loads are in units of a link's weight.
 WEIGHTLESS = 1e-6
 
 
@@ -48,13 +56,12 @@ class _Geometry(NamedTuple):
 class PendulumChain(Plant):
     """Frictionless equations of motion M(q) qdd + bias(q, qd) = tau + torque_offset.
 
-    Behind gears, tau is what they deliver of the drives' torque.
-
     Joint coordinates: with a free arm, column 0 is its angle about the vertical; the first link
     is measured from upright, each further one relative to the link before. Friction is not part
-    of a plant (a rollout subtracts it from tau); air drag is, once `replace` sets it. So are
-    eccentric encoders: all methods then take and give what the encoders read, except that
-    `mass_matrix`, `bias` and `gravity` are those over the true angles at that reading.
+    of a plant (a rollout subtracts it from tau). Air drag, gears and eccentric encoders are, once
+    `replace` sets them: with gears, tau is the torque at the joint; with eccentric encoders, inputs
+    and outputs are encoder angles, except that `mass_matrix`, `bias` and `gravity` are those over
+    the true angles at that reading.
 
     Args:
         mass: of each link [kg].
@@ -74,9 +81,9 @@ class PendulumChain(Plant):
         gravity_moment: g b_i, (links,) [N m].
         armature: (joints,) [kg m^2].
         angle_offset: added to q before the geometry is evaluated, (joints,) [rad].
-        encoder_cosine, encoder_sine: eccentricity of the encoders, see `encoder`, (joints,) [rad].
-        torque_gain, gear_loss: what becomes of tau before it reaches the joints, see `gear`,
-            (joints,) [-]. Friction is told in the drives' torque, as a controller commands it.
+        encoder_cosine, encoder_sine: eccentricity of the encoders, see `gears`, (joints,) [rad].
+        torque_gain, gear_loss: from the motor's torque to the joint's, see `gears`, (joints,) [-].
+            Friction is expressed at the motor side, as a controller commands it.
         torque_offset: added to tau at the joints, (joints,) [N m].
         drag_linear, drag_quadratic: k1 [N s/m^2], k2 [N s^2/m^3] per link.
         length: (links,) [m].
@@ -134,8 +141,7 @@ class PendulumChain(Plant):
         gravity = number("gravity", gravity, positive=True)
         if gravity < WEIGHTLESS:
             raise ValueError(f"`gravity` must be at least {WEIGHTLESS:g} m/s^2, got {gravity:g}.")
-        links = len(m)
-        first = 1 if arm else 0
+        links, first = len(m), int(arm is not None)
         super().__init__(
             first + links,
             joint_names=joint_names,
@@ -152,30 +158,28 @@ class PendulumChain(Plant):
                        self.joints)  # fmt: skip
         if (rotor < 0).any():
             raise ValueError(f"`armature` must not be negative, got {rotor.tolist()}.")
-        moment = static_moment(m, size, centre)
-        zero = torch.zeros(links, dtype=torch.float64)
-        self.register_buffer("inertia_coupling", coupling_constants(m, size, centre, tensors[:, 2]))
-        self.register_buffer("gravity_moment", gravity * moment)
-        self.register_buffer("armature", rotor)
-        self.register_buffer("angle_offset", torch.zeros_like(rotor))
-        self.register_buffer("encoder_cosine", torch.zeros_like(rotor))
-        self.register_buffer("encoder_sine", torch.zeros_like(rotor))
+        buffers = {
+            "inertia_coupling": coupling_constants(m, size, centre, tensors[:, 2]),
+            "gravity_moment": gravity * static_moment(m, size, centre),
+            "armature": rotor,
+            **{name: torch.zeros_like(rotor) for name in _PER_JOINT},
+            "torque_gain": torch.ones_like(rotor),
+            "drag_linear": torch.zeros_like(m),
+            "drag_quadratic": torch.zeros_like(m),
+            "length": size,
+            "load_lever": centre / gravity,
+        }
+        if arm:
+            buffers["arm_inertia"] = m.sum() * arm.length**2 + arm.inertia
+            buffers["arm_lever"] = m.new_tensor(arm.length / gravity)
+            buffers["inertia_tensor"] = tensors
+        for key, value in buffers.items():
+            self.register_buffer(key, value)
         hanging = torch.ones_like(rotor)
         hanging[first] = -1.0
         self.register_buffer("encoder_zero", hanging, persistent=False)
-        self.register_buffer("torque_gain", torch.ones_like(rotor))
-        self.register_buffer("gear_loss", torch.zeros_like(rotor))
-        self.register_buffer("torque_offset", torch.zeros_like(rotor))
-        self.register_buffer("drag_linear", zero)
-        self.register_buffer("drag_quadratic", zero.clone())
-        self.register_buffer("length", size)
-        self.register_buffer("load_lever", centre / gravity)
-        if arm:
-            self.register_buffer("arm_inertia", m.sum() * arm.length**2 + arm.inertia)
-            self.register_buffer("arm_lever", m.new_tensor(arm.length / gravity))
-            self.register_buffer("inertia_tensor", tensors)
-        # What is not there costs nothing: Python flags, settled here and by `replace`, never in a
-        # step.
+        # Absent terms cost nothing: they are Python flags, set here and by `replace`, never
+        # tested by value within a step.
         self.has_armature = bool(rotor.any())
         self.has_gear = False
         self.has_drag = False
@@ -196,7 +200,7 @@ class PendulumChain(Plant):
             "armature": rotor.tolist() if self.has_armature else None,
         }
         aligned = self.mass_matrix(rotor.new_zeros(self.joints))
-        refuse_indefinite(self.inertia_coupling, aligned[first:, first:])
+        require_positive_definite(self.inertia_coupling, aligned[first:, first:])
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         """Mass matrix M(q) [kg m^2].
@@ -222,9 +226,8 @@ class PendulumChain(Plant):
     def gravity(self, q: Tensor) -> Tensor:
         """The gravity part of the bias [N m], (*batch, joint): the potential's gradient."""
         self._check(q=q)
-        force = gravity_forces(
-            self._geometry(self._true(q, q)[0]).pose, self.gravity_moment.unbind(-1)
-        )
+        pose = self._geometry(self._true(q, q)[0]).pose
+        force = gravity_forces(pose, self.gravity_moment.unbind(-1))
         own = [torch.zeros_like(force[0])] * self.first_link
         return stack(joint_forces([*own, *force], self.first_link))
 
@@ -239,19 +242,20 @@ class PendulumChain(Plant):
         """
         self._check(q=q, qd=qd, tau=tau)
         if self.has_eccentricity:
-            turned = self._turned(q)
-            return turned.reading(qd, self._accelerate(turned.angle, turned.slope * qd, tau))
+            corrected = self._corrected(q)
+            qdd = self._accelerate(corrected.angle, corrected.slope * qd, tau)
+            return corrected.read_acceleration(qd, qdd)
         return self._accelerate(q, qd, tau)
 
     def _accelerate(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
         """True accelerations at true angles and rates."""
         geometry = self._geometry(q)
         if self.has_gear:
-            tau = delivered(tau, qd, self.torque_gain, self.gear_loss)
+            tau = joint_torque(tau, qd, self.torque_gain, self.gear_loss)
         force = link_forces((tau + self.torque_offset).unbind(-1), self.first_link)
         bias = self._bias(geometry, qd)
         rhs = [f - h for f, h in zip(force, bias, strict=True)]
-        # Every acceleration hangs on every input, so all share one shape: no broadcast needed.
+        # Every acceleration depends on every input, so all share one shape without broadcasting.
         return torch.stack(relative(solve(self._mass(geometry), rhs), self.first_link), -1)
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
@@ -265,14 +269,15 @@ class PendulumChain(Plant):
         """
         self._check(q=q, qd=qd, qdd=qdd)
         if self.has_eccentricity:
-            turned = self._turned(q)
-            q, qd, qdd = turned.angle, turned.slope * qd, turned.acceleration(qd, qdd)
+            corrected = self._corrected(q)
+            true_qdd = corrected.true_acceleration(qd, qdd)
+            q, qd, qdd = corrected.angle, corrected.slope * qd, true_qdd
         geometry = self._geometry(q)
         inertial = multiply(self._mass(geometry), absolute(qdd.unbind(-1), self.first_link))
         force = [f + h for f, h in zip(inertial, self._bias(geometry, qd), strict=True)]
         torque = stack(joint_forces(force, self.first_link)) - self.torque_offset
         if self.has_gear:
-            torque = demanded(torque, qd, self.torque_gain, self.gear_loss)
+            torque = motor_torque(torque, qd, self.torque_gain, self.gear_loss)
         return torque
 
     def energy(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
@@ -306,39 +311,26 @@ class PendulumChain(Plant):
         load = (self.load_lever * rate * rate - angle.cos()).abs()
         return torch.cat([torch.ones_like(load[..., :1]), load], -1) if self.first_link else load
 
-    def has_slopes(self) -> bool:
-        """Whether `slopes` knows all terms of this chain; what a subclass adds it does not."""
-        more = self.first_link or self.has_drag or self.has_eccentricity
-        return type(self) is PendulumChain and not more
-
     @torch.no_grad()
-    def slopes(self, q: Tensor, qd: Tensor, qdd: Tensor) -> PlantSlopes:
-        """Derivatives of `inverse_dynamics` and `load` at a motion (*batch, joint)."""
-        gain, loss = self.torque_gain, self.gear_loss
-        if self.has_gear:
-            shape = torch.broadcast_shapes(q.shape, gain.shape, loss.shape)
-            q, qd, qdd = (x.expand(shape) for x in (q, qd, qdd))
-        geometry = self._geometry(q)
-        moment, lever = self.gravity_moment.unbind(-1), self.load_lever.unbind(-1)
-        mass = self._mass(geometry)
-        slopes = planar_slopes(geometry.pose, geometry.coupling, mass, moment, lever, qd, qdd)
-        if not self.has_gear:
-            return slopes
-        tau = self.inverse_dynamics(q, qd, qdd)
-        return slopes.geared(passed_on(tau, qd, gain, loss), by_velocity(tau, qd, loss))
+    def decay_rate(self, damping: Tensor) -> Tensor:
+        """Fastest decay of velocities that joint friction can cause in any pose [1/s].
 
-    @torch.no_grad()
-    def max_inverse_inertia(self) -> Tensor:
-        """Largest acceleration of a joint by its own torque, (*batch, joint) [rad/s^2 per N m].
+        The largest eigenvalue of M^-1 D over a grid of poses, of at most 5 degrees for one or two
+        turning angles and coarser for more, with D the slopes of friction over velocity, times
+        what a gear makes of the torque. Negative slopes count as zero, which bounds it from above.
 
-        Over poses, the largest diagonal entry of M^-1, times what a gear makes of the torque.
-
-        Explicit RK4 stays stable while a friction curve is flatter than 2.785 / (dt * mobility).
-        Searched on a grid of at most 5 degrees for one or two turning angles, coarser for more.
+        Args:
+            damping: slope of each joint's friction torque [N m s/rad], (*batch, joint).
+        Returns:
+            Shape (*batch,), the largest over all values of a plant with batches of buffers.
         """
-        inverse = torch.linalg.inv(self.mass_matrix(turning_poses(self.joints).to(self.armature)))
-        most = self.torque_gain * (1.0 + self.gear_loss)
-        return (most * inverse.diagonal(dim1=-2, dim2=-1)).amax(-2)
+        effective = damping.clamp(min=0.0)
+        if not effective.isfinite().all():
+            return effective.amax(-1)
+        rows = effective.reshape(-1, self.joints).to(self.armature)
+        gear = self.torque_gain * (1.0 + self.gear_loss)
+        found = [fastest_mode(self, gear * row) for row in rows]
+        return torch.stack(found).reshape(damping.shape[:-1])
 
     def extra_repr(self) -> str:
         """Name, links, arm and what is switched on."""
@@ -362,15 +354,15 @@ class PendulumChain(Plant):
         self.has_gear = self.has_gear or bool({"torque_gain", "gear_loss"} & set(names))
         self._slender = self._slender and "inertia_tensor" not in names
 
-    def _turned(self, q: Tensor) -> Turned:
-        return true_angle(q, self.encoder_zero, self.encoder_cosine, self.encoder_sine)
+    def _corrected(self, q: Tensor) -> EncoderCorrection:
+        return correct_encoder(q, self.encoder_zero, self.encoder_cosine, self.encoder_sine)
 
     def _true(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
         """True angles and rates of what the encoders read."""
         if not self.has_eccentricity:
             return q, qd
-        turned = self._turned(q)
-        return turned.angle, turned.slope * qd
+        corrected = self._corrected(q)
+        return corrected.angle, corrected.slope * qd
 
     def _geometry(self, q: Tensor) -> _Geometry:
         pose = pose_of((q + self.angle_offset).unbind(-1)[self.first_link :])
@@ -411,7 +403,7 @@ class PendulumChain(Plant):
     @classmethod
     def _check_buffers(cls, values: Mapping[str, Tensor]) -> None:
         super()._check_buffers(values)
-        refuse_powered(values)
+        check_gear(values)
 
     @classmethod
     def _parse(cls, given: dict[str, Any]) -> dict[str, Any]:
@@ -419,7 +411,3 @@ class PendulumChain(Plant):
             return given
         check_keys("arm", given["arm"], ("inertia", "length"))
         return given | {"arm": Arm(**{k: number(k, v) for k, v in given["arm"].items()})}
-
-
-def _numbers(values: object) -> Any:
-    return torch.as_tensor(values, dtype=torch.float64).tolist()

@@ -10,8 +10,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from nfriction.plant.linear import dot
-from nfriction.plant.planar import Pose
+from nfriction.plant.dynamics import Pose, dot
 
 _TINY = 1e-30  # keeps 0/0 away where a whole link is at rest; its numerators are cubic in v
 
@@ -23,22 +22,16 @@ def drag_forces(
     linear: Sequence[Tensor],
     quadratic: Sequence[Tensor],
 ) -> list[Tensor]:
-    """Generalised drag torques on the absolute angles, on the left-hand side (they oppose motion).
+    """Generalised drag torques int f(v) dv/dphi_j' ds on the absolute angles [N m].
 
-    Args:
-        pose: of the links.
-        rate: absolute link rates phi_i' [rad/s].
-        length: joint-to-joint lengths, for the last link joint to tip [m].
-        linear, quadratic: k1 [N s/m^2], k2 [N s^2/m^3] per link.
-    Returns:
-        int f(v) dv/dphi_j' ds, summed over the links, per absolute angle [N m]. Their product with
-        `rate` is the power lost, never negative for k1, k2 >= 0.
+    They oppose the motion, on the left-hand side: their product with the absolute rates phi_i'
+    `rate` is the power lost, never negative for k1, k2 >= 0 (`linear`, `quadratic`).
     """
     torque: list[Tensor] = []
     for i, (size, k1, k2) in enumerate(zip(length, linear, quadratic, strict=True)):
         reach = [length[j] * pose.cos_between[j, i] for j in range(i)]
         sweep = size * rate[i]
-        if i == 0:  # the joint stands still: v grows from 0, no parents to push
+        if i == 0:  # its joint is fixed, so that v grows from 0
             torque.append(size * size * sweep * (k1 / 3 + k2 / 4 * sweep.abs()))
             continue
         start = dot(reach, rate[:i])
@@ -55,11 +48,6 @@ def square_moments(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
 
     Exact for either sign of both ends. With w = start * end, the second is half the first plus
     the moment about the middle; |w| - w is zero unless v changes sign on the way.
-
-    Args:
-        start, end: speeds at both ends [m/s], broadcastable.
-    Returns:
-        Mean and first moment [m^2/s^2].
     """
     w = start * end
     both = w.abs()

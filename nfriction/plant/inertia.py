@@ -1,13 +1,14 @@
-"""Inertia of links as given by a user: three spellings into one tensor, and a physical check."""
+"""Inertia: of links as given by a user, and bounds on a chain's mass matrix over all poses."""
 
+import math
 import warnings
+from typing import Any
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
 
 from nfriction.plant.base import vector
-
-COLUMNS = ("Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
 
 
 def inertia_tensors(inertia: object, links: int) -> Tensor:
@@ -19,11 +20,7 @@ def inertia_tensors(inertia: object, links: int) -> Tensor:
     Args:
         inertia: None (point masses), one Izz per link (slender rods: Iyy = Izz, Ixx = 0), or
             (links, 6) numbers in the order above.
-        links: how many rows.
-    Returns:
-        float64 tensor of shape (links, 6).
-    Raises:
-        ValueError: for another shape.
+        links: number of rows.
     Warns:
         UserWarning: where no rigid body has such an inertia.
     """
@@ -40,15 +37,15 @@ def inertia_tensors(inertia: object, links: int) -> Tensor:
         rows[:, 1] = rows[:, 2] = vector("inertia", given, links)
     else:
         raise ValueError(
-            f"`inertia` must be None, ({links},) for Izz per link or ({links}, 6) for {COLUMNS}, "
-            f"got shape {tuple(given.shape)}."
+            f"`inertia` must be None, ({links},) for Izz per link or ({links}, 6) for "
+            f"(Ixx, Iyy, Izz, Ixy, Ixz, Iyz), got shape {tuple(given.shape)}."
         )
     _warn_impossible(rows)
     return rows
 
 
 def _warn_impossible(rows: Tensor) -> None:
-    """A body's principal inertias are not negative, and none exceeds the sum of the others."""
+    """Warn unless principal inertias are >= 0 and obey the triangle inequality."""
     xx, yy, zz, xy, xz, yz = rows.unbind(-1)
     matrix = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).reshape(-1, 3, 3)
     small, middle, large = torch.linalg.eigvalsh(matrix).unbind(-1)
@@ -62,3 +59,103 @@ def _warn_impossible(rows: Tensor) -> None:
             f"{rows[wrong].tolist()}; the motion may still be right where it was identified so.",
             stacklevel=4,
         )
+
+
+class _Poses:
+    """M^-1 of a chain over a grid of poses.
+
+    Attributes:
+        values: of the chain's buffers, which it belongs to.
+        inverse: M^-1, (batch, pose, joint, joint).
+        squares: its squared entries, flat.
+    """
+
+    def __init__(self, plant: Any, values: Tensor) -> None:
+        mass = plant.mass_matrix(configuration_grid(plant.joints).to(values))
+        self.values = values
+        self.inverse = torch.linalg.inv(mass).reshape(-1, *mass.shape[-3:])
+        self.squares = self.inverse.square().flatten(-2)
+        self._damping: Tensor | None = None
+        self._rate = values.new_zeros(())
+
+    def fastest_mode(self, damping: Tensor) -> Tensor:
+        """Largest eigenvalue of M^-1 D, with D diagonal, (batch, 1, joint), and not negative."""
+        if self._damping is None or not torch.equal(damping, self._damping):
+            self._damping, self._rate = damping, self._largest(damping.mT * damping)
+        return self._rate
+
+    def _largest(self, products: Tensor) -> Tensor:
+        """The eigenvalue for products of the entries of D, (batch, joint, joint)."""
+        # D^1/2 M^-1 D^1/2 has the same eigenvalues, and is symmetric: its Frobenius norm bounds
+        # them, so that few poses need theirs.
+        bound = (self.squares @ products.flatten(-2).unsqueeze(-1)).squeeze(-1)
+        scale = products.sqrt().expand(len(bound), -1, -1)
+        inverse = self.inverse.expand(len(bound), -1, -1, -1)
+
+        def largest(where: Tensor) -> Tensor:
+            batch, pose = where.nonzero(as_tuple=True)
+            return torch.linalg.eigvalsh(inverse[batch, pose] * scale[batch]).amax()
+
+        least = largest(bound == bound.amax())
+        return largest(bound >= (least * (1 - 1e-9)).square())
+
+
+# Kept, as every rollout needs them and the grid costs as much as thousands of compiled steps.
+_poses: WeakKeyDictionary[Any, _Poses] = WeakKeyDictionary()
+
+
+def fastest_mode(plant: Any, damping: Tensor) -> Tensor:
+    """Largest eigenvalue of M^-1 D over a grid of poses [1/s].
+
+    Args:
+        plant: the chain.
+        damping: diagonal of D, not negative [N m s/rad], (joint,) or (*batch of the plant, joint).
+    """
+    values = torch.cat([buffer.reshape(-1) for buffer in plant.buffers()])
+    known = _poses.get(plant)
+    if known is None or not torch.equal(known.values, values):
+        known = _poses[plant] = _Poses(plant, values)
+    return known.fastest_mode(damping.reshape(-1, 1, plant.joints))
+
+
+def configuration_grid(joints: int) -> Tensor:
+    """A grid of joint angles over which M varies, (poses, joints) [rad].
+
+    The first coordinate stays 0: neither a fixed chain's first angle nor a free arm's changes M.
+    """
+    turning = joints - 1
+    if not turning:
+        return torch.zeros(1, 1)
+    count = min(72, max(4, 4 * int(20_000 ** (1 / turning) / 4)))
+    axis = torch.arange(count, dtype=torch.float64) * (math.tau / count)
+    if turning > 7:  # four angles for each would be too many: some of these poses at random
+        chosen = torch.randint(4, (2_000, turning), generator=torch.Generator().manual_seed(0))
+        poses = axis[chosen]
+    else:
+        poses = torch.cartesian_prod(*[axis] * turning).reshape(-1, turning)
+    return torch.nn.functional.pad(poses, (1, 0))
+
+
+def require_positive_definite(coupling: Tensor, aligned: Tensor) -> None:
+    """Refuse inertias that do not resist every motion.
+
+    M over absolute angles is a_ij cos(phi_i - phi_j) plus the rotors. The cosines are a Gram
+    matrix, so by Schur's product theorem a positive semidefinite `coupling` (a_ij) keeps M so in
+    every pose.
+
+    Args:
+        coupling: a_ij, (links, links) [kg m^2].
+        aligned: the links' mass matrix, rotors included, with all links in line.
+    Raises:
+        ValueError: where `coupling` has a negative eigenvalue, or `aligned` one not positive.
+    """
+    rounding = 1e-12 * aligned.trace().item()
+    smallest = torch.linalg.eigvalsh(aligned)[0].item()
+    alone = torch.linalg.eigvalsh(coupling)[0].item()
+    if smallest > 0 and alone > -rounding:
+        return
+    raise ValueError(
+        f"the mass matrix must be positive definite, but its smallest eigenvalue is "
+        f"{min(smallest, alone):.3g} kg m^2; check `mass`, `com` and `inertia` (a link without "
+        "inertia needs `com` away from its joint)."
+    )

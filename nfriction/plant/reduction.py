@@ -1,7 +1,7 @@
 """A serial chain of hinged bodies in space as links in one plane, on a pivot or a rotating arm.
 
-What a robot description says (URDF, MJCF) is in space and may hold any mechanism; what is no
-`PendulumChain` is refused with the name of the joint and the rule.
+Robot descriptions (URDF, MJCF) may hold any mechanism in space; mechanisms that are no
+`PendulumChain` are refused with the name of the joint and the rule.
 """
 
 import math
@@ -23,9 +23,9 @@ Array = NDArray[np.float64]
 MOST_JOINTS, LONGEST_NAME = 50, 200
 # Of metres, kilograms and kg m^2: far beyond any mechanism, and squares of it can be added up.
 LARGEST_NUMBER = 1e9
-# A right angle written as 1.57 is off by less than this [rad]; beyond, it is meant.
+# A right angle written as 1.57 is off by less than this [rad]; a larger tilt is intended.
 TILT = 1e-3
-# Of a link's length: how far its mass centre may lie off the line through its joints.
+# Largest distance of a mass centre from the line through the joints, in lengths of the link.
 ASIDE = 1e-3
 
 
@@ -40,7 +40,7 @@ class RigidBody:
 
 @dataclass
 class HingedLink:
-    """A hinge and all that turns with it, at the pose in which the file describes it.
+    """A hinge and all bodies that turn with it, at the pose in which the file describes it.
 
     Attributes:
         name: of the joint.
@@ -49,7 +49,7 @@ class HingedLink:
         anchor: a point of the axis in the world, (3,) [m].
         armature: rotor inertia seen at the joint [kg m^2].
         reading: the joint's coordinate at this pose [rad].
-        bodies: what turns with it and with no later hinge.
+        bodies: those that turn with it and with no later hinge.
     """
 
     name: str
@@ -84,20 +84,19 @@ class _Planar:
 
 
 def pendulum_chain(links: Sequence[HingedLink], gravity: Array, name: str) -> PendulumChain:
-    """The planar chain that these links are.
+    """The planar chain that these links form.
 
-    Joint coordinates are those of the file: where the first link stands nearer to upright than to
-    hanging at zero, its convention is measured from upright, else from hanging, and what is left
-    over goes into `angle_offset`. A first joint about the vertical becomes the arm. The length of
-    the last link, which only drag needs, is that of a rod with its mass and inertia.
+    Joint coordinates are those of the file: where the first link is nearer to upright than to
+    hanging at zero, its convention is measured from upright, else from hanging, and the rest goes
+    into `angle_offset`. A first joint about the vertical becomes the arm. The length of the last
+    link, which only drag needs, is that of a rod with its mass and inertia.
 
     Args:
         links: in any order.
         gravity: acceleration in the world, (3,) [m/s^2].
         name: of the mechanism.
-
     Raises:
-        ValueError: if they are no such chain, naming the joint and the rule.
+        ValueError: if they form no such chain, naming the joint and the rule.
     """
     chain = _in_series(links)
     strength = float(np.linalg.norm(gravity))
@@ -120,7 +119,7 @@ def pendulum_chain(links: Sequence[HingedLink], gravity: Array, name: str) -> Pe
     if arm:
         carrier, tensors = _carried(arm, hinged[0], mass, flat, tensors, up, z)
     with warnings.catch_warnings():
-        # Of an arm's tensors it has been said before they took in what is not theirs.
+        # An arm's tensors were checked before terms of other bodies were added to them.
         warnings.filterwarnings("ignore", message="the inertia of link")
         plant = PendulumChain(
             mass=mass,

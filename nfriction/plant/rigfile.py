@@ -20,7 +20,7 @@ from typing import Any
 
 from nfriction.io import strict_json
 from nfriction.io.atomic import write_atomically
-from nfriction.plant import robotfile
+from nfriction.plant import robot_file
 from nfriction.plant.axis import LinearAxis
 from nfriction.plant.base import Plant
 from nfriction.plant.chain import PendulumChain
@@ -28,7 +28,7 @@ from nfriction.plant.chain import PendulumChain
 _KINDS: dict[str, type[PendulumChain] | type[LinearAxis]] = {
     plant.kind: plant for plant in (PendulumChain, LinearAxis)
 }
-# Far beyond any rig; a chain's matrices take memory with the square of its links.
+# Far beyond any rig; the memory of a chain's matrices grows with the square of its links.
 LARGEST_FILE, MOST_LINKS, LARGEST_NUMBER = 2**20, 100, 1e30
 _TEXTS, _LISTS_OF_TEXT, _TABLES = (
     ("kind", "name"),
@@ -65,9 +65,9 @@ def read(path: str | Path) -> Plant:
         ImportError: for an MJCF where MuJoCo is not installed.
     """
     path = Path(path)
-    if path.suffix.lower() in robotfile.ENDINGS:
+    if path.suffix.lower() in robot_file.ENDINGS:
         try:
-            return robotfile.read_robot(path)
+            return robot_file.read_robot(path)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
     if path.is_file() and path.stat().st_size > LARGEST_FILE:

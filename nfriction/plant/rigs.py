@@ -47,7 +47,7 @@ def tlrip(
     """Triple link rotary inverted pendulum (Table 2); paper joints 2, 3, 4, with a free arm 1 too.
 
     Mass centres half way. The printed Izz are taken about the mass centres. The arm is a rod with
-    Izz1 about its own centre; its balance mass stands in no printed equation and is left out.
+    Izz1 about its own centre; its balance mass appears in no printed equation and is left out.
 
     Args:
         arm: "fixed" (three joints) or "free" (four, the arm first).
@@ -101,7 +101,7 @@ def multiarm_single() -> PendulumChain:
 
     The last link's length is published for none of the three; it is taken as twice the distance to
     its mass centre, as for an even rod, and matters to air drag only. The authors' values were
-    fitted with viscous friction; in free swing only ratios can be told.
+    fitted with viscous friction; in free swing only ratios are identifiable.
     """
     return PendulumChain(
         mass=[0.14758],
@@ -177,7 +177,7 @@ def dfki(build: Literal["A0", "C0", "C1"]) -> PendulumChain:
     inertia = [i - m * r**2 for i, m, r in zip(p["I"], p["m"], p["r"], strict=True)]
     inertia[1] -= gear * p["Ir"]
     with warnings.catch_warnings():
-        # Build C0: stated above, and nothing its user could mend.
+        # Build C0: stated above, and its user cannot change it.
         warnings.filterwarnings("ignore", message="the inertia of link")
         return PendulumChain(
             mass=p["m"],

@@ -91,15 +91,18 @@ def integrate_compiled(
         x = x.detach()
         if x.ndim > trailing:
             x = x.expand(*batch, *x.shape[x.ndim - trailing :]).reshape(-1, *x.shape[-trailing:])
-        return x
+        # An expanded constant needs no value for each step.
+        return x[0] if x.ndim == trailing and not x.stride(0) else x
 
-    def finer(x: Tensor, axis: int) -> Tensor:
-        return x if substeps == 1 else x.repeat_interleave(substeps, axis)
+    def finer(x: Tensor, trailing: int) -> Tensor:
+        """Values of samples repeated for their substeps."""
+        every = x.ndim >= trailing and substeps > 1
+        return x.repeat_interleave(substeps, -trailing) if every else x
 
     steps = step.shape[-1] * substeps
     drive = None
     if measured is not None:
-        drive = (finer(rows(measured[0], 2), -2), finer(rows(measured[1], 2), -2))
+        drive = (finer(rows(measured[0], 2), 2), finer(rows(measured[1], 2), 2))
     values = _values(plant, friction, compiled.parameter_names)
     for name, value in (parameters or {}).items():
         own = value.shape[len(batch) :]
@@ -110,8 +113,8 @@ def integrate_compiled(
         q.detach().reshape(-1, joints).contiguous(),
         qd.detach().reshape(-1, joints).contiguous(),
         steps=steps,
-        time_step=finer(rows(step, 1) / substeps, -1),
-        tau=finer(rows(tau, 2), -2),
+        time_step=finer(rows(step, 1) / substeps, 1),
+        tau=finer(rows(tau, 2), 2),
         parameters=values,
         drive=drive,
         threads=threads,

@@ -1,22 +1,23 @@
-"""What a rollout needs of a mechanism and of its friction."""
+"""Interfaces and inputs of a rollout: mechanism, friction, initial state and what drives it."""
 
+from dataclasses import dataclass
 from typing import Protocol, cast
 
 from torch import Tensor
 
 
 class Plant(Protocol):
-    """What a rollout needs of a mechanism; all shapes (*batch, joint)."""
+    """Mechanism as seen by a rollout; all shapes (*batch, joint)."""
 
     joints: int
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor: ...
     def load(self, q: Tensor, qd: Tensor) -> Tensor: ...
-    def max_inverse_inertia(self) -> Tensor: ...
+    def decay_rate(self, damping: Tensor) -> Tensor: ...
 
 
 class Friction(Protocol):
-    """What a rollout needs of a friction model."""
+    """Friction model as seen by a rollout; see `Schedule` for its hidden state, if it has one."""
 
     joints: int
 
@@ -25,8 +26,8 @@ class Friction(Protocol):
     def zero_velocity_damping(self) -> Tensor: ...
 
 
-class RememberingFriction(Friction, Protocol):
-    """A friction model whose coefficients have a memory; see `Schedule`."""
+class StatefulFriction(Friction, Protocol):
+    """Friction model whose coefficients have a hidden state; see `Schedule`."""
 
     state_size: int
 
@@ -35,8 +36,32 @@ class RememberingFriction(Friction, Protocol):
     def coefficients_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor: ...
 
 
-def remembering(friction: Friction | None) -> RememberingFriction | None:
-    """The friction model if its coefficients have a memory."""
+def as_stateful(friction: Friction | None) -> StatefulFriction | None:
+    """The friction model if its coefficients have a hidden state, else None."""
     if getattr(friction, "state_size", 0) > 0:
-        return cast(RememberingFriction, friction)
+        return cast(StatefulFriction, friction)
     return None
+
+
+@dataclass(frozen=True)
+class RolloutInputs:
+    """Initial state and inputs of a rollout.
+
+    Attributes:
+        q0, qd0: initial state [rad, rad/s], (*batch, joint).
+        tau: torque held over each step [N m], (steps, joint) or (*batch, steps, joint).
+        step: sample times [s], (steps,) or (*batch, steps).
+        substeps: integration steps to each sample.
+        measured: velocity and acceleration that drive the coefficients in place of the simulated
+            ones, each (*batch, steps, joint) or without batch; None for the simulated ones.
+        hidden_state: of the coefficients after the first sample, (*batch, joint, state_size);
+            None for that of the first sample alone.
+    """
+
+    q0: Tensor
+    qd0: Tensor
+    tau: Tensor
+    step: Tensor
+    substeps: int = 1
+    measured: tuple[Tensor, Tensor] | None = None
+    hidden_state: Tensor | None = None

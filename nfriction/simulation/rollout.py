@@ -6,31 +6,28 @@ acceleration needs friction.
 """
 
 import logging
-from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
-import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from nfriction.simulation.adjoint import differentiable
+from nfriction.simulation.adjoint import adjoint_rollout, own_tensors
 from nfriction.simulation.compiled import Backend, integrate_compiled, wants_compiled
-from nfriction.simulation.mechanism import mechanism_of
-from nfriction.simulation.protocols import Friction, Plant
-from nfriction.simulation.rk4 import stepped
-from nfriction.simulation.stiction import stuck
+from nfriction.simulation.protocols import Friction, Plant, RolloutInputs
+from nfriction.simulation.rk4 import simulate_eager
+from nfriction.simulation.stiction import simulate_stiction
 from nfriction.simulation.validate import (
-    all_finite,
-    compare_sample_times,
-    driving_motion,
-    given_memory,
-    prepared,
-    refuse_unstable,
+    require_stability,
+    validate_inputs,
+    validate_measured,
+    warn_of_sample_time,
+    with_hidden_state,
 )
 
 logger = logging.getLogger(__name__)
 
-Scheme = Literal["rk4", "stop"]
+Scheme = Literal["rk4", "time_stepping"]
 # Beyond this many steps gradients are rarely meant and may take gigabytes: they must be asked for.
 GRADIENT_STEPS = 10_000
 # A joint faster than this [rad/s] has left any mechanism's range: the rollout has diverged.
@@ -76,7 +73,7 @@ def rollout(
     scheme: Scheme = "rk4",
     drive: Literal["simulated", "measured"] = "simulated",
     measured: tuple[Tensor, Tensor] | None = None,
-    memory: Tensor | None = None,
+    hidden_state: Tensor | None = None,
     gradients: bool | None = None,
     backend: Backend = "auto",
     threads: int = 1,
@@ -84,9 +81,9 @@ def rollout(
 ) -> Rollout:
     """Simulate a plant with friction from an initial state.
 
-    Models that `fit` and `load` return ask for no gradients and are compiled, thousands of times
-    faster than eager torch. To train through a rollout ask for them first,
-    `model.requires_grad_(True)`; a new model of one's own does so by itself.
+    Models from `fit` and `load` require no gradients and are compiled, thousands of times faster
+    than eager torch. To train through a rollout call `model.requires_grad_(True)` first; newly
+    constructed models require gradients.
 
     Args:
         plant: the mechanism, e.g. `rigs.tlrip()`.
@@ -94,121 +91,107 @@ def rollout(
         q0, qd0: initial state [rad, rad/s] in joint coordinates, shape (*batch, joint).
         tau: joint torque [N m], held over each step, shape (steps, joint) or
             (*batch, steps, joint); None for none.
-        sample_time: step [s], or steps of their own, shape (steps,) or (*batch, steps).
-        steps: number of steps; may be left out where `tau` or `sample_time` gives it.
-        substeps: Runge-Kutta steps to each sample. Coefficients with a memory advance once a
-            sample; others are held anew at each of these steps.
-        scheme: `"rk4"` takes friction as the smooth function of velocity that it is, and creeps
-            where it ought to rest; `"stop"` takes semi-implicit steps of first order in which dry
-            friction stops a joint and holds it, however steep. It needs shorter steps, and has no
-            gradients, no measured drive and no coefficients with a memory.
-        drive: what drives motion-dependent coefficients: the simulated motion, or the
-            `measured` one, as in the papers.
+        sample_time: sample time [s], a number, (steps,) or (*batch, steps).
+        steps: number of samples after the first; optional where `tau` or `sample_time` gives it.
+        substeps: integration steps to each sample. A hidden state advances once a sample; other
+            coefficients are evaluated anew at each of these steps.
+        scheme: `"rk4"` integrates friction as a smooth function of velocity, so that joints creep
+            where they ought to rest. `"time_stepping"` takes semi-implicit steps of first order
+            in which dry friction stops a joint and holds it, however steep; it needs shorter
+            steps, and has no gradients, measured drive or hidden state.
+        drive: motion that drives the coefficients: the `"simulated"` one, or the `"measured"` one,
+            as in the papers.
         measured: velocity and acceleration for `drive="measured"`, each (*batch, steps, joint).
-        memory: what the coefficients remember after the first sample, (*batch, joint,
-            state_size), where the motion goes on from an earlier one (see `Schedule.states`); by
-            default what they would of the first sample alone.
-        gradients: make the motion differentiable; None does so where any input asks for it, no
+        hidden_state: of the coefficients after the first sample, (*batch, joint, state_size), to
+            continue an earlier motion (see `Schedule.states`); by default that of the first
+            sample alone.
+        gradients: make the motion differentiable; None does so where any input requires it, no
             compiled backend is named, and there are at most 10,000 steps.
         backend: `"torch"` steps in eager torch; `"c"` and `"numba"` compile the same definition
-            (no gradients); `"auto"` compiles where it can. Gradients then come from an adjoint
-            pass over all steps at once, good for one derivative; for higher ones, or within
-            `torch.func`, `"torch"` records every step.
-        threads: a compiled batch is shared out among this many.
+            (no gradients); `"auto"` compiles where it can. Its gradients come from an adjoint
+            sweep, which gives first derivatives only; for higher ones, or within `torch.func`,
+            `"torch"` records every step.
+        threads: number of threads that share a compiled batch.
         progress: show a progress bar (eager torch only; compiled rollouts take milliseconds).
 
     Returns:
-        Rollout with `q` and `qd` of shape (*batch, steps + 1, joint). A diverging candidate is
-        no error: `diverged_at` tells when, and NaN follows.
+        Rollout with `q` and `qd` of shape (*batch, steps + 1, joint). A diverging candidate is no
+        error: it is NaN from `diverged_at` on.
 
     Raises:
-        ValueError: if shapes do not fit, inputs are not finite, the friction is so steep at rest
-            that the integration would be unstable, or the scheme cannot do what is asked.
-        CodegenError: if a backend asked for by name cannot serve.
+        ValueError: if shapes do not fit, inputs are not finite, friction is too steep at rest for
+            a stable integration, or the scheme does not support an option.
+        CodegenError: if a backend asked for by name is not available.
     """
-    if substeps < 1:
-        raise ValueError(f"`substeps` must be at least 1, got {substeps}.")
-    q, qd, torque, step, steps = prepared(plant, friction, q0, qd0, tau, sample_time, steps)
-    measured = driving_motion(drive, measured, q, steps)
+    inputs = validate_inputs(plant, friction, q0, qd0, tau, sample_time, steps, substeps)
+    inputs = replace(inputs, measured=validate_measured(drive, measured, inputs))
+    inputs = with_hidden_state(inputs, friction, hidden_state)
     if scheme not in get_args(Scheme):
         raise ValueError(f"`scheme` must be one of {get_args(Scheme)}, got {scheme!r}.")
-    if scheme == "stop":
-        if friction is None or gradients or measured is not None or memory is not None:
+    if scheme == "time_stepping":
+        if friction is None or gradients or measured is not None or hidden_state is not None:
             raise ValueError(
-                '`scheme="stop"` needs a friction model, and has no gradients, measured drive or '
-                'memory; use scheme="rk4" for these.'
+                '`scheme="time_stepping"` needs a friction model, and has no gradients, measured '
+                'drive or hidden state; use scheme="rk4" for these.'
             )
-        return _finished(step, stuck(plant, friction, q, qd, torque, step, substeps, progress))
-    refuse_unstable(plant, friction, float(step.max()), substeps)
-    memory = given_memory(friction, memory, q)
-    if memory is not None:
-        shape = np.broadcast_shapes(q.shape, memory.shape[:-1])
-        q, qd = q.expand(shape), qd.expand(shape)
-    compare_sample_times(friction, float(step.mean()))
+        return _as_rollout(inputs, simulate_stiction(plant, friction, inputs, progress))
+    require_stability(plant, friction, inputs)
+    warn_of_sample_time(friction, inputs)
     if gradients is None:
         gradients = (
             backend in ("auto", "torch")
             and torch.is_grad_enabled()
-            and steps <= GRADIENT_STEPS
-            and _asks_gradients(plant, friction, q, qd, torque)
+            and inputs.tau.shape[-2] <= GRADIENT_STEPS
+            and (
+                any(x.requires_grad for x in (inputs.q0, inputs.qd0, inputs.tau))
+                or bool(own_tensors(plant, friction))
+            )
         )
-    return integrate(
-        plant, friction, q, qd, torque, step, substeps=substeps, measured=measured, memory=memory,
+    states = simulate(
+        plant, friction, inputs,
         gradients=gradients, backend=backend, threads=threads, progress=progress,
     )  # fmt: skip
+    return _as_rollout(inputs, states)
 
 
-def integrate(
+def integrate(plant: Plant, friction: Friction | None, inputs: RolloutInputs) -> Rollout:
+    """`rollout` without checks and gradients, for searches whose trials may well be unstable."""
+    return _as_rollout(inputs, simulate(plant, friction, inputs))
+
+
+def simulate(
     plant: Plant,
     friction: Friction | None,
-    q0: Tensor,
-    qd0: Tensor,
-    tau: Tensor,
-    step: Tensor,
+    inputs: RolloutInputs,
     *,
-    substeps: int = 1,
-    measured: tuple[Tensor, Tensor] | None = None,
-    memory: Tensor | None = None,
     gradients: bool = False,
     backend: Backend = "auto",
     threads: int = 1,
     progress: bool = False,
-) -> Rollout:
-    """`rollout` without its checks, for searches whose trials may well be unstable.
-
-    Shapes: q0, qd0 (*batch, joint); tau (*batch, steps, joint) and step (*batch, steps), or
-    without the batch; the rest as in `rollout`.
-    """
-    compiled = wants_compiled(backend, q0, gradients)
-
-    def simulate() -> tuple[Tensor, ...]:
-        found = None
-        if compiled or (gradients and wants_compiled(backend, q0, gradients=False)):
-            found = integrate_compiled(
-                plant, friction, q0, qd0, tau, step, substeps, measured, backend, threads,
-                memory=memory,
+) -> tuple[Tensor, ...]:
+    """States q, qd, qdd, each (*batch, steps + 1, joint), by the backend that can compute them."""
+    compiled = wants_compiled(backend, inputs.q0, gradients)
+    if gradients:
+        states = None
+        if backend == "auto":
+            states = adjoint_rollout(
+                lambda: simulate(plant, friction, inputs, threads=threads, progress=progress),
+                plant, friction, inputs,
             )  # fmt: skip
-        return found or record()
-
-    def record() -> tuple[Tensor, ...]:
-        return stepped(plant, friction, q0, qd0, tau, step, substeps, measured, memory, progress)
-
-    mechanism = None
-    if gradients and backend == "auto":
-        mechanism = mechanism_of(plant, friction, q0, qd0, tau, step, measured)
-    if mechanism is not None:
-        states = differentiable(simulate, mechanism, q0, qd0, tau, step, substeps, measured)
-    elif gradients:
-        states = record()
-    else:
-        with torch.no_grad():
-            states = simulate()
-    return _finished(step, states)
+        return states or simulate_eager(plant, friction, inputs, progress)
+    with torch.no_grad():
+        states = None
+        if compiled:
+            states = integrate_compiled(
+                plant, friction, inputs.q0, inputs.qd0, inputs.tau, inputs.step, inputs.substeps,
+                inputs.measured, backend, threads, memory=inputs.hidden_state,
+            )  # fmt: skip
+        return states or simulate_eager(plant, friction, inputs, progress)
 
 
-def _finished(step: Tensor, states: tuple[Tensor, ...]) -> Rollout:
-    """A motion with its time; what diverged is NaN from there on."""
-    time = torch.cat([torch.zeros_like(step[..., :1]), step.cumsum(-1)], -1)
+def _as_rollout(inputs: RolloutInputs, states: tuple[Tensor, ...]) -> Rollout:
+    """The motion with its time, NaN from where it diverged."""
+    time = torch.nn.functional.pad(inputs.step.cumsum(-1), (1, 0))
     q, qd, qdd = states
     diverged_at = _divergence(time, q, qd)
     if torch.isfinite(diverged_at).any():
@@ -217,18 +200,12 @@ def _finished(step: Tensor, states: tuple[Tensor, ...]) -> Rollout:
     return Rollout(time, q, qd, qdd, diverged_at)
 
 
-def _asks_gradients(plant: Plant, friction: Friction | None, *inputs: Tensor) -> bool:
-    """Whether anything that shapes the motion requires a gradient."""
-    given: tuple[Any, ...] = (plant, friction)
-    modules = [m for m in given if isinstance(m, nn.Module)]
-    owned = [t for m in modules for t in (*m.parameters(), *m.buffers())]
-    return any(t.requires_grad for t in (*inputs, *owned))
-
-
 def _divergence(time: Tensor, q: Tensor, qd: Tensor) -> Tensor:
     """Time of the first sample that is not finite or beyond any speed, infinity where none."""
     with torch.no_grad():
-        if all_finite(q) and all(abs(float(v)) < SPEED_LIMIT for v in qd.aminmax()):
+        # Positions are finite while velocities are; a NaN fails every comparison.
+        low, high = qd.aminmax()
+        if float(low) > -SPEED_LIMIT and float(high) < SPEED_LIMIT:
             return time.new_full(q.shape[:-2], torch.inf)
         lost = ~(torch.isfinite(q) & (qd.abs() < SPEED_LIMIT)).all(-1)
         first = lost.to(torch.int64).argmax(-1, keepdim=True)

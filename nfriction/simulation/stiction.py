@@ -1,8 +1,8 @@
-"""Steps with dry friction that truly sticks: velocities stop, instead of creeping through zero.
+"""Time-stepping with dry friction that truly sticks: joints stop instead of creeping.
 
 A smoothed sign lets a joint that ought to rest creep at a share of its smoothing velocity. Here
-friction is an impulse that at most stops its joint within the step; what it takes to hold a joint
-below breakaway is found, not modelled.
+friction is an impulse that at most stops its joint within the step; the torque that holds a joint
+below breakaway is solved for, not modelled.
 """
 
 import logging
@@ -15,13 +15,13 @@ from torch import Tensor
 from tqdm import tqdm
 
 from nfriction import codegen
-from nfriction.simulation.protocols import Friction, Plant, remembering
+from nfriction.simulation.protocols import Friction, Plant, RolloutInputs, as_stateful
 
 logger = logging.getLogger(__name__)
 
-# Of the smoothing velocity: from there on a joint slides, and its friction is that of the law.
+# In units of the smoothing velocity: from there on a joint slides, with the law's friction.
 SLIDING = 5.0
-# Rounds over the joints in which their impulses settle; a single joint takes one.
+# Gauss-Seidel sweeps over the joints' impulses; a single joint takes one.
 SWEEPS = 20
 
 
@@ -34,9 +34,9 @@ def moreau_step(
     coefficients: Tensor,
     step: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """One semi-implicit Euler step with friction that stops, then holds.
+    """One semi-implicit Euler step with friction that stops a joint, then holds it.
 
-    The impulse of friction is what brings each joint to rest, no more than the law gives while it
+    The impulse of friction brings each joint to rest, limited to what the law gives while it
     slides. With several joints impulses are found in turns (projected Gauss-Seidel).
 
     Args:
@@ -67,7 +67,7 @@ def moreau_step(
         for j in range(plant.joints)
     ]
     if getattr(plant, "has_gear", False):
-        # A gear loses of what friction leaves over, which the impulses are to take.
+        # A gear's loss is a share of the torque without friction, which the impulses add.
         drag = friction.torque(qd, load, coefficients)
         taken = sum(torch.stack(c, -1) * drag[..., j : j + 1] for j, c in enumerate(inverse))
         qdd = plant.forward_dynamics(q, qd, tau - drag) + taken
@@ -88,7 +88,7 @@ def moreau_step(
 class _Stepper:
     """Steps whose coefficients follow their own motion, compiled where there is a compiler.
 
-    A step takes and gives one array, for a call costs more than its arithmetic: position, velocity,
+    A call costs more than its arithmetic, so a step maps one array to another: position, velocity,
     acceleration, then torque and step length.
     """
 
@@ -99,7 +99,7 @@ class _Stepper:
         try:
             self._compiled = codegen.compile_function(self._after, [example]).bound()
         except codegen.CodegenError as error:
-            logger.warning("sticking is simulated in eager torch, slowly: %s", error)
+            logger.warning("stiction is simulated in eager torch, slowly: %s", error)
 
     def _after(self, given: Tensor) -> Tensor:
         joints = self.plant.joints
@@ -114,28 +114,23 @@ class _Stepper:
 
 
 @torch.no_grad()
-def stuck(
-    plant: Plant,
-    friction: Friction,
-    q: Tensor,
-    qd: Tensor,
-    tau: Tensor,
-    step: Tensor,
-    substeps: int,
-    progress: bool,
+def simulate_stiction(
+    plant: Plant, friction: Friction, inputs: RolloutInputs, progress: bool
 ) -> tuple[Tensor, ...]:
     """States at every sample: q, qd, qdd, each (*batch, steps + 1, joint).
 
     Raises:
-        ValueError: if the coefficients have a memory.
+        ValueError: if the coefficients have a hidden state.
     """
-    if remembering(friction) is not None:
+    if as_stateful(friction) is not None:
         raise ValueError(
-            'scheme="stop" does not simulate coefficients with a memory; use scheme="rk4".'
+            'scheme="time_stepping" does not simulate coefficients with a hidden state; use '
+            'scheme="rk4".'
         )
+    q, qd, tau, step = inputs.q0, inputs.qd0, inputs.tau, inputs.step
     joints, steps = q.shape[-1], step.shape[-1]
     shape = torch.broadcast_shapes(q.shape[:-1], tau.shape[:-2], step.shape[:-1])
-    inner = (step / substeps).expand(*shape, steps)[..., None]
+    inner = (step / inputs.substeps).expand(*shape, steps)[..., None]
     each = torch.cat([tau.expand(*shape, steps, joints), inner], -1)
     driven = each.reshape(-1, steps, joints + 1).to("cpu", torch.float64).numpy()
     first = torch.cat([q, qd, plant.forward_dynamics(q, qd, tau[..., 0, :])], -1)
@@ -145,7 +140,7 @@ def stuck(
     states[0] = given[:, : 3 * joints]
     for k in tqdm(range(steps), disable=not progress, unit="step", leave=False):
         given[:, 3 * joints :] = driven[:, k]
-        for _ in range(substeps):
+        for _ in range(inputs.substeps):
             given[:, : 3 * joints] = stepper(given)
         states[k + 1] = given[:, : 3 * joints]
     motion = torch.from_numpy(states).transpose(0, 1).reshape(*shape, steps + 1, 3 * joints)

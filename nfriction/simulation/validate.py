@@ -1,14 +1,15 @@
-"""Validation of what a rollout is given."""
+"""Validation of a rollout's arguments."""
 
 import logging
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.simulation.protocols import Friction, Plant
-from nfriction.simulation.rk4 import required_substeps, stability_limit
+from nfriction.simulation.protocols import Friction, Plant, RolloutInputs
+from nfriction.simulation.rk4 import RK4_STABILITY, required_substeps
 
 logger = logging.getLogger(__name__)
 
@@ -21,28 +22,7 @@ def all_finite(x: Tensor) -> bool:
     return math.isfinite(low) and math.isfinite(high)
 
 
-def driving_motion(
-    drive: str, measured: tuple[Tensor, Tensor] | None, q: Tensor, steps: int
-) -> tuple[Tensor, Tensor] | None:
-    """Validate the measured motion that drives the coefficients."""
-    if drive not in ("simulated", "measured") or (drive == "measured") != (measured is not None):
-        raise ValueError(
-            '`drive` is "simulated", or "measured" together with `measured=(qd, qdd)`; got '
-            f"{drive!r} {'without' if measured is None else 'with'} `measured`."
-        )
-    if measured is None:
-        return None
-    found = torch.as_tensor(measured[0]).to(q), torch.as_tensor(measured[1]).to(q)
-    for x in found:
-        if x.shape[-2:] != (steps, q.shape[-1]) or not all_finite(x):
-            raise ValueError(
-                f"`measured` must be two finite (*batch, {steps}, {q.shape[-1]}), a value a step, "
-                f"got {tuple(found[0].shape)} and {tuple(found[1].shape)}."
-            )
-    return found
-
-
-def prepared(
+def validate_inputs(
     plant: Plant,
     friction: Friction | None,
     q0: Tensor,
@@ -50,8 +30,11 @@ def prepared(
     tau: Tensor | None,
     sample_time: float | Tensor,
     steps: int | None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:
-    """Validate a rollout's inputs and bring them to tensors of matching shape."""
+    substeps: int,
+) -> RolloutInputs:
+    """Initial state, torque and sample times as tensors of matching shape."""
+    if substeps < 1:
+        raise ValueError(f"`substeps` must be at least 1, got {substeps}.")
     q0, qd0 = torch.as_tensor(q0), torch.as_tensor(qd0)
     if not q0.is_floating_point():
         q0 = q0.to(torch.float64)
@@ -76,7 +59,7 @@ def prepared(
     if not known or len(set(known.values())) != 1:
         raise ValueError(f"the number of steps must be given and agree, got {known or 'nothing'}.")
     steps = next(iter(known.values()))
-    if steps < 1 or not bool((step >= 0).all()) or not all_finite(step):
+    if steps < 1 or not all_finite(step) or float(step.min()) < 0:
         raise ValueError("`steps` must be at least 1 and `sample_time` finite and positive [s].")
     if step.ndim == 0:
         step = step.expand(steps)
@@ -88,50 +71,83 @@ def prepared(
     shape = np.broadcast_shapes(
         q0.shape, qd0.shape, (*torque.shape[:-2], joints), (*step.shape[:-1], joints)
     )
-    return q0.expand(shape), qd0.expand(shape), torque, step, steps
+    return RolloutInputs(q0.expand(shape), qd0.expand(shape), torque, step, substeps)
 
 
-def refuse_unstable(
-    plant: Plant, friction: Friction | None, sample_time: float, substeps: int
-) -> None:
+def validate_measured(
+    drive: str, measured: tuple[Tensor, Tensor] | None, inputs: RolloutInputs
+) -> tuple[Tensor, Tensor] | None:
+    """The measured motion that drives the coefficients."""
+    if drive not in ("simulated", "measured") or (drive == "measured") != (measured is not None):
+        raise ValueError(
+            '`drive` must be "simulated", or "measured" together with `measured=(qd, qdd)`; got '
+            f"{drive!r} {'without' if measured is None else 'with'} `measured`."
+        )
+    if measured is None:
+        return None
+    shape = inputs.step.shape[-1], inputs.q0.shape[-1]
+    found = torch.as_tensor(measured[0]).to(inputs.q0), torch.as_tensor(measured[1]).to(inputs.q0)
+    for x in found:
+        if x.shape[-2:] != shape or not all_finite(x):
+            raise ValueError(
+                f"`measured` must be two finite (*batch, {shape[0]}, {shape[1]}), a value a step, "
+                f"got {tuple(found[0].shape)} and {tuple(found[1].shape)}."
+            )
+    return found
+
+
+def with_hidden_state(
+    inputs: RolloutInputs, friction: Friction | None, hidden_state: Tensor | None
+) -> RolloutInputs:
+    """The inputs with a hidden state from which coefficients continue."""
+    if hidden_state is None:
+        return inputs
+    given, joints = torch.as_tensor(hidden_state).to(inputs.q0), inputs.q0.shape[-1]
+    size = getattr(friction, "state_size", 0)
+    if size == 0:
+        raise ValueError(
+            "`hidden_state` is for friction whose coefficients have one; leave it out."
+        )
+    if given.shape[-2:] != (joints, size) or not all_finite(given):
+        raise ValueError(
+            f"`hidden_state` must be finite (*batch, {joints}, {size}), got {tuple(given.shape)}."
+        )
+    shape = np.broadcast_shapes(inputs.q0.shape, given.shape[:-1])
+    q0, qd0 = inputs.q0.expand(shape), inputs.qd0.expand(shape)
+    return replace(inputs, q0=q0, qd0=qd0, hidden_state=given)
+
+
+def require_stability(plant: Plant, friction: Friction | None, inputs: RolloutInputs) -> None:
+    """Refuse friction too steep at rest for stable Runge-Kutta steps."""
     if friction is None:
         return
-    longest_step = sample_time / substeps
-    slope, limit = friction.zero_velocity_damping(), stability_limit(plant, longest_step)
-    excess = (slope / limit).reshape(-1, plant.joints).amax(0)
-    # As much slack as `required_substeps` takes, so that what it says is never refused.
-    if bool((excess * (1 - 1e-9) > 1).any()):
-        joint = int(excess.argmax())
-        v_smooth = getattr(friction, "v_smooth", float("nan"))
-        raise ValueError(
-            f"friction of joint {joint + 1} is too steep at rest for steps of {longest_step:g} s: "
-            f"slope {float(slope.reshape(-1, plant.joints)[:, joint].max()):.3g} N m s/rad, "
-            f"stable below {float(limit.reshape(-1, plant.joints)[:, joint].min()):.3g}. "
-            f"Use substeps={required_substeps(plant, friction, sample_time)} or "
-            # A twentieth more outweighs the rounding to two digits.
-            f"v_smooth >= {1.05 * v_smooth * float(excess.max()):.2g} (now {v_smooth:g})."
-        )
+    sample_time = float(inputs.step.max())
+    longest_step = sample_time / inputs.substeps
+    slope = friction.zero_velocity_damping()
+    excess = float(plant.decay_rate(slope).max()) * longest_step / RK4_STABILITY
+    # As much slack as `required_substeps` takes, so that its number is never refused.
+    if not excess * (1 - 1e-9) > 1:  # false of NaN
+        return
+    rows = slope.reshape(-1, plant.joints)
+    alone = torch.stack([plant.decay_rate(row.diag()) for row in rows]).amax(0)
+    joint = int(alone.argmax())
+    v_smooth = getattr(friction, "v_smooth", float("nan"))
+    raise ValueError(
+        f"friction is too steep at rest for steps of {longest_step:g} s, most at joint "
+        f"{joint + 1} with a slope of {float(rows[:, joint].max()):.3g} N m s/rad: it damps "
+        f"{excess:.3g} times as fast as RK4 can integrate. "
+        f"Use substeps={required_substeps(plant, friction, sample_time)} or "
+        # A twentieth more outweighs the rounding to two digits.
+        f"v_smooth >= {1.05 * v_smooth * excess:.2g} (now {v_smooth:g})."
+    )
 
 
-def compare_sample_times(friction: Friction | None, step: float) -> None:
-    """Warn of a memory that fades at another rate than the model was made for."""
+def warn_of_sample_time(friction: Friction | None, inputs: RolloutInputs) -> None:
+    """Warn of a hidden state that decays at another rate than the model was made for."""
     meant = getattr(getattr(friction, "schedule", None), "sample_time", None)
+    step = float(inputs.step.mean()) if meant is not None else 0.0
     if meant is not None and not 0.5 < step / meant < 2.0:
         logger.warning(
-            "samples of %.3g s advance a memory made for %.3g s, so it fades over %.2g times its "
-            "time; see `Adaptive.set_sample_time`", step, meant, step / meant,
+            "samples of %.3g s advance a hidden state made for %.3g s, so it decays over %.2g "
+            "times its time constant; see `Adaptive.set_sample_time`", step, meant, step / meant,
         )  # fmt: skip
-
-
-def given_memory(friction: Friction | None, memory: Tensor | None, q: Tensor) -> Tensor | None:
-    """Validate a given memory."""
-    if memory is None:
-        return None
-    given, size = torch.as_tensor(memory).to(q), getattr(friction, "state_size", 0)
-    if size == 0:
-        raise ValueError("`memory` is for friction whose coefficients have one; leave it out.")
-    if given.shape[-2:] != (q.shape[-1], size) or not all_finite(given):
-        raise ValueError(
-            f"`memory` must be finite (*batch, {q.shape[-1]}, {size}), got {tuple(given.shape)}."
-        )
-    return given

@@ -15,7 +15,7 @@ from nfriction.friction.models import NCFM
 from nfriction.friction.registry import model_names
 from nfriction.io.model_file import save
 from nfriction.papers import twin
-from nfriction.plant import robotfile
+from nfriction.plant import robot_file
 from nfriction.version import __version__
 
 
@@ -34,7 +34,7 @@ def test_names_are_those_of_the_library() -> None:
     assert list(model_names()) == list(names.MODELS)
     assert rigs.names() == list(names.RIGS)
     assert names.models(names.DEFAULT_MODELS)
-    assert (".json", ".toml", *robotfile.ENDINGS) == names.RIG_FILES
+    assert (".json", ".toml", *robot_file.ENDINGS) == names.RIG_FILES
     assert demo.DURATION == twin.QUICK_DURATION
 
 

@@ -19,6 +19,7 @@ from nfriction.fitting.strategy.extrapolation_prior import (
     visits,
 )
 from nfriction.signals import Motion
+from nfriction.simulation.protocols import RolloutInputs
 from nfriction.simulation.rollout import integrate
 from tests.fitting.recordings import F64, pendulum
 
@@ -103,7 +104,7 @@ def problem(model: NFLFM, held: Anchors | None) -> TrajectoryProblem:
     qd0 = torch.tensor([[2.0, -3.0], [-1.0, 4.0]], dtype=F64)
     tau = 0.05 * torch.randn(2, 60, 2, generator=g, dtype=F64)
     step = torch.full((2, 60), 5e-3, dtype=F64)
-    q = integrate(pendulum(), network(0.3), q0, qd0, tau, step).q
+    q = integrate(pendulum(), network(0.3), RolloutInputs(q0, qd0, tau, step)).q
     w = Windows(q, tau, step, torch.ones(2, 61, dtype=F64), q0, qd0)
     jacobian = StepJacobian(pendulum(), model, [])
     return TrajectoryProblem(jacobian, w, 1e-4, torch.eye(2, dtype=F64), anchors=held)

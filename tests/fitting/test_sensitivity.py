@@ -8,6 +8,7 @@ from nfriction.codegen import NoBackend
 from nfriction.fitting.plant_parameters import adjusted_buffers, plant_parameters
 from nfriction.fitting.shooting.sensitivity import CHUNK, StepJacobian, start_slope, step_maps
 from nfriction.friction.registry import model_by_name
+from nfriction.simulation.protocols import RolloutInputs
 from nfriction.simulation.rk4 import rk4_step
 from nfriction.simulation.rollout import integrate
 from tests.fitting.recordings import F64, pendulum
@@ -125,7 +126,7 @@ def test_pieces_of_a_run_are_the_whole(run):
     jacobian = StepJacobian(plant, model, [])
     q0, qd0 = torch.ones(2, 2, dtype=F64), torch.zeros(2, 2, dtype=F64)
     tau, step = torch.zeros(2, 10, 2, dtype=F64), torch.full((2, 10), 1e-3, dtype=F64)
-    motion = integrate(plant, model, q0, qd0, tau, step)
+    motion = integrate(plant, model, RolloutInputs(q0, qd0, tau, step))
     empty = torch.zeros(0, dtype=F64)
     maps = list(step_maps(jacobian, motion, tau, step, empty, run))
     whole = next(step_maps(jacobian, motion, tau, step, empty, 10))
@@ -143,7 +144,7 @@ def test_a_block_is_the_chain_of_its_steps(name):
     jacobian = StepJacobian(plant, model, [])
     q0, qd0 = torch.ones(2, 2, dtype=F64), torch.zeros(2, 2, dtype=F64)
     tau, step = torch.zeros(2, 7, 2, dtype=F64), torch.full((2, 7), 1e-3, dtype=F64)
-    motion = integrate(plant, model, q0, qd0, tau, step)
+    motion = integrate(plant, model, RolloutInputs(q0, qd0, tau, step))
     empty = torch.zeros(0, dtype=F64)
     single = next(step_maps(jacobian, motion, tau, step, empty, 7))
     blocks, rest = step_maps(jacobian, motion, tau, step, empty, 7, block=3)

@@ -14,6 +14,7 @@ from nfriction.fitting.shooting.propagation import _carried
 from nfriction.fitting.shooting.sensitivity import StepJacobian, StepMaps
 from nfriction.fitting.strategy.continuation import JUMP_SD
 from nfriction.signals import Motion
+from nfriction.simulation.protocols import RolloutInputs
 from nfriction.simulation.rollout import integrate
 from tests.fitting.recordings import F64, pendulum
 
@@ -30,7 +31,7 @@ def windows(steps=20, step=2e-3, joined=False) -> Windows:
     weight = torch.ones(2, steps + 1, dtype=F64)
     steps_[1, -4:], weight[1, -4:] = 0.0, 0.0
     truth = LFM(2, [[4e-3, 3e-3], [2e-3, 1e-3]], v_smooth=0.1)
-    q = integrate(pendulum(), truth, q0, qd0, tau, steps_).q
+    q = integrate(pendulum(), truth, RolloutInputs(q0, qd0, tau, steps_)).q
     second = (0, steps, 2 * steps - 4) if joined else (1, 0, steps - 4)
     spans = ((0, 0, steps), second)
     return Windows(q, tau, steps_, weight, q0, qd0, spans)
@@ -208,7 +209,9 @@ def halves(noise: float = 1e-3) -> Windows:
     truth = LFM(2, [[4e-3, 3e-3], [2e-3, 1e-3]], v_smooth=0.1)
     q0, qd0 = torch.tensor([[1.6, 0.5]], dtype=F64), torch.tensor([[2.0, -3.0]], dtype=F64)
     step = torch.full((1, 80), 5e-3, dtype=F64)
-    run = integrate(pendulum(), truth, q0, qd0, torch.zeros(1, 80, 2, dtype=F64), step)
+    run = integrate(
+        pendulum(), truth, RolloutInputs(q0, qd0, torch.zeros(1, 80, 2, dtype=F64), step)
+    )
     q = run.q + noise * torch.randn(run.q.shape, generator=g, dtype=F64)
     start = [x[0, [0, 40]] + 0.01 for x in (run.q, run.qd)]
     return Windows(

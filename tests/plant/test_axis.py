@@ -21,7 +21,7 @@ def test_newton() -> None:
     assert not potential.any()
     assert not axis.gravity(q).any()
     assert torch.equal(axis.load(q, qd), torch.ones(5, 1).double())
-    assert axis.max_inverse_inertia().item() == 0.25
+    assert axis.decay_rate(torch.tensor([2.0])).item() == 0.5
     assert (axis.unit, axis.joints, axis.has_drag) == ("m", 1, False)
 
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from nfriction.plant import Arm, PendulumChain, gear, rigs
+from nfriction.plant import Arm, PendulumChain, gears, rigs
 
 FULL_TENSOR = [
     [0.002, 0.0388, 0.04, 0.0004, 0.00032, -0.00024],
@@ -83,7 +83,7 @@ def test_inverse_dynamics_undoes_forward_dynamics(rig: PendulumChain, seed: int)
 def test_forward_dynamics_is_mass_matrix_and_bias(arm: Any) -> None:
     rig = every_kind(arm)
     q, qd, tau = states(rig.joints)
-    loss = rig.gear_loss * tau.abs() * torch.tanh(qd / gear.TURN)
+    loss = rig.gear_loss * tau.abs() * torch.tanh(qd / gears.SIGN_WIDTH)
     rhs = rig.torque_gain * (tau - loss) + rig.torque_offset - rig.bias(q, qd)
     expected = torch.linalg.solve(rig.mass_matrix(q), rhs)
     torch.testing.assert_close(rig(q, qd, tau), expected, rtol=1e-10, atol=1e-10)
@@ -132,20 +132,41 @@ def test_load_is_one_at_rest_in_line_and_none_at_rest_level() -> None:
     assert rig.load(hanging, qd)[1].item() == pytest.approx(swing)
 
 
-def test_mobility_gives_the_papers_stability_bounds() -> None:
-    bound = 2.785 / (1e-3 * rigs.tlrip().max_inverse_inertia())
+def test_one_joint_s_damping_gives_the_papers_stability_bounds() -> None:
+    bound = 2.785 / (1e-3 * rigs.tlrip().decay_rate(torch.eye(3).double()))
     torch.testing.assert_close(bound, torch.tensor([247.0, 77, 77]).double(), rtol=0.01, atol=0)
 
 
 @pytest.mark.parametrize("arm", ARMS)
-def test_mobility_bounds_random_poses(arm: Any) -> None:
+def test_decay_rates_bound_random_poses(arm: Any) -> None:
     rig = every_kind(arm)
     q, _, _ = states(rig.joints, (2000,))
-    found = torch.linalg.inv(rig.mass_matrix(q)).diagonal(dim1=-2, dim2=-1).amax(0)
-    found = rig.torque_gain * (1.0 + rig.gear_loss) * found
-    # The grid's steps of 15 degrees for three angles miss the top by no more than a percent.
-    assert (found <= 1.01 * rig.max_inverse_inertia()).all()
-    assert (found >= 0.8 * rig.max_inverse_inertia()).all()
+    damping = torch.rand(4, rig.joints, generator=torch.Generator().manual_seed(2)).double()
+    damping = torch.cat([damping, torch.eye(rig.joints).double()])
+    for slopes in damping:
+        gear = rig.torque_gain * (1.0 + rig.gear_loss)
+        found = torch.linalg.inv(rig.mass_matrix(q)) @ torch.diag(gear * slopes)
+        fastest = torch.linalg.eigvals(found).real.amax()
+        # The grid's steps of 15 degrees for three angles miss the top by no more than a percent.
+        assert fastest <= 1.01 * rig.decay_rate(slopes)
+        assert fastest >= 0.8 * rig.decay_rate(slopes)
+    together = rig.decay_rate(damping)
+    torch.testing.assert_close(together, torch.stack([rig.decay_rate(d) for d in damping]))
+
+
+def test_decay_rates_follow_the_values_of_the_plant() -> None:
+    rig, ones = rigs.multiarm_double(), torch.ones(2).double()
+    before = rig.decay_rate(ones)
+    rig.inertia_coupling *= 2.0
+    torch.testing.assert_close(rig.decay_rate(ones), before / 2.0)
+    heavy = rig.replace(inertia_coupling=4.0 * rig.inertia_coupling)
+    torch.testing.assert_close(heavy.decay_rate(ones), before / 8.0)
+    torch.testing.assert_close(rig.decay_rate(ones), before / 2.0)
+    # Negative slopes decay nothing, and what is no number is no rate.
+    torch.testing.assert_close(rig.decay_rate(ones - torch.tensor([0.0, 3.0])),
+                               rig.decay_rate(torch.tensor([1.0, 0.0]).double()))  # fmt: skip
+    assert rig.decay_rate(ones * torch.nan).isnan()
+    assert rig.decay_rate(ones * torch.inf).isinf()
 
 
 @pytest.mark.parametrize("arm", ARMS)
@@ -175,6 +196,7 @@ def test_replaced_buffers_broadcast_over_the_batch(arm: Any) -> None:
     }
     batched = rig.replace(**swapped)
     q, qd, tau = states(rig.joints, (3, 5))
+    scales, rates = torch.rand(rig.joints, generator=torch.Generator().manual_seed(2)).double(), []
     for p in range(3):
         one = rig.replace(**{name: value[p, 0] for name, value in swapped.items()})
         at = q[p], qd[p], tau[p]
@@ -184,7 +206,8 @@ def test_replaced_buffers_broadcast_over_the_batch(arm: Any) -> None:
         torch.testing.assert_close(batched.bias(q, qd)[p], one.bias(q[p], qd[p]))
         torch.testing.assert_close(batched.load(q, qd)[p], one.load(q[p], qd[p]))
         torch.testing.assert_close(batched.energy(q, qd)[0][p], one.energy(q[p], qd[p])[0])
-        torch.testing.assert_close(batched.max_inverse_inertia()[p], one.max_inverse_inertia())
+        rates.append(one.decay_rate(scales))
+    torch.testing.assert_close(batched.decay_rate(scales), torch.stack(rates).amax())
 
 
 def test_a_single_link_keeps_the_batch() -> None:

@@ -3,14 +3,16 @@
 import pytest
 import torch
 
-from nfriction.plant.coordinates import (
+from nfriction.plant.dynamics import (
     absolute,
+    dot,
+    entries,
     joint_forces,
     joint_matrix,
     link_forces,
     relative,
+    stack_matrix,
 )
-from nfriction.plant.linear import dot, entries, stack_matrix
 
 
 @pytest.mark.parametrize(("size", "first"), [(1, 0), (3, 0), (2, 1), (4, 1)])

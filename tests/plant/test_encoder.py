@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from nfriction import PendulumChain, rigs, rollout
-from nfriction.plant.encoder import true_angle
+from nfriction.plant.gears import correct_encoder
 
 F64 = torch.float64
 COSINE, SINE = torch.tensor([2e-3, -1e-3, 3e-3], dtype=F64), torch.tensor([1e-3] * 3, dtype=F64)
@@ -21,7 +21,7 @@ def readings(rig: PendulumChain, q: Tensor) -> Tensor:
     """Readings of true angles, by Newton's method."""
     read = q.clone()
     for _ in range(6):
-        turned = true_angle(read, rig.encoder_zero, COSINE, SINE)
+        turned = correct_encoder(read, rig.encoder_zero, COSINE, SINE)
         read = read - (turned.angle - q) / turned.slope
     return read
 
@@ -50,7 +50,7 @@ def test_the_motion_is_the_same_read_otherwise() -> None:
     q0, qd0 = torch.tensor([[2.0, 0.6, -0.4], [0.5, -0.2, 0.9]], dtype=F64)
     true = rollout(rig, None, q0, qd0, steps=500, gradients=False)
     read = readings(rig, true.q)
-    slope = true_angle(read, rig.encoder_zero, COSINE, SINE).slope
+    slope = correct_encoder(read, rig.encoder_zero, COSINE, SINE).slope
     found = rollout(
         eccentric(rig), None, read[0], qd0 / slope[0], steps=500, gradients=False
     )  # fmt: skip

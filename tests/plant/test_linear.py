@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nfriction.plant.linear import entries, multiply, solve, stack, stack_matrix
+from nfriction.plant.dynamics import entries, multiply, solve, stack, stack_matrix
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 4, 6])

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from nfriction import LFM, NFLFM, LinearAxis, PendulumChain, rollout
+from nfriction import LFM, NFLFM, LinearAxis, PendulumChain, rigs, rollout
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.registry import model_by_name, model_names
 from nfriction.papers.afem.adaptive import Adaptive
-from nfriction.simulation.rk4 import required_substeps, stability_limit
+from nfriction.simulation.rk4 import RK4_STABILITY, required_substeps
 
 F64 = torch.float64
 CHAIN = PendulumChain([0.3, 0.2], [0.2, 0.15], inertia=[1e-3, 4e-4])
@@ -225,6 +225,7 @@ class Reads(TorchDispatchMode):
 @pytest.mark.parametrize("name", model_names())
 def test_no_value_is_asked_for_within_the_loop(name):
     counts = []
+    run(named_model(name), *MOVING, sample_time=5e-4, steps=2)  # bounds of the plant are kept
     for steps in (3, 9):
         with Reads() as reads:
             run(named_model(name), *MOVING, sample_time=5e-4, steps=steps, backend="torch")
@@ -297,14 +298,14 @@ def test_a_motion_goes_on_with_what_it_remembers(backend):
     whole = run(model, *MOVING, steps=400, **settings)
     # The acceleration that a restart knows at first is another, so its class must not count.
     states = model.schedule.states(whole.qd, whole.qdd)
-    rest = run(model, whole.q[200], whole.qd[200], steps=200, memory=states[200], **settings)
+    rest = run(model, whole.q[200], whole.qd[200], steps=200, hidden_state=states[200], **settings)
     torch.testing.assert_close(rest.q, whole.q[200:], rtol=0, atol=1e-12)
     other = states[200].clone()
     other[:, 0], other[:, 1] = 4 * model.schedule.thresholds[:, 1], 2.0
-    lost = run(model, whole.q[200], whole.qd[200], steps=200, memory=other, **settings)
+    lost = run(model, whole.q[200], whole.qd[200], steps=200, hidden_state=other, **settings)
     assert not torch.allclose(lost.q, whole.q[200:], rtol=0, atol=1e-9)
     two = torch.stack([states[200], other])
-    both = run(model, whole.q[200], whole.qd[200], steps=200, memory=two, **settings)
+    both = run(model, whole.q[200], whole.qd[200], steps=200, hidden_state=two, **settings)
     torch.testing.assert_close(both.q, torch.stack([rest.q, lost.q]), rtol=0, atol=1e-13)
 
 
@@ -333,10 +334,10 @@ def test_a_memory_made_for_other_samples_is_warned_of(caplog):
 
 def test_a_memory_must_fit_the_model():
     with pytest.raises(ValueError, match="leave it out"):
-        run(smooth_model(), steps=2, memory=torch.zeros(2, 2))
+        run(smooth_model(), steps=2, hidden_state=torch.zeros(2, 2))
     for wrong in (torch.zeros(2, 3), torch.full((2, 2), torch.nan)):
-        with pytest.raises(ValueError, match="memory"):
-            run(named_model("ALFM"), steps=2, memory=wrong)
+        with pytest.raises(ValueError, match="hidden_state"):
+            run(named_model("ALFM"), steps=2, hidden_state=wrong)
 
 
 def test_gradients_reach_every_class_that_was_there():
@@ -398,7 +399,7 @@ def test_too_steep_friction_is_refused_and_the_message_mends_it(substeps):
 def test_the_stability_limit_is_where_rk4_turns_unstable():
     """An axis with viscous friction just below the limit dies out, just above it grows."""
     axis = LinearAxis(0.5)
-    limit = float(stability_limit(axis, 1e-3))
+    limit = 0.5 * RK4_STABILITY / 1e-3
     assert required_substeps(axis, model_by_name("NCFM")(1, [limit]), 1e-3) == 1
     start = torch.zeros(1, dtype=F64), torch.ones(1, dtype=F64)
     ends = []
@@ -409,6 +410,21 @@ def test_the_stability_limit_is_where_rk4_turns_unstable():
     assert ends[1] == pytest.approx(1.0, abs=0.2)
     with pytest.raises(ValueError, match="too steep"):
         run(model_by_name("NCFM")(1, [1.01 * limit]), *start, axis, steps=5)
+
+
+def test_coupled_joints_are_limited_by_their_fastest_mode():
+    """Each joint alone allows twice these coefficients; together they need more steps."""
+    plant, model = rigs.multiarm_triple(), model_by_name("NCFM")(3, [[0.97], [0.25], [0.18]])
+    start = torch.tensor([3.6, 0.5, -0.4], dtype=F64), torch.zeros(3, dtype=F64)
+    alone = plant.decay_rate(model.zero_velocity_damping().diag())
+    assert float(alone.max()) * 0.01 < 0.6 * RK4_STABILITY
+    with pytest.raises(ValueError, match="too steep"):
+        run(model, *start, plant, sample_time=0.01, steps=100)
+    needed = required_substeps(plant, model, 0.01)
+    assert needed == 2
+    out = run(model, *start, plant, sample_time=0.01, steps=100, substeps=needed)
+    exact = run(model, *start, plant, sample_time=0.01, steps=100, substeps=50)
+    assert float((out.q - exact.q).abs().max()) < 1e-3
 
 
 # Gradients

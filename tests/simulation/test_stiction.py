@@ -20,7 +20,7 @@ def slide(force: float, *, v0: float = 0.0, steps: int = 1000, **settings):
     tau = torch.full((steps, 1), force, dtype=F64)
     q0, qd0 = torch.zeros(1, dtype=F64), torch.full((1,), v0, dtype=F64)
     return rollout(axis, model, q0, qd0, tau, sample_time=1e-3,
-                   **{"scheme": "stop", "gradients": False} | settings)  # fmt: skip
+                   **{"scheme": "time_stepping", "gradients": False} | settings)  # fmt: skip
 
 
 def test_a_sliding_mass_stops_where_mechanics_says_and_stays():
@@ -45,7 +45,7 @@ def test_a_smooth_sign_creeps_where_it_ought_to_rest():
     q0 = torch.tensor([math.pi + 0.05], dtype=F64)
     start = {"q0": q0, "qd0": torch.zeros(1, dtype=F64), "sample_time": 1e-3, "steps": 500}
     settings = {**start, "gradients": False}
-    held = rollout(plant, model, **settings, scheme="stop")
+    held = rollout(plant, model, **settings, scheme="time_stepping")
     crept = rollout(plant, model, **settings, substeps=4)
     assert bool((held.q == held.q[0]).all())
     assert float((crept.q[-1] - crept.q[0]).abs()) > 1e-3
@@ -54,8 +54,8 @@ def test_a_smooth_sign_creeps_where_it_ought_to_rest():
 def test_two_joints_come_to_rest_and_lose_energy_all_the_way():
     plant, model = pendulum(), LFM(2, [[4e-3, 6e-2], [2e-3, 2e-2]], v_smooth=0.01)
     q0, zero = torch.tensor([math.pi + 0.6, 0.4], dtype=F64), torch.zeros(2, dtype=F64)
-    run = rollout(plant, model, q0, zero, sample_time=1e-3, steps=4000, substeps=4, scheme="stop",
-                  gradients=False)  # fmt: skip
+    run = rollout(plant, model, q0, zero, sample_time=1e-3, steps=4000, substeps=4,
+                  scheme="time_stepping", gradients=False)  # fmt: skip
     energy = sum(plant.energy(run.q, run.qd))
     assert float(energy.diff().max()) < 1e-5
     assert float(run.qd[-1].abs().max()) < 1e-5
@@ -68,9 +68,9 @@ def test_shorter_steps_come_nearer_to_the_smooth_solution_while_joints_move():
     q0, zero = torch.tensor([2.0, 0.4], dtype=F64), torch.zeros(2, dtype=F64)
     settings = {"sample_time": 1e-3, "steps": 300, "gradients": False}
     exact = rollout(plant, model, q0, zero, substeps=20, **settings).q
+    settings["scheme"] = "time_stepping"
     errors = [
-        float((rollout(plant, model, q0, zero, substeps=n, scheme="stop", **settings).q - exact)
-              .abs().max())
+        float((rollout(plant, model, q0, zero, substeps=n, **settings).q - exact).abs().max())
         for n in (4, 8, 16)
     ]  # fmt: skip
     assert errors[2] < 2e-3
@@ -90,9 +90,9 @@ def test_gears_lose_what_they_lose_in_smooth_steps(torque):
     start = torch.tensor([math.pi + 1.5, -0.8], dtype=F64), torch.zeros(2, dtype=F64)
     settings = {"sample_time": 1e-3, "gradients": False}
     smooth = rollout(plant, model, *start, tau, substeps=8, **settings).q
-    stopped = rollout(plant, model, *start, tau, substeps=8, scheme="stop", **settings).q
+    stopped = rollout(plant, model, *start, tau, substeps=8, scheme="time_stepping", **settings).q
     lossless = plant.replace(gear_loss=torch.zeros(2, dtype=F64))
-    free = rollout(lossless, model, *start, tau, substeps=8, scheme="stop", **settings).q
+    free = rollout(lossless, model, *start, tau, substeps=8, scheme="time_stepping", **settings).q
     off = float((stopped - smooth).abs().max())
     assert off < 0.01
     assert float((free - stopped).abs().max()) > 5 * off
@@ -114,7 +114,7 @@ def test_eager_torch_serves_where_nothing_compiles(monkeypatch, caplog):
 def test_a_batch_is_its_members():
     plant, model = pendulum(), LFM(2, [4e-3, 3e-2], v_smooth=0.01)
     q0 = torch.tensor([[2.0, 0.4], [3.0, -0.4], [3.5, 0.0]], dtype=F64)
-    settings = {"sample_time": 1e-3, "steps": 50, "scheme": "stop", "gradients": False}
+    settings = {"sample_time": 1e-3, "steps": 50, "scheme": "time_stepping", "gradients": False}
     both = rollout(plant, model, q0, torch.zeros_like(q0), **settings)
     assert both.q.shape == (3, 51, 2)
     for k in range(3):
@@ -129,9 +129,9 @@ def test_what_it_cannot_do_is_refused():
         slide(0.0, gradients=True)
     plant, zero = pendulum(), torch.zeros(2, dtype=F64)
     with pytest.raises(ValueError, match="needs a friction model"):
-        rollout(plant, None, zero, zero, steps=2, scheme="stop")
-    with pytest.raises(ValueError, match="with a memory"):
-        rollout(plant, ALFM(2), zero, zero, steps=2, scheme="stop", gradients=False)
+        rollout(plant, None, zero, zero, steps=2, scheme="time_stepping")
+    with pytest.raises(ValueError, match="with a hidden state"):
+        rollout(plant, ALFM(2), zero, zero, steps=2, scheme="time_stepping", gradients=False)
 
 
 def test_a_score_may_take_it():
@@ -139,7 +139,7 @@ def test_a_score_may_take_it():
     truth = LFM(2, [[4e-3, 3e-2], [2e-3, 1e-2]], v_smooth=0.02)
     recording = swing(pendulum(), truth, seconds=1.0)
     sharp = LFM(2, [[4e-3, 3e-2], [2e-3, 1e-2]], v_smooth=1e-6)
-    told = score(pendulum(), sharp, recording, horizons=(0.5,), scheme="stop")
+    told = score(pendulum(), sharp, recording, horizons=(0.5,), scheme="time_stepping")
     assert np.isfinite(told.free_run.all)
     assert told.free_run.all < 0.01
     assert told.windows["0.5"].all < 0.01

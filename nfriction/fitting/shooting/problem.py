@@ -34,6 +34,7 @@ from nfriction.optim.least_squares import LeastSquaresResult, Quadratic, Step
 from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
 from nfriction.plant import Plant
 from nfriction.signals import Motion
+from nfriction.simulation.protocols import RolloutInputs
 from nfriction.simulation.rollout import Rollout, integrate
 
 
@@ -191,7 +192,8 @@ class TrajectoryProblem:
 
     def _run(self, plant: Plant, q0: Tensor, qd0: Tensor) -> Rollout:
         """Motion of all windows from their first states, with the schedule as it is."""
-        return integrate(plant, self.friction, q0, qd0, self.tau, self.step, memory=self.memory)
+        inputs = RolloutInputs(q0, qd0, self.tau, self.step, hidden_state=self.memory)
+        return integrate(plant, self.friction, inputs)
 
     @torch.no_grad()
     def _states(self, motion: Rollout) -> Tensor | None:

@@ -17,6 +17,7 @@ from nfriction.papers.afem.classes import AccelerationClasses
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
+from nfriction.simulation.protocols import RolloutInputs
 from nfriction.simulation.rollout import Rollout, integrate
 
 
@@ -59,10 +60,9 @@ class LabelledProblem(TrajectoryProblem):
     def _run(self, plant: Plant, q0: Tensor, qd0: Tensor) -> Rollout:
         assert self.classes is not None
         classes = self.classes.repeat_interleave(self.substeps, 1)
-        motion = integrate(
-            plant, self.friction, q0, qd0, self.tau, self.step,
-            measured=(torch.zeros_like(classes), classes),
-        )  # fmt: skip
+        measured = torch.zeros_like(classes), classes
+        inputs = RolloutInputs(q0, qd0, self.tau, self.step, measured=measured)
+        motion = integrate(plant, self.friction, inputs)
         # What a step's derivatives are taken at must be what drove it.
         return replace(motion, qdd=torch.cat([classes, classes[:, -1:]], 1))
 

@@ -9,6 +9,7 @@ from nfriction.fitting.data.windows import Windows
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.simulation.compiled import integrate_compiled
+from nfriction.simulation.protocols import RolloutInputs
 from nfriction.simulation.rollout import integrate
 
 
@@ -80,8 +81,10 @@ class PositionError:
             schedule.set_parameter_vector(vector)
             rows.append(
                 integrate(
-                    self.plant, self.friction, of.q0[w], of.qd0[w], of.tau[w], of.step[w],
-                    substeps=self.substeps, measured=measured, memory=memory,
+                    self.plant, self.friction,
+                    RolloutInputs(
+                        of.q0[w], of.qd0[w], of.tau[w], of.step[w], self.substeps, measured, memory
+                    ),
                 ).q
             )  # fmt: skip
         schedule.set_parameter_vector(before)

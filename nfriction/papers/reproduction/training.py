@@ -122,7 +122,7 @@ def write(
     path = save(model, given.out / f"{name}.json", info)
     torchscript(model, path.with_suffix(".pt"), info)
     lines = [f"{name}: {info.fit.get('status', 'made')}"]
-    kinds = {"train": "trained on", "test": "held out"}
+    kinds = {"train": "train", "test": "test"}
     for split, recording, motion in bench.parts():
         state = bench.states.get(recording.name)
         found = score(plant, model, recording, motion=motion, initial_state=state)

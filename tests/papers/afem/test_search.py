@@ -11,6 +11,7 @@ from nfriction.papers.afem.fit_by_search import fit_by_search
 from nfriction.papers.afem.position_error import PositionError
 from nfriction.papers.afem.search import Box, SearchOptions, SearchState, search
 from nfriction.signals import kalman_smoother
+from nfriction.simulation.protocols import RolloutInputs
 from nfriction.simulation.rollout import integrate
 from tests.fitting.recordings import F64, pendulum, swing
 
@@ -81,7 +82,7 @@ def test_candidates_of_a_batch_equal_single_simulations(recorded):
     assert torch.equal(model.schedule.parameter_vector(), before)
     for vector, square in zip(vectors, found, strict=True):
         model.schedule.set_parameter_vector(vector)
-        q = integrate(plant, model, cut.q0, cut.qd0, cut.tau, cut.step, substeps=2).q
+        q = integrate(plant, model, RolloutInputs(cut.q0, cut.qd0, cut.tau, cut.step, substeps=2)).q
         expected = ((q - cut.q) * cut.weight[..., None]).square().sum() / error.values
         torch.testing.assert_close(square, expected, rtol=1e-9, atol=0)
         torch.testing.assert_close(error.residuals(vector).square().sum() / error.values, expected)
