@@ -38,7 +38,6 @@ MAY_USE_PAPERS = {"papers", "cli"}
 STILL_USE_PAPERS = {
     "nfriction/plots/fuzzy.py",
     "nfriction/friction/models.py",
-    "nfriction/fitting/fit.py",
 }
 # Only command lines talk to a person: the program's, and the one that scripts share.
 MAY_PRINT = ("cli/", "papers/twin/command.py")
