@@ -37,13 +37,8 @@ def friction_torque(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Velocity, load and friction torque along a recording, each (sample, joint).
 
-    `tau_f = tau - inverse_dynamics(q, qd, qdd)`, without the ends of the record.
-
-    Args:
-        plant: the mechanism.
-        recording: in joint coordinates.
-        motion: its smoothed motion.
-        options: how much of each end is dropped.
+    `tau_f = tau - inverse_dynamics(q, qd, qdd)` in joint coordinates, without the ends of the
+    record.
     """
     inside = _inside(motion.time, options.edge)
     q, qd, qdd = (torch.as_tensor(x[inside]) for x in (motion.q, motion.qd, motion.qdd))
@@ -84,19 +79,12 @@ def fit_torque(
     """Least squares of the friction torque, joint by joint.
 
     Linear least squares within bounds where the torque is linear in the coefficients, for every
-    combination of the law's initial values of the others.
-
-    Args:
-        law: the law to fit.
-        plant: the mechanism.
-        recordings: in joint coordinates.
-        motions: smoothed motion of each recording.
-        v_smooth: regularisation velocity of the sign [rad/s].
-        options: tuning constants.
+    combination of the law's initial values of the others. Recordings and motions are in joint
+    coordinates.
 
     Raises:
         ValueError: if there are too few samples, or the law's torque is not finite along the
-            motion.
+        motion.
     """
     parts = [
         friction_torque(plant, r, m, options) for r, m in zip(recordings, motions, strict=True)
@@ -173,14 +161,9 @@ def _linear_fit(
 def coefficient_scale(
     model: FrictionModel, plant: Plant, recordings: Sequence[Recording], motions: Sequence[Motion]
 ) -> Tensor:
-    """Size of each coefficient that alone would explain a third of the friction torque.
+    """Size of each coefficient that alone would explain a third of the friction torque, in SI.
 
-    Args:
-        model: its law has the coefficients.
-        plant, recordings, motions: see `fit_torque`.
-
-    Returns:
-        In SI, (joint, coefficient); zero where the torque is not linear in the coefficient.
+    Shape (joint, coefficient); zero where the torque is not linear in the coefficient.
     """
     torque = fit_torque(model.law, plant, recordings, motions, model.v_smooth).torque
     rms = torch.as_tensor(np.concatenate([m.qd for m in motions])).square().mean(0).sqrt()
@@ -196,15 +179,9 @@ def coefficient_scale(
 
 
 def prior_sd(law: Law, torque: TorqueFit, options: FitOptions = DEFAULTS) -> Tensor:
-    """Standard deviation of the law's zero-mean priors, in SI.
+    """Standard deviation of the law's zero-mean priors in SI, (joint, coefficient).
 
-    Args:
-        law: has the coefficients.
-        torque: its fit to the motion; the explained torque is the scale.
-        options: tuning constants.
-
-    Returns:
-        (joint, coefficient); infinite without a prior.
+    Infinite without a prior; the torque that the law explains is the scale.
     """
     shares = torch.tensor([c.share for c in law.coefficients], dtype=torque.torque.dtype)
     # On a light mechanism most of the torque is an error of inertia terms and smoothing.

@@ -135,10 +135,6 @@ class FitOptions:
     max_ratio_all: float = 1.1
     # Candidate priors, relative to the network's own.
     prior_shares: tuple[float, ...] = (1.0, 1 / 3)
-    # Candidate shares of a correction.
-    correction_shares: tuple[float, ...] = (0.0, 0.25, 0.5, 1.0)
-    # Standard errors by which a gain must be significant: 95 % of a normal distribution.
-    significance: float = 2.0
 
     # --- Extrapolation prior of a network.
     # Grid cells along velocity and acceleration, cells around a visited one that count as

@@ -21,7 +21,8 @@ def made(monkeypatch):
     problems = []
 
     class Recorded(ShootingProblem):
-        def __post_init__(self):
+        def __init__(self, *args, **settings):
+            super().__init__(*args, **settings)
             problems.append(self)
 
     monkeypatch.setattr(stages, "ShootingProblem", Recorded)

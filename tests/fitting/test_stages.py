@@ -65,7 +65,7 @@ def test_only_a_search_that_settled_claims_convergence(monkeypatch, status):
     ended = search.search(problem, problem.variables.start(), 1e-9, "")
     assert ended.result.status == status
     assert ended.result.converged == (status == "converged_step")
-    assert ended.plant_vector.shape == (0,)
+    assert ended.parts.plant.shape == (0,)
 
 
 def test_what_is_shared_has_settled_once_it_moves_no_more():

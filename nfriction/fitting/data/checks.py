@@ -51,25 +51,13 @@ def data_warnings(
     motions: Sequence[Motion],
     options: FitOptions = DEFAULTS,
 ) -> tuple[str, ...]:
-    """Warnings about recordings, a sentence each; none for sound ones.
-
-    Args:
-        plant: the mechanism as given.
-        given: the recordings as written.
-        joint: the same in joint coordinates.
-        motions: their smoothed motion, in joint coordinates.
-        options: thresholds.
-    """
+    """Warnings about recordings as written and in joint coordinates, a sentence each."""
     still = _still_joints(plant, given, joint, options.min_counts)
     return (*still, *_other_vertical(plant, given, joint, motions, options.reference_ratio))
 
 
 def require_motion(plant: Plant, joint: Sequence[Recording]) -> None:
-    """Refuse to fit coefficients that follow the motion of a joint that never moves.
-
-    Raises:
-        ValueError: naming the joints.
-    """
+    """Raise a ValueError that names joints which never move: no network can follow them."""
     still = [plant.joint_names[j] for j in np.flatnonzero(_ranges(joint) == 0)]
     if still:
         raise ValueError(

@@ -135,15 +135,9 @@ def adjustable_terms(
     eccentric: bool = False,
     per_recording: bool = False,
 ) -> list[PlantParameter]:
-    """Terms of the plant that a fit adjusts.
+    """Terms of the plant that a fit adjusts; `drag=None` includes drag for undriven pendulums.
 
-    Args:
-        plant: the mechanism as given.
-        joint: recordings in joint coordinates.
-        options: `drag=None` fits drag to an undriven pendulum.
-        eccentric: fit the encoders' eccentricity.
-        per_recording: encoders have an offset in each recording, of which the plant's would only
-            be the mean.
+    If encoders have an offset `per_recording`, the plant's would only be the mean of these.
     """
     if not options.fit_plant:
         return []

@@ -65,11 +65,10 @@ def cut_windows(
     """Cut recordings into windows of about `length` seconds that cover all but their gaps.
 
     Args:
-        recordings: in joint coordinates; a recording shorter than `length` is one window.
-        motions: the smoothed motion of each recording.
+        recordings, motions: in joint coordinates; a recording shorter than `length` is one window.
         length: [s].
-        rest_speed: recordings that begin slower than this [rad/s] start from rest, and not from
-            the smoothed motion; by default none does.
+        rest_speed: recordings that begin slower than this [rad/s] start from rest, and not from the
+            smoothed motion; by default none does.
 
     Raises:
         ValueError: if a recording has so few samples that no window fits.

@@ -67,8 +67,7 @@ def information(
     respond to their start by 1e15 times as much as to anything else.
 
     Args:
-        hessian: of the cost, prior included, (n, n).
-        precision: of the prior, (n,).
+        hessian, precision: of the cost, prior included, (n, n), and of the prior, (n,).
         shared: number of variables to keep.
         score: covariance of the gradient by the data, (n, n), where it is not the curvature:
             heteroscedastic or autocorrelated residuals.
@@ -129,8 +128,8 @@ def null_directions(
 ) -> tuple[str, ...]:
     """Parameters, and combinations `"a with b"`, about which the data say nothing.
 
-    The prior is ignored, except that a parameter counts as unidentifiable where the information
-    of the data is a millionth of its prior's.
+    The prior is ignored, except that a parameter counts as unidentifiable where the information of
+    the data is a millionth of its prior's.
     """
     least = options.null_ratio**-2
     seen = known.data.diagonal() > known.prior * least
@@ -150,13 +149,7 @@ def null_directions(
 def weakly_identified(
     names: Sequence[str], values: Tensor, known: Information, options: FitOptions = DEFAULTS
 ) -> tuple[str, ...]:
-    """Parameters whose interval includes zero because others compensate them.
-
-    Args:
-        names, values: of the leading parameters.
-        known: information about these and others.
-        options: the ratio of the sd to that with the others given.
-    """
+    """Leading parameters of `known` whose interval includes zero as others compensate them."""
     sd = standard_deviations(known)[: len(names)]
     conditional = known.data.diagonal()[: len(names)].clamp_min(1e-300).rsqrt()
     found = (NORMAL_95 * sd >= values.abs()) & (sd > options.conditional_ratio * conditional)
@@ -168,12 +161,9 @@ def exceeds_drive_torque(
 ) -> tuple[str, ...]:
     """Coefficients within whose intervals friction exceeds the torque that moves the joint.
 
-    A ratio to the value would not do: a coefficient near zero may be known to be small.
-
-    Args:
-        names, sd: of the coefficients.
-        slope: of the friction torque by each, at its joint's largest speed.
-        need: the largest torque that moves its joint along the recordings.
+    A ratio to the value would not do: a coefficient near zero may be known to be small. `slope` is
+    that of the friction torque by each coefficient at its joint's peak speed, `need` the largest
+    torque.
     """
     found = NORMAL_95 * sd * slope.abs() > need
     return tuple(names[i] for i in found.nonzero().flatten().tolist())

@@ -9,10 +9,9 @@ from nfriction.fitting.options import DEFAULTS, FitOptions
 
 
 def correlation_time(residuals: Tensor) -> float:
-    """Integrated autocorrelation time in samples, 1 or more: n residuals weigh like n / tau.
+    """Integrated autocorrelation time of residuals (window, sample, joint) in samples, 1 or more.
 
-    Args:
-        residuals: [rad; m], shape (window, sample, joint).
+    n residuals weigh like n over this time.
     """
     centred = residuals - residuals.mean(1, keepdim=True)
     return float(_integrated(_autocovariance(centred).sum((0, 2))[None, :, None]))
@@ -24,12 +23,7 @@ def effective_noise(residuals: Tensor) -> float:
 
 
 def bandwidth(q: Tensor, options: FitOptions = DEFAULTS) -> float:
-    """Highest frequency at which a motion responds to parameters [cycles per sample].
-
-    Args:
-        q: positions, shape (window, sample, joint).
-        options: tuning constants.
-    """
+    """Highest frequency at which a motion (window, sample, joint) responds [cycles per sample]."""
     samples = q.shape[1]
     hann = torch.hann_window(samples, periodic=False, dtype=q.dtype)[:, None]
     power = torch.fft.rfft(hann * (q - q.mean(1, keepdim=True)), dim=1).abs().square().sum((0, 2))
@@ -43,15 +37,12 @@ def hac_sd(residuals: Tensor, band: float, options: FitOptions = DEFAULTS) -> Te
     The noise level is the residuals' peak spectral density within the motion's bandwidth, which
     bounds the variance of their sum times a sensitivity of that bandwidth. It is estimated stretch
     by stretch: quantisation error is white while a joint moves and constant while it is nearly at
-    rest, and model errors follow the motion.
+    rest.
 
     Args:
-        residuals: [rad; m], shape (window, sample, joint).
+        residuals: [rad; m], shape (window, sample, joint), like the result.
         band: see `bandwidth` [cycles per sample].
         options: tuning constants.
-
-    Returns:
-        Of the same shape.
 
     References:
         W. K. Newey, K. D. West, Econometrica 55 (1987), 703-708.

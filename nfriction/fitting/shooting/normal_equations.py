@@ -8,15 +8,11 @@ from torch import Tensor
 
 
 class Rows(NamedTuple):
-    """Rows of the Jacobian at some samples of all windows.
+    """Rows of the Jacobian at some samples (`part`) of all windows.
 
-    The columns are the shared variables, then each window's own, see `DecisionVariables.indices`.
-
-    Attributes:
-        part: which samples.
-        scaled: of the scaled errors, (window, row, column).
-        states: of positions, and of the velocities at the end of a window, in joint coordinates,
-            (window, sample, row, column).
+    Columns are the shared variables, then each window's own (`DecisionVariables.indices`). `scaled`
+    are rows of the scaled errors, (window, row, column); `states` those of the positions, and at
+    the end of a window of the velocities, in joint coordinates, (window, sample, row, column).
     """
 
     part: slice
@@ -27,13 +23,9 @@ class Rows(NamedTuple):
 def scaled_rows(
     pieces: Iterable[tuple[slice, Tensor]], scale: Tensor, measurement: Tensor, indices: Tensor
 ) -> Iterator[Rows]:
-    """Rows of the Jacobian from derivatives of the positions.
+    """Rows of the Jacobian from derivatives of the positions, see `propagate`.
 
-    Args:
-        pieces: samples and derivatives of the positions there, see `propagate`.
-        scale: 1 over the noise of each error, (window, sample, joint or 1).
-        measurement: see `measurement_matrix`.
-        indices: see `DecisionVariables.indices`.
+    `scale` is 1 over the noise of each error, (window, sample, joint or 1).
     """
     joints, shared, own = len(measurement), int(indices[0, 0]), indices.shape[1]
     for part, rows in pieces:
@@ -48,17 +40,10 @@ def scaled_rows(
 def normal_equations(
     rows: Iterable[Rows], r: Tensor, indices: Tensor, size: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """J^T r and J^T J of all variables.
+    """J^T r and J^T J of all variables, and derivatives of the windows' final states.
 
-    Args:
-        rows: of the Jacobian.
-        r: scaled errors, (window, sample, joint).
-        indices: see `DecisionVariables.indices`.
-        size: number of variables.
-
-    Returns:
-        Gradient, Hessian, and the derivatives of the windows' final states, (window, 2 joint,
-        column).
+    `r` are the scaled errors, (window, sample, joint); the last result is (window, 2 joint,
+    column).
     """
     windows, count = indices.shape
     shared = int(indices[0, 0])
@@ -92,11 +77,8 @@ def add_defects(
 ) -> None:
     """Add the defects between windows to normal equations, in place.
 
-    Args:
-        gradient, hessian, ends, indices: see `normal_equations`.
-        defects: over their standard deviations, (pair, 2 joint).
-        pairs: see `Windows.continuity_pairs`.
-        sd: standard deviations, (2 joint,).
+    `defects` are over their standard deviations `sd`, (pair, 2 joint) and (2 joint,); `ends` come
+    from `normal_equations`.
     """
     shared, state = int(indices[0, 0]), len(sd)
     before, after = ([pair[k] for pair in pairs] for k in (0, 1))

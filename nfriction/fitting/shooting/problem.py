@@ -19,11 +19,7 @@ from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.plant_parameters import adjusted_plant
 from nfriction.fitting.result.identifiability import Information, information, standard_deviations
-from nfriction.fitting.shooting.marginalization import (
-    BlockLayout,
-    marginalize_states,
-    score_covariance,
-)
+from nfriction.fitting.shooting.marginalization import Kept, marginalize_states, score_covariance
 from nfriction.fitting.shooting.normal_equations import (
     Rows,
     add_defects,
@@ -154,23 +150,20 @@ class ShootingProblem:
         return standard_deviations(information(hessian, precision, self.variables.shared_count))
 
     def information(self, x: Tensor, sd: Tensor) -> Information:
-        """Information about the shared variables, where the errors have their own sizes.
+        """Information about the shared variables, given the sd of each error.
 
-        Args:
-            x: decision variables.
-            sd: of each error, inflated for autocorrelation, (window, step + 1, joint).
+        `sd` is inflated for autocorrelation, (window, step + 1, joint).
         """
         variables, run = self.variables, self._simulate(x, with_memory=True)
-        shared, state = variables.shared_count, variables.state_count
-        layout = BlockLayout.of(variables.indices(), state, len(x))
-        precision, _ = variables.prior()
-        of_states = variables.split(precision).states
-        kept = torch.cat([precision[:shared], variables.split(precision).offsets.flatten()])
+        shared, (precision, _) = variables.shared_count, variables.prior()
+        of_states, of_offsets = variables.split(precision)[2:]
+        kept = Kept(variables.indices(), variables.state_count, len(x))
         joined = (self.pairs, self._defect_sd) if self.pairs else ((), None)
-        known = marginalize_states(self._rows(run, self._scale), layout, of_states, *joined)
+        data, response = marginalize_states(self._rows(run, self._scale), kept, of_states, *joined)
         rows = self._rows(run, self._scale * sd / self.noise_sd)
-        score = score_covariance(rows, layout, known, of_states)
-        return information(known.data + torch.diag(kept), kept, shared, score)
+        score = score_covariance(rows, kept, response, of_states)
+        prior = torch.cat([precision[:shared], of_offsets.flatten()])
+        return information(data + torch.diag(prior), prior, shared, score)
 
     @cached_property
     def _scale(self) -> Tensor:

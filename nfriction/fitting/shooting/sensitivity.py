@@ -14,7 +14,6 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from nfriction import codegen
@@ -27,7 +26,7 @@ from nfriction.simulation.rollout import Rollout
 
 logger = logging.getLogger(__name__)
 
-# Samples linearised together in eager torch: dual numbers should stay in the processor's cache.
+# Samples linearised together in eager torch, which should stay in the processor's cache.
 CHUNK = 1024
 # Samples, over all windows, whose sensitivities are accumulated together: enough for fast matrix
 # products, few enough for the processor's cache.
@@ -37,7 +36,7 @@ PIECE = 2000
 class StepJacobian:
     """Exact derivatives of one step by state, held coefficients and plant terms.
 
-    Compiled where there is a compiler (20 to 30 times faster), otherwise by eager dual numbers.
+    Compiled where there is a compiler (20 to 30 times faster), otherwise in eager torch.
 
     Args:
         plant: the mechanism as given.
@@ -72,18 +71,16 @@ class StepJacobian:
         if self._compiled is not None:
             given = (q, qd, held, tau, step, vector[None])
             return torch.from_numpy(self._compiled(*given)[-1])
-        pieces = zip(*(x.split(CHUNK) for x in (q, qd, held, tau, step)), strict=True)
-        return torch.cat([self._eager(vector, *piece) for piece in pieces])
+        slopes = torch.func.jacfwd(self._step, (0, 1, 2, 5))
+        found = torch.func.vmap(slopes, (0, 0, 0, 0, 0, None), chunk_size=CHUNK)(
+            q, qd, held, tau, step, vector
+        )
+        return torch.cat([slope.flatten(2) for slope in found], -1)
 
     def initial_acceleration(self, q: Tensor, qd: Tensor, tau: Tensor, vector: Tensor) -> Tensor:
-        """Derivatives of the acceleration known before the first step, which has no friction.
+        """Derivatives of the first acceleration, which has no friction, by q, qd and plant terms.
 
-        Args:
-            q, qd, tau: initial state and torque, (window, joint).
-            vector: terms of the plant.
-
-        Returns:
-            By q, qd and the plant's terms, (window, joint, direction).
+        `q`, `qd` and `tau` are (window, joint); the result is (window, joint, direction).
         """
 
         def acceleration(q: Tensor, qd: Tensor, vector: Tensor, tau: Tensor) -> Tensor:
@@ -99,36 +96,13 @@ class StepJacobian:
         plant = adjusted_plant(self.plant, self.terms, vector)
         return torch.cat(rk4_step(plant, self.friction, q, qd, tau, held, step), -1)
 
-    def _eager(
-        self, vector: Tensor, q: Tensor, qd: Tensor, held: Tensor, tau: Tensor, step: Tensor
-    ) -> Tensor:
-        inputs = (q, qd, held.flatten(1), vector.expand(len(q), -1))
-        unit = torch.eye(sum(x.shape[1] for x in inputs), dtype=q.dtype)
-        tangents = unit.split([x.shape[1] for x in inputs], 1)
-        with torch.no_grad(), forward_ad.dual_level():
-            q_, qd_, held_, vector_ = (
-                forward_ad.make_dual(
-                    x.expand(len(unit), *x.shape).contiguous(),
-                    tangent[:, None].expand(len(unit), *x.shape).contiguous(),
-                )
-                for x, tangent in zip(inputs, tangents, strict=True)
-            )
-            after = self._step(q_, qd_, held_.unflatten(-1, held.shape[1:]), tau, step, vector_)
-            return forward_ad.unpack_dual(after).tangent.permute(1, 2, 0)
-
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Simulated windows.
+    """Simulated windows with their friction model and plant terms.
 
-    Attributes:
-        friction: the friction model that drove them.
-        plant_vector: terms of the plant.
-        motion: (window, step + 1, joint).
-        tau, step: torque held over each step and its length, (window, step, joint) and (window,
-            step).
-        memory: of the coefficients at every step, (window, step, joint, state_size), of a schedule
-            with one; its dependence on the motion is not differentiated.
+    `motion` is (window, step + 1, joint), `tau` (window, step, joint), `step` (window, step). The
+    `memory` of the coefficients (window, step, joint, state_size) is held constant in derivatives.
     """
 
     friction: FrictionModel
@@ -151,9 +125,9 @@ def propagate(
         stride: samples per counted one.
 
     Yields:
-        Samples, and (window, sample, joint, column); columns are the friction parameters, the
-        plant's terms, then the window's initial state. The last piece is the windows' last sample,
-        counted or not, with the rows of its velocities below those of the positions.
+        Samples, and (window, sample, joint, column) by the friction parameters, the plant terms and
+        the window's initial state. The last piece is the windows' last sample, counted or not, with
+        the rows of its velocities below those of the positions.
     """
     windows, steps = run.step.shape
     joints, plant_count = run.motion.q.shape[-1], len(run.plant_vector)
@@ -213,8 +187,7 @@ def _compose(
 ) -> tuple[Tensor, Tensor]:
     """Close the loop from the state through the coefficients, and chain the steps of blocks.
 
-    Returns:
-        Derivatives of the ends of blocks by the state before them, and by what is shared.
+    The results are derivatives of the ends of blocks by the state before, and by what is shared.
     """
     samples, joints, k = slope.qd.shape
     by_q, by_qd, by_held, by_plant = derivative.split(
@@ -243,15 +216,9 @@ def _compose(
 
 
 def _carry(by_state: Tensor, by_shared: Tensor, start: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Carry the derivatives of a state through a run of maps.
+    """Carry derivatives of a state (window, row, column) through maps (map, window, row, column).
 
-    Args:
-        by_state, by_shared: of the maps, one after another, (map, window, row, column).
-        start: derivatives before them, (window, row, column); the shared variables come first.
-        count: leading rows that are kept.
-
-    Returns:
-        The kept rows before every map, (window, map, count, column), and all rows after the last.
+    The results are the first `count` rows before every map, and all rows after the last.
     """
     # Thousands of products of small matrices: NumPy's overhead is a fifth of torch's.
     state, shared = by_state.numpy(), by_shared.numpy()

@@ -25,10 +25,8 @@ def model_at(model: FrictionModel, vector: Tensor) -> FrictionModel:
 class Parts(NamedTuple):
     """A vector of decision variables, taken apart.
 
-    Attributes:
-        friction, plant: parameter vectors.
-        states: position and velocity at the start of each window, (window, 2 joint).
-        offsets: encoder offsets, (recording, joint); no rows where they are not sought.
+    `friction` and `plant` are parameter vectors, `states` position and velocity at the start of
+    each window, (window, 2 joint), `offsets` those of the encoders, (recording, joint) or no rows.
     """
 
     friction: Tensor
@@ -44,13 +42,11 @@ class DecisionVariables:
     The shared variables, those of all windows, come first.
 
     Args:
-        schedule: its parameters are the start, and the values of what is not fitted.
-        terms: adjustable terms of the plant.
-        windows: what was measured.
-        friction_prior: mean and standard deviation; default `schedule.prior()`.
-        plant_prior: mean and standard deviation; default 0, the plant as given, and the terms' own.
-        offset_sd: of the encoder offsets, (recording, joint) [rad; m]; None seeks no offsets.
-        options: priors of the initial states.
+        schedule: its parameters are the start, and the values of what is not fitted. terms:
+        adjustable terms of the plant. windows: what was measured. friction_prior, plant_prior: mean
+        and standard deviation; default those of schedule and terms. offset_sd: of the encoder
+        offsets, (recording, joint) [rad; m]; None seeks no offsets. options: priors of the initial
+        states.
     """
 
     schedule: Schedule

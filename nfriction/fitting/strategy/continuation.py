@@ -13,7 +13,7 @@ from nfriction.fitting.options import FitOptions
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
-from nfriction.fitting.shooting.variables import model_at
+from nfriction.fitting.shooting.variables import Parts, model_at
 from nfriction.fitting.strategy.extrapolation_prior import ExtrapolationPrior
 from nfriction.friction.model import FrictionModel
 from nfriction.optim.least_squares import LeastSquaresResult, Quadratic, Status, Step
@@ -29,12 +29,7 @@ EquationError = Callable[[Plant], Tensor]
 
 @dataclass(frozen=True, eq=False)
 class HorizonResult:
-    """End of a search with windows of one length.
-
-    Attributes:
-        problem: the problem that was minimised.
-        result: of the search.
-    """
+    """The end of a search with windows of one length."""
 
     problem: ShootingProblem
     result: LeastSquaresResult
@@ -44,20 +39,10 @@ class HorizonResult:
         """Position errors [rad; m], (window, step + 1, joint)."""
         return self.problem.errors(self.result.x)
 
-    @property
-    def friction(self) -> Tensor:
-        """Parameters of the friction model."""
-        return self.problem.variables.split(self.result.x).friction.clone()
-
-    @property
-    def plant_vector(self) -> Tensor:
-        """Terms of the plant."""
-        return self.problem.variables.split(self.result.x).plant.clone()
-
-    @property
-    def offsets(self) -> Tensor:
-        """Encoder offsets, (recording, joint); no rows where they were not sought."""
-        return self.problem.variables.split(self.result.x).offsets.clone()
+    @cached_property
+    def parts(self) -> Parts:
+        """Parameters of friction and plant, window states and encoder offsets."""
+        return self.problem.variables.split(self.result.x)
 
     @property
     def stopped(self) -> bool:
@@ -83,12 +68,8 @@ class HorizonResult:
 class ShootingFitter:
     """Poses and solves shooting problems of one friction model, plant and set of recordings.
 
-    Args:
-        jacobian, friction, measurement, friction_prior, plant_prior, offset_sd, defect_sd,
-            extrapolation: see `ShootingProblem`.
-        recordings: in joint coordinates.
-        options: of the fit.
-        callback: called with a stage name after every step; True stops.
+    The recordings are in joint coordinates; `callback` is called with a stage name after every
+    step, True stops; for the other attributes see `ShootingProblem`.
     """
 
     jacobian: StepJacobian
@@ -120,7 +101,7 @@ class ShootingFitter:
     ) -> ShootingProblem:
         """The problem of windows that starts at these friction parameters.
 
-        Defects are at most penalised where the start is `far` away.
+        Where the start is `far` away, defects are at most penalised.
         """
         model = model_at(self.friction, friction)
         longest_step = max(r.longest_step for r in self.recordings)
@@ -137,13 +118,10 @@ class ShootingFitter:
     def search(
         self, problem: ShootingProblem, start: Tensor, tolerance: float, name: str
     ) -> HorizonResult:
-        """Minimise a problem.
+        """Minimise a problem of this fitter.
 
-        Args:
-            problem: of this fitter.
-            start: decision variables.
-            tolerance: relative decrease of the cost that counts as none.
-            name: of the stage, for the callback.
+        `tolerance` is the relative decrease of the cost that counts as none, `name` the stage's for
+        the callback.
         """
         solver = LevenbergMarquardt(
             max_steps=self.options.max_steps,
@@ -218,12 +196,11 @@ def horizon_continuation(
     If a horizon fails, return the previous stage and the skipped horizons.
 
     Args:
-        fitter: of the model; `options.windows` are the lengths.
-        friction, plant: parameters to start from.
-        motions: smoothed, in joint coordinates.
-        equation_error: repeats the first stage from the coefficients that torques imply on the
-            plant that it found: a nonlinear law has several minima, and on a slightly wrong
-            inertia the torques lead to a worse one.
+        fitter: of the model; `options.windows` are the lengths. friction, plant: parameters to
+        start from. motions: smoothed, in joint coordinates. equation_error: repeats the first stage
+        from the coefficients that torques imply on the plant
+            that it found: a nonlinear law has several minima, and on a slightly wrong inertia the
+            torques lead to a worse one.
         of: ending of the stages' names.
     """
     options = fitter.options
@@ -245,8 +222,8 @@ def horizon_continuation(
             found = restart_from_equation_error(fitter, found, tolerance, name, equation_error)
         if reached is not None and found.lost_motion(reached, options):
             return reached, tuple(options.windows[place:])
-        reached, friction, plant = found, found.friction, found.plant_vector
-        offsets, noise = found.offsets, max(found.noise, options.min_noise)
+        reached, noise = found, max(found.noise, options.min_noise)
+        friction, plant, _, offsets = found.parts
         if found.stopped:
             break
         simulated = problem.simulated_motions(found.result.x, simulated)
@@ -262,10 +239,10 @@ def restart_from_equation_error(
     equation_error: EquationError,
 ) -> HorizonResult:
     """A stage, or the same from the coefficients that torques imply on its plant, if lower."""
-    problem, plant = found.problem, found.plant_vector
+    problem, plant = found.problem, found.parts.plant
     friction = equation_error(problem.plant_at(plant)).reshape(-1)
     problem = replace(problem, friction=model_at(problem.friction, friction))
-    start = problem.variables.start(plant, found.offsets)
+    start = problem.variables.start(plant, found.parts.offsets)
     other = fitter.search(problem, start, tolerance, name)
     return other if other.stopped or other.result.cost < found.result.cost else found
 

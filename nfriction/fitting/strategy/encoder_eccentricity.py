@@ -13,12 +13,8 @@ def richer_by_evidence(
 
     The two plants are compared by their evidence in Laplace's approximation: the decrease of the
     cost less the Occam factor of the new terms, with residuals inflated for autocorrelation. A
-    first prediction of the decrease from derivatives alone may save the search.
-
-    Args:
-        base: stage without the terms, at the last horizon.
-        richer: fitter whose plant terms are those of `base`, then the encoders'.
-        tolerance: of the search, a relative decrease of the cost.
+    first prediction of the decrease from derivatives alone may save the search. The terms of
+    `richer` are those of `base`, then the encoders'.
 
     References:
         D. J. C. MacKay, Neural Computation 4 (1992), 415-447.
@@ -26,7 +22,7 @@ def richer_by_evidence(
     extra = len(richer.jacobian.terms) - len(base.problem.jacobian.terms)
     if not base.noise > 0 or extra < 1:
         return None
-    problem = richer.problem(base.problem.windows, base.noise, base.friction)
+    problem = richer.problem(base.problem.windows, base.noise, base.parts.friction)
     variables = problem.variables
     shared, old = variables.shared_count, base.problem.variables.shared_count
     zeros = torch.zeros(extra, dtype=torch.float64)
@@ -44,7 +40,7 @@ def richer_by_evidence(
 
     if _newton_decrease(before, both) - _newton_decrease(before, known) + occam(before) <= 0:
         return None
-    start = variables.start(torch.cat([base.plant_vector, zeros]), base.offsets)
+    start = variables.start(torch.cat([base.parts.plant, zeros]), base.parts.offsets)
     found = richer.search(problem, start, tolerance, "eccentric encoders")
     end = found.result
     gain = float(before.cost) - float(end.cost)

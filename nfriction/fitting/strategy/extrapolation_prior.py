@@ -23,10 +23,8 @@ from nfriction.signals import Motion
 class ExtrapolationPrior:
     """Points of the input range at which coefficients are pulled to those of the constant law.
 
-    Attributes:
-        qd, qdd: velocity and acceleration, (point, joint).
-        weight: 1 where no sample came near, else 0, (point, joint).
-        sd: expected deviation, in units of the coefficients' scale.
+    `qd` and `qdd` are (point, joint), `weight` 1 where no sample came near, else 0, and `sd` the
+    expected deviation in units of the coefficients' scale.
     """
 
     qd: Tensor
@@ -65,13 +63,7 @@ class ExtrapolationPrior:
 def prior_on_unvisited_cells(
     schedule: NeuroFuzzy, motions: Sequence[Motion], options: FitOptions = DEFAULTS
 ) -> ExtrapolationPrior:
-    """Prior at those points of a schedule's trained range that motions never came near.
-
-    Args:
-        schedule: with its range set.
-        motions: smoothed, in joint coordinates.
-        options: grid, radius and standard deviation.
-    """
+    """Prior at those points of a schedule's trained range that motions never came near."""
     from scipy.ndimage import binary_dilation  # slow to import
 
     visits = visit_histogram(schedule, motions, options.cells)
@@ -94,8 +86,7 @@ def visit_histogram(
 ) -> NDArray[np.float64]:
     """Samples in each cell of the trained range; those outside count at its edge.
 
-    Returns:
-        Shape (joint, cell of |velocity|, cell of acceleration).
+    Shape (joint, cell of |velocity|, cell of acceleration).
     """
     qd, qdd = (np.concatenate([getattr(m, name) for m in motions]) for name in ("qd", "qdd"))
     if schedule.along_motion:

@@ -1,9 +1,8 @@
 """Hold-out validation of a network: trained on some windows, judged on the others."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 
 import torch
 from torch import Tensor
@@ -37,57 +36,11 @@ def holdout_split(
     return cut.subset(~test), cut.subset(test)
 
 
-def stacking_weights(
-    errors: Callable[[Tensor], Tensor], joints: int, options: FitOptions = DEFAULTS
-) -> Tensor:
-    """Share of a correction that each joint takes, by hold-out windows.
-
-    The criterion is the mean over windows of the log ratio of errors with to those without the
-    correction, so that a single diverging window does not outvote the others. The best shares make
-    no joint worse and lower the mean over joints most, at the upper end of its confidence
-    interval; an insignificant gain is none. First the same share is tried for all joints, then
-    each joint's own until none changes.
-
-    Args:
-        errors: root mean square errors at given shares (joint,), shape (window, joint).
-        joints: their number.
-        options: candidate shares and significance.
-
-    Returns:
-        Shares between 0 and 1, (joint,).
-    """
-
-    def log_errors(shares: tuple[float, ...]) -> Tensor:
-        found = errors(torch.tensor(shares, dtype=torch.float64))
-        return found.clamp_min(options.min_noise).log().nan_to_num(torch.inf, torch.inf)
-
-    without = log_errors((0.0,) * joints)
-
-    @cache
-    def change(shares: tuple[float, ...]) -> float:
-        ratio = log_errors(shares) - without
-        own = ratio.mean(1)
-        found = own.mean() + options.significance * own.std() / len(own) ** 0.5
-        return float(found) if bool((ratio.mean(0) <= 0).all()) else math.inf
-
-    best = min(((share,) * joints for share in options.correction_shares), key=change)
-    before = None
-    while best != before:
-        before = best
-        for j in range(joints):
-            trials = ((*best[:j], share, *best[j + 1 :]) for share in options.correction_shares)
-            best = min(trials, key=change)
-    return torch.tensor(best, dtype=torch.float64)
-
-
 @dataclass(frozen=True)
 class HoldoutScore:
-    """Hold-out RMSE of a network relative to that of its constant law.
+    """Hold-out RMSE of a network over that of its constant law.
 
-    Attributes:
-        same: with the law fitted to the same windows as the network.
-        all: with the law fitted to all windows, the hold-out ones too.
-        options: the largest ratios that are accepted.
+    `same` is the ratio to the law fitted to the same windows, `all` to the law fitted to all.
     """
 
     same: float
@@ -118,17 +71,11 @@ def _change(ratio: float) -> str:
 def holdout_rmse(
     test: Windows, problem: ShootingProblem, friction: Tensor, plant: Tensor
 ) -> float | None:
-    """Root mean square error on windows, each simulated from its best initial state.
+    """Root mean square error on windows [rad; m], each simulated from its best initial state.
 
-    Smoothed states err by more than the difference between two laws.
-
-    Args:
-        test: the windows.
-        problem: of other windows, with the same friction model and plant.
-        friction, plant: parameters to judge.
-
-    Returns:
-        [rad; m]; infinite where the motion diverges, None where the search was interrupted.
+    Smoothed states err by more than the difference between two laws. Infinite where the motion
+    diverges, None where the search was interrupted. The problem is of other windows with the same
+    friction model and plant, whose parameters are given.
     """
     judged, options = replace(problem, windows=test), problem.options
     x = judged.variables.start(plant, friction=friction)

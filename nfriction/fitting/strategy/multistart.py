@@ -27,21 +27,18 @@ def warm_start_from_nested(
     motions: tuple[Motion, ...],
     equation_error: EquationError,
 ) -> tuple[HorizonResult, tuple[float, ...]]:
-    """The lowest end of a law, also searched from that of its nested law.
+    """The lowest end of a law and its skipped horizons, also searched from its nested law.
 
     Args:
         own: end of the law and the skipped horizons on the way there.
         fitter, nested: of the law, and of the nested one.
         start: parameters of the nested law, and of the plant.
         motions, equation_error: see `horizon_continuation`.
-
-    Returns:
-        The end with its skipped horizons.
     """
     stages = f", {nested.friction.law.name} law"
     base, skipped = horizon_continuation(nested, *start, motions, of=stages)
     best = best_of_starts(fitter, own[0], base, equation_error)
-    return own if best.problem is own[0].problem else (best, skipped)
+    return best, own[1] if best.problem is own[0].problem else skipped
 
 
 def best_of_starts(
@@ -54,14 +51,9 @@ def best_of_starts(
 
     A nonlinear law has several minima, and the plant decides to which of them the torques lead. So
     it is searched again from the coefficients that they imply on the nested law's plant and, while
-    it is above the nested law, from that law itself. Priors guide each search; the comparison of
-    the ends is by their residuals alone. Longer windows win where only the nested law could follow
+    it is above the nested law, from that law itself. Priors guide each search; the ends are
+    compared by their residuals alone. Longer windows win where only the nested law could follow
     them.
-
-    Args:
-        fitter: of the law.
-        own, nested: ends of the law and of its nested law.
-        equation_error: coefficients of the law that torques imply on a plant.
     """
     if nested.stopped:
         return own.as_stopped()
@@ -73,8 +65,8 @@ def best_of_starts(
     # With the larger noise of the two, priors would outweigh the data.
     sizes = (own.noise, nested.noise, own.problem.noise_sd, nested.problem.noise_sd)
     noise = max(min(size for size in sizes if math.isfinite(size)), options.min_noise)
-    implied = equation_error(own.problem.plant_at(nested.plant_vector))
-    embedded = embed_nested(law, nested.friction.reshape(len(implied), -1), implied)
+    implied = equation_error(own.problem.plant_at(nested.parts.plant))
+    embedded = embed_nested(law, nested.parts.friction.reshape(len(implied), -1), implied)
     best, lowest = own, _misfit(own, noise) if same else math.inf
     limit = _misfit(nested, noise)
     tolerance = loglik_tolerance(min(lowest, limit), options)
@@ -82,7 +74,7 @@ def best_of_starts(
         if coefficients is embedded and lowest <= limit:
             break
         problem = fitter.problem(windows, noise, coefficients.reshape(-1))
-        start = problem.variables.start(nested.plant_vector, nested.offsets)
+        start = problem.variables.start(nested.parts.plant, nested.parts.offsets)
         name = f"from the {nested.problem.friction.law.name} law"
         found = fitter.search(problem, start, tolerance, name)
         misfit = _misfit(found, noise)
@@ -97,10 +89,7 @@ def best_of_starts(
 def embed_nested(law: Law, nested: Tensor, shapes: Tensor) -> Tensor:
     """Coefficients at which a law equals its nested law, (joint, coefficient).
 
-    Args:
-        law: the law.
-        nested: coefficients of the nested law.
-        shapes: coefficients of the law; those in which it is nonlinear are taken.
+    Those in which the law is nonlinear are taken from `shapes`.
     """
     linear = torch.tensor([c.linear for c in law.coefficients])
     embedded = torch.where(linear, 0.0, shapes)

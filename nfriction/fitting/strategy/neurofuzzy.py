@@ -100,11 +100,7 @@ def initialise_from_constant(
 ) -> FrictionModel:
     """A copy of a neuro-fuzzy model at a constant fit of its law, over the range of the motion.
 
-    Args:
-        model: neuro-fuzzy; the copy's network is zero.
-        constant: fit of the same law with constant coefficients.
-        recordings, motions: in joint coordinates.
-        options: quantiles of the acceleration.
+    Its network is zero; recordings and motions are in joint coordinates.
     """
     network = copy.deepcopy(model)
     schedule = cast("NeuroFuzzy", network.schedule)
@@ -151,14 +147,7 @@ class _Trial:
 
 
 class _Validation:
-    """Networks judged against a constant law on hold-out windows.
-
-    Args:
-        law: fitter of the constant law, with the plant's prior mean at its fit.
-        start: the constant fit.
-        motions: smoothed, in joint coordinates.
-        length: of the windows [s].
-    """
+    """Networks judged against a constant law on hold-out windows of one length [s]."""
 
     def __init__(
         self, law: ShootingFitter, start: FitResult, motions: tuple[Motion, ...], length: float
@@ -178,17 +167,17 @@ class _Validation:
         """The best of all priors; wider plant priors must earn their place. None if stopped."""
         values = self.law.friction.schedule.parameter_vector()
         same = self._search(self.law, values, "constant law, hold-out")
-        if same.stopped:
+        of_same = self._error(same)
+        if of_same is None:
             return None
-        errors = (
-            self._error(same, same.friction, same.plant_vector),
-            self._error(same, values, self.plant),
-        )
+        of_all = holdout_rmse(self.test, same.problem, values, self.plant)
+        if of_all is None:
+            return None
         best: _Trial | None = None
         for fitter in fitters:
             trials = []
             for share in self.options.prior_shares:
-                trial = self._trial(fitter, share, errors)
+                trial = self._trial(fitter, share, of_same, of_all)
                 if trial is None:
                     return None
                 trials.append(trial)
@@ -201,12 +190,14 @@ class _Validation:
     def fit_all(self, trial: _Trial) -> HorizonResult:
         """The network of a trial, fitted to all windows."""
         windows = trial.fitter.cut(self.motions, self.length)
-        problem = trial.fitter.problem(windows, self.noise, trial.end.friction, stride=self.stride)
-        start = problem.variables.start(trial.end.plant_vector)
+        problem = trial.fitter.problem(
+            windows, self.noise, trial.end.parts.friction, stride=self.stride
+        )
+        start = problem.variables.start(trial.end.parts.plant)
         return trial.fitter.search(problem, start, self.tolerance, f"{self.length:g} s windows")
 
     def _trial(
-        self, fitter: ShootingFitter, share: float, errors: Sequence[float | None]
+        self, fitter: ShootingFitter, share: float, of_same: float, of_all: float
     ) -> _Trial | None:
         """A network under a prior, from zero: from another prior's end it would stay there."""
         widest = cast("NeuroFuzzy", fitter.friction.schedule).prior_sd
@@ -214,11 +205,12 @@ class _Validation:
         prior = (zeros, torch.full_like(zeros, share * widest))
         fitter = replace(fitter, friction_prior=prior)
         end = self._search(fitter, zeros, "network, hold-out")
-        error = None if end.stopped else self._error(end, end.friction, end.plant_vector)
-        if error is None or None in errors:
+        error = self._error(end)
+        if error is None:
             return None
-        same, of_all = (error / law if math.isfinite(error) else math.inf for law in errors if law)
-        return _Trial(HoldoutScore(same, of_all, self.options), fitter, share * widest, end)
+        ratios = [error / law if math.isfinite(error) else math.inf for law in (of_same, of_all)]
+        score = HoldoutScore(ratios[0], ratios[1], self.options)
+        return _Trial(score, fitter, share * widest, end)
 
     def _search(self, fitter: ShootingFitter, friction: Tensor, name: str) -> HorizonResult:
         """Search of the training windows."""
@@ -226,8 +218,11 @@ class _Validation:
         start = problem.variables.start(self.plant)
         return fitter.search(problem, start, self.tolerance, name)
 
-    def _error(self, end: HorizonResult, friction: Tensor, plant: Tensor) -> float | None:
-        return holdout_rmse(self.test, end.problem, friction, plant)
+    def _error(self, end: HorizonResult) -> float | None:
+        """Hold-out RMSE of a search; None if it was stopped, half trained and unjudged."""
+        if end.stopped:
+            return None
+        return holdout_rmse(self.test, end.problem, end.parts.friction, end.parts.plant)
 
 
 def _constant_kept(

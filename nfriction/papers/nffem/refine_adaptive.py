@@ -1,7 +1,9 @@
 """Neuro-fuzzy corrections of an adaptive model, kept as far as they help on what they never saw."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -12,13 +14,13 @@ from nfriction.fitting.data.inputs import (
     measurement_matrix,
 )
 from nfriction.fitting.equation_error import coefficient_scale
-from nfriction.fitting.options import FitOptions
+from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.result.fit_result import FitResult, result_from_shooting
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.continuation import ShootingFitter
-from nfriction.fitting.strategy.holdout import cut_for_folds, stacking_weights
+from nfriction.fitting.strategy.holdout import cut_for_folds
 from nfriction.fitting.strategy.neurofuzzy import input_range
 from nfriction.friction.model import FrictionModel
 from nfriction.optim.least_squares import Step
@@ -29,6 +31,10 @@ from nfriction.recording import Recording
 # Relative fall of the cost that ends the search: only its neighbourhood matters to a correction.
 LOOSE = 1e-3
 FOLDS = 3
+# Candidate shares of a correction.
+SHARES = (0.0, 0.25, 0.5, 1.0)
+# Standard errors by which a gain must be significant: 95 % of a normal distribution.
+SIGNIFICANCE = 2.0
 
 
 def refine_adaptive(
@@ -140,7 +146,7 @@ def _cross_fitted(
             for chosen in (fold != k, fold == k)
         )
         found = fitter.search(seen, seen.variables.start(friction=zero), LOOSE, name)
-        learned.append(found.friction)
+        learned.append(found.parts.friction)
         unseen.append(rest)
         if found.stopped:
             break
@@ -167,3 +173,43 @@ def _errors(problem: ShootingProblem, vector: Tensor) -> Tensor:
     """Root mean square error of windows from their smoothed starts, (window, joint)."""
     start = problem.variables.start(friction=vector)
     return problem.errors(start).square().mean(1).sqrt()
+
+
+def stacking_weights(errors: Callable[[Tensor], Tensor], joints: int) -> Tensor:
+    """Share of a correction that each joint takes, by hold-out windows.
+
+    The criterion is the mean over windows of the log ratio of errors with to those without the
+    correction, so that a single diverging window does not outvote the others. The best shares make
+    no joint worse and lower the mean over joints most, at the upper end of its confidence
+    interval; an insignificant gain is none. First the same share is tried for all joints, then
+    each joint's own until none changes.
+
+    Args:
+        errors: root mean square errors at given shares (joint,), shape (window, joint).
+        joints: their number.
+
+    Returns:
+        Shares between 0 and 1, (joint,).
+    """
+
+    def log_errors(shares: tuple[float, ...]) -> Tensor:
+        found = errors(torch.tensor(shares, dtype=torch.float64))
+        return found.clamp_min(DEFAULTS.min_noise).log().nan_to_num(torch.inf, torch.inf)
+
+    without = log_errors((0.0,) * joints)
+
+    @cache
+    def change(shares: tuple[float, ...]) -> float:
+        ratio = log_errors(shares) - without
+        own = ratio.mean(1)
+        found = own.mean() + SIGNIFICANCE * own.std() / len(own) ** 0.5
+        return float(found) if bool((ratio.mean(0) <= 0).all()) else math.inf
+
+    best = min(((share,) * joints for share in SHARES), key=change)
+    before = None
+    while best != before:
+        before = best
+        for j in range(joints):
+            trials = ((*best[:j], share, *best[j + 1 :]) for share in SHARES)
+            best = min(trials, key=change)
+    return torch.tensor(best, dtype=torch.float64)
