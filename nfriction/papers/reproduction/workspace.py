@@ -251,14 +251,14 @@ class Workspace:
 
 
 # Fields of a fit that are kept as arrays or in its model file; the others are plain JSON.
-_APART = ("model", "plant", "motions", "uncertainty", "_residuals", "plant_terms", "intervals")
+_APART = ("model", "plant", "motions", "uncertainty", "residuals", "plant_terms", "intervals")
 _TERM = [("name", "U200"), ("value", float), ("bound", float)]
 _INTERVAL = [("name", "U200"), ("value", float), ("low", float), ("high", float)]
 
 
 def _tables(found: FitResult) -> dict[str, NDArray[Any]]:
     return {
-        "residuals": found._residuals.numpy(),
+        "residuals": found.residuals.numpy(),
         "plant_terms": np.array(list(found.plant_terms), dtype=_TERM),
         "intervals": np.array([astuple(i) for i in found.intervals], dtype=_INTERVAL),
     }
@@ -272,7 +272,7 @@ def _restored(
         model=load(path),
         plant=load_plant(path),
         motions=tuple(bench.train_motions),
-        _residuals=torch.as_tensor(arrays["residuals"]),
+        residuals=torch.as_tensor(arrays["residuals"]),
         plant_terms=tuple(arrays["plant_terms"].tolist()),
         intervals=tuple(Interval(*row) for row in arrays["intervals"].tolist()),
         **plain,
