@@ -17,8 +17,8 @@ from nfriction.evaluation.time_blocks import (
     leave_blocks_out,
     longest_stretch,
 )
-from nfriction.fitting.data.inputs import zeroed_each
-from nfriction.fitting.strategy.holdout import LEAST_ERROR
+from nfriction.fitting.data.checks import looks_zeroed_per_recording
+from nfriction.fitting.options import DEFAULTS
 from nfriction.friction.registry import model_by_name
 from nfriction.plant import Plant
 from nfriction.recording import Recording
@@ -142,10 +142,10 @@ def select(
         )
     names = list(dict.fromkeys(models))
     splits = [leave_blocks_out(plant, recording, folds) for recording in recordings]
-    if fit_settings.get("zeroed", "auto") == "auto":
+    if fit_settings.get("encoder_reference", "auto") == "auto":
         # Blocks no longer show where their recording began.
-        each = zeroed_each(plant, recordings)
-        fit_settings["zeroed"] = "each" if each else "once"
+        per_recording = looks_zeroed_per_recording(plant, recordings)
+        fit_settings["encoder_reference"] = "per_recording" if per_recording else "shared"
     horizon = min(horizon, *(longest_stretch(s.unseen.recording) for row in splits for s in row))
     seen, unseen = _folds(splits, folds)
     fits = fit_models(
@@ -233,7 +233,7 @@ def _alike(one: Candidate, best: Candidate, tolerance: float) -> bool:
     if one.error <= (1 + tolerance) * best.error:
         return True
     squares = np.square([one.errors, best.errors])
-    logarithms = np.log(squares.clip(min=LEAST_ERROR**2))
+    logarithms = np.log(squares.clip(min=DEFAULTS.min_noise**2))
     return all(_within_error(a - b) for a, b in (squares, logarithms))
 
 

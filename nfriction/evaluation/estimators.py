@@ -13,8 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from nfriction.evaluation.score import score
 from nfriction.fitting.fit import fit
+from nfriction.fitting.options import (
+    Continuity,
+    Eccentricity,
+    EncoderReference,
+    FitOptions,
+    Method,
+)
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.fitting.strategy.constant import WINDOWS
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.registry import model_by_name
@@ -37,8 +43,8 @@ class FrictionEstimator:
     Args:
         plant: the mechanism.
         model: name of a friction model, or one to start from, which stays as it is.
-        method, windows, fit_plant, drag, eccentricity, zeroed, continuity, max_steps: see
-            `nfriction.fit`.
+        method, windows, fit_plant, drag, eccentricity, encoder_reference, continuity, max_steps:
+            see `nfriction.fit`.
         horizon: length of the simulations by which `score` judges [s].
 
     Attributes:
@@ -60,13 +66,13 @@ class FrictionEstimator:
         plant: Plant | None = None,
         model: str | FrictionModel = "LFM",
         *,
-        method: str = "trajectory",
-        windows: Sequence[float] = WINDOWS,
+        method: Method = "output_error",
+        windows: Sequence[float] = FitOptions.windows,
         fit_plant: bool = True,
         drag: bool | None = None,
-        eccentricity: bool | None = False,
-        zeroed: str = "auto",
-        continuity: str = "free",
+        eccentricity: Eccentricity = "off",
+        encoder_reference: EncoderReference = "auto",
+        continuity: Continuity = "none",
         max_steps: int = 30,
         horizon: float = 5.0,
     ) -> None:
@@ -78,7 +84,7 @@ class FrictionEstimator:
         self.fit_plant = fit_plant
         self.drag = drag
         self.eccentricity = eccentricity
-        self.zeroed = zeroed
+        self.encoder_reference = encoder_reference
         self.continuity = continuity
         self.max_steps = max_steps
         self.horizon = horizon

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfriction.evaluation.score import score
-from nfriction.fitting.data.inputs import at_zeros
+from nfriction.fitting.data.inputs import apply_encoder_offsets
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.plant import Plant
 from nfriction.recording import Recording
@@ -68,8 +68,11 @@ def _part(motion: Motion, mask: NDArray[np.bool_]) -> Motion:
 
 def at_found_zeros(found: FitResult, blocks: Sequence[Block]) -> list[Block]:
     """Blocks with the zeros that a fit found in the rest of their recordings, one block to each."""
-    recordings, motions = at_zeros(
-        found.zeros, found.plant, [b.recording for b in blocks], [b.motion for b in blocks]
+    recordings, motions = apply_encoder_offsets(
+        found.encoder_offsets,
+        found.plant,
+        [b.recording for b in blocks],
+        [b.motion for b in blocks],
     )
     return [Block(*pair) for pair in zip(recordings, motions, strict=True)]
 

@@ -76,6 +76,7 @@ class NeuroFuzzy(Schedule):
     reach: Final[float] = 0.5  # distance from the trained range where it is zero, in ranges
     turn: Final[float] = 3e-3  # width of the sign of qdd sgn(qd), in ranges of the velocity
 
+    fit_strategy = "nfriction.fitting.strategy.neurofuzzy:fit_neurofuzzy"
     handles_range = True
 
     reference: Tensor

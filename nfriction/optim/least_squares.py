@@ -22,16 +22,15 @@ Status = Literal[
 ]
 
 MESSAGES: dict[str, str] = {
-    "converged_gradient": "The projected gradient is zero to tolerance, or the residuals vanish.",
-    "converged_cost": "A full step can lower the cost by no more than its tolerance.",
-    "converged_step": "A full step moves the parameters by no more than the tolerance.",
-    "max_steps": "The step limit was reached before convergence.",
-    "creeping": "Steps creep: several in a row together lowered the cost by no more than their "
-    "tolerance, short of the minimum (a kink or a narrow valley).",
-    "stalled": "No step lowers the cost although the gradient is not small: the gradient and the "
-    "cost disagree (a kink, noise or a wrong derivative).",
+    "converged_gradient": "Converged: the gradient is zero to tolerance, or the residuals are.",
+    "converged_cost": "Converged.",
+    "converged_step": "Converged: the parameters no longer move.",
+    "max_steps": "The step limit was reached.",
+    "creeping": "Stalled before reaching a minimum (a kink or a narrow valley in the cost).",
+    "stalled": "No step lowers the cost although the gradient is not small: gradient and cost "
+    "disagree (a kink, noise or a wrong derivative).",
     "not_finite": "Cost or derivatives are not finite, at the start or at every step from `x`.",
-    "stopped": "Stopped by the callback or by an interrupt; `x` is the best point reached.",
+    "stopped": "Stopped by the callback or an interrupt; `x` is the best point reached.",
 }
 
 

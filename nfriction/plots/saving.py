@@ -92,8 +92,10 @@ def _figures(
     last = list(comparison.fits.values())[-1]
     order = [s.recording for s in next(iter(comparison.train.values()))]
     moved = last.motions
-    if last.zeros:
-        moved = tuple(replace(m, q=m.q + z) for m, z in zip(moved, last.zeros, strict=True))
+    if last.encoder_offsets:
+        moved = tuple(
+            replace(m, q=m.q + z) for m, z in zip(moved, last.encoder_offsets, strict=True)
+        )
     trained = dict(zip(order, moved, strict=True))
     given = [r for r in recordings if r.name in trained]
     joints = comparison.joint_names

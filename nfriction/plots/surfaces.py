@@ -14,7 +14,7 @@ from scipy.ndimage import binary_dilation, gaussian_filter
 
 from nfriction.fitting.result.identifiability import NORMAL_95
 from nfriction.fitting.result.uncertainty import CoefficientUncertainty
-from nfriction.fitting.strategy.extrapolation_prior import visits
+from nfriction.fitting.strategy.extrapolation_prior import visit_histogram
 from nfriction.friction.laws import Coefficient
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
@@ -72,7 +72,7 @@ def coefficient_surfaces(
         rows, columns, width or (style.COLUMN if columns == 1 else style.PAGE), 0.7 + 1.5 * rows,
         sharex=share, sharey=share,
     )  # fmt: skip
-    visited = None if motions is None else visits(schedule, motions, CELLS)
+    visited = None if motions is None else visit_histogram(schedule, motions, CELLS)
     for j, maps in enumerate(axes.T if across else axes):
         edges = _edges(schedule, j)
         qd, qdd = _middles(schedule, edges)
@@ -135,7 +135,7 @@ def coefficient_sections(
     if schedule.along_motion:
         levels = ("braking", "steady", "speeding up")
     looks = style.looks(levels)
-    visited = None if motions is None else visits(schedule, motions, CELLS)
+    visited = None if motions is None else visit_histogram(schedule, motions, CELLS)
     for j, panels in enumerate(axes):
         edges = _edges(schedule, j)
         accelerations = _levels(*range_of(schedule, j, 1))

@@ -162,7 +162,7 @@ def _fit(run: Run, name: str) -> Markup:
     if fit.residual == fit.residual:
         said.append(f" Left over: {1e3 * fit.residual:.4g} m{fit.residual_unit}.")
     wary = [*fit.warnings]
-    for what, of in (("At a bound", fit.at_bounds), ("The data cannot tell", fit.lost)):
+    for what, of in (("At a bound", fit.at_bounds), ("Not identifiable", fit.lost)):
         # Most fits say so themselves, and say more.
         if of and not any(warning.startswith(what) for warning in wary):
             wary.append(f"{what}: {'; '.join(of)}.")

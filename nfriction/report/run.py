@@ -237,7 +237,7 @@ def _fit(value: object, name: str) -> FitRecord:
         residual_unit=text(entry.get("residual_unit", ""), where),
         at_bounds=texts(entry.get("at_bounds", []), where),
         warnings=texts(entry.get("warnings", []), where),
-        lost=texts(entry.get("lost", []), where),
+        lost=texts(entry.get("unidentifiable", entry.get("lost", [])), where),
         plant=mapped(entry.get("plant", {}), where, number),
         intervals=mapped(entry.get("intervals", {}), where, _interval),
     )

@@ -57,7 +57,7 @@ def same(one: FitResult, other: FitResult) -> bool:
 
 # A network's law must be known again in another process: laws are told by identity.
 CASES = [
-    pytest.param(["NCFM", "LFM"], {"method": "torque"}, marks=pytest.mark.slow),
+    pytest.param(["NCFM", "LFM"], {"method": "equation_error"}, marks=pytest.mark.slow),
     pytest.param(["LFM", "NFLFM"], QUICK, marks=pytest.mark.slow),
 ]
 
@@ -91,7 +91,7 @@ def test_a_model_that_fails_loses_no_other(
         started[name] = settings["start"]
         if name == "LFM":
             raise ValueError("the data say nothing")
-        return fit(model, plant, recordings, method="torque")
+        return fit(model, plant, recordings, method="equation_error")
 
     monkeypatch.setattr(many, "fit", fragile)
     with caplog.at_level(logging.INFO, "nfriction"):

@@ -7,7 +7,7 @@ import torch
 from scipy.optimize import lsq_linear
 from torch import Tensor
 
-from nfriction.optim.least_squares import Quadratic, from_residuals
+from nfriction.optim.least_squares import Quadratic, Status, from_residuals
 from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
 
 F64 = torch.float64
@@ -293,9 +293,9 @@ def test_interrupt_returns_the_best_so_far() -> None:
 def test_callback_sees_every_step_and_can_stop() -> None:
     seen = []
 
-    def callback(x: Tensor, step: object) -> bool:
+    def callback(x: Tensor, local: Quadratic, step: object) -> Status | None:
         seen.append((x, step))
-        return len(seen) == 3
+        return "stopped" if len(seen) == 3 else None
 
     result = LevenbergMarquardt().minimise(
         from_residuals(rosenbrock), vector(-1.2, 1), callback=callback

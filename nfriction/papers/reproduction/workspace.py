@@ -18,7 +18,7 @@ from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.identifiability import Interval
 from nfriction.io.atomic import replacing, write_atomically
 from nfriction.io.model_file import load, load_plant, save
-from nfriction.papers.afem.search import SearchState
+from nfriction.papers.afem.fit_by_search import SearchState
 from nfriction.plant import Plant, rigs
 from nfriction.recording import Recording, read_initial_states
 from nfriction.signals import Motion, kalman_smoother
@@ -251,14 +251,14 @@ class Workspace:
 
 
 # Fields of a fit that are kept as arrays or in its model file; the others are plain JSON.
-_APART = ("model", "plant", "motions", "uncertainty", "_residuals", "plant_terms", "intervals")
+_APART = ("model", "plant", "motions", "uncertainty", "residuals", "plant_terms", "intervals")
 _TERM = [("name", "U200"), ("value", float), ("bound", float)]
 _INTERVAL = [("name", "U200"), ("value", float), ("low", float), ("high", float)]
 
 
 def _tables(found: FitResult) -> dict[str, NDArray[Any]]:
     return {
-        "residuals": found._residuals.numpy(),
+        "residuals": found.residuals.numpy(),
         "plant_terms": np.array(list(found.plant_terms), dtype=_TERM),
         "intervals": np.array([astuple(i) for i in found.intervals], dtype=_INTERVAL),
     }
@@ -272,7 +272,7 @@ def _restored(
         model=load(path),
         plant=load_plant(path),
         motions=tuple(bench.train_motions),
-        _residuals=torch.as_tensor(arrays["residuals"]),
+        residuals=torch.as_tensor(arrays["residuals"]),
         plant_terms=tuple(arrays["plant_terms"].tolist()),
         intervals=tuple(Interval(*row) for row in arrays["intervals"].tolist()),
         **plain,

@@ -7,9 +7,14 @@ import torch
 
 from nfriction import LFM, NCFM, NFLFM
 from nfriction.fitting.data.windows import cut_windows
-from nfriction.papers.afem.fit_by_search import fit_by_search
-from nfriction.papers.afem.position_error import PositionError
-from nfriction.papers.afem.search import Box, SearchOptions, SearchState, search
+from nfriction.papers.afem.fit_by_search import (
+    Box,
+    SearchOptions,
+    SearchState,
+    fit_by_search,
+    search,
+)
+from nfriction.papers.afem.given_classes import PositionError
 from nfriction.signals import kalman_smoother
 from nfriction.simulation.rollout import integrate
 from tests.fitting.recordings import F64, pendulum, swing
@@ -50,7 +55,7 @@ def test_known_friction_is_recovered(recorded, method):
 def test_a_free_run_is_one_window(recorded):
     model = NCFM(2, v_smooth=V_SMOOTH)
     found = fitted(recorded, model, method="sqp", horizon=None, max_evaluations=30)
-    assert found._residuals.shape[0] == 1
+    assert found.residuals.shape[0] == 1
     assert found.status.startswith(("converged", "not converged"))
 
 

@@ -5,12 +5,11 @@ import torch
 
 from nfriction import ALFM, LFM, NFLFM, fit
 from nfriction.evaluation.score import score
-from nfriction.fitting.shooting.problem import TrajectoryProblem
+from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.friction.laws import LINEAR
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
-from nfriction.papers.afem.fit_adaptive import fit_adaptive
 from nfriction.papers.nffem.refine_adaptive import refine_adaptive
 from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import F64, pendulum, swing
@@ -47,7 +46,7 @@ def case():
     motions = [kalman_smoother(r.time, r.q) for r in train]
     settings = {"fit_plant": False, "windows": (1.0,), "motions": motions}
     constant = fit(LFM(2, v_smooth=V_SMOOTH), plant, train, **settings)
-    by_class = fit_adaptive(ALFM(2, v_smooth=V_SMOOTH), plant, train, start=constant, **settings)
+    by_class = fit(ALFM(2, v_smooth=V_SMOOTH), plant, train, start=constant, **settings)
     return plant, train, held, by_class
 
 
@@ -124,15 +123,15 @@ def test_gradient_with_a_memory_is_the_cost_s_derivative():
     model.requires_grad_(False)
     w = windows()
     memory = model.schedule.initial_state(w.qd0, torch.full_like(w.qd0, 20.0))
-    p = TrajectoryProblem(
-        StepJacobian(pendulum(), model, []), w, 1e-3, ABSOLUTE, stride=4, memory=memory
+    p = ShootingProblem(
+        StepJacobian(pendulum(), model, []), model, w, 1e-3, ABSOLUTE, stride=4, memory=memory
     )
     g = torch.Generator().manual_seed(1)
-    x = p.unknowns.start()
-    x[: p.unknowns.friction_count] = 0.1 * torch.randn(
-        p.unknowns.friction_count, generator=g, dtype=F64
+    x = p.variables.start()
+    x[: p.variables.friction_count] = 0.1 * torch.randn(
+        p.variables.friction_count, generator=g, dtype=F64
     )
-    found = p.quadratic(x)
+    found = p.linearise(x)
     assert float(found.cost) == pytest.approx(float(p.cost(x)))
     for _ in range(4):
         along = torch.randn(x.shape, generator=g, dtype=F64)
