@@ -237,7 +237,7 @@ def fitted_offset(plant, truth, recording, share):
     """The offset of a fit, expected to be within a share of the friction."""
     law = truth.law
     if share is not None:
-        expected = tuple(replace(c, share=share) if c.name == "f_o" else c
+        expected = tuple(replace(c, prior_scale=share) if c.name == "f_o" else c
                          for c in law.coefficients)  # fmt: skip
         law = replace(law, coefficients=expected)
     model = FrictionModel(law, Constant(law, 2), V_SMOOTH)

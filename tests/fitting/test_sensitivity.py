@@ -8,6 +8,7 @@ from nfriction.codegen import NoBackend
 from nfriction.fitting.plant_parameters import adjusted_buffers, plant_parameters
 from nfriction.fitting.shooting.sensitivity import CHUNK, StepJacobian, Trajectory, propagate
 from nfriction.friction.models import MODELS
+from nfriction.friction.registry import model_by_name
 from nfriction.simulation.rk4 import rk4_step
 from nfriction.simulation.rollout import integrate
 from tests.fitting.recordings import F64, pendulum
@@ -121,7 +122,7 @@ def test_the_start_slope_is_the_frictionless_acceleration_s():
 
 def rows_of(name, steps, substeps, stride):
     """Samples of a short motion and the derivatives of the positions there, in one piece."""
-    plant, model = pendulum(), MODELS[name](2, v_smooth=0.5)
+    plant, model = pendulum(), model_by_name(name)(2, v_smooth=0.5)
     q0, qd0 = torch.ones(2, 2, dtype=F64), torch.zeros(2, 2, dtype=F64)
     tau, step = torch.zeros(2, steps, 2, dtype=F64), torch.full((2, steps), 1e-3, dtype=F64)
     motion = integrate(plant, model, q0, qd0, tau, step)

@@ -162,16 +162,3 @@ def test_parameter_names_say_where_a_parameter_acts(law: Law) -> None:
     for joint, row in zip(["shoulder", "elbow"], schedule.values.tolist(), strict=True):
         for coefficient, value in zip(law.names, row, strict=True):
             assert names[round(value) - 1] == f"{coefficient} of {joint}"
-
-
-def test_what_a_fit_expects_is_no_part_of_the_model() -> None:
-    schedule = Constant(NONLINEAR, 2)
-    before = schedule.state_dict()
-    mean, sd = schedule.prior()
-    assert not mean.any()
-    assert torch.isinf(sd).all()
-    expected = torch.full((2, 5), torch.inf, dtype=torch.float64)
-    expected[:, 0] = torch.tensor([1e-4, 2e-4])
-    schedule.set_prior_sd(expected)
-    assert torch.equal(schedule.prior()[1], expected.reshape(-1))
-    assert schedule.state_dict().keys() == before.keys()

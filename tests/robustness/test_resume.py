@@ -12,7 +12,6 @@ from pathlib import Path
 from random import Random
 
 import pytest
-
 from nfriction.papers.afem.search import SearchState
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -33,6 +33,36 @@ DYNAMIC_RANGE = 1e-2
 
 
 @dataclass(frozen=True)
+class ClassOptions:
+    """How classes are found, and how far their coefficients may deviate.
+
+    Attributes:
+        thresholds: given ones [rad/s^2], (joint, 2) or (2,), instead of searched ones.
+        intervals: given ones, by recording and joint; samples outside belong to the nearest.
+        window: length of the moving window [s], longer than half a swing.
+        least: a class with less data than this takes its neighbour's coefficients [s].
+        prior_sd: standard deviation of a class around the constant law, in units of a coefficient
+            that explains a third of the friction (or of the coefficient itself, if larger).
+
+    Raises:
+        ValueError: if the standard deviation is not positive.
+    """
+
+    thresholds: Tensor | Sequence | None = None
+    intervals: Intervals | None = None
+    window: float = 1.0
+    least: float = 0.5
+    prior_sd: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not self.prior_sd > 0:
+            raise ValueError(f"`prior_sd` must be positive, got {self.prior_sd}.")
+
+
+DEFAULTS = ClassOptions()
+
+
+@dataclass(frozen=True)
 class AccelerationClasses:
     """Classes of acceleration along recordings.
 
@@ -91,11 +121,7 @@ def find_classes(
     recordings: Sequence[Recording],
     motions: Sequence[Motion],
     joints: Sequence[str],
-    *,
-    thresholds: Tensor | Sequence | None = None,
-    intervals: Intervals | None = None,
-    window: float = 1.0,
-    least: float = 0.5,
+    options: ClassOptions = DEFAULTS,
 ) -> AccelerationClasses:
     """Find classes of acceleration and set the schedule to them.
 
@@ -109,10 +135,7 @@ def find_classes(
         recordings: in joint coordinates.
         motions: smoothed motion of each recording.
         joints: names of the joints.
-        thresholds: given ones [rad/s^2], (joint, 2) or (2,), instead of searched ones.
-        intervals: given ones, by recording and joint; samples outside belong to the nearest.
-        window: length of the moving window [s], longer than half a swing.
-        least: a class with less data than this takes its neighbour's coefficients [s].
+        options: given classes, or how to find them.
 
     Raises:
         ValueError: if no joint's acceleration varies enough to have classes, sample times differ,
@@ -124,13 +147,13 @@ def find_classes(
     qd = [torch.as_tensor(m.qd, dtype=torch.float64) for m in motions]
     rate = torch.cat(qdd).square().mean(0).sqrt() / torch.cat(qd).square().mean(0).sqrt()
     notes: list[str] = []
-    labels = None
-    if intervals is not None:
-        labels = [_labels(intervals, r, joints) for r in recordings]
+    labels, thresholds = None, options.thresholds
+    if options.intervals is not None:
+        labels = [_labels(options.intervals, r, joints) for r in recordings]
         envelopes = [peak_envelope(a.abs(), schedule.fading) for a in qdd]
         thresholds = _separating(labels, envelopes)
     elif thresholds is None:
-        thresholds = _by_otsu(qdd, step, window, joints, notes)
+        thresholds = _by_otsu(qdd, step, options.window, joints, notes)
     schedule.set_classes(thresholds, rate.nan_to_num(0.0, 0.0))
     if labels is None:
         labels = [schedule.classes(v, a) for v, a in zip(qd, qdd, strict=True)]
@@ -139,7 +162,7 @@ def find_classes(
     return AccelerationClasses(
         thresholds=schedule.thresholds.clone(),
         labels=tuple(labels),
-        stands_for=_merged(seconds, least, joints, notes),
+        stands_for=_merged(seconds, options.least, joints, notes),
         notes=tuple(notes),
         recordings=tuple(r.name for r in recordings),
         joints=tuple(joints),

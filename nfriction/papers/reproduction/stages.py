@@ -15,6 +15,7 @@ from nfriction.evaluation.results import model_info
 from nfriction.evaluation.score import RMSE, score
 from nfriction.export import ExportError, torchscript
 from nfriction.fitting.fit import fit
+from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.registry import model_by_name
@@ -23,8 +24,7 @@ from nfriction.io.model_info import ModelInfo
 from nfriction.papers import twin
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
 from nfriction.papers.afem.fit_adaptive import fit_adaptive
-from nfriction.papers.afem.fit_by_search import fit_by_search
-from nfriction.papers.afem.search import SearchMethod, SearchOptions
+from nfriction.papers.afem.fit_by_search import SearchMethod, SearchOptions, fit_by_search
 from nfriction.papers.nffem.refine_adaptive import refine_adaptive
 from nfriction.papers.reproduction.procedure import papers_neuro_fuzzy
 from nfriction.papers.reproduction.workspace import Array, Bench, Workspace, smoothed
@@ -116,9 +116,12 @@ def fit_by_class(workspace: Workspace, bench: Bench, name: str) -> FitResult:
     settings = workspace.settings
     start = fit_constant(workspace, bench, name.removeprefix("A"))
     model = model_by_name(name)(bench.plant.joints)
+    options = FitOptions(
+        windows=settings.windows, fit_plant=settings.fit_plant, max_steps=settings.max_steps
+    )
     return workspace.fit(name, bench, lambda step: fit_adaptive(
-        model, bench.plant, bench.train, windows=settings.windows, max_steps=settings.max_steps,
-        fit_plant=settings.fit_plant, start=start, motions=bench.train_motions, callback=step,
+        model, bench.plant, bench.train, options=options, start=start,
+        motions=bench.train_motions, callback=step,
     ))  # fmt: skip
 
 

@@ -18,7 +18,7 @@ from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.identifiability import Interval
 from nfriction.io.atomic import atomic_write, write_atomically
 from nfriction.io.model_file import load, load_plant, save
-from nfriction.papers.afem.search import SearchState
+from nfriction.papers.afem.fit_by_search import SearchState
 from nfriction.plant import Plant, rigs
 from nfriction.recording import Recording, read_initial_states
 from nfriction.signals import Motion, kalman_smoother

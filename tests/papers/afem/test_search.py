@@ -7,9 +7,14 @@ import torch
 
 from nfriction import LFM, NCFM, NFLFM
 from nfriction.fitting.data.windows import cut_windows
-from nfriction.papers.afem.fit_by_search import fit_by_search
-from nfriction.papers.afem.position_error import PositionError
-from nfriction.papers.afem.search import Box, SearchOptions, SearchState, search
+from nfriction.papers.afem.fit_by_search import (
+    Box,
+    SearchOptions,
+    SearchState,
+    fit_by_search,
+    search,
+)
+from nfriction.papers.afem.given_classes import PositionError
 from nfriction.signals import kalman_smoother
 from nfriction.simulation.protocols import RolloutInputs
 from nfriction.simulation.rollout import integrate
