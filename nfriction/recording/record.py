@@ -39,7 +39,7 @@ class Recording:
 
     Args:
         time: [s], increasing, shape (time,).
-        q: position [rad, or m where `unit` says so], shape (time, joint).
+        q: position [rad, or m by `unit`], shape (time, joint).
         tau: joint torque [N m, or N], shape like `q`.
         qd: measured velocity [rad/s, or m/s], shape like `q`.
         names: one name per joint, "joint1" … by default.
@@ -189,7 +189,7 @@ class Recording:
             return self
         if convention is None:
             raise ValueError(
-                "the recording does not say how its angles are written; give the plant, or read "
+                "the recording has no angle convention; give the plant, or read "
                 "it with convention='absolute,hanging' or the like."
             )
         first_link = 0 if plant is None else plant.first_link
@@ -266,7 +266,7 @@ class Recording:
         unit = unit or written or found or "rad"
         if found and found != unit:
             raise ValueError(
-                f"`unit` is {unit!r}, but the columns say {found!r}; drop one of the two."
+                f"`unit` is {unit!r}, but the columns are in {found!r}; drop one of the two."
             )
         if degrees and unit == "m":
             raise ValueError("`degrees=True` needs angles, but `unit` is 'm'; drop one of the two.")
@@ -302,7 +302,7 @@ class Recording:
         or .mf4.
 
         A CSV file may begin with comment lines `# convention: absolute,hanging` and `# unit: rad`;
-        arguments override what the file says. Cells may be separated by commas, semicolons, tabs
+        arguments override the file. Cells may be separated by commas, semicolons, tabs
         or blanks, as the header is; numbers may have a decimal comma where no comma separates. A
         row of units under the header, or units in it as in `time [ms]`, are followed. Arrays of
         .mat and .h5 files are named by their path, `data.Y.q1`, `enc[0]`; signals of dSPACE

@@ -46,7 +46,7 @@ def test_channels_are_read_by_name_with_their_units(asammdf: Any, tmp_path: Path
     back = Recording.read(path, columns={"q1": "enc_1", "q2": "enc_2:rad"})
     np.testing.assert_allclose(back.q, Q, rtol=6e-16)
     np.testing.assert_allclose(back.time, TIME, rtol=4e-16)
-    with pytest.raises(ValueError, match="said to be in 'rad', but the file says 'deg'"):
+    with pytest.raises(ValueError, match="given as 'rad', but the file says 'deg'"):
         Recording.read(path, columns={"q1": "enc_1:rad"})
     with pytest.raises(ValueError, match="'bar' is no unit of q"):
         Recording.read(path, columns={"q1": "gas"})

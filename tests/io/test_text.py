@@ -89,7 +89,7 @@ def test_lengths_make_a_sliding_axis(tmp_path: Path) -> None:
     np.testing.assert_allclose(back.q, Q * [1e-3, 1.0], rtol=4e-16)
     with pytest.raises(ValueError, match="all be angles or all be lengths"):
         read(tmp_path, text, columns={"q1": "x:mm", "q2": "y:deg"})
-    with pytest.raises(ValueError, match="`unit` is 'rad', but the columns say 'm'"):
+    with pytest.raises(ValueError, match="`unit` is 'rad', but the columns are in 'm'"):
         read(tmp_path, text, columns={"q1": "x:mm", "q2": "y:m"}, unit="rad")
 
 
@@ -162,7 +162,7 @@ def test_units_that_contradict_are_refused(tmp_path: Path) -> None:
     text = written(",", False, "time [s]{0}q1 [rad]{0}q2 [rad]")
     with pytest.raises(ValueError, match=r"`degrees=True`, but column q1 \[rad\]"):
         read(tmp_path, text, degrees=True)
-    with pytest.raises(ValueError, match="said to be in 'deg', but the file says"):
+    with pytest.raises(ValueError, match="given as 'deg', but the file says"):
         read(tmp_path, text, columns={"q1": "q1 [rad]:deg"})
 
 

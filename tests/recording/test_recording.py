@@ -123,7 +123,7 @@ def test_a_joint_without_torque_beside_a_driven_one_is_undriven_and_said(
     """As of an acrobot, whose one motor is between its links."""
     recording = swing()
     table = recording.to_pandas().drop(columns=["tau1"])
-    said = r"'run': column tau1 is missing, so nothing .*columns=\{\"tau1\": \"\.\.\.\"\}"
+    said = r"'run': no column tau1, .* to be passive.*columns=\{\"tau1\": \"\.\.\.\"\}"
     with pytest.warns(RecordingWarning, match=said):
         back = Recording.from_pandas(table, columns=columns, name="run")
     table.to_csv(tmp_path / "run.csv", index=False)
@@ -517,7 +517,7 @@ def test_what_a_recording_does_not_say_the_plant_says() -> None:
     assert unsaid.joint_coordinates(hanging).digest() == said.joint_coordinates().digest()
     # What it says itself is stronger.
     assert said.resolve_convention(Rig(("relative", "upright"), 0)) == said.convention
-    with pytest.raises(ValueError, match="does not say how its angles are written; give the plant"):
+    with pytest.raises(ValueError, match="has no angle convention; give the plant"):
         unsaid.joint_coordinates()
     assert unsaid.digest() != said.digest()
     assert "that of the plant" in repr(unsaid)

@@ -1,8 +1,8 @@
 """Recordings as files: CSV, Parquet, NPZ, MATLAB, HDF5 and MDF as tables.
 
-A table is a pandas DataFrame with columns `time`, `q1` …, `qd1` …, `tau1` …, or what the file calls
-them; cells of a CSV file stay text. Its `attrs` hold what the file says beside the numbers:
-`convention`, `unit`, `names`, and `units` by column.
+A table is a pandas DataFrame with columns `time`, `q1` …, `qd1` …, `tau1` …, or the file's names of
+them; cells of a CSV file stay text. Its `attrs` hold the file's other information: `convention`,
+`unit`, `names`, and `units` by column.
 
 pandas is slow to import, so only functions that make tables import it.
 """

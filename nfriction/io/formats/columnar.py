@@ -35,7 +35,7 @@ def read_parquet(path: Path, _: object = ()) -> pd.DataFrame:
         table = pd.read_parquet(content, engine="pyarrow")
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"the description of its columns is damaged: {error!r}") from error
-    # pandas copies all attributes at every step, whatever a stranger put there.
+    # pandas copies all attributes at every step, so foreign ones are dropped.
     table.attrs = {k: table.attrs[k] for k in ATTRIBUTES if isinstance(table.attrs.get(k), str)}
     return table
 
@@ -80,8 +80,8 @@ def read_npz(path: Path, _: object = ()) -> pd.DataFrame:
 def _array(content: bytes) -> np.ndarray:
     """A vector, a matrix or a text of a `.npy` file.
 
-    NumPy's reader evaluates the header, accepts objects and records, and allocates whatever size
-    the header claims; here the header has one form, and its claims must match the data.
+    NumPy's reader evaluates the header, accepts objects and records, and allocates the claimed
+    size; here the header has one form, and its claims must match the data.
     """
     if content[:6] != b"\x93NUMPY" or len(content) < 12:
         raise ValueError("it holds something that is no array")

@@ -71,7 +71,7 @@ def _nested(value: Any) -> Any:
 
 
 def _check_unpacked_size(content: bytes) -> None:
-    """Refuse compression bombs: SciPy inflates whatever is there."""
+    """Refuse compression bombs: SciPy inflates without a limit."""
     order = "<" if content[126:128] == b"IM" else ">"
     at, unpacked = _HEADER, 0
     while at + 8 <= len(content):

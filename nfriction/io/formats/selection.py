@@ -42,7 +42,7 @@ _SPELLINGS = {
 
 
 class Source(NamedTuple):
-    """A column of a table and its unit, None if nothing says one."""
+    """A column of a table and its unit, None if unknown."""
 
     column: str
     unit: str | None
@@ -53,7 +53,7 @@ class Arrays(NamedTuple):
 
     Attributes:
         values: time, q; qd where every joint has it; tau where any has, zero for the others.
-        slides: whether positions are lengths; None where nothing says so.
+        slides: whether positions are lengths; None if unknown.
         remarks: doubts about the choice of columns, and the remedy of each.
     """
 
@@ -142,7 +142,7 @@ def is_number(cell: object) -> bool:
 
 
 def canonical_unit(text: str) -> str:
-    """A unit's own spelling, whatever brackets and signs a file writes it with."""
+    """A unit in our spelling, without the brackets and signs of a file."""
     text = unicodedata.normalize("NFKC", text).strip().strip("[]()").strip()
     return _SPELLINGS.get(text, text)
 
@@ -205,25 +205,32 @@ def _sources(table: pd.DataFrame, columns: dict[str, str]) -> dict[str, Source]:
 
 
 def _known(table: pd.DataFrame, aliases: dict[str, str], source: Source) -> Source:
-    """A source by the table's own name for it, with the unit that the file says."""
+    """A source by the table's own name for it, with the unit in the file."""
     column = aliases.get(source.column, source.column)
     if column in table.attrs.get("repeated", ()) or (table.columns == column).sum() > 1:
         raise ValueError(f"column {column} is there more than once; rename one of them.")
-    said = _texts(table, "units").get(column)
-    if source.unit and said and not is_unit(said):
-        said = None  # a word of the logger's own
-    if source.unit and said and canonical_unit(said) != canonical_unit(source.unit):
+    written = _texts(table, "units").get(column)
+    units = {canonical_unit(unit) for unit in (source.unit, written) if unit and is_unit(unit)}
+    if source.unit and len(units) > 1:
         raise ValueError(
-            f"column {column} is said to be in {source.unit!r}, but the file says {said!r}."
+            f"column {column} is given as {source.unit!r}, but the file says {written!r}."
         )
-    return Source(column, source.unit or said)
+    return Source(column, source.unit or written)
 
 
 def _joint_column(table: pd.DataFrame, key: str, source: Source | None, degrees: bool) -> Array:
     """A joint's numbers in SI; zero without a source."""
     if source is None:
         return np.zeros(len(table))
-    return _column(table, key, _default_unit(key, source, degrees))
+    if degrees and key in ("q", "qd"):
+        unit = "deg" if key == "q" else "deg/s"
+        if source.unit and canonical_unit(source.unit) != unit:
+            raise ValueError(
+                f"`degrees=True`, but column {source.column} is given as {source.unit!r}; "
+                f"drop one of the two."
+            )
+        source = Source(source.column, unit)
+    return _column(table, key, source)
 
 
 def _number(name: str) -> int:
@@ -245,14 +252,14 @@ def _remarks(
         remarks.append((finding, "name or drop those of all joints"))
     free = lacking["tau"]
     if 0 < len(free) < joints:
-        finding = f"column {', '.join(free)} is missing, so nothing is taken to drive that joint"
-        remarks.append((finding, f'if something does, name it with columns={{"{free[0]}": "..."}}'))
+        finding = f"no column {', '.join(free)}, so that joint is assumed to be passive"
+        remarks.append((finding, f'if it is driven, name it with columns={{"{free[0]}": "..."}}'))
     unread = _unread_torques(table, sources) if free else []
     if unread:
         own = f"tau{_number(unread[0])}"
-        mend = f'columns={{"{own if own in free else free[0]}": "{unread[0]}"}}'
+        remedy = f'columns={{"{own if own in free else free[0]}": "{unread[0]}"}}'
         finding = f"column {', '.join(unread[:3])} looks like torque and is not read"
-        remarks.append((finding, f"if it is, name it with {mend}"))
+        remarks.append((finding, f"if it is, name it with {remedy}"))
     return tuple(remarks)
 
 
@@ -265,18 +272,6 @@ def _unread_torques(table: pd.DataFrame, sources: dict[str, Source]) -> list[str
         for name in names
         if name not in read and _LIKE_TORQUE.search(name) and f"tau{_number(name)}" not in sources
     ]
-
-
-def _default_unit(key: str, source: Source, degrees: bool) -> Source:
-    if not degrees or key not in ("q", "qd"):
-        return source
-    unit = "deg" if key == "q" else "deg/s"
-    if source.unit and canonical_unit(source.unit) != unit:
-        raise ValueError(
-            f"`degrees=True`, but column {source.column} is said to be in {source.unit!r}; "
-            f"drop one of the two."
-        )
-    return Source(source.column, unit)
 
 
 def _column(table: pd.DataFrame, kind: str, source: Source) -> Array:

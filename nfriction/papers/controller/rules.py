@@ -77,7 +77,7 @@ class Variable:
             raise ValueError(f"{where}: needs 1 to {MAX_SETS} sets, got {len(self.sets)}.")
         _refuse_duplicates(f"{where}: sets", self.terms)
         if ANY in self.terms:
-            raise ValueError(f"{where}: {ANY!r} stands for any term and cannot name a set.")
+            raise ValueError(f"{where}: {ANY!r} means any term and cannot name a set.")
         for before, after in pairwise(self.sets):
             if before.core > after.core:
                 raise ValueError(
