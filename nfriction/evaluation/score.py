@@ -64,7 +64,7 @@ class RMSE:
 
 @dataclass(frozen=True)
 class Score:
-    """How well a model predicts one recording.
+    """Position errors of a model on one recording.
 
     Attributes:
         recording: name of the recording.
