@@ -30,20 +30,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command.
 
     Errors are one line on standard error and exit status 2, an interrupt gives status 130, and
-    141 says that whoever read the output had enough of it.
+    141 says that the reader of the output closed it.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     try:
         try:
             return _answer(words)
         finally:
-            sys.stdout.flush()  # what is still held back would fail too late to be caught
+            sys.stdout.flush()  # buffered output would fail too late to be caught
     except BrokenPipeError:
         return drop_output()
 
 
 def _answer(words: list[str]) -> int:
-    """Parse and run, and tell errors."""
+    """Parse, run and report errors."""
     parser = make_parser()
     arguments = argparse.Namespace(debug="--debug" in words)
     try:

@@ -1,4 +1,4 @@
-"""What a person meets at the console: errors and warnings in a line, progress, Ctrl-C."""
+"""The console: errors and warnings in a line, progress, Ctrl-C."""
 
 import argparse
 import logging
@@ -18,11 +18,11 @@ from typing import Any, NoReturn
 
 
 class UsageError(Exception):
-    """What the user asked for cannot be done; the message says why and what to do."""
+    """The request cannot be met; the message says why and what to do."""
 
 
 class _Help(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
-    """Tells defaults where there is one to tell; leaves examples as they are written."""
+    """Shows defaults where there is one; leaves examples as they are written."""
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
         if action.default in (None, False, []):
@@ -31,7 +31,7 @@ class _Help(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpF
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line, as all others are, and whose help tells defaults."""
+    """A parser whose errors are one line, and whose help shows defaults."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(formatter_class=_Help, **kwargs)

@@ -35,7 +35,7 @@ def error_tables(comparison: Comparison) -> str:
 
 
 def fit_lines(name: str, fit: FitResult) -> str:
-    """How a fit ended and its warnings: bounds, unidentifiable directions, model error."""
+    """Status and warnings of a fit: bounds, unidentifiable directions, model error."""
     note = f"; at a bound: {', '.join(fit.at_bounds)}" if fit.at_bounds else ""
     return "\n  - ".join([f"{name}: {fit.status.rstrip('.')}{note}", *fit.warnings])
 
@@ -43,7 +43,9 @@ def fit_lines(name: str, fit: FitResult) -> str:
 def interval_table(fit: FitResult) -> str:
     """Values and 95 % intervals of constant coefficients and of the plant's terms; may be empty."""
     rows = [(i.name, i.value, i.low, i.high) for i in fit.intervals]
-    return str(tables.interval_table(type(fit.model).__name__, rows)) if rows else ""
+    if not rows:
+        return ""
+    return str(tables.interval_table(type(fit.model).__name__, rows, bool(fit.plant_terms)))
 
 
 def choice(selection: Selection) -> str:
@@ -63,16 +65,16 @@ def verdict(comparison: Comparison) -> str:
         return "no verdict: every free run over the test recordings diverged"
     error = 1e3 * comparison.table()["all"][best]
     end = "; no model is better" if best == NO_FRICTION else ""
-    told = (
+    found = (
         f"best on test recordings: {best} (free run over all joints: {error:.3g} "
         f"m{comparison.unit}){end}"
     )
     tied, floor = comparison.indistinguishable(), comparison.floor()
     if len(tied) < 2 or floor is None:
-        return told
+        return found
     others = ", ".join(name for name in tied if name != best)
     return (
-        f"{told}\nstatistically tied with {others} (differences below the floor of "
+        f"{found}\nstatistically tied with {others} (differences below the floor of "
         f"{1e3 * floor:.3g} m{comparison.unit} are not meaningful); the simplest of them is "
         f"{tied[0]}"
     )

@@ -133,16 +133,10 @@ def select(
     all others.
 
     Args:
-        plant: the mechanism as given.
-        models: names of models, simple ones first.
+        plant, models, progress, jobs, fit_settings: as in `compare`.
         recordings: training recordings.
         folds: at least 2.
         horizon: length of the simulations [s]; a block where that is shorter.
-        progress, jobs: as in `compare`; fits of different folds never wait for each other.
-        fit_settings: see `fit`.
-
-    Returns:
-        The choice, with every model's error on every block.
 
     Raises:
         ValueError: if there are fewer than two folds, no model or no recording, or a recording is
@@ -249,14 +243,11 @@ def _candidate(
 
 
 def choose(candidates: Sequence[Candidate], unit: str = "rad") -> tuple[str, str]:
-    """The model with the fewest parameters that is statistically tied with the best.
+    """The model with the fewest parameters that is statistically tied with the best, and why.
 
     Args:
         candidates: with errors of the same blocks.
         unit: of the errors.
-
-    Returns:
-        Its name, and why, in a sentence.
     """
 
     def error(candidate: Candidate) -> str:
@@ -284,7 +275,7 @@ def choose(candidates: Sequence[Candidate], unit: str = "rad") -> tuple[str, str
 
 
 def _indistinguishable(one: Candidate, best: Candidate) -> bool:
-    """Whether two errors differ by no more than the scatter over their blocks."""
+    """True where two errors differ by no more than the scatter over their blocks."""
     if not math.isfinite(one.error):
         return False
     if one.error <= (1 + TOLERANCE) * best.error:
@@ -295,7 +286,7 @@ def _indistinguishable(one: Candidate, best: Candidate) -> bool:
 
 
 def _within_error(difference: NDArray[np.float64]) -> bool:
-    """Whether a mean is no larger than its standard error."""
+    """True where a mean is no larger than its standard error."""
     n = len(difference)
     error = float(difference.std(ddof=1)) / math.sqrt(n) if n > 1 else 0.0
     return float(difference.mean()) <= error

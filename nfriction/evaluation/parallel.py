@@ -71,27 +71,13 @@ def fit_models(
     progress: Progress | None = None,
     **fit_settings: Any,
 ) -> dict[str, Fits]:
-    """Fit every model to every part of the data.
+    """Fit every model to every part of the data, in levels of independent fits.
 
-    Fits of a level start from those of the levels before and are independent of each other, so
-    the result is the same however many processes share the work. A model that cannot be fitted
-    does not stop the others.
-
-    Args:
-        plant: the mechanism as given.
-        models: names of models.
-        parts: data by the label of the work on them, such as "fit".
-        jobs: number of processes, each on one thread; -1 for one to each core.
-        progress: receives what is being done.
-        fit_settings: see `nfriction.fit`.
+    Arguments and errors are those of `compare`; `parts` are data by the label of the work on them,
+    such as "fit". A model that cannot be fitted does not stop the others.
 
     Returns:
         Fits by part.
-
-    Raises:
-        ValueError: if there is no such model, or a setting cannot be sent to other processes.
-        ImportError: if `jobs` needs joblib and it is not installed.
-        ValueError, ArithmeticError, RuntimeError: the first model's error where all failed.
     """
     check_jobs(jobs)
     if jobs != 1 and fit_settings.get("callback") is not None:
@@ -140,9 +126,6 @@ def warm_starts(models: Sequence[str]) -> dict[str, str | None]:
 
     Constant laws begin with the plant's terms of the first of them, all others with the constant
     fit of their own law, or of the first where that is not asked for.
-
-    Raises:
-        ValueError: if there is no such model.
     """
     kinds = {name: model_by_name(name) for name in models}
     constant = {n: k.definition for n, k in kinds.items() if issubclass(k, ConstantModel)}
@@ -178,12 +161,7 @@ def _fit(
 
 
 def check_jobs(jobs: int) -> None:
-    """Require a number of processes that makes sense, and joblib where there are several.
-
-    Raises:
-        ValueError: if it is 0.
-        ImportError: if it is not 1 and joblib is not installed.
-    """
+    """Require at least one process, and joblib where there are several."""
     if jobs == 0:
         raise ValueError("`jobs` must be at least 1, or -1 for one to each core, got 0.")
     if jobs != 1:
@@ -202,16 +180,13 @@ def as_completed(
     jobs: int = 1,
     progress: Progress | None = None,
 ) -> Iterator[tuple[str, T]]:
-    """Run independent tasks and yield each result as it is finished.
+    """Run independent tasks and yield label and result of each as it is finished.
 
     Args:
         work: a function; for more than one process it must be importable by its name.
         tasks: its arguments by the label of each task.
         jobs: number of processes; the tasks run in this one where it is 1, or there is one task.
         progress: receives the labels.
-
-    Yields:
-        Label and result; in order where `jobs` is 1, else as they come.
 
     Raises:
         ValueError, RuntimeError, ...: the first error of a task, its message preceded by the

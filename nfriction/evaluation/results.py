@@ -73,14 +73,11 @@ def write_results(
 
     Args:
         comparison: fits and scores.
-        train, test: the recordings behind them.
+        train, test: their recordings.
         folder: made where it does not exist.
         selection: the choice on the training recordings alone, if there is one.
         command: reproduces the results.
         figures: draw them.
-
-    Returns:
-        The files written.
     """
     folder = Path(folder)
     results = comparison.to_dict() | {

@@ -10,14 +10,13 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from nfriction.friction.models import FrictionModel
+from nfriction.friction.model import FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion, kalman_smoother
@@ -64,7 +63,7 @@ class RMSE:
 
 @dataclass(frozen=True)
 class Score:
-    """How well a model predicts one recording.
+    """Position errors of a model on one recording.
 
     Attributes:
         recording: name of the recording.
@@ -115,8 +114,8 @@ def score(
         initial_state: q0 and qd0 of the free run in the recording's convention, (joint,) each;
             default from the smoothed motion.
         horizons: lengths of windows [s]; those longer than the recording are skipped.
-        scheme: of the integration, see `rollout`; `"time_stepping"` where joints come to rest
-            off their balance, which a smoothed sign lets creep back.
+        scheme: of the integration, see `rollout`; `"time_stepping"` where joints come to rest off their
+            balance, which a smoothed sign lets creep back.
 
     Returns:
         Errors in the recording's coordinates and unit.
@@ -124,62 +123,93 @@ def score(
     convention, first_link = recording.resolve_convention(plant), plant.first_link
     joint = recording.joint_coordinates(plant)
     motion = motion or kalman_smoother(joint.time, joint.q)
-    simulate = _Simulator(plant, friction, joint, scheme)
-    q0, qd0 = motion.q[0], motion.qd[0]
+    start = motion.q[0], motion.qd[0]
     if initial_state is not None:
-        q0 = convention.position_to_joint(np.asarray(initial_state[0]), first_link)
-        qd0 = convention.rate_to_joint(np.asarray(initial_state[1]), first_link)
-
-    # The free run, and beside it one run for each joint that starts one encoder count off.
-    count, joints = plant.position_quantum, len(q0)
-    off = np.zeros((1, joints)) if count is None else count * np.eye(joints + 1, joints, -1)
-    q = np.broadcast_to(motion.q, (len(off), *motion.q.shape)).copy()
-    diverged_at = np.inf
-    for first, last in recording.segments:
-        if first > 0:
-            q0, qd0 = motion.q[first], motion.qd[first]
-        q[:, first : last + 1], lost = simulate(q0 + off, qd0, np.arange(first, last))
-        diverged_at = min(diverged_at, joint.time[first] - joint.time[0] + float(lost[0]))
+        q0, qd0 = (np.asarray(given) for given in initial_state)
+        start = (convention.position_to_joint(q0, first_link),
+                 convention.rate_to_joint(qd0, first_link))  # fmt: skip
+    simulator = _Simulator(plant, friction, joint, motion, scheme)
+    q, diverged_at = simulator.free_runs(*start)
     simulated = convention.position_from_joint(q, first_link)
+    windows = {}
+    for horizon in horizons:
+        samples, q = simulator.windows(horizon)
+        if len(samples):
+            error = convention.position_from_joint(q, first_link) - recording.q[samples]
+            windows[f"{horizon:g}"] = RMSE.of(error)
     floor = None
-    if count is not None:
+    if plant.position_quantum is not None:
         # Independent errors of every joint add in the mean square.
         floor = RMSE.of(np.sqrt(np.sum((simulated[1:] - simulated[0]) ** 2, axis=0)))
-
-    windows = {}
-    memory = None
-    if friction is not None and friction.state_size:
-        # The state in which a controller would be at the start of each window.
-        memory = friction.schedule.states(torch.tensor(motion.qd), torch.tensor(motion.qdd))
-    for horizon in horizons:
-        starts, length = _windows(recording, horizon)
-        if length < 1:
-            continue
-        samples = starts[:, None] + np.arange(length + 1)
-        state = None if memory is None else memory[starts]
-        q, _ = simulate(motion.q[starts], motion.qd[starts], samples[:, :-1], state)
-        error = convention.position_from_joint(q, first_link) - recording.q[samples]
-        windows[f"{horizon:g}"] = RMSE.of(error)
     free_run = RMSE.of(simulated[0] - recording.q)
     return Score(
-        recording.name, free_run, windows, floor, recording.time, simulated[0], float(diverged_at)
+        recording.name, free_run, windows, floor, recording.time, simulated[0], diverged_at
     )
 
 
 class _Simulator:
-    """Simulates stretches of a recording (in joint coordinates), driven by its torques."""
+    """Simulates parts of a recording, driven by its torques; all in joint coordinates."""
 
     def __init__(
-        self, plant: Plant, friction: FrictionModel | None, recording: Recording, scheme: Scheme
+        self,
+        plant: Plant,
+        friction: FrictionModel | None,
+        recording: Recording,
+        motion: Motion,
+        scheme: Scheme,
     ) -> None:
         self.plant, self.friction, self.recording = plant, friction, recording
+        self.motion = motion
         self.scheme: Scheme = scheme
-        self.step = np.diff(recording.time)
+        # From zero, so that the rounding of large stamps costs no window its last sample.
+        self.time = recording.time - recording.time[0]
         self.substeps: int | None = math.ceil(recording.longest_step / STOP_STEP)
         if scheme != "time_stepping":
             self.substeps = _substeps(plant, friction, recording)
+        self.states: torch.Tensor | None = None
+        if friction is not None and friction.state_size:
+            # Those of a controller at every sample, from which windows go on.
+            qd, qdd = torch.tensor(motion.qd), torch.tensor(motion.qdd)
+            self.states = friction.schedule.states(qd, qdd)
 
-    def __call__(
+    def free_runs(self, q0: Array, qd0: Array) -> tuple[Array, float]:
+        """The free run, then one for each joint that starts one encoder count off.
+
+        Returns:
+            Positions (run, sample, joint), and when the first run diverged [s].
+        """
+        count, joints = self.plant.position_quantum, len(q0)
+        off = np.zeros((1, joints)) if count is None else count * np.eye(joints + 1, joints, -1)
+        q = np.broadcast_to(self.motion.q, (len(off), *self.motion.q.shape)).copy()
+        diverged_at = math.inf
+        for first, last in self.recording.segments:
+            if first > 0:
+                q0, qd0 = self.motion.q[first], self.motion.qd[first]
+            run, lost = self._simulate(q0 + off, qd0, np.arange(first, last))
+            q[:, first : last + 1] = run
+            diverged_at = min(diverged_at, float(self.time[first] + lost[0]))
+        return q, diverged_at
+
+    def windows(self, horizon: float) -> tuple[NDArray[np.intp], Array]:
+        """Samples (window, sample) of windows that follow each other, and positions there."""
+        starts: list[int] = []
+        length = len(self.time)
+        for first, last in self.recording.segments:
+            stamps = self.time[first : last + 1] - self.time[first]
+            # A stretch a few samples short of a whole number of windows still gives that number.
+            count = int(stamps[-1] / horizon + 0.02)
+            width = min(horizon, stamps[-1] / max(count, 1))
+            edges = first + np.searchsorted(stamps, width * np.arange(count + 1) - 1e-9)
+            starts += edges[:-1].tolist()
+            length = min([length, *np.diff(edges).tolist()])
+        if not starts or length < 1:
+            return np.zeros((0, 0), dtype=np.intp), np.zeros(0)
+        samples = np.array(starts)[:, None] + np.arange(length + 1)
+        memory = None if self.states is None else self.states[starts]
+        q0, qd0 = self.motion.q[starts], self.motion.qd[starts]
+        return samples, self._simulate(q0, qd0, samples[:, :-1], memory)[0]
+
+    def _simulate(
         self, q0: Array, qd0: Array, samples: NDArray[np.intp], memory: torch.Tensor | None = None
     ) -> tuple[Array, Array]:
         """Positions (*batch, sample + 1, joint) over samples, and when they diverged (*batch,)."""
@@ -188,11 +218,11 @@ class _Simulator:
             return lost, np.zeros(len(q0))
         # Copies, because a recording's arrays are read-only, which tensors cannot be.
         tau = None if self.recording.tau is None else torch.tensor(self.recording.tau[samples])
+        step = torch.tensor(np.diff(self.time)[samples])
         with torch.no_grad():
             run = rollout(
                 self.plant, self.friction, torch.tensor(q0), torch.tensor(qd0), tau,
-                sample_time=torch.tensor(self.step[samples]), substeps=self.substeps,
-                scheme=self.scheme, hidden_state=memory,
+                sample_time=step, substeps=self.substeps, scheme=self.scheme, hidden_state=memory,
             )  # fmt: skip
         return run.q.numpy(), run.diverged_at.numpy()
 
@@ -214,21 +244,3 @@ def _substeps(plant: Plant, friction: FrictionModel | None, recording: Recording
         "less steep.", recording.name, found, MOST_SUBSTEPS,
     )  # fmt: skip
     return None
-
-
-def _windows(recording: Recording, horizon: float) -> tuple[NDArray[np.intp], int]:
-    """First samples of windows that follow each other, and the steps that all of them have."""
-    # From zero, so that the rounding of large stamps cannot cost a window its last sample.
-    time = recording.time - recording.time[0]
-    starts: list[int] = []
-    length = len(time)
-    for first, last in recording.segments:
-        duration = time[last] - time[first]
-        # A stretch a few samples short of a whole number of windows still gives that number.
-        count = int(duration / horizon + 0.02)
-        width = min(horizon, duration / max(count, 1))
-        stamps = time[first : last + 1] - time[first]
-        edges = first + np.searchsorted(stamps, width * np.arange(count + 1) - 1e-9)
-        starts += edges[:-1].tolist()
-        length = min([length, *(b - a for a, b in pairwise(edges.tolist()))])
-    return np.array(starts, dtype=np.intp), length if starts else 0

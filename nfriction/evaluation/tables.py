@@ -47,11 +47,11 @@ class Table:
         return f"{value:.0f}" if 1e3 <= abs(value) < 1e7 else f"{value:.4g}"
 
     def is_numeric(self, column: int) -> bool:
-        """Whether every value of a column is a number."""
+        """True where every value of a column is a number."""
         return column > 0 and not any(isinstance(row[column], str) for row in self.rows)
 
     def is_marked(self, row: Sequence[Value], column: int) -> bool:
-        """Whether a row has the least number of a column, and that is finite."""
+        """True where a row has the least number of a marked column, and that is finite."""
         if column not in self.marked:
             return False
         least = min(float(other[column]) for other in self.rows)
@@ -126,19 +126,20 @@ def coefficient_table(
     return Table(caption, ("joint", *(["applies"] if follows else []), *heads), tuple(rows))
 
 
-def interval_table(model: str, intervals: Sequence[tuple[str, float, float, float]]) -> Table:
+def interval_table(
+    model: str, intervals: Sequence[tuple[str, float, float, float]], plant: bool
+) -> Table:
     """95 % confidence intervals.
 
     Args:
         model: its name.
         intervals: parameter, value, lower and upper end.
+        plant: terms of the plant are among them.
     """
-    return Table(
-        f"95 % confidence intervals of {model} (plant terms as relative change from the rig's, "
-        "offsets in SI)",
-        ("parameter", "value", "from", "to"),
-        tuple(intervals),
-    )
+    caption = f"95 % confidence intervals of {model}"
+    if plant:
+        caption += " (plant terms as relative change from the rig, offsets in SI)"
+    return Table(caption, ("parameter", "value", "from", "to"), tuple(intervals))
 
 
 def coefficient_units(model: FrictionModel, unit: str) -> dict[str, str]:

@@ -120,7 +120,7 @@ def coefficient_surfaces(
     """
     rules, coefficients = fuzzy_rules(model), _fitted(model)
     names = style.joint_labels(joint_names, model.joints)
-    # The fewer of the two stand side by side: the maps with their bars need the room.
+    # The fewer of the two go side by side: the maps with their bars need the room.
     across = model.joints <= len(coefficients)
     rows, columns = sorted((model.joints, len(coefficients)), reverse=True)
     share = "col" if across else "row"
@@ -288,7 +288,7 @@ def _limit(ax: Axes, values: Array, reach: Array, positive: bool) -> None:
 
 
 def _opacity(value: Array, sd: Array, seen: NDArray[np.bool_] | None) -> Array:
-    """How firmly a map is drawn: 1 where all is known, about half at a deviation of `VAGUE`."""
+    """Opacity of a map: 1 where all is known, about half at a deviation of `VAGUE`."""
     among = np.abs(value) if seen is None or not seen.any() else np.abs(value[seen])
     size = float(among.mean()) or 1.0
     return _LEAST + (1.0 - _LEAST) / (1.0 + (sd / (VAGUE * size)) ** 4)

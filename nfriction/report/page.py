@@ -97,7 +97,7 @@ def _policy(style: str, script: str) -> str:
 
 
 def _fit(run: Run, name: str) -> dict[str, Any]:
-    """How a fit ended, its warnings and its tables."""
+    """The record of a fit, its warnings and its tables."""
     fit, joints = run.fits[name], run.comparison.joint_names
     warnings = [*fit.warnings]
     for what, names in (("At a bound", fit.at_bounds), ("Not identifiable", fit.lost)):
@@ -120,7 +120,7 @@ def _fit(run: Run, name: str) -> dict[str, Any]:
         for what, (low, high) in fit.intervals.items()
     ]
     if intervals:
-        tables.append(interval_table(name, intervals))
+        tables.append(interval_table(name, intervals, bool(fit.plant)))
     return {
         "name": name,
         "record": fit,

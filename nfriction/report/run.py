@@ -38,7 +38,7 @@ class _EntryError(ValueError):
 
 @dataclass(frozen=True)
 class FitRecord:
-    """How a fit ended, from `FitResult.to_dict`; entries that an older version lacks are empty.
+    """End of a fit, from `FitResult.to_dict`; entries that an older version lacks are empty.
 
     Attributes:
         intervals: 95 % interval by parameter, infinity for an open end.
@@ -63,7 +63,7 @@ class Run:
     Attributes:
         folder: as it was given.
         comparison: the scores, without simulated positions and without fits.
-        fits: how each fit ended, by model.
+        fits: status of each fit, by model.
         coefficients: by model, then by where they apply (`"always"` for a constant model),
             then by name: a value a joint.
         best: name of the best model, None where there was no test recording.
