@@ -15,7 +15,7 @@ from nfriction.io.atomic import write_atomically
 from nfriction.io.model_content import ModelFileError, checksum_of, read_model_file, short
 from nfriction.io.model_info import ModelInfo, describe
 from nfriction.plant import Plant
-from nfriction.plant.rigfile import from_dict
+from nfriction.plant.rigs import from_dict
 
 # What building a mechanism from foreign JSON may raise.
 _UNFIT = (ValueError, TypeError, AttributeError, RuntimeError, OverflowError)
