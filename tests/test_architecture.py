@@ -26,7 +26,7 @@ ALLOWED: dict[str, set[str]] = {
     "signals": {"recording"},
     "friction": {"fuzzy"},
     "io.model": {"io", "version", "plant", "friction"},
-    "simulation": {"plant", "friction", "codegen"},
+    "simulation": {"codegen"},
     "fitting": {
         *("recording", "signals", "plant", "fuzzy", "friction", "codegen", "simulation", "optim"),
     },

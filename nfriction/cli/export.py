@@ -108,13 +108,13 @@ def _write_simulator(
 ) -> None:
     """Write joint parameters, and tell what they cost."""
     from nfriction import export
-    from nfriction.plant import rigfile
+    from nfriction.plant import rigs
     from nfriction.signals import kalman_smoother
 
     if arguments.rig:
         plant = estimation.read_rig(arguments.rig)
     elif info.rig is not None:
-        plant = rigfile.from_dict(info.rig)
+        plant = rigs.from_dict(info.rig)
     else:
         raise UsageError("the model file tells no rig; give --rig, whose loads friction needs.")
     recordings = estimation.read_recordings(arguments.recording, plant, arguments)

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion, kalman_smoother
@@ -114,8 +114,8 @@ def score(
         initial_state: q0 and qd0 of the free run in the recording's convention, (joint,) each;
             default from the smoothed motion.
         horizons: lengths of windows [s]; those longer than the recording are skipped.
-        scheme: of the integration, see `rollout`; `"time_stepping"` where joints come to rest off their
-            balance, which a smoothed sign lets creep back.
+        scheme: of the integration, see `rollout`; `"time_stepping"` where joints come to
+            rest off their balance, which a smoothed sign lets creep back.
 
     Returns:
         Errors in the recording's coordinates and unit.

@@ -21,7 +21,7 @@ from nfriction.io import strict_json
 from nfriction.io.atomic import write_atomically
 from nfriction.io.model_info import FORMAT, SCHEMA, ModelInfo, describe
 from nfriction.plant import Plant
-from nfriction.plant.rigfile import from_dict
+from nfriction.plant.rigs import from_dict
 
 # A neuro-fuzzy model of ten joints takes less than a megabyte.
 LARGEST_FILE = 64 * 2**20

@@ -130,7 +130,7 @@ class Plant(nn.Module):
             # A module lists each tensor once, but each buffer must be found by its own name.
             if sum(value is other for other in values.values()) > 1:
                 values[name] = value.view_as(value)
-        # A deep copy takes from its memo what is to be shared, or to take the original's place.
+        # A deep copy takes shared and replaced objects from its memo.
         shared = (*self.parameters(), *(v for v in vars(self).values() if not isinstance(v, dict)))
         memo: dict[int, Any] = {id(v): v for v in shared}
         memo |= {id(own[name]): value for name, value in values.items()}

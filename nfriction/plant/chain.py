@@ -316,8 +316,8 @@ class PendulumChain(Plant):
         """Fastest decay of velocities that joint friction can cause in any pose [1/s].
 
         The largest eigenvalue of M^-1 D over a grid of poses, of at most 5 degrees for one or two
-        turning angles and coarser for more, with D the slopes of friction over velocity, times
-        what a gear makes of the torque. Negative slopes count as zero, which bounds it from above.
+        turning angles and coarser for more, with D the slopes of friction over velocity at the
+        joint side of gears. Negative slopes count as zero, which bounds it from above.
 
         Args:
             damping: slope of each joint's friction torque [N m s/rad], (*batch, joint).
@@ -333,7 +333,7 @@ class PendulumChain(Plant):
         return torch.stack(found).reshape(damping.shape[:-1])
 
     def extra_repr(self) -> str:
-        """Name, links, arm and what is switched on."""
+        """Name, links, arm and optional terms."""
         parts = [self.name or "unnamed", f"links={self.links}"]
         parts.append(f"arm={'free' if self.first_link else 'fixed'}")
         parts.append(f"mass={self._given['mass']}, length={self._given['length']}")
@@ -358,7 +358,7 @@ class PendulumChain(Plant):
         return correct_encoder(q, self.encoder_zero, self.encoder_cosine, self.encoder_sine)
 
     def _true(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
-        """True angles and rates of what the encoders read."""
+        """True angles and rates of readings."""
         if not self.has_eccentricity:
             return q, qd
         corrected = self._corrected(q)

@@ -128,8 +128,9 @@ def configuration_grid(joints: int) -> Tensor:
         return torch.zeros(1, 1)
     count = min(72, max(4, 4 * int(20_000 ** (1 / turning) / 4)))
     axis = torch.arange(count, dtype=torch.float64) * (math.tau / count)
-    if turning > 7:  # four angles for each would be too many: some of these poses at random
+    if turning > 7:  # too many poses: some at random, the straight and the folded one
         chosen = torch.randint(4, (2_000, turning), generator=torch.Generator().manual_seed(0))
+        chosen[0], chosen[1] = 0, 2
         poses = axis[chosen]
     else:
         poses = torch.cartesian_prod(*[axis] * turning).reshape(-1, turning)

@@ -64,7 +64,7 @@ class HingedLink:
         """All bodies as one."""
         mass = sum(body.mass for body in self.bodies)
         if not mass > 0:
-            _refuse(self.name, "carries no mass; give what it moves an inertial")
+            _refuse(self.name, "carries no mass; add an inertial to the bodies it moves")
         com = sum((b.mass * b.com for b in self.bodies), np.zeros(3)) / mass
         inertia = np.zeros((3, 3))
         for body in self.bodies:
@@ -252,7 +252,7 @@ def _carried(
         own += float(up @ body.inertia @ up + body.mass * (radius @ radius))
     own += float(m @ (reach**2 - length**2))
     if not own > 0:
-        _refuse(arm.name, "carries no mass of its own; give what it moves an inertial")
+        _refuse(arm.name, "carries no mass of its own; add an inertial to the bodies it moves")
     return Arm(own, length), seen
 
 

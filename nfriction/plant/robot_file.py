@@ -78,7 +78,7 @@ def parse_xml(path: Path, *, comments: bool = False) -> Element:
 
 
 def urdf_links(robot: Element) -> list[HingedLink]:
-    """The hinged links of a robot, with what is fixed to them.
+    """The hinged links of a robot, with the bodies fixed to them.
 
     Its root link is the ground. Limits, friction and transmissions are not read: friction is no
     part of a plant.
@@ -89,7 +89,7 @@ def urdf_links(robot: Element) -> list[HingedLink]:
     for name, joint in _named(robot, "joint").items():
         parent, child = (_link(joint, end, name, links) for end in ("parent", "child"))
         if child in carried:
-            raise ValueError(f"link {child!r} hangs on two joints; a chain closes no loop.")
+            raise ValueError(f"link {child!r} is the child of two joints; a chain has no loop.")
         carried.add(child)
         children[parent].append(joint)
     roots = [name for name in links if name not in carried]
@@ -258,7 +258,7 @@ def _at_reference(path: Path, mujoco: Any) -> tuple[Any, Any]:
     """The compiled model, and its data at the reference pose."""
     said: list[str] = []
     handler = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(said.append)  # else MuJoCo writes a file where the user stands
+    mujoco.set_mju_user_warning(said.append)  # else MuJoCo writes a log file to the current folder
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
         _refuse_more_than_hinges(model, mujoco)

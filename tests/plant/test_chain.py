@@ -154,6 +154,13 @@ def test_decay_rates_bound_random_poses(arm: Any) -> None:
     torch.testing.assert_close(together, torch.stack([rig.decay_rate(d) for d in damping]))
 
 
+def test_decay_rates_of_a_long_chain_look_at_few_poses() -> None:
+    rig = PendulumChain([0.1] * 20, [0.1] * 20, inertia=[1e-4] * 20)
+    damping = torch.ones(20).double()
+    straight = torch.linalg.inv(rig.mass_matrix(torch.zeros(20).double()))
+    assert rig.decay_rate(damping) >= torch.linalg.eigvalsh(straight).amax()
+
+
 def test_decay_rates_follow_the_values_of_the_plant() -> None:
     rig, ones = rigs.multiarm_double(), torch.ones(2).double()
     before = rig.decay_rate(ones)

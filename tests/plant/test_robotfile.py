@@ -258,7 +258,7 @@ ELBOW = '<axis xyz="0 1 0"/><origin xyz="0 0 -0.4"/>'
         ('<mass value="0.5"/>', '<mass value="heavy"/>', "mass of link 'bob'.*'heavy'"),
         ('<mass value="0.5"/>', '<mass value="nan"/>', r"1 finite numbers up to 1e\+09, got 'nan'"),
         ('xyz="0 0 -0.1"', 'xyz="0 0"', r"3 finite numbers up to 1e\+09, got '0 0'"),
-        ('<child link="bob"/>', '<child link="rod"/>', "'rod' hangs on two joints"),
+        ('<child link="bob"/>', '<child link="rod"/>', "'rod' is the child of two joints"),
         ('<child link="bob"/>', '<child link="base"/>', "links go round in a circle"),
         ('<link name="base"/>', '<link name="base"/><link name="b2"/>', "one link that no joint"),
         ('<child link="bob"/>', '<child link="gone"/>', "a child that is no link: 'gone'"),

@@ -38,7 +38,7 @@ from nfriction.io.model_info import parameter_hash
 from nfriction.papers.controller.fis import load_fis
 from nfriction.papers.controller.mamdani import MamdaniController
 from nfriction.papers.controller.rules import format_rules, load_rules, parse_rules
-from nfriction.plant import rigfile
+from nfriction.plant import rigs
 from nfriction.recording import Recording, read_initial_states
 from nfriction.recording.angles import AngleConvention
 from nfriction.report.page import to_html
@@ -348,9 +348,9 @@ _MJCF = b"""<mujoco model="bench"><option gravity="0 0 -9.7"/><compiler angle="d
 
 
 def _read_rig(path: Path) -> None:
-    plant = rigfile.read(path)
+    plant = rigs.read(path)
     said = plant.to_dict()
-    assert rigfile.from_dict(said).to_dict() == said
+    assert rigs.from_dict(said).to_dict() == said
     q = torch.zeros(plant.joints, dtype=torch.float64)
     assert plant.mass_matrix(q).shape == (plant.joints, plant.joints)
     assert all(bool(b.isfinite().all()) for b in plant.buffers())
