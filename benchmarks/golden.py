@@ -52,7 +52,7 @@ from nfriction import (
 from nfriction.papers import twin as twins
 
 PROGRAM = (sys.executable, "-m", "nfriction")
-TEST_RECORDINGS, INITIAL_STATES = "--held-out", "--initial-states"
+TEST_RECORDINGS, INITIAL_STATES = "--test", "--initial-states"
 TEST_KIND, FREE_RUN = "held out", "free run"  # as `table.csv` says
 EQUATION_ERROR = {"method": "torque"}
 

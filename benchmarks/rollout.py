@@ -24,6 +24,7 @@ from timing import Contestant, verdict
 
 from nfriction import FrictionModel, PendulumChain, rollout
 from nfriction.codegen import compile_rollout
+from nfriction.simulation.rk4 import rk4_step
 
 BATCH_STEPS = 2_000
 
@@ -53,7 +54,7 @@ def ours(
 
 def bare(plant: PendulumChain, friction: FrictionModel, q0: Any, qd0: Any) -> Callable:
     """The compiled code without the public call's checks, as hand-written C has none."""
-    compiled = compile_rollout(plant, friction, backend="c")
+    compiled = compile_rollout(plant, friction, rk4_step)
     q, qd = q0[None].numpy(), qd0[None].numpy()
 
     def run() -> np.ndarray:
@@ -69,24 +70,18 @@ def single(friction: FrictionModel, label: str, rounds: int, folder: str) -> dic
     n = cases.numbers(plant, friction)
     start = (q0.numpy(), qd0.numpy())
     our = partial(ours, plant, friction, q0, qd0)
-    early = our(steps=peers.SHORT, backend="c")()
+    early = our(steps=peers.SHORT, backend="compiled")()
     by_hand = hand_written(n, folder)
     fewer_sines = hand_written(n, folder, "-DADDITION")
     contestants = [
-        Contestant("ours, c", our(steps=STEPS, backend="c")),
-        Contestant("ours, c, bare", bare(plant, friction, q0, qd0), note="without checks"),
+        Contestant("ours, compiled", our(steps=STEPS, backend="compiled")),
+        Contestant("ours, bare", bare(plant, friction, q0, qd0), note="without checks"),
         Contestant("ours, torch", our(steps=peers.SHORT, backend="torch"), STEPS / peers.SHORT,
                    rounds=3, note=f"{peers.SHORT} steps, scaled", expected=early),
         Contestant("C by hand", lambda: by_hand(*start)),
         Contestant("C by hand, addition theorems", lambda: fewer_sines(*start),
                    note="fewer sines than the definition"),
     ]  # fmt: skip
-    try:
-        numba = Contestant("ours, numba", our(steps=STEPS, backend="numba"))
-        numba.run()
-        contestants.insert(2, numba)
-    except ImportError as error:
-        print(f"  left out: {error}")
     makers: list[Callable[[], Contestant]] = [
         lambda: peers.jax_scan(n, *start),
         lambda: peers.diffrax(n, *start),
@@ -113,7 +108,9 @@ def batched(count: int, rounds: int) -> dict[str, float]:
             plant, q0.numpy(), qd0.numpy(), steps=BATCH_STEPS, tolerance=np.inf, rounds=2
         )
     ]
-    own = Contestant("ours, c", ours(plant, friction, q0, qd0, steps=BATCH_STEPS, backend="c"))
+    own = Contestant(
+        "ours, compiled", ours(plant, friction, q0, qd0, steps=BATCH_STEPS, backend="compiled")
+    )
     title = f"{count:,} candidates x {BATCH_STEPS:,} steps, constant, one thread each"
     return timing.compare(title, [own, *present(makers)], rounds)
 
@@ -124,7 +121,7 @@ def same_mechanism() -> None:
     with torch.no_grad():
         friction.schedule.raw[:, 1] = -800.0  # exp of it is zero: no Coulomb friction
     q0, qd0 = cases.release()
-    expected = ours(plant, friction, q0, qd0, steps=1_000, backend="c")()
+    expected = ours(plant, friction, q0, qd0, steps=1_000, backend="compiled")()
     try:
         peer = peers.mujoco(plant, q0.numpy(), qd0.numpy(), steps=1_000, coulomb=False)
     except ImportError:
@@ -159,14 +156,13 @@ def main(argv: list[str] | None = None) -> int:
         (fuzzy, "neuro-fuzzy", (1.2, 5.0)),
     ):
         print(f"  {label}")
-        ratio(times, "ours, c", "C by hand", limits[0], True)
-        ratio(times, "ours, c, bare", "C by hand", limits[0], True)
-        ratio(times, "ours, numba", "ours, c", 1.5, True)
-        ratio(times, "diffrax", "ours, c", limits[1], False)
-    ratio(plain, "MuJoCo", "ours, c", 30.0, False)
-    ratio(fuzzy, "ours, torch", "ours, c", 300.0, False)
+        ratio(times, "ours, compiled", "C by hand", limits[0], True)
+        ratio(times, "ours, bare", "C by hand", limits[0], True)
+        ratio(times, "diffrax", "ours, compiled", limits[1], False)
+    ratio(plain, "MuJoCo", "ours, compiled", 30.0, False)
+    ratio(fuzzy, "ours, torch", "ours, compiled", 300.0, False)
     print("  candidates")
-    ratio(batch, "MuJoCo", "ours, c", 30.0, False)
+    ratio(batch, "MuJoCo", "ours, compiled", 30.0, False)
     return 0
 
 

@@ -18,7 +18,7 @@ import time, torch
 start = time.perf_counter()
 from nfriction import LFM, rigs, rollout
 zero = torch.zeros(3, dtype=torch.float64)
-rollout(rigs.tlrip(), LFM(3, [0.01, 0.01]), zero + 3.0, zero, steps=1000, backend={backend!r},
+rollout(rigs.tlrip(), LFM(3, [0.01, 0.01]), zero + 3.0, zero, steps=1000, backend="compiled",
         gradients=False)
 print(time.perf_counter() - start)
 """
@@ -40,19 +40,12 @@ def _python(code: str, *flags: str, cache: str | None = None) -> subprocess.Comp
     )  # fmt: skip
 
 
-def first_calls(backend: str, repeats: int) -> None:
+def first_calls(repeats: int) -> None:
     """The first rollout of a process: the very first on a machine, then those that follow."""
     with tempfile.TemporaryDirectory() as cache:
-        try:
-            calls = [
-                float(_python(FIRST_CALL.format(backend=backend), cache=cache).stdout)
-                for _ in range(1 + repeats)
-            ]
-        except subprocess.CalledProcessError as error:
-            print(f"  {backend} left out: {error.stderr.strip().splitlines()[-1]}")
-            return
-    verdict(f"first call, {backend}, compiling [s]", calls[0], 4.0)
-    verdict("the same, cached [s]", sorted(calls[1:])[repeats // 2], 1.0)
+        calls = [float(_python(FIRST_CALL, cache=cache).stdout) for _ in range(1 + repeats)]
+    verdict("first call, compiling [s]", calls[0], 1.5)
+    verdict("the same, cached [s]", sorted(calls[1:])[repeats // 2], 0.5)
 
 
 def imports(repeats: int) -> None:
@@ -95,8 +88,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--repeats", type=int, default=5)
     options = parser.parse_args(argv)
     print(f"Start-up beyond `import torch`, wall time; {timing.pin()}; {timing.yardstick()}")
-    for backend in ("c", "numba"):
-        first_calls(backend, options.repeats)
+    first_calls(options.repeats)
     imports(options.repeats)
     return 0
 

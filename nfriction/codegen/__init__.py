@@ -3,15 +3,14 @@
 Knows nothing of plants or friction beyond the methods it calls.
 """
 
-from nfriction.codegen.build import cache_folder
 from nfriction.codegen.errors import (
     CodegenError,
-    CompilerError,
     NoBackend,
     SelfCheckFailed,
     UnsupportedOperation,
 )
 from nfriction.codegen.function import CompiledFunction, compile_function
+from nfriction.codegen.llvm.jit import cache_folder
 from nfriction.codegen.operations import supported_operations
 from nfriction.codegen.rollout import CompiledRollout, Trajectories, compile_rollout
 
@@ -19,7 +18,6 @@ __all__ = [
     "CodegenError",
     "CompiledFunction",
     "CompiledRollout",
-    "CompilerError",
     "NoBackend",
     "SelfCheckFailed",
     "Trajectories",

@@ -1,4 +1,4 @@
-"""Scalar nodes as text: C (double or float) or Python.
+"""Scalar nodes as C, double or float.
 
 Values used once are written where they are used, the others become constants of the function.
 The text depends on the graph alone, so the same model gives the same bytes.
@@ -10,7 +10,6 @@ from typing import Literal
 
 import numpy as np
 
-from nfriction.codegen import lanes
 from nfriction.codegen.scalar import Node, is_predicate, reachable
 
 Real = Literal["double", "float"]
@@ -30,21 +29,6 @@ _INFIX = {
     "ne": ("!=", _COMPARE),
 }
 _C_NAMES = {"abs": "fabs"}
-
-PYTHON_PRELUDE = """\
-import math
-
-from numba import njit, void
-
-from nfriction.codegen.straight import COUNT, COUNTS, REAL, REALS, moved, op, straight
-"""
-
-# No entries for C and Python, of which the loader needs none, and no rewriting of array
-# expressions, of which there are none.
-COMPILED = (
-    'error_model="numpy", fastmath={"contract"}, no_cfunc_wrapper=True, no_cpython_wrapper=True, '
-    "no_rewrites=True"
-)
 
 # The two functions that the emitted C relies on both propagate NaN.
 C_PRELUDE = """\
@@ -91,37 +75,8 @@ class C:
         return f"const {'int' if predicate else self.real} {name} = {text};"
 
 
-@dataclass(frozen=True)
-class Python:
-    """Straight-line Python, see `straight`."""
-
-    def literal(self, value: float | bool) -> str:
-        if isinstance(value, bool):
-            return repr(value)
-        if np.isnan(value):
-            return "math.nan"
-        if np.isinf(value):
-            return "math.inf" if value > 0 else "(-math.inf)"
-        return f"({value!r})" if repr(value).startswith("-") else repr(value)
-
-    def call(self, op: str, args: Sequence[str]) -> str:
-        return f"op.{op}({', '.join(args)})"
-
-    def logical(self, op: str) -> str:
-        return {"and": "&", "or": "|", "not": "~"}[op]
-
-    def where(self, condition: str, a: str, b: str) -> str:
-        return f"op.where({condition}, {a}, {b})"
-
-    def define(self, name: str, text: str, predicate: bool) -> str:
-        return f"{name} = {text}"
-
-
-Dialect = C | Python
-
-
 def statements(
-    outputs: Sequence[Node], bound: Mapping[int, str], dialect: Dialect, collect: bool = False
+    outputs: Sequence[Node], bound: Mapping[int, str], dialect: C
 ) -> tuple[list[str], list[str]]:
     """Definitions of local values, and one expression per output.
 
@@ -129,7 +84,6 @@ def statements(
         outputs: nodes to express.
         bound: text of nodes that are already at hand (inputs, hoisted values), by node number.
         dialect: the language.
-        collect: compute independent sin, cos, exp and tanh four at a time (C, double).
     """
     nodes = reachable(outputs, [n for n in reachable(outputs) if n.number in bound])
     uses: dict[int, int] = {}
@@ -157,36 +111,12 @@ def statements(
                 text, binding = name, ATOM
             texts[node.number] = text, binding
 
-    waiting: dict[str, list[Node]] = {}
-    phase = lanes.phases(nodes, bound) if collect else {}
-    order = sorted(nodes, key=lambda n: (phase[n.number], n.number)) if collect else nodes
-    for i, node in enumerate(order):
-        if collect and node.op in lanes.FAMILY and node.number not in bound:
-            waiting.setdefault(lanes.FAMILY[node.op], []).append(node)
-        else:
-            write(node)
-        if waiting and (i + 1 == len(order) or phase[order[i + 1].number] > phase[node.number]):
-            for family, calls in waiting.items():
-                _collected(family, calls, lines, texts)
-            waiting.clear()
+    for node in nodes:
+        write(node)
     return lines, [texts[node.number][0] for node in outputs]
 
 
-def _collected(
-    family: str,
-    calls: list[Node],
-    lines: list[str],
-    texts: dict[int, tuple[str, int]],
-) -> None:
-    arguments = list(dict.fromkeys(node.args[0].number for node in calls))
-    call = lanes.call(family, len(lines), [texts[number][0] for number in arguments])
-    for node in calls:
-        results = call.cosines if node.op == "cos" else call.results
-        texts[node.number] = results[arguments.index(node.args[0].number)], ATOM
-    lines += call.lines
-
-
-def expression(op: str, operands: Sequence[tuple[str, int]], dialect: Dialect) -> tuple[str, int]:
+def expression(op: str, operands: Sequence[tuple[str, int]], dialect: C) -> tuple[str, int]:
     """Text of an operation, and how tightly it binds, of operands given likewise."""
 
     def operand(i: int, binding: int) -> str:
@@ -195,7 +125,7 @@ def expression(op: str, operands: Sequence[tuple[str, int]], dialect: Dialect) -
 
     if op in _INFIX:
         sign, binding = _INFIX[op]
-        # Python chains comparisons, so those never stand side by side.
+        # Compilers warn of comparisons side by side.
         left = operand(0, binding + (binding == _COMPARE))
         return f"{left} {sign} {operand(1, binding + 1)}", binding
     if op == "neg":
@@ -216,7 +146,6 @@ def c_function(
     outputs: Mapping[str, Sequence[Node]],
     bound: Mapping[int, str],
     qualifier: str = "static ",
-    collect: bool = False,
 ) -> str:
     """A C function of doubles that writes each of `outputs` to the array of that name.
 
@@ -226,41 +155,12 @@ def c_function(
         outputs: nodes by output array.
         bound: text of the input nodes.
         qualifier: what stands before `void`.
-        collect: see `statements`; needs C99 and `lanes.PRELUDE`.
     """
     nodes = [node for group in outputs.values() for node in group]
-    lines, texts = statements(nodes, bound, C(), collect)
+    lines, texts = statements(nodes, bound, C())
     targets = [f"{array}[{i}]" for array, group in outputs.items() for i in range(len(group))]
     lines += [f"{target} = {text};" for target, text in zip(targets, texts, strict=True)]
     signature = [f"const double *{a}" for a in arguments] + [f"double *{a}" for a in outputs]
     unused = [f"(void){a};" for a in (*arguments, *outputs)]
     body = "\n    ".join(lines + unused)
     return f"{qualifier}void {name}({', '.join(signature)})\n{{\n    {body}\n}}\n"
-
-
-def python_function(
-    name: str,
-    arguments: Sequence[str],
-    outputs: Sequence[Node],
-    bound: Mapping[int, str],
-    into: Sequence[str] = (),
-) -> str:
-    """A function that returns `outputs` as a tuple, or assigns them to elements `into`."""
-    return python_text(name, arguments, *statements(outputs, bound, Python()), into)
-
-
-def python_text(
-    name: str,
-    arguments: Sequence[str],
-    lines: Sequence[str],
-    texts: Sequence[str],
-    into: Sequence[str] = (),
-) -> str:
-    """A function of statements and of expressions, which it returns or assigns."""
-    if into:
-        last = [f"{target} = {text}" for target, text in zip(into, texts, strict=True)]
-    else:
-        last = [f"return ({', '.join(texts)},)" if texts else "pass"]
-    body = "\n    ".join([*lines, *last])
-    count = 0 if into else len(texts)
-    return f"@straight({count})\ndef {name}({', '.join(arguments)}):\n    {body}\n"

@@ -1,4 +1,4 @@
-"""What can go wrong between a torch module and its compiled form; named for what happened."""
+"""Errors between a torch module and its compiled form, named for what happened."""
 
 
 class CodegenError(RuntimeError):
@@ -21,11 +21,7 @@ class UnsupportedOperation(CodegenError):  # noqa: N818
 
 
 class NoBackend(CodegenError):  # noqa: N818
-    """Neither a C compiler nor numba is at hand."""
-
-
-class CompilerError(CodegenError):
-    """The C compiler refused the emitted source; the message carries its output."""
+    """llvmlite, which makes machine code, cannot be loaded."""
 
 
 class SelfCheckFailed(CodegenError):  # noqa: N818

@@ -8,7 +8,7 @@ fails too; here it becomes the test of a, b and whatever else flows into the sum
 import math
 from collections.abc import Callable, Mapping, Sequence
 
-from nfriction.codegen.scalar import Graph, Level, Node, reachable
+from nfriction.codegen.scalar import Graph, Node, UpdateRate, reachable
 
 # NaN in, NaN out, whatever the other operand.
 _CARRIES_NAN = frozenset({"add", "sub", "neg", "abs"})
@@ -62,7 +62,7 @@ def decided(graph: Graph, outputs: Sequence[Node], test: Node, value: bool) -> l
 
 
 def _finite(graph: Graph, node: Node) -> Node:
-    return graph._intern("finite", (node,), None, max(node.level, Level.PARAMETER))
+    return graph._intern("finite", (node,), None, max(node.rate, UpdateRate.PARAMETER))
 
 
 def _infinite(node: Node) -> bool:
@@ -82,7 +82,7 @@ def _is_sum_of_sizes(node: Node) -> bool:
 
 
 def _is_input(node: Node) -> bool:
-    return node.op == "input" and node.level > Level.PARAMETER
+    return node.op == "input" and node.rate > UpdateRate.PARAMETER
 
 
 def _leaves(node: Node) -> list[Node]:
@@ -93,7 +93,7 @@ def _leaves(node: Node) -> list[Node]:
         top = stack.pop()
         if top.op in _CARRIES_NAN:
             stack.extend(reversed(top.args))
-        elif top.level > Level.PARAMETER:
+        elif top.rate > UpdateRate.PARAMETER:
             found.setdefault(top.number, top)
     return list(found.values())
 

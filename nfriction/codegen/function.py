@@ -1,4 +1,4 @@
-"""Compile single functions, and fold what their parameters decide."""
+"""Compile single functions, and specialise them to their parameters."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,16 +8,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.codegen import arguments, build, kernels
+from nfriction.codegen.batch import (
+    Kernel,
+    common_rows,
+    parameter_rows,
+    rows_of,
+    to_array,
+)
 from nfriction.codegen.derivative import with_jacobian
 from nfriction.codegen.errors import SelfCheckFailed
-from nfriction.codegen.function_source import c_source, python_source
-from nfriction.codegen.graph import Program
-from nfriction.codegen.lift import Lifted, Method
-from nfriction.codegen.partition import Partition, partition
-from nfriction.codegen.scalar import Level, Node, evaluate
-
-Array = np.ndarray
+from nfriction.codegen.graph import FunctionalModule, Method, Program
+from nfriction.codegen.hoist import hoist
+from nfriction.codegen.llvm import jit
+from nfriction.codegen.llvm.driver import Driver, Layout
+from nfriction.codegen.llvm.emit import write_function
+from nfriction.codegen.scalar import Node, UpdateRate, evaluate
 
 _CHECK_TOLERANCE = 1e-10
 
@@ -27,7 +32,6 @@ def compile_function(
     example_inputs: Sequence[Tensor],
     *,
     jacobian: Sequence[int] = (),
-    backend: build.Backend = "auto",
 ) -> "CompiledFunction":
     """Compile a function of tensors.
 
@@ -37,61 +41,49 @@ def compile_function(
         example_inputs: float64 tensors of the right shapes, without a batch dimension.
         jacobian: positions of the inputs by which to differentiate; the exact Jacobian, (elements
             of all outputs, elements of these inputs), is then returned last.
-        backend: "c", "numba", or "auto" for the first of them that is there.
 
     Returns:
         A callable on NumPy arrays whose first axis is a batch.
 
     Raises:
-        NoBackend, UnsupportedOperation, CompilerError, SelfCheckFailed: see `compile_rollout`.
+        NoBackend, UnsupportedOperation, SelfCheckFailed: see `compile_rollout`.
     """
-    served = build.choose(backend)
-    compiled = CompiledFunction(function, example_inputs, served, jacobian)
+    jit.require_backend()
+    compiled = CompiledFunction(function, example_inputs, jacobian)
     compiled.check(example_inputs)
     return compiled
 
 
 class CompiledFunction:
-    """A compiled function; made by `compile_function`.
-
-    Attributes:
-        backend: "c" or "numba".
-        source: what was compiled.
-    """
+    """A compiled function; made by `compile_function`."""
 
     def __init__(
         self,
         function: Callable[..., Any],
         example_inputs: Sequence[Tensor],
-        backend: str,
         jacobian: Sequence[int] = (),
     ) -> None:
-        self.backend = backend
         self._function = function
         self._jacobian = tuple(jacobian)
-        self._lifted = Lifted(Method(function))
+        self._module = FunctionalModule(Method(function))
         inputs = {f"x{i}": x for i, x in enumerate(example_inputs)}
-        program = self._lifted.trace(inputs, dict.fromkeys(inputs, Level.STAGE))
+        program = self._module.trace(inputs)
         if jacobian:
             program = with_jacobian(program, [f"x{i}" for i in jacobian])
-        self._inputs = [p.shape for p in program.inputs if p.name in inputs]
-        self._outputs = [p.shape for p in program.outputs]
-        split, groups = _split(program)
-        emit = c_source if backend == "c" else python_source
-        self.source = emit(program, split, groups, self._inputs)
-        arrays = [kernels.ARRAY] * (1 + len(self._inputs) + len(self._outputs))
-        if backend == "c":
-            # A Jacobian is long straight code, whose optimisation takes minutes and gains little.
-            level = "-O1" if jacobian else "-O3"
-            self._kernel = _c_kernel(self.source, level, arrays)
-        else:
-            self._kernel = _numba_kernel(self.source, len(split.hoisted[Level.PARAMETER]), arrays)
+        self._inputs = {p.name: p.shape for p in program.inputs if p.name in inputs}
+        self._outputs = {f"y{i}": p.shape for i, p in enumerate(program.outputs)}
+        layout = Layout(tuple(self._inputs), tuple(self._outputs))
+        self._kernel = Kernel(lambda width: _driver(program, layout, width), layout)
+
+    def source(self, width: int = 0) -> str:
+        """LLVM IR that computes so many rows together, 0 for one at a time."""
+        return self._kernel.source(width)
 
     def __call__(self, *inputs: Any) -> Any:
         """Evaluate row by row.
 
         Args:
-            *inputs: arrays of shape (batch, *shape of the example).
+            *inputs: arrays of shape (batch, *shape of the example); a single row is for all.
 
         Returns:
             One array (batch, *shape), or a tuple of them where the function returns several.
@@ -101,30 +93,15 @@ class CompiledFunction:
         """
         if len(inputs) != len(self._inputs):
             raise ValueError(f"expected {len(self._inputs)} inputs, got {len(inputs)}.")
-        given = [arguments.to_array(x) for x in inputs]
-        for i, (x, shape) in enumerate(zip(given, self._inputs, strict=True)):
-            if x.shape[1:] != shape or not x.ndim:
-                raise ValueError(f"input {i} must be (batch, *{shape}), got {x.shape}.")
-        rows = arguments.candidates({f"input {i}": len(x) for i, x in enumerate(given)})
-        out = self.bound()(rows, *(arguments.repeated(x, rows) for x in given))
-        return out[0] if len(out) == 1 else tuple(out)
-
-    def bound(self) -> Callable[..., list[arguments.Array]]:
-        """The function with its parameters as they are now and no checks, for calls in a row.
-
-        Returns:
-            `(rows, *inputs) -> outputs`, where inputs are flat, contiguous and float64, and
-            outputs (rows, *shape).
-        """
-        p, _ = arguments.parameter_rows(self._lifted.values(), {})
-        flat = p.reshape(-1)
-
-        def call(rows: int, *inputs: arguments.Array) -> list[arguments.Array]:
-            out = [np.empty((rows, *shape)) for shape in self._outputs]
-            self._kernel(rows, flat, *inputs, *(o.reshape(-1) for o in out))
-            return out
-
-        return call
+        given = {
+            name: rows_of(f"input {name[1:]}", x, shape)
+            for (name, shape), x in zip(self._inputs.items(), inputs, strict=True)
+        }
+        rows = common_rows({name: one.rows for name, one in given.items()})
+        p, _ = parameter_rows(self._module, {})
+        out = {name: np.empty((rows, *shape)) for name, shape in self._outputs.items()}
+        self._kernel(rows, p, given, out)
+        return tuple(out.values()) if len(out) > 1 else out["y0"]
 
     def check(self, example_inputs: Sequence[Tensor]) -> None:
         """Compare with eager torch at the example inputs and near them.
@@ -139,14 +116,14 @@ class CompiledFunction:
                 for x in example_inputs
             ]
             with torch.no_grad():
-                eager = self._eager([x.to(self._lifted.device) for x in inputs])
+                eager = self._eager([x.to(self._module.device) for x in inputs])
             ours = self(*(x[None] for x in inputs))
             for a, b in zip(
                 ours if isinstance(ours, tuple) else (ours,),
                 eager,
                 strict=True,
             ):
-                expected = arguments.to_array(b)
+                expected = to_array(b)
                 tolerance = _CHECK_TOLERANCE
                 if not np.allclose(a[0], expected, tolerance, tolerance, equal_nan=True):
                     raise SelfCheckFailed(
@@ -173,11 +150,11 @@ def _tuple(found: Any) -> tuple[Tensor, ...]:
 
 
 @dataclass(frozen=True)
-class Folded:
+class Specialised:
     """A traced function in which all that depends on parameters alone is a known number.
 
     Attributes:
-        program: what was traced.
+        program: the traced function.
         outputs: nodes of each output, in row-major order.
         known: value of each node that the parameters decide and others read, by node number.
     """
@@ -187,7 +164,7 @@ class Folded:
     known: dict[int, float]
 
 
-def fold(function: Callable[..., Any], inputs: Mapping[str, Tensor]) -> Folded:
+def specialise(function: Callable[..., Any], inputs: Mapping[str, Tensor]) -> Specialised:
     """Trace a function and compute, in float64, what its parameters decide.
 
     Args:
@@ -197,55 +174,65 @@ def fold(function: Callable[..., Any], inputs: Mapping[str, Tensor]) -> Folded:
     Raises:
         UnsupportedOperation: an operation without scalar form.
     """
-    lifted = Lifted(Method(function))
-    program = lifted.trace(dict(inputs), dict.fromkeys(inputs, Level.STAGE))
-    split, groups = _split(program)
-    table = _read_parameters(split)
-    values = evaluate(table, _port_values(program, lifted))
+    module = FunctionalModule(Method(function))
+    program = module.trace(inputs)
+    groups, once = _hoisted(program)
+    table = _read_parameters(groups, once)
+    flat = {f"p{i}": to_array(module.value(n)).reshape(-1) for i, n in enumerate(module.shapes)}
+    values = evaluate(table, flat)
     known = {node.number: float(v) for node, v in zip(table, values, strict=True)}
-    return Folded(program, groups, known)
+    return Specialised(program, groups, known)
 
 
-def _split(program: Program) -> tuple[Partition, list[tuple[Node, ...]]]:
-    nodes = [node for port in program.outputs for node in port.nodes]
-    split = partition(program.graph, nodes)
-    groups, start = [], 0
-    for port in program.outputs:
-        groups.append(split.outputs[start : start + len(port.nodes)])
-        start += len(port.nodes)
-    return split, groups
+def _hoisted(program: Program) -> tuple[list[tuple[Node, ...]], list[Node]]:
+    """Nodes of each output, and those to compute before."""
+    found = hoist(program.graph, [node for port in program.outputs for node in port.nodes])
+    nodes = iter(found.outputs)
+    return [tuple(next(nodes) for _ in port.nodes) for port in program.outputs], found.once
 
 
-def _read_parameters(split: Partition) -> list[Node]:
-    """Parameter-level nodes that the row function reads: hoisted ones and bare inputs."""
-    hoisted = set(split.hoisted[Level.PARAMETER])
+def _read_parameters(groups: Sequence[Sequence[Node]], once: Sequence[Node]) -> list[Node]:
+    """Nodes of parameters alone that a row reads: hoisted ones and bare inputs."""
+    hoisted = set(once)
     read: dict[int, Node] = {}
-    stack = list(split.outputs)
+    stack = [node for group in groups for node in group]
     seen: set[int] = set()
     while stack:
         node = stack.pop()
         if node.number in seen:
             continue
         seen.add(node.number)
-        if node in hoisted or (node.op == "input" and node.level == Level.PARAMETER):
+        if node in hoisted or (node.op == "input" and node.rate == UpdateRate.PARAMETER):
             read[node.number] = node
         else:
             stack.extend(node.args)
     return [read[number] for number in sorted(read)]
 
 
-def _port_values(program: Program, lifted: Lifted) -> dict[str, Array]:
-    flat = [value.reshape(-1) for value in lifted.values().values()]
-    return {f"p{i}": value for i, value in enumerate(flat)}
-
-
-def _c_kernel(source: str, level: str, arrays: Sequence[type]) -> Callable[..., None]:
-    function = build.build_c(source, level).nf_function
-    function.restype, function.argtypes = None, [kernels.COUNT, *arrays]
-    return kernels.of_arrays(function)
-
-
-def _numba_kernel(source: str, once: int, arrays: Sequence[type]) -> Callable[..., None]:
-    types = [kernels.ARRAY, kernels.COUNT, *arrays]
-    function = kernels.of_arrays(build.build_numba(source, "nf_function", types))
-    return lambda rows, *given: function(np.empty(once), rows, *given)
+def _driver(program: Program, layout: Layout, width: int) -> Driver:
+    """A loop over rows."""
+    groups, once = _hoisted(program)
+    outputs = dict(zip(layout.outputs, groups, strict=True))
+    places: dict[int, tuple[str, int]] = {}
+    sizes = {name: len(group) for name, group in outputs.items()}
+    parameters = 0
+    for port in program.inputs:
+        own = port.name in layout.series
+        array, offset = (port.name, 0) if own else ("p", parameters)
+        places |= {node.number: (array, offset + i) for i, node in enumerate(port.nodes)}
+        sizes |= {port.name: len(port.nodes)} if own else {}
+        parameters += 0 if own else len(port.nodes)
+    driver = Driver(layout, width, sizes, len(once))
+    write_function(driver.body, "nf_once", {"once": once}, places, ["p"], [], seldom=True)
+    places |= {node.number: ("once", i) for i, node in enumerate(once)}
+    shared = ["p", "once"]
+    write_function(driver.body, "nf_row", outputs, places, shared, layout.series, width)
+    with driver.entry():
+        driver.call("nf_once", "own_p", "room.once")
+        for name in layout.series:
+            driver.gather(name, sizes[name], driver.value[f"room.{name}"])
+        rooms = (f"room.{name}" for name in (*layout.series, *layout.outputs))
+        driver.call("nf_row", "own_p", "room.once", *rooms)
+        for name in layout.outputs:
+            driver.scatter(name, name, sizes[name], "0", "1")
+    return driver

@@ -9,20 +9,20 @@ milliseconds where `torch.export` takes seconds, so compiled code is looked up b
 source rather than by guessing whether a module has changed.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils._mode_utils import no_dispatch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 from nfriction.codegen.errors import UnsupportedOperation
 from nfriction.codegen.operations import OPERATIONS, constants
-from nfriction.codegen.scalar import Graph, Level, Node
+from nfriction.codegen.scalar import Graph, Node, UpdateRate
 
 LIMIT = 50_000
 """Most elements a traced tensor, and most scalar operations a traced function, may have."""
@@ -39,7 +39,7 @@ class Port:
 
 @dataclass(frozen=True)
 class Program:
-    """What a traced function computes."""
+    """A traced function: its graph, inputs and outputs."""
 
     graph: Graph
     inputs: tuple[Port, ...]
@@ -84,7 +84,7 @@ class ScalarTensor(Tensor):
 
 
 class _Rules:
-    """What holds while tracing: nothing random, and freshly created tensors are traceable."""
+    """Rules of tracing: nothing is random, and freshly created tensors are traceable."""
 
     graph: Graph
 
@@ -208,23 +208,20 @@ def _decomposed(func: Any, name: str, args: tuple[Any, ...], kwargs: dict[str, A
 def trace(
     function: Callable[..., Any],
     inputs: Mapping[str, Tensor],
-    levels: Mapping[str, Level] | None = None,
-    graph: Graph | None = None,
+    parameters: Collection[str] = (),
 ) -> Program:
     """Run `function(**inputs)` symbolically.
 
     Args:
         function: takes the inputs by keyword; returns a tensor or a tuple of tensors.
         inputs: example tensors, float64; each becomes an input of its own.
-        levels: how long each input lives, `Level.STAGE` where not given.
-        graph: the graph to extend; a new one by default.
+        parameters: names of the inputs that stay the same over many calls.
 
     Raises:
         UnsupportedOperation: an operation without scalar form, named.
         ValueError: an example that is not float64.
     """
-    graph = Graph() if graph is None else graph
-    ports, arguments = [], {}
+    graph, ports, arguments = Graph(), [], {}
     for name, example in inputs.items():
         if example.dtype != torch.float64:
             raise ValueError(
@@ -232,8 +229,8 @@ def trace(
             )
         # A copy each: inputs never share memory, whatever the caller passed.
         example = example.detach().to("cpu").clone(memory_format=torch.contiguous_format)
-        level = (levels or {}).get(name, Level.STAGE)
-        nodes = [graph.input(name, i, level) for i in range(example.numel())]
+        rate = UpdateRate.PARAMETER if name in parameters else UpdateRate.STEP
+        nodes = [graph.input(name, i, rate) for i in range(example.numel())]
         ports.append(Port(name, tuple(example.shape), tuple(nodes)))
         array = np.empty(len(nodes), dtype=object)
         array[:] = nodes
@@ -249,3 +246,69 @@ def _output(graph: Graph, index: int, output: Any) -> Port:
         raise ValueError(f"a compiled function returns tensors, got {type(output).__name__}.")
     nodes = output.nodes if isinstance(output, ScalarTensor) else constants(graph, output)
     return Port(f"out{index}", tuple(output.shape), tuple(nodes.ravel()))
+
+
+class FunctionalModule:
+    """A module whose floating-point parameters and buffers are inputs named p0, p1, ...
+
+    Integer and boolean buffers stay constants: they index and select, which has to be known when
+    code is emitted.
+
+    Args:
+        module: whose `forward` is traced.
+
+    Attributes:
+        shapes: of these parameters and buffers, by their names in the module.
+    """
+
+    def __init__(self, module: nn.Module) -> None:
+        self.module = module
+        state = self._state()
+        self.shapes = {n: tuple(t.shape) for n, t in state.items() if t.is_floating_point()}
+        self._fixed = {n: t.detach().cpu() for n, t in state.items() if n not in self.shapes}
+
+    def _state(self) -> dict[str, Tensor]:
+        return {**dict(self.module.named_parameters()), **dict(self.module.named_buffers())}
+
+    @property
+    def device(self) -> torch.device:
+        """The device of the module, by its first tensor."""
+        return next((t.device for t in self._state().values()), torch.device("cpu"))
+
+    def value(self, name: str) -> Tensor:
+        """The present value of a parameter or buffer."""
+        owner, _, last = name.rpartition(".")
+        value: Tensor = getattr(self.module.get_submodule(owner), last)
+        return value
+
+    def trace(self, inputs: Mapping[str, Tensor]) -> Program:
+        """Trace `module(**inputs)`; the program's first inputs are the parameters.
+
+        Args:
+            inputs: example tensors by the names of `forward`'s arguments.
+        """
+        state = self._state()
+        parameters = {f"p{i}": state[name] for i, name in enumerate(self.shapes)}
+
+        def call(**given: Tensor) -> Any:
+            values = {name: given.pop(f"p{i}") for i, name in enumerate(self.shapes)}
+            return torch.func.functional_call(self.module, {**self._fixed, **values}, kwargs=given)
+
+        return trace(call, {**parameters, **inputs}, parameters)
+
+
+class Method(nn.Module):
+    """A module, a bound method of one, or any callable, with named arguments.
+
+    Args:
+        function: what to call; its arguments are passed by position in the order given.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__()
+        owner = function if isinstance(function, nn.Module) else getattr(function, "__self__", None)
+        self.owner = owner if isinstance(owner, nn.Module) else None
+        self._function = [function]  # in a list, so that it is not registered a second time
+
+    def forward(self, **inputs: Tensor) -> Any:
+        return self._function[0](*inputs.values())

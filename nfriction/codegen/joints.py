@@ -10,7 +10,7 @@ from itertools import islice
 
 import numpy as np
 
-from nfriction.codegen.scalar import Graph, Level, Node
+from nfriction.codegen.scalar import Graph, Node, UpdateRate
 
 TABLE = "p"
 """Name of the input that stands for a row of the table."""
@@ -133,7 +133,7 @@ class _Merge:
         if any(isinstance(value, bool) for value in values):
             raise _Unlike
         self.columns.append(tuple(float(value) for value in values))
-        return self.graph.input(TABLE, len(self.columns) - 1, Level.PARAMETER)
+        return self.graph.input(TABLE, len(self.columns) - 1, UpdateRate.PARAMETER)
 
     def _input(self, nodes: tuple[Node, ...]) -> Node:
         places = set()

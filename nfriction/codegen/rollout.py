@@ -1,22 +1,25 @@
 """Compile the rollout of a plant with friction, and run many at once."""
 
-from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
-from typing import Any, NamedTuple, cast
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from nfriction.codegen import arguments, build, driver, driver_c, driver_python
-from nfriction.codegen.arguments import series
+from nfriction.codegen.batch import (
+    Kernel,
+    common_rows,
+    parameter_rows,
+    rows_of,
+    series,
+    to_array,
+)
+from nfriction.codegen.derivative import with_jacobian
 from nfriction.codegen.errors import SelfCheckFailed
-from nfriction.codegen.fused import Friction, Fused, Plant
-from nfriction.codegen.kernels import c_kernel, numba_kernel
-from nfriction.codegen.lift import Lifted
-
-Array = np.ndarray
+from nfriction.codegen.graph import FunctionalModule, Program
+from nfriction.codegen.llvm import jit
+from nfriction.codegen.rollout_program import LAYOUT, ForcedSystem, RolloutDriver, arrange
 
 SPEED_LIMIT = 1e6
 """Above this velocity [rad/s or m/s] a candidate counts as diverged."""
@@ -29,24 +32,27 @@ class Trajectories(NamedTuple):
     """Simulated motions, NumPy or torch as the initial state was.
 
     Attributes:
-        q, qd: positions and velocities [rad, rad/s], shape (candidate, record, joint); NaN from
-            where a candidate diverged.
-        qdd: acceleration known at each record [rad/s^2]: of the first stage of the step before it,
+        q, qd: positions and velocities [rad, rad/s], shape (candidate, sample + 1, joint); NaN
+            from where a candidate diverged.
+        qdd: acceleration known at each sample [rad/s^2]: of the first stage of the step before it,
             at the start that without friction; same shape.
-        diverged_step: step after which the state was not finite or too fast, -1 where it never
-            was, shape (candidate,).
+        diverged_at: number of the sample at which the state was not finite or too fast, -1 where
+            it never was, shape (candidate,).
+        jacobian: derivatives of (q, qd, qdd) after each step by what was asked for, shape
+            (candidate, sample, 3 joint, direction); None where nothing was.
     """
 
     q: Any
     qd: Any
     qdd: Any
-    diverged_step: Any
+    diverged_at: Any
+    jacobian: Any = None
 
 
 def compile_rollout(
-    plant: Plant, friction: Friction, *, backend: build.Backend = "auto", hold: bool = True
+    plant: Any, friction: Any, step: Callable[..., Any], *, jacobian: Sequence[str] = ()
 ) -> "CompiledRollout":
-    """Compile RK4 rollouts of a plant with friction from their torch definition.
+    """Compile rollouts of a plant with friction from their torch definition.
 
     Parameters and floating-point buffers stay inputs: they are read at every call, so a fit may
     change them, and may differ from candidate to candidate. Everything else (Python numbers,
@@ -54,68 +60,70 @@ def compile_rollout(
 
     Args:
         plant: module with `joints`, `forward_dynamics` and `load`.
-        friction: module with `coefficients` and `torque`.
-        backend: "c", "numba", or "auto" for the first of them that is there.
-        hold: hold the coefficients over a step, from its first state and the step before's
-            acceleration; otherwise evaluate them in every stage, with that same acceleration.
-            Coefficients with a memory are always held.
+        friction: module with `coefficients` and `torque`; one whose coefficients have a memory
+            also has `state_size` > 0, `initial_state`, `advance` and `coefficients_from`.
+        step: `(plant, friction, q, qd, tau, coefficients, step) -> (q, qd, qdd)`, which is
+            repeated; for instance `nfriction.simulation.rk4.rk4_step`.
+        jacobian: with each step its derivatives by these are computed: "q", "qd", "held" (the
+            coefficients, joint-major) and names of parameters or buffers ("plant.…").
 
     Raises:
-        NoBackend: no C compiler and no numba.
+        NoBackend: llvmlite cannot be loaded.
         UnsupportedOperation: the modules use an operation that has no scalar form here.
-        CompilerError: the C compiler failed; the message tells how.
-        SelfCheckFailed: the compiled acceleration is not the eager one.
-        ValueError: coefficients with a memory are not to be held.
+        SelfCheckFailed: a compiled step is not the eager one.
     """
-    served = build.choose(backend)
+    jit.require_backend()
     for name, module in (("plant", plant), ("friction", friction)):
         if not isinstance(module, nn.Module):
             raise TypeError(f"`{name}` must be a torch module, got {type(module).__name__}.")
-    fused = Fused(plant, friction, hold)
-    if fused.remembers and not hold:
-        raise ValueError("coefficients with a memory are held over a step; use `hold=True`.")
-    lifted = Lifted(fused)
-    examples = dict(zip(EXAMPLES, _states(plant.joints, seed=0), strict=True))
-    if fused.remembers:
-        with torch.no_grad():
-            rest = torch.zeros(plant.joints, dtype=torch.float64, device=lifted.device)
-            examples["memory"] = fused.friction.initial_state(rest, rest)
-    parts = driver.pieces(lifted.trace(examples, driver.LEVELS))
-    source = (driver_c.c_source if served == "c" else driver_python.python_source)(parts)
-    kernel = c_kernel(source) if served == "c" else numba_kernel(source, parts)
-    compiled = CompiledRollout(served, source, lifted, kernel)
+    compiled = CompiledRollout(ForcedSystem(plant, friction, step), tuple(jacobian))
     compiled.check()
     return compiled
-
-
-EXAMPLES = ("qd_held", "qdd_held", "tau", "q", "qd")
-
-
-def _states(joints: int, seed: int) -> list[Tensor]:
-    generator = torch.Generator().manual_seed(seed)
-    scales = (3.0, 10.0, 1.0, 1.0, 3.0)  # of `EXAMPLES`, as mechanisms move
-    return [s * torch.randn(joints, generator=generator, dtype=torch.float64) for s in scales]
 
 
 class CompiledRollout:
     """Rollouts of one plant and friction model; made by `compile_rollout`.
 
     Attributes:
-        backend: "c" or "numba".
-        source: what was compiled.
-        parameter_names: names under which `parameters` may be given, in the source's order.
+        parameter_names: names under which `parameters` may be given.
     """
 
-    def __init__(
-        self, backend: str, source: str, lifted: Lifted, kernel: Callable[..., None]
-    ) -> None:
-        self.backend = backend
-        self.source = source
-        self.parameter_names = lifted.names
-        self._lifted = lifted
-        self._kernel = kernel
-        self._fused = cast(Fused, lifted.module)
-        self.joints = int(self._fused.plant.joints)
+    def __init__(self, system: ForcedSystem, jacobian: tuple[str, ...]) -> None:
+        self._system = system
+        self.joints = int(system.plant.joints)
+        self._module = FunctionalModule(system)
+        self.parameter_names = tuple(self._module.shapes)
+        examples = self._examples()
+        traced = self._module.trace(examples)
+        slopes = None
+        if jacobian:
+            given = {name: f"p{i}" for i, name in enumerate(self.parameter_names)}
+            wanted = [name if name in examples else given[name] for name in jacobian]
+            step = Program(traced.graph, traced.inputs, traced.outputs[:3])
+            slopes = with_jacobian(step, wanted).outputs[-1]
+        self._jacobian = slopes.shape if slopes else None
+        program = arrange(traced, slopes)
+        self._kernel = Kernel(lambda width: RolloutDriver(program, width), LAYOUT)
+
+    def source(self, width: int = 0) -> str:
+        """LLVM IR that computes so many candidates together, 0 for one at a time."""
+        return self._kernel.source(width)
+
+    def _examples(self) -> dict[str, Tensor]:
+        n, device = self.joints, self._module.device
+        generator = torch.Generator().manual_seed(0)
+        shapes = {"q": 1.0, "qd": 3.0, "tau": 1.0, "seen_qd": 3.0, "seen_qdd": 10.0}
+        found = {
+            name: scale * torch.randn(n, generator=generator, dtype=torch.float64)
+            for name, scale in shapes.items()
+        }
+        seen = [found[name].to(device) for name in ("seen_qd", "seen_qdd")]
+        with torch.no_grad():
+            held = self._system.friction.coefficients(*seen)
+            if self._system.remembers:
+                found["memory"] = self._system.friction.initial_state(*seen)
+        step = torch.full((1,), 1e-3, dtype=torch.float64)
+        return {**found, "step": step, "held": held}
 
     def __call__(
         self,
@@ -128,30 +136,27 @@ class CompiledRollout:
         parameters: Mapping[str, Any] | None = None,
         drive: tuple[Any, Any] | None = None,
         threads: int = 1,
-        record_every: int | None = 1,
-        hold_for: int = 1,
+        substeps: int = 1,
         memory: Any = None,
         speed_limit: float = SPEED_LIMIT,
     ) -> Trajectories:
         """Integrate all candidates from their initial states.
 
         Args:
-            q0, qd0: initial state [rad, rad/s], shape (candidate, joint); one row serves all.
-            steps: number of steps.
-            time_step: step length [s]: a number, (steps,) or (candidate, steps).
-            tau: joint torque held over each step [N m], (steps, joint) or (candidate, steps,
+            q0, qd0: initial state [rad, rad/s], shape (candidate, joint); one row is for all.
+            steps: number of samples.
+            time_step: sample time [s]: a number, (steps,) or (candidate, steps).
+            tau: joint torque held over each sample [N m], (steps, joint) or (candidate, steps,
                 joint); zero by default.
             parameters: values that differ from the modules', by name ("plant.…", "friction.…"),
                 shape (candidate, *the parameter's own) or just the parameter's own.
             drive: measured velocity and acceleration that drive the coefficients instead of the
                 simulated ones, each (steps, joint) or (candidate, steps, joint).
             threads: candidates are shared out among this many.
-            record_every: record the initial state and every `record_every`-th one; None records the
-                initial and the final state.
-            hold_for: steps over which held coefficients stay as they are; where they have a
-                memory, it advances as often.
+            substeps: steps to each sample. Coefficients with a memory are held over the sample;
+                others are held anew at each of these steps.
             memory: what the coefficients remember after the first sample, (candidate, joint,
-                state_size), one row serves all; by default what they would of that sample alone.
+                state_size), one row is for all; by default that of this sample alone.
             speed_limit: a candidate faster than this [rad/s] has diverged and is stopped.
 
         Returns:
@@ -160,71 +165,59 @@ class CompiledRollout:
         Raises:
             ValueError: for shapes that do not fit, or a name that is not there.
         """
-        if steps < 0 or (record_every is not None and record_every < 1) or threads < 1:
+        if steps < 0 or substeps < 1 or threads < 1:
             raise ValueError(
-                "`steps` must be 0 or more, `record_every` and `threads` 1 or more, got "
-                f"{steps}, {record_every} and {threads}."
+                "`steps` must be 0 or more, `substeps` and `threads` 1 or more, got "
+                f"{steps}, {substeps} and {threads}."
             )
-        if hold_for < 1 or (hold_for > 1 and not self._fused.hold):
-            raise ValueError(
-                f"`hold_for` must be 1 or more, and 1 unless compiled with `hold=True`, got "
-                f"{hold_for}."
-            )
-        if drive is not None and not self._fused.hold:
-            raise ValueError("`drive` holds the coefficients; compile with `hold=True` for it.")
-        n, every = self.joints, record_every or max(steps, 1)
-        q, qd = arguments.states("q0", q0, n), arguments.states("qd0", qd0, n)
-        h = series("time_step", time_step, steps, ())
-        torque = series("tau", np.zeros(n) if tau is None else tau, steps, (n,))
-        measured = [
-            series(f"drive[{i}]", values, steps, (n,))
-            for i, values in enumerate(drive or (np.zeros(n), np.zeros(n)))
-        ]
-        if len({(m.rows, m.step) for m in measured}) > 1 or (drive and not measured[0].step):
-            raise ValueError("`drive` must be two arrays of one shape, each with a value a step.")
-        p, counts = arguments.parameter_rows(self._lifted.values(), parameters or {})
-        counts |= {} if memory is None else {"memory": len(memory)}
-        counts |= {"q0": len(q), "qd0": len(qd), "time_step": h.rows, "tau": torque.rows}
-        count = arguments.candidates({**counts, "drive": measured[0].rows})
-        remembered = self._memory(memory, count)
-        out = [np.empty((count, steps // every + 1, n)) for _ in range(3)]
-        diverged = np.empty(count, dtype=np.intp)
-        shared = (
-            *(steps, every, hold_for, float(speed_limit)),
-            *(p.reshape(-1), p.shape[1] if len(p) > 1 else 0),
-            *(arguments.repeated(q, count), arguments.repeated(qd, count)),
-            *(h.values, h.row, h.step, torque.values, torque.row, torque.step),
-            *(measured[0].values, measured[1].values, measured[0].row, measured[0].step),
-            *(remembered, int(memory is not None)),
-            *(*(a.reshape(-1) for a in out), diverged),
-        )
-        self._run(count, threads, shared)
+        if self._jacobian and substeps > 1:
+            raise ValueError("a rollout with derivatives of each step has one step a sample.")
+        n = self.joints
+        step = time_step if substeps == 1 else to_array(time_step) / substeps
+        given = {
+            "q0": rows_of("q0", q0, (n,)),
+            "qd0": rows_of("qd0", qd0, (n,)),
+            "tau": series("tau", np.zeros(n) if tau is None else tau, steps, (n,)),
+            "step": series("time_step", step, steps, ()),
+            "limit": rows_of("speed_limit", [[speed_limit]], (1,)),
+        }
+        if drive is not None:
+            for name, value in zip(("drive_qd", "drive_qdd"), drive, strict=True):
+                given[name] = series("drive", value, steps, (n,))
+        if memory is not None:
+            size = getattr(self._system.friction, "state_size", 0)
+            given["memory"] = rows_of("memory", memory, (n, size))
+        p, rows = parameter_rows(self._module, parameters or {})
+        count = common_rows(rows | {name: one.rows for name, one in given.items()})
+        outputs: dict[str, np.ndarray] = {
+            name: np.empty((count, steps + 1, n)) for name in LAYOUT.outputs[:3]
+        }
+        outputs["diverged"] = np.empty(count, dtype=np.int64)
+        if self._jacobian:
+            outputs["jacobian_out"] = np.empty((count, steps, *self._jacobian))
+        settings = {"samples": steps, "substeps": substeps, "driven": drive is not None,
+                    "remembered": memory is not None}  # fmt: skip
+        self._kernel(count, p, given, outputs, settings, threads)
+        results: list[Any] = list(outputs.values())
         if isinstance(q0, Tensor):
-            tensors = [torch.from_numpy(a) for a in (*out, diverged)]
-            return Trajectories(tensors[0], tensors[1], tensors[2], tensors[3])
-        return Trajectories(out[0], out[1], out[2], diverged)
+            results = [torch.from_numpy(x) for x in results]
+        return Trajectories(*results)
 
-    def _memory(self, memory: Any, count: int) -> Array:
-        """Given memory of every candidate, flat; a placeholder where none is given."""
-        if memory is None:
-            return np.zeros(1)
-        array = arguments.to_array(memory)
-        shape = (self.joints, getattr(self._fused.friction, "state_size", 0))
-        if array.shape[1:] != shape or not shape[1]:
-            raise ValueError(f"`memory` must be (candidate, {shape[0]}, {shape[1]}), got "
-                             f"{array.shape}.")  # fmt: skip
-        return arguments.repeated(array, count)
-
-    def check(self, states: int = 3) -> None:
+    def check(self) -> None:
         """Compare two steps from random states with the same steps in eager torch.
 
         Raises:
             SelfCheckFailed: if they differ by more than rounding explains.
         """
         steps, dt = 2, 1e-4
-        for seed in range(states):
-            _, _, tau, q, qd = _states(self.joints, seed)
-            expected = arguments.to_array(self._eager(q, qd, tau, steps, dt)) - qd.numpy()
+        generator = torch.Generator().manual_seed(1)
+        scales = (1.0, 1.0, 3.0)  # of torque, position and velocity, as mechanisms move
+        for _ in range(3):
+            tau, q, qd = (
+                s * torch.randn(self.joints, generator=generator, dtype=torch.float64)
+                for s in scales
+            )
+            expected = to_array(self._eager(q, qd, tau, steps, dt)) - qd.numpy()
             ours = self(q[None], qd[None], steps=steps, time_step=dt, tau=tau.expand(steps, -1))
             rate, eager = (ours.qd[0, -1].numpy() - qd.numpy()) / dt, expected / dt
             scale = _CHECK_TOLERANCE * (1.0 + np.abs(eager).max())
@@ -235,41 +228,17 @@ class CompiledRollout:
                     '(`backend="torch"`) meanwhile.'
                 )
 
+    @torch.no_grad()
     def _eager(self, q: Tensor, qd: Tensor, tau: Tensor, steps: int, dt: float) -> Tensor:
         """Velocity after some steps in torch."""
-        device = self._lifted.device
-        q, qd, tau = (x.to(device) for x in (q, qd, tau))
-        with torch.no_grad():
-            friction = self._fused.friction
-            prev = self._fused.plant.forward_dynamics(q, qd, tau)
-            memory: tuple[Tensor, ...] = ()
-            for k in range(steps):
-                held: tuple[Tensor, ...] = (qd, prev)
-                if self._fused.remembers:
-                    begun = friction.advance(*held, *memory) if k else friction.initial_state(*held)
-                    memory = (begun,)
-                held += memory
-                a1 = self._fused(q, qd, tau, *held)[0]
-                v2 = qd + dt / 2 * a1
-                a2 = self._fused(q + dt / 2 * qd, v2, tau, *held)[0]
-                v3 = qd + dt / 2 * a2
-                a3 = self._fused(q + dt / 2 * v2, v3, tau, *held)[0]
-                v4 = qd + dt * a3
-                a4 = self._fused(q + dt * v3, v4, tau, *held)[0]
-                q = q + dt / 6 * (qd + 2 * (v2 + v3) + v4)
-                qd, prev = qd + dt / 6 * (a1 + 2 * (a2 + a3) + a4), a1
+        q, qd, tau = (x.to(self._module.device) for x in (q, qd, tau))
+        plant, friction = self._system.plant, self._system.friction
+        qdd, memory = plant.forward_dynamics(q, qd, tau), None
+        for k in range(steps):
+            if not self._system.remembers:
+                held = friction.coefficients(qd, qdd)
+            else:
+                memory = friction.advance(qd, qdd, memory) if k else friction.initial_state(qd, qdd)
+                held = friction.coefficients_from(qd, qdd, memory)
+            q, qd, qdd = self._system.step(plant, friction, q, qd, tau, held, dt)
         return qd
-
-    def _run(self, count: int, threads: int, shared: tuple[Any, ...]) -> None:
-        chunks = min(threads, count)
-        if chunks <= 1:
-            self._kernel(0, count, *shared)
-            return
-        # More chunks than threads, since candidates that diverge early leave a thread idle.
-        borders = np.linspace(0, count, min(count, 4 * chunks) + 1).astype(int).tolist()
-        with ThreadPoolExecutor(threads) as pool:
-            jobs = [
-                pool.submit(self._kernel, first, last, *shared) for first, last in pairwise(borders)
-            ]
-            for job in jobs:
-                job.result()

@@ -1,8 +1,7 @@
 """A graph of scalar operations that simplifies itself while it is built.
 
 Nodes are hash-consed: the same operation on the same arguments is the same node, so common
-subexpressions never arise. Each node carries a `Level` that tells how long its value stays the
-same during a rollout; an operation has the level of its most volatile argument.
+subexpressions never arise. Each node has an `UpdateRate`, that of its most volatile argument.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -14,27 +13,26 @@ import numpy as np
 from nfriction.codegen.simplify import SIMPLIFY
 
 
-class Level(IntEnum):
-    """How long a value lives: the lower, the more seldom it has to be computed."""
+class UpdateRate(IntEnum):
+    """Frequency at which a value has to be computed; the lower, the more seldom."""
 
     CONSTANT = 0
     PARAMETER = 1
     STEP = 2
-    STAGE = 3
 
 
 class Node:
     """One scalar value: a constant, an element of an input, or an operation on other nodes."""
 
-    __slots__ = ("args", "level", "number", "op", "value")
+    __slots__ = ("args", "number", "op", "rate", "value")
 
     def __init__(
-        self, op: str, args: tuple["Node", ...], value: Any, level: Level, number: int
+        self, op: str, args: tuple["Node", ...], value: Any, rate: UpdateRate, number: int
     ) -> None:
         self.op = op
         self.args = args
         self.value = value  # of a constant: float or bool; of an input: (name, flat index)
-        self.level = level
+        self.rate = rate
         self.number = number
 
     def __repr__(self) -> str:
@@ -79,9 +77,9 @@ EVALUATE: dict[str, Callable[..., Any]] = {
     "or": np.logical_or,
     "not": np.logical_not,
     "where": np.where,
-    "finite": np.isfinite,  # made by `finite.py` alone, for C that tells it by the bits
+    "finite": np.isfinite,  # made by `finite.py` alone, for C that looks at the bits
 }
-"""Every scalar operation with its meaning; the emitters spell the same ones in C and Python."""
+"""Every scalar operation with its meaning; the emitters know the same ones."""
 
 PREDICATES = frozenset({"lt", "le", "eq", "ne", "and", "or", "not", "finite"})
 _COMMUTATIVE = frozenset({"add", "mul", "max", "min", "eq", "ne", "and", "or"})
@@ -96,22 +94,22 @@ class Graph:
     def __len__(self) -> int:
         return len(self._nodes)
 
-    def _intern(self, op: str, args: tuple[Node, ...], value: Any, level: Level) -> Node:
-        # repr tells -0.0 from 0.0 and True from 1.0, and makes NaN equal to itself.
+    def _intern(self, op: str, args: tuple[Node, ...], value: Any, rate: UpdateRate) -> Node:
+        # By repr, -0.0 and 0.0 differ, True and 1.0 differ, and NaN is equal to itself.
         key = (op, *(a.number for a in args)) if args else (op, repr(value))
         node = self._nodes.get(key)
         if node is None:
-            node = self._nodes[key] = Node(op, args, value, level, len(self._nodes))
+            node = self._nodes[key] = Node(op, args, value, rate, len(self._nodes))
         return node
 
     def constant(self, value: float | bool) -> Node:
         """A literal; booleans stay booleans, every other number becomes a float."""
         value = bool(value) if isinstance(value, (bool, np.bool_)) else float(value)
-        return self._intern("constant", (), value, Level.CONSTANT)
+        return self._intern("constant", (), value, UpdateRate.CONSTANT)
 
-    def input(self, name: str, index: int, level: Level = Level.STAGE) -> Node:
+    def input(self, name: str, index: int, rate: UpdateRate = UpdateRate.STEP) -> Node:
         """Element `index` (flat) of the input called `name`."""
-        return self._intern("input", (), (name, index), level)
+        return self._intern("input", (), (name, index), rate)
 
     def apply(self, op: str, *args: Node) -> Node:
         """The simplified value of `op` on `args`."""
@@ -125,7 +123,7 @@ class Graph:
             return simpler
         if op in _COMMUTATIVE and args[0].number > args[1].number:
             args = args[::-1]
-        return self._intern(op, args, None, max(a.level for a in args))
+        return self._intern(op, args, None, max(a.rate for a in args))
 
     def total(self, terms: Sequence[Node], op: str = "add") -> Node:
         """`terms` folded by `op` as a balanced tree: less rounding, more parallelism."""
@@ -137,12 +135,12 @@ class Graph:
         return terms[0]
 
     def known(self, op: str, *args: Node) -> bool:
-        """Whether this very operation is already in the graph."""
+        """Return true if this very operation is already in the graph."""
         return (op, *(a.number for a in args)) in self._nodes
 
 
 def is_predicate(node: Node) -> bool:
-    """Whether a node is a truth value rather than a number."""
+    """Return true for a truth value, false for a number."""
     if node.op == "where":
         return is_predicate(node.args[1])
     return node.op in PREDICATES or isinstance(node.value, bool)

@@ -12,7 +12,7 @@ import numpy as np
 
 from nfriction.codegen.finite import rebuilt
 from nfriction.codegen.joints import TABLE, Template
-from nfriction.codegen.scalar import Level, Node, reachable
+from nfriction.codegen.scalar import Node, UpdateRate, reachable
 
 # A constant this small beside what it is the difference of, in units of rounding, is none.
 _NOTHING = 8.0 * float(np.finfo(np.float64).eps)
@@ -145,4 +145,4 @@ class _Rewriter:
 
     def _known(self, values: np.ndarray) -> Node:
         self.columns.append(values)
-        return self.graph.input(TABLE, len(self.columns) - 1, Level.PARAMETER)
+        return self.graph.input(TABLE, len(self.columns) - 1, UpdateRate.PARAMETER)

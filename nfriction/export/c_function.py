@@ -13,7 +13,7 @@ import numpy as np
 from torch import Tensor
 
 from nfriction.codegen import finite
-from nfriction.codegen.function import fold
+from nfriction.codegen.function import specialise
 from nfriction.codegen.joints import TABLE, template
 from nfriction.codegen.packing import pack
 from nfriction.codegen.packs import Packing
@@ -65,7 +65,7 @@ def emit(
         dialect: the C.
         arrays: what stands for an argument in the call, where that is not its name.
     """
-    folded = fold(function, inputs)
+    folded = specialise(function, inputs)
     joints = next(iter(inputs.values())).shape[0]
     sizes = {key: x.numel() for key, x in inputs.items()}
     one = completed(template(folded.outputs, sizes, folded.known, joints))

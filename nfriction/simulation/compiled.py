@@ -1,31 +1,33 @@
 """Compiled rollouts, found by the structure of plant and friction and kept for later calls.
 
-What was compiled once serves every plant and friction model of the same structure: parameters and
+Code is compiled once for all plants and friction models of the same structure: parameters and
 buffers are inputs of the compiled code, so a fit may change them between calls.
 """
 
 import logging
 from collections import OrderedDict
 from collections.abc import Hashable, Mapping
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from nfriction import codegen
+from nfriction.simulation.protocols import RolloutInputs
+from nfriction.simulation.rk4 import StepFunction, rk4_step
 
 logger = logging.getLogger(__name__)
 
-Backend = Literal["auto", "torch", "c", "numba"]
+Backend = Literal["auto", "compiled", "torch"]
 # Compiled structures kept in memory; each is some hundred kilobytes.
 KEPT = 32
 
-_cache: OrderedDict[Hashable, "codegen.CompiledRollout | None"] = OrderedDict()
+_cache: OrderedDict[Hashable, "codegen.CompiledRollout | codegen.CodegenError"] = OrderedDict()
 
 
 class NoFriction(nn.Module):
-    """Stands where a compiled rollout needs a friction model and there is none."""
+    """A friction model without torque, where a compiled rollout needs one."""
 
     def __init__(self, joints: int) -> None:
         super().__init__()
@@ -39,17 +41,17 @@ class NoFriction(nn.Module):
 
 
 def wants_compiled(backend: Backend, q: Tensor, gradients: bool) -> bool:
-    """Whether a rollout should be tried in compiled code.
+    """Return true if compiled code should be tried.
 
     Raises:
-        ValueError: if a compiled backend is asked for together with gradients or off the CPU.
+        ValueError: if compiled code is asked for together with gradients or off the CPU.
     """
-    if backend not in ("auto", "torch", "c", "numba"):
-        raise ValueError(f'`backend` is "auto", "torch", "c" or "numba", got {backend!r}.')
+    if backend not in get_args(Backend):
+        raise ValueError(f"`backend` must be one of {get_args(Backend)}, got {backend!r}.")
     able = not gradients and q.dtype == torch.float64 and q.device.type == "cpu"
-    if backend in ("c", "numba") and not able:
+    if backend == "compiled" and not able:
         raise ValueError(
-            f'backend="{backend}" needs float64 on the CPU and records no gradients; use '
+            'backend="compiled" needs float64 on the CPU and records no gradients; use '
             'backend="torch", or `gradients=False`.'
         )
     return backend != "torch" and able
@@ -58,32 +60,37 @@ def wants_compiled(backend: Backend, q: Tensor, gradients: bool) -> bool:
 def integrate_compiled(
     plant: Any,
     friction: Any,
-    q: Tensor,
-    qd: Tensor,
-    tau: Tensor,
-    step: Tensor,
-    substeps: int,
-    measured: tuple[Tensor, Tensor] | None,
+    inputs: RolloutInputs,
     backend: Backend,
     threads: int,
     parameters: Mapping[str, Tensor] | None = None,
-    memory: Tensor | None = None,
+    step_function: StepFunction = rk4_step,
+    jacobian: tuple[str, ...] = (),
 ) -> tuple[Tensor, ...] | None:
     """States at every sample: q, qd, qdd, each (*batch, steps + 1, joint).
 
     Args:
+        plant, friction, inputs: as in `integrate`.
+        backend: `"auto"` or `"compiled"`.
+        threads: number of threads that share a batch.
         parameters: values of the friction model's parameters by name that differ from its own,
-            each (*batch, *the parameter's shape); the other arguments as in `integrate`.
+            each (*batch, *the parameter's shape).
+        step_function: what is repeated, with the arguments of `rk4_step`.
+        jacobian: return the derivatives of (q, qd, qdd) after each step as well, shape
+            (*batch, steps, 3 joint, direction), by these: "q", "qd", "held" (the coefficients,
+            joint-major), and names of parameters and buffers ("plant.…", "friction.…").
 
     Returns:
-        None where `backend="auto"` finds no way to compile, so that eager torch serves.
+        None where `backend="auto"` finds no way to compile, so that eager torch has to do it.
 
     Raises:
-        CodegenError: if a backend asked for by name cannot serve.
+        CodegenError: if compiled code is asked for and cannot be made.
     """
-    compiled = _compiled(plant, friction or NoFriction(plant.joints), backend)
+    friction = NoFriction(plant.joints) if friction is None else friction
+    compiled = _compiled(plant, friction, backend, step_function, jacobian)
     if compiled is None:
         return None
+    q, qd, measured, memory = inputs.q0, inputs.qd0, inputs.measured, inputs.hidden_state
     batch, joints = q.shape[:-1], q.shape[-1]
 
     def rows(x: Tensor, trailing: int) -> Tensor:
@@ -94,38 +101,34 @@ def integrate_compiled(
         # An expanded constant needs no value for each step.
         return x[0] if x.ndim == trailing and not x.stride(0) else x
 
-    def finer(x: Tensor, trailing: int) -> Tensor:
-        """Values of samples repeated for their substeps."""
-        every = x.ndim >= trailing and substeps > 1
-        return x.repeat_interleave(substeps, -trailing) if every else x
-
-    steps = step.shape[-1] * substeps
-    drive = None
-    if measured is not None:
-        drive = (finer(rows(measured[0], 2), 2), finer(rows(measured[1], 2), 2))
+    drive = None if measured is None else (rows(measured[0], 2), rows(measured[1], 2))
     values = _values(plant, friction, compiled.parameter_names)
     for name, value in (parameters or {}).items():
         own = value.shape[len(batch) :]
         values[f"friction.{name}"] = value.detach().reshape(-1, *own)
-    # Coefficients with a memory are held as a controller would, at the sample rate.
-    remembers = getattr(friction, "state_size", 0) > 0
     found = compiled(
-        q.detach().reshape(-1, joints).contiguous(),
-        qd.detach().reshape(-1, joints).contiguous(),
-        steps=steps,
-        time_step=finer(rows(step, 1) / substeps, 1),
-        tau=finer(rows(tau, 2), 2),
+        q.detach().reshape(-1, joints),
+        qd.detach().reshape(-1, joints),
+        steps=inputs.step.shape[-1],
+        time_step=rows(inputs.step, 1),
+        tau=rows(inputs.tau, 2),
         parameters=values,
         drive=drive,
         threads=threads,
-        record_every=substeps,
-        hold_for=substeps if remembers else 1,
+        substeps=inputs.substeps,
         memory=None if memory is None else rows(memory, 2).reshape(-1, *memory.shape[-2:]),
     )
-    return tuple(x.reshape(*batch, -1, joints) for x in (found.q, found.qd, found.qdd))
+    states = tuple(x.reshape(*batch, -1, joints) for x in (found.q, found.qd, found.qdd))
+    return (*states, found.jacobian.unflatten(0, batch)) if jacobian else states
 
 
-def _compiled(plant: Any, friction: Any, backend: Backend) -> "codegen.CompiledRollout | None":
+def _compiled(
+    plant: Any,
+    friction: Any,
+    backend: Backend,
+    step_function: StepFunction = rk4_step,
+    jacobian: tuple[str, ...] = (),
+) -> "codegen.CompiledRollout | None":
     """The compiled rollout of this structure, from the cache where it is there."""
     if backend == "torch":
         return None
@@ -136,24 +139,33 @@ def _compiled(plant: Any, friction: Any, backend: Backend) -> "codegen.CompiledR
             "only a plant and a friction model that are torch modules can be compiled; use "
             'backend="torch".'
         )
-    key = (backend, _structure(plant), _structure(friction))
+    key = (step_function, jacobian, _structure(plant), _structure(friction))
     if key in _cache:
         _cache.move_to_end(key)
-        return _cache[key]
-    compiled = None
+    else:
+        _cache[key] = _attempt(plant, friction, step_function, jacobian)
+        if len(_cache) > KEPT:
+            _cache.popitem(last=False)
+    found = _cache[key]
+    if isinstance(found, codegen.CodegenError):
+        if backend != "auto":
+            raise found
+        return None
+    return found
+
+
+def _attempt(
+    plant: Any, friction: Any, step_function: StepFunction, jacobian: tuple[str, ...]
+) -> "codegen.CompiledRollout | codegen.CodegenError":
+    """A compiled rollout, or the reason why there is none."""
     try:
         _check_compilable(plant, friction)
-        compiled = codegen.compile_rollout(plant, friction, backend=backend)
+        return codegen.compile_rollout(plant, friction, step_function, jacobian=jacobian)
     except codegen.SelfCheckFailed:
         raise
     except codegen.CodegenError as error:
-        if backend != "auto":
-            raise
         logger.warning("rollouts run in eager torch, as they cannot be compiled: %s", error)
-    _cache[key] = compiled
-    while len(_cache) > KEPT:
-        _cache.popitem(last=False)
-    return compiled
+        return error.with_traceback(None)
 
 
 def _check_compilable(plant: Any, friction: Any) -> None:
@@ -165,7 +177,8 @@ def _check_compilable(plant: Any, friction: Any) -> None:
                     f"compiled rollouts need float64, but `{name}` is {value.dtype}"
                 )
     with torch.no_grad():
-        rest = torch.zeros(plant.joints, dtype=torch.float64)
+        device = next((t.device for t in (*plant.parameters(), *plant.buffers())), None)
+        rest = torch.zeros(plant.joints, dtype=torch.float64, device=device)
         held = friction.coefficients(rest, rest)
         tau_f = friction.torque(rest, plant.load(rest, rest), held)
         if plant.forward_dynamics(rest, rest, tau_f).shape != rest.shape:

@@ -83,8 +83,16 @@ def rk4_step(
     )
 
 
+StepFunction = Callable[..., tuple[Tensor, Tensor, Tensor]]
+"""Of the arguments of `rk4_step`, in that order."""
+
+
 def simulate_eager(
-    plant: Plant, friction: Friction | None, inputs: RolloutInputs, progress: bool = False
+    plant: Plant,
+    friction: Friction | None,
+    inputs: RolloutInputs,
+    progress: bool = False,
+    step_function: StepFunction = rk4_step,
 ) -> tuple[Tensor, ...]:
     """States at every sample in eager torch: q, qd, qdd, each (*batch, steps + 1, joint)."""
     q, qd, tau = inputs.q0, inputs.qd0, inputs.tau
@@ -111,7 +119,8 @@ def simulate_eager(
         for _ in range(inputs.substeps):
             if friction is not None and stateful is None:
                 held = friction.coefficients(*(measured or (qd, qdd)))
-            q, qd, qdd = rk4_step(plant, friction, q, qd, tau[..., k, :], held, inner[..., k, None])
+            given = (q, qd, tau[..., k, :], held, inner[..., k, None])
+            q, qd, qdd = step_function(plant, friction, *given)
         states.append((q, qd, qdd))
     shape = states[-1][0].shape
     return tuple(

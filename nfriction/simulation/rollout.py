@@ -107,7 +107,7 @@ def rollout(
             sample alone.
         gradients: make the motion differentiable; None does so where any input requires it, no
             compiled backend is named, and there are at most 10,000 steps.
-        backend: `"torch"` steps in eager torch; `"c"` and `"numba"` compile the same definition
+        backend: `"torch"` steps in eager torch; `"compiled"` compiles the same definition
             (no gradients); `"auto"` compiles where it can. Its gradients come from an adjoint
             sweep, which gives first derivatives only; for higher ones, or within `torch.func`,
             `"torch"` records every step.
@@ -121,7 +121,7 @@ def rollout(
     Raises:
         ValueError: if shapes do not fit, inputs are not finite, friction is too steep at rest for
             a stable integration, or the scheme does not support an option.
-        CodegenError: if a backend asked for by name is not available.
+        CodegenError: if `backend="compiled"` and the model cannot be compiled.
     """
     inputs = validate_inputs(plant, friction, q0, qd0, tau, sample_time, steps, substeps)
     inputs = replace(inputs, measured=validate_measured(drive, measured, inputs))
@@ -182,10 +182,7 @@ def simulate(
     with torch.no_grad():
         states = None
         if compiled:
-            states = integrate_compiled(
-                plant, friction, inputs.q0, inputs.qd0, inputs.tau, inputs.step, inputs.substeps,
-                inputs.measured, backend, threads, memory=inputs.hidden_state,
-            )  # fmt: skip
+            states = integrate_compiled(plant, friction, inputs, backend, threads)
         return states or simulate_eager(plant, friction, inputs, progress)
 
 

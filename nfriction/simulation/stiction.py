@@ -5,19 +5,14 @@ friction is an impulse that at most stops its joint within the step; the torque 
 below breakaway is solved for, not modelled.
 """
 
-import logging
-from collections.abc import Callable
+from dataclasses import replace
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
-from tqdm import tqdm
 
-from nfriction import codegen
+from nfriction.simulation.compiled import integrate_compiled
 from nfriction.simulation.protocols import Friction, Plant, RolloutInputs, as_stateful
-
-logger = logging.getLogger(__name__)
+from nfriction.simulation.rk4 import simulate_eager
 
 # In units of the smoothing velocity: from there on a joint slides, with the law's friction.
 SLIDING = 5.0
@@ -85,34 +80,6 @@ def moreau_step(
     return q + step * after, after, (after - qd) / step
 
 
-class _Stepper:
-    """Steps whose coefficients follow their own motion, compiled where there is a compiler.
-
-    A call costs more than its arithmetic, so a step maps one array to another: position, velocity,
-    acceleration, then torque and step length.
-    """
-
-    def __init__(self, plant: Plant, friction: Friction) -> None:
-        self.plant, self.friction = plant, friction
-        self._compiled: Callable[..., list[NDArray[np.float64]]] | None = None
-        example = torch.full((4 * plant.joints + 1,), 1e-3, dtype=torch.float64)
-        try:
-            self._compiled = codegen.compile_function(self._after, [example]).bound()
-        except codegen.CodegenError as error:
-            logger.warning("stiction is simulated in eager torch, slowly: %s", error)
-
-    def _after(self, given: Tensor) -> Tensor:
-        joints = self.plant.joints
-        q, qd, qdd, tau, step = given.split([joints] * 4 + [1], -1)
-        held = self.friction.coefficients(qd, qdd)
-        return torch.cat(moreau_step(self.plant, self.friction, q, qd, tau, held, step), -1)
-
-    def __call__(self, given: NDArray[np.float64]) -> NDArray[np.float64]:
-        if self._compiled is None:
-            return self._after(torch.from_numpy(given)).numpy()
-        return self._compiled(len(given), given.reshape(-1))[0]
-
-
 @torch.no_grad()
 def simulate_stiction(
     plant: Plant, friction: Friction, inputs: RolloutInputs, progress: bool
@@ -127,21 +94,14 @@ def simulate_stiction(
             'scheme="time_stepping" does not simulate coefficients with a hidden state; use '
             'scheme="rk4".'
         )
-    q, qd, tau, step = inputs.q0, inputs.qd0, inputs.tau, inputs.step
-    joints, steps = q.shape[-1], step.shape[-1]
-    shape = torch.broadcast_shapes(q.shape[:-1], tau.shape[:-2], step.shape[:-1])
-    inner = (step / inputs.substeps).expand(*shape, steps)[..., None]
-    each = torch.cat([tau.expand(*shape, steps, joints), inner], -1)
-    driven = each.reshape(-1, steps, joints + 1).to("cpu", torch.float64).numpy()
-    first = torch.cat([q, qd, plant.forward_dynamics(q, qd, tau[..., 0, :])], -1)
-    given = np.zeros((len(driven), 4 * joints + 1))
-    given[:, : 3 * joints] = first.expand(*shape, -1).reshape(-1, 3 * joints).cpu()
-    stepper, states = _Stepper(plant, friction), np.empty((steps + 1, len(driven), 3 * joints))
-    states[0] = given[:, : 3 * joints]
-    for k in tqdm(range(steps), disable=not progress, unit="step", leave=False):
-        given[:, 3 * joints :] = driven[:, k]
-        for _ in range(inputs.substeps):
-            given[:, : 3 * joints] = stepper(given)
-        states[k + 1] = given[:, : 3 * joints]
-    motion = torch.from_numpy(states).transpose(0, 1).reshape(*shape, steps + 1, 3 * joints)
-    return motion.to(q).chunk(3, -1)
+    double = replace(
+        inputs,
+        q0=inputs.q0.double(),
+        qd0=inputs.qd0.double(),
+        tau=inputs.tau.double(),
+        step=inputs.step.double(),
+    )
+    states = integrate_compiled(plant, friction, double, "auto", 1, step_function=moreau_step)
+    if states is None:
+        states = simulate_eager(plant, friction, double, progress, moreau_step)
+    return tuple(x.to(inputs.q0) for x in states)

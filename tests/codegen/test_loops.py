@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from nfriction.codegen import finite
 from nfriction.codegen.elements import Names
 from nfriction.codegen.emit import C_PRELUDE, C
-from nfriction.codegen.function import fold
+from nfriction.codegen.function import specialise
 from nfriction.codegen.joints import TABLE, Template, template
 from nfriction.codegen.loops import body
 from nfriction.codegen.packing import pack
@@ -28,7 +28,7 @@ JOINTS = 3
 
 def templated(function, *shapes, joints=JOINTS):
     inputs = {f"x{i}": torch.rand(joints, *s, dtype=F64) + 0.5 for i, s in enumerate(shapes)}
-    folded = fold(function, inputs)
+    folded = specialise(function, inputs)
     sizes = {name: x.numel() for name, x in inputs.items()}
     return template(folded.outputs, sizes, folded.known, joints)
 

@@ -1,16 +1,22 @@
-"""Every executor runs the same rollout as eager torch."""
+"""Compiled rollouts are those of eager torch."""
 
 import numpy as np
 import pytest
 import torch
 from torch import nn
 
-from nfriction.codegen import SelfCheckFailed, UnsupportedOperation, compile_rollout
-from nfriction.codegen import rollout as rollout_module
+from nfriction import codegen
+from nfriction.codegen import SelfCheckFailed, UnsupportedOperation
+from nfriction.codegen.llvm import body
+from nfriction.simulation.rk4 import rk4_step
 from tests.codegen.mechanisms import F64, Coulomb, NeuroFuzzy, Pendulum, reference
 
 # Rounding differs by an ulp or two a step; a second of a falling chain amplifies that tenfold.
 TOLERANCE = {"rtol": 0.0, "atol": 1e-12}
+
+
+def compile_rollout(plant, friction, **settings):
+    return codegen.compile_rollout(plant, friction, rk4_step, **settings)
 
 
 def start(joints=3, batch=1, seed=0):
@@ -22,13 +28,13 @@ def start(joints=3, batch=1, seed=0):
 @pytest.fixture(scope="module")
 def coulomb():
     plant, friction = Pendulum(), Coulomb()
-    return plant, friction, compile_rollout(plant, friction, backend="c")
+    return plant, friction, compile_rollout(plant, friction)
 
 
 @pytest.fixture(scope="module")
 def neurofuzzy():
     plant, friction = Pendulum(), NeuroFuzzy()
-    return plant, friction, compile_rollout(plant, friction, backend="c")
+    return plant, friction, compile_rollout(plant, friction)
 
 
 def assert_same(got, expected):
@@ -41,7 +47,7 @@ def test_constant_coefficients_agree_after_1000_steps(coulomb):
     q, qd = start(batch=3)
     got = compiled(q, qd, steps=1000, time_step=1e-3)
     assert_same(got, reference(plant, friction, q, qd, 1000, 1e-3))
-    assert got.diverged_step.tolist() == [-1, -1, -1]
+    assert got.diverged_at.tolist() == [-1, -1, -1]
 
 
 def test_held_coefficients_agree_after_1000_steps(neurofuzzy):
@@ -49,15 +55,6 @@ def test_held_coefficients_agree_after_1000_steps(neurofuzzy):
     q, qd = start()
     got = compiled(q, qd, steps=1000, time_step=1e-3)
     assert_same(got, reference(plant, friction, q, qd, 1000, 1e-3))
-
-
-def test_coefficients_in_every_stage_agree_and_differ_from_held_ones(neurofuzzy):
-    plant, friction, held = neurofuzzy
-    compiled = compile_rollout(plant, friction, backend="c", hold=False)
-    q, qd = start()
-    got = compiled(q, qd, steps=100, time_step=1e-3)
-    assert_same(got, reference(plant, friction, q, qd, 100, 1e-3, hold=False))
-    assert (got.q - held(q, qd, steps=100, time_step=1e-3).q).abs().max() > 1e-9
 
 
 def test_irregular_steps_and_torque_agree(neurofuzzy):
@@ -100,7 +97,7 @@ def test_each_candidate_has_its_own_parameters(coulomb):
 
 def test_parameters_are_read_at_every_call():
     plant, friction = Pendulum(2), Coulomb(2)
-    compiled = compile_rollout(plant, friction, backend="c")
+    compiled = compile_rollout(plant, friction)
     with torch.no_grad():
         friction.log += 1.0
     q, qd = start(2)
@@ -108,16 +105,41 @@ def test_parameters_are_read_at_every_call():
     assert_same(got, reference(plant, friction, q, qd, 100, 1e-3))
 
 
-def test_threads_and_records_change_nothing_else(coulomb):
+def test_threads_change_nothing(coulomb):
     _, _, compiled = coulomb
     q, qd = start(batch=9)
     whole = compiled(q, qd, steps=100, time_step=1e-3)
     np.testing.assert_array_equal(compiled(q, qd, steps=100, time_step=1e-3, threads=3).q, whole.q)
-    for every in (1, 7, 100):
-        some = compiled(q, qd, steps=100, time_step=1e-3, record_every=every)
-        np.testing.assert_array_equal(some.q, whole.q[:, ::every])
-    ends = compiled(q, qd, steps=100, time_step=1e-3, record_every=None)
-    np.testing.assert_array_equal(ends.qd, whole.qd[:, [0, -1]])
+
+
+@pytest.mark.parametrize("model", ["coulomb", "neurofuzzy"])
+@pytest.mark.parametrize("batch", [2, 3, 8, 13])
+def test_a_batch_has_the_bits_of_its_candidates(model, batch, request):
+    """Several candidates are computed together, with torque, stamps and a drive of their own."""
+    _, _, compiled = request.getfixturevalue(model)
+    q, qd = start(batch=batch)
+    g = torch.Generator().manual_seed(4)
+    tau, fast, faster = torch.randn(3, batch, 60, 3, generator=g, dtype=F64).unbind()
+    h = 5e-4 + 1e-3 * torch.rand(batch, 60, generator=g, dtype=F64)
+    drive = (fast, 10 * faster)
+    for given in ({}, {"drive": drive}):
+        whole = compiled(q, qd, steps=60, time_step=h, tau=tau, substeps=2, **given)
+        for i in range(batch):
+            own = {name: tuple(x[i] for x in pair) for name, pair in given.items()}
+            alone = compiled(q[i : i + 1], qd[i : i + 1], steps=60, time_step=h[i], tau=tau[i],
+                             substeps=2, **own)  # fmt: skip
+            for ours, theirs in zip(whole[:3], alone[:3], strict=True):
+                np.testing.assert_array_equal(ours[i], theirs[0])
+
+
+def test_substeps_are_finer_steps_at_the_same_torque(neurofuzzy):
+    _, _, compiled = neurofuzzy
+    q, qd = start(batch=2)
+    tau = torch.sin(torch.arange(120, dtype=F64)).reshape(40, 3)
+    some = compiled(q, qd, steps=40, time_step=4e-3, tau=tau, substeps=4)
+    fine = compiled(q, qd, steps=160, time_step=1e-3, tau=tau.repeat_interleave(4, 0))
+    np.testing.assert_array_equal(some.q, fine.q[:, ::4])
+    np.testing.assert_array_equal(some.qdd, fine.qdd[:, ::4])
 
 
 def test_a_diverging_candidate_stops_alone(coulomb):
@@ -127,15 +149,15 @@ def test_a_diverging_candidate_stops_alone(coulomb):
     tau[1, 50:] = 1e9
     tau[2, 80] = torch.nan
     got = compiled(q, qd, steps=200, time_step=1e-3, tau=tau, threads=2)
-    assert got.diverged_step.tolist() == [-1, 51, 81]
+    assert got.diverged_at.tolist() == [-1, 51, 81]
     for i, step in ((1, 51), (2, 81)):
         assert torch.isfinite(got.q[i, :step]).all()
         assert torch.isnan(got.q[i, step:]).all()
         assert torch.isnan(got.qd[i, step:]).all()
     alone = compiled(q[:1], qd[:1], steps=200, time_step=1e-3)
     np.testing.assert_array_equal(got.q[0], alone.q[0])
-    slow = compiled(q, qd, steps=200, time_step=1e-3, speed_limit=1e-3, record_every=50)
-    assert (slow.diverged_step == 1).all()
+    slow = compiled(q, qd, steps=4, time_step=0.05, substeps=50, speed_limit=1e-3)
+    assert (slow.diverged_at == 1).all()
     assert torch.isnan(slow.q[:, 1:]).all()
 
 
@@ -146,8 +168,7 @@ def test_rk4_converges_with_order_four(coulomb):
     smooth = {"friction.log": friction.log.detach() + torch.tensor([0.0, -40.0], dtype=F64)}
 
     def end(steps):
-        run = compiled(q, qd, steps=steps, time_step=0.4 / steps, parameters=smooth,
-                       record_every=None)  # fmt: skip
+        run = compiled(q, qd, steps=1, time_step=0.4, substeps=steps, parameters=smooth)
         return run.q[0, -1]
 
     exact = end(6400)
@@ -156,33 +177,77 @@ def test_rk4_converges_with_order_four(coulomb):
     assert np.all(np.abs(slopes - 4) < 0.3)
 
 
-def test_numba_agrees_with_eager_and_with_c():
+def test_torque_of_its_own_may_stop_a_candidate_among_many():
     plant, friction = Pendulum(2), Coulomb(2)
-    numba, c = (compile_rollout(plant, friction, backend=b) for b in ("numba", "c"))
-    q, qd = start(2, batch=2)
+    compiled = compile_rollout(plant, friction)
+    q, qd = start(2, batch=11)
     tau = 0.1 * torch.cos(torch.arange(2000, dtype=F64)).reshape(1000, 2)
-    got = numba(q, qd, steps=1000, time_step=1e-3, tau=tau, threads=2)
+    got = compiled(q, qd, steps=1000, time_step=1e-3, tau=tau, threads=2)
     assert_same(got, reference(plant, friction, q, qd, 1000, 1e-3, tau))
-    torch.testing.assert_close(got.q, c(q, qd, steps=1000, time_step=1e-3, tau=tau).q, **TOLERANCE)
-    tau = tau.expand(2, -1, -1).clone()
-    tau[1, 10] = torch.inf
-    for compiled in (numba, c):
-        got = compiled(q, qd, steps=1000, time_step=1e-3, tau=tau, record_every=3)
-        assert got.diverged_step.tolist() == [-1, 11]
-        assert torch.isnan(got.q[1, 4:]).all()
-        assert torch.isfinite(got.q[1, :4]).all()
+    tau = tau.expand(11, -1, -1).clone()
+    tau[9, 10] = torch.inf
+    stopped = compiled(q, qd, steps=1000, time_step=1e-3, tau=tau)
+    assert stopped.diverged_at.tolist() == [-1] * 9 + [11, -1]
+    assert torch.isnan(stopped.q[9, 11:]).all()
+    assert torch.isfinite(stopped.q[9, :11]).all()
+    others = [i for i in range(11) if i != 9]
+    np.testing.assert_array_equal(stopped.q[others], got.q[others])
 
 
-@pytest.mark.slow
-def test_numba_agrees_on_held_coefficients_and_measured_drive():
-    plant, friction = Pendulum(), NeuroFuzzy()
-    compiled = compile_rollout(plant, friction, backend="numba")
-    q, qd = start()
-    got = compiled(q, qd, steps=1000, time_step=1e-3)
-    assert_same(got, reference(plant, friction, q, qd, 1000, 1e-3))
-    drive = [torch.ones(50, 3, dtype=F64), 5 * torch.ones(50, 3, dtype=F64)]
-    got = compiled(q, qd, steps=50, time_step=1e-3, drive=drive)
-    assert_same(got, reference(plant, friction, q, qd, 50, 1e-3, drive=drive))
+def test_inputs_are_read_where_they_are(coulomb):
+    """Transposed, strided and repeated arrays give what their copies give."""
+    _, _, compiled = coulomb
+    q, qd = start(batch=4)
+    tau = torch.randn(3, 4, 80, dtype=F64).permute(1, 2, 0)[:, ::2]
+    given = {"steps": 40, "time_step": torch.tensor(1e-3, dtype=F64).expand(40)}
+    got = compiled(q.T.contiguous().T, qd, tau=tau, **given)
+    np.testing.assert_array_equal(got.q, compiled(q, qd, tau=tau.clone().contiguous(), **given).q)
+
+
+@pytest.mark.parametrize("wanted", [("q", "qd", "held"), ("qd", "plant.gravity", "friction.log")])
+def test_derivatives_of_each_step_come_with_it(wanted):
+    plant, friction = Pendulum(2), NeuroFuzzy(2)
+    compiled = compile_rollout(plant, friction, jacobian=wanted)
+    q, qd = start(2, batch=5)
+    tau = torch.randn(20, 2, dtype=F64)
+    got = compiled(q, qd, steps=20, time_step=1e-3, tau=tau)
+    plain = compile_rollout(plant, friction)(q, qd, steps=20, time_step=1e-3, tau=tau)
+    torch.testing.assert_close(got.q, plain.q, **TOLERANCE)
+    before = {name: getattr(got, name)[2, 7] for name in ("q", "qd")}
+    held = friction.coefficients(got.qd[2, 7], got.qdd[2, 7]).detach()
+
+    def after(**changed):
+        own = {"q": before["q"], "qd": before["qd"], "held": held} | changed
+        swapped = {n: own.pop(n) for n in list(own) if "." in n}
+
+        def step(module):
+            return torch.cat(rk4_step(module[0], module[1], own["q"], own["qd"], tau[7],
+                                      own["held"], 1e-3))  # fmt: skip
+
+        system = nn.ModuleDict({"plant": plant, "friction": friction})
+        with torch.nn.utils.parametrize.cached():
+            return torch.func.functional_call(
+                _Called(system, step), {f"system.{n}": v for n, v in swapped.items()}, ()
+            )
+
+    values = {**before, "held": held, "plant.gravity": plant.gravity,
+              "friction.log": friction.log.detach()}  # fmt: skip
+    columns = [
+        torch.func.jacfwd(lambda x, n=name: after(**{n: x}))(values[name]).reshape(6, -1)
+        for name in wanted
+    ]
+    torch.testing.assert_close(got.jacobian[2, 7], torch.cat(columns, -1), rtol=1e-9, atol=1e-12)
+    with pytest.raises(ValueError, match="one step a sample"):
+        compiled(q, qd, steps=20, time_step=1e-3, substeps=2)
+
+
+class _Called(nn.Module):
+    def __init__(self, system, function):
+        super().__init__()
+        self.system, self.function = system, function
+
+    def forward(self):
+        return self.function((self.system["plant"], self.system["friction"]))
 
 
 def test_numpy_in_numpy_out(coulomb):
@@ -194,14 +259,14 @@ def test_numpy_in_numpy_out(coulomb):
 
 def test_the_same_model_gives_the_same_source(coulomb):
     _, _, compiled = coulomb
-    assert compile_rollout(Pendulum(), Coulomb(), backend="c").source == compiled.source
+    assert compile_rollout(Pendulum(), Coulomb()).source() == compiled.source()
 
 
-def test_nothing_that_only_needs_parameters_is_left_in_the_stage(coulomb):
+def test_nothing_that_only_needs_parameters_is_computed_in_the_steps(coulomb):
     _, _, compiled = coulomb
-    stage = compiled.source.split("static void nf_stage")[1].split("\n}")[0]
-    assert "exp(" not in stage  # exp(log coefficient) is computed once a rollout
-    assert "exp(" in compiled.source
+    functions = {part.split("(")[0]: part for part in compiled.source().split("define internal ")}
+    assert "@exp(" in functions["void @nf_once"]  # of the logarithms of coefficients
+    assert "fmul" not in functions["void @nf_held"]
 
 
 @pytest.mark.parametrize(
@@ -215,7 +280,8 @@ def test_nothing_that_only_needs_parameters_is_left_in_the_stage(coulomb):
         ({"q0": np.ones((2, 3)), "qd0": np.ones((4, 3))}, "`q0` 2, `qd0` 4"),
         ({"steps": -1}, "`steps`"),
         ({"threads": 0}, "`threads`"),
-        ({"drive": (np.ones((5, 3)), np.ones((2, 5, 3)))}, "`drive`"),
+        ({"substeps": 0}, "`substeps`"),
+        ({"drive": (np.ones((5, 3)), np.ones((4, 3)))}, "`drive` must be"),
     ],
 )
 def test_bad_arguments_are_told(coulomb, change, message):
@@ -243,10 +309,9 @@ class Remembering(Coulomb):
         return self.coefficients_from(qd, qdd, self.initial_state(qd, qdd))
 
 
-@pytest.mark.parametrize("backend", ["c", pytest.param("numba", marks=pytest.mark.slow)])
-def test_a_memory_agrees_with_eager_steps(backend):
+def test_a_memory_agrees_with_eager_steps():
     plant, friction = Pendulum(2), Remembering(2)
-    compiled = compile_rollout(plant, friction, backend=backend)
+    compiled = compile_rollout(plant, friction)
 
     class Replayed(Coulomb):
         """The same friction for `reference`, which calls once a step."""
@@ -270,35 +335,20 @@ def test_a_memory_agrees_with_eager_steps(backend):
                          memory=memory[i : i + 1])  # fmt: skip
         np.testing.assert_array_equal(given.q[i], alone.q[0])
     assert not np.allclose(given.q, got.q[:, :51], atol=1e-6)
+    many = compiled(*start(2, batch=5), steps=50, time_step=1e-3, substeps=3, memory=memory[1:])
+    for i in range(5):
+        alone = compiled(*(x[i : i + 1] for x in start(2, batch=5)), steps=50, time_step=1e-3,
+                         substeps=3, memory=memory[1:])  # fmt: skip
+        np.testing.assert_array_equal(many.q[i], alone.q[0])
     with pytest.raises(ValueError, match="memory"):
         compiled(q, qd, steps=5, time_step=1e-3, memory=memory[0])
 
 
-def test_a_memory_is_always_held():
-    with pytest.raises(ValueError, match="hold=True"):
-        compile_rollout(Pendulum(2), Remembering(2), backend="c", hold=False)
-    with pytest.raises(ValueError, match="hold_for"):
-        compile_rollout(Pendulum(2), Coulomb(2), backend="c")(
-            np.ones((1, 2)), np.ones((1, 2)), steps=5, time_step=1e-3, hold_for=0
-        )
-
-
-def test_measured_drive_needs_held_coefficients():
-    compiled = compile_rollout(Pendulum(2), Coulomb(2), backend="c", hold=False)
-    drive = (np.ones((5, 2)), np.ones((5, 2)))
-    with pytest.raises(ValueError, match="hold=True"):
-        compiled(np.ones((1, 2)), np.ones((1, 2)), steps=5, time_step=1e-3, drive=drive)
-
-
 def test_wrong_code_fails_the_self_check(monkeypatch):
-    true = rollout_module.driver_c.c_source
-
-    def wrong(parts):
-        return true(parts).replace("qdd[0] = ", "qdd[0] = 1e-6 + ")
-
-    monkeypatch.setattr(rollout_module.driver_c, "c_source", wrong)
+    true = body.Body.text
+    monkeypatch.setattr(body.Body, "text", lambda b: true(b).replace("fsub double", "fadd double"))
     with pytest.raises(SelfCheckFailed, match=r'backend="torch"'):
-        compile_rollout(Pendulum(2), Coulomb(2), backend="c")
+        compile_rollout(Pendulum(2), Coulomb(2))
 
 
 def test_an_unknown_operation_names_itself_and_the_fallback():
@@ -307,9 +357,9 @@ def test_an_unknown_operation_names_itself_and_the_fallback():
             return super().torque(qd.sort(-1).values, load, c)
 
     with pytest.raises(UnsupportedOperation, match=r'`sort`.*backend="torch"'):
-        compile_rollout(Pendulum(), Sorted(), backend="c")
+        compile_rollout(Pendulum(), Sorted())
 
 
 def test_what_is_no_module_is_refused():
     with pytest.raises(TypeError, match="friction"):
-        compile_rollout(Pendulum(), object(), backend="c")
+        compile_rollout(Pendulum(), object())

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nfriction.codegen.scalar import EVALUATE, Graph, Level, evaluate, reachable
+from nfriction.codegen.scalar import EVALUATE, Graph, UpdateRate, evaluate, reachable
 
 UNARY = ("neg", "abs", "sin", "cos", "tanh", "exp", "sqrt", "atan", "floor")
 BINARY = ("add", "sub", "mul", "div", "max", "min", "atan2", "pow")
@@ -100,12 +100,11 @@ def test_signed_zero_and_nan_are_told_apart():
     assert g.constant(True) is not g.constant(1.0)
 
 
-def test_a_value_lives_as_long_as_its_most_volatile_argument():
+def test_a_value_is_computed_as_often_as_its_most_volatile_argument():
     g = Graph()
-    p, s, x = (g.input(n, 0, level) for n, level in zip("psx", list(Level)[1:], strict=True))
-    assert g.apply("mul", p, g.constant(2.0)).level == Level.PARAMETER
-    assert g.apply("mul", p, s).level == Level.STEP
-    assert g.apply("mul", g.apply("mul", p, s), x).level == Level.STAGE
+    p, x = g.input("p", 0, UpdateRate.PARAMETER), g.input("x", 0)
+    assert g.apply("mul", p, g.constant(2.0)).rate == UpdateRate.PARAMETER
+    assert g.apply("mul", g.apply("exp", p), x).rate == UpdateRate.STEP
 
 
 def test_reachable_lists_arguments_first_and_leaves_dead_code_out():

@@ -11,7 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nfriction.codegen.function import fold
+from nfriction.codegen.function import specialise
 from nfriction.codegen.joints import template
 from nfriction.codegen.scalar import evaluate, reachable
 from nfriction.export.c_bounds import bounds_of
@@ -85,7 +85,7 @@ def test_it_vanishes_far_below_and_keeps_nan(library, real):
 
 def traced(function, joints: int = 2, size: int = 3):
     inputs = {"x0": torch.rand(joints, size, dtype=F64) + 0.5}
-    folded = fold(function, inputs)
+    folded = specialise(function, inputs)
     return template(folded.outputs, {"x0": joints * size}, folded.known, joints)
 
 

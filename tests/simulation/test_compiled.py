@@ -2,15 +2,18 @@
 
 import functools
 import logging
+import sys
 
 import pytest
 import torch
 
 from nfriction import LFM, NFLFM, PendulumChain, codegen, rollout
+from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import LINEAR, Law, linear
 from nfriction.friction.models import FrictionModel
 from nfriction.simulation import compiled
+from nfriction.simulation.protocols import RolloutInputs
 
 F64 = torch.float64
 CHAIN = PendulumChain([0.3, 0.2], [0.2, 0.15])
@@ -137,38 +140,20 @@ def test_old_structures_are_forgotten(compilations, monkeypatch):
     assert len(compiled._cache) == 1
 
 
-def test_without_a_backend_eager_torch_serves_and_says_so_once(compilations, monkeypatch, caplog):
-    def nothing(backend):
-        raise codegen.NoBackend("no compiler and no numba")
-
-    monkeypatch.setattr("nfriction.codegen.build.choose", nothing)
+def test_without_llvm_eager_torch_steps_and_says_so_once(compilations, monkeypatch, caplog):
+    monkeypatch.setitem(sys.modules, "llvmlite", None)
+    monkeypatch.setitem(sys.modules, "llvmlite.binding", None)
     with caplog.at_level(logging.WARNING, "nfriction"):
         both(LFM(2, v_smooth=0.05))
         both(LFM(2, v_smooth=0.05))
     assert caplog.text.count("eager torch") == 1
-    with pytest.raises(codegen.NoBackend):
-        rollout(CHAIN, LFM(2, v_smooth=0.05), Q0, QD0, steps=5, gradients=False, backend="c")
+    with pytest.raises(codegen.NoBackend, match="llvmlite"):
+        rollout(CHAIN, LFM(2, v_smooth=0.07), Q0, QD0, steps=5, gradients=False, backend="compiled")
 
 
-@pytest.mark.slow
-def test_each_executor_serves_where_the_ones_before_it_are_hidden(
-    compilations, monkeypatch, tmp_path, caplog
-):
-    """The C compiler, then numba: the public call goes on and ends at the same place."""
-    monkeypatch.setenv("NFRICTION_CACHE", str(tmp_path / "cache"))
-    first = both(LFM(2, v_smooth=0.05))
-    monkeypatch.delenv("CC", raising=False)
-    monkeypatch.setenv("PATH", str(tmp_path))
-    compiled._cache.clear()
-    second = both(LFM(2, v_smooth=0.05))
-    assert [c.backend for c in compiled._cache.values()] == ["numba"]
-    monkeypatch.setattr("importlib.util.find_spec", lambda name, *rest: None)
-    compiled._cache.clear()
-    third = both(LFM(2, v_smooth=0.05))
-    assert list(compiled._cache.values()) == [None]
-    assert "eager torch" in caplog.text
-    torch.testing.assert_close(second, first, rtol=0, atol=1e-12)
-    torch.testing.assert_close(third, first, rtol=0, atol=1e-12)
+def test_the_error_lists_valid_backends():
+    with pytest.raises(ValueError, match=r"'auto', 'compiled', 'torch'"):
+        rollout(CHAIN, LFM(2, v_smooth=0.05), Q0, QD0, steps=5, backend="numba")
 
 
 def test_an_operation_without_scalar_form_falls_back_unless_asked_by_name(compilations):
@@ -179,7 +164,7 @@ def test_an_operation_without_scalar_form_falls_back_unless_asked_by_name(compil
     model = FrictionModel(law, Constant(law, 2, [1e-3, 1e-3]))
     both(model)
     with pytest.raises(codegen.UnsupportedOperation, match="i0"):
-        rollout(CHAIN, model, Q0, QD0, steps=5, gradients=False, backend="c")
+        rollout(CHAIN, model, Q0, QD0, steps=5, gradients=False, backend="compiled")
 
 
 def test_single_precision_and_plain_objects_run_in_torch(compilations):
@@ -201,7 +186,7 @@ def test_single_precision_and_plain_objects_run_in_torch(compilations):
     assert len(compilations) == 1
     for model in (LFM(2, v_smooth=0.05).float(), Nothing()):
         with pytest.raises(codegen.CodegenError, match="compiled"):
-            rollout(CHAIN, model, Q0, QD0, steps=5, gradients=False, backend="c")
+            rollout(CHAIN, model, Q0, QD0, steps=5, gradients=False, backend="compiled")
 
 
 def test_a_batch_of_plants_runs(compilations):
@@ -211,3 +196,23 @@ def test_a_batch_of_plants_runs(compilations):
     together = both(LFM(2, v_smooth=0.05), plant)
     assert together.shape == (2, 41, 2)
     torch.testing.assert_close(together[1], both(LFM(2, v_smooth=0.05)), rtol=0, atol=1e-12)
+
+
+def test_a_rollout_may_bring_the_derivatives_of_its_steps(compilations):
+    """One pass gives the motion, and the step maps that a fit chains."""
+    model = NFLFM(2, v_smooth=0.05, terms=(2, 2), head_units=2)
+    q0 = torch.stack([Q0, 0.9 * Q0, Q0 - 0.1]).expand(2, 3, 2)
+    given = (torch.zeros(1, 2, dtype=F64).expand(30, 2), torch.full((30,), 1e-3, dtype=F64))
+    q, qd, qdd, slopes = compiled.integrate_compiled(
+        CHAIN, model, RolloutInputs(q0, QD0.expand(2, 3, 2), *given), "compiled", 1,
+        jacobian=("q", "qd", "held"),
+    )  # fmt: skip
+    plain = rollout(CHAIN, model, q0, QD0, steps=30, gradients=False)
+    torch.testing.assert_close(q, plain.q, rtol=0, atol=1e-12)
+    assert slopes.shape == (2, 3, 30, 6, 4 + 2 * 2)
+    jacobian = StepJacobian(CHAIN, model, [])
+    before = [x[..., :-1, :].reshape(-1, 2) for x in (q, qd, qdd)]
+    held = model.coefficients(*before[1:]).detach()
+    rest = torch.zeros(len(held), 2, dtype=F64), torch.full((len(held), 1), 1e-3, dtype=F64)
+    expected = jacobian(*before[:2], held, *rest, torch.zeros(0, dtype=F64))
+    torch.testing.assert_close(slopes.reshape(-1, 6, 8), expected, rtol=1e-11, atol=1e-13)

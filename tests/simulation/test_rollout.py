@@ -74,7 +74,7 @@ def test_order_of_convergence_is_four(friction):
     )
 
     def end(steps):
-        out = run(model, sample_time=0.8 / steps, steps=steps, backend="c")
+        out = run(model, sample_time=0.8 / steps, steps=steps, backend="compiled")
         return torch.cat([out.q[-1], 0.1 * out.qd[-1]])
 
     exact = end(12800)
@@ -123,7 +123,7 @@ def test_shapes_times_and_the_first_acceleration():
     assert not bool(out.diverged)
 
 
-@pytest.mark.parametrize("backend", ["torch", "c"])
+@pytest.mark.parametrize("backend", ["torch", "compiled"])
 def test_a_batch_equals_single_runs(backend):
     generator = torch.Generator().manual_seed(0)
     q0, qd0 = torch.randn(2, 2, 3, 2, generator=generator, dtype=F64)
@@ -139,7 +139,7 @@ def test_a_batch_equals_single_runs(backend):
                 torch.testing.assert_close(got, getattr(one, name), rtol=1e-13, atol=1e-13)
 
 
-@pytest.mark.parametrize("backend", ["torch", "c"])
+@pytest.mark.parametrize("backend", ["torch", "compiled"])
 def test_torques_or_steps_alone_may_bring_the_batch(backend):
     tau = torch.tensor([0.0, 0.01, 0.02], dtype=F64)[:, None, None].expand(3, 20, 2)
     out = run(smooth_model(), tau=tau, backend=backend)
@@ -159,16 +159,18 @@ NAMES = [
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_torch_and_c_agree(name):
+def test_torch_and_compiled_code_agree(name):
     model = FrictionModel(DRAG, Constant(DRAG, 2), 1.0) if name == "user" else named_model(name)
-    eager, c = (
+    eager, compiled = (
         run(model, *MOVING, sample_time=5e-4, steps=1000, backend=backend)
-        for backend in ("torch", "c")
+        for backend in ("torch", "compiled")
     )
     for field in ("q", "qd"):
-        torch.testing.assert_close(getattr(c, field), getattr(eager, field), rtol=0, atol=1e-12)
+        torch.testing.assert_close(
+            getattr(compiled, field), getattr(eager, field), rtol=0, atol=1e-12
+        )
     # An acceleration is a velocity's difference over a step, and rounds as such.
-    torch.testing.assert_close(c.qdd, eager.qdd, rtol=1e-10, atol=1e-9)
+    torch.testing.assert_close(compiled.qdd, eager.qdd, rtol=1e-10, atol=1e-9)
 
 
 def recorded(steps: int) -> dict:
@@ -186,27 +188,19 @@ def recorded(steps: int) -> dict:
     }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [*model_names(), "user"])
-def test_c_and_numba_agree(name):
-    model = FrictionModel(DRAG, Constant(DRAG, 2), 1.0) if name == "user" else named_model(name)
-    for given in ({"sample_time": 5e-4, "steps": 1000}, recorded(1000)):
-        c, numba = (run(model, *MOVING, backend=backend, **given) for backend in ("c", "numba"))
-        torch.testing.assert_close(numba.q, c.q, rtol=0, atol=1e-12)
-        torch.testing.assert_close(numba.qd, c.qd, rtol=0, atol=1e-12)
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_torque_drag_irregular_stamps_and_a_measured_drive_agree(name):
     model = FrictionModel(DRAG, Constant(DRAG, 2), 1.0) if name == "user" else named_model(name)
     plant = CHAIN.replace(drag_quadratic=torch.tensor([0.02, 0.01], dtype=F64))
     given = recorded(200 if name in OFTEN else 1000)
-    eager, c = (run(model, *MOVING, plant, backend=b, **given) for b in ("torch", "c"))
-    torch.testing.assert_close(c.q, eager.q, rtol=0, atol=1e-12)
-    torch.testing.assert_close(c.qd, eager.qd, rtol=0, atol=1e-12)
-    undriven = run(model, *MOVING, plant, backend="c", tau=given["tau"],
+    eager, compiled = (
+        run(model, *MOVING, plant, backend=b, **given) for b in ("torch", "compiled")
+    )
+    torch.testing.assert_close(compiled.q, eager.q, rtol=0, atol=1e-12)
+    torch.testing.assert_close(compiled.qd, eager.qd, rtol=0, atol=1e-12)
+    undriven = run(model, *MOVING, plant, backend="compiled", tau=given["tau"],
                    sample_time=given["sample_time"])  # fmt: skip
-    assert torch.equal(undriven.q, c.q) == isinstance(model.schedule, Constant)
+    assert torch.equal(undriven.q, compiled.q) == isinstance(model.schedule, Constant)
 
 
 class Reads(TorchDispatchMode):
@@ -233,7 +227,7 @@ def test_no_value_is_asked_for_within_the_loop(name):
     assert counts[0] == counts[1] > 0
 
 
-@pytest.mark.parametrize("backend", ["torch", "c"])
+@pytest.mark.parametrize("backend", ["torch", "compiled"])
 @pytest.mark.parametrize("name", ["LFM", "NFLFM"])
 def test_substeps_are_finer_steps(backend, name):
     """With coefficients held anew at every substep, substeps are nothing but shorter steps."""
@@ -247,7 +241,7 @@ def test_substeps_are_finer_steps(backend, name):
         )
 
 
-@pytest.mark.parametrize("backend", ["torch", "c"])
+@pytest.mark.parametrize("backend", ["torch", "compiled"])
 def test_irregular_stamps_reach_the_same_place(backend):
     """The motion belongs to time, not to samples: other stamps, same end."""
     generator = torch.Generator().manual_seed(1)
@@ -262,7 +256,7 @@ def test_the_simulated_motion_as_measured_one_gives_itself():
     model = named_model("NFLFM")
     free = run(model, *MOVING, steps=60)
     measured = (free.qd[:-1], free.qdd[:-1])
-    for backend in ("torch", "c"):
+    for backend in ("torch", "compiled"):
         driven = run(model, *MOVING, steps=60, drive="measured", measured=measured, backend=backend)
         torch.testing.assert_close(driven.q, free.q, rtol=0, atol=1e-13)
     slow = tuple(torch.zeros_like(m) for m in measured)
@@ -270,7 +264,7 @@ def test_the_simulated_motion_as_measured_one_gives_itself():
     assert not torch.allclose(other.q, free.q, atol=1e-8)
 
 
-@pytest.mark.parametrize("backend", [pytest.param("torch", marks=pytest.mark.slow), "c"])
+@pytest.mark.parametrize("backend", [pytest.param("torch", marks=pytest.mark.slow), "compiled"])
 def test_a_memory_advances_once_a_sample(backend):
     """Substeps refine the integration; the class changes at samples only, as in a controller."""
     seen = []
@@ -290,7 +284,7 @@ def test_a_memory_advances_once_a_sample(backend):
     assert len(known.unique()) > 1
 
 
-@pytest.mark.parametrize("backend", [pytest.param("torch", marks=pytest.mark.slow), "c"])
+@pytest.mark.parametrize("backend", [pytest.param("torch", marks=pytest.mark.slow), "compiled"])
 def test_a_motion_goes_on_with_what_it_remembers(backend):
     """Cut in two with the memory handed over, a run is the uncut one."""
     model = named_model("ALFM")
@@ -309,7 +303,7 @@ def test_a_motion_goes_on_with_what_it_remembers(backend):
     torch.testing.assert_close(both.q, torch.stack([rest.q, lost.q]), rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("backend", [pytest.param("torch", marks=pytest.mark.slow), "c"])
+@pytest.mark.parametrize("backend", [pytest.param("torch", marks=pytest.mark.slow), "compiled"])
 def test_a_measured_motion_drives_the_memory_too(backend):
     model = named_model("ALFM")
     settings = {"sample_time": 5e-4, "steps": 300, "backend": backend}
@@ -360,7 +354,7 @@ def test_threads_change_nothing():
 # Divergence and stability
 
 
-@pytest.mark.parametrize("backend", ["torch", "c"])
+@pytest.mark.parametrize("backend", ["torch", "compiled"])
 def test_divergence_is_reported_with_its_time(backend, caplog):
     """Negative viscosity b feeds an axis: qd grows by exp(b/m t) and passes 1e6 at a known time."""
     explode = Law("explode", (Coefficient("b", "N s/m", positive=False),),
@@ -478,7 +472,7 @@ def test_gradients_are_recorded_where_asked_for_and_affordable(monkeypatch):
     assert not rollout(CHAIN, None, Q0, QD0, steps=5).q.requires_grad
     assert rollout(CHAIN, None, Q0.clone().requires_grad_(), QD0, steps=5).q.requires_grad
     with pytest.raises(ValueError, match="gradients"):
-        rollout(CHAIN, model, Q0, QD0, steps=5, gradients=True, backend="c")
+        rollout(CHAIN, model, Q0, QD0, steps=5, gradients=True, backend="compiled")
 
 
 # Errors

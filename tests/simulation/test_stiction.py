@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from nfriction import ALFM, CVFM, LFM, LinearAxis, PendulumChain, codegen, rollout, score
-from nfriction.simulation import stiction as sticking
+from nfriction.simulation import compiled
 from tests.fitting.recordings import F64, pendulum, swing
 
 DRY = 2.0
@@ -99,16 +99,17 @@ def test_gears_lose_what_they_lose_in_smooth_steps(torque):
 
 
 def test_eager_torch_serves_where_nothing_compiles(monkeypatch, caplog):
-    compiled = slide(2.5, v0=-0.1, steps=200)
+    fast = slide(2.5, v0=-0.1, steps=200)
 
     def refuse(*_):
         raise codegen.CodegenError("no compiler")
 
-    monkeypatch.setattr(sticking.codegen, "compile_function", refuse)
+    monkeypatch.setattr(codegen, "compile_rollout", lambda *_, **__: refuse())
+    monkeypatch.setattr(compiled, "_cache", type(compiled._cache)())
     eager = slide(2.5, v0=-0.1, steps=200)
-    assert "slowly: no compiler" in caplog.text
-    torch.testing.assert_close(eager.q, compiled.q, rtol=0, atol=1e-12)
-    torch.testing.assert_close(eager.qd, compiled.qd, rtol=0, atol=1e-12)
+    assert "eager torch, as they cannot be compiled: no compiler" in caplog.text
+    torch.testing.assert_close(eager.q, fast.q, rtol=0, atol=1e-12)
+    torch.testing.assert_close(eager.qd, fast.qd, rtol=0, atol=1e-12)
 
 
 def test_a_batch_is_its_members():

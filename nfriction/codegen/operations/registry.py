@@ -1,4 +1,4 @@
-"""How an ATen operation acts on arrays of scalar nodes, and what all of them share.
+"""The table of ATen operations on arrays of scalar nodes, and their common parts.
 
 Every function takes the graph and then the operation's own arguments in their order, with tensors
 replaced by object arrays of nodes, and returns such an array (views really are views).

@@ -132,10 +132,8 @@ class PositionError:
         measured = None if self.drive is None else (torch.zeros_like(self.drive[w]), self.drive[w])
         memory = None if self.memory is None else self.memory[w]
         q0, qd0 = of.q0[w].expand(m, -1), of.qd0[w].expand(m, -1)
-        states = integrate_compiled(
-            self.plant, self.friction, q0, qd0, of.tau[w], of.step[w], self.substeps, measured,
-            "auto", self.threads, own, memory,
-        )  # fmt: skip
+        inputs = RolloutInputs(q0, qd0, of.tau[w], of.step[w], self.substeps, measured, memory)
+        states = integrate_compiled(self.plant, self.friction, inputs, "auto", self.threads, own)
         if states is not None:
             return states[0]
         schedule = self.friction.schedule

@@ -1,0 +1,196 @@
+"""Machine code of LLVM IR, kept in a private folder of the user's.
+
+Object code is kept under the hash of the IR, the processor and llvmlite's version, so an unchanged
+model is compiled once per machine. Where the folder cannot be used, code is compiled in memory.
+"""
+
+import ctypes
+import hashlib
+import logging
+import os
+import stat
+import sys
+import tempfile
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from nfriction.codegen.errors import NoBackend
+
+logger = logging.getLogger(__name__)
+
+_KEPT = ".object"
+LIBRARY = (
+    *("exp", "expm1", "log", "log1p", "pow", "fmod", "sin", "cos", "tan", "asin", "acos", "atan"),
+    *("atan2", "sinh", "cosh", "tanh"),
+)
+"""Functions of the C library that emitted code calls."""
+
+
+def cache_folder() -> Path:
+    """The private folder for compiled models; `NFRICTION_CACHE` overrides the platform's choice.
+
+    Raises:
+        PermissionError: if the folder belongs to somebody else or others may write to it.
+    """
+    given = os.environ.get("NFRICTION_CACHE")
+    folder = Path(given) if given else _user_cache() / "nfriction"
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if os.name == "posix":
+        status = folder.stat()
+        if status.st_uid != os.getuid() or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+            raise PermissionError(
+                f"the cache folder {folder} must belong to you and be writable by you alone, "
+                "because code is loaded from it; `chmod 700` it or set NFRICTION_CACHE."
+            )
+    return folder
+
+
+def _user_cache() -> Path:
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+
+
+def require_backend() -> None:
+    """Load llvmlite.
+
+    Raises:
+        NoBackend: if it cannot be loaded.
+    """
+    try:
+        import llvmlite.binding  # noqa: F401
+    except (ImportError, OSError) as error:
+        raise NoBackend(
+            f'llvmlite cannot be loaded ({error}); install it, or use `backend="torch"`.'
+        ) from error
+
+
+def build(source: str, name: str) -> Callable[..., None]:
+    """A function of a module of LLVM IR, which lets go of the GIL.
+
+    It takes two whole numbers and three addresses, as `Driver.entry` writes it.
+
+    Args:
+        source: the module.
+        name: of the function, which returns nothing.
+
+    Raises:
+        NoBackend: if llvmlite cannot be loaded.
+    """
+    require_backend()
+    from llvmlite import binding as llvm
+
+    recipe = (source, llvm.get_process_triple(), *_processor(), _version())
+    key = hashlib.sha256("\0".join(recipe).encode()).hexdigest()[:32]
+    folder = _usable_folder()
+    code = _kept(folder, key) if folder else None
+    if code is None:
+        code = _compile(source)
+        if folder:
+            _keep(folder, key, code)
+    _find_library(llvm)
+    # The engine also owns the target machine, so each has its own.
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _target_machine())
+    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+    engine.finalize_object()
+    kinds = [ctypes.c_ssize_t] * 2 + [ctypes.c_void_p] * 3
+    function = ctypes.CFUNCTYPE(None, *kinds)(engine.get_function_address(name))
+
+    def call(*given: Any, engine: Any = engine) -> None:  # the engine owns the code
+        function(*given)
+
+    return call
+
+
+def _find_library(llvm: Any) -> None:
+    """Name functions that LLVM does not find on Windows, where a missing one ends the process."""
+    if sys.platform == "win32":
+        for library, names in (("ucrtbase", LIBRARY), ("ntdll", ("__chkstk",))):
+            for name in names:
+                function = ctypes.CDLL(library)[name]
+                llvm.add_symbol(name, ctypes.cast(function, ctypes.c_void_p).value)
+
+
+def _usable_folder() -> Path | None:
+    try:
+        return cache_folder()
+    except PermissionError as error:
+        reason = str(error)
+    except OSError as error:
+        reason = f"the cache folder cannot be made ({error})"
+    logger.warning("compiled models are not kept: %s", reason)
+    return None
+
+
+def _kept(folder: Path, key: str) -> bytes | None:
+    """Object code whose contents still have the digest that its name has."""
+    for path in sorted(folder.glob(f"{key}-*{_KEPT}")):
+        try:
+            code = path.read_bytes()
+        except OSError:
+            continue
+        if path.name == f"{key}-{_digest(code)}{_KEPT}":
+            return code
+    return None
+
+
+def _keep(folder: Path, key: str, code: bytes) -> None:
+    """Write object code. The rename is atomic: others see the whole or nothing."""
+    draft = None
+    try:
+        handle, draft = tempfile.mkstemp(dir=folder, prefix="building-")
+        with os.fdopen(handle, "wb") as file:
+            file.write(code)
+        os.replace(draft, folder / f"{key}-{_digest(code)}{_KEPT}")
+    except OSError as error:
+        logger.warning("the compiled model is not kept: %s", error)
+        if draft and os.path.exists(draft):
+            os.unlink(draft)
+
+
+def _digest(code: bytes) -> str:
+    return hashlib.sha256(code).hexdigest()[:32]
+
+
+@cache
+def _version() -> str:
+    from llvmlite import __version__
+
+    return str(__version__)
+
+
+@cache
+def _processor() -> tuple[str, str]:
+    """Name and features of this processor: a cache shared by machines must keep them apart."""
+    from llvmlite import binding as llvm
+
+    return llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+
+
+def _target_machine() -> Any:
+    from llvmlite import binding as llvm
+
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    target = llvm.Target.from_triple(llvm.get_process_triple())
+    cpu, features = _processor()
+    return target.create_target_machine(
+        cpu=cpu, features=features, reloc="default", codemodel="jitdefault", jit=True
+    )
+
+
+def _compile(source: str) -> bytes:
+    from llvmlite import binding as llvm
+
+    machine = _target_machine()
+    module = llvm.parse_assembly(source)
+    module.triple = machine.triple
+    module.data_layout = str(machine.target_data)
+    module.verify()
+    # The graph is simplified and its values are shared, so LLVM's own passes, which take as long as
+    # everything else, gain nothing.
+    return bytes(machine.emit_object(module))

@@ -1,0 +1,267 @@
+"""A whole rollout: what is traced of it, and the loops around that."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor, nn
+
+from nfriction.codegen.graph import Port, Program
+from nfriction.codegen.hoist import hoist
+from nfriction.codegen.llvm.body import real
+from nfriction.codegen.llvm.driver import Driver, Layout
+from nfriction.codegen.llvm.emit import write_function
+from nfriction.codegen.scalar import Graph, Node
+
+LAYOUT = Layout(
+    series=("q0", "qd0", "tau", "step", "drive_qd", "drive_qdd", "memory", "limit"),
+    outputs=("q_out", "qd_out", "qdd_out", "diverged", "jacobian_out"),
+    settings=("samples", "substeps", "driven", "remembered"),
+)
+INPUTS = ("q", "qd", "tau", "step", "held", "seen_qd", "seen_qdd", "memory")
+"""Of `ForcedSystem`; all other inputs of its trace are parameters."""
+
+
+class ForcedSystem(nn.Module):
+    """Plant and friction as the one function that a rollout repeats.
+
+    Args:
+        plant: the mechanism.
+        friction: the friction model.
+        step: `(plant, friction, q, qd, tau, coefficients, step) -> (q, qd, qdd)`.
+    """
+
+    def __init__(self, plant: Any, friction: Any, step: Callable[..., Any]) -> None:
+        super().__init__()
+        self.plant = plant
+        self.friction = friction
+        self.step = step
+        self.remembers = int(getattr(friction, "state_size", 0)) > 0
+
+    def forward(
+        self,
+        q: Tensor,
+        qd: Tensor,
+        tau: Tensor,
+        step: Tensor,
+        held: Tensor,
+        seen_qd: Tensor,
+        seen_qdd: Tensor,
+        memory: Tensor | None = None,
+    ) -> tuple[Tensor, ...]:
+        after = self.step(self.plant, self.friction, q, qd, tau, held, step)
+        start = self.plant.forward_dynamics(q, qd, tau)
+        if memory is None:
+            return *after, start, self.friction.coefficients(seen_qd, seen_qdd)
+        coefficients = self.friction.coefficients_from(seen_qd, seen_qdd, memory)
+        begin = self.friction.initial_state(seen_qd, seen_qdd)
+        return *after, start, coefficients, begin, self.friction.advance(seen_qd, seen_qdd, memory)
+
+
+@dataclass(frozen=True)
+class RolloutProgram:
+    """The functions of a rollout as groups of nodes.
+
+    Attributes:
+        joints: number of joints.
+        once: values computed once a rollout.
+        start: acceleration without friction, which is the one known at the start.
+        held: coefficients of a motion, and of a memory where they have one.
+        step: q, qd and qdd after a step with these.
+        within: whether that state is finite and no joint too fast.
+        begin: memory of the coefficients after the first sample; empty where they have none.
+        advance: memory after a sample, from that before.
+        jacobian: derivatives of `step`; empty where they are not wanted.
+        places: array and index of the input nodes.
+    """
+
+    joints: int
+    once: tuple[Node, ...]
+    start: tuple[Node, ...]
+    held: tuple[Node, ...]
+    step: tuple[Node, ...]
+    within: Node
+    begin: tuple[Node, ...]
+    advance: tuple[Node, ...]
+    jacobian: tuple[Node, ...]
+    places: dict[int, tuple[str, int]]
+
+
+def arrange(program: Program, jacobian: Port | None) -> RolloutProgram:
+    """Arrange what was traced of a `ForcedSystem`.
+
+    Args:
+        program: with the outputs of its `forward`.
+        jacobian: derivatives of the first three of them, where they are wanted.
+    """
+    graph, outputs = program.graph, [port.nodes for port in program.outputs]
+    q, qd, qdd, start, held, *remembered = outputs
+    begin, advance = remembered or ((), ())
+    joints = len(q)
+    limit = graph.input("limit", 0)
+    within = _within(graph, q, qd, limit)
+    slopes = jacobian.nodes if jacobian else ()
+    groups = [start, held, (*q, *qd, *qdd), (within,), begin, advance, slopes]
+    found = hoist(graph, [node for group in groups for node in group])
+    nodes = iter(found.outputs)
+    start, held, step, (within,), begin, advance, slopes = (
+        tuple(next(nodes) for _ in group) for group in groups
+    )
+    at = {"q": ("state", 0), "qd": ("state", joints), "seen_qdd": ("seen", joints),
+          "seen_qd": ("seen", 0)}  # fmt: skip
+    places = {limit.number: ("limit", 0)}
+    parameters = 0
+    for port in program.inputs:
+        own = port.name in INPUTS
+        array, offset = at.get(port.name, (port.name, 0)) if own else ("p", parameters)
+        places |= {node.number: (array, offset + i) for i, node in enumerate(port.nodes)}
+        parameters += 0 if own else len(port.nodes)
+    once = tuple(found.once)
+    return RolloutProgram(joints, once, start, held, step, within, begin, advance, slopes, places)
+
+
+def _within(graph: Graph, q: Sequence[Node], qd: Sequence[Node], limit: Node) -> Node:
+    """A test for finite and slow enough states; numbers that are not finite compare false."""
+    zero = graph.constant(0.0)
+    tests = [graph.apply("eq", graph.apply("sub", x, x), zero) for x in q]
+    tests += [graph.apply("le", graph.apply("abs", x), limit) for x in qd]
+    return graph.total(tests, "and")
+
+
+class RolloutDriver(Driver):
+    """The loops over candidates, samples and substeps.
+
+    Args:
+        program: functions to call in them.
+        width: see `Driver`.
+    """
+
+    def __init__(self, program: RolloutProgram, width: int) -> None:
+        n = program.joints
+        sizes = {"state": 3 * n, "seen": 2 * n, "tau": n, "step": 1, "held": len(program.held),
+                 "memory": len(program.advance), "limit": 1, "within": 1,
+                 "jacobian": len(program.jacobian), "alive": 1}  # fmt: skip
+        super().__init__(LAYOUT, width, sizes, len(program.once))
+        self.program = program
+        self._functions()
+        with self.entry():
+            self._candidates()
+
+    def _functions(self) -> None:
+        parts, body = self.program, self.body
+        known = parts.places | {n.number: ("once", i) for i, n in enumerate(parts.once)}
+
+        def function(
+            name: str, inputs: Sequence[str], outputs: dict[str, Any], seldom: bool = False
+        ) -> None:
+            shared = ["p", "once"]
+            write_function(body, name, outputs, known, shared, inputs, self.width, seldom)
+
+        once = {"once": parts.once}
+        write_function(body, "nf_once", once, parts.places, ["p"], [], seldom=True)
+        function("nf_start", ["state", "tau"], {"rate": parts.start}, seldom=True)
+        function("nf_held", ["seen", "memory"], {"held": parts.held})
+        function("nf_begin", ["seen"], {"memory": parts.begin}, seldom=True)
+        function("nf_advance", ["seen", "memory"], {"memory": parts.advance})
+        after = {"state": parts.step, "within": (parts.within,), "jacobian": parts.jacobian}
+        function("nf_step", ["state", "tau", "step", "held", "limit"], after)
+
+    def _candidates(self) -> None:
+        """The candidates that are computed together."""
+        body, n, value = self.body, self.program.joints, self.value
+        self.call("nf_once", "own_p", "room.once")
+        self.gather("q0", n, value["room.state"])
+        self.gather("qd0", n, self.element("state", n))
+        self.gather("tau", n, value["room.tau"])
+        self.gather("limit", 1, value["room.limit"])
+        value["rate"] = self.element("state", 2 * n)
+        self.call("nf_start", "own_p", "room.once", "room.state", "room.tau", "rate")
+        with self.each() as (candidate, _):
+            body.store("-1", value["diverged"], candidate, "i64")
+        self._record("0")
+        alive = self.element("alive", 0)
+        ahead = body.let(f"sub i64 %last, {value['first']}")
+        body.run(f"store i64 {self.least(ahead, str(self.lanes))}, ptr {alive}")
+        with body.loop("0", value["samples"]) as k:
+            some = body.let(f"icmp sgt i64 {body.let(f'load i64, ptr {alive}')}, 0")
+            with body.when(some):
+                self._sample(k, alive)
+            self._record(body.let(f"add i64 {k}, 1"))
+
+    def _sample(self, k: str, alive: str) -> None:
+        body, n, value = self.body, self.program.joints, self.value
+        self.gather("tau", n, value["room.tau"], k)
+        self.gather("step", 1, value["room.step"], k)
+        driven = body.let(f"icmp ne i64 {value['driven']}, 0")
+        with body.when(driven):
+            self.gather("drive_qd", n, value["room.seen"], k)
+            self.gather("drive_qdd", n, self.element("seen", n), k)
+        moving = self.element("state", n)  # qd, then qdd
+        given = f"ptr {value['room.seen']}, ptr {moving}"
+        value["sees"] = body.let(f"select i1 {driven}, {given}")
+        if self.program.advance:
+            self._remember(k)
+            # A controller at the sample rate holds its coefficients over the whole sample.
+            self.call("nf_held", "own_p", "room.once", "sees", "room.memory", "room.held")
+        with body.loop("0", value["substeps"]):
+            if not self.program.advance:
+                self.call("nf_held", "own_p", "room.once", "sees", "room.memory", "room.held")
+            rooms = ("state", "tau", "step", "held", "limit", "within", "jacobian")
+            self.call("nf_step", "own_p", "room.once", *(f"room.{name}" for name in rooms))
+            fine = body.load(value["room.within"], 0, real(self.width))
+            one = body.constant(1.0, self.width)
+            lost = body.let(f"fcmp une {real(self.width)} {fine}, {one}")
+            if self.width:
+                every = body.let(f"bitcast <{self.width} x i1> {lost} to i{self.width}")
+                lost = body.let(f"icmp ne i{self.width} {every}, 0")
+            with body.when(lost):
+                self._stop(k, alive)
+        if self.program.jacobian:
+            size = len(self.program.jacobian)
+            self.scatter("jacobian", "jacobian_out", size, k, value["samples"])
+
+    def _remember(self, k: str) -> None:
+        body, size = self.body, len(self.program.advance)
+        later = body.let(f"icmp sgt i64 {k}, 0")
+        first = body.let(f"xor i1 {later}, true")
+        given = body.let(f"icmp ne i64 {self.value['remembered']}, 0")
+        unknown = body.let(f"xor i1 {given}, true")
+        with body.when(later):
+            self.call("nf_advance", "own_p", "room.once", "sees", "room.memory")
+        with body.when(body.let(f"and i1 {first}, {given}")):
+            self.gather("memory", size, self.value["room.memory"])
+        with body.when(body.let(f"and i1 {first}, {unknown}")):
+            self.call("nf_begin", "own_p", "room.once", "sees", "room.memory")
+
+    def _stop(self, k: str, alive: str) -> None:
+        """Note which candidates are lost; their state goes on from zero, unseen."""
+        body = self.body
+        reached = body.let(f"add i64 {k}, 1")
+        with self.each() as (candidate, lane):
+            lost = body.let(f"fcmp une double {body.load(self.value['room.within'], lane)}, 1.0")
+            with body.when(lost):
+                for i in range(3 * self.program.joints):
+                    body.store("0.0", self.element("state", i), lane)
+                place = body.at(self.value["diverged"], candidate, "i64")
+                fresh = body.let(f"icmp slt i64 {body.let(f'load i64, ptr {place}')}, 0")
+                with body.when(fresh):
+                    body.run(f"store i64 {reached}, ptr {place}")
+                    left = body.let(f"sub i64 {body.let(f'load i64, ptr {alive}')}, 1")
+                    body.run(f"store i64 {left}, ptr {alive}")
+
+    def _record(self, sample: str) -> None:
+        """Write states; NaN of candidates that are lost."""
+        body, n = self.body, self.program.joints
+        records = body.let(f"add i64 {self.value['samples']}, 1")
+        with self.each() as (candidate, lane):
+            place = body.let(f"add i64 {body.let(f'mul i64 {candidate}, {records}')}, {sample}")
+            to = body.let(f"mul i64 {place}, {n}")
+            diverged = body.load(self.value["diverged"], candidate, "i64")
+            fine = body.let(f"icmp slt i64 {diverged}, 0")
+            nan = body.constant(float("nan"))
+            for part, name in enumerate(("q_out", "qd_out", "qdd_out")):
+                target = body.at(self.value[name], to)
+                for joint in range(n):
+                    state = body.load(self.element("state", part * n + joint), lane)
+                    shown = body.let(f"select i1 {fine}, double {state}, double {nan}")
+                    body.store(shown, target, joint)

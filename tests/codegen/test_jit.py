@@ -1,0 +1,200 @@
+"""Machine code is made without a compiler; the cache is safe, private and reused."""
+
+import logging
+import multiprocessing
+import os
+import stat
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from nfriction.codegen import NoBackend, compile_function
+from nfriction.codegen.build import find_compiler
+from nfriction.codegen.llvm import jit
+
+F64 = torch.float64
+SOURCE = """
+define void @answer(i64 %a, i64 %b, ptr %x, ptr %y, ptr %z) { store i64 42, ptr %x ret void }
+"""
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    folder = tmp_path / "cache"
+    monkeypatch.setenv("NFRICTION_CACHE", str(folder))
+    return folder
+
+
+def answer():
+    x = np.zeros(1, dtype=np.int64)
+    jit.build(SOURCE, "answer")(0, 0, x.ctypes.data, 0, 0)
+    return int(x[0])
+
+
+def objects(folder):
+    return sorted(p.name for p in folder.iterdir() if p.suffix == ".object")
+
+
+def test_code_is_made_once_and_reused(cache, monkeypatch):
+    assert answer() == 42
+    made = objects(cache)
+    assert len(made) == 1
+
+    def forbidden(*_):
+        raise AssertionError("compiled again")
+
+    monkeypatch.setattr(jit, "_compile", forbidden)
+    assert answer() == 42
+    assert objects(cache) == made
+    assert not list(cache.glob("building-*"))
+
+
+@pytest.mark.parametrize("content", [b"", b"not code", None])
+def test_damaged_code_is_made_anew(cache, content):
+    answer()
+    (name,) = objects(cache)
+    whole = (cache / name).read_bytes()
+    (cache / name).write_bytes(whole[:-1] if content is None else content)
+    assert answer() == 42
+    assert (cache / name).read_bytes() == whole
+
+
+@pytest.mark.parametrize("changed", ["_processor", "_version"])
+def test_code_of_another_machine_or_version_is_not_taken(cache, monkeypatch, changed):
+    answer()
+    own = getattr(jit, changed)()
+    other = ("some-cpu", own[1]) if changed == "_processor" else "0.0"
+    with monkeypatch.context() as patch:
+        patch.setattr(jit, changed, lambda: other)
+        patch.setattr(jit, "_compile", lambda source: (_ for _ in ()).throw(InterruptedError))
+        with pytest.raises(InterruptedError):
+            answer()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="permissions of POSIX")
+def test_the_cache_folder_is_private(cache):
+    answer()
+    assert stat.S_IMODE(cache.stat().st_mode) == 0o700
+    cache.chmod(0o777)
+    with pytest.raises(PermissionError, match="chmod 700"):
+        jit.cache_folder()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="owners of POSIX")
+def test_a_cache_folder_of_somebody_else_is_refused(cache, monkeypatch):
+    jit.cache_folder()
+    monkeypatch.setattr(jit.os, "getuid", lambda: cache.stat().st_uid + 1)
+    with pytest.raises(PermissionError, match="belong to you"):
+        jit.cache_folder()
+
+
+@pytest.mark.parametrize("obstacle", ["open to others", "a file", "full"])
+def test_without_a_usable_cache_code_is_made_in_memory(cache, monkeypatch, caplog, obstacle):
+    if obstacle == "a file":
+        cache.write_text("")
+    elif obstacle == "open to others":
+        cache.mkdir()
+        cache.chmod(0o777)
+    else:
+        cache.mkdir(mode=0o700)
+
+        def full(*_):
+            raise OSError("no space left on device")
+
+        monkeypatch.setattr(jit.os, "replace", full)
+    with caplog.at_level(logging.WARNING, "nfriction"):
+        assert answer() == 42
+    assert "not kept" in caplog.text
+    if cache.is_dir():
+        assert not list(cache.iterdir())
+
+
+def test_without_the_override_the_platforms_cache_is_used(tmp_path, monkeypatch):
+    monkeypatch.delenv("NFRICTION_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("LOCALAPPDATA", str(tmp_path))
+    monkeypatch.setenv("HOME", str(tmp_path))
+    folder = jit.cache_folder()
+    assert folder.name == "nfriction"
+    assert tmp_path in folder.parents
+
+
+def _build(folder, barrier, queue):
+    os.environ["NFRICTION_CACHE"] = folder
+    barrier.wait()
+    queue.put(answer())
+
+
+def test_two_processes_may_build_at_once(cache):
+    context = multiprocessing.get_context("spawn")
+    barrier, queue = context.Barrier(2), context.Queue()
+    args = (str(cache), barrier, queue)
+    workers = [context.Process(target=_build, args=args) for _ in range(2)]
+    for worker in workers:
+        worker.start()
+    assert [queue.get(timeout=60) for _ in workers] == [42, 42]
+    for worker in workers:
+        worker.join()
+    assert all(worker.exitcode == 0 for worker in workers)
+    assert not list(cache.glob("building-*"))
+
+
+def test_without_llvmlite_the_error_says_what_to_do(monkeypatch):
+    monkeypatch.setitem(sys.modules, "llvmlite", None)
+    monkeypatch.setitem(sys.modules, "llvmlite.binding", None)
+    with pytest.raises(NoBackend, match=r'install it, or use `backend="torch"`'):
+        compile_function(torch.sin, [torch.ones(1, dtype=F64)])
+
+
+def test_neither_a_compiler_nor_numba_is_needed(cache, tmp_path):
+    """A fresh process with an empty PATH and no numba; the next one takes the code as it is."""
+    script = (
+        "import sys; sys.modules['numba'] = None\n"
+        "import torch; from nfriction import LFM, NFLFM, PendulumChain, rollout\n"
+        "from nfriction.codegen.llvm import jit; plant = PendulumChain([0.3, 0.2], [0.2, 0.15])\n"
+        "made = []; make = jit._compile\n"
+        "jit._compile = lambda source: made.append(1) or make(source)\n"
+        "for model in (LFM(2, v_smooth=0.1), NFLFM(2, v_smooth=0.1, terms=(2, 2), head_units=2)):\n"
+        "    rest = torch.zeros(2, dtype=torch.float64)\n"
+        "    end = rollout(plant, model, rest + 2.0, rest, steps=50, backend='compiled',\n"
+        "                  gradients=False, substeps=20).q[-1]\n"
+        "    print(end.tolist())\n"
+        "print(len(made))"
+    )
+    environment = dict(os.environ, PATH=str(tmp_path)) | {"CC": ""}
+    runs = [
+        subprocess.run(
+            [sys.executable, "-c", script],
+            capture_output=True, text=True, check=True, env=environment,
+        ).stdout.splitlines()
+        for _ in range(2)
+    ]  # fmt: skip
+    assert runs[0][:2] == runs[1][:2]
+    assert (runs[0][2], runs[1][2]) == ("2", "0")
+
+
+def test_importing_codegen_and_tracing_stay_light():
+    """Neither torch._dynamo, torch.distributed nor LLVM is loaded before it is needed."""
+    script = (
+        "import sys, torch; before = set(sys.modules)\n"
+        "from nfriction.codegen.function import specialise\n"
+        "m = torch.nn.Linear(2, 2).double()\n"
+        "specialise(m, {'x': torch.ones(2, dtype=torch.float64)})\n"
+        "new = {n for n in set(sys.modules) - before}\n"
+        "heavy = ('torch._dynamo', 'torch.distributed.tensor', 'llvmlite')\n"
+        "print([n for n in heavy if n in new])"
+    )
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[]"
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+def test_cc_names_the_compiler_and_its_arguments(monkeypatch):
+    compiler = find_compiler()
+    monkeypatch.setenv("CC", f"{compiler[0]} -DX=1")
+    assert find_compiler() == [compiler[0], "-DX=1"]
+    monkeypatch.setenv("CC", "no-such-compiler")
+    assert find_compiler() is None
