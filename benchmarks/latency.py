@@ -25,10 +25,10 @@ import numpy as np
 import torch
 
 from nfriction import NFLFM, FrictionModel
-from nfriction.codegen import build
-from nfriction.export.c_export import c
+from nfriction.export import c
+from nfriction.export.c_code.run import find_compiler
 from nfriction.export.controller import controller_of
-from nfriction.export.points import draw
+from nfriction.export.test_vectors import draw
 from nfriction.io.model_info import ModelInfo
 
 JOINTS = (1, 4)
@@ -82,7 +82,7 @@ def c_timer(dtype: str, *options: str) -> Timer:
     def run(given: Case) -> Times:
         folder = given.folder / "_".join(["c", dtype, str(given.model.joints), *options])
         c(given.model, folder, given.info, dtype=dtype)
-        compiler = build.find_compiler()
+        compiler = find_compiler()
         if compiler is None:
             raise FileNotFoundError("no C compiler")
         library = folder / "latency.so"
@@ -111,7 +111,7 @@ def alone(timer: Callable[[Case], np.ndarray]) -> Timer:
     return lambda given: Times(timer(given))
 
 
-NATIVE = ("-O3", "-march=native", *build.FLAGS)
+NATIVE = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast")
 
 # A target is one line here: its name, its timer, and the goals of its p99 for 1 and 4 joints [us].
 TARGETS: list[tuple[str, Timer, tuple[float | None, float | None]]] = [

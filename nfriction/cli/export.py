@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from nfriction.io.model_info import ModelInfo
 
 EXAMPLE = """example:
-  nfriction export model.json --to torchscript,c --out artefacts"""
+  nfriction export model.json --format torchscript,c --out artefacts"""
 
 # Ending of the file that each target is written to; C is a folder of files.
 CONTROLLERS = {"torchscript": ".pt", "c": ".c", "pt2": ".pt2", "onnx": ".onnx"}
@@ -30,7 +30,7 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
         "the nearest joint parameters of a simulator.", epilog=EXAMPLE,
     )  # fmt: skip
     parser.add_argument("model", type=names.file, metavar="MODEL", help="model file")
-    parser.add_argument("--to", type=_targets, default="torchscript", metavar="TARGETS",
+    parser.add_argument("--format", type=_targets, default="torchscript", metavar="FORMATS",
                         help=f"with commas between them: {', '.join(TARGETS)}")  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path(), help="folder to write to")
     parser.add_argument("--dtype", choices=("float64", "float32"), default="float64",
@@ -47,7 +47,7 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
                        "several times")  # fmt: skip
     group.add_argument("--rig", type=names.rig,
                        help="rig file or name (default: the one in the model file)")  # fmt: skip
-    group.add_argument("--into", type=names.file, metavar="ROBOT",
+    group.add_argument("--patch", type=names.file, metavar="ROBOT",
                        help="robot description whose joints of these names get them")  # fmt: skip
     group.add_argument("--angles", metavar="HOW,ZERO",
                        help="how the recordings write angles, e.g. absolute,hanging "
@@ -63,16 +63,16 @@ def run(arguments: argparse.Namespace) -> int:
     """Load, then write each artefact."""
     from nfriction.io.model_file import load, load_info
 
-    wanted = [target for target in arguments.to if target in SIMULATORS]
+    wanted = [target for target in arguments.format if target in SIMULATORS]
     if wanted and not arguments.recording:
         raise UsageError(f"{wanted[0]} needs a motion: give --recording FILE.")
-    if arguments.into and len(wanted) != 1:
-        raise UsageError("--into takes one of mjcf and urdf in --to.")
+    if arguments.patch and len(wanted) != 1:
+        raise UsageError("--patch takes one of mjcf and urdf in --format.")
     if len(arguments.cutoff) != 1:
         raise UsageError("--cutoff takes one number.")
     model, info = load(arguments.model), load_info(arguments.model)
     check_writable(arguments.out)
-    for target in arguments.to:
+    for target in arguments.format:
         if target in SIMULATORS:
             _write_simulator(target, model, info, arguments)
         else:
@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _write_controller(
     target: str, model: "FrictionModel", info: "ModelInfo", arguments: argparse.Namespace
 ) -> list[Path]:
-    """Write an artefact, and tell its files."""
+    """Write an artefact; returns its files."""
     from nfriction import export
 
     options: dict[str, Any] = {
@@ -106,7 +106,7 @@ def _write_controller(
 def _write_simulator(
     target: str, model: "FrictionModel", info: "ModelInfo", arguments: argparse.Namespace
 ) -> None:
-    """Write joint parameters, and tell what they cost."""
+    """Write joint parameters, and print their errors."""
     from nfriction import export
     from nfriction.plant import rigs
     from nfriction.signals import kalman_smoother
@@ -116,13 +116,13 @@ def _write_simulator(
     elif info.rig is not None:
         plant = rigs.from_dict(info.rig)
     else:
-        raise UsageError("the model file tells no rig; give --rig, whose loads friction needs.")
+        raise UsageError("the model file has no rig; give --rig, whose loads friction needs.")
     recordings = estimation.read_recordings(arguments.recording, plant, arguments)
     moved = (recording.joint_coordinates(plant) for recording in recordings)
     motions = [kalman_smoother(recording.time, recording.q) for recording in moved]
     path = arguments.out / f"{arguments.model.stem}{SIMULATORS[target]}"
     writer = getattr(export, target)
-    print(writer(model, path, motions, info, load=plant.load, into=arguments.into))
+    print(writer(model, path, motions, info, load=plant.load, patch=arguments.patch))
     print(f"wrote {path}")
 
 

@@ -56,6 +56,6 @@ def run(arguments: argparse.Namespace) -> int:
         print(intervals)
     print(f"wrote {arguments.out}")
     if found.converged:
-        further = ["nfriction", "export", str(arguments.out), "--to", "torchscript"]
+        further = ["nfriction", "export", str(arguments.out), "--format", "torchscript"]
         print(f"next: {shlex.join(further)}")
     return 0

@@ -1,26 +1,27 @@
 """Artefacts for controllers, each proven equal to the model that was scored."""
 
-from nfriction.export.c_export import c
-from nfriction.export.contract import Contract, ContractError, Parity, contract_of, verify
+from nfriction.export.c_code.export import c
+from nfriction.export.contract import Contract, contract_of, verify
 from nfriction.export.controller import controller_of
-from nfriction.export.errors import ExportError
+from nfriction.export.errors import ContractError, ExportError
 from nfriction.export.onnx_file import onnx
-from nfriction.export.program import pt2
-from nfriction.export.script import torchscript
-from nfriction.export.simulators import Collapse, collapse, mjcf, urdf
+from nfriction.export.parity import Parity
+from nfriction.export.simulators import DampingFit, fit_damping_frictionloss, mjcf, urdf
+from nfriction.export.torch_code.pt2 import pt2
+from nfriction.export.torch_code.torchscript import torchscript
 from nfriction.export.verification import Verdict, verify_artefact
 
 __all__ = [
-    "Collapse",
     "Contract",
     "ContractError",
+    "DampingFit",
     "ExportError",
     "Parity",
     "Verdict",
     "c",
-    "collapse",
     "contract_of",
     "controller_of",
+    "fit_damping_frictionloss",
     "mjcf",
     "onnx",
     "pt2",

@@ -1,43 +1,24 @@
-"""What every artefact carries so that it can be used safely, and how one is proven equal."""
+"""Contract of an artefact: description, test vectors and tolerance, and its verification."""
 
 import copy
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from nfriction.export.controller import AnyController, controller_of
-from nfriction.export.errors import ContractError, first_line
-from nfriction.export.filtered import FilteredController
+from nfriction.export.controller import NOT_FINITE, OUTSIDE, SATURATED, Controller
+from nfriction.export.errors import ContractError, ExportError, first_line
 from nfriction.export.parity import COEFFICIENT_SLACK, Parity, compare
-from nfriction.export.points import draw, trials
-from nfriction.export.unfiltered import NOT_FINITE, OUTSIDE, SATURATED, Controller, MemoryController
+from nfriction.export.test_vectors import draw_motion, trials
 from nfriction.friction.models import FrictionModel
 from nfriction.io import strict_json
+from nfriction.io.atomic import atomic_write
 from nfriction.io.model_info import ModelInfo, describe
-
-__all__ = [
-    "COEFFICIENT_SLACK",
-    "NOT_FINITE",
-    "OUTSIDE",
-    "SATURATED",
-    "AnyController",
-    "Contract",
-    "ContractError",
-    "Controller",
-    "FilteredController",
-    "MemoryController",
-    "Parity",
-    "compare",
-    "contract_of",
-    "controller_of",
-    "run_through",
-    "verify",
-]
 
 FORMAT, SCHEMA = "nfriction controller", 1
 # Largest torque error over full scale that a target in double, or in single precision, may show;
@@ -51,7 +32,7 @@ Runner = Callable[..., Sequence[Any]]
 
 @dataclass(frozen=True, eq=False)
 class Contract:
-    """What an artefact says of itself.
+    """Description of an artefact, with test vectors.
 
     Attributes:
         description: model, joint names in order, units, sample time, input ranges, hashes of
@@ -81,7 +62,7 @@ class Contract:
         return {**self.description, "tolerance": self.tolerance, "vectors": vectors}
 
     def to_json(self) -> str:
-        """The same as text, the same to the byte for the same model."""
+        """As text; the same model gives the same bytes."""
         return json.dumps(self.to_dict(), allow_nan=False)
 
     @classmethod
@@ -112,8 +93,8 @@ class Contract:
         except (
             KeyError, TypeError, AttributeError, ValueError, RuntimeError, OverflowError,
         ) as error:  # fmt: skip
-            told = first_line(error)
-            raise ContractError(f"the test vectors are missing or damaged ({told}).") from error
+            reason = first_line(error)
+            raise ContractError(f"the test vectors are missing or damaged ({reason}).") from error
         _check_vectors(inputs, outputs, tolerance)
         _check_interface(content, list(inputs))
         outputs["status"] = outputs["status"].to(torch.int32)
@@ -122,17 +103,17 @@ class Contract:
 
 def contract_of(
     model: FrictionModel,
-    controller: AnyController,
+    controller: Controller,
     info: ModelInfo | None = None,
     *,
     dtype: str = "float64",
 ) -> Contract:
-    """The contract of a controller, with its test vectors.
+    """Make the contract of a controller, with its test vectors.
 
     Args:
         model: the model that the controller was made of.
         controller: what is exported.
-        info: what to say of the model besides its parameters.
+        info: description of the model besides its parameters.
         dtype: "float64" or "float32", in which the target computes.
 
     Raises:
@@ -140,96 +121,52 @@ def contract_of(
     """
     if dtype not in TOLERANCE:
         raise ValueError(f'`dtype` must be "float64" or "float32", got {dtype!r}.')
-    names = ("q", "load") if isinstance(controller, FilteredController) else ("qd", "qdd", "load")
     inputs = trials(controller)
     if dtype == "float32":
-        # What the target will be given; at the edges of the range a rounding decides the status.
+        # As the target will be given them: at the edges of the range a rounding decides the status.
         inputs = tuple(x.float().double() for x in inputs)
-    outputs = run_through(controller, inputs)
+    outputs = controller.run(*inputs)
+    beyond = "of clamped inputs" if controller.clamps else "as the model has them there"
     description = {
         **describe(model, info or ModelInfo()),
         "format": FORMAT,
         "schema": SCHEMA,
         "dtype": dtype,
-        **_interface(controller, names),
-    }
-    # Once through JSON, so that tuples are lists here as they are for a reader.
-    description = json.loads(json.dumps(description, allow_nan=False))
-    return Contract(
-        description,
-        dict(zip(names, inputs, strict=True)),
-        dict(zip(OUTPUTS, outputs, strict=True)),
-        TOLERANCE[dtype] if dtype == "float64" else _single_tolerance(controller),
-    )
-
-
-def _single_tolerance(controller: AnyController) -> float:
-    """What a target in single precision may err.
-
-    A network that is steep in its inputs passes their roundings on: twice what torch errs in
-    single precision over 20,000 samples is allowed where that is more.
-    """
-    inner = controller.inner if isinstance(controller, FilteredController) else controller
-    inputs = tuple(x.float() for x in draw(inner, 20_000, seed=7))
-    single = copy.deepcopy(inner).float()
-    doubled = tuple(x.double() for x in inputs)
-    if isinstance(inner, MemoryController) and isinstance(single, MemoryController):
-        # Whatever memory: that of a first sample.
-        state = inner.initial_state(*doubled[:2])
-        expected, found = inner(*doubled, state)[:3], single(*inputs, state.float())[:3]
-    else:
-        expected, found = inner(*doubled), single(*inputs)
-    parity = compare(expected, found, TOLERANCE["float32"])
-    worst = max(parity.torque_error, parity.coefficient_error / COEFFICIENT_SLACK)
-    return max(TOLERANCE["float32"], float(f"{2.0 * worst:.1e}"))
-
-
-def _interface(controller: AnyController, inputs: Sequence[str]) -> dict[str, Any]:
-    """What goes in and comes out, and what happens at the edges."""
-    inner = controller.inner if isinstance(controller, FilteredController) else controller
-    assert isinstance(inner, (Controller, MemoryController))
-    beyond = "of clamped inputs" if inner.clamps else "as the model has them there"
-    return {
-        "inputs": list(inputs),
-        "outputs": list(OUTPUTS),
-        "state_size": 0 if isinstance(controller, Controller) else controller.state_size,
-        "torque_limit": inner.torque_limit.tolist() if inner.limited else None,
-        "filter": {
-            "cutoff_hz": controller.cutoff_hz,
-            "damping": controller.damping,
-            "sample_time": controller.sample_time,
-        }
-        if isinstance(controller, FilteredController)
-        else None,
+        "inputs": controller.inputs,
+        "outputs": OUTPUTS,
+        "state_size": controller.state_size,
+        "torque_limit": controller.torque_limit.tolist() if controller.limited else None,
+        "filter": controller.filter_options,
         "status_bits": {"outside": OUTSIDE, "not_finite": NOT_FINITE, "saturated": SATURATED},
         "edges": {
             "outside_input_ranges": f"coefficients {beyond}; the law goes on",
             "not_finite": "NaN torque and coefficients of that joint; its state stays",
         },
     }
+    # Once through JSON, so that tuples are lists here as they are for a reader.
+    description = json.loads(json.dumps(description, allow_nan=False))
+    return Contract(
+        description,
+        dict(zip(controller.inputs, inputs, strict=True)),
+        dict(zip(OUTPUTS, outputs, strict=True)),
+        TOLERANCE[dtype] if dtype == "float64" else _single_tolerance(controller),
+    )
 
 
-@torch.no_grad()
-def run_through(controller: Callable[..., Any], inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
-    """Torque, coefficients and status of samples in order, (sample, joint, ...).
+def _single_tolerance(controller: Controller) -> float:
+    """Largest torque error that a target in single precision may show.
 
-    Args:
-        controller: of `controller_of`, or a module with the same methods.
-        inputs: (sample, joint) each.
+    A network that is steep in its inputs passes their roundings on: twice the error of torch in
+    single precision over 20,000 samples is allowed where that is more.
     """
-    if isinstance(controller, Controller):
-        return controller(*inputs)
-    assert isinstance(controller, (MemoryController, FilteredController))
-    first = [x[0] for x in inputs]
-    if isinstance(controller, MemoryController):
-        state = controller.initial_state(first[0], first[1])
-    else:
-        state = controller.initial_state(first[0])
-    found = []
-    for sample in zip(*inputs, strict=True):
-        *outputs, state = controller(*sample, state)
-        found.append(outputs)
-    return tuple(torch.stack(column) for column in zip(*found, strict=True))
+    qd, qdd, load = (x.float().double() for x in draw_motion(controller, 20_000, seed=7))
+    # Any memory will do: that of a first sample.
+    exact = (qd, qdd, load, controller.initial_memory(qd, qdd))
+    expected = controller.step(*exact)[:3]
+    found = copy.deepcopy(controller).float().step(*(x.float() for x in exact))[:3]
+    parity = compare(expected, found, TOLERANCE["float32"])
+    worst = max(parity.torque_error, parity.coefficient_error / COEFFICIENT_SLACK)
+    return max(TOLERANCE["float32"], float(f"{2.0 * worst:.1e}"))
 
 
 def verify(run: Runner, contract: Contract) -> Parity:
@@ -239,10 +176,34 @@ def verify(run: Runner, contract: Contract) -> Parity:
         run: takes the inputs in their order, each a float64 tensor (vector, joint), and gives
             torque, coefficients and status for all of them; a target with a state goes through
             them in order, from its initial state at the first.
-        contract: what the artefact promises.
+        contract: of the artefact.
     """
     found = run(*contract.inputs.values())
     return compare(tuple(contract.outputs.values()), found, contract.tolerance)
+
+
+def write_verified(
+    path: str | Path, content: bytes, opener: Callable[[Path], tuple[Contract, Runner]], kind: str
+) -> Path:
+    """Write an artefact, read it again and compare it with its model before it takes its place.
+
+    Args:
+        path: file to write; missing folders are made.
+        content: of the file.
+        opener: reads the artefact; gives its contract, and how to run it.
+        kind: of artefact, for errors.
+
+    Raises:
+        ExportError: if the artefact differs from the model.
+        OSError: if it cannot be written.
+    """
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(content)
+        contract, run = opener(temporary)
+        parity = verify(run, contract)
+        if not parity.passed:
+            raise ExportError(f"the {kind} differs from its model: {parity}.")
+    return Path(path)
 
 
 def _plain(x: Tensor) -> list[Any]:

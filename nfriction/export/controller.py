@@ -1,14 +1,33 @@
-"""What every target exports: the controller of a model, with its causal filter or without."""
+"""Controllers: a friction model under the one contract of its edges.
 
-from collections.abc import Sequence
+    finite inputs      torque and coefficients of the model
+    outside the range  coefficients as the schedule has them there, the law goes on; OUTSIDE
+    NaN or infinity    NaN torque and coefficients of that joint, the others as ever; NOT_FINITE
+    beyond a limit     torque at the limit; SATURATED
 
-from nfriction.export.filtered import FilteredController
-from nfriction.export.unfiltered import Controller, MemoryController, memory_of
+Schedules that handle their range themselves see all finite inputs: neuro-fuzzy ones return to their
+constant law beyond it. Others see inputs clamped to `ModelInfo.input_ranges`. OUTSIDE always means:
+outside `input_ranges`.
+"""
+
+import copy
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Final
+
+import torch
+from torch import Tensor, nn
+
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_info import ModelInfo
 from nfriction.signals import SecondOrderLowPass
 
-AnyController = Controller | MemoryController | FilteredController
+# Bits of the status.
+OUTSIDE, NOT_FINITE, SATURATED = 1, 2, 4
+# Edge of a range that nobody gave; the largest float, so that targets of single precision know it.
+UNBOUNDED = float(torch.finfo(torch.float32).max)
+# Numbers a joint that the causal filter carries: last position, last velocity, two by low-pass.
+FILTER_STATE = 6
 
 
 def controller_of(
@@ -18,12 +37,12 @@ def controller_of(
     torque_limit: float | Sequence[float] | None = None,
     with_filter: bool = False,
     cutoff_hz: float = 20.0,
-) -> AnyController:
-    """The controller that every target exports.
+) -> "Controller":
+    """Make the controller that every target exports.
 
     Args:
         model: a friction model; a frozen copy is taken, in float64 on the CPU.
-        info: tells the trained ranges, and the sample time that a filter needs.
+        info: the trained ranges, and the sample time that a filter needs.
         torque_limit: largest |torque| given out [N m], a number or one a joint.
         with_filter: take raw positions, with the causal filter inside.
         cutoff_hz: cut-off of that filter [Hz].
@@ -31,14 +50,266 @@ def controller_of(
     Raises:
         ValueError: if a range or the limit is malformed, or a filter lacks its sample time.
     """
-    kind = MemoryController if memory_of(model) else Controller
-    inner = kind(model, info, torque_limit)
+    info = info or ModelInfo()
     if not with_filter:
-        return inner
-    sample_time = (info or ModelInfo()).sample_time
-    if sample_time is None:
+        return Controller(model, info, torque_limit)
+    if info.sample_time is None:
         raise ValueError(
             "a filter needs `ModelInfo.sample_time` [s], got None: none was given, or the model "
             "was fitted to recordings of different ones."
         )
-    return FilteredController(inner, SecondOrderLowPass(cutoff_hz, float(sample_time)))
+    return Controller(
+        model, info, torque_limit, SecondOrderLowPass(cutoff_hz, float(info.sample_time))
+    )
+
+
+class Controller(nn.Module):
+    """Friction torque, coefficients and status of one sample after another.
+
+    `controller(*inputs)` gives torque, coefficients and status; where the controller has a state,
+    `controller(*inputs, state)` gives the next state too. Inputs are velocity, acceleration and
+    load, or position and load with the filter inside: velocity is then the difference of the
+    position through a causal second-order low-pass filter, acceleration the difference of that
+    velocity through the same filter again. An input that is not finite leaves the state of its
+    joint as it was, a load that is not finite does not.
+
+    Args:
+        model, info, torque_limit: see `controller_of`.
+        low_pass: the filter.
+
+    Shape:
+        Inputs (*batch, joint), state (*batch, joint, state_size); torque (*batch, joint),
+        coefficients (*batch, joint, coefficient), status (*batch, joint), int32.
+
+    Attributes:
+        inputs: names of the inputs.
+        state_size: numbers a joint that it carries from sample to sample; those of the filter come
+            before those of the schedule.
+        memory_size: those of the schedule alone.
+
+    References:
+        TLRIP paper: a second-order IIR filter on the velocity (there from frequency counting, which
+        needs time stamps of encoder edges).
+    """
+
+    qd_lower: Tensor
+    qd_upper: Tensor
+    qdd_lower: Tensor
+    qdd_upper: Tensor
+    torque_limit: Tensor
+
+    # Constants by which TorchScript compiles the branches that are taken, and no others.
+    clamps: Final[bool]
+    limited: Final[bool]
+    remembers: Final[bool]
+    filters: Final[bool]
+
+    def __init__(
+        self,
+        model: FrictionModel,
+        info: ModelInfo,
+        torque_limit: float | Sequence[float] | None = None,
+        low_pass: SecondOrderLowPass | None = None,
+    ) -> None:
+        super().__init__()
+        self.model = copy.deepcopy(model).to("cpu", torch.float64).eval().requires_grad_(False)
+        self.joints = model.joints
+        self.coefficient_count = len(model.law.names)
+        self.clamps = not model.schedule.handles_range
+        for name in ("qd", "qdd"):
+            lower, upper = _range(name, info.input_ranges.get(name), model.joints)
+            self.register_buffer(f"{name}_lower", lower)
+            self.register_buffer(f"{name}_upper", upper)
+        self.limited = torque_limit is not None
+        self.register_buffer("torque_limit", _limit(torque_limit, model.joints))
+        self.memory_size = model.state_size
+        self.remembers = self.memory_size > 0
+        self.filters = low_pass is not None
+        self.inputs = ("q", "load") if self.filters else ("qd", "qdd", "load")
+        self.state_size = self.memory_size + (FILTER_STATE if self.filters else 0)
+        self.b0, self.b1, self.b2, self.a1, self.a2, self.sample_time = 6 * (0.0,)
+        self.filter_options: dict[str, float] | None = None
+        if low_pass is not None:
+            (self.b0, self.b1, self.b2), (_, self.a1, self.a2) = (
+                c.tolist() for c in low_pass.coefficients
+            )
+            self.sample_time = float(low_pass.sample_time)
+            self.filter_options = {
+                "cutoff_hz": float(low_pass.cutoff_hz),
+                "damping": float(low_pass.damping),
+                "sample_time": self.sample_time,
+            }
+
+    @torch.jit.unused
+    def forward(self, *given: Tensor) -> tuple[Tensor, ...]:
+        """Torque [N m], coefficients, status and, where there is one, the next state."""
+        if self.filters:
+            return self.filtered_step(*given)
+        if self.remembers:
+            return self.step(*given)
+        qd, qdd, load = given
+        return self.step(qd, qdd, load, load)[:3]
+
+    @torch.jit.unused
+    def start(self, *inputs: Tensor) -> Tensor:
+        """State before a first sample of these inputs, (*batch, joint, state_size)."""
+        if self.filters:
+            return self.filtered_start(inputs[0])
+        return self.initial_memory(inputs[0], inputs[1])
+
+    @torch.jit.unused
+    @torch.no_grad()
+    def run(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Torque, coefficients and status of samples in order, (sample, joint, ...)."""
+        if not self.state_size:
+            return self(*inputs)
+        return run_in_order(self, inputs, self.start(*(x[0] for x in inputs)))
+
+    def step(
+        self, qd: Tensor, qdd: Tensor, load: Tensor, memory: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Torque, coefficients, status and next memory at velocity, acceleration and load.
+
+        Without a memory, whatever is given for it is handed back.
+        """
+        qd_seen, qdd_seen, outside = self._seen(qd, qdd)
+        motion = qd.abs() + qdd.abs()
+        if self.remembers:
+            following = self.model.schedule.advance(qd_seen, qdd_seen, memory)
+            coefficients = self.model.schedule.coefficients_from(qd_seen, qdd_seen, following)
+            memory = torch.where(motion.unsqueeze(-1) < math.inf, following, memory)
+        else:
+            coefficients = self.model.schedule(qd_seen, qdd_seen)
+        tau_f = self.model.torque(qd, load, coefficients)
+        status = outside.to(torch.int32)
+        if self.limited:
+            held = torch.clamp(tau_f, -self.torque_limit, self.torque_limit)
+            # SATURATED; TorchScript takes no global.
+            status = status + 4 * (held != tau_f).to(torch.int32)
+            tau_f = held
+        # The comparisons are false for NaN as for infinity.
+        finite = (motion + load.abs() < math.inf) & (tau_f.abs() < math.inf)
+        return (
+            torch.where(finite, tau_f, math.nan),
+            torch.where(finite.unsqueeze(-1), coefficients, math.nan),
+            torch.where(finite, status, 2),  # NOT_FINITE
+            memory,
+        )
+
+    def filtered_step(
+        self, q: Tensor, load: Tensor, state: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Torque, coefficients, status and next state at a position, by the filter."""
+        q_last, qd_last, first, second, third, fourth = state[..., :6].unbind(-1)
+        qd, first, second = self._low_pass((q - q_last) / self.sample_time, first, second)
+        qdd, third, fourth = self._low_pass((qd - qd_last) / self.sample_time, third, fourth)
+        following = torch.stack([q, qd, first, second, third, fourth], -1)
+        following = torch.where(q.abs().unsqueeze(-1) < math.inf, following, state[..., :6])
+        tau_f, coefficients, status, memory = self.step(qd, qdd, load, state[..., 6:])
+        if self.remembers:
+            following = torch.cat([following, memory], -1)
+        return tau_f, coefficients, status, following
+
+    def initial_memory(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        """Memory before a first sample; a joint that is not finite counts as one at rest."""
+        finite = qd.abs() + qdd.abs() < math.inf
+        qd_seen, qdd_seen, _ = self._seen(
+            torch.where(finite, qd, 0.0), torch.where(finite, qdd, 0.0)
+        )
+        return self.model.schedule.initial_state(qd_seen, qdd_seen)
+
+    def filtered_start(self, q: Tensor) -> Tensor:
+        """State of a filter that has rested at `q`, (*batch, joint); a reset is the same."""
+        rest = torch.zeros_like(q)
+        position = torch.where(q.abs() < math.inf, q, rest)
+        state = torch.stack([position, rest, rest, rest, rest, rest], -1)
+        if self.remembers:
+            state = torch.cat([state, self.initial_memory(rest, rest)], -1)
+        return state
+
+    def torque(self, qd: Tensor, qdd: Tensor, load: Tensor) -> Tensor:
+        """The torque alone, by the same contract; a memory is that after a first sample."""
+        qd_seen, qdd_seen, _ = self._seen(qd, qdd)
+        tau_f = self.model.torque(qd, load, self.model.schedule(qd_seen, qdd_seen))
+        held = torch.clamp(tau_f, -self.torque_limit, self.torque_limit) if self.limited else tau_f
+        # Zero times what is not finite is NaN: a third of the operations of comparisons.
+        held = torch.addcmul(held, qd, qdd, value=0.0)
+        return torch.addcmul(held, load, tau_f, value=0.0)
+
+    def _seen(self, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Velocity and acceleration that the schedule sees, and whether they leave the range."""
+        if qd.size(-1) != self.joints:
+            raise ValueError(
+                f"inputs must be (*batch, joint) with {self.joints} joints, got last axis "
+                f"{qd.size(-1)}."
+            )
+        qd_held = torch.clamp(qd, self.qd_lower, self.qd_upper)
+        qdd_held = torch.clamp(qdd, self.qdd_lower, self.qdd_upper)
+        outside = (qd_held != qd) | (qdd_held != qdd)
+        if self.clamps:
+            return qd_held, qdd_held, outside
+        return qd, qdd, outside
+
+    def _low_pass(self, x: Tensor, s0: Tensor, s1: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Output and next state of the filter, in transposed direct form II."""
+        y = self.b0 * x + s0
+        return y, self.b1 * x - self.a1 * y + s1, self.b2 * x - self.a2 * y
+
+
+def run_in_order(
+    step: Callable[..., Any], inputs: Iterable[Tensor], state: Tensor
+) -> tuple[Tensor, ...]:
+    """Torque, coefficients and status of samples in order, (sample, joint, ...).
+
+    Args:
+        step: takes one sample of each input and the state, gives the next state last.
+        inputs: (sample, joint) each.
+        state: before the first sample.
+    """
+    found = []
+    for sample in zip(*inputs, strict=True):
+        *outputs, state = step(*sample, state)
+        found.append(outputs)
+    return tuple(torch.stack(column) for column in zip(*found, strict=True))
+
+
+def for_single_precision(controller: Controller) -> Controller:
+    """With ranges such that no number in single precision changes its side by their rounding."""
+    single = copy.deepcopy(controller)
+    for name in ("qd", "qdd"):
+        for edge, inward in (("lower", math.inf), ("upper", -math.inf)):
+            exact = single.get_buffer(f"{name}_{edge}")
+            near = exact.float()
+            outside = near.double() < exact if edge == "lower" else near.double() > exact
+            next_in = torch.nextafter(near, torch.full_like(near, inward))
+            exact.copy_(torch.where(outside, next_in, near))
+    return single
+
+
+def _range(name: str, given: object, joints: int) -> tuple[Tensor, Tensor]:
+    """Lower and upper edge by joint."""
+    if given is None:
+        edge = torch.full((joints,), UNBOUNDED, dtype=torch.float64)
+        return -edge, edge
+    try:
+        pairs = torch.tensor(given, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"`input_ranges` of {name} must be numbers, got {given!r}.") from error
+    if pairs.shape != (joints, 2) or not (pairs[:, 0] <= pairs[:, 1]).all():
+        raise ValueError(
+            f"`input_ranges` of {name} must be [lowest, highest] for each of {joints} joints, got "
+            f"{given!r}."
+        )
+    pairs = pairs.clamp(-UNBOUNDED, UNBOUNDED)
+    return pairs[:, 0].clone(), pairs[:, 1].clone()
+
+
+def _limit(given: float | Sequence[float] | None, joints: int) -> Tensor:
+    """Largest |torque| by joint."""
+    limit = torch.as_tensor(UNBOUNDED if given is None else given, dtype=torch.float64)
+    if limit.shape not in ((), (joints,)) or not ((limit > 0) & (limit < math.inf)).all():
+        raise ValueError(
+            f"`torque_limit` must be positive and finite [N m], one number or one for each of "
+            f"{joints} joints, got {given!r}."
+        )
+    return limit.expand(joints).clone()

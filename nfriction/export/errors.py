@@ -1,4 +1,4 @@
-"""What can go wrong with an artefact."""
+"""Errors of artefacts."""
 
 
 class ExportError(RuntimeError):
@@ -6,7 +6,7 @@ class ExportError(RuntimeError):
 
 
 def first_line(error: Exception) -> str:
-    """The first line that says something, of an error that has many."""
+    """First line of an error's message that is not empty."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[0][:200] if lines else type(error).__name__
 

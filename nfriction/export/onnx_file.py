@@ -8,15 +8,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from nfriction.export.archive import METADATA
-from nfriction.export.contract import OUTPUTS, Contract, Runner, contract_of, verify
-from nfriction.export.controller import controller_of
+from nfriction.export.contract import OUTPUTS, Contract, Runner, contract_of, write_verified
+from nfriction.export.controller import controller_of, for_single_precision
 from nfriction.export.errors import ExportError, first_line
 from nfriction.export.onnx_graph import OnnxGraph
-from nfriction.export.program import exported, run_stateful, silent
-from nfriction.export.unfiltered import Controller, MemoryController, for_single_precision
+from nfriction.export.torch_code.archive import METADATA
+from nfriction.export.torch_code.pt2 import exported, run_from_nan, silent
 from nfriction.friction.models import FrictionModel
-from nfriction.io.atomic import atomic_write
 from nfriction.io.model_info import ModelInfo
 
 # Old enough for runtimes in the field; nothing newer is needed.
@@ -46,7 +44,7 @@ def onnx(
     Args:
         model: a friction model.
         path: file to write, by custom `.onnx`; missing folders are made.
-        info: what the metadata say of the model besides its parameters.
+        info: description of the model besides its parameters.
         dtype: "float64" or "float32", of inputs, outputs and all between.
         torque_limit, with_filter, cutoff_hz: see `controller_of`.
 
@@ -69,26 +67,19 @@ def onnx(
     )
     contract = contract_of(model, controller, info, dtype=dtype)
     inputs, outputs = list(contract.inputs), list(OUTPUTS)
-    if not isinstance(controller, Controller):
+    if controller.state_size:
         inputs, outputs = [*inputs, "state"], [*outputs, "next_state"]
     if dtype == "float32":
-        assert isinstance(controller, Controller | MemoryController)
         controller = for_single_precision(controller)
     with silent():
         program = exported(controller).run_decompositions()
     graph = OnnxGraph(program, inputs, outputs, REAL[dtype])
     file = _model_file(package, graph, inputs, outputs, contract)
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(file.SerializeToString(deterministic=True))
-        contract, run = open_onnx(temporary)
-        parity = verify(run, contract)
-        if not parity.passed:
-            raise ExportError(f"the ONNX graph differs from its model: {parity}.")
-    return Path(path)
+    return write_verified(path, file.SerializeToString(deterministic=True), open_onnx, "ONNX graph")
 
 
 def open_onnx(path: str | Path) -> tuple[Contract, Runner]:
-    """Load an artefact: what it says of itself, and how to run it.
+    """Load an artefact; returns its contract, and how to run it.
 
     Raises:
         ImportError: if the package `onnx` is missing.
@@ -114,7 +105,7 @@ def open_onnx(path: str | Path) -> tuple[Contract, Runner]:
         given = {name: x.numpy().astype(real) for name, x in zip(names, inputs, strict=True)}
         return evaluate(given)
 
-    return contract, lambda *x: run_stateful(step, x, size)
+    return contract, lambda *x: run_from_nan(step, x, size)
 
 
 def _package() -> Any:

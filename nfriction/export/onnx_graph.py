@@ -18,7 +18,7 @@ from nfriction.export.errors import ExportError
 
 
 class Value(NamedTuple):
-    """What is computed at run time: its name in the graph and its type in torch."""
+    """A value known at run time only: its name in the graph and its type in torch."""
 
     name: str
     dtype: torch.dtype
@@ -104,7 +104,7 @@ class OnnxGraph:
         self.nodes.append(helper.make_node(op, inputs, [output], **attributes))
 
     def _call(self, node: Any, values: dict[Any, Any]) -> Any:
-        """What a node of the program gives: a value, or a tensor where all is known."""
+        """Result of a node of the program: a value, or a tensor where all is known."""
         args, kwargs = torch.fx.node.map_arg((node.args, node.kwargs), lambda n: values[n])
         leaves = list(_leaves((args, kwargs)))
         if not any(isinstance(leaf, (Value, Unknown)) for leaf in leaves):
@@ -135,7 +135,7 @@ def _owned(program: torch.export.ExportedProgram) -> dict[str, Tensor]:
 
 
 def _leaves(x: Any) -> Iterator[Any]:
-    """All that nested arguments hold."""
+    """Leaves of nested arguments."""
     if isinstance(x, Value):
         yield x
     elif isinstance(x, dict):

@@ -1,4 +1,4 @@
-"""How close an artefact comes to its model: torque, coefficients and status over many samples."""
+"""Parity of an artefact with its model: torque, coefficients and status over many samples."""
 
 import math
 from collections.abc import Sequence
@@ -16,14 +16,14 @@ COEFFICIENT_SLACK = 20.0
 
 @dataclass(frozen=True)
 class Parity:
-    """How close an artefact comes to its model.
+    """Largest differences of an artefact from its model.
 
     Attributes:
         points: samples compared.
         torque_error: largest |difference| of the torque over the largest |torque| of the joint.
         coefficient_error: the same of the coefficients, over the largest of each coefficient.
         edges: samples whose status, or whose NaN, are not those of the model.
-        tolerance: what the torque error may be; the coefficients have 20 times that.
+        tolerance: largest torque error allowed; the coefficients have 20 times that.
     """
 
     points: int
@@ -34,7 +34,7 @@ class Parity:
 
     @property
     def passed(self) -> bool:
-        """Whether all of it is within tolerance."""
+        """True where all of it is within tolerance."""
         return (
             self.points > 0
             and self.torque_error <= self.tolerance

@@ -1,38 +1,39 @@
-"""MJCF and URDF: the nearest damping and friction loss of a simulator's joints, and its price.
+"""MJCF and URDF: the nearest damping and friction loss of a simulator's joints, and the error.
 
 Simulators know `damping * qd + frictionloss * sgn(qd)`. Of all such pairs the one that comes
-closest along a real motion is written, beside the torque error that is left.
+closest along a real motion is written, beside the residual torque error.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from xml.etree import ElementTree
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import torch
 from scipy.optimize import nnls
 from torch import Tensor
 
-from nfriction.export.robot_xml import mjcf_snippet, patched, urdf_snippet
-from nfriction.export.unfiltered import memory_of
 from nfriction.friction.models import FrictionModel
 from nfriction.io.atomic import write_atomically
 from nfriction.io.model_info import ModelInfo
+from nfriction.plant.robot_file import parse_xml
 from nfriction.signals import Motion
 
 Load = Callable[[Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True)
-class Collapse:
-    """A model brought down to two numbers a joint.
+class DampingFit:
+    """Damping and friction loss nearest to a model.
 
     Attributes:
         joint_names: in the order of the joints.
         damping: [N m s/rad], (joint,).
         frictionloss: [N m], (joint,).
         rms_torque: of the model along the motion [N m], (joint,).
-        rms_error: of what the two numbers give instead [N m], (joint,).
+        rms_error: of the torque by these two numbers [N m], (joint,).
         unit: of a joint's position, "rad" or "m".
     """
 
@@ -63,19 +64,18 @@ class Collapse:
 
 
 @torch.no_grad()
-def collapse(
+def fit_damping_frictionloss(
     model: FrictionModel,
     motions: Motion | Sequence[Motion],
     *,
     load: Load | None = None,
     info: ModelInfo | None = None,
-) -> Collapse:
-    """The nearest damping and friction loss along a motion, by least squares over its samples.
+) -> DampingFit:
+    """Fit damping and friction loss to a model along a motion, by least squares over its samples.
 
     Args:
         model: a friction model.
-        motions: in joint coordinates; every sample has the same weight, so that what the mechanism
-            does most counts most.
+        motions: in joint coordinates; every sample has the same weight.
         load: normal load at positions and velocities (sample, joint), as `Plant.load`; 1 if not
             given.
         info: names and unit of the joints.
@@ -91,7 +91,7 @@ def collapse(
     pairs = [_fit(np.stack([qd[:, j], sign[:, j]], -1), tau[:, j], j) for j in range(model.joints)]
     left = tau - np.stack([d * qd[:, j] + f * sign[:, j] for j, (d, f) in enumerate(pairs)], -1)
     info = info or ModelInfo()
-    return Collapse(
+    return DampingFit(
         joint_names=joint_names(model, info),
         damping=tuple(d for d, _ in pairs),
         frictionloss=tuple(f for _, f in pairs),
@@ -108,27 +108,28 @@ def mjcf(
     info: ModelInfo | None = None,
     *,
     load: Load | None = None,
-    into: str | Path | None = None,
-) -> Collapse:
+    patch: str | Path | None = None,
+) -> DampingFit:
     """Write a model as `damping` and `frictionloss` of MuJoCo's joints.
 
     Args:
         model: a friction model.
         path: XML file to write; missing folders are made.
-        motions, load: see `collapse`.
-        info: names of the joints, by which they are found in `into`.
-        into: an MJCF file whose joints are given the numbers; default a file of default classes,
+        motions, load: see `fit_damping_frictionloss`.
+        info: names of the joints, by which they are found in `patch`.
+        patch: an MJCF file whose joints are given the numbers; default a file of default classes,
             one a joint, to be included and named as the joints' `class`.
 
     Returns:
-        The numbers and what they cost.
+        The numbers and their errors.
 
     Raises:
-        ValueError: see `collapse`; or if `into` is no MJCF, or lacks a joint of that name.
+        ValueError: see `fit_damping_frictionloss`; or if `patch` is no MJCF, or lacks a joint of
+            that name.
         OSError: if a file cannot be read or written.
     """
-    found = collapse(model, motions, load=load, info=info)
-    return _written(found, path, "mujoco", mjcf_snippet, into)
+    found = fit_damping_frictionloss(model, motions, load=load, info=info)
+    return _written(found, path, "mujoco", patch)
 
 
 def urdf(
@@ -138,29 +139,53 @@ def urdf(
     info: ModelInfo | None = None,
     *,
     load: Load | None = None,
-    into: str | Path | None = None,
-) -> Collapse:
+    patch: str | Path | None = None,
+) -> DampingFit:
     """Write a model as `<dynamics damping friction/>` of URDF joints.
 
-    Args, Returns, Raises: as `mjcf`; without `into` the file holds the joints' elements alone, to
+    Args, Returns, Raises: as `mjcf`; without `patch` the file holds the joints' elements alone, to
         be copied into a robot.
     """
-    found = collapse(model, motions, load=load, info=info)
-    return _written(found, path, "robot", urdf_snippet, into)
+    found = fit_damping_frictionloss(model, motions, load=load, info=info)
+    return _written(found, path, "robot", patch)
 
 
 def _written(
-    found: Collapse,
-    path: str | Path,
-    root: str,
-    snippet: Callable[..., bytes],
-    into: str | Path | None,
-) -> Collapse:
-    """Write the numbers as a snippet of its own, or into a robot of that root element."""
+    found: DampingFit, path: str | Path, root: str, patch: str | Path | None
+) -> DampingFit:
+    """Write the numbers as a file of their own, or into a robot of that root element."""
     numbers = found.joint_names, found.damping, found.frictionloss
-    text = snippet(*numbers, str(found)) if into is None else patched(into, root, *numbers)
-    write_atomically(path, text)
+    if patch is not None:
+        write_atomically(path, patched(patch, root, *numbers))
+        return found
+    # An XML comment must not hold two hyphens.
+    note = "\n".join(f"       {x}" for x in str(found).replace("--", "- -").splitlines())
+    whole, row = _SNIPPETS[root]
+    rows = "\n".join(
+        row.format(name=quoteattr(name), damping=d, friction=f)
+        for name, d, f in zip(*numbers, strict=True)
+    )
+    write_atomically(path, whole.format(note=note, rows=rows).encode())
     return found
+
+
+# Files by their root element, and what they say of a joint. An MJCF has a default class for each
+# joint; elements of a URDF are to be copied into a robot.
+_NOTE = "  <!-- The nearest to the model along a recorded motion:\n{note}\n  -->\n"
+_SNIPPETS = {
+    "mujoco": (
+        f"<mujoco>\n{_NOTE}  <default>\n{{rows}}\n  </default>\n</mujoco>\n",
+        "    <default class={name}>\n"
+        '      <joint damping="{damping!r}" frictionloss="{friction!r}"/>\n'
+        "    </default>",
+    ),
+    "robot": (
+        f'<robot name="friction">\n{_NOTE}{{rows}}\n</robot>\n',
+        "  <joint name={name}>\n"
+        '    <dynamics damping="{damping!r}" friction="{friction!r}"/>\n'
+        "  </joint>",
+    ),
+}
 
 
 def joint_names(model: FrictionModel, info: ModelInfo) -> tuple[str, ...]:
@@ -176,13 +201,9 @@ def _torque(model: FrictionModel, motion: Motion, load: Load | None) -> Tensor:
         )
     q, qd, qdd = (torch.as_tensor(x) for x in (motion.q, motion.qd, motion.qdd))
     weight = torch.ones_like(qd) if load is None else load(q, qd)
-    if not memory_of(model):
-        return model(qd, qdd, weight)
     schedule = model.schedule
-    states = [schedule.initial_state(qd[0], qdd[0])]
-    for k in range(1, len(qd)):
-        states.append(schedule.advance(qd[k], qdd[k], states[-1]))
-    return model.torque(qd, weight, schedule.coefficients_from(qd, qdd, torch.stack(states)))
+    states = schedule.states(qd, qdd)
+    return model.torque(qd, weight, schedule.coefficients_from(qd, qdd, states))
 
 
 def _fit(columns: np.ndarray, tau: np.ndarray, joint: int) -> tuple[float, float]:
@@ -193,3 +214,49 @@ def _fit(columns: np.ndarray, tau: np.ndarray, joint: int) -> tuple[float, float
     found, _ = nnls(columns / sizes, tau)
     damping, frictionloss = (found / sizes).tolist()
     return damping, frictionloss
+
+
+def patched(
+    path: str | Path,
+    root: str,
+    names: Sequence[str],
+    damping: Sequence[float],
+    frictionloss: Sequence[float],
+) -> bytes:
+    """A robot description with the friction of the named joints replaced.
+
+    Args:
+        path: an MJCF or URDF file, in UTF-8.
+        root: name of its root element, "mujoco" or "robot".
+        names, damping, frictionloss: of the joints.
+
+    Raises:
+        ValueError: if the file is of another kind, declares entities, or a joint is missing or
+            there twice.
+        OSError: if it cannot be read.
+    """
+    try:
+        tree = parse_xml(Path(path), comments=True)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    if tree.tag != root:
+        raise ValueError(f"{path}: the root element is <{tree.tag[:40]}>, not <{root}>.")
+    # In MJCF other things refer to joints by elements of that name too.
+    bodies = tree.findall("worldbody") if root == "mujoco" else [tree]
+    joints = [joint for body in bodies for joint in body.iter("joint")]
+    for name, d, f in zip(names, damping, frictionloss, strict=True):
+        matches = [joint for joint in joints if joint.get("name") == name]
+        if len(matches) != 1:
+            known = ", ".join(str(joint.get("name")) for joint in joints)[:200]
+            raise ValueError(
+                f"{path}: there must be one joint called {name!r}, found {len(matches)}; its "
+                f"joints are {known or 'none'}. Name the model's joints in `joint_names`."
+            )
+        target = matches[0]
+        if root == "robot":
+            dynamics = target.find("dynamics")
+            target = ElementTree.SubElement(target, "dynamics") if dynamics is None else dynamics
+        target.set("damping", repr(d))
+        target.set("frictionloss" if root == "mujoco" else "friction", repr(f))
+    text = ElementTree.tostring(tree, encoding="unicode")
+    return f'<?xml version="1.0" encoding="utf-8"?>\n{text}\n'.encode()

@@ -41,10 +41,13 @@ class Schedule(nn.Module, ABC):
             exports clamp the inputs of any other.
         fit_strategy: function that fits such coefficients, as `"module:function"`; it takes a
             `nfriction.fitting.fit.FitTask`.
+        form: formula that exports have code of their own for, named by the very class that
+            computes it; a subclass is traced unless it names it again.
     """
 
     follows_motion: ClassVar[bool] = True
     handles_range: ClassVar[bool] = False
+    form: ClassVar[str] = "traced"
     fit_strategy: ClassVar[str] = ""
 
     joints: int
@@ -272,6 +275,7 @@ class Constant(Tabulated):
     follows_motion = False
     handles_range = True
     fit_strategy = "nfriction.fitting.strategy.constant:fit_constant"
+    form = "constant"
 
     def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
         return self.table()

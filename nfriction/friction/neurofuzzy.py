@@ -72,6 +72,8 @@ class NeuroFuzzy(Schedule):
         TLRIP paper, neuro-fuzzy friction estimation (5 x 5 sets, 25 rules, 10 radial basis units).
     """
 
+    form = "neurofuzzy"
+
     # Final makes them constants for TorchScript.
     roundness: Final[float] = 0.005  # of the positive map, in units of a coefficient's scale
     reach: Final[float] = 0.5  # distance from the trained range where it is zero, in ranges

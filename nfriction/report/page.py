@@ -224,5 +224,5 @@ def _commands(run: Run) -> list[str]:
     if run.best in run.models:
         file = str(run.folder / "models" / f"{run.best}.json")
         lines.append(shlex.join(["nfriction", "info", file]))
-        lines.append(shlex.join(["nfriction", "export", file, "--to", "c"]))
+        lines.append(shlex.join(["nfriction", "export", file, "--format", "c"]))
     return lines

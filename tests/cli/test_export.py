@@ -38,7 +38,7 @@ def test_to_controllers_and_back(
 ) -> None:
     out = tmp_path / "out"
     limits = ",".join(["3"] * RIG.joints)
-    words = ["--to", "torchscript,c", "--out", str(out), "--torque-limit", limits]
+    words = ["--format", "torchscript,c", "--out", str(out), "--torque-limit", limits]
     assert cli.main(["export", str(model), *words]) == 0
     said = capsys.readouterr().out
     assert str(out / "lfm.pt") in said
@@ -58,7 +58,7 @@ def test_to_controllers_and_back(
 def test_artefacts_beside_a_model_leave_it_whole(model: Path) -> None:
     before = model.read_bytes()
     targets = "torchscript,c,pt2,onnx"
-    assert cli.main(["export", str(model), "--to", targets, "--out", str(model.parent)]) == 0
+    assert cli.main(["export", str(model), "--format", targets, "--out", str(model.parent)]) == 0
     assert model.read_bytes() == before
 
 
@@ -67,7 +67,7 @@ def test_to_simulators(model: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     phase = 5 * time[:, None] + np.arange(RIG.joints)
     recording = Recording(time, np.sin(phase), names=tuple(RIG.joint_names))
     recording.write(tmp_path / "run.csv")
-    words = ["--to", "mjcf,urdf", "--recording", str(tmp_path / "run.csv")]
+    words = ["--format", "mjcf,urdf", "--recording", str(tmp_path / "run.csv")]
     assert cli.main(["export", str(model), *words, "--out", str(tmp_path)]) == 0
     said = capsys.readouterr().out
     assert said.count("RMS") == 2 * RIG.joints
@@ -91,7 +91,8 @@ def test_a_recording_in_degrees_with_names_of_its_own_gives_the_same(
         path = tmp_path / f"{columns[0]}.csv"
         rows = np.column_stack([time, angles])
         np.savetxt(path, rows, "%.15g", ",", header=",".join(columns), comments="")
-        words = ["--to", "urdf", "--angles", "relative,upright", "--recording", str(path), *words]
+        words = ["--angles", "relative,upright", "--recording", str(path), *words]
+        words = ["--format", "urdf", *words]
         assert cli.main(["export", str(model), *words, "--out", str(tmp_path / columns[0])]) == 0
         text = (tmp_path / columns[0] / "lfm.urdf").read_text()
         found.append([float(x) for x in re.findall(r'(?:damping|friction)="([^"]+)"', text)])
@@ -102,9 +103,9 @@ def test_a_recording_in_degrees_with_names_of_its_own_gives_the_same(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--to", "basic"], "cannot export to 'basic'; there are torchscript, c, pt2"),
-        (["--to", ","], "takes some of"),
-        (["--to", "mjcf"], "--recording"),
+        (["--format", "basic"], "cannot export to 'basic'; there are torchscript, c, pt2"),
+        (["--format", ","], "takes some of"),
+        (["--format", "mjcf"], "--recording"),
         (["--torque-limit", "-1"], "positive numbers"),
         (["--torque-limit", "1,2"], "torque_limit"),
         (["--cutoff", "1,2"], "takes one number"),
@@ -119,7 +120,7 @@ def test_what_cannot_be_done_is_said(
 
 
 def test_the_filter_goes_in(model: Path, tmp_path: Path) -> None:
-    words = ["--with-filter", "--cutoff", "30", "--to", "c", "--out", str(tmp_path / "out")]
+    words = ["--with-filter", "--cutoff", "30", "--format", "c", "--out", str(tmp_path / "out")]
     assert cli.main(["export", str(model), *words]) == 0
     told = json.loads((tmp_path / "out" / "lfm.contract.json").read_text())
     assert told["filter"]["cutoff_hz"] == 30.0

@@ -150,7 +150,8 @@ def test_export_info_and_demo_say_what_they_cannot(bench: Path, compared: Path, 
     for command in ("export", "info"):
         assert "check the path" in failing(command, bench / "absent.json")
         assert "model file" in failing(command, bench / "bench.json")
-    assert "torchscript" in failing("export", compared / "models" / "NCFM.json", "--to", "basic")
+    model = compared / "models" / "NCFM.json"
+    assert "torchscript" in failing("export", model, "--format", "basic")
     assert "positive seconds" in failing("demo", "--seconds", "nan")
     assert "whole number" in failing("demo", "--seed", "-1")
     assert "NCFM, LFM" in failing("demo", "--models", "FOO")

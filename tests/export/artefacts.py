@@ -21,7 +21,7 @@ INFO = ModelInfo(
 class Rising(Constant):
     """Coefficients that grow with speed and acceleration for ever: one that has no range."""
 
-    bounded = False
+    handles_range = False
 
     def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
         growth = 1.0 + 0.1 * qd.abs() + 0.01 * qdd.abs()

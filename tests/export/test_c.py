@@ -13,19 +13,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nfriction.codegen import UnsupportedOperation
-from nfriction.export.c_dialect import comment
-from nfriction.export.c_export import c
-from nfriction.export.c_run import c_contract, c_runner
-from nfriction.export.contract import compare, run_through, verify
-from nfriction.export.controller import controller_of
+from nfriction.export.c_code.dialect import comment
+from nfriction.export.c_code.export import c
+from nfriction.export.c_code.run import c_contract, c_runner
+from nfriction.export.contract import verify
+from nfriction.export.controller import NOT_FINITE, OUTSIDE, SATURATED, controller_of
 from nfriction.export.errors import ExportError
-from nfriction.export.points import draw
-from nfriction.export.unfiltered import NOT_FINITE, OUTSIDE, SATURATED
+from nfriction.export.parity import compare
+from nfriction.export.test_vectors import draw
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
-from nfriction.friction.models import FrictionModel
-from nfriction.friction.registry import model_by_name, model_names
+from nfriction.friction.models import MODELS, FrictionModel
 from nfriction.io.model_info import ModelInfo
+from tests.export.artefacts import Rising
+from tests.friction.samples import randomise
 
 STUBS = Path(__file__).parent / "stubs"
 GCC, GXX = shutil.which("gcc"), shutil.which("g++")
@@ -55,7 +56,7 @@ INFO = ModelInfo(
 def random_model(name: str, joints: int = 3, seed: int = 0) -> FrictionModel:
     """A named model, every parameter off its start."""
     random = torch.Generator().manual_seed(seed)
-    kind = model_by_name(name)
+    kind = MODELS[name]
     initial = INITIAL[kind(1).law.name]
     factors = 1.0 + 0.3 * torch.rand(joints, len(initial), generator=random, dtype=torch.float64)
     model = kind(joints, factors * torch.tensor(initial, dtype=torch.float64))
@@ -98,7 +99,7 @@ def points(controller, dtype: str, count: int):
 
 
 cases = pytest.mark.parametrize("dtype", ["float64", "float32"])
-names = pytest.mark.parametrize("name", list(model_names()))
+names = pytest.mark.parametrize("name", list(MODELS))
 few = pytest.mark.parametrize("name", ["Stribeck", "ALFM", "NFLFM"])  # one of each kind
 
 
@@ -130,9 +131,9 @@ def test_is_valid_cpp(exported, name, dtype):
 def test_equals_its_model_to_beyond_the_range(exported, name, dtype):
     _, controller, folder = exported(name, dtype)
     # Models with a memory are stepped through one sample at a time in torch.
-    inputs = points(controller, dtype, 500 if hasattr(controller, "state_size") else 5000)
+    inputs = points(controller, dtype, 500 if controller.state_size else 5000)
     run = c_runner(folder / "nfriction.c")
-    parity = compare(run_through(controller, inputs), run(*inputs), TOLERANCE[dtype])
+    parity = compare(controller.run(*inputs), run(*inputs), TOLERANCE[dtype])
     assert parity.passed, parity
     assert verify(run, c_contract(folder / "nfriction.c")).passed
 
@@ -151,8 +152,8 @@ def test_is_valid_cpp_and_passes_its_own_test_under_fast_math(exported, name, dt
 @names
 def test_equals_its_model_at_200000_points(exported, name, dtype):
     _, controller, folder = exported(name, dtype)
-    inputs = points(controller, dtype, 20_000 if hasattr(controller, "state_size") else 200_000)
-    expected = run_through(controller, inputs)
+    inputs = points(controller, dtype, 20_000 if controller.state_size else 200_000)
+    expected = controller.run(*inputs)
     for flags in (("-std=c89", "-O2"), ("-O3", "-ffast-math")):
         found = c_runner(folder / "nfriction.c", flags)(*inputs)
         parity = compare(expected, found, TOLERANCE[dtype])
@@ -210,7 +211,7 @@ def test_status_tells_clamping_and_saturation(exported):
     _, controller, folder = exported("NFLFM", "float64", torque_limit=0.05)
     inputs = draw(controller, 2000, seed=1)
     tau, _, status = c_runner(folder / "nfriction.c")(*inputs)
-    np.testing.assert_array_equal(status, run_through(controller, inputs)[2])
+    np.testing.assert_array_equal(status, controller.run(*inputs)[2])
     assert np.abs(tau).max() == 0.05
     for bit in (OUTSIDE, SATURATED):
         assert 0 < (status & bit > 0).mean() < 1
@@ -229,7 +230,7 @@ def test_the_filter_runs_inside(exported, name, dtype):
         inputs = draw(controller, 300)
         found = c_runner(folder / "nfriction.c")(*inputs)
         # Differences over a millisecond, taken twice, raise rounding a thousandfold each.
-        parity = compare(run_through(controller, inputs), found, 1e-10)
+        parity = compare(controller.run(*inputs), found, 1e-10)
         assert parity.passed, parity
 
 
@@ -346,12 +347,12 @@ def test_a_law_and_schedule_of_ones_own_export(tmp_path, schedule, dtype):
     controller = controller_of(model, INFO)
     inputs = points(controller, dtype, 2000)
     run = c_runner(tmp_path / "nfriction.c")
-    parity = compare(run_through(controller, inputs), run(*inputs), TOLERANCE[dtype])
+    parity = compare(controller.run(*inputs), run(*inputs), TOLERANCE[dtype])
     assert parity.passed, parity
 
 
 class Fading(Constant):
-    """A memory of past motion among exponentials in plenty; more than its last sample counts."""
+    """A memory of past motion, of which more than the last sample counts."""
 
     state_size = 2
 
@@ -372,20 +373,73 @@ class Fading(Constant):
 
 @cases
 @pytest.mark.parametrize("flags", [("-O3",), ("-O3", "-ffast-math")])
-def test_a_memory_goes_side_by_side_too(tmp_path, dtype, flags):
+def test_a_schedule_of_ones_own_with_a_memory_exports(tmp_path, dtype, flags):
     """Where the load alone is not finite, the memory goes on."""
     model = FrictionModel(DRAG, Fading(DRAG, 3, [[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]]))
     c(model, tmp_path, INFO, dtype=dtype)
-    assert "qd_now" in (tmp_path / "nfriction.c").read_text()
     build([*C89, "-c", "nfriction.c", "-o", "n.o"], tmp_path)
     controller = controller_of(model, INFO)
     inputs = [x.clone() for x in points(controller, dtype, 300)]
     for which, joint in ((0, 0), (1, 1), (2, 2)):
         inputs[which][20 + which :: 40, joint] = (torch.nan, torch.inf, -torch.inf)[which]
     found = c_runner(tmp_path / "nfriction.c", flags)(*inputs)
-    parity = compare(run_through(controller, inputs), found, TOLERANCE[dtype])
+    parity = compare(controller.run(*inputs), found, TOLERANCE[dtype])
     assert parity.passed, parity
     self_test(tmp_path, *flags)
+
+
+@cases
+@pytest.mark.parametrize("schedule", [Rising, Fading])
+def test_a_schedule_that_has_no_range_is_clamped_in_c_too(tmp_path, schedule, dtype):
+    """Under a prefix that begins as the usual one does."""
+
+    class Unbounded(schedule):
+        handles_range = False
+
+    model = FrictionModel(DRAG, Unbounded(DRAG, 3, [[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]]))
+    c(model, tmp_path, INFO, dtype=dtype, prefix="nf_max")
+    build([*C89, "-c", "nfriction.c", "-o", "n.o"], tmp_path)
+    controller = controller_of(model, INFO)
+    assert controller.clamps
+    inputs = points(controller, dtype, 500)
+    found = c_runner(tmp_path / "nfriction.c")(*inputs)
+    parity = compare(controller.run(*inputs), found, TOLERANCE[dtype])
+    assert parity.passed, parity
+    assert verify(c_runner(tmp_path / "nfriction.c"), c_contract(tmp_path / "nfriction.c")).passed
+
+
+@pytest.mark.parametrize("terms", [(3, 5), (6, 2)])
+def test_one_input_may_have_fewer_sets_than_the_other(tmp_path, terms):
+    model = MODELS["NFLFM"](2, INITIAL["linear"], terms=terms)
+    randomise(model, 0.2)
+    c(model, tmp_path)
+    inputs = points(controller_of(model), "float64", 1000)
+    parity = compare(controller_of(model).run(*inputs), c_runner(tmp_path / "nfriction.c")(*inputs),
+                     TOLERANCE["float64"])  # fmt: skip
+    assert parity.passed, parity
+
+
+def test_sets_so_narrow_that_all_underflow_export(tmp_path):
+    model = random_model("NFLFM")
+    with torch.no_grad():
+        model.schedule.network.anfis.partition.log_widths.sub_(2.7)
+    c(model, tmp_path, INFO)
+    assert verify(c_runner(tmp_path / "nfriction.c"), c_contract(tmp_path / "nfriction.c")).passed
+
+
+def test_a_law_may_differ_by_joint(tmp_path):
+    """A law that reads a number of its own for every joint is written out for all of them."""
+    factors = torch.tensor([1.0, 2.0, 4.0], dtype=torch.float64)
+
+    def own(qd, load, coefficients, v_smooth):
+        return coefficients.select(-1, 0) * qd * factors[: qd.shape[-1]]
+
+    law = Law("own", (Coefficient("A", "N m s/rad"),), own)
+    model = FrictionModel(law, Constant(law, 3, [[0.1], [0.2], [0.3]]))
+    c(model, tmp_path, INFO)
+    inputs = points(controller_of(model, INFO), "float64", 100)
+    found = c_runner(tmp_path / "nfriction.c")(*inputs)
+    assert compare(controller_of(model, INFO).run(*inputs), found, TOLERANCE["float64"]).passed
 
 
 def test_an_operation_without_c_form_is_named(tmp_path):

@@ -10,14 +10,12 @@ from torch import Tensor
 
 from nfriction.export.contract import (
     Contract,
-    ContractError,
-    compare,
     contract_of,
-    run_through,
     verify,
 )
-from nfriction.export.controller import controller_of
-from nfriction.export.unfiltered import NOT_FINITE
+from nfriction.export.controller import NOT_FINITE, controller_of
+from nfriction.export.errors import ContractError
+from nfriction.export.parity import compare
 from nfriction.friction.models import LFM
 from nfriction.io.model_info import ModelInfo
 from tests.export.artefacts import INFO
@@ -113,8 +111,8 @@ def infinite(tau_f: Tensor, coefficients: Tensor, status: Tensor) -> tuple[Tenso
 def test_every_difference_is_found(harm: Callable[..., tuple[Tensor, ...]]) -> None:
     found = contract("NFLFM")
     controller = controller_of(MODELS["NFLFM"], INFO)
-    assert verify(lambda *x: run_through(controller, x), found).passed
-    assert not verify(lambda *x: harm(*run_through(controller, x)), found).passed
+    assert verify(lambda *x: controller.run(*x), found).passed
+    assert not verify(lambda *x: harm(*controller.run(*x)), found).passed
 
 
 def test_errors_are_relative_to_each_joints_own_scale() -> None:

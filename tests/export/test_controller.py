@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction.export.controller import controller_of
-from nfriction.export.filtered import FilteredController
-from nfriction.export.points import draw
-from nfriction.export.unfiltered import NOT_FINITE, OUTSIDE, SATURATED, Controller, MemoryController
+from nfriction.export.controller import NOT_FINITE, OUTSIDE, SATURATED, controller_of
+from nfriction.export.test_vectors import draw
 from nfriction.friction.models import LFM, NFLFM
 from nfriction.io.model_info import ModelInfo
 from nfriction.signals import SecondOrderLowPass
@@ -105,9 +103,9 @@ def test_a_memory_goes_along_and_survives_nan(name: str) -> None:
     model = MODELS[name]
     schedule = model.schedule
     controller = controller_of(model)
-    assert isinstance(controller, MemoryController)
+    assert controller.inputs == ("qd", "qdd", "load")
     qd, qdd, load = motion(60, 3)
-    state = memory = controller.initial_state(qd[0], qdd[0])
+    state = memory = controller.start(qd[0], qdd[0], load[0])
     torch.testing.assert_close(state, schedule.initial_state(qd[0], qdd[0]))
     for k in range(60):
         tau_f, coefficients, _, state = controller(qd[k], qdd[k], load[k], state)
@@ -129,7 +127,7 @@ def test_a_network_by_class_is_the_model_beyond_its_range_too() -> None:
     schedule.set_range(torch.full((3,), 9.0).double(), torch.tensor([[-90.0, 90.0]] * 3).double())
     controller = controller_of(model, INFO)
     qd, qdd, load = motion(500, 3)
-    state = controller.initial_state(qd, qdd)
+    state = controller.start(qd, qdd, load)
     coefficients = controller(qd, qdd, load, state)[1]
     memory = schedule.advance(qd, qdd, state)
     torch.testing.assert_close(coefficients, schedule.coefficients_from(qd, qdd, memory))
@@ -139,7 +137,7 @@ def test_a_network_by_class_is_the_model_beyond_its_range_too() -> None:
 def test_the_filter_is_that_of_signals_on_differences() -> None:
     model = MODELS["NFLFM"]
     controller = controller_of(model, INFO, with_filter=True, cutoff_hz=30.0)
-    assert isinstance(controller, FilteredController)
+    assert controller.inputs == ("q", "load")
     time = 1e-3 * np.arange(400)
     q = np.sin(9 * time)[:, None] * [1.0, 0.5, 2.0]
     load = torch.ones(400, 3, dtype=torch.float64)
@@ -152,7 +150,7 @@ def test_the_filter_is_that_of_signals_on_differences() -> None:
     qd = low_pass(difference(q, q[:1]), rest)
     qdd = low_pass(difference(qd, np.zeros((1, 3))), rest)
     expected = model(torch.as_tensor(qd), torch.as_tensor(qdd), load)
-    state = controller.initial_state(torch.as_tensor(q[0]))
+    state = controller.start(torch.as_tensor(q[0]), load[0])
     for k in range(400):
         tau_f, _, _, state = controller(torch.as_tensor(q[k]), load[k], state)
         # Accelerations are differences of differences over 1e-6 s^2.
@@ -162,9 +160,9 @@ def test_the_filter_is_that_of_signals_on_differences() -> None:
 @pytest.mark.parametrize("name", ["LFM", "ALFM"])
 def test_the_filter_survives_a_lost_sample(name: str) -> None:
     controller = controller_of(MODELS[name], INFO, with_filter=True)
-    assert isinstance(controller, FilteredController)
+    assert controller.inputs == ("q", "load")
     q, load = draw(controller, 50)
-    state = controller.initial_state(q[0])
+    state = controller.start(q[0], load[0])
     for k in range(25):
         *_, state = controller(q[k], load[k], state)
     lost = q[25].clone()
@@ -183,7 +181,6 @@ def test_the_filter_survives_a_lost_sample(name: str) -> None:
 def test_the_model_stays_as_it_was_and_is_not_shared() -> None:
     model = NFLFM(2).to(torch.float32).train()
     controller = controller_of(model)
-    assert isinstance(controller, Controller)
     assert model.training
     assert all(p.requires_grad and p.dtype == torch.float32 for p in model.parameters())
     assert all(p.dtype == torch.float64 for p in controller.parameters())
@@ -209,12 +206,8 @@ def test_malformed_limits_are_refused(limit: float) -> None:
         controller_of(LFM(2), torque_limit=limit)
 
 
-def test_a_filter_needs_the_sample_time_and_a_memory_its_own_class() -> None:
+def test_a_filter_needs_the_sample_time_and_inputs_their_joints() -> None:
     with pytest.raises(ValueError, match="sample_time"):
         controller_of(LFM(2), with_filter=True)
-    with pytest.raises(ValueError, match="MemoryController"):
-        Controller(MODELS["ALFM"])
-    with pytest.raises(ValueError, match="use `Controller`"):
-        MemoryController(LFM(2))
     with pytest.raises(ValueError, match="with 2 joints, got last axis 3"):
         controller_of(LFM(2))(*motion(4, 3))

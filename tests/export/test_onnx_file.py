@@ -12,11 +12,13 @@ import torch
 from torch import Tensor
 
 from nfriction.export import ExportError, onnx
-from nfriction.export.archive import METADATA
-from nfriction.export.contract import ContractError, compare, run_through, verify
+from nfriction.export.contract import verify
 from nfriction.export.controller import controller_of
+from nfriction.export.errors import ContractError
 from nfriction.export.onnx_file import open_onnx
-from nfriction.export.points import draw
+from nfriction.export.parity import compare
+from nfriction.export.test_vectors import draw
+from nfriction.export.torch_code.archive import METADATA
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.models import LFM, FrictionModel
@@ -80,7 +82,7 @@ def check_parity(
     if dtype == "float32":
         inputs = tuple(x.float().double() for x in inputs)
     tolerance = 1e-12 if dtype == "float64" else contract.tolerance
-    parity = compare(run_through(controller, inputs), run(*inputs), tolerance)
+    parity = compare(controller.run(*inputs), run(*inputs), tolerance)
     assert parity.passed, parity
 
 

@@ -5,7 +5,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from nfriction.export.robot_xml import patched
+from nfriction.export.simulators import patched
 
 URDF = """<robot name="r"><link name="l"/>
   <joint name="a" type="revolute"><limit effort="1"/></joint>

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction.export import collapse, mjcf, urdf
+from nfriction.export import fit_damping_frictionloss, mjcf, urdf
 from nfriction.friction.models import LFM, NCFM, NFLFM, NLFM
 from nfriction.io.model_info import ModelInfo
 from nfriction.papers.afem.models import ALFM
@@ -30,7 +30,7 @@ def swing(joints: int = 2, amplitude: float = 1.0) -> Motion:
 def test_what_damping_and_friction_loss_can_say_costs_nothing(
     model: NCFM | LFM, frictionloss: float
 ) -> None:
-    found = collapse(model, swing())
+    found = fit_damping_frictionloss(model, swing())
     assert found.damping == pytest.approx([0.3, 0.3], rel=1e-9)
     assert found.frictionloss == pytest.approx([frictionloss] * 2, abs=1e-9)
     assert max(found.relative_error) < 1e-9
@@ -40,7 +40,7 @@ def test_the_price_is_the_least_there_is() -> None:
     model = NFLFM(2, [0.1, 0.2])
     randomise(model, 0.3)
     motion = swing()
-    found = collapse(model, motion)
+    found = fit_damping_frictionloss(model, motion)
     qd, qdd = torch.as_tensor(motion.qd), torch.as_tensor(motion.qdd)
     tau = model(qd, qdd, torch.ones_like(qd)).detach().numpy()
 
@@ -60,32 +60,34 @@ def test_the_price_is_the_least_there_is() -> None:
 def test_neither_number_feeds_energy_in() -> None:
     # Friction that falls with speed would want negative damping.
     falling = NLFM(1, [0.0, 1.0, 0.0, 0.0, 1.0])
-    found = collapse(falling, swing(1))
+    found = fit_damping_frictionloss(falling, swing(1))
     assert min(*found.damping, *found.frictionloss) >= 0
-    offset = collapse(NLFM(1, [-1.0, 0.01, 0.0, 0.0, 1.0]), swing(1))
+    offset = fit_damping_frictionloss(NLFM(1, [-1.0, 0.01, 0.0, 0.0, 1.0]), swing(1))
     assert min(*offset.damping, *offset.frictionloss) >= 0
     assert offset.relative_error[0] > 0.9  # a constant offset is all lost, and it says so
 
 
 def test_load_and_memory_go_in() -> None:
-    heavy = collapse(LFM(2, [0.3, 0.7]), swing(), load=lambda q, qd: torch.full_like(q, 2.0))
+    heavy = fit_damping_frictionloss(
+        LFM(2, [0.3, 0.7]), swing(), load=lambda q, qd: torch.full_like(q, 2.0)
+    )
     assert heavy.frictionloss == pytest.approx([1.4, 1.4])
     adaptive = ALFM(2, torch.tensor([[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]]).repeat(2, 1, 1))
     # Slow motion of small acceleration has the coefficients of the lowest class, fast the highest.
     slow, fast = swing(amplitude=0.01), swing(amplitude=5.0)
-    assert collapse(adaptive, slow).damping == pytest.approx([0.1, 0.1], rel=1e-6)
+    assert fit_damping_frictionloss(adaptive, slow).damping == pytest.approx([0.1, 0.1], rel=1e-6)
     # The first joint starts without acceleration, in the lowest class.
-    assert collapse(adaptive, fast).damping[1] == pytest.approx(0.5, rel=1e-6)
-    both = collapse(adaptive, [slow, fast])
+    assert fit_damping_frictionloss(adaptive, fast).damping[1] == pytest.approx(0.5, rel=1e-6)
+    both = fit_damping_frictionloss(adaptive, [slow, fast])
     assert max(both.relative_error) > 1e-6
 
 
 def test_a_motion_that_says_nothing_is_refused() -> None:
     still = Motion(TIME, *(np.zeros((len(TIME), 2)) for _ in range(3)))
     with pytest.raises(ValueError, match="stands still"):
-        collapse(LFM(2), still)
+        fit_damping_frictionloss(LFM(2), still)
     with pytest.raises(ValueError, match="with 2 joints"):
-        collapse(LFM(2), swing(3))
+        fit_damping_frictionloss(LFM(2), swing(3))
 
 
 ROBOT = """<mujoco><!-- kept -->
@@ -103,7 +105,7 @@ def test_mujoco_damps_as_the_numbers_say(tmp_path: Path) -> None:
     (tmp_path / "robot.xml").write_text(ROBOT)
     info = ModelInfo(joint_names=["elbow", "shoulder"])
     model = LFM(2, [[0.3, 0.7], [0.5, 0.9]])
-    found = mjcf(model, tmp_path / "out.xml", swing(), info, into=tmp_path / "robot.xml")
+    found = mjcf(model, tmp_path / "out.xml", swing(), info, patch=tmp_path / "robot.xml")
     loaded = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
     state = mujoco.MjData(loaded)
     state.qvel[:] = [2.0, -3.0]  # of shoulder and elbow, in the robot's own order

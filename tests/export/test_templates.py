@@ -4,9 +4,12 @@ from importlib import resources
 
 import pytest
 
+NAMES = ["adaptive.c", "arduino.ino", "controller.c", "controller.h", "exponential.c", "filter.c",
+         "neurofuzzy.c", "numbers.c", "selftest.c", "simulink.c", "wrapper.hpp"]  # fmt: skip
 
-@pytest.mark.parametrize("name", ["arduino.ino", "selftest.c", "simulink.c", "wrapper.hpp"])
+
+@pytest.mark.parametrize("name", NAMES)
 def test_a_template_is_found_where_the_package_is(name):
-    template = resources.files("nfriction.export").joinpath("c_templates", name)
+    template = resources.files("nfriction.export.c_code").joinpath("templates", name)
     text = template.read_text("ascii")
-    assert "$HEADER" in text  # the one word that all of them are filled with
+    assert "nf_" in text or "NF_" in text  # in place of which the prefix is written

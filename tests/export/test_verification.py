@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from nfriction.codegen.build import find_compiler
 from nfriction.export import ContractError, ExportError, c, torchscript, verify_artefact
+from nfriction.export.c_code.run import find_compiler
 from nfriction.export.contract import Contract
 from nfriction.friction.models import LFM
 from tests.export.artefacts import INFO

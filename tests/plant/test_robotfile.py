@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from nfriction.export.robot_xml import patched
+from nfriction.export.simulators import patched
 from nfriction.plant import PendulumChain, rigs
 
 mujoco = pytest.importorskip("mujoco")

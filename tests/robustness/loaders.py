@@ -29,8 +29,8 @@ from nfriction.export.contract import Contract, ContractError, Runner, contract_
 from nfriction.export.controller import controller_of
 from nfriction.export.errors import ExportError
 from nfriction.export.onnx_file import open_onnx
-from nfriction.export.program import open_pt2
-from nfriction.export.script import open_torchscript
+from nfriction.export.torch_code.pt2 import open_pt2
+from nfriction.export.torch_code.torchscript import open_torchscript
 from nfriction.io.formats import matlab, mdf
 from nfriction.io.formats.worker import load_signals, save_signals
 from nfriction.io.model_file import ModelFileError, load, load_info, load_plant

@@ -133,7 +133,7 @@ def test_a_disk_that_is_read_only(name: str, read_only_disk: Path) -> None:
 @pytest.mark.parametrize(
     "words",
     [
-        ["-m", "nfriction", "export", "{model}", "--to", "torchscript", "--out", "{disk}"],
+        ["-m", "nfriction", "export", "{model}", "--format", "torchscript", "--out", "{disk}"],
         ["-m", "nfriction", "demo", "--out", "{disk}/demo", "--models", "NCFM"],
         [str(ROOT / "trainers" / "train_constant.py"), "--seconds", "1", "--windows", "0.5",
          "--max-steps", "1", "--model", "NCFM", "--out", "{disk}/train"],

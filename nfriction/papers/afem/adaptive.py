@@ -57,6 +57,7 @@ class Adaptive(Tabulated):
     state_size: int = 2
     fit_strategy = "nfriction.papers.afem.fit_adaptive:fit_by_class"
     handles_range = True
+    form = "adaptive"
 
     # An acceleration beyond this many upper thresholds is no more than high: one wild value must
     # not keep the class for long. Final, so that TorchScript takes it for a constant.

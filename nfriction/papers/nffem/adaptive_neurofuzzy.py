@@ -43,6 +43,7 @@ class AdaptiveNeuroFuzzy(Schedule):
 
     state_size: int = 2
     handles_range = True
+    form = "adaptive_neurofuzzy"
     # Final, so that TorchScript takes it for a constant.
     least_ratio: Final[float] = LEAST_RATIO
 
@@ -117,13 +118,13 @@ class AdaptiveNeuroFuzzy(Schedule):
 
     def coefficients_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
         base = self.adaptive.coefficients_from(qd, qdd, state)
-        reference = self._lifted(base)
+        reference = self.lifted(base)
         # As a difference, so that a network of zeros leaves the adaptive schedule to the last bit.
         moved = self.deviation.residual_coefficients(reference, qd, qdd)
         corrected = base + (moved - self.deviation.to_coefficients(reference))
         return torch.where(self.positive, corrected.clamp_min(0.0), corrected)
 
-    def _lifted(self, base: Tensor) -> Tensor:
+    def lifted(self, base: Tensor) -> Tensor:
         """The class's coefficients in the network's units, those of zero free to rise."""
         ratio = base / self.deviation.scale
         least = torch.full_like(ratio, self.least_ratio)
@@ -171,7 +172,7 @@ class AdaptiveNeuroFuzzy(Schedule):
         return self.sensitivities_from(qd, qdd, self.initial_state(qd, qdd))
 
     def sensitivities_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Sensitivity:
-        reference = self._lifted(self.adaptive.coefficients_from(qd, qdd, state)).detach()
+        reference = self.lifted(self.adaptive.coefficients_from(qd, qdd, state)).detach()
         return self.deviation.residual_sensitivities(reference, qd, qdd)
 
     def within_range(self, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor]:

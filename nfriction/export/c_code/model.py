@@ -1,0 +1,325 @@
+"""The C of a controller: templates filled with a model's tables and with its law, emitted."""
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nfriction.codegen.emit import statements
+from nfriction.codegen.errors import UnsupportedOperation
+from nfriction.codegen.graph import Program, trace
+from nfriction.codegen.scalar import Node, evaluate, reachable
+from nfriction.export.c_code.dialect import ControllerC, comment
+from nfriction.export.c_code.exponential import exponential, spare
+from nfriction.export.controller import (
+    FILTER_STATE,
+    UNBOUNDED,
+    Controller,
+    for_single_precision,
+)
+from nfriction.export.errors import ExportError
+from nfriction.export.neurofuzzy import tables
+from nfriction.friction.models import FrictionModel
+
+
+@dataclass(frozen=True)
+class Source:
+    """The texts of an export.
+
+    Attributes:
+        code: the `.c` file.
+        header: the `.h` file.
+    """
+
+    code: str
+    header: str
+
+
+def source_of(
+    controller: Controller, description: Mapping[str, Any], dialect: ControllerC, name: str
+) -> Source:
+    """C of a controller.
+
+    Args:
+        controller: of `controller_of`.
+        description: of the contract, for the header's comment.
+        dialect: the C.
+        name: of the files, without suffix.
+
+    Raises:
+        ExportError: if the law or schedule uses an operation that has no C form, or a number of
+            the model is not finite.
+    """
+    if dialect.real == "float":
+        controller = for_single_precision(controller)
+    words: dict[str, Any] = {
+        "joints": controller.joints,
+        "coefficients": controller.coefficient_count,
+        "state_size": controller.memory_size,
+        "filter_size": FILTER_STATE if controller.filters else 0,
+        "filter": controller,
+        "bits": description["status_bits"],
+        # Names and units are foreign text.
+        "about": description,
+        "safe": lambda text: comment(str(text)).rstrip(),
+    }
+    try:
+        with torch.no_grad():
+            body = dialect.text("controller.c", **words, **_words(controller, dialect))
+    except (UnsupportedOperation, ValueError) as error:
+        raise ExportError(f"the model has no C form: {error}") from error
+    head = (
+        f"/* Made by nfriction; do not edit. {name}.h says what it is. */\n"
+        f'#include "{name}.h"\n\n#include <limits.h>\n#include <math.h>\n#include <string.h>\n'
+    )
+    code = "\n".join([head, dialect.functions(body), body])
+    header = dialect.text("controller.h", **words)
+    return Source(*(re.sub(r"\n{3,}", "\n\n", text) for text in (code, header)))
+
+
+def _words(controller: Controller, dialect: ControllerC) -> dict[str, Any]:
+    """Words of the controller's template beside its sizes."""
+    model: FrictionModel = controller.model
+    # A subclass computes as it likes: only the class that names its form itself has that form.
+    form = vars(type(model.schedule)).get("form", "traced")
+    network = form in ("neurofuzzy", "adaptive_neurofuzzy")
+    ends = [f"{name}_{end}" for name in ("qd", "qdd") for end in ("lower", "upper")]
+    ranges = torch.stack([controller.get_buffer(end) for end in ends])
+    values: dict[str, Any] = {"range": ranges, "torque_limit": controller.torque_limit}
+    words: dict[str, Any] = {
+        "form": form, "network": network,
+        "by_class": form.startswith("adaptive"), "along_motion": False,
+        "bounded": bool((ranges.abs() < UNBOUNDED).any()), "clamped": controller.clamps,
+        "limited": controller.limited, "law_comment": comment(model.law.name),
+        # Calls of an own exponential for many joints at once cost flash on a microcontroller.
+        "array_tanh": network and (controller.joints > 1 or dialect.real == "double"),
+        "table": lambda name, *sizes: dialect.table(name, values[name], *sizes),
+        "sum": _sum,
+    }  # fmt: skip
+    words["clamped"] &= words["bounded"]
+    signs: list[str] = []
+    if form == "constant":
+        values["constant"] = model.schedule(torch.zeros(()), torch.zeros(())).mT
+    elif form == "traced":
+        words["schedule"] = _schedule(controller, dialect)
+    if words["by_class"]:
+        _add_classes(model.schedule, values, words, dialect)
+    if network:
+        _add_network(model.schedule, values, words, dialect)
+        if words["along_motion"]:
+            signs.append(dialect.own("NF_RATE[j] * v[j]"))
+    words["c"] = dialect.own("NF_CONSTANT") if form == "constant" else "c"
+    words["law"] = _law(model, dialect, words["c"], signs if network else None)
+    words["array_tanh"] &= bool(signs)
+    if network:
+        tanhs = len(signs) if words["array_tanh"] else 0
+        words["exponential"] = exponential(dialect, controller.joints, tanhs)
+    return {**words, "signs": signs}
+
+
+def _add_classes(
+    schedule: Any, values: dict[str, Any], words: dict[str, Any], dialect: ControllerC
+) -> None:
+    """Tables of the classes of acceleration."""
+    adaptive = getattr(schedule, "adaptive", schedule)
+    borders = adaptive.thresholds.mT
+    values |= {
+        "middle": borders, "upper": borders * adaptive.band, "lower": borders / adaptive.band,
+        "swing_rate": adaptive.swing_rate, "ceiling": adaptive.ceiling * borders[1],
+        "by_class": adaptive.table().permute(1, 2, 0),
+    }  # fmt: skip
+    words["fading"] = dialect.literal(float(adaptive.fading))
+
+
+def _add_network(
+    schedule: Any, values: dict[str, Any], words: dict[str, Any], dialect: ControllerC
+) -> None:
+    """Tables of the neuro-fuzzy network."""
+    network = getattr(schedule, "deviation", schedule)
+    made = tables(network)
+    joints, sets, units = network.joints, made["set_slope"].shape[1], made["weights"].shape[1]
+    values |= {
+        "gain": made["gain"].mT, "shift": made["shift"].mT, "rate": made["rate"],
+        "set_slope": made["set_slope"].permute(1, 2, 0),
+        "set_shift": made["set_shift"].permute(1, 2, 0),
+        "plane": made["planes"].view(joints, -1, sets, sets).permute(3, 2, 1, 0),
+        "unit_slope": made["unit_slope"].permute(2, 1, 0),
+        "unit_shift": made["unit_shift"].permute(2, 1, 0),
+        "unit_weight": made["weights"].permute(2, 1, 0),
+        "reference": made["reference"].mT, "roundness": made["roundness"].mT,
+    }  # fmt: skip
+    if words["by_class"]:
+        base = schedule.adaptive.table().transpose(0, 1)
+        reference = schedule.lifted(base)
+        values["reference"] = (0.5 * network.scale * reference).mT
+        values["offset"] = (base - network.at_reference(reference)).mT
+    runs: list[tuple[int, int, bool]] = []
+    for k, positive in enumerate(network.positive.tolist()):
+        start = runs.pop()[0] if runs and runs[-1][2] == positive else k
+        runs.append((start, k + 1, positive))
+    words |= {
+        "sets": sets, "units": units, "seen": made["unit_slope"].shape[2],
+        "along_motion": network.along_motion, "signs_of_coefficients": runs,
+        "per_reach": dialect.literal(0.5 / network.reach),
+        "least_exponent": dialect.literal(network.network.head.least_exponent),
+        "deep": _deepest(made["set_slope"].mT, made["set_shift"].mT) >= _DEEP,
+        "spare": lambda count: spare(count, dialect),
+    }  # fmt: skip
+
+
+# Where some set is within this exponent of full membership, strengths are far from underflow.
+_DEEP = 40.0
+
+
+def _deepest(slope: Tensor, shift: Tensor) -> float:
+    """Largest exponent (slope x + shift)^2 of the nearest set, over inputs of -1 to 1.
+
+    It lies at an end of the range, or where two sets are alike.
+
+    Args:
+        slope, shift: (joint, input, set).
+    """
+    meetings = [
+        (sign * shift[..., :, None] - shift[..., None, :])
+        / (slope[..., None, :] - sign * slope[..., :, None])
+        for sign in (1.0, -1.0)
+    ]
+    ends = torch.ones_like(shift[..., :1])
+    points = torch.cat([-ends, ends, *(m.flatten(-2) for m in meetings)], -1)
+    points = points.nan_to_num(0.0, 0.0, 0.0).clamp(-1.0, 1.0)
+    z = slope.unsqueeze(-1) * points.unsqueeze(-2) + shift.unsqueeze(-1)
+    return float(z.square().amin(-2).max())
+
+
+def _sum(term: str, count: int, indent: int) -> str:
+    """A sum of terms in which `@` is the number of each."""
+    terms = [term.replace("@", str(i)) for i in range(count)]
+    if sum(map(len, terms)) + indent < 90:
+        return " + ".join(terms)
+    return f"\n{indent * ' '}+ ".join(terms)
+
+
+def _law(
+    model: FrictionModel, dialect: ControllerC, coefficients: str, signs: list[str] | None
+) -> str:
+    """The law as C: of joint j in a loop, or of every joint where they differ.
+
+    Args:
+        coefficients: name of the array that they are read from.
+        signs: filled with the arguments of hyperbolic tangents of the motion alone, which are then
+            read from `sign`; None to leave such calls in place.
+    """
+    names = ("qd", "load", "c")
+
+    def traced(joints: int) -> Program:
+        sizes = ((joints,), (joints,), (joints, len(model.law.names)))
+        given = {n: _example(*size) for n, size in zip(names, sizes, strict=True)}
+        return trace(lambda qd, load, c: model.torque(qd, load, c), given)
+
+    one, every = traced(1), traced(model.joints)
+    alike = _same_by_joint(one, every, model.joints)
+    outputs = one.outputs[0].nodes if alike else every.outputs[0].nodes
+    bound, joint = {}, "j"
+    for node in reachable(outputs):
+        if node.op == "input":
+            name, index = node.value
+            count = len(model.law.names)
+            if not alike:
+                joint, index = str(index // (count if name == "c" else 1)), index % count
+            bound[node.number] = {"qd": f"v[{joint}]", "load": f"n[{joint}]"}.get(
+                name, f"{coefficients}[{index}][{joint}]"
+            )
+    if not alike:
+        targets = [f"torque[{j}]" for j in range(model.joints)]
+        return f"    {_braces(_assignments(targets, outputs, bound, dialect), '    ')}"
+    if signs is not None:
+        for node in reachable(outputs):
+            if node.op == "tanh" and not _depends(node, "c"):
+                lines, (argument,) = statements(node.args, bound, dialect)
+                if not lines:
+                    bound[node.number] = f"sign[{len(signs)}][j]"
+                    signs.append(argument)
+    lines = _assignments(["torque[j]"], outputs, bound, dialect)
+    return dialect.own("    for (j = 0; j < NF_JOINTS; ++j) ") + _braces(lines, "    ")
+
+
+def _same_by_joint(one: Program, every: Program, joints: int) -> bool:
+    """True where the law of all joints is that of one, joint by joint."""
+    generator = np.random.default_rng(0)
+    points = {p.name: generator.uniform(0.1, 2.0, (8, joints, len(p.nodes))) for p in one.inputs}
+    alone = evaluate(one.outputs[0].nodes, points)[0]
+    flat = {name: x.reshape(8, -1) for name, x in points.items()}
+    together = np.stack(evaluate(every.outputs[0].nodes, flat), -1)
+    return bool(np.array_equal(np.broadcast_to(alone, together.shape), together, equal_nan=True))
+
+
+def _depends(node: Node, name: str) -> bool:
+    return any(n.op == "input" and n.value[0] == name for n in reachable([node]))
+
+
+def _schedule(controller: Controller, dialect: ControllerC) -> str:
+    """Functions of the coefficients of a schedule of whatever kind, written out for all joints."""
+    schedule, joints = controller.model.schedule, controller.joints
+    motion = {"qd": _example(joints), "qdd": _example(joints)}
+
+    def coefficients(qd: Tensor, qdd: Tensor) -> Tensor:
+        return schedule(qd, qdd).expand(joints, -1)
+
+    def advanced(qd: Tensor, qdd: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
+        following = schedule.advance(qd, qdd, last)
+        found = schedule.coefficients_from(qd, qdd, following)
+        return found.expand(joints, -1), following
+
+    if not controller.remembers:
+        return _function("nf_schedule", trace(coefficients, motion), ("c",), dialect)
+    state = {**motion, "last": _example(joints, controller.memory_size)}
+    start = trace(schedule.initial_state, motion)
+    return "\n".join([
+        _function("nf_schedule_start", start, ("next",), dialect),
+        _function("nf_schedule", trace(advanced, state), ("c", "next"), dialect),
+    ])  # fmt: skip
+
+
+def _function(name: str, program: Program, outputs: Sequence[str], dialect: ControllerC) -> str:
+    bound = {
+        node.number: f"{port.name}[{i}]"
+        for port in program.inputs
+        for i, node in enumerate(port.nodes)
+    }
+    targets, nodes = [], []
+    for output, port in zip(outputs, program.outputs, strict=True):
+        columns = port.shape[-1]
+        for i, node in enumerate(port.nodes):
+            targets.append(f"c[{i % columns}][{i // columns}]" if output == "c" else f"next[{i}]")
+            nodes.append(node)
+    arguments = [f"const REAL {port.name}[NF_JOINTS]" for port in program.inputs[:2]]
+    arguments += [f"const REAL *{port.name}" for port in program.inputs[2:]]
+    kinds = {"c": "REAL c[NF_COEFFICIENTS][NF_JOINTS]", "next": "REAL *next"}
+    arguments += [kinds[output] for output in sorted(outputs, reverse=True)]
+    head = dialect.own(f"static void {name}(\n    {', '.join(arguments)})")
+    lines = _assignments(targets, nodes, bound, dialect)
+    lines += [f"(void){port.name};" for port in program.inputs]
+    return f"{head}\n{_braces(lines, '')}\n"
+
+
+def _assignments(
+    targets: Sequence[str], nodes: Sequence[Node], bound: Mapping[int, str], dialect: ControllerC
+) -> list[str]:
+    """Statements that compute nodes, and store them."""
+    lines, texts = statements(nodes, bound, dialect)
+    return [*lines, *(f"{target} = {text};" for target, text in zip(targets, texts, strict=True))]
+
+
+def _braces(lines: Sequence[str], indent: str) -> str:
+    inside = "".join(f"{indent}    {line}\n" for line in lines)
+    return f"{{\n{inside}{indent}}}"
+
+
+def _example(*size: int) -> Tensor:
+    # All different, so that nothing looks alike by chance.
+    return torch.linspace(0.5, 1.5, math.prod(size), dtype=torch.float64).reshape(size)

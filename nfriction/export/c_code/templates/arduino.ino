@@ -1,0 +1,88 @@
+// {{ title }} on an Arduino. Put this file, {{ name }}.c and {{ name }}.h into one folder that is called
+// {{ name }}; write `read_position` and `write_torque` for your board.
+extern "C" {
+#include "{{ name }}.h"
+}
+#include <Arduino.h>
+
+// Time between calls [us].
+static const unsigned long PERIOD = {{ period }};
+
+#if NF_STATE_SIZE
+static nf_state state;
+#endif
+#if NF_FILTER_SIZE
+static nf_filter filter;
+#endif
+static unsigned long next_call;
+
+// Position [{{ unit }}] of a joint; here from an analogue pin over one turn.
+static double read_position(int joint)
+{
+    return analogRead(A0 + joint) * (6.283185307179586 / 1023.0);
+}
+
+// Hand out the torque that compensates friction [{{ torque_unit }}]; 0 where it is not to be trusted.
+static void write_torque(int joint, nf_real tau, int status)
+{
+    if (status & NF_NOT_FINITE)
+        tau = 0;
+    analogWrite(9 + joint, (int)constrain(128 + 100 * tau, 0, 255));
+}
+
+static void read_positions(double *q)
+{
+    int j;
+    for (j = 0; j < NF_JOINTS; ++j)
+        q[j] = read_position(j);
+}
+
+void setup()
+{
+    double q[NF_JOINTS];
+    read_positions(q);
+#if NF_FILTER_SIZE
+    nf_filter_init(&filter, q);
+#endif
+#if NF_STATE_SIZE
+    nf_real rest[NF_JOINTS] = {0};
+    nf_init(&state, rest, rest);
+#endif
+    next_call = micros();
+}
+
+void loop()
+{
+    static double q[NF_JOINTS];
+    static nf_real qd[NF_JOINTS], qdd[NF_JOINTS];
+    nf_real load[NF_JOINTS], tau[NF_JOINTS];
+    nf_real coefficients[NF_JOINTS * NF_COEFFICIENTS];
+    int status[NF_JOINTS];
+    int j;
+    // Unsigned differences stay right when the clock wraps.
+    if ((long)(micros() - next_call) < 0)
+        return;
+    next_call += PERIOD;
+#if NF_FILTER_SIZE
+    read_positions(q);
+    nf_filter_step(&filter, q, qd, qdd);
+#else
+    // Export with the filter inside for anything better than plain differences.
+    for (j = 0; j < NF_JOINTS; ++j) {
+        const double position = read_position(j);
+        const nf_real velocity = (nf_real)((position - q[j]) * (1e6 / PERIOD));
+        qdd[j] = (velocity - qd[j]) * (nf_real)(1e6 / PERIOD);
+        qd[j] = velocity;
+        q[j] = position;
+    }
+#endif
+    for (j = 0; j < NF_JOINTS; ++j)
+        load[j] = 1;
+#if NF_STATE_SIZE
+    nf_step(&state, qd, qdd, load, tau, coefficients, status);
+#else
+    nf_step(qd, qdd, load, tau, coefficients, status);
+#endif
+    for (j = 0; j < NF_JOINTS; ++j)
+        write_torque(j, tau[j], status[j]);
+}

@@ -1,0 +1,86 @@
+/*
+ * {{ safe(about.model) }}: friction of {{ joints }} joints, made by nfriction {{ safe(about.version) }} (schema {{ about.schema }}).
+ *
+ * Inputs: qd [{{ safe(about.units.qd) }}], qdd [{{ safe(about.units.qdd) }}], load [{{ safe(about.units.load) }}].
+ * Outputs: tau [{{ safe(about.units.tau_f) }}], on the left of M(q) qdd + bias(q, qd) + tau = drive; coefficients:
+{% for coefficient in about.coefficients %}
+ *     {{ safe(coefficient.name) }} [{{ safe(coefficient.unit) }}]
+{% endfor %}
+ * Sample time: {{ "any" if about.sample_time is none else "%r s" % about.sample_time }}.
+ * Joints, in order:
+{% for name in about.joint_names or range(1, joints + 1) %}
+ *     {{ safe(name) if about.joint_names else "joint %d" % name }}
+{% endfor %}
+ * Trained ranges:
+{% for name, edges in about.input_ranges | dictsort %}
+ *     {{ safe(name) }}: {{ safe(edges) }}
+{% endfor %}
+ * Outside them (OUTSIDE): {{ safe(about.edges.outside_input_ranges) }}.
+ * NaN or infinity gives NaN for that joint (NOT_FINITE), under -ffast-math too.
+ * SATURATED: the torque limit.
+ * Torque limit: {{ safe(about.torque_limit) }}.
+ * Filter: {{ safe(about.filter) }}.
+ * Parameters: {{ safe(about.parameter_hash) }}.
+{% for name, value in about.training_data | dictsort %}
+ * Training data: {{ safe(name) }}: {{ safe(value) }}
+{% endfor %}
+ */
+
+#ifndef NF_H
+#define NF_H
+
+#define NF_JOINTS {{ joints }}
+#define NF_COEFFICIENTS {{ coefficients }}
+#define NF_STATE_SIZE {{ state_size }}
+#define NF_FILTER_SIZE {{ filter_size }}
+#define NF_OUTSIDE {{ bits.outside }}
+#define NF_NOT_FINITE {{ bits.not_finite }}
+#define NF_SATURATED {{ bits.saturated }}
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+typedef REAL nf_real;
+
+{% if state_size %}
+/* What the coefficients remember of earlier samples. */
+typedef struct {
+    nf_real memory[NF_JOINTS * NF_STATE_SIZE];
+} nf_state;
+
+/* Memory before the first sample, whose motion is given. */
+void nf_init(nf_state *state, const nf_real qd[NF_JOINTS], const nf_real qdd[NF_JOINTS]);
+
+{% endif %}
+/* Friction torque, coefficients (joint by joint) and status bits of every joint.
+ * No array may be NULL, and no output may lie where an input does. */
+void nf_step(
+{% if state_size %}
+    nf_state *state,
+{% endif %}
+    const nf_real qd[NF_JOINTS], const nf_real qdd[NF_JOINTS], const nf_real load[NF_JOINTS],
+    nf_real tau[NF_JOINTS], nf_real coefficients[NF_JOINTS * NF_COEFFICIENTS],
+    int status[NF_JOINTS]);
+
+{% if filter_size %}
+/* Two causal low-pass filters in series, each of 2 states, and the last position and velocity.
+ * Positions are double: their differences would cost float its digits. */
+typedef struct {
+    double memory[NF_JOINTS * NF_FILTER_SIZE];
+} nf_filter;
+
+/* A filter that has rested at positions q; the same to start anew. */
+void nf_filter_init(nf_filter *filter, const double q[NF_JOINTS]);
+void nf_filter_reset(nf_filter *filter, const double q[NF_JOINTS]);
+
+/* Velocity and acceleration of one more sample, to be taken at the sample time. */
+void nf_filter_step(
+    nf_filter *filter, const double q[NF_JOINTS], nf_real qd[NF_JOINTS], nf_real qdd[NF_JOINTS]);
+
+{% endif %}
+#ifdef __cplusplus
+}
+#endif
+
+#endif

@@ -1,0 +1,1 @@
+"""Artefacts of torch: TorchScript and `torch.export` programs, read back with suspicion."""

@@ -1,0 +1,166 @@
+"""Allowlist of what a program of torch may hold: arithmetic of tensors, and nothing else.
+
+torch evaluates sizes and guards of a `.pt2` as Python, resolves names of functions in it, and a
+TorchScript may read and write files. Whatever is not on the list is refused unread.
+"""
+
+import re
+from collections.abc import Iterator
+from functools import cache
+from typing import Any
+
+import torch
+
+from nfriction.codegen.operations import supported_operations
+from nfriction.export.errors import ExportError
+
+# ATen operations on tensors besides those that can be compiled, without the "_" of in-place forms.
+_MORE = """
+    __and__ __or__ __xor__ _assert_tensor_metadata acosh all any arange argmax argmin asinh atanh
+    broadcast_to bucketize concat copysign cummax cummin cumprod deg2rad diff einsum elu empty erf
+    erfc exp2 expand_as eye flatten floor_divide fmax fmin frac full gelu hardtanh heaviside
+    isfinite isinf leaky_relu linalg_norm linear linspace log10 log2 log_sigmoid log_softmax
+    logaddexp logit matmul movedim moveaxis nan_to_num narrow norm ones outer positive rad2deg
+    reshape_as round scalar_tensor searchsorted sinc size softmax square std swapaxes sym_size take
+    tile to tril triu true_divide type_as unflatten unfold var vdot view_as xlogy zeros
+"""
+# One of those that can be compiled sees memory beyond its tensor, unchecked.
+_TENSORS = {*supported_operations(), *_MORE.split()} - {"_reshape_alias"}
+# Numbers, lists and words of the TorchScript language.
+_WORDS_OF_SCRIPT = """
+    Bool Float FloatImplicit Int IntImplicit ScalarImplicit __contains__ __getitem__ __is__
+    __isnot__ __not__ __range_length append dim extend format is_floating_point item len list numel
+    range tensor prim::Constant prim::If prim::Loop prim::ListConstruct prim::ListUnpack
+    prim::NumToTensor prim::RaiseException prim::TupleConstruct prim::TupleIndex prim::TupleUnpack
+    prim::Uninitialized prim::device prim::dtype prim::layout prim::max prim::min
+    prim::unchecked_cast
+"""
+_LANGUAGE = set(_WORDS_OF_SCRIPT.split())
+# Kinds of arguments in a `.pt2`, after "as_".
+_ARGUMENTS = """
+    bool bools device expr float floats int ints layout memory_format name none optional_tensors
+    scalar_type string sym_int sym_ints tensor tensors
+"""
+_KINDS = {f"as_{kind}" for kind in _ARGUMENTS.split()}
+_EXPRESSION = (
+    r"(?:\b(?:Symbol|Integer|Add|Mul|positive|integer|True)\b|'[a-z]+\d+'|\b[a-z]+\d+\b"
+    r"|\b\d{1,18}\b|\*(?!\*)|[()+,= -])*"
+)
+_SIZE = r"L\['\w+'\]\.size\(\)\[\d+\]"
+_SPEC = (
+    r"(?:null|\"(?:type|context|children_spec|null|\[\]|builtins\.(?:tuple|list|dict))\""
+    r"|[][{}:, 0-9])*"
+)
+# Strings of a program by their key; all others, and all keys, are plain words.
+_WORDS = re.compile(r"-?[\w.]*", re.ASCII)
+_STRINGS = {
+    key: re.compile(pattern, re.ASCII)
+    for key, pattern in {
+        "target": r"torch\.ops\.aten\.\w+\.\w+",
+        "expr_str": _EXPRESSION,
+        "guards_code": rf"{_SIZE} (?:==|!=|<=|>=|<|>) (?:{_SIZE}|\d+)",
+        "in_spec": _SPEC,
+        "out_spec": _SPEC,
+        "torch_version": r"[\w.+]*",
+    }.items()
+}
+# In the source of a TorchScript: words after a dot, and what else leads to an operator.
+_DOTTED = re.compile(rb"\.(?:\s|\\|#[^\n]*)*([A-Za-z_]\w*)")
+_DETOUR = re.compile(rb"__setstate__|\bgetattr\b|\bops\b(?!\.(?:aten|prim)\.)")
+
+
+def check_program(document: Any) -> None:
+    """Refuse the graph of a `.pt2`, as parsed from JSON, that is more than arithmetic of tensors.
+
+    Raises:
+        ExportError: names what it holds.
+    """
+    for key, value in _strings("", document):
+        sound = _STRINGS.get(key, _WORDS).fullmatch(value) is not None
+        if key == "target":
+            sound = sound and _is_overload(*value.split(".")[3:])
+        elif key == "":
+            sound = sound and (not value.startswith("as_") or value in _KINDS)
+        if not sound:
+            raise _foreign(value)
+
+
+def check_source(name: str, content: bytes) -> None:
+    """Refuse a file of a TorchScript that does more than arithmetic of tensors as it is loaded.
+
+    torch evaluates defaults of arguments and constants of classes then, before a graph is there,
+    and lets objects of its own classes restore themselves.
+
+    Args:
+        name: of the file in the archive.
+        content: of the file.
+
+    Raises:
+        ExportError: names what it holds.
+    """
+    found: set[bytes] = set()
+    if name.endswith(".py"):
+        found |= {*_DETOUR.findall(content)} | (_foreign_words() & {*_DOTTED.findall(content)})
+    elif name.endswith(".pkl"):
+        found |= {*re.findall(rb"__setstate__|\bclasses\b", content)}
+    if found:
+        raise _foreign(min(found).decode())
+
+
+@cache
+def _foreign_words() -> frozenset[bytes]:
+    """Names of torch's operators that are more than arithmetic, and of the home of its classes."""
+    names = {schema.name.partition("::")[2] for schema in torch._C._jit_get_all_schemas()}
+    own = {n for n in names if any(map(_is_allowed, (n, f"prim::{n}", f"aten::{n}")))}
+    return frozenset(word.encode() for word in {"classes", *(names - own)})
+
+
+def check_script(graph: Any) -> None:
+    """Refuse a graph of TorchScript, its calls inlined, that is more than arithmetic of tensors.
+
+    Raises:
+        ExportError: names what it holds.
+    """
+    for node in _nodes(graph):
+        if not _is_allowed(node.kind()):
+            raise _foreign(node.kind())
+
+
+def _is_allowed(kind: str) -> bool:
+    """True for a kind of node of TorchScript that is arithmetic of tensors, or of the language."""
+    name = kind.removeprefix("aten::")
+    return name in _LANGUAGE or (name != kind and _is_arithmetic(name))
+
+
+def _is_overload(name: str, overload: str) -> bool:
+    """True for an operator on tensors, not some other attribute of torch's object."""
+    known = getattr(torch.ops.aten, name, None) if _is_arithmetic(name) else None
+    return known is not None and overload in known.overloads()
+
+
+def _is_arithmetic(name: str) -> bool:
+    return name in _TENSORS or (not name.startswith("_") and name.removesuffix("_") in _TENSORS)
+
+
+def _foreign(what: str) -> ExportError:
+    return ExportError(f"it holds {what[:80]!r}, which is no part of a controller.")
+
+
+def _strings(key: str, value: Any) -> Iterator[tuple[str, str]]:
+    """Every string of nested JSON with the key that it lies under, and every key under ""."""
+    if isinstance(value, str):
+        yield key, value
+    elif isinstance(value, dict):
+        for inner_key, inner in value.items():
+            yield "", inner_key
+            yield from _strings(inner_key, inner)
+    elif isinstance(value, list):
+        for inner in value:
+            yield from _strings(key, inner)
+
+
+def _nodes(block: Any) -> Iterator[Any]:
+    for node in block.nodes():
+        yield node
+        for inner in node.blocks():
+            yield from _nodes(inner)

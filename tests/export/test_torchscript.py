@@ -1,0 +1,257 @@
+"""TorchScript: equal to the model, alone with torch, silent, and never half written."""
+
+import json
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from nfriction.export import ExportError, torchscript
+from nfriction.export.contract import verify
+from nfriction.export.controller import controller_of
+from nfriction.export.parity import compare
+from nfriction.export.test_vectors import draw
+from nfriction.export.torch_code.archive import METADATA
+from nfriction.export.torch_code.torchscript import open_torchscript, sample_inputs
+from nfriction.friction.coefficients import Constant
+from nfriction.friction.laws import Coefficient, Law, TorqueFunction
+from nfriction.friction.models import LFM, NFLFM, FrictionModel
+from nfriction.friction.neurofuzzy import NeuroFuzzy
+from nfriction.io.model_info import ModelInfo, parameter_hash
+from tests.export.artefacts import INFO, rising
+from tests.friction.samples import QUADRATIC, named_models, randomise
+
+# Whatever the export lets through fails the test.
+pytestmark = pytest.mark.filterwarnings("error")
+
+
+def load(path: Path) -> torch.nn.Module:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return torch.jit.load(str(path))
+
+
+def assert_equal(model: FrictionModel, path: Path) -> None:
+    inputs = sample_inputs(model, 2000, seed=7)
+    with torch.no_grad():
+        expected, found = model(*inputs), load(path)(*inputs)
+    assert found.dtype == torch.float64
+    # Sums may be taken in another order: some roundings of full scale.
+    assert (found - expected).abs().max() <= 1e-12 * expected.abs().max()
+
+
+@pytest.mark.parametrize("name", named_models())
+def test_every_named_model_scripts_silently_and_equals_itself(name: str, tmp_path: Path) -> None:
+    model = named_models()[name]
+    training = model.training
+    path = torchscript(model, tmp_path / "model.pt")
+    assert_equal(model, path)
+    # The model itself stays as it was.
+    assert model.training == training
+    assert all(p.requires_grad for p in model.parameters())
+
+
+@pytest.mark.parametrize("make", [Constant, NeuroFuzzy])
+def test_a_law_of_ones_own_scripts(make: type, tmp_path: Path) -> None:
+    model = FrictionModel(QUADRATIC, make(QUADRATIC, 2))
+    randomise(model, 0.3)
+    assert_equal(model, torchscript(model, tmp_path / "own.pt"))
+
+
+def test_any_batch_shape_and_nan(tmp_path: Path) -> None:
+    model = named_models()["NFLFM"]
+    loaded = load(torchscript(model, tmp_path / "model.pt"))
+    qd, qdd, load_ = sample_inputs(model, 20, seed=1)
+    flat = loaded(qd, qdd, load_)
+    shaped = loaded(*(x.reshape(4, 5, 3) for x in (qd, qdd, load_)))
+    torch.testing.assert_close(shaped.reshape(20, 3), flat, rtol=1e-12, atol=1e-14)
+    one = loaded(qd[0], qdd[0], load_[0])
+    torch.testing.assert_close(one, flat[0], rtol=1e-12, atol=1e-14)
+    qdd[3, 1] = torch.nan
+    lost = torch.isnan(loaded(qd, qdd, load_))
+    assert lost[3, 1]
+    assert lost.sum() == 1
+
+
+def test_single_precision_models_are_written_in_double(tmp_path: Path) -> None:
+    model = NFLFM(2).to(torch.float32)
+    path = torchscript(model, tmp_path / "model.pt")
+    assert_equal(model.to(torch.float64), path)
+
+
+ALONE = """
+import json, sys
+import torch
+
+files = {"nfriction.json": ""}
+module = torch.jit.load(sys.argv[1], _extra_files=files)
+told = json.loads(files["nfriction.json"])
+inputs = torch.load(sys.argv[2], weights_only=True)
+torch.save(module(*inputs), sys.argv[3])
+assert "nfriction" not in sys.modules
+json.dump(told, sys.stdout)
+"""
+
+
+def test_it_runs_and_tells_of_itself_with_torch_alone(tmp_path: Path) -> None:
+    model = named_models()["NFNLFM"]
+    info = ModelInfo(
+        joint_names=["a", "b", "c"], sample_time=1e-3, input_ranges={"qd": [[-1.0, 1.0]] * 3}
+    )
+    path = torchscript(model, tmp_path / "model.pt", info)
+    inputs = sample_inputs(model, 100, seed=3)
+    torch.save(inputs, tmp_path / "inputs")
+    run = subprocess.run(
+        [sys.executable, "-c", ALONE, path, tmp_path / "inputs", tmp_path / "outputs"],
+        capture_output=True, text=True, cwd=tmp_path, check=False,
+    )  # fmt: skip
+    assert run.returncode == 0, run.stderr
+    found = torch.load(tmp_path / "outputs", weights_only=True)
+    expected = model(*inputs).detach()
+    assert (found - expected).abs().max() <= 1e-12 * expected.abs().max()
+    told = json.loads(run.stdout)
+    assert told["joint_names"] == ["a", "b", "c"]
+    assert told["sample_time"] == 1e-3
+    assert told["input_ranges"] == {"qd": [[-1.0, 1.0]] * 3}
+    assert told["units"]["tau_f"] == "N m"
+    assert told["parameter_hash"] == parameter_hash(model.state_dict())
+    assert METADATA == "nfriction.json"  # others read it by this name
+
+
+# The contract
+
+
+@pytest.mark.parametrize("name", named_models())
+def test_step_gives_all_of_the_contract_to_beyond_the_range(name: str, tmp_path: Path) -> None:
+    model = named_models()[name]
+    check_parity(model, tmp_path / "model.pt", 5000 if not model.state_size else 300)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", named_models())
+def test_parity_over_very_many_points(name: str, tmp_path: Path) -> None:
+    model = named_models()[name]
+    check_parity(model, tmp_path / "model.pt", 200_000 if not model.state_size else 5000)
+
+
+def check_parity(model: FrictionModel, path: Path, points: int) -> None:
+    contract, run = open_torchscript(torchscript(model, path, INFO, torque_limit=50.0))
+    controller = controller_of(model, INFO, torque_limit=50.0)
+    inputs = draw(controller, points, seed=11)
+    parity = compare(controller.run(*inputs), run(*inputs), 1e-12)
+    assert parity.points == points
+    assert parity.passed, parity
+    assert verify(run, contract).passed
+
+
+def test_a_schedule_of_ones_own_is_clamped_in_the_artefact(tmp_path: Path) -> None:
+    check_parity(rising(), tmp_path / "model.pt", 1000)
+
+
+def test_nan_and_infinity_give_nan_from_the_short_call_too(tmp_path: Path) -> None:
+    model = named_models()["NCFM"]  # whose law looks at neither acceleration nor load
+    loaded = load(torchscript(model, tmp_path / "model.pt"))
+    for which in range(3):
+        for bad in (torch.nan, torch.inf, -torch.inf):
+            inputs = sample_inputs(model, 5, seed=2)
+            inputs[which][3, 1] = bad
+            lost = torch.isnan(loaded(*inputs))
+            assert lost[3, 1]
+            assert lost.sum() == 1
+
+
+@pytest.mark.parametrize("name", ["LFM", "ALFM", "NFLFM"])
+def test_the_filter_inside_equals_the_one_outside(name: str, tmp_path: Path) -> None:
+    model = named_models()[name]
+    path = torchscript(model, tmp_path / "model.pt", INFO, with_filter=True)
+    contract, run = open_torchscript(path)
+    assert contract.state_size == 6 + model.state_size
+    assert verify(run, contract).passed
+    assert_equal(model, path)  # the short call takes motions as ever
+
+
+def test_what_is_no_artefact_is_refused(tmp_path: Path) -> None:
+    good = torchscript(LFM(2), tmp_path / "good.pt").read_bytes()
+    bad = tmp_path / "bad.pt"
+    for content in (b"", b"junk", good[: len(good) // 2]):
+        bad.write_bytes(content)
+        with pytest.raises(ExportError, match="no TorchScript"):
+            open_torchscript(bad)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.jit.save(torch.jit.script(torch.nn.Linear(2, 2)), str(bad))
+    with pytest.raises(ExportError, match="not ours"):
+        open_torchscript(bad)
+
+
+# Refusals
+
+
+def law(function: TorqueFunction) -> Law:
+    return Law("odd one", (Coefficient("a", "N m"),), function)
+
+
+def through_numpy(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
+    return coefficients.select(-1, 0) * torch.as_tensor(qd.numpy().copy())
+
+
+def any_number(*inputs: Tensor) -> Tensor:
+    return inputs[2].select(-1, 0) * inputs[0]
+
+
+def without_annotations(qd, load, coefficients, v_smooth):
+    return coefficients.select(-1, 0) * torch.tanh(qd / v_smooth)
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (lambda qd, load, coefficients, v_smooth: coefficients.select(-1, 0) * qd, "the law 'odd "),
+        (through_numpy, "the law 'odd one' does not script.*numpy"),
+        (any_number, "the law 'odd one' does not script.*variable number of arguments"),
+        (without_annotations, "the law 'odd one' does not script.*v_smooth"),
+    ],
+    ids=["lambda", "numpy", "any number", "without annotations"],
+)
+def test_what_does_not_script_is_refused_and_leaves_nothing_behind(
+    function: TorqueFunction, message: str, tmp_path: Path
+) -> None:
+    model = FrictionModel(law(function), Constant(law(function), 2))
+    for _ in range(2):  # a second try must say the same
+        with pytest.raises(ExportError, match=f"(?s){message}"):
+            torchscript(model, tmp_path / "model.pt")
+    assert not list(tmp_path.iterdir())
+    # Nor does it spoil what comes after.
+    torchscript(LFM(2), tmp_path / "good.pt")
+
+
+def training_only(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
+    """A law that computes something else when it is scripted."""
+    if torch.jit.is_scripting():
+        return coefficients.select(-1, 0) * qd * (1 + 1e-9)
+    return coefficients.select(-1, 0) * qd
+
+
+def test_an_artefact_that_differs_from_its_model_is_not_written(tmp_path: Path) -> None:
+    path = torchscript(LFM(2), tmp_path / "model.pt")
+    before = path.read_bytes()
+    model = FrictionModel(law(training_only), Constant(law(training_only), 2))
+    with pytest.raises(ExportError, match=r"differs from its model by 1\.0e-09"):
+        torchscript(model, path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_names_of_the_joints_must_be_one_a_joint(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="name 2 joints"):
+        torchscript(LFM(2), tmp_path / "model.pt", ModelInfo(joint_names=["a"]))
+
+
+def test_an_impossible_path_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match=r"cannot write the file .*model\.pt"):
+        torchscript(LFM(2), tmp_path / "file" / "model.pt")
