@@ -8,19 +8,28 @@ from pathlib import Path
 import numpy as np
 from cases import DT, STEPS, Numbers
 
-from nfriction.codegen import build
+from nfriction.export.c_code.run import find_compiler
 
 
 def hand_written(
     numbers: Numbers, folder: str, *flags: str
 ) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """A function (q0, qd0) -> final state; like ours it records the whole motion."""
-    compiler = build.find_compiler()
+    compiler = find_compiler()
     if compiler is None:
         raise SystemExit("no C compiler found")
     library = Path(folder) / f"limit{abs(hash(flags))}.so"
     source = Path(__file__).with_name("limit.c")
-    options = ["-O3", *build.FLAGS, "-march=native", "-shared", "-fPIC", *flags]
+    options = [
+        "-O3",
+        "-fno-math-errno",
+        "-fno-trapping-math",
+        "-ffp-contract=fast",
+        "-march=native",
+        "-shared",
+        "-fPIC",
+        *flags,
+    ]
     subprocess.run([*compiler, *options, "-o", str(library), str(source), "-lm"], check=True)
     function = ctypes.CDLL(str(library)).limit_rollout
     body = np.concatenate(

@@ -12,7 +12,7 @@ import pytest
 from nfriction import LFM, ModelInfo, Recording, cli, rigs, save
 from nfriction.cli import verify
 from nfriction.cli.console import Parser
-from nfriction.codegen.build import find_compiler
+from nfriction.export.c_code.run import find_compiler
 from tests.friction.samples import randomise
 
 RIG = rigs.tlrip()

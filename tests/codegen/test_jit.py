@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from nfriction.codegen import NoBackend, compile_function
-from nfriction.codegen.build import find_compiler
 from nfriction.codegen.llvm import jit
+from nfriction.export.c_code.run import find_compiler
 
 F64 = torch.float64
 SOURCE = """

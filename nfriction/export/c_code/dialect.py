@@ -11,7 +11,7 @@ from typing import Any
 import jinja2
 import numpy as np
 
-from nfriction.codegen.emit import C
+from nfriction.export.c_code.emit import C
 
 # Functions of C89's math.h; others, and all in single precision, came with C99.
 _C89 = frozenset(

@@ -4,8 +4,8 @@ The exponential of `math.h` is a call for every number. This one is a loop over 
 branches or tables.
 """
 
-from nfriction.codegen.emit import Real
 from nfriction.export.c_code.dialect import ControllerC
+from nfriction.export.c_code.emit import Real
 
 _POLYNOMIAL: dict[Real, tuple[float, ...]] = {
     "double": (1.0, 0.5000000000000012, 0.16666666666666222, 0.0416666666665181,

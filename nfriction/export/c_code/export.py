@@ -6,8 +6,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from nfriction.codegen.emit import Real
 from nfriction.export.c_code.dialect import ControllerC, is_identifier
+from nfriction.export.c_code.emit import Real
 from nfriction.export.c_code.model import source_of
 from nfriction.export.contract import Contract, contract_of
 from nfriction.export.controller import controller_of

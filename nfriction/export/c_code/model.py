@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.codegen.emit import statements
 from nfriction.codegen.errors import UnsupportedOperation
 from nfriction.codegen.graph import Program, trace
 from nfriction.codegen.scalar import Node, evaluate, reachable
 from nfriction.export.c_code.dialect import ControllerC, comment
+from nfriction.export.c_code.emit import statements
 from nfriction.export.c_code.exponential import exponential, spare
 from nfriction.export.controller import (
     FILTER_STATE,
