@@ -51,7 +51,7 @@ static void nf_network(
 {
     REAL seen[NF_SEEN][NF_JOINTS], trust[NF_JOINTS];
     REAL membership[NF_SETS{{ " + 1" if spare(2 * sets * joints) }}][2][NF_JOINTS]{{ " = {{{0}}}" if spare(2 * sets * joints) }};
-    REAL row[NF_SETS][NF_PLANES][NF_JOINTS], plane[NF_PLANES][NF_JOINTS];
+    REAL plane[NF_PLANES][NF_JOINTS];
     REAL unit[NF_UNITS{{ " + 3" if spare(units * joints) }}][NF_JOINTS]{{ " = {{0}}" if spare(units * joints) }};
     int s, i, k, j;
 
@@ -86,14 +86,14 @@ static void nf_network(
     nf_exp(&membership[0][0][0], NF_SETS * 2 * NF_JOINTS{{ spare(2 * sets * joints) }}, 0);
 
     /* 3. A rule fires by the product of its memberships: its plane is blended with the others'. */
-    for (s = 0; s < NF_SETS; ++s)
-        for (i = 0; i < NF_PLANES; ++i)
-            for (j = 0; j < NF_JOINTS; ++j)
-                row[s][i][j] = membership[s][0][j] * (
-                    {{ sum("NF_PLANE[@][s][i][j] * membership[@][1][j]", sets, 20) }});
     for (i = 0; i < NF_PLANES; ++i)
-        for (j = 0; j < NF_JOINTS; ++j)
-            plane[i][j] = {{ sum("row[@][i][j]", sets, 16) }};
+        for (j = 0; j < NF_JOINTS; ++j) {
+            REAL blend = 0;
+            for (s = 0; s < NF_SETS; ++s)
+                blend += membership[s][0][j] * (
+                    {{ sum("NF_PLANE[@][s][i][j] * membership[@][1][j]", sets, 20) }});
+            plane[i][j] = blend;
+        }
 
     /* 4. Coefficients by the rules, whose firing strengths are divided by their sum. */
     for (j = 0; j < NF_JOINTS; ++j) {
