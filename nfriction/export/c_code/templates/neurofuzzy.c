@@ -1,3 +1,4 @@
+{% set per_reach = "" if per_reach in ("1.0", "1.0f") else per_reach ~ " * " %}
 /*
  * Coefficients by a neuro-fuzzy network of each joint: Gaussian sets of |qd| and of qdd, a rule for
  * every pair of them, and a head of radial units that adds a correction. The joint is the last
@@ -61,8 +62,8 @@ static void nf_network(
         const REAL acceleration = NF_GAIN[1][j] * ({{ "sign[j] * qdd[j]" if along_motion else "qdd[j]" }}) + NF_SHIFT[1][j];
         seen[0][j] = nf_min(nf_max(speed, -1), 1);
         seen[1][j] = nf_min(nf_max(acceleration, -1), 1);
-        trust[j] = nf_square({{ per_reach }} * (speed - seen[0][j]))
-            + nf_square({{ per_reach }} * (acceleration - seen[1][j]));
+        trust[j] = nf_square({{ per_reach }}(speed - seen[0][j]))
+            + nf_square({{ per_reach }}(acceleration - seen[1][j]));
         trust[j] = nf_square(nf_max(1 - trust[j], 0));
     }
 
