@@ -61,6 +61,7 @@ def hybrid_step(
         gradients = torch.autograd.grad(error.sum(), [anfis.partition.centres, *logs])
     with torch.no_grad():
         values = [anfis.partition.centres, *(log.exp() for log in logs)]
+        # d/dv = (d/dlog v) / v.
         natural = [gradients[0]] + [
             gradient / value for gradient, value in zip(gradients[1:], values[1:], strict=True)
         ]
@@ -107,6 +108,7 @@ def train_hybrid(
     for epoch in range(epochs):
         before = {name: value.detach().clone() for name, value in anfis.named_parameters()}
         error = hybrid_step(anfis, x, y, length, prior_precision=prior_precision)
+        # The error is that of the sets before the step with consequents solved for them.
         before["consequents"] = anfis.consequents.detach().clone()
         better = error < best
         best = torch.where(better, error, best)

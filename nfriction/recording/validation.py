@@ -47,6 +47,7 @@ def read_only(values: ArrayLike, key: str) -> Array:
             f"`{key}` must be a rectangular array of numbers ({error}); "
             f"every sample needs a number for every joint."
         ) from error
+    # Recordings are shared between fits, and a digest must stay true.
     array.setflags(write=False)
     return array
 

@@ -197,6 +197,7 @@ def _sources(table: pd.DataFrame, columns: dict[str, str]) -> dict[str, Source]:
         for key, spec in columns.items()
     }
     found = {key: source for key, source in mapped.items() if source is not None}
+    # A column that is mapped to one key must not also be found by its own name.
     claimed = {aliases.get(s.column, s.column) for s in found.values()}
     for name in (*names, *aliases):
         if OURS.fullmatch(name) and name not in columns and aliases.get(name, name) not in claimed:
@@ -207,6 +208,7 @@ def _sources(table: pd.DataFrame, columns: dict[str, str]) -> dict[str, Source]:
 def _known(table: pd.DataFrame, aliases: dict[str, str], source: Source) -> Source:
     """A source by the table's own name for it, with the unit in the file."""
     column = aliases.get(source.column, source.column)
+    # pandas renames repeated columns, so that the first would be taken silently.
     if column in table.attrs.get("repeated", ()) or (table.columns == column).sum() > 1:
         raise ValueError(f"column {column} is there more than once; rename one of them.")
     written = _texts(table, "units").get(column)
