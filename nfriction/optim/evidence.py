@@ -144,7 +144,7 @@ class EvidenceResult:
 
     @property
     def converged(self) -> bool:
-        """Whether the fit ended at a maximum of the evidence or at the noise floor."""
+        """True at a maximum of the evidence or at the noise floor."""
         return self.status in ("converged", "noise_floor")
 
     @property
@@ -288,7 +288,7 @@ class _Fit:
         self.state = replace(self.state, alpha=alpha, beta=beta)
 
     def _settled(self, known: Posterior) -> bool:
-        """Whether the log evidence is stationary in w, log alpha and log beta."""
+        """True where the log evidence is stationary in w, log alpha and log beta."""
         alpha, gamma, tolerance = self.state.alpha, known.gamma, self.options.tolerance
         assert alpha is not None
         # Derivatives of the log evidence by log alpha are (gamma - 2 alpha E_g) / 2.

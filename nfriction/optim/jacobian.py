@@ -42,7 +42,7 @@ class NormalEquations(NamedTuple):
 
     @property
     def finite(self) -> bool:
-        """Whether every entry is a finite number."""
+        """True if every entry is a finite number."""
         return all(bool(torch.isfinite(part).all()) for part in self)
 
 
@@ -55,7 +55,7 @@ class SharedColumns(Protocol):
 
 
 def shares_columns(model: object) -> bool:
-    """Whether a module offers the columns that its outputs share."""
+    """True for a module that offers the columns that its outputs share."""
     names = ("jacobian_columns", "jacobian_maps", "readout")
     return all(callable(getattr(model, name, None)) for name in names)
 

@@ -106,7 +106,7 @@ class Recording:
 
     @property
     def is_uniform(self) -> bool:
-        """Whether all steps are alike but for the rounding of the stamps."""
+        """True if all steps are equal up to the rounding of the stamps."""
         return is_uniform(self.time)
 
     def __len__(self) -> int:

@@ -18,7 +18,7 @@ LARGE_STAMP = 1e6
 
 
 def is_uniform(time: Array) -> bool:
-    """Whether all steps between stamps are alike.
+    """True if all steps between stamps are equal up to rounding.
 
     Stamps rounded to a microsecond at 1 kHz differ by 1e-3 of a step; real jitter is larger.
     """

@@ -175,7 +175,7 @@ def _unique(names: Iterable[str]) -> list[str]:
 
 
 def _all_numbers_with(cells: pd.Series, form: re.Pattern[str], sign: str) -> bool:
-    """Whether some cells have this decimal sign, and all that have are numbers."""
+    """True if cells with this decimal sign exist and all of them are numbers."""
     holding = cells[cells.str.contains(sign, regex=False, na=False)]
     return len(holding) > 0 and bool(holding.str.fullmatch(form).all())
 
