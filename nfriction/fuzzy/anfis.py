@@ -83,6 +83,7 @@ class Anfis(LinearOutputModule):
         self.consequents = nn.Parameter(
             torch.zeros(groups, outputs, self.rules, columns, dtype=dtype)
         )
+        # A valid partition from the start, before data place the sets.
         self.init_grid(-1.0, 1.0)
 
     def extra_repr(self) -> str:
@@ -101,6 +102,7 @@ class Anfis(LinearOutputModule):
             Shape (*batch, groups, outputs).
         """
         columns = to_columns(x)
+        # (groups, outputs * columns, rules): one product blends all consequents.
         weights = self.consequents.transpose(2, 3).flatten(1, 2)
         blended = torch.bmm(weights, self.strength_columns(columns))
         if self.order == 1:
@@ -205,6 +207,7 @@ class Anfis(LinearOutputModule):
         shares = uses @ strengths
         sets = F[:, shared:].unflatten(1, (self.outputs, own // z.shape[1], z.shape[1]))
         for k in range(self.outputs):
+            # s_r f_kr of every rule.
             weighted = torch.bmm(self.consequents[:, k], terms).mul_(strengths)
             Q = (uses @ weighted).addcmul_(shares, weighted.sum(1, keepdim=True), value=-1.0)
             torch.mul(Q, h, out=sets[:, k, 0])
@@ -232,6 +235,7 @@ class Anfis(LinearOutputModule):
 
     def readout(self) -> Tensor:
         """The consequents as (groups, outputs, regressors)."""
+        # The regressors have the same order: rule by rule, inputs then 1.
         return self.consequents.flatten(2)
 
     @property

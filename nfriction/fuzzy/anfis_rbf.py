@@ -1,6 +1,7 @@
 """ANFIS with a radial basis head: the layer carries the fit, the head refines it."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -16,9 +17,10 @@ class AnfisRBF(GroupedModule):
     The ANFIS carries the fit, the head refines it; the output of a fresh head is zero.
 
     Args:
-        groups, inputs, terms, outputs, order, kind, interpretable: of the layer, see `Anfis`.
-        units: units of the head.
+        groups, inputs, terms, outputs: of the layer, see `Anfis`.
+        units: of the head.
         seed: of the head's fresh centres.
+        options: of the layer: order, kind, interpretable, dtype.
     """
 
     def __init__(
@@ -29,24 +31,13 @@ class AnfisRBF(GroupedModule):
         outputs: int,
         *,
         units: int = 10,
-        order: int = 1,
-        kind: str = "gaussian",
-        interpretable: bool = False,
         seed: int = 0,
-        dtype: torch.dtype = torch.float64,
+        **options: Any,
     ) -> None:
         super().__init__()
         self.groups, self.inputs, self.outputs = groups, inputs, outputs
-        self.anfis = Anfis(
-            groups,
-            inputs,
-            terms,
-            outputs,
-            order=order,
-            kind=kind,
-            interpretable=interpretable,
-            dtype=dtype,
-        )
+        self.anfis = Anfis(groups, inputs, terms, outputs, **options)
+        dtype = self.anfis.consequents.dtype
         self.head = RBFNetwork(groups, inputs + outputs, units, outputs, seed=seed, dtype=dtype)
         # A fresh head changes nothing.
         nn.init.zeros_(self.head.output_weight)

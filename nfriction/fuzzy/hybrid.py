@@ -1,4 +1,4 @@
-"""The classical hybrid learning of ANFIS: least squares forward, one short gradient step back."""
+"""Jang's hybrid learning of ANFIS: least squares forward, one short gradient step back."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from torch import Tensor
 from nfriction.fuzzy.anfis import Anfis
 from nfriction.fuzzy.partition import FreePartition
 
-_INTERVAL = 4  # epochs that a step size is kept at least
+# Jang's heuristic: epochs that a step size is kept at least, and factors of its change.
+_INTERVAL, _INCREASE, _DECREASE = 4, 1.1, 0.9
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,7 @@ def hybrid_step(
         gradients = torch.autograd.grad(error.sum(), [anfis.partition.centres, *logs])
     with torch.no_grad():
         values = [anfis.partition.centres, *(log.exp() for log in logs)]
+        # d/dv = (d/dlog v) / v.
         natural = [gradients[0]] + [
             gradient / value for gradient, value in zip(gradients[1:], values[1:], strict=True)
         ]
@@ -68,7 +70,7 @@ def hybrid_step(
         rate = wanted / length.clamp(min=torch.finfo(length.dtype).tiny)
         anfis.partition.centres.sub_(rate.unsqueeze(1) * natural[0])
         for log, value, gradient in zip(logs, values[1:], natural[1:], strict=True):
-            # A step that would cross zero stops at a tenth of the way.
+            # A step toward zero or beyond stops at a tenth of the value.
             log.copy_(torch.maximum(value - rate.unsqueeze(1) * gradient, 0.1 * value).log())
     return error.detach().sqrt()
 
@@ -80,15 +82,13 @@ def train_hybrid(
     epochs: int = 20,
     *,
     step: float = 0.01,
-    increase: float = 1.1,
-    decrease: float = 0.9,
     prior_precision: float = 1e-6,
     callback: Callable[[int, Tensor], None] | None = None,
 ) -> HybridResult:
     """Train by `hybrid_step` with Jang's step-size heuristic; the best epoch's layer is kept.
 
-    The step grows by `increase` after four falls of the error in a row and shrinks by `decrease`
-    after two oscillations (up, down, up, down), each group for itself.
+    The step grows by 10 % after four falls of the error in a row and shrinks by 10 % after two
+    oscillations (up, down, up, down), each group for itself.
 
     Args:
         anfis: layer with free sets, trained in place.
@@ -108,6 +108,7 @@ def train_hybrid(
     for epoch in range(epochs):
         before = {name: value.detach().clone() for name, value in anfis.named_parameters()}
         error = hybrid_step(anfis, x, y, length, prior_precision=prior_precision)
+        # The error is that of the sets before the step with consequents solved for them.
         before["consequents"] = anfis.consequents.detach().clone()
         better = error < best
         best = torch.where(better, error, best)
@@ -119,7 +120,7 @@ def train_hybrid(
         }
         errors.append(error)
         lengths.append(length)
-        length = _adapt(length, errors, changed, epoch, increase, decrease)
+        length = _adapt(length, errors, changed, epoch)
         if callback is not None:
             callback(epoch, error)
     with torch.no_grad():
@@ -128,14 +129,7 @@ def train_hybrid(
     return HybridResult(torch.stack(errors), torch.stack(lengths))
 
 
-def _adapt(
-    length: Tensor,
-    errors: list[Tensor],
-    changed: Tensor,
-    epoch: int,
-    increase: float,
-    decrease: float,
-) -> Tensor:
+def _adapt(length: Tensor, errors: list[Tensor], changed: Tensor, epoch: int) -> Tensor:
     """Next step length of each group; `changed` keeps the epochs of the last fall and growth."""
     if len(errors) <= _INTERVAL:
         return length
@@ -146,6 +140,5 @@ def _adapt(
     grow = (change < 0).all(0) & due[1] & ~shrink
     changed[0, shrink.cpu()] = epoch
     changed[1, grow.cpu()] = epoch
-    return length * (
-        1.0 + (increase - 1.0) * grow.to(length) + (decrease - 1.0) * shrink.to(length)
-    )
+    change = (_INCREASE - 1.0) * grow.to(length) + (_DECREASE - 1.0) * shrink.to(length)
+    return length * (1.0 + change)

@@ -118,6 +118,7 @@ class OrderedPartition(nn.Module):
             c = centres[:, start : start + terms]
             half = widths[:, start : start + terms] * self.half_width
             spacing = c.diff(dim=1) / (half[:, :-1] + half[:, 1:])
+            # The inverse of `forward`: margins and spacings as shares of their open intervals.
             share = torch.cat(
                 [
                     (c[:, :1] - self.lower[:, i : i + 1]) / half[:, :1],

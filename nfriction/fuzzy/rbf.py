@@ -149,6 +149,7 @@ class RBFNetwork(LinearOutputModule):
             Shapes (groups, units, 1), (groups, units, 2 inputs) and (groups, 2 inputs, samples).
         """
         columns = to_columns(x)
+        # Expanding about zero would cancel digits where inputs lie far from it.
         middle = self.centres.mean(1)
         offset = self.centres - middle.unsqueeze(1)
         v = columns - middle.unsqueeze(-1)
@@ -244,6 +245,7 @@ def _kmeans(samples: Tensor, units: int, seed: int) -> Tensor:
     """Centres of `units` clusters, shape (units, inputs), inputs weighed by their deviation."""
     from scipy.cluster.vq import kmeans2  # slow to import, and seldom needed
 
+    # k-means is not invariant to the units of its inputs.
     scale = samples.std(0)
     centres, _ = kmeans2((samples / scale).cpu().numpy(), units, iter=50, minit="++", seed=seed)
     return torch.as_tensor(centres).to(samples) * scale
@@ -274,6 +276,7 @@ def _selected(samples: Tensor, targets: Tensor, units: int, widths: Tensor) -> T
     candidates = _thin(samples, _CANDIDATES)
     columns = torch.exp(-0.5 * torch.cdist(samples / widths, candidates / widths) ** 2)
     power = (columns**2).sum(0)
+    # The output bias explains the means.
     columns, left = columns - columns.mean(0), targets - targets.mean(0)
     left = left / left.norm(dim=0).clamp(min=torch.finfo(left.dtype).tiny)
     chosen: list[int] = []

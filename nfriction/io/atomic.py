@@ -29,6 +29,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         temporary.open("xb").close()
         yield temporary
         with temporary.open("rb+") as file:
+            # Else a power failure could leave the new name with no content.
             os.fsync(file.fileno())
         temporary.replace(path)
     except OSError as error:

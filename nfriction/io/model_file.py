@@ -223,6 +223,7 @@ def _check_same_model(content: Mapping[str, Any], model: FrictionModel) -> None:
         "v_smooth": (content["v_smooth"], model.v_smooth),
         "options": (content["options"], model.options()),
     }
+    # By key, so that the message names the first difference.
     for key, (ours, theirs) in pairs.items():
         if ours != theirs:
             raise ValueError(

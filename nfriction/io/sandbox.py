@@ -51,6 +51,7 @@ def run_isolated(module: str, task: Mapping[str, Any], folder: Path, *, seconds:
         InvalidFile: the worker refused the file.
         WorkerDied: the worker ended otherwise than by returning.
     """
+    # The worker imports from the same places as this process.
     path = os.pathsep.join(place or os.getcwd() for place in sys.path)
     temporary = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(folder))
     request = {"folder": str(folder), "seconds": seconds, "task": dict(task)}
@@ -64,6 +65,7 @@ def run_isolated(module: str, task: Mapping[str, Any], folder: Path, *, seconds:
             )  # fmt: skip
         except subprocess.TimeoutExpired:
             raise WorkerDied("it does not come to an end") from None
+        # By a file: printed text could come from the library, exit codes cannot hold a message.
         refusal = folder / _REFUSAL
         if refusal.exists():
             raise InvalidFile(refusal.read_text(encoding="utf-8", errors="replace"))
@@ -105,6 +107,7 @@ def _limit(seconds: float, memory: int) -> None:
         resource.RLIMIT_CPU: math.ceil(time.process_time() + seconds),
         resource.RLIMIT_AS: memory,
         resource.RLIMIT_FSIZE: memory // _FILE_SHARE,
+        # A core dump of gigabytes helps nobody.
         resource.RLIMIT_CORE: 0,
     }
     for kind, bound in bounds.items():

@@ -144,7 +144,7 @@ class EvidenceResult:
 
     @property
     def converged(self) -> bool:
-        """Whether the fit ended at a maximum of the evidence or at the noise floor."""
+        """True at a maximum of the evidence or at the noise floor."""
         return self.status in ("converged", "noise_floor")
 
     @property
@@ -283,13 +283,15 @@ class _Fit:
         curvature = group_sums(local.JtJ.diagonal(), problem.groups, count) / sizes
         # A group without influence at the start has no curvature to compare with.
         curvature = torch.where(curvature > 0, curvature, local.JtJ.diagonal().mean())
+        # Far below the data: the first step is nearly plain least squares.
         alpha = 1e-6 * beta * torch.where(curvature > 0, curvature, 1.0)
         self.state = replace(self.state, alpha=alpha, beta=beta)
 
     def _settled(self, known: Posterior) -> bool:
-        """Whether the log evidence is stationary in w, log alpha and log beta."""
+        """True where the log evidence is stationary in w, log alpha and log beta."""
         alpha, gamma, tolerance = self.state.alpha, known.gamma, self.options.tolerance
         assert alpha is not None
+        # Derivatives of the log evidence by log alpha are (gamma - 2 alpha E_g) / 2.
         off = (gamma - 2 * alpha * known.parameter_squares).abs() / gamma.clamp(min=1)
         unexplained = self.problem.samples - float(gamma.sum())
         noise_off = abs(unexplained - 2 * self.state.beta * float(self.local.squares))
@@ -320,6 +322,7 @@ class _Fit:
             scale, factor = factorise(system + damping * system.diagonal().diag())
             step = -scale * torch.cholesky_solve((scale * slope)[:, None], factor)[:, 0]
             predicted = -float(2 * slope @ step + step @ (system @ step))
+            # Only a nearly undamped step proves that nothing is left to gain.
             if damping <= 1 and predicted <= rounding:
                 # The parameters are optimal for these alpha and beta: only those change.
                 self.state = replace(state, step=state.step + 1)

@@ -42,7 +42,7 @@ class NormalEquations(NamedTuple):
 
     @property
     def finite(self) -> bool:
-        """Whether every entry is a finite number."""
+        """True if every entry is a finite number."""
         return all(bool(torch.isfinite(part).all()) for part in self)
 
 
@@ -55,7 +55,7 @@ class SharedColumns(Protocol):
 
 
 def shares_columns(model: object) -> bool:
-    """Whether a module offers the columns that its outputs share."""
+    """True for a module that offers the columns that its outputs share."""
     names = ("jacobian_columns", "jacobian_maps", "readout")
     return all(callable(getattr(model, name, None)) for name in names)
 
@@ -155,6 +155,7 @@ def normal_equations(
     JtJ, Jte, squares = inputs.new_zeros(p, p), inputs.new_zeros(p), inputs.new_zeros(())
     for rows, output, jacobians in jacobian_pieces(model, parameters, inputs, chunk):
         error = _errors(output, targets[rows])
+        # Weighted least squares: rows and errors scale by the weight's root.
         root = None
         if weights is not None:
             root = weights[rows].reshape(len(error), -1).sqrt().expand_as(error)
@@ -235,6 +236,7 @@ def _from_columns(
     count = sum(value.numel() for value in parameters.values())
     JtJ, Jte = inputs.new_zeros(count, count), inputs.new_zeros(count)
     squares = inputs.new_zeros(())
+    # Groups share no parameter: J^T J is block diagonal.
     for group, gram in enumerate(grams.unbind(0)):
         where = _entries(parameters, len(grams), group).to(inputs.device)
         map_ = torch.cat([maps[name][group] for name in parameters], -1)

@@ -133,9 +133,11 @@ def reestimate(
         The new alpha, shape (groups,), and beta.
     """
     curvature = group_sums(local.JtJ.diagonal(), problem.groups, len(alpha))
+    # As many parameters as samples would leave no noise at all.
     beta = float((problem.samples - known.gamma.sum()).clamp(min=1e-3) / (2 * local.squares))
     beta = min(beta, largest_beta)
     limit = LARGEST_RATIO * beta * curvature
+    # A group without curvature has no scale for a limit.
     limit = torch.where(limit > 0, limit, alpha)
     estimate = torch.minimum(known.gamma / (2 * known.parameter_squares), limit)
     usable = (known.parameter_squares > 0) & (estimate > 0)

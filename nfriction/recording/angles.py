@@ -63,6 +63,7 @@ class AngleConvention:
         """
         settings: dict[str, str] = {}
         for word in re.split(r"[\s,;/_+-]+", text.strip().lower()):
+            # The two vocabularies share no word, so that the order does not matter.
             key = "angles" if word in get_args(Angles) else "measured_from"
             if word not in get_args(Angles) + get_args(MeasuredFrom) or key in settings:
                 raise ValueError(

@@ -70,6 +70,7 @@ class Recording:
         convention = None if self.convention is None else AngleConvention.of(self.convention)
         joints = np.shape(arrays["q"])[-1] if np.ndim(arrays["q"]) else 0
         names = tuple(self.names) or tuple(f"joint{k + 1}" for k in range(joints))
+        # A frozen dataclass can only normalise its fields this way.
         for key, value in (arrays | {"convention": convention, "names": names}).items():
             object.__setattr__(self, key, value)
         check(arrays, self.names, self.unit)
@@ -105,7 +106,7 @@ class Recording:
 
     @property
     def is_uniform(self) -> bool:
-        """Whether all steps are alike but for the rounding of the stamps."""
+        """True if all steps are equal up to the rounding of the stamps."""
         return is_uniform(self.time)
 
     def __len__(self) -> int:
@@ -261,6 +262,7 @@ class Recording:
         arrays, slides, remarks = formats.table_arrays(table, columns, degrees=degrees)
         found: Unit | None = None if slides is None else "m" if slides else "rad"
         written = attributes.get("unit")
+        # The file's own word for what `degrees` states.
         if degrees and written == "deg":
             written = None
         unit = unit or written or found or "rad"
@@ -316,6 +318,7 @@ class Recording:
             ImportError: a format whose library is not installed.
             ValueError: broken content or missing columns; names the file.
         """
+        # Before the file is read, so that a wrong argument does not blame the file.
         if convention is not None:
             convention = AngleConvention.of(convention)
         table = formats.read_table(path, list((columns or {}).values()))

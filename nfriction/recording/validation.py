@@ -18,7 +18,7 @@ LARGE_STAMP = 1e6
 
 
 def is_uniform(time: Array) -> bool:
-    """Whether all steps between stamps are alike.
+    """True if all steps between stamps are equal up to rounding.
 
     Stamps rounded to a microsecond at 1 kHz differ by 1e-3 of a step; real jitter is larger.
     """
@@ -47,6 +47,7 @@ def read_only(values: ArrayLike, key: str) -> Array:
             f"`{key}` must be a rectangular array of numbers ({error}); "
             f"every sample needs a number for every joint."
         ) from error
+    # Recordings are shared between fits, and a digest must stay true.
     array.setflags(write=False)
     return array
 

@@ -109,6 +109,7 @@ def causal_motion(
     time, q = check_motion(time, q)
     low_pass = SecondOrderLowPass(cutoff_hz, float(np.median(np.diff(time))), damping)
     qd = low_pass(frequency_counting(time, q, counts_per_revolution, offset=offset))
+    # A difference needs a past sample; the first has none.
     rate = np.zeros_like(qd)
     rate[1:] = np.diff(qd, axis=0) / np.diff(time)[:, None]
     measured = quantise(q, counts_per_revolution, offset=offset)

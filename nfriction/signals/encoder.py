@@ -89,8 +89,10 @@ def frequency_counting(
     for joint in range(q.shape[1]):
         step = np.diff(counts[:, joint])
         edges = np.flatnonzero(step) + 1
+        # One edge gives a place but no time to travel.
         if len(edges) < 2:
             continue
+        # An edge lies half a count before the new count, on the side it came from.
         place = counts[edges, joint] - 0.5 * np.sign(step[edges - 1])
         moment = latched[edges, joint]
         if np.any(np.diff(moment) <= 0):

@@ -55,6 +55,7 @@ def kalman_smoother(
     joints = q.shape[1]
     sigma = None if noise is None else _per_joint(noise, joints, "noise")
     density = None if jerk_density is None else _per_joint(jerk_density, joints, "jerk_density")
+    # Far from zero the position's digits would be lost in the smoother's products.
     centred = q - q[0]
     if sigma is None or density is None:
         sigma, bandwidth = _most_likely(steps, centred, sigma, density)
@@ -81,6 +82,7 @@ def _smooth(delta: Array, process: Array, y: Array) -> tuple[Array, Array]:
     mean, covariance = _initial(spans, series)
     predicted, filtered, settled = _covariances(transition, diffusion, covariance)
     means = _filter(transition, predicted, mean, series)
+    # Smoother gain C = P F^T (F P F^T + Q)^-1, from its transpose as the predictions are symmetric.
     gain = np.linalg.solve(predicted[1:], transition @ filtered[:-1]).swapaxes(-1, -2)
     means[:-1] -= gain @ (transition @ means[:-1])
     for k in range(len(y) - 2, -1, -1):
@@ -89,6 +91,7 @@ def _smooth(delta: Array, process: Array, y: Array) -> tuple[Array, Array]:
     k = len(y) - 2
     while k >= 0:
         filtered[k] += gain[k] @ filtered[k + 1] @ gain[k].swapaxes(-1, -2)
+        # Far from both ends a uniform record has one covariance.
         if k > settled and _settled(filtered[k], filtered[k + 1]):
             filtered[settled:k] = filtered[k]
             k = settled
@@ -105,6 +108,7 @@ def _most_likely(
     search is on a grid, with up to eight stretches of the record as independent series.
     """
     step = float(np.median(steps))
+    # Stretches of 1000 samples determine two noise parameters well; more only cost time.
     length = min(len(q), 1000)
     first = np.linspace(0, len(q) - length, min(8, len(q) // length)).astype(int)
     grid = np.geomspace(2e-3, 2.0, 19)  # bandwidth · step
@@ -178,6 +182,7 @@ def _model(delta: Array, process: Array) -> tuple[Array, Array]:
         one = _model(delta[:1], process)
         shape = (*delta.shape, ORDER, ORDER)
         return np.broadcast_to(one[0], shape), np.broadcast_to(one[1], shape)
+    # Powers of a long gap would swamp all other entries.
     delta = np.minimum(delta, FARTHEST)
     order = np.arange(ORDER)
     ahead = order - order[:, None]

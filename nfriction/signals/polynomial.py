@@ -68,6 +68,7 @@ def _smoothed(time: Array, q: Array, window: int, order: int) -> Array:
         )
     first = np.clip(np.arange(len(time)) - window // 2, 0, len(time) - window)
     smoothed = np.empty((3, *q.shape))
+    # In parts: each sample has a design matrix of its own, which add up to much memory.
     for part in np.array_split(np.arange(len(time)), math.ceil(len(time) / 4096)):
         samples = first[part, None] + np.arange(window)
         coefficients = local_polynomial(time[samples] - time[part, None], q[samples], order)
@@ -115,6 +116,7 @@ def local_polynomial(span: Array, q: Array, order: int) -> Array:
         span: time from the moment asked for [s], (batch, sample).
         q: (batch, sample, joint).
     """
+    # Powers of a span scaled to 1 keep the normal equations well conditioned.
     scale = np.abs(span).max(axis=1, keepdims=True)[..., None]
     powers = np.arange(order + 1)
     basis = (span[..., None] / scale) ** powers

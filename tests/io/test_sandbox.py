@@ -10,7 +10,6 @@ from nfriction.io import sandbox
 
 WORK = """
 import os, pathlib, sys, tempfile, time
-from nfriction.io import sandbox as apart
 from nfriction.io import sandbox
 
 def work(task, folder):

@@ -66,6 +66,7 @@ class _Reader:
             content = self.group(item, depth) if hasattr(item, "keys") else {}
             return _struct_array(content)
         self.bytes += int(item.size or 0) * item.dtype.itemsize
+        # Before it is read: chunks that were never written take no space in the file.
         refuse_bomb(self.bytes, self.size)
         if item.dtype.kind == "O":
             return self._referred(item, depth)

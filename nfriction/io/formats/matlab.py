@@ -76,6 +76,7 @@ def _check_unpacked_size(content: bytes) -> None:
     at, unpacked = _HEADER, 0
     while at + 8 <= len(content):
         kind, size = struct.unpack_from(f"{order}II", content, at)
+        # Elements at the top level are not padded.
         at += 8 + size
         if kind == _COMPRESSED:
             limit = most_unpacked(len(content)) - unpacked + 1

@@ -72,7 +72,9 @@ def choose_signals(
         signals[path] = values
         if len(signals) > MOST:
             raise ValueError(f"it holds more than {MOST} signals")
+    # Paths win over names, for names in a file are arbitrary.
     signals = _controldesk(content) | signals
+    # A matrix called q holds a joint in each column.
     for key in ("q", "qd", "tau"):
         for k in range(MOST_COLUMNS):
             if f"{key}[{k}]" not in signals:

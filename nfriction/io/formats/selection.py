@@ -133,7 +133,7 @@ def column_numbers(table: pd.DataFrame, column: str) -> Array:
 
 
 def is_number(cell: object) -> bool:
-    """Whether Python reads a cell as a float."""
+    """True if Python reads the cell as a float."""
     try:
         float(cell)  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
@@ -148,12 +148,12 @@ def canonical_unit(text: str) -> str:
 
 
 def is_unit(text: str) -> bool:
-    """Whether text is a unit of some column."""
+    """True for a unit of any kind of column."""
     return any(_per_si(kind, text) is not None for kind in _PER_SI)
 
 
 def slides(unit: str) -> bool:
-    """Whether a position in this unit is that of a sliding joint."""
+    """True for the unit of a sliding joint."""
     return canonical_unit(unit) in ("m", "mm")
 
 
@@ -184,7 +184,7 @@ def _per_si(kind: str, unit: str) -> float | None:
 
 
 def _sources(table: pd.DataFrame, columns: dict[str, str]) -> dict[str, Source]:
-    """Where each of time, q1 … comes from."""
+    """Sources of time, q1 … by our names."""
     unknown = [key for key in columns if not OURS.fullmatch(key)]
     if unknown:
         raise ValueError(
@@ -197,6 +197,7 @@ def _sources(table: pd.DataFrame, columns: dict[str, str]) -> dict[str, Source]:
         for key, spec in columns.items()
     }
     found = {key: source for key, source in mapped.items() if source is not None}
+    # A column that is mapped to one key must not also be found by its own name.
     claimed = {aliases.get(s.column, s.column) for s in found.values()}
     for name in (*names, *aliases):
         if OURS.fullmatch(name) and name not in columns and aliases.get(name, name) not in claimed:
@@ -207,6 +208,7 @@ def _sources(table: pd.DataFrame, columns: dict[str, str]) -> dict[str, Source]:
 def _known(table: pd.DataFrame, aliases: dict[str, str], source: Source) -> Source:
     """A source by the table's own name for it, with the unit in the file."""
     column = aliases.get(source.column, source.column)
+    # pandas renames repeated columns, so that the first would be taken silently.
     if column in table.attrs.get("repeated", ()) or (table.columns == column).sum() > 1:
         raise ValueError(f"column {column} is there more than once; rename one of them.")
     written = _texts(table, "units").get(column)

@@ -73,6 +73,7 @@ def parse_csv(text: str) -> pd.DataFrame:
         dtype=str,
         skipinitialspace=True,
     )
+    # pandas makes an index of surplus cells.
     if not isinstance(table.index, pd.RangeIndex):
         raise ValueError(
             "its rows have more cells than its header; with decimal commas, cells must be "
@@ -84,6 +85,7 @@ def parse_csv(text: str) -> pd.DataFrame:
     unnamed = [c for c in table.columns if c.startswith("Unnamed: ") and table[c].isna().all()]
     table = table.drop(columns=unnamed)
     table, units = _without_units_row(table)
+    # Between commas a decimal comma is indistinguishable from a separator.
     if separator != ",":
         table = _with_decimal_points(table)
     aliases: dict[str, str] = {}
@@ -173,7 +175,7 @@ def _unique(names: Iterable[str]) -> list[str]:
 
 
 def _all_numbers_with(cells: pd.Series, form: re.Pattern[str], sign: str) -> bool:
-    """Whether some cells have this decimal sign, and all that have are numbers."""
+    """True if cells with this decimal sign exist and all of them are numbers."""
     holding = cells[cells.str.contains(sign, regex=False, na=False)]
     return len(holding) > 0 and bool(holding.str.fullmatch(form).all())
 
@@ -187,6 +189,7 @@ def _without_units_row(table: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, str
         return table, {}
     if not any(is_unit(cell) for cell in first.values()):
         return table, {}
+    # Dimensionless columns have an empty or dashed unit.
     silent = {"", "[]", "[-]", "()", "(-)", "-"}
     units = {str(c): cell for c, cell in first.items() if cell not in silent}
     return table.iloc[1:].reset_index(drop=True), units

@@ -41,6 +41,7 @@ def read_in_worker(
         try:
             sandbox.run_isolated(module, task, Path(folder), seconds=STARTING + BY_BYTE * size)
             return load_signals(Path(folder)).table()
+        # A corrupted worker may leave anything, so reading its output may fail, too.
         except (sandbox.WorkerDied, OSError, EOFError, LookupError, TypeError) as error:
             raise ValueError(f"{library} cannot read it ({error})") from None
 
@@ -56,6 +57,7 @@ def read_main(read: Callable[[Path, Sequence[str]], Signals]) -> None:
 
 def save_signals(signals: Signals, folder: Path) -> None:
     """Write signals where `load_signals` finds them."""
+    # NPZ without pickles: the worker's output is as untrusted as the file.
     described = {"names": list(signals.columns), "found": signals.found, "units": signals.units}
     arrays = {f"c{k}": _plain(values) for k, values in enumerate(signals.columns.values())}
     np.savez(folder / _SIGNALS, allow_pickle=False, described=json.dumps(described), **arrays)

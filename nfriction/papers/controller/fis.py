@@ -117,6 +117,7 @@ def _sections(text: str) -> dict[str, dict[str, _Line]]:
         if section is None:
             raise line.error("expected a section such as [System] first.")
         key, equals, value = (part.strip() for part in stripped.partition("="))
+        # Rules have no `name=`; they are numbered.
         if heading == "Rules":
             key, value = str(len(section)), stripped
         elif not equals:

@@ -208,6 +208,7 @@ class MamdaniController(nn.Module):
         Clipping every rule's set and taking the largest is the same as clipping each term's set
         once at its strongest rule, with a fifth of the work.
         """
+        # Terms without as many rules point to a row of zeros.
         padded = torch.cat([strengths, torch.zeros_like(strengths[:1])])
         return padded[self.rules_of_term].amax(2)
 
@@ -216,6 +217,7 @@ class MamdaniController(nn.Module):
         clipped = torch.minimum(strengths.unsqueeze(2), self.output_sets.unsqueeze(3))
         moments = torch.bmm(self.moments, clipped.amax(1))
         area, moment = moments[:, 0], moments[:, 1]
+        # No rule fires: the middle of the universe, and no division by zero in the gradient.
         empty = area == 0
         offset = torch.where(empty, 0.0, moment / torch.where(empty, 1.0, area))
         return offset.T + self.middle

@@ -78,6 +78,7 @@ class Variable:
         _refuse_duplicates(f"{where}: sets", self.terms)
         if ANY in self.terms:
             raise ValueError(f"{where}: {ANY!r} means any term and cannot name a set.")
+        # Ascending sets have a linguistic order, which plots and reports use.
         for before, after in pairwise(self.sets):
             if before.core > after.core:
                 raise ValueError(
