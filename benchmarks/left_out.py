@@ -153,7 +153,7 @@ def real(
                 left = fold.left if blocks == 1 else at_found_zeros(fits[-1], fold.left)
                 rows[m].add(start, fits[-1].plant, model, left)
             # The peer knows no gaps and one zero for all.
-            whole = [r[a : b + 1] for r in fold.fitted for a, b in r.spans]
+            whole = [r[a : b + 1] for r in fold.fitted for a, b in r.segments]
             states = [first_state(data, of, r) if blocks == 1 else None for r in whole]
             for m in models if peer else ():
                 if is_constant(m):

@@ -9,7 +9,7 @@ import torch
 from nfriction import plots
 from nfriction.fuzzy import RBFNetwork
 from nfriction.papers.controller.mamdani import MamdaniController
-from nfriction.papers.controller.rulefile import parse_rules
+from nfriction.papers.controller.rules import parse_rules
 from nfriction.papers.nffem.train_network import train_on_controller
 
 RULES = """{

@@ -31,7 +31,7 @@ def add(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
     )  # fmt: skip
     parser.add_argument("train", nargs="+", type=names.file, metavar="TRAIN",
                         help="recordings to fit, with columns time, q1, ... "
-                        "(.csv, .parquet or .npz)")  # fmt: skip
+                        "(CSV, TSV, TXT, Parquet, NPZ, MAT, HDF5 or MDF4)")  # fmt: skip
     parser.add_argument("--held-out", nargs="+", type=names.file, default=[], metavar="TEST",
                         help="recordings to judge by, which no fit sees")  # fmt: skip
     add_comparison_options(parser)

@@ -18,8 +18,8 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
         description="Fit one friction model to recordings and write it as a model file.",
     )  # fmt: skip
     parser.add_argument("recordings", nargs="+", type=names.file, metavar="RECORDING",
-                        help="with columns time, q1, ... (.csv, .parquet, .npz, .mat, .h5, .mf4)"
-                        )  # fmt: skip
+                        help="with columns time, q1, ... "
+                        "(CSV, TSV, TXT, Parquet, NPZ, MAT, HDF5 or MDF4)")  # fmt: skip
     parser.add_argument("--model", type=names.model, default="NFLFM",
                         help=f"one of {', '.join(names.MODELS)}")  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path("model.json"), help="model file to write")
@@ -28,7 +28,7 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Fit, write the model, report."""
+    """Fit, write, say how it went."""
     from nfriction.cli.tables import coefficient_table, fit_lines, interval_table
     from nfriction.evaluation.results import model_info
     from nfriction.fitting.fit import fit

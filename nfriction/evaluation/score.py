@@ -133,7 +133,7 @@ def score(
     off = np.zeros((1, len(q0))) if quantum is None else np.eye(len(q0) + 1, len(q0), -1) * quantum
     run = np.broadcast_to(motion.q, (len(off), *motion.q.shape)).copy()
     diverged_at = np.inf
-    for first, last in recording.spans:
+    for first, last in recording.segments:
         if first > 0:
             q0, qd0 = motion.q[first], motion.qd[first]
         tau = None if joint.tau is None else joint.tau[first:last]
@@ -222,7 +222,7 @@ def _windows(
     if friction is not None and friction.state_size:
         known = friction.schedule.states(torch.tensor(motion.qd), torch.tensor(motion.qdd))
     for horizon in horizons:
-        edges = [_edges(time, span, horizon) for span in recording.spans]
+        edges = [_edges(time, span, horizon) for span in recording.segments]
         length = min((b - a for e in edges for a, b in pairwise(e)), default=0)
         starts = [a for e in edges for a in e[:-1]]
         if length < 1:

@@ -59,7 +59,7 @@ def leave_blocks_out(plant: Plant, recording: Recording, count: int) -> list[Spl
 
 def longest_stretch(recording: Recording) -> float:
     """Duration of the longest stretch without a gap [s]."""
-    return max(float(recording.time[b] - recording.time[a]) for a, b in recording.spans)
+    return max(float(recording.time[b] - recording.time[a]) for a, b in recording.segments)
 
 
 def _part(motion: Motion, mask: NDArray[np.bool_]) -> Motion:

@@ -14,8 +14,7 @@ from nfriction.evaluation.score import RMSE, Score
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.registry import model_names
 from nfriction.io import strict_json
-from nfriction.io.model_content import ModelFileError
-from nfriction.io.model_file import load, load_info
+from nfriction.io.model_file import ModelFileError, load, load_info
 from nfriction.io.model_info import ModelInfo
 from nfriction.report.entries import UnfitError, mapped, mapping, number, seconds, text, texts
 from nfriction.report.png import Figure, read_figures

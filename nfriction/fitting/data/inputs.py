@@ -181,7 +181,7 @@ def apply_encoder_offsets(
         return list(recordings), tuple(motions)
     matrix = measurement_matrix(plant, recordings[0].resolve_convention(plant)).numpy()
     rows = [np.array(row) for row in offsets]
-    shifted = [r.derived(q=r.q + matrix @ row) for r, row in zip(recordings, rows, strict=True)]
+    shifted = [r._replace(q=r.q + matrix @ row) for r, row in zip(recordings, rows, strict=True)]
     return shifted, tuple(replace(m, q=m.q + row) for m, row in zip(motions, rows, strict=True))
 
 

@@ -11,7 +11,7 @@ from nfriction.friction.laws import Law
 from nfriction.friction.neurofuzzy import LEAST_RATIO, NeuroFuzzy, smooth_relu_inverse
 from nfriction.friction.sensitivity import Sensitivity
 from nfriction.fuzzy.membership import HALF_WIDTH_OF_GAUSSIAN
-from nfriction.fuzzy.placement import crossing_half_widths
+from nfriction.fuzzy.partition import crossing_half_widths
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
 
 # Powers of an even spacing from zero by which sets of velocity and acceleration are placed.

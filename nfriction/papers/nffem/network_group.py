@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from nfriction.fuzzy import Anfis, AnfisRBF, RBFNetwork
-from nfriction.optim.evidence import bayesian_regularisation
-from nfriction.optim.evidence_result import EvidenceResult
+from nfriction.optim.evidence import EvidenceOptions, EvidenceResult
 from nfriction.optim.jacobian import trainable
+from nfriction.optim.regularisation import bayesian_regularisation
 from nfriction.papers.nffem.projection import LINEAR, project
 from nfriction.papers.nffem.scaling import FuzzyNetwork, Scaling, to_own_units
 
@@ -133,7 +133,9 @@ def regularise(
     for name in parameters:
         groups.setdefault(_kind(name), []).append(name)
     wanted = {name: value for name, value in prior.items() if name in parameters}
-    return bayesian_regularisation(layer, x, y, groups=groups, prior=wanted, **options)
+    return bayesian_regularisation(
+        layer, x, y, groups=groups, prior=wanted, options=EvidenceOptions(**options)
+    )
 
 
 def _kind(name: str) -> str:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from nfriction.fuzzy import Anfis, AnfisRBF, RBFNetwork
-from nfriction.optim.evidence_result import EvidenceResult, EvidenceState
+from nfriction.optim.evidence import EvidenceResult, EvidenceState
 from nfriction.papers.controller.mamdani import MamdaniController
 from nfriction.papers.nffem.network_group import NetworkGroup
 from nfriction.papers.nffem.scaling import FuzzyNetwork, Scaling

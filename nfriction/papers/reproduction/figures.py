@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from nfriction.evaluation.score import RMSE, Score
-from nfriction.io.atomic import replacing
+from nfriction.io.atomic import atomic_write
 from nfriction.io.model_file import load
 from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.controller.mamdani import paper_controller
-from nfriction.papers.controller.rulebase import Variable
+from nfriction.papers.controller.rules import Variable
 from nfriction.papers.reproduction import tables
 from nfriction.papers.reproduction.stages import ADAPTIVE, LAWS, NEURO_FUZZY, SECOND_PAPER
 from nfriction.papers.reproduction.workspace import Array, Workspace
@@ -49,7 +49,7 @@ def draw_all(workspace: Workspace, *, progress: bool = False) -> list[Path]:
     for name, draw in tqdm(drawers.items(), unit="figure", disable=not progress, leave=False):
         figure = draw()
         path = workspace.folder / "figures" / f"{name}.png"
-        with replacing(path) as temporary:
+        with atomic_write(path) as temporary:
             figure.savefig(temporary, dpi=DPI, format="png")
         figure.clear()
         written.append(path)

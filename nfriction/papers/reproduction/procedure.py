@@ -10,10 +10,10 @@ from nfriction.friction.laws import Law
 from nfriction.friction.models import FrictionModel, NeuroFuzzyModel
 from nfriction.friction.registry import model_by_name, model_names
 from nfriction.fuzzy import FuzzySet, RBFNetwork, sets_from_ranges
-from nfriction.optim.evidence_result import EvidenceState
+from nfriction.optim.evidence import EvidenceState
 from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.controller.mamdani import MamdaniController, paper_controller
-from nfriction.papers.controller.rulebase import Rule, RuleBase, Variable
+from nfriction.papers.controller.rules import Rule, RuleBase, Variable
 from nfriction.papers.nffem.rbf_coefficients import RadialBasis
 from nfriction.papers.nffem.train_network import train_on_controller
 from nfriction.signals import Motion

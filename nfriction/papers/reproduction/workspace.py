@@ -16,7 +16,7 @@ from tqdm import tqdm
 from nfriction.evaluation.results import model_info
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.identifiability import Interval
-from nfriction.io.atomic import replacing, write_atomically
+from nfriction.io.atomic import atomic_write, write_atomically
 from nfriction.io.model_file import load, load_plant, save
 from nfriction.papers.afem.fit_by_search import SearchState
 from nfriction.plant import Plant, rigs
@@ -178,7 +178,7 @@ class Workspace:
         """Keep arrays beside a stage's result; to be called before `finish`."""
         # The result of other settings would otherwise pass for that of these arrays.
         self._file(stage, "json").unlink(missing_ok=True)
-        with replacing(self._file(stage, "npz")) as temporary, temporary.open("wb") as file:
+        with atomic_write(self._file(stage, "npz")) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
 
     def arrays(self, stage: str) -> dict[str, NDArray[Any]]:

@@ -14,7 +14,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from nfriction.io.atomic import replacing
+from nfriction.io.atomic import atomic_write
 from nfriction.io.formats import write_table
 from nfriction.papers.twin.mechanics import Links, TrueMotion, simulate
 from nfriction.papers.twin.releases import Split, specification
@@ -184,7 +184,7 @@ def build(
         for key in ("q", "qd", "tau_f")
     }
     # Not compressed: the last bits of floats do not shrink, and trying takes longest of all.
-    with replacing(folder / "truth.npz") as unfinished, unfinished.open("wb") as file:
+    with atomic_write(folder / "truth.npz") as unfinished, unfinished.open("wb") as file:
         np.savez(file, **arrays)
     write_table(_overview(twin), folder / "recordings.csv")
     return twin

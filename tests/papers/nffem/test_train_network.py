@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from nfriction.fuzzy import Anfis, AnfisRBF, RBFNetwork
-from nfriction.optim.evidence_result import EvidenceState
+from nfriction.optim.evidence import EvidenceState
 from nfriction.optim.jacobian import flatten, trainable
 from nfriction.papers.controller.mamdani import paper_controller
 from nfriction.papers.nffem.network_group import one_group
