@@ -26,6 +26,7 @@ from nfriction.papers.afem.adaptive import CLASSES, Adaptive
 from nfriction.papers.afem.fit_adaptive import fit_adaptive
 from nfriction.papers.afem.fit_by_search import SearchMethod, SearchOptions, fit_by_search
 from nfriction.papers.nffem.refine_adaptive import refine_adaptive
+from nfriction.papers.nffem.train_network import TrainingOptions
 from nfriction.papers.reproduction.procedure import papers_neuro_fuzzy
 from nfriction.papers.reproduction.workspace import Array, Bench, Workspace, smoothed
 from nfriction.recording import Recording
@@ -167,7 +168,8 @@ def network_by_controller(
     settings = workspace.settings
     return papers_neuro_fuzzy(
         load(workspace.model(f"A{law}")), bench.train_motions,
-        samples=settings.controller_samples, seed=settings.seed, progress=progress,
+        samples=settings.controller_samples,
+        options=TrainingOptions(seed=settings.seed, progress=progress),
     )  # fmt: skip
 
 
