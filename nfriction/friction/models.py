@@ -195,8 +195,8 @@ class NeuroFuzzyModel(NamedModel):
 
     Args:
         joints, initial, v_smooth: see `NamedModel`; training starts from constants `initial`.
-        network: `"anfis"`; `"rbf"` for the papers' network alone, see `RBFCoefficients`; `"by_class"`
-            for a network that corrects coefficients by class, see `AdaptiveNeuroFuzzy`.
+        network: `"anfis"`; `"rbf"`: the papers' network alone, see `RBFCoefficients`; `"by_class"`:
+            a network that corrects coefficients by class, see `AdaptiveNeuroFuzzy`.
         options: of the coefficients, e.g. `terms=(7, 5)`.
     """
 
