@@ -17,14 +17,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     # A simulated rig stands in for yours; its files are as an encoder log would be.
     simulated = twin.make("tlrip", duration=2.0 if arguments.quick else 10.0)
     files = {}
-    for part in ("train", "held_out"):
+    for part in ("train", "test"):
         recording = simulated.part(part)[-1]
         files[part] = arguments.out / f"{recording.name}.csv.gz"
         files[part].parent.mkdir(parents=True, exist_ok=True)
         recording.write(files[part])
 
     rig = simulated.plant  # of your own rig: rigs.read("rig.json")
-    train, held_out = (Recording.read(files[part]) for part in ("train", "held_out"))
+    train, test = (Recording.read(files[part]) for part in ("train", "test"))
     errors = {}
     for model in (NCFM(rig.joints), LFM(rig.joints)):
         name = type(model).__name__
@@ -33,8 +33,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         for interval in found.intervals:
             print(f"  {interval.name}: {interval.value:.4g} ({interval.low:.4g} to "
                   f"{interval.high:.4g})")  # fmt: skip
-        errors[name] = score(found.plant, found.model, held_out).free_run.all
-        print(f"  position error on {held_out.name}: {1e3 * errors[name]:.3g} mrad")
+        errors[name] = score(found.plant, found.model, test).free_run.all
+        print(f"  position error on {test.name}: {1e3 * errors[name]:.3g} mrad")
         save(found.model, arguments.out / f"{name}.json")
     best = min(errors, key=lambda name: errors[name])
     print(f"best: {best}, in {arguments.out / best}.json")

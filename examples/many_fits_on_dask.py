@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     settings = QUICK if arguments.quick else {"fit_plant": False}
     simulated = twin.make("tlrip", duration=1.0 if arguments.quick else 10.0)
-    rig, train, held_out = simulated.plant, simulated.part("train"), simulated.part("held_out")
+    rig, train, held_out = simulated.plant, simulated.part("train"), simulated.part("test")
     if arguments.quick:
         train, held_out = train[:2], held_out[:1]
     arguments.out.mkdir(parents=True, exist_ok=True)

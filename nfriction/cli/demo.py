@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
         duration=arguments.seconds,
         progress=sys.stderr.isatty(),
     )
-    plant, train, held_out = simulated.plant, simulated.part("train"), simulated.part("held_out")
+    plant, train, held_out = simulated.plant, simulated.part("train"), simulated.part("test")
     print(
         f"simulated the papers' rig with friction unknown to every model: {len(train)} recordings "
         f"of {arguments.seconds:g} s to train on, {len(held_out)} held out"

@@ -179,7 +179,7 @@ def model_groups(workspace: Workspace, joint: int) -> Figure:
         TLRIP paper, Figs. 11 to 13.
     """
     bench = workspace.bench("tlrip")
-    recording = next(r for r in bench.held_out if r.name == SHOWN)
+    recording = next(r for r in bench.test if r.name == SHOWN)
     groups = {"constant": tuple(LAWS), "adaptive": ADAPTIVE, "neuro-fuzzy": NEURO_FUZZY}
     q = {n: workspace.arrays(n)[SHOWN][:, joint] for names in groups.values() for n in names}
     measured = recording.q[:, joint]
@@ -247,7 +247,7 @@ def second_positions(workspace: Workspace, law: str) -> Figure:
     References:
         RTIP paper, Figs. 5 to 7.
     """
-    recording = next(r for r in workspace.bench("rtip").held_out if r.name == SECOND_SHOWN)
+    recording = next(r for r in workspace.bench("rtip").test if r.name == SECOND_SHOWN)
     simulated = workspace.arrays(f"rtip-{law}")[SECOND_SHOWN]
     return positions(recording, {law: _score(recording, simulated)})
 

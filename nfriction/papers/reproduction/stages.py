@@ -234,7 +234,7 @@ def _classes(model: FrictionModel) -> dict[str, Any]:
 
 
 def judge(bench: Bench, model: FrictionModel) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Position errors on every recording by name, and simulated positions of those held out.
+    """Position errors on every recording by name, and simulated positions of the test recordings.
 
     The coefficients are driven by the simulated motion, which is honest, and also by the measured
     one, as in the papers; with constant coefficients the two are the same.
@@ -249,7 +249,7 @@ def judge(bench: Bench, model: FrictionModel) -> tuple[dict[str, Any], dict[str,
             driven = driven_by_measurement(bench, model, recording)
         error = RMSE.of(driven - recording.q).to_dict()
         scores[name] = found.to_dict() | {"split": split, "measured_drive": error}
-        if split == "held_out":
+        if split == "test":
             simulated |= {name: found.simulated, f"{name}_measured_drive": driven}
     return scores, simulated
 

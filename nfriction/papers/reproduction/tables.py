@@ -112,7 +112,7 @@ def rmse(
     workspace: Workspace,
     models: Sequence[str],
     *,
-    split: str = "held_out",
+    split: str = "test",
     drive: Drive = "free_run",
 ) -> pd.DataFrame:
     """Position RMSE over all recordings of a split, a row a model, a column a joint [rad]."""
@@ -127,7 +127,7 @@ def rmse(
 
 
 def table_10(workspace: Workspace, drive: Drive = "free_run") -> pd.DataFrame:
-    """Position RMSE of every model on held-out releases, beside the paper's.
+    """Position RMSE of every model on test releases, beside the paper's.
 
     References:
         TLRIP paper, Table 10.
@@ -176,7 +176,7 @@ def second_coefficients(workspace: Workspace, law: str) -> pd.DataFrame:
     return _beside(_table(found), _table(SECOND_COEFFICIENTS[law]))
 
 
-def second_table_4(workspace: Workspace, split: str = "held_out") -> pd.DataFrame:
+def second_table_4(workspace: Workspace, split: str = "test") -> pd.DataFrame:
     """Position RMSE on the second paper's rig, beside the paper's.
 
     References:
@@ -196,7 +196,7 @@ def _beside(ours: pd.DataFrame, theirs: pd.DataFrame) -> pd.DataFrame:
 
 
 def order(workspace: Workspace) -> Order:
-    """Whether the papers' order of models holds on held-out releases, joint by joint."""
+    """Whether the papers' order of models holds on test releases, joint by joint."""
     table = rmse(workspace, NINE)
     error = {str(model): np.asarray(table.loc[model], dtype=float) for model in table.index}
     broken = [
@@ -238,11 +238,11 @@ def long_table(workspace: Workspace) -> pd.DataFrame:
 def all_tables(workspace: Workspace) -> dict[str, tuple[str, pd.DataFrame]]:
     """The papers' tables with their titles, by the name of their file."""
     settings = workspace.settings
-    held_out = "position RMSE [mrad] on held-out releases, free runs of"
+    error = "position RMSE [mrad] on test releases, free runs of"
     methods = ("sequential quadratic programming", "pattern search", "pattern search")
     found = {
         "table_10": (
-            f"Table 10: {held_out} {settings.tlrip_seconds:g} s, coefficients driven by the "
+            f"Table 10: {error} {settings.tlrip_seconds:g} s, coefficients driven by the "
             "simulated motion",
             table_10(workspace),
         ),
@@ -258,7 +258,7 @@ def all_tables(workspace: Workspace) -> dict[str, tuple[str, pd.DataFrame]]:
             second_coefficients(workspace, law),
         )
     found["second_table_iv"] = (
-        f"second paper, Table IV: {held_out} {settings.rtip_seconds:g} s",
+        f"second paper, Table IV: {error} {settings.rtip_seconds:g} s",
         second_table_4(workspace),
     )
     return found

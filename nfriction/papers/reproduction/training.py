@@ -94,9 +94,9 @@ def _bench(given: argparse.Namespace) -> Bench:
         made = twin.make(
             given.twin, seed=given.seed, duration=given.seconds, progress=sys.stderr.isatty()
         )
-        train, held_out = made.part("train"), made.part("held_out")
-        motions = smoothed(made.plant, [*train, *held_out])
-        return Bench(made.plant, train, held_out, motions, made.initial_states)
+        train, test = made.part("train"), made.part("test")
+        motions = smoothed(made.plant, [*train, *test])
+        return Bench(made.plant, train, test, motions, made.initial_states)
     if given.rig is None:
         raise ValueError("recordings need --rig, a rig file or the name of one.")
     plant = rigs.by_name(given.rig) if given.rig in rigs.names() else rigs.read(given.rig)
@@ -122,13 +122,12 @@ def write(
     path = save(model, given.out / f"{name}.json", info)
     torchscript(model, path.with_suffix(".pt"), info)
     lines = [f"{name}: {info.fit.get('status', 'made')}"]
-    kinds = {"train": "trained on", "held_out": "held out"}
     for split, recording, motion in bench.parts():
         state = bench.states.get(recording.name)
         found = score(plant, model, recording, motion=motion, initial_state=state)
         joints = ", ".join(f"{1e3 * e:.4g}" for e in found.free_run.joints)
         lines.append(
-            f"{recording.name}, {kinds[split]}: position RMSE of the free run by joint {joints} "
+            f"{recording.name}, {split}: position RMSE of the free run by joint {joints} "
             f"m{plant.unit}"
         )
     return "\n".join([*lines, f"wrote {path} and {path.with_suffix('.pt')}"])

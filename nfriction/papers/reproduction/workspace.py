@@ -5,7 +5,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,13 +19,13 @@ from nfriction.fitting.result.identifiability import Interval
 from nfriction.io.atomic import atomic_write, write_atomically
 from nfriction.io.model_file import load, load_plant, save
 from nfriction.papers.afem.fit_by_search import SearchState
+from nfriction.papers.twin.releases import Split
 from nfriction.plant import Plant, rigs
 from nfriction.recording import Recording, read_initial_states
 from nfriction.signals import Motion, kalman_smoother
 from nfriction.version import __version__
 
 Array = NDArray[np.float64]
-Split = Literal["train", "held_out"]
 Callback = Callable[..., None]
 
 
@@ -95,14 +95,14 @@ class Bench:
 
     Attributes:
         plant: the rig.
-        train, held_out: recordings to fit on and to judge by.
+        train, test: recordings to fit on and to judge by.
         motions: smoothed motion of each, training first, in joint coordinates.
         states: exact q0 and qd0 by recording, where known.
     """
 
     plant: Plant
     train: list[Recording]
-    held_out: list[Recording]
+    test: list[Recording]
     motions: list[Motion]
     states: Mapping[str, tuple[Array, Array]]
 
@@ -114,7 +114,7 @@ class Bench:
     def parts(self) -> list[tuple[Split, Recording, Motion]]:
         """Every recording with its split and its motion."""
         splits: tuple[tuple[Split, list[Recording]], ...] = (
-            ("train", self.train), ("held_out", self.held_out)
+            ("train", self.train), ("test", self.test)
         )  # fmt: skip
         motions = iter(self.motions)
         return [(split, r, next(motions)) for split, part in splits for r in part]
@@ -235,16 +235,16 @@ class Workspace:
         folder = self.folder / "twin" / twin
         plant = rigs.read(folder / "rig.json")
         convention = ",".join(plant.convention)
-        parts: dict[str, list[Recording]] = {"train": [], "held_out": []}
+        parts: dict[str, list[Recording]] = {"train": [], "test": []}
         for row in pd.read_csv(folder / "recordings.csv", dtype=str).to_dict("records"):
             parts[row["split"]].append(Recording.read(folder / row["file"], convention=convention))
         kept = self.arrays(f"twin-{twin}")
         motions = [
             Motion(r.time, kept[f"{r.name}_q"], kept[f"{r.name}_qd"], kept[f"{r.name}_qdd"])
-            for r in (*parts["train"], *parts["held_out"])
+            for r in (*parts["train"], *parts["test"])
         ]
         states = read_initial_states(folder / "recordings.csv")
-        return Bench(plant, parts["train"], parts["held_out"], motions, states)
+        return Bench(plant, parts["train"], parts["test"], motions, states)
 
     def _file(self, stage: str, suffix: str) -> Path:
         return self.folder / "stages" / f"{stage}.{suffix}"

@@ -83,7 +83,7 @@ class Twin:
         name: of the twin.
         plant: the rig without friction.
         recordings: by label, in the rig's own convention.
-        splits: by label: to fit on ("train") or to judge by ("held_out").
+        splits: by label: to fit on ("train") or to judge by ("test").
         initial_states: by label: q0 and qd0 at the release, exact, in the rig's own convention.
         truth: by label: the motion before the encoder, in joint coordinates. Never to fit on.
     """

@@ -8,7 +8,7 @@ from typing import Literal
 from nfriction.papers.twin.mechanics import HiddenFriction, Vector
 from nfriction.plant import PendulumChain, rigs
 
-Split = Literal["train", "held_out"]
+Split = Literal["train", "test"]
 
 
 @dataclass(frozen=True)
@@ -67,8 +67,8 @@ _TLRIP = Specification(
     releases=(
         Release("train_upright", "train", (20.0, 30.0, 40.0)),
         Release("train_hanging", "train", (180.0, 0.0, 0.0), (4.0, 0.0, 0.0)),
-        Release("test_hanging", "held_out", (200.56, 32.21, 45.0)),
-        Release("test_upright", "held_out", (60.0, 0.0, 0.0)),
+        Release("test_hanging", "test", (200.56, 32.21, 45.0)),
+        Release("test_upright", "test", (60.0, 0.0, 0.0)),
     ),
 )
 
@@ -88,8 +88,8 @@ _RTIP = Specification(
     releases=(
         Release("train_bent", "train", (45.0, 45.0, 45.0)),
         Release("train_zigzag", "train", (-45.0, 45.0, -45.0)),
-        Release("test_bent", "held_out", (20.0, 30.0, 40.0)),
-        Release("test_hooked", "held_out", (45.0, 45.0, -45.0)),
+        Release("test_bent", "test", (20.0, 30.0, 40.0)),
+        Release("test_hooked", "test", (45.0, 45.0, -45.0)),
     ),
 )
 

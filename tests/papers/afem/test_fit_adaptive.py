@@ -35,7 +35,7 @@ def true_model():
 
 @pytest.fixture(scope="module")
 def case():
-    """Training and held-out swings, their motions and the constant fit."""
+    """Training and test swings, their motions and the constant fit."""
     plant = pendulum()
     train = [swing(plant, true_model(), seconds=6.0, start=start, name=name)
              for name, start in (("a", (2.6, 0.2)), ("b", (0.9, -0.5)))]  # fmt: skip

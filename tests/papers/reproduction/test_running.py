@@ -56,7 +56,7 @@ def test_a_constant_model_is_fitted_judged_and_kept(tmp_path: Path) -> None:
     for name in ("twin-tlrip", "NCFM"):
         run_stage(workspace, name)
     found = workspace.found("NCFM")
-    assert {s["split"] for s in found["scores"].values()} == {"train", "held_out"}
+    assert {s["split"] for s in found["scores"].values()} == {"train", "test"}
     for score in found["scores"].values():
         # Constant coefficients do not ask what drives them.
         assert score["measured_drive"] == score["free_run"]

@@ -25,7 +25,7 @@ def entry(error: float | None, split: str) -> dict[str, Any]:
 
 
 def workspace(folder: Path, errors: Mapping[str, float | None]) -> Workspace:
-    """Every stage finished, with errors by model (1 by default) on one of two held-out runs."""
+    """Every stage finished, with errors by model (1 by default) on one of two test runs."""
     made = Workspace(folder, QUICK)
     for name in stages():
         names = tables.SECOND_COEFFICIENTS.get(name.removeprefix("rtip-"), {})
@@ -34,8 +34,8 @@ def workspace(folder: Path, errors: Mapping[str, float | None]) -> Workspace:
             {
                 "scores": {
                     "a": entry(9.0, "train"),
-                    "b": entry(errors.get(name, 1.0), "held_out"),
-                    "c": entry(0.0, "held_out"),
+                    "b": entry(errors.get(name, 1.0), "test"),
+                    "c": entry(0.0, "test"),
                 },
                 "coefficients": {k: [1.0, 2.0, 3.0] for k in names},
             },
