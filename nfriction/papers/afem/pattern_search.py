@@ -152,7 +152,7 @@ class PatternResult:
 
     @property
     def converged(self) -> bool:
-        """Whether the mesh was refined to its tolerance without finding a better point."""
+        """True if the mesh was refined to its tolerance without finding a better point."""
         return self.status == "mesh_tolerance"
 
     @property

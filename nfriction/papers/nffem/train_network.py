@@ -72,7 +72,7 @@ DEFAULTS = TrainingOptions()
 
 @dataclass(frozen=True, eq=False)
 class NetworkFit:
-    """How one group was trained.
+    """Outcome of the training of one group.
 
     Args:
         evidence: result in scaled units (inputs and outputs on [-1, 1]); log evidences of fits to

@@ -135,7 +135,7 @@ def _variable(name: str, unit: str, terms: Sequence[str], ranges: Ranges) -> Var
 
 
 def _range(term: FuzzySet) -> tuple[float, float]:
-    """The range of Table 4 that a set stands for, see `sets_from_ranges`."""
+    """The range of Table 4 behind a set, see `sets_from_ranges`."""
     centre, sigma = term.parameters
     reach = {
         "left_shoulder": (0.0, 2.0),

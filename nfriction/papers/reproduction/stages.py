@@ -44,7 +44,7 @@ NEURO_FUZZY = tuple(f"NF{law}" for law in LAWS)
 PAPERS_WAY = tuple(f"{name}-papers" for name in NEURO_FUZZY)
 SECOND_PAPER = tuple(f"rtip-{law}" for law in LAWS)
 SEARCH: dict[str, SearchMethod] = {"NCFM": "sqp", "LFM": "pattern", "NLFM": "pattern"}
-"""How the second paper estimates each model."""
+"""The second paper's method for each model."""
 COUNTS = 8192
 """Counts a revolution of the papers' encoders, four edges to each of 2048 lines."""
 

@@ -97,7 +97,7 @@ class Order:
 
     @property
     def holds(self) -> bool:
-        """Whether there is no exception."""
+        """True without exceptions."""
         return not self.broken
 
     def __str__(self) -> str:
@@ -196,7 +196,7 @@ def _beside(ours: pd.DataFrame, theirs: pd.DataFrame) -> pd.DataFrame:
 
 
 def order(workspace: Workspace) -> Order:
-    """Whether the papers' order of models holds on test releases, joint by joint."""
+    """Verdict on the papers' order of models on test releases, joint by joint."""
     table = rmse(workspace, NINE)
     error = {str(model): np.asarray(table.loc[model], dtype=float) for model in table.index}
     broken = [

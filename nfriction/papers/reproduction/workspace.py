@@ -154,7 +154,7 @@ class Workspace:
         return content["result"]
 
     def begun(self, stage: str) -> bool:
-        """Whether a stage has a result, be it of other settings."""
+        """True if a stage has a result, possibly of other settings."""
         return self._file(stage, "json").exists()
 
     def found(self, stage: str) -> dict[str, Any]:
@@ -216,7 +216,7 @@ class Workspace:
         return found
 
     def search_state(self, stage: str) -> SearchState | None:
-        """Where an unfinished search of a stage is to go on; None at its start."""
+        """The state of an unfinished search of a stage; None at its start."""
         state = self.result(f"{stage}-search")
         return None if state is None else SearchState.from_dict(state)
 
