@@ -189,7 +189,7 @@ class Stribeck(ConstantModel):
 NETWORKS = {
     "anfis": "nfriction.friction.neurofuzzy:NeuroFuzzy",
     "by_class": "nfriction.papers.nffem.adaptive_neurofuzzy:AdaptiveNeuroFuzzy",
-    "rbf": "nfriction.papers.nffem.rbf_coefficients:RadialBasis",
+    "rbf": "nfriction.papers.nffem.rbf_coefficients:RBFCoefficients",
 }
 
 
@@ -198,8 +198,8 @@ class NeuroFuzzyModel(NamedModel):
 
     Args:
         joints, initial, v_smooth: see `NamedModel`; training starts from constants `initial`.
-        network: `"anfis"`; `"rbf"` for the papers' network alone, see `RadialBasis`; `"by_class"`
-            for a network that corrects coefficients by class, see `AdaptiveNeuroFuzzy`.
+        network: `"anfis"`; `"rbf"`: the papers' network alone, see `RBFCoefficients`; `"by_class"`:
+            a network that corrects coefficients by class, see `AdaptiveNeuroFuzzy`.
         options: of the coefficients, e.g. `terms=(7, 5)`.
     """
 

@@ -12,7 +12,8 @@ from pathlib import Path
 from random import Random
 
 import pytest
-from nfriction.papers.afem.search import SearchState
+
+from nfriction.papers.afem.fit_by_search import SearchState
 
 ROOT = Path(__file__).resolve().parents[2]
 SEARCH = ["train_constant.py", "--twin", "rtip", "--seconds", "1", "--model", "LFM",

@@ -117,8 +117,8 @@ class Adaptive(Tabulated):
         Args:
             thresholds: between low and medium, medium and high [rad/s^2], (joint, 2) or (2,).
             swing_rate: size of acceleration over velocity of each joint [rad/s], (joint,). It
-                tells the envelope of a motion that starts at full speed, where the acceleration
-                happens to be small. Kept where not given (zero at first: not used).
+                estimates the envelope of a motion that starts at full speed, where the
+                acceleration is small. Unchanged where not given (initially zero: not used).
 
         Raises:
             ValueError: if thresholds are not positive, finite and ascending, or rates negative.
@@ -163,7 +163,7 @@ class Adaptive(Tabulated):
         return torch.minimum(risen, self.ceiling * self.thresholds.select(-1, 1))
 
     def _count(self, envelope: Tensor, borders: Tensor) -> Tensor:
-        """How many of both borders the envelope exceeds: the class."""
+        """Number of borders that the envelope exceeds: the class."""
         first = (envelope > borders.select(-1, 0)).to(envelope.dtype)
         return first + (envelope > borders.select(-1, 1)).to(envelope.dtype)
 

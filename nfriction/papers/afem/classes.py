@@ -34,7 +34,7 @@ DYNAMIC_RANGE = 1e-2
 
 @dataclass(frozen=True)
 class ClassOptions:
-    """How classes are found, and how far their coefficients may deviate.
+    """Search for the classes, and the prior of their coefficients.
 
     Attributes:
         thresholds: given ones [rad/s^2], (joint, 2) or (2,), instead of searched ones.

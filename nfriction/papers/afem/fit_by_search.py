@@ -199,10 +199,8 @@ def _pattern(cost: Cost, box: Box, options: SearchOptions, callback: Callback) -
         upper=scaling.upper, scale=scaling.scale, logarithmic=scaling.logarithmic,
         state=None if state is None else state.pattern, callback=step,
     )  # fmt: skip
-    return SearchResult(
-        box.whole(result.x), result.value, result.converged, result.message,
-        result.state.iterations,
-    )  # fmt: skip
+    value, iterations = result.state.value, result.state.iterations
+    return SearchResult(box.whole(result.x), value, result.converged, result.message, iterations)
 
 
 class _StoppedError(Exception):

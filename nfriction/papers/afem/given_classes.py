@@ -208,7 +208,7 @@ class ClassFit:
         return integration_substeps(self.task.plant, self.given, longest)
 
     def drive(self) -> Tensor:
-        """Class that drives every step, a class without data as the one it stands for."""
+        """Class that drives every step, a class with too few data as its neighbour."""
         stands_for = self.classes.stands_for
         joints = torch.arange(len(stands_for))
         driving = torch.zeros_like(self.windows.tau)

@@ -42,8 +42,8 @@ class VariableScaling:
     def build(
         cls,
         x0: Tensor,
-        lower: Tensor | float | None = None,
-        upper: Tensor | float | None = None,
+        lower: Tensor | float = -math.inf,
+        upper: Tensor | float = math.inf,
         scale: Tensor | float | None = None,
         logarithmic: Tensor | Sequence[bool] | bool = False,
     ) -> VariableScaling:
@@ -61,8 +61,7 @@ class VariableScaling:
                 )
             return given.expand_as(x0)
 
-        low = vector("lower", -math.inf if lower is None else lower)
-        high = vector("upper", math.inf if upper is None else upper)
+        low, high = vector("lower", lower), vector("upper", upper)
         log = vector("logarithmic", logarithmic, torch.bool)
         if not (low <= high).all():
             raise ValueError("`lower` must not exceed `upper`, and neither may be NaN.")
@@ -143,22 +142,17 @@ class PatternResult:
 
     Args:
         x: best point, shape (d,), in the caller's units.
-        value: objective there.
         status: why the search ended; `message` says it in words.
-        at_lower, at_upper: variables on a bound, bool, shape (d,).
-        state: counts and history, and for resuming.
+        state: value, counts and history; resumes the search.
     """
 
     x: Tensor
-    value: float
     status: Status
-    at_lower: Tensor
-    at_upper: Tensor
     state: PatternState
 
     @property
     def converged(self) -> bool:
-        """Whether the mesh was refined to its tolerance without finding a better point."""
+        """True if the mesh was refined to its tolerance without finding a better point."""
         return self.status == "mesh_tolerance"
 
     @property
@@ -221,8 +215,8 @@ class PatternSearch:
         objective: Objective,
         x0: Tensor,
         *,
-        lower: Tensor | float | None = None,
-        upper: Tensor | float | None = None,
+        lower: Tensor | float = -math.inf,
+        upper: Tensor | float = math.inf,
         scale: Tensor | float | None = None,
         logarithmic: Tensor | Sequence[bool] | bool = False,
         state: PatternState | None = None,
@@ -234,7 +228,7 @@ class PatternSearch:
             objective: values (m,) of candidates (m, d), all of a poll at once; a value that is
                 not finite rejects its candidate.
             x0: start, shape (d,); projected into the bounds.
-            lower, upper: bounds, shape (d,) or a number; infinite where there is none.
+            lower, upper: bounds, shape (d,) or a number.
             scale: the change of each variable that counts as large, positive; by default the
                 range between the bounds, else the size of x0, else 1. In decades for
                 logarithmic variables.
@@ -261,8 +255,7 @@ class PatternSearch:
             status = self._run(objective, scaling, state, callback)
         except KeyboardInterrupt:
             status = "stopped"
-        x = scaling.from_unit(scaling.tensor(state.x))
-        return PatternResult(x, state.value, status, x <= scaling.lower, x >= scaling.upper, state)
+        return PatternResult(scaling.from_unit(scaling.tensor(state.x)), status, state)
 
     def _run(
         self,

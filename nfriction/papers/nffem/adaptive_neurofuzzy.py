@@ -44,7 +44,7 @@ class AdaptiveNeuroFuzzy(Schedule):
     state_size: int = 2
     handles_range = True
     form = "adaptive_neurofuzzy"
-    # Final, so that TorchScript takes it for a constant.
+    # Final makes it a constant for TorchScript.
     least_ratio: Final[float] = LEAST_RATIO
 
     def __init__(
@@ -61,22 +61,15 @@ class AdaptiveNeuroFuzzy(Schedule):
         self.adaptive = Adaptive(law, joints, initial, **(memory or {}))
         self.deviation = NeuroFuzzy(law, joints, self.adaptive.values.mean(1), **network)
 
-    def set_memory(self, **options: float) -> None:
-        """Set hysteresis, time constant and sample time of the classes, see `Adaptive`."""
-        before = self.adaptive
-        self.adaptive = Adaptive(self._law, self.joints, before.values, **options)
-        self.adaptive.set_classes(before.thresholds, before.swing_rate)
-
     @torch.no_grad()
     def set_adaptive(self, adaptive: Adaptive, scale: Tensor | None = None) -> None:
-        """Deviate from this schedule, and by nothing yet.
+        """Take over an adaptive schedule with its classes, without any deviation.
 
         Args:
-            adaptive: taken over with its classes.
-            scale: how far a coefficient may deviate, see `NeuroFuzzy.set_reference`.
+            adaptive: the new reference.
+            scale: unit of the deviation of a coefficient, see `NeuroFuzzy.set_reference`.
         """
-        self.set_memory(**adaptive.options())
-        self.adaptive.set_coefficients(adaptive.values)
+        self.adaptive = Adaptive(self._law, self.joints, adaptive.values, **adaptive.options())
         self.adaptive.set_classes(adaptive.thresholds, adaptive.swing_rate)
         largest = adaptive.values.abs().amax(1)
         self.deviation.set_reference(

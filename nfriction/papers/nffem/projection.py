@@ -1,4 +1,4 @@
-"""Variable projection: where sets (or units) belong once the output layer is eliminated.
+"""Variable projection: least-squares placement of sets (or units), the output layer eliminated.
 
 For given sets the best output layer follows by linear least squares, so only the sets are left to
 search; the search is shorter and better conditioned than one over all parameters.
@@ -78,7 +78,7 @@ class Projection:
 
     @property
     def separable(self) -> bool:
-        """Whether there are sets to place, and a whole output layer to eliminate for them."""
+        """True if there are sets to place, and a whole output layer to eliminate for them."""
         whole = not any(
             name.endswith(LINEAR) and not p.requires_grad
             for name, p in self.layer.named_parameters()

@@ -12,7 +12,7 @@ from nfriction.friction.sensitivity import Sensitivity
 from nfriction.fuzzy import RBFNetwork
 
 
-class RadialBasis(Schedule):
+class RBFCoefficients(Schedule):
     """A radial basis network of |velocity| and acceleration gives the coefficients of a law.
 
     Its numbers are those of the network itself, in SI, so what was trained on a controller's

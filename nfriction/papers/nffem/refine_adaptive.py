@@ -1,4 +1,4 @@
-"""Neuro-fuzzy corrections of an adaptive model, kept as far as they help on what they never saw."""
+"""Neuro-fuzzy corrections of an adaptive model, kept as far as they help on hold-out windows."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -28,7 +28,7 @@ from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.nffem.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
 from nfriction.recording import Recording
 
-# Relative fall of the cost that ends the search: only its neighbourhood matters to a correction.
+# Relative decrease of the cost that ends a search: a correction need not be more accurate.
 LOOSE = 1e-3
 FOLDS = 3
 # Candidate shares of a correction.
@@ -48,10 +48,9 @@ def refine_adaptive(
 ) -> FitResult:
     """Fit a network that corrects an adaptive model's coefficients.
 
-    Three corrections are learned, each from two windows of three, and the windows that each has
-    not seen decide which share of it every joint takes. The model takes these shares of one that
-    is learned from all windows, begun at the mean of the three; where no share serves, it is the
-    adaptive one.
+    Three corrections are learned, each from two windows of three, and their hold-out windows decide
+    the share of it that every joint takes. The model takes these shares of a correction learned
+    from all windows, starting at the mean of the three; without any share it is the adaptive one.
 
     Args:
         model: its schedule an `AdaptiveNeuroFuzzy`; changed in place.
@@ -66,7 +65,7 @@ def refine_adaptive(
 
     References:
         TLRIP paper, neuro-fuzzy friction estimation (NFFEM), which starts from AFEM's models.
-        L. Breiman, Machine Learning 24 (1996) 49, on shares from data held back (stacking).
+        L. Breiman, Machine Learning 24 (1996) 49, on shares from hold-out data (stacking).
     """
     schedule = _schedule_of(model, adaptive)
     plant, motions = adaptive.plant, adaptive.motions
@@ -95,9 +94,9 @@ def refine_adaptive(
         start = whole.variables.start(friction=begun)
         result = fitter.search(whole, start, LOOSE, name).result
         result.x[: len(begun)] *= part
-    if not part.any() or not _serves(whole, result.x[: len(begun)]):
+    if not part.any() or not _improves(whole, result.x[: len(begun)]):
         schedule.adaptive.set_sample_time(sample_time)
-        note = "The correction serves no better: the adaptive model is kept."
+        note = "The correction is no better: the adaptive model is kept."
         return replace(adaptive, model=model, status=f"{adaptive.status} {note}")
     found = result_from_shooting(model, whole, result, motions)
     schedule.adaptive.set_sample_time(sample_time)
@@ -133,7 +132,7 @@ def _start_at(model: FrictionModel, adaptive: FitResult, joint: Sequence[Recordi
 def _cross_fitted(
     whole: ShootingProblem, fitter: ShootingFitter, name: str
 ) -> tuple[Tensor, Tensor]:
-    """The mean of corrections learned from parts, and what share of them each joint is to take."""
+    """The mean of corrections learned from parts, and the share of them for each joint."""
     schedule, windows, memory = whole.friction.schedule, whole.windows, whole.memory
     assert isinstance(schedule, AdaptiveNeuroFuzzy)
     assert memory is not None
@@ -160,10 +159,10 @@ def _cross_fitted(
     return torch.stack(learned).mean(0), shares
 
 
-def _serves(whole: ShootingProblem, vector: Tensor) -> bool:
-    """Whether a correction is no worse on any joint over the very windows it learned from.
+def _improves(whole: ShootingProblem, vector: Tensor) -> bool:
+    """A correction is kept only if it is no worse on any joint over the windows it learned from.
 
-    What shares of the parts' corrections do, the same shares of another need not do.
+    The shares were chosen for the corrections of the parts, and may not suit this one.
     """
     ratio = _errors(whole, vector) / _errors(whole, torch.zeros_like(vector))
     return bool((ratio.log().mean(0) <= 0).all())

@@ -1,6 +1,6 @@
 """The papers' own neuro-fuzzy procedure: coefficients by class → fuzzy controller → network."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -10,12 +10,11 @@ from nfriction.friction.laws import Law
 from nfriction.friction.models import FrictionModel, NeuroFuzzyModel
 from nfriction.friction.registry import model_by_name, model_names
 from nfriction.fuzzy import FuzzySet, RBFNetwork, sets_from_ranges
-from nfriction.optim.evidence import EvidenceState
 from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.controller.mamdani import MamdaniController, paper_controller
 from nfriction.papers.controller.rules import Rule, RuleBase, Variable
-from nfriction.papers.nffem.rbf_coefficients import RadialBasis
-from nfriction.papers.nffem.train_network import train_on_controller
+from nfriction.papers.nffem.rbf_coefficients import RBFCoefficients
+from nfriction.papers.nffem.train_network import DEFAULTS, TrainingOptions, train_on_controller
 from nfriction.signals import Motion
 
 Ranges = list[tuple[float, float]]
@@ -30,9 +29,7 @@ def papers_neuro_fuzzy(
     *,
     samples: int = 40_000,
     units: int = 10,
-    seed: int = 0,
-    callback: Callable[[EvidenceState], bool | None] | None = None,
-    progress: bool = False,
+    options: TrainingOptions = DEFAULTS,
 ) -> NeuroFuzzyModel:
     """The neuro-fuzzy model of an adaptive one, by the papers' procedure.
 
@@ -45,8 +42,7 @@ def papers_neuro_fuzzy(
         motions: of the recordings behind it, in joint coordinates.
         samples: a joint.
         units: of the network.
-        seed: of the samples.
-        callback, progress: see `train_on_controller`.
+        options: of its training, see `train_on_controller`.
 
     Returns:
         A model of the same law with the network for its schedule, without gradients.
@@ -69,9 +65,7 @@ def papers_neuro_fuzzy(
         np.concatenate([m.qdd for m in motions]),
     )
     network = RBFNetwork(joints, 2, units, len(law.names))
-    train_on_controller(
-        network, controllers, samples=samples, seed=seed, callback=callback, progress=progress
-    )
+    train_on_controller(network, controllers, samples=samples, options=options)
     model = _neuro_fuzzy_class(law)(
         joints,
         adaptive.schedule.values.mean(1),
@@ -80,7 +74,7 @@ def papers_neuro_fuzzy(
         acceleration="signed",
         network="rbf",
     )
-    assert isinstance(model.schedule, RadialBasis)
+    assert isinstance(model.schedule, RBFCoefficients)
     inputs = torch.stack(
         [torch.stack([end(c) for c in controllers]) for end in (_lower_inputs, _upper_inputs)]
     )
@@ -141,7 +135,7 @@ def _variable(name: str, unit: str, terms: Sequence[str], ranges: Ranges) -> Var
 
 
 def _range(term: FuzzySet) -> tuple[float, float]:
-    """The range of Table 4 that a set stands for, see `sets_from_ranges`."""
+    """The range of Table 4 behind a set, see `sets_from_ranges`."""
     centre, sigma = term.parameters
     reach = {
         "left_shoulder": (0.0, 2.0),

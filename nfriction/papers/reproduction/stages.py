@@ -26,6 +26,7 @@ from nfriction.papers.afem.adaptive import CLASSES, Adaptive
 from nfriction.papers.afem.fit_adaptive import fit_adaptive
 from nfriction.papers.afem.fit_by_search import SearchMethod, SearchOptions, fit_by_search
 from nfriction.papers.nffem.refine_adaptive import refine_adaptive
+from nfriction.papers.nffem.train_network import TrainingOptions
 from nfriction.papers.reproduction.procedure import papers_neuro_fuzzy
 from nfriction.papers.reproduction.workspace import Array, Bench, Workspace, smoothed
 from nfriction.recording import Recording
@@ -43,7 +44,7 @@ NEURO_FUZZY = tuple(f"NF{law}" for law in LAWS)
 PAPERS_WAY = tuple(f"{name}-papers" for name in NEURO_FUZZY)
 SECOND_PAPER = tuple(f"rtip-{law}" for law in LAWS)
 SEARCH: dict[str, SearchMethod] = {"NCFM": "sqp", "LFM": "pattern", "NLFM": "pattern"}
-"""How the second paper estimates each model."""
+"""The second paper's method for each model."""
 COUNTS = 8192
 """Counts a revolution of the papers' encoders, four edges to each of 2048 lines."""
 
@@ -167,7 +168,8 @@ def network_by_controller(
     settings = workspace.settings
     return papers_neuro_fuzzy(
         load(workspace.model(f"A{law}")), bench.train_motions,
-        samples=settings.controller_samples, seed=settings.seed, progress=progress,
+        samples=settings.controller_samples,
+        options=TrainingOptions(seed=settings.seed, progress=progress),
     )  # fmt: skip
 
 
@@ -232,7 +234,7 @@ def _classes(model: FrictionModel) -> dict[str, Any]:
 
 
 def judge(bench: Bench, model: FrictionModel) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Position errors on every recording by name, and simulated positions of those held out.
+    """Position errors on every recording by name, and simulated positions of the test recordings.
 
     The coefficients are driven by the simulated motion, which is honest, and also by the measured
     one, as in the papers; with constant coefficients the two are the same.

@@ -97,7 +97,7 @@ class Order:
 
     @property
     def holds(self) -> bool:
-        """Whether there is no exception."""
+        """True without exceptions."""
         return not self.broken
 
     def __str__(self) -> str:
@@ -196,7 +196,7 @@ def _beside(ours: pd.DataFrame, theirs: pd.DataFrame) -> pd.DataFrame:
 
 
 def order(workspace: Workspace) -> Order:
-    """Whether the papers' order of models holds on test releases, joint by joint."""
+    """Verdict on the papers' order of models on test releases, joint by joint."""
     return order_of(rmse(workspace, NINE))
 
 
@@ -242,11 +242,11 @@ def long_table(workspace: Workspace) -> pd.DataFrame:
 def all_tables(workspace: Workspace) -> dict[str, tuple[str, pd.DataFrame]]:
     """The papers' tables with their titles, by the name of their file."""
     settings = workspace.settings
-    test = "position RMSE [mrad] on test releases, free runs of"
+    error = "position RMSE [mrad] on test releases, free runs of"
     methods = ("sequential quadratic programming", "pattern search", "pattern search")
     found = {
         "table_10": (
-            f"Table 10: {test} {settings.tlrip_seconds:g} s, coefficients driven by the "
+            f"Table 10: {error} {settings.tlrip_seconds:g} s, coefficients driven by the "
             "simulated motion",
             table_10(workspace),
         ),
@@ -262,7 +262,7 @@ def all_tables(workspace: Workspace) -> dict[str, tuple[str, pd.DataFrame]]:
             second_coefficients(workspace, law),
         )
     found["second_table_iv"] = (
-        f"second paper, Table IV: {test} {settings.rtip_seconds:g} s",
+        f"second paper, Table IV: {error} {settings.rtip_seconds:g} s",
         second_table_4(workspace),
     )
     return found

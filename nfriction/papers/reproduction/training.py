@@ -122,13 +122,12 @@ def write(
     path = save(model, given.out / f"{name}.json", info)
     torchscript(model, path.with_suffix(".pt"), info)
     lines = [f"{name}: {info.fit.get('status', 'made')}"]
-    kinds = {"train": "train", "test": "test"}
     for split, recording, motion in bench.parts():
         state = bench.states.get(recording.name)
         found = score(plant, model, recording, motion=motion, initial_state=state)
         joints = ", ".join(f"{1e3 * e:.4g}" for e in found.free_run.joints)
         lines.append(
-            f"{recording.name}, {kinds[split]}: position RMSE of the free run by joint {joints} "
+            f"{recording.name}, {split}: position RMSE of the free run by joint {joints} "
             f"m{plant.unit}"
         )
     return "\n".join([*lines, f"wrote {path} and {path.with_suffix('.pt')}"])

@@ -5,7 +5,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,13 +19,13 @@ from nfriction.fitting.result.identifiability import Interval
 from nfriction.io.atomic import atomic_write, write_atomically
 from nfriction.io.model_file import load, load_plant, save
 from nfriction.papers.afem.fit_by_search import SearchState
+from nfriction.papers.twin.releases import Split
 from nfriction.plant import Plant, rigs
 from nfriction.recording import Recording, read_initial_states
 from nfriction.signals import Motion, kalman_smoother
 from nfriction.version import __version__
 
 Array = NDArray[np.float64]
-Split = Literal["train", "test"]
 Callback = Callable[..., None]
 
 
@@ -154,7 +154,7 @@ class Workspace:
         return content["result"]
 
     def begun(self, stage: str) -> bool:
-        """Whether a stage has a result, be it of other settings."""
+        """True if a stage has a result, possibly of other settings."""
         return self._file(stage, "json").exists()
 
     def found(self, stage: str) -> dict[str, Any]:
@@ -216,7 +216,7 @@ class Workspace:
         return found
 
     def search_state(self, stage: str) -> SearchState | None:
-        """Where an unfinished search of a stage is to go on; None at its start."""
+        """The state of an unfinished search of a stage; None at its start."""
         state = self.result(f"{stage}-search")
         return None if state is None else SearchState.from_dict(state)
 

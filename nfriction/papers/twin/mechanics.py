@@ -182,7 +182,7 @@ def rates_of(links: Links, friction: HiddenFriction | None) -> _Rates:
         if drag is None:
             return (x2, x3, x4), (0.0, 0.0, 0.0)
 
-        torque = drag(time, s2, s3, s4, c2, c3, c4, w2, w3, w4, x2, x3, x4)
+        torque = drag(time, (s2, s3, s4), (c2, c3, c4), (w2, w3, w4), (x2, x3, x4))
         t2, t3, t4 = torque
         f2 = t3 - t2
         f3 = t4 - t3 - l32 * f2
@@ -207,9 +207,10 @@ def _drag(links: Links, friction: HiddenFriction) -> Callable[..., Vector]:
     viscosity_at, sqrt = friction.viscosity, math.sqrt
 
     def drag(
-        time: float, s2: float, s3: float, s4: float, c2: float, c3: float, c4: float,
-        w2: float, w3: float, w4: float, a2: float, a3: float, a4: float,
-    ) -> Vector:  # fmt: skip
+        time: float, sines: Vector, cosines: Vector, rates: Vector, accelerations: Vector
+    ) -> Vector:
+        (s2, s3, s4), (c2, c3, c4) = sines, cosines
+        (w2, w3, w4), (a2, a3, a4) = rates, accelerations
         # Acceleration, less gravity's, of the hinges and mass centres; x across, y up.
         x2, y2 = c2 * a2 - s2 * w2 * w2, -s2 * a2 - c2 * w2 * w2
         x3, y3 = c3 * a3 - s3 * w3 * w3, -s3 * a3 - c3 * w3 * w3

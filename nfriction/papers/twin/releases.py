@@ -13,7 +13,7 @@ Split = Literal["train", "test"]
 
 @dataclass(frozen=True)
 class Release:
-    """How one recording starts.
+    """The start of one recording.
 
     Attributes:
         label: names the recording and its file.
