@@ -106,7 +106,7 @@ def test_verdicts_warnings_and_rules_are_told(page):
         "leaves 2000.",
         f"it cannot be told from {EVIL}. The simplest of them is {EVIL}.",
         "Not converged.",
-        "The data cannot tell: f_a with f_v.",
+        "Not identifiable: f_a with f_v.",
         "At a bound: f_b.",
         "IF velocity is slow AND acceleration is about zero THEN",
         "diverged",
