@@ -145,7 +145,7 @@ def test_every_recording_is_smoothed_once(monkeypatch):
         smoothed.append(len(time))
         return kalman_smoother(time, q, **settings)
 
-    for user in ("comparison", "scoring", "fitting.preparation"):
+    for user in ("evaluation.compare", "evaluation.score", "fitting.data.inputs"):
         monkeypatch.setattr(f"nfriction.{user}.kalman_smoother", counting)
     compare(pendulum(), ["NCFM", "LFM"], [A], [B], windows=(0.5,), max_steps=1)
     assert len(smoothed) == 2

@@ -10,7 +10,7 @@ from nfriction.io import sandbox as apart
 
 WORK = """
 import os, pathlib, sys, tempfile, time
-from nfriction import apart
+from nfriction.io import sandbox as apart
 
 def work(asked, folder):
     {body}

@@ -563,7 +563,12 @@ def test_a_wrong_convention_is_refused_at_once(given: Any) -> None:
 
 
 def test_real_files_read_silently_and_their_degrees_are_noticed(data_dir: Path) -> None:
-    paths = [p for p in sorted(data_dir.glob("*/*.csv*")) if p.name != "recordings.csv"]
+    # Some sets are tables of friction over velocity, not recordings of a motion.
+    paths = [
+        path
+        for path in sorted(data_dir.glob("*/*.csv*"))
+        if {"time", "q1"} <= set(pd.read_csv(path, nrows=0)) and path.name != "recordings.csv"
+    ]
     assert paths
     for path in paths:
         unit = "m" if path.parent.name == "emps" else "rad"
@@ -587,6 +592,8 @@ def test_initial_states_of_the_real_sets(data_dir: Path) -> None:
         "triple_b0": 3,
     }
     for table in data_dir.glob("*/recordings.csv"):
+        if "qd0_1" not in pd.read_csv(table, nrows=0):
+            continue
         for key, (q0, qd0) in read_initial_states(table).items():
             path = next(table.parent.glob(f"{key}.csv*"))
             recording = Recording.read(path)
