@@ -155,9 +155,8 @@ class StallMonitor:
     def __call__(self, x: Tensor, local: Quadratic, step: Step) -> Status | None:
         patience = self.options.patience
         self.costs.append(step.cost)
-        self.still = (
-            self.still + 1 if self._move(x, local, step) <= self.options.settled_move else 0
-        )
+        rests = self._move(x, local, step) <= self.options.settled_move
+        self.still = self.still + 1 if rests else 0
         if not patience:
             return None
         if self.still >= patience:
@@ -196,11 +195,12 @@ def horizon_continuation(
     If a horizon fails, return the previous stage and the skipped horizons.
 
     Args:
-        fitter: of the model; `options.windows` are the lengths. friction, plant: parameters to
-        start from. motions: smoothed, in joint coordinates. equation_error: repeats the first stage
-        from the coefficients that torques imply on the plant
-            that it found: a nonlinear law has several minima, and on a slightly wrong inertia the
-            torques lead to a worse one.
+        fitter: of the model; `options.windows` are the lengths.
+        friction, plant: parameters to start from.
+        motions: smoothed, in joint coordinates.
+        equation_error: repeats the first stage from the coefficients that torques imply on the
+            plant that it found: a nonlinear law has several minima, and on a slightly wrong
+            inertia the torques lead to a worse one.
         of: ending of the stages' names.
     """
     options = fitter.options
