@@ -22,7 +22,6 @@ from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
-Callback = Callable[[str, Step], bool | None]
 # Coefficients (joint, coefficient) that torques imply on a plant.
 EquationError = Callable[[Plant], Tensor]
 
@@ -77,7 +76,7 @@ class ShootingFitter:
     recordings: Sequence[Recording]
     measurement: Tensor
     options: FitOptions
-    callback: Callback | None = None
+    callback: Callable[[str, Step], bool | None] | None = None
     friction_prior: tuple[Tensor, Tensor] | None = None
     plant_prior: tuple[Tensor, Tensor] | None = None
     offset_sd: Tensor | None = None
