@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -36,15 +35,17 @@ MANY = 100
 # keeps round-off from drifting along a singular direction. Only up to FULL is a short step evidence
 # of a minimum rather than of the damping.
 FLOOR, SMALLEST, FULL, LARGEST = 1e-16, 1e-8, 1.0, 1e16
+# Factor after a rejected or poor step, divisor after a good one.
+UP, DOWN = 4.0, 6.0
 
 
 @dataclass(frozen=True)
 class LevenbergMarquardt:
     """Damped Gauss-Newton minimiser of 1/2 sum r^2 within bounds.
 
-    Each step minimises the local quadratic plus damping/2 * |D^(1/2) step|^2. With Marquardt's
-    scaling D is the largest diagonal of the Hessian so far, and all tests are made in these units:
-    a fit does not depend on the units of its parameters.
+    Each step minimises the local quadratic plus damping/2 * |D^(1/2) step|^2 with the largest
+    diagonal D of the Hessian so far. All tests are made in these units, so that a fit does not
+    depend on the units of its parameters.
 
     Args:
         max_steps: limit of accepted steps.
@@ -52,9 +53,6 @@ class LevenbergMarquardt:
         cost_tolerance: relative decrease of the cost, predicted and actual, that counts as none.
         step_tolerance: step over parameters, both scaled, that counts as none.
         initial_damping: relative to D; 0 tries a pure Gauss-Newton step first.
-        damping_up: factor after a rejected or poor step, above 1.
-        damping_down: divisor after a good step, above 1.
-        scaling: "marquardt", or "identity" for D = max diag(H at x0) * I.
     References:
         D. W. Marquardt, SIAM J. Appl. Math. 11 (1963); J. J. Moré, LNM 630 (1978) for the running
         maximum and the convergence tests.
@@ -65,23 +63,13 @@ class LevenbergMarquardt:
     cost_tolerance: float = 1e-14
     step_tolerance: float = 1e-12
     initial_damping: float = 1e-3
-    damping_up: float = 4.0
-    damping_down: float = 6.0
-    scaling: Literal["marquardt", "identity"] = "marquardt"
 
     def __post_init__(self) -> None:
-        if not (self.damping_up > 1 and self.damping_down > 1):
-            raise ValueError(
-                "`damping_up` and `damping_down` must be above 1, got "
-                f"{self.damping_up} and {self.damping_down}."
-            )
         if not (self.initial_damping >= 0 and self.max_steps >= 0):
             raise ValueError(
                 "`initial_damping` and `max_steps` must not be negative, got "
                 f"{self.initial_damping} and {self.max_steps}."
             )
-        if self.scaling not in ("marquardt", "identity"):
-            raise ValueError(f'`scaling` is "marquardt" or "identity", got {self.scaling!r}.')
 
     def minimise(
         self,
@@ -129,13 +117,9 @@ class LevenbergMarquardt:
         if cost is not None:
             _compare(float(cost(state.x)), state.cost)
         vanished = state.cost * torch.finfo(state.x.dtype).eps ** 2
-        diagonal = state.local.hessian.diagonal()
-        state.scale = diagonal
-        if self.scaling == "identity" and len(diagonal):
-            state.scale = diagonal.max().expand_as(diagonal)
+        state.scale = state.local.hessian.diagonal()
         while True:
-            if self.scaling == "marquardt":
-                state.scale = torch.maximum(state.scale, state.local.hessian.diagonal())
+            state.scale = torch.maximum(state.scale, state.local.hessian.diagonal())
             if state.cost <= vanished or state.gradient_cosine() <= self.gradient_tolerance:
                 return "converged_gradient"
             if len(state.history) >= self.max_steps:
@@ -161,15 +145,15 @@ class LevenbergMarquardt:
                 flat = undamped and max(decrease, predicted) <= tolerated
                 gain = decrease / max(predicted, 1e-300)
                 if gain > 0.75 and state.damping > FLOOR:
-                    state.damping /= self.damping_down
+                    state.damping /= DOWN
                 elif gain < 0.25:
-                    state.damping = max(state.damping * self.damping_up, SMALLEST)
+                    state.damping = max(state.damping * UP, SMALLEST)
                 return "converged_cost" if flat else "converged_step" if settled else None
             if settled and math.isfinite(decrease):
                 return "converged_step"
             if undamped and max(-decrease, predicted) <= tolerated:
                 return "converged_cost"
-            state.damping = max(state.damping * self.damping_up, SMALLEST)
+            state.damping = max(state.damping * UP, SMALLEST)
             if state.damping > LARGEST:
                 return "stalled" if math.isfinite(decrease) else "not_finite"
 

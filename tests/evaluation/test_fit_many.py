@@ -99,7 +99,7 @@ def test_a_model_that_fails_loses_no_other(
     assert list(found) == ["NCFM", "NLFM"]
     assert failed == {"LFM": "the data say nothing"}
     assert "fit LFM failed: the data say nothing" in caplog.messages
-    assert sum("converged: linear" in message for message in caplog.messages) == 2
+    assert sum("Converged: linear" in message for message in caplog.messages) == 2
     assert started["NCFM"] is None
     assert started["NLFM"] is not None
     with pytest.raises(ValueError, match="the data say nothing"):

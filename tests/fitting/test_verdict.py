@@ -9,6 +9,7 @@ from nfriction.fitting.result.identifiability import (
     confidence_intervals,
     exceeds_drive_torque,
     information,
+    model_error_warning,
     null_directions,
     standard_deviations,
     warnings_of,
@@ -166,15 +167,18 @@ def test_intervals_end_at_the_bounds():
 
 
 def test_warnings_name_what_is_wrong_and_are_silent_otherwise():
-    good = {"converged": True, "at_bounds": (), "unidentifiable": (), "residual": 3e-4,
-            "effective_sd": 3e-4, "quantum": 1e-3, "unit": "rad"}  # fmt: skip
+    good = {"converged": True, "at_bounds": (), "unidentifiable": ()}
     assert warnings_of(**good) == ()
-    bad = warnings_of(**good | {"converged": False, "at_bounds": ["B of joint1"],
-                                "unidentifiable": ["drag reach"], "residual": 3e-3})  # fmt: skip
-    assert len(bad) == 4
+    bad = warnings_of(
+        converged=False, at_bounds=["B of joint1"], unidentifiable=["drag reach", "F_c with F_d"]
+    )
+    assert len(bad) == 3
     assert "B of joint1" in bad[1]
-    assert "drag reach" in bad[2]
-    assert "10x the encoder resolution" in bad[3]
+    assert bad[2].endswith("drag reach; F_c and F_d (only their combination).")
+    assert model_error_warning(3e-4, 3e-4, 1e-3, "rad") == ()
+    assert model_error_warning(3e-3, 3e-4, None, "rad") == ()
+    (model_error,) = model_error_warning(3e-3, 3e-4, 1e-3, "rad")
+    assert "3 mrad RMS, 10x the encoder's quantisation noise" in model_error
     none, beyond = warnings_of(**good | {"at_bounds": ["B", "v_s", "C"]}, at_zero=["B", "C"])
     assert none == "At zero: B, C; the data show none."
     assert beyond == "At a bound: v_s; the data favour values beyond it."

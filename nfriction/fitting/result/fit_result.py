@@ -16,6 +16,7 @@ from nfriction.fitting.result.identifiability import (
     confidence_intervals,
     covariance_root,
     exceeds_drive_torque,
+    model_error_warning,
     null_directions,
     warnings_of,
     weakly_identified,
@@ -166,6 +167,7 @@ def result_from_shooting(
         tuple(names[i] for i in mask.nonzero().flatten().tolist())
         for mask in (hit, hit & result.at_lower[:count] & least)
     )
+    encoder_count = plant.position_quantum or _observed_count(problem)
     residuals = problem.errors(x)
     residual = float(residuals.square().mean().sqrt())
     intervals, unidentifiable, root = _identifiability(problem, result, names, residuals, motions)
@@ -187,10 +189,11 @@ def result_from_shooting(
         encoder_offsets=tuple(map(tuple, offsets.tolist())),
         warnings=warnings_of(
             converged=result.converged, at_bounds=at_bounds, unidentifiable=unidentifiable,
-            residual=residual, effective_sd=effective_noise(residuals),
-            quantum=plant.position_quantum or _observed_count(problem), unit=plant.unit,
-            largest_defect=float(problem.defects(x).abs().max()) if problem.pairs else 0.0,
             at_zero=at_zero, options=problem.options,
+            largest_defect=float(problem.defects(x).abs().max()) if problem.pairs else 0.0,
+        )
+        + model_error_warning(
+            residual, effective_noise(residuals), encoder_count, plant.unit, problem.options
         ),
         uncertainty=None if root is None else CoefficientUncertainty(model.schedule, root),
     )  # fmt: skip

@@ -174,15 +174,11 @@ def warnings_of(
     converged: bool,
     at_bounds: Sequence[str],
     unidentifiable: Sequence[str],
-    residual: float,
-    effective_sd: float,
-    quantum: float | None,
-    unit: str,
-    largest_defect: float = 0.0,
     at_zero: Sequence[str] = (),
+    largest_defect: float = 0.0,
     options: FitOptions = DEFAULTS,
 ) -> tuple[str, ...]:
-    """Warnings about a fit, a sentence each.
+    """Warnings about the end of a search, a sentence each.
 
     `at_zero` are those of `at_bounds` at the absence of an effect, which is a finding unless the
     parameter is unidentifiable.
@@ -202,15 +198,25 @@ def warnings_of(
     if unidentifiable:
         parts = [_in_words(direction) for direction in unidentifiable]
         found.append(f"Not identifiable from these data: {'; '.join(parts)}.")
-    resolution = None if quantum is None else quantum / 12**0.5
-    if resolution and residual > options.model_error_ratio * resolution:
-        samples = (effective_sd / residual) ** 2
-        found.append(
-            f"Residual: {1e3 * residual:.3g} m{unit} RMS, {residual / resolution:.0f}x the encoder "
-            "resolution, so the model is missing something (error is correlated over "
-            f"~{samples:.0f} samples). The intervals do not cover this."
-        )
     return tuple(found)
+
+
+def model_error_warning(
+    residual: float,
+    effective_sd: float,
+    count: float | None,
+    unit: str,
+    options: FitOptions = DEFAULTS,
+) -> tuple[str, ...]:
+    """A warning if the residual exceeds what the encoder's count [rad; m] explains."""
+    noise = None if count is None else count / 12**0.5
+    if not noise or not residual > options.model_error_ratio * noise:
+        return ()
+    return (
+        f"Residual: {1e3 * residual:.3g} m{unit} RMS, {residual / noise:.0f}x the encoder's "
+        "quantisation noise, so the model is missing something (error is correlated over "
+        f"~{(effective_sd / residual) ** 2:.0f} samples). The intervals do not cover this.",
+    )
 
 
 def _in_words(direction: str) -> str:

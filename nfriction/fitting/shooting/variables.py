@@ -42,11 +42,13 @@ class DecisionVariables:
     The shared variables, those of all windows, come first.
 
     Args:
-        schedule: its parameters are the start, and the values of what is not fitted. terms:
-        adjustable terms of the plant. windows: what was measured. friction_prior, plant_prior: mean
-        and standard deviation; default those of schedule and terms. offset_sd: of the encoder
-        offsets, (recording, joint) [rad; m]; None seeks no offsets. options: priors of the initial
-        states.
+        schedule: its parameters are the start, and the values of what is not fitted.
+        terms: adjustable terms of the plant.
+        windows: what was measured.
+        friction_prior, plant_prior: mean and standard deviation; default those of schedule and
+            terms.
+        offset_sd: of the encoder offsets, (recording, joint) [rad; m]; None seeks no offsets.
+        options: priors of the initial states.
     """
 
     schedule: Schedule

@@ -22,7 +22,6 @@ from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
-Callback = Callable[[str, Step], bool | None]
 # Coefficients (joint, coefficient) that torques imply on a plant.
 EquationError = Callable[[Plant], Tensor]
 
@@ -77,7 +76,7 @@ class ShootingFitter:
     recordings: Sequence[Recording]
     measurement: Tensor
     options: FitOptions
-    callback: Callback | None = None
+    callback: Callable[[str, Step], bool | None] | None = None
     friction_prior: tuple[Tensor, Tensor] | None = None
     plant_prior: tuple[Tensor, Tensor] | None = None
     offset_sd: Tensor | None = None
@@ -155,9 +154,8 @@ class StallMonitor:
     def __call__(self, x: Tensor, local: Quadratic, step: Step) -> Status | None:
         patience = self.options.patience
         self.costs.append(step.cost)
-        self.still = (
-            self.still + 1 if self._move(x, local, step) <= self.options.settled_move else 0
-        )
+        rests = self._move(x, local, step) <= self.options.settled_move
+        self.still = self.still + 1 if rests else 0
         if not patience:
             return None
         if self.still >= patience:
@@ -196,11 +194,12 @@ def horizon_continuation(
     If a horizon fails, return the previous stage and the skipped horizons.
 
     Args:
-        fitter: of the model; `options.windows` are the lengths. friction, plant: parameters to
-        start from. motions: smoothed, in joint coordinates. equation_error: repeats the first stage
-        from the coefficients that torques imply on the plant
-            that it found: a nonlinear law has several minima, and on a slightly wrong inertia the
-            torques lead to a worse one.
+        fitter: of the model; `options.windows` are the lengths.
+        friction, plant: parameters to start from.
+        motions: smoothed, in joint coordinates.
+        equation_error: repeats the first stage from the coefficients that torques imply on the
+            plant that it found: a nonlinear law has several minima, and on a slightly wrong
+            inertia the torques lead to a worse one.
         of: ending of the stages' names.
     """
     options = fitter.options

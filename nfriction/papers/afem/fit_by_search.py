@@ -331,7 +331,7 @@ def fit_by_search(
         model=model.requires_grad_(False),
         plant=constant.plant,
         plant_terms=constant.plant_terms,
-        status=("converged: " if result.converged else "not converged: ") + result.message,
+        status=("Converged: " if result.converged else "Not converged: ") + result.message,
         converged=result.converged,
         residual=float(error.mean_square(result.vector[None])[0].sqrt()),
         at_bounds=tuple(n for n, h in zip(names, hit.tolist(), strict=True) if h),

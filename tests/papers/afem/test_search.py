@@ -57,7 +57,7 @@ def test_a_free_run_is_one_window(recorded):
     model = NCFM(2, v_smooth=V_SMOOTH)
     found = fitted(recorded, model, method="sqp", horizon=None, max_evaluations=30)
     assert found.residuals.shape[0] == 1
-    assert found.status.startswith(("converged", "not converged"))
+    assert found.status.startswith(("Converged", "Not converged"))
 
 
 def test_a_resumed_search_is_the_uninterrupted_one(recorded):
