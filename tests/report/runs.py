@@ -38,7 +38,7 @@ def fit(**changes: Any) -> dict[str, Any]:
 
 
 def results() -> dict[str, Any]:
-    """What `results.json` holds: LFM is best, NLFM diverged, all texts are hostile."""
+    """Content of a `results.json`: LFM is best, NLFM diverged, all texts are hostile."""
     scales = {"no friction": 2.0, "LFM": 0.1, "NLFM": None, "NFLFM": 0.2}
     recordings = [EVIL, "calm"]
     models: dict[str, Any] = {
