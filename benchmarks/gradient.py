@@ -107,7 +107,7 @@ def gauss_newton(repeats: int) -> None:
 
     from nfriction import rollout
     from nfriction.fitting.data.windows import Windows
-    from nfriction.fitting.shooting.problem import TrajectoryProblem
+    from nfriction.fitting.shooting.problem import ShootingProblem
     from nfriction.fitting.shooting.sensitivity import StepJacobian
 
     torch.set_num_threads(1)
@@ -124,13 +124,13 @@ def gauss_newton(repeats: int) -> None:
             qd0=qd0,
         )
         identity = torch.eye(3, dtype=torch.float64)
-        problem = TrajectoryProblem(StepJacobian(plant, model, []), windows, 1e-3, identity)
-        x = problem.unknowns.start()
-        found = problem.quadratic(x)
+        problem = ShootingProblem(StepJacobian(plant, model, []), model, windows, 1e-3, identity)
+        x = problem.variables.start()
+        found = problem.linearise(x)
         if not torch.isfinite(found.hessian).all():
             raise SystemExit("the Gauss-Newton model is not finite")
-        seconds, _ = median_time(lambda p=problem, x=x: p.quadratic(x), repeats)
-        count = problem.unknowns.friction_count
+        seconds, _ = median_time(lambda p=problem, x=x: p.linearise(x), repeats)
+        count = problem.variables.friction_count
         print(f"  {name}: {count} friction parameters and {x.numel()} unknowns: "
               f"{seconds:.3f} s, peak {peak_memory():.0f} MB", flush=True)  # fmt: skip
 

@@ -30,7 +30,9 @@ def intervals(data: Path, only: Sequence[str], models: Sequence[str], seconds: f
             found = []
             for piece in pieces(read(data, of), seconds):
                 model = model_by_name(law)(plant.joints)
-                told = fit(model, plant, piece, windows=WINDOWS, zeroed=of.zeroed).intervals
+                told = fit(
+                    model, plant, piece, windows=WINDOWS, encoder_reference=of.encoder_reference
+                ).intervals
                 found.append({i.name: i for i in told if np.isfinite(i.sd) and i.sd > 0})
             z = np.array([
                 abs(one[n].value - other[n].value) / np.hypot(one[n].sd, other[n].sd)

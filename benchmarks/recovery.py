@@ -98,7 +98,7 @@ def ours(recording: Recording, row: Row, seed: int) -> None:
         for end in ("value", "low", "high")
     )
     row.add(values, low, high, spent)
-    row.remarks |= {f"cannot tell {name}" for name in found.lost}
+    row.remarks |= {f"not identifiable: {name}" for name in found.unidentifiable}
     if not found.converged:
         row.remarks.add("not converged")
 

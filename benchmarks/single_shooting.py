@@ -47,7 +47,7 @@ def single_shooting(
         states: initial position and velocity of each, as they are written; None for the smoothed
             motion's.
     """
-    motions = fit(model, plant, recordings, method="torque").motions
+    motions = fit(model, plant, recordings, method="equation_error").motions
     driven = np.flatnonzero(sum(np.abs(_torque(r)).sum(0) for r in recordings))
     terms = [
         t for t in plant_parameters(plant, driven=driven.tolist()) if t.name.startswith(ADJUSTED)

@@ -37,7 +37,6 @@ MAY_USE_PAPERS = {"papers", "cli"}
 # Imports of the papers' classes that are still to be replaced by methods of `Schedule`.
 STILL_USE_PAPERS = {
     "nfriction/friction/models.py",
-    "nfriction/fitting/fit.py",
 }
 # Only command lines talk to a person: the program's, and the one that scripts share.
 MAY_PRINT = ("cli/", "papers/twin/command.py")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from nfriction.cli import names
 from nfriction.cli.console import UsageError, count, one_line, seconds, warn
+from nfriction.fitting.options import CHOICES
 
 if TYPE_CHECKING:
     from nfriction.plant import Plant
@@ -22,47 +23,51 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         help="a rig file (.json, .toml), a robot description (.urdf, MuJoCo's "
                         f".xml), or one of {', '.join(names.RIGS)}")  # fmt: skip
     parser.add_argument("--angles", metavar="HOW,ZERO",
-                        help="how the files write angles, relative or absolute and from upright or "
-                        "hanging, e.g. absolute,hanging (default: as file or rig say)")  # fmt: skip
+                        help="angle convention of the files: relative or absolute, from upright or "
+                        "hanging, e.g. absolute,hanging (default: of the file or the rig)"
+                        )  # fmt: skip
     parser.add_argument("--degrees", action="store_true", help="the files are in degrees")
     parser.add_argument("--columns", type=_columns, metavar="OURS=THEIRS,...",
                         help="the files' names of time, q1, ..., tau1, ... where they differ, "
                         "e.g. time=t,q1=enc_1,q2=enc_2")  # fmt: skip
     parser.add_argument("--windows", type=_windows, metavar="SECONDS",
-                        help="lengths of the fitted windows, one after the other [s] "
+                        help="lengths of the shooting windows, in the order of their use [s] "
                         "(default: 0.5,2,5)")  # fmt: skip
-    parser.add_argument("--plant", choices=("fit", "given"), default="fit",
-                        help="adjust inertia and gravity terms within bounds, or keep those of "
-                        "the rig")  # fmt: skip
-    parser.add_argument("--drag", action=argparse.BooleanOptionalAction,
-                        help="fit air drag on the links, or none (default: where nothing drives "
-                        "the rig)")  # fmt: skip
-    parser.add_argument("--eccentricity", choices=("none", "fit", "evidence"), default="none",
-                        help="how far encoders sit off their shafts: none, fitted, or fitted "
-                        "where the evidence asks for it")  # fmt: skip
-    parser.add_argument("--zeroed", choices=("auto", "once", "each"), default="auto",
-                        help="when incremental encoders were set to zero: once, or at the start of "
-                        "each recording, wherever dry friction held the links (default: each, "
-                        "where all recordings of a driven rig begin at rest at zero)")  # fmt: skip
-    parser.add_argument("--continuity", choices=("free", "soft", "hard"), default="free",
-                        help="windows of a recording: each with a start of its own, or one "
-                        "motion but for jumps of 0.3 mrad, or for none")  # fmt: skip
-    parser.add_argument("--max-steps", type=count, default=30, metavar="N",
-                        help="most steps of the search at each window length")  # fmt: skip
+    parser.add_argument("--fit-plant", action=argparse.BooleanOptionalAction, default=True,
+                        help="adjust the rig's inertia and gravity terms within bounds "
+                        "(default: yes)")  # fmt: skip
+    parser.add_argument(
+        "--drag",
+        action=argparse.BooleanOptionalAction,
+        help="fit air drag on the links (default: if nothing drives the rig)",
+    )
+    parser.add_argument("--eccentricity", choices=CHOICES["eccentricity"], default="off",
+                        help="fit the eccentricity of the encoders; auto: if the evidence favours "
+                        "it (default: off)")  # fmt: skip
+    parser.add_argument("--encoder-reference", choices=CHOICES["encoder_reference"],
+                        default="auto", help="when incremental encoders were set to zero: before "
+                        "all recordings (shared), or at the start of each in a pose held by "
+                        "stiction (default: per_recording if all recordings of a driven rig begin "
+                        "at rest at zero)")  # fmt: skip
+    parser.add_argument("--continuity", choices=CHOICES["continuity"], default="none",
+                        help="continuity between shooting windows: none, penalised, or enforced "
+                        "(default: none)")  # fmt: skip
+    parser.add_argument(
+        "--max-steps",
+        type=count,
+        default=30,
+        metavar="N",
+        help="limit of search steps at each window length (default: 30)",
+    )
 
 
 def fit_settings(arguments: argparse.Namespace) -> dict[str, Any]:
-    """What `nfriction.fit` takes of these options; its own default where one is not given."""
+    """Arguments of `nfriction.fit` among these options; its own default where one is not given."""
     windows = {} if arguments.windows is None else {"windows": arguments.windows}
-    return {
-        **windows,
-        "fit_plant": arguments.plant == "fit",
-        "drag": arguments.drag,
-        "eccentricity": {"none": False, "fit": True, "evidence": None}[arguments.eccentricity],
-        "zeroed": arguments.zeroed,
-        "continuity": arguments.continuity,
-        "max_steps": arguments.max_steps,
-    }
+    own = (
+        "fit_plant", "drag", "eccentricity", "encoder_reference", "continuity", "max_steps",
+    )  # fmt: skip
+    return windows | {name: getattr(arguments, name) for name in own}
 
 
 def read_rig(name: str) -> Plant:
@@ -75,12 +80,12 @@ def read_rig(name: str) -> Plant:
 def read_recordings(
     paths: Sequence[Path], plant: Plant, arguments: argparse.Namespace
 ) -> list[Recording]:
-    """The recordings in files, in the angles and units that the options tell."""
+    """The recordings in files, in the angles and units of the options."""
     from nfriction.recording import Recording, RecordingWarning
 
     unit: Literal["rad", "m"] = "m" if plant.unit == "m" else "rad"
     recordings: list[Recording] = []
-    said: dict[str, list[str]] = {}
+    said_of: dict[str, list[str]] = {}
     for path in paths:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -93,15 +98,15 @@ def read_recordings(
         recordings.append(recording)
         for warning in caught:
             message = str(warning.message).removeprefix(f"recording '{recording.name}': ")
-            said.setdefault(message, []).append(recording.name)
-    in_degrees = [name for told, of in said.items() if "degrees=True" in told for name in of]
-    for told, of in said.items():
-        if "degrees=True" not in told:
-            warn(f"{', '.join(of)}: {one_line(told)}")
-    # Told once: every change of coordinates would say it again.
+            said_of.setdefault(message, []).append(recording.name)
+    in_degrees = [name for text, of in said_of.items() if "degrees=True" in text for name in of]
+    for text, of in said_of.items():
+        if "degrees=True" not in text:
+            warn(f"{', '.join(of)}: {one_line(text)}")
+    # Every change of coordinates would repeat the warning.
     warnings.simplefilter("ignore", RecordingWarning)
     if in_degrees:
-        # Who forgets the option for one file forgets it for all.
+        # If the option is missing for one file, it is missing for all.
         warn(f"{', '.join(in_degrees)}: positions look like degrees; if they are, add --degrees.")
     return recordings
 

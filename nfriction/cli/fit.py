@@ -27,7 +27,7 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Fit, write, say how it went."""
+    """Fit, write the model, report."""
     from nfriction.cli.tables import coefficient_table, fit_lines, interval_table
     from nfriction.evaluation.results import model_info
     from nfriction.fitting.fit import fit

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from nfriction.evaluation.parallel import Data, Fits, Progress, fit_models
 from nfriction.evaluation.score import score
-from nfriction.fitting.data.inputs import at_zeros, zeroed_each
+from nfriction.fitting.data.checks import looks_zeroed_per_recording
+from nfriction.fitting.data.inputs import apply_encoder_offsets
+from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.fitting.strategy.holdout import LEAST_ERROR
 from nfriction.friction.models import model_by_name
 from nfriction.plant import Plant
 from nfriction.recording import Recording
@@ -125,11 +126,11 @@ def select(
 
     Every recording is cut into as many blocks of time as there are folds. Each fold leaves one
     block of every recording out, fits all models to the rest and simulates the blocks left out;
-    where encoders were zeroed anew for each recording, with the offsets estimated from the rest. A
-    model with fewer parameters is preferred where its error is statistically tied with the least
-    one: within 2 %, or within the standard error of the difference over blocks, both of their mean
-    squares and of the logarithms: one block of violent motion must not hide that it is worse on
-    all others.
+    where encoders were zeroed at the start of each recording, with the offsets estimated from the
+    rest. A model with fewer parameters is preferred where its error is statistically tied with the
+    least one: within 2 %, or within the standard error of the difference over blocks, both of their
+    mean squares and of the logarithms: one block of violent motion must not hide that it is worse
+    on all others.
 
     Args:
         plant, models, progress, jobs, fit_settings: as in `compare`.
@@ -148,10 +149,10 @@ def select(
         )
     names = list(dict.fromkeys(models))
     by_recording = [blocked_k_fold(plant, recording, folds) for recording in recordings]
-    if fit_settings.get("zeroed", "auto") == "auto":
+    if fit_settings.get("encoder_reference", "auto") == "auto":
         # Blocks no longer show where their recording began.
-        each = zeroed_each(plant, recordings)
-        fit_settings["zeroed"] = "each" if each else "once"
+        per_recording = looks_zeroed_per_recording(plant, recordings)
+        fit_settings["encoder_reference"] = "per_recording" if per_recording else "shared"
     horizon = min(
         horizon, *(longest_segment(f.test.recording) for row in by_recording for f in row)
     )
@@ -205,8 +206,11 @@ def longest_segment(recording: Recording) -> float:
 
 def with_fitted_offsets(found: FitResult, blocks: Sequence[TimeBlock]) -> list[TimeBlock]:
     """Blocks with the encoder offsets that a fit found in the rest, one block a recording."""
-    recordings, motions = at_zeros(
-        found.zeros, found.plant, [b.recording for b in blocks], [b.motion for b in blocks]
+    recordings, motions = apply_encoder_offsets(
+        found.encoder_offsets,
+        found.plant,
+        [block.recording for block in blocks],
+        [block.motion for block in blocks],
     )
     return [TimeBlock(*pair) for pair in zip(recordings, motions, strict=True)]
 
@@ -277,7 +281,7 @@ def _indistinguishable(one: Candidate, best: Candidate) -> bool:
     if one.error <= (1 + TOLERANCE) * best.error:
         return True
     squares = np.square([one.errors, best.errors])
-    logarithms = np.log(squares.clip(min=LEAST_ERROR**2))
+    logarithms = np.log(squares.clip(min=DEFAULTS.min_noise**2))
     return all(_within_error(a - b) for a, b in (squares, logarithms))
 
 

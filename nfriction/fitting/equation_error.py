@@ -1,4 +1,4 @@
-"""Equation error: constant coefficients from the friction torque that a motion implies."""
+"""Equation error: constant coefficients by regression on the torque that a motion implies."""
 
 import itertools
 from collections.abc import Sequence
@@ -9,28 +9,21 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.friction.laws import Law
 from nfriction.friction.model import V_SMOOTH, FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
-# Smoothers know less at the ends of a record; that much of each end is left out [s].
-EDGE = 0.02
-# Precision of each coefficient around zero over that of the data: nothing where they tell, and
-# where they do not (an offset and a sign that never turns, say) no runaway.
-RIDGE = 1e-6
-# Share of a torque that is taken for friction even where no law explains any of it.
-LEAST_TOLD = 0.01
-
 
 @dataclass(frozen=True)
 class TorqueFit:
-    """Constant coefficients found from torques.
+    """Constant coefficients from a regression on torques.
 
     Attributes:
         coefficients: (joint, coefficient), in SI.
-        residual: root mean square of the torque left over, (joint,) [N m].
+        residual: root mean square of the unexplained torque, (joint,) [N m].
         torque: root mean square of the friction torque, (joint,) [N m].
     """
 
@@ -40,43 +33,39 @@ class TorqueFit:
 
 
 def friction_torque(
-    plant: Plant, recording: Recording, motion: Motion
+    plant: Plant, recording: Recording, motion: Motion, options: FitOptions = DEFAULTS
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Velocity, load and friction torque along a recording, each (sample, joint).
 
-    `tau_f = tau - inverse_dynamics(q, qd, qdd)`, the ends of the record left out.
-
-    Args:
-        plant: the mechanism.
-        recording: in joint coordinates.
-        motion: its smoothed motion.
+    `tau_f = tau - inverse_dynamics(q, qd, qdd)` in joint coordinates, without the ends of the
+    record.
     """
-    inside = _inside(motion.time)
+    inside = _inside(motion.time, options.edge)
     q, qd, qdd = (torch.as_tensor(x[inside]) for x in (motion.q, motion.qd, motion.qdd))
     tau = np.zeros_like(recording.q) if recording.tau is None else recording.tau
-    left = torch.as_tensor(tau[inside]) - plant.inverse_dynamics(q, qd, qdd)
-    return qd, plant.load(q, qd), left
+    friction = torch.as_tensor(tau[inside]) - plant.inverse_dynamics(q, qd, qdd)
+    return qd, plant.load(q, qd), friction
 
 
-def largest_moved(plant: Plant, motions: Sequence[Motion]) -> tuple[Tensor, Tensor]:
-    """Largest speed of each joint, and largest torque of gravity or of inertia there, (joint,).
+def peak_dynamics_torque(
+    plant: Plant, motions: Sequence[Motion], options: FitOptions = DEFAULTS
+) -> tuple[Tensor, Tensor]:
+    """Largest speed of each joint, and its largest torque of gravity or of inertia, (joint,).
 
-    Of a free swing they all but cancel; each by itself tells what moves the joint.
+    Each of the two alone, as in a free swing they all but cancel.
     """
     speeds, torques = [], []
     for motion in motions:
-        inside = _inside(motion.time)
+        inside = _inside(motion.time, options.edge)
         q, qd, qdd = (torch.as_tensor(x[inside]) for x in (motion.q, motion.qd, motion.qdd))
-        weight = plant.gravity(q)
-        speeds.append(qd)
         rest = plant.inverse_dynamics(q, torch.zeros_like(q), torch.zeros_like(q))
-        torques += [weight, plant.inverse_dynamics(q, qd, qdd) - rest]
+        speeds.append(qd)
+        torques += [plant.gravity(q), plant.inverse_dynamics(q, qd, qdd) - rest]
     return torch.cat(speeds).abs().amax(0), torch.cat(torques).abs().amax(0)
 
 
-def _inside(time: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Samples away from a record's ends, (time,)."""
-    return (time >= time[0] + EDGE) & (time <= time[-1] - EDGE)
+def _inside(time: NDArray[np.float64], edge: float) -> NDArray[np.bool_]:
+    return (time >= time[0] + edge) & (time <= time[-1] - edge)
 
 
 def fit_torque(
@@ -85,106 +74,47 @@ def fit_torque(
     recordings: Sequence[Recording],
     motions: Sequence[Motion],
     v_smooth: float = V_SMOOTH,
+    options: FitOptions = DEFAULTS,
 ) -> TorqueFit:
     """Least squares of the friction torque, joint by joint.
 
-    Linear least squares within bounds where the torque is linear in the coefficients; the others
-    are searched over the law's candidates.
-
-    Args:
-        law: the law to fit.
-        plant: the mechanism.
-        recordings: in joint coordinates.
-        motions: smoothed motion of each recording.
-        v_smooth: velocity over which the sign turns [rad/s].
-
-    Returns:
-        Coefficients with what they leave unexplained.
+    Linear least squares within bounds where the torque is linear in the coefficients, for every
+    combination of the law's initial values of the others. Recordings and motions are in joint
+    coordinates.
 
     Raises:
         ValueError: if there are too few samples, or the law's torque is not finite along the
-            motion.
+        motion.
     """
-    parts = [friction_torque(plant, r, m) for r, m in zip(recordings, motions, strict=True)]
+    parts = [
+        friction_torque(plant, r, m, options) for r, m in zip(recordings, motions, strict=True)
+    ]
     qd, load, torque = (torch.cat(x) for x in zip(*parts, strict=True))
     if len(qd) <= len(law.coefficients):
         names = ", ".join(r.name or "a recording" for r in recordings)
         raise ValueError(
-            f"{names}: too few samples, {len(qd)} are left {EDGE:g} s away from the ends for "
-            f"{len(law.coefficients)} coefficients a joint; record for longer."
+            f"{names}: too few samples, {len(qd)} are left {options.edge:g} s away from the ends "
+            f"for {len(law.coefficients)} coefficients a joint; record for longer."
         )
-    searched = [c.search for c in law.coefficients if not c.linear]
-    candidates = [_linear_fit(law, qd, load, torque, v_smooth, dict(zip(
-        (i for i, c in enumerate(law.coefficients) if not c.linear), values, strict=True)))
-        for values in itertools.product(*searched)]  # fmt: skip
-    residuals = torch.stack([c[1] for c in candidates])
+    nonlinear = {i: c.search for i, c in enumerate(law.coefficients) if not c.linear}
+    candidates = []
+    for values in itertools.product(*nonlinear.values()):
+        fixed = dict(zip(nonlinear, values, strict=True))
+        design = _design(law, qd, load, v_smooth, fixed)
+        candidates.append(_linear_fit(law, design, torque, fixed, options.ridge))
+    coefficients, residuals = (torch.stack(x) for x in zip(*candidates, strict=True))
     best = residuals.argmin(0)
-    joints = range(qd.shape[1])
     return TorqueFit(
-        torch.stack([candidates[int(best[j])][0][j] for j in joints]),
+        coefficients[best, torch.arange(len(best))],
         residuals.amin(0),
         torque.square().mean(0).sqrt(),
     )
 
 
-def natural_scale(
-    model: FrictionModel,
-    plant: Plant,
-    recordings: Sequence[Recording],
-    motions: Sequence[Motion],
-) -> Tensor:
-    """Size of each coefficient that alone would explain a third of the friction torque.
-
-    Args:
-        model: whose law's coefficients they are.
-        plant, recordings, motions: see `fit_torque`.
-
-    Returns:
-        In SI, (joint, coefficient); zero where the torque is not linear in the coefficient.
-    """
-    torque = fit_torque(model.law, plant, recordings, motions, model.v_smooth).torque
-    rms = torch.as_tensor(np.concatenate([m.qd for m in motions])).square().mean(0).sqrt()
-    columns = []
-    for c in model.law.coefficients:
-        if not c.linear:
-            columns.append(torch.zeros_like(rms))
-        elif c.unit.endswith("s/rad"):
-            columns.append(torque / rms / 3)
-        else:
-            columns.append(torque / 3)
-    return torch.stack(columns, -1)
-
-
-def prior_sd(law: Law, torque: TorqueFit) -> Tensor:
-    """What a fit expects of each coefficient, as its law says: sd around zero, in SI.
-
-    Args:
-        law: whose coefficients they are.
-        torque: its fit to the motion.
-
-    Returns:
-        (joint, coefficient); infinite where the law expects nothing.
-    """
-    shares = torque.torque.new_tensor([c.share for c in law.coefficients])
-    # Of a light mechanism's torque most is what inertia terms and smoothing leave over.
-    left = torque.torque.square() - torque.residual.square()
-    told = torch.maximum(left.clamp_min(0.0).sqrt(), LEAST_TOLD * torque.torque).clamp_min(1e-9)
-    return told[:, None] * shares
-
-
-def _linear_fit(
-    law: Law,
-    qd: Tensor,
-    load: Tensor,
-    torque: Tensor,
-    v_smooth: float,
-    fixed: dict[int, float],
-) -> tuple[Tensor, Tensor]:
-    """Coefficients (joint, coefficient) and residual (joint,) with the nonlinear ones given."""
-    from scipy.optimize import lsq_linear  # slow to import
-
-    columns = []
+def _design(law: Law, qd: Tensor, load: Tensor, v_smooth: float, fixed: dict[int, float]) -> Tensor:
+    """Torque per unit of each linear coefficient, (sample, joint, coefficient)."""
     linear = [i for i, c in enumerate(law.coefficients) if c.linear]
+    columns = []
     for i in linear:
         unit = torch.zeros(*qd.shape, len(law.coefficients), dtype=qd.dtype)
         unit[..., i] = 1.0
@@ -199,19 +129,62 @@ def _linear_fit(
             f"{float(qd[sample, joint]):g} and load {float(load[sample, joint]):g}; its torque "
             "must be a finite number."
         )
+    return design
+
+
+def _linear_fit(
+    law: Law, design: Tensor, torque: Tensor, fixed: dict[int, float], ridge: float
+) -> tuple[Tensor, Tensor]:
+    """Coefficients (joint, coefficient) and residual (joint,), the nonlinear ones given."""
+    from scipy.optimize import lsq_linear  # slow to import
+
+    linear = [i for i, c in enumerate(law.coefficients) if c.linear]
     lower = [0.0 if law.coefficients[i].positive else -np.inf for i in linear]
-    coefficients = torch.zeros(qd.shape[1], len(law.coefficients), dtype=qd.dtype)
+    joints = torque.shape[1]
+    coefficients = torch.zeros(joints, len(law.coefficients), dtype=torque.dtype)
     for k, value in fixed.items():
         coefficients[:, k] = value
-    residual = torch.zeros(qd.shape[1], dtype=qd.dtype)
-    for joint in range(qd.shape[1]):
+    residual = torch.zeros(joints, dtype=torque.dtype)
+    for joint in range(joints):
         a, y = design[:, joint].numpy(), torque[:, joint].numpy()
-        # Columns of unit length: coefficients differ by orders of magnitude.
+        # Columns of unit length, as coefficients differ by orders of magnitude.
         scale = np.linalg.norm(a, axis=0)
         scale[scale == 0] = 1.0
-        rows = np.concatenate([a / scale, RIDGE * np.eye(len(linear))])
-        aim = np.concatenate([y, np.zeros(len(linear))])
-        solution = lsq_linear(rows, aim, bounds=(lower, np.inf), tol=1e-12).x / scale
+        rows = np.concatenate([a / scale, ridge * np.eye(len(linear))])
+        target = np.concatenate([y, np.zeros(len(linear))])
+        solution = lsq_linear(rows, target, bounds=(lower, np.inf), tol=1e-12).x / scale
         coefficients[joint, linear] = torch.as_tensor(solution)
         residual[joint] = float(np.sqrt(np.mean((a @ solution - y) ** 2)))
     return coefficients, residual
+
+
+def coefficient_scale(
+    model: FrictionModel, plant: Plant, recordings: Sequence[Recording], motions: Sequence[Motion]
+) -> Tensor:
+    """Size of each coefficient that alone would explain a third of the friction torque, in SI.
+
+    Shape (joint, coefficient); zero where the torque is not linear in the coefficient.
+    """
+    torque = fit_torque(model.law, plant, recordings, motions, model.v_smooth).torque
+    rms = torch.as_tensor(np.concatenate([m.qd for m in motions])).square().mean(0).sqrt()
+    columns = []
+    for c in model.law.coefficients:
+        if not c.linear:
+            columns.append(torch.zeros_like(rms))
+        elif c.unit.endswith("s/rad"):
+            columns.append(torque / rms / 3)
+        else:
+            columns.append(torque / 3)
+    return torch.stack(columns, -1)
+
+
+def prior_sd(law: Law, torque: TorqueFit, options: FitOptions = DEFAULTS) -> Tensor:
+    """Standard deviation of the law's zero-mean priors in SI, (joint, coefficient).
+
+    Infinite without a prior; the torque that the law explains is the scale.
+    """
+    shares = torch.tensor([c.share for c in law.coefficients], dtype=torque.torque.dtype)
+    # On a light mechanism most of the torque is an error of inertia terms and smoothing.
+    explained = (torque.torque.square() - torque.residual.square()).clamp_min(0.0).sqrt()
+    explained = torch.maximum(explained, options.min_explained * torque.torque)
+    return explained.clamp_min(1e-9)[:, None] * shares

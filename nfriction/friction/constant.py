@@ -1,13 +1,9 @@
 """Constant coefficients: the schedule that does not follow the motion."""
 
-import math
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
 from nfriction.friction.coefficients import Tabulated
-from nfriction.friction.laws import Law
 from nfriction.friction.sensitivity import Sensitivity
 
 
@@ -21,31 +17,15 @@ class Constant(Tabulated):
             `Tabulated`.
     """
 
+    fit_strategy = "nfriction.fitting.strategy.constant:fit_constant"
     follows_motion = False
     handles_range = True
-
-    def __init__(self, law: Law, joints: int, initial: Tensor | Sequence | None = None) -> None:
-        super().__init__(law, joints, initial)
-        # Of the fit under way, and no part of the model.
-        self._prior_sd: list[list[float]] = [[math.inf] * len(law.names)] * joints
 
     def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
         return self.table()
 
     def coefficient_sets(self) -> dict[str, Tensor]:
         return {"always": self.values}
-
-    def prior(self) -> tuple[Tensor, Tensor]:
-        vector = self.parameter_vector()
-        return torch.zeros_like(vector), vector.new_tensor(self._prior_sd).reshape(-1)
-
-    def set_prior_sd(self, sd: Tensor) -> None:
-        """Set the standard deviation around zero that a fit expects of each coefficient.
-
-        Args:
-            sd: in SI, (joint, coefficient); infinite where nothing is known.
-        """
-        self._prior_sd = sd.tolist()
 
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
         joints, k = self.raw.shape

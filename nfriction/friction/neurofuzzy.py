@@ -50,6 +50,7 @@ class NeuroFuzzy(Schedule):
     reach: Final[float] = 0.5  # how far beyond its trained range the network counts, in ranges
     turn: Final[float] = 3e-3  # where qdd sgn(qd) turns, in units of the velocity's range
 
+    fit_strategy = "nfriction.fitting.strategy.neurofuzzy:fit_neurofuzzy"
     handles_range = True
 
     reference: Tensor

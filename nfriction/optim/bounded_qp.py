@@ -1,4 +1,4 @@
-"""Bounds, and a quadratic within them."""
+"""Convex quadratic minimisation within bounds."""
 
 import math
 from collections.abc import Callable
@@ -8,21 +8,25 @@ from torch import Tensor
 
 from nfriction.optim.linear_algebra import solve_semidefinite
 
-# Times the number of unknowns; a round pins one or lets one go.
+# Limit of rounds, times the number of variables; each round activates or releases one bound.
 ROUNDS = 3
-# Unknowns without bounds from which on it pays to solve for them apart.
+# From so many unbounded variables on it pays to eliminate them once.
 APART = 400
-# In roundings of a bound; nearer than that a parameter is on it.
+# A parameter nearer to a bound than so many roundings is on it.
 NEAR = 4
 
-# (matrix, right sides, which unknowns these are) -> solutions.
+# (matrix, right sides, which variables these are) -> solutions.
 Solve = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
-def bounds_of(
+def as_bounds(
     x0: Tensor, lower: Tensor | float | None, upper: Tensor | float | None
 ) -> tuple[Tensor, Tensor]:
-    """Both bounds in the shape of `x0`; none is infinite."""
+    """Both bounds in the shape of `x0`; infinite where there is none.
+
+    Raises:
+        ValueError: if a shape does not fit, or a lower bound exceeds the upper one.
+    """
     low = torch.as_tensor(-math.inf if lower is None else lower, dtype=x0.dtype, device=x0.device)
     high = torch.as_tensor(math.inf if upper is None else upper, dtype=x0.dtype, device=x0.device)
     for name, bound in (("lower", low), ("upper", high)):
@@ -36,8 +40,8 @@ def bounds_of(
     return low.expand_as(x0), high.expand_as(x0)
 
 
-def on_bounds(x: Tensor, lower: Tensor, upper: Tensor, before: Tensor) -> Tensor:
-    """Within bounds, and on them where only a rounding of the step from `before` is between."""
+def snap_to_bounds(x: Tensor, lower: Tensor, upper: Tensor, before: Tensor) -> Tensor:
+    """Within bounds, and on them where only round-off of the step from `before` is between."""
     near = NEAR * torch.finfo(x.dtype).eps
     for bound, inside in ((lower, x - lower), (upper, upper - x)):
         there = bound.isfinite() & (inside <= near * torch.maximum(bound.abs(), before.abs()))
@@ -45,20 +49,20 @@ def on_bounds(x: Tensor, lower: Tensor, upper: Tensor, before: Tensor) -> Tensor
     return x
 
 
-def minimise_within(
+def minimise(
     system: Tensor, slope: Tensor, low: Tensor, high: Tensor, free: Tensor, solve: Solve
 ) -> Tensor:
     """Minimiser of `slope @ x + x @ system @ x / 2` within `low <= 0 <= high`, by an active set.
 
-    From zero it goes toward the minimiser over the free unknowns up to the first bound, which holds
-    from there on; at a minimum over the free ones, the bound that is pulled away from most is let
-    go. To pin all at once what leaves the bounds at once would end short of the minimum: of two
-    unknowns that make up for each other, one has its place inside.
+    From zero it moves toward the minimiser over the free variables up to the first bound, which
+    becomes active; at a minimum, the active bound with the most negative multiplier is released.
+    Activating all violated bounds at once can stop short of the minimum when variables are
+    correlated.
 
     Args:
         system: positive semidefinite, (p, p).
         slope, low, high: (p,); bounds may be infinite.
-        free: what to begin with, bool (p,); the rest is at a bound.
+        free: initially free variables, bool (p,); the rest is at a bound.
         solve: (matrix, right sides, free) -> solutions over the free ones; one or several.
 
     References:
@@ -71,7 +75,7 @@ def minimise_within(
     loose = low.isinf() & high.isinf()
     if loose.all() or int(loose.sum()) < APART:
         return _active_set(system, slope, low, high, free, solve)
-    # What has no bounds follows the rest, and is solved for once.
+    # Unbounded variables follow the others, and are eliminated once.
     tight = ~loose
     right = torch.cat([system[loose][:, tight], slope[loose, None]], 1)
     following = solve(system[loose][:, loose], right, loose)
@@ -93,8 +97,8 @@ def _active_set(
     for _ in range(ROUNDS * len(x)):
         if free.any():
             given = slope[free] + system[free][:, ~free] @ x[~free]
-            wanted = x.masked_scatter(free, -solve(system[free][:, free], given, free))
-            x, hit = _towards(x, wanted, low, high)
+            target = x.masked_scatter(free, -solve(system[free][:, free], given, free))
+            x, hit = _towards(x, target, low, high)
             if hit.any():
                 free = free & ~hit
                 continue
@@ -108,14 +112,14 @@ def _active_set(
     return x
 
 
-def _towards(x: Tensor, wanted: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """As far towards what is wanted as the bounds allow, and which of them hold it, bool."""
-    move = wanted - x
+def _towards(x: Tensor, target: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    """As far towards a target as the bounds allow, and the bounds that stop it, bool."""
+    move = target - x
     share = torch.where(move > 0, high - x, low - x) / move
     share = torch.where(move == 0, torch.inf, share)
     least = float(share.min())
     if not least < 1:
-        return wanted, torch.zeros_like(move, dtype=torch.bool)
+        return target, torch.zeros_like(move, dtype=torch.bool)
     hit = share <= least
     reached = torch.where(hit, torch.where(move > 0, high, low), x + least * move)
     return reached.clamp(low, high), hit

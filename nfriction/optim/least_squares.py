@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -22,16 +21,15 @@ Status = Literal[
 ]
 
 MESSAGES: dict[str, str] = {
-    "converged_gradient": "The projected gradient is zero to tolerance, or the residuals vanish.",
-    "converged_cost": "A full step can lower the cost by no more than its tolerance.",
-    "converged_step": "A full step moves the parameters by no more than the tolerance.",
-    "max_steps": "The step limit was reached before convergence.",
-    "creeping": "Steps creep: several in a row together lowered the cost by no more than their "
-    "tolerance, short of the minimum (a kink or a narrow valley).",
-    "stalled": "No step lowers the cost although the gradient is not small: the gradient and the "
-    "cost disagree (a kink, noise or a wrong derivative).",
+    "converged_gradient": "Converged: the gradient is zero to tolerance, or the residuals are.",
+    "converged_cost": "Converged.",
+    "converged_step": "Converged: the parameters no longer move.",
+    "max_steps": "The step limit was reached.",
+    "creeping": "Stalled before reaching a minimum (a kink or a narrow valley in the cost).",
+    "stalled": "No step lowers the cost although the gradient is not small: gradient and cost "
+    "disagree (a kink, noise or a wrong derivative).",
     "not_finite": "Cost or derivatives are not finite, at the start or at every step from `x`.",
-    "stopped": "Stopped by the callback or by an interrupt; `x` is the best point reached.",
+    "stopped": "Stopped by the callback or an interrupt; `x` is the best point reached.",
 }
 
 
@@ -107,80 +105,6 @@ class LeastSquaresResult:
     def message(self) -> str:
         """The status in words."""
         return MESSAGES[self.status]
-
-    def covariance(self, noise_variance: float) -> Tensor:
-        """Gauss-Newton covariance noise_variance * (J^T J)^-1 of the free parameters.
-
-        Rows and columns of parameters at a bound are NaN: a linear theory says nothing of them.
-        Curvature below rounding is taken as rounding, so an unidentifiable direction shows as a
-        huge variance (a lower limit), never as a small one; `unidentifiable` names it.
-
-        Args:
-            noise_variance: variance of one residual; 2 cost / (n - p) estimates it.
-        Returns:
-            Shape (p, p).
-        """
-        free, scale, values, vectors = self._spectrum()
-        floor = torch.finfo(values.dtype).eps * len(values)
-        roots = scale[:, None] * vectors * (noise_variance / values.clamp(min=floor)).sqrt()
-        covariance = torch.full_like(self.hessian, torch.nan)
-        covariance[free[:, None] & free] = (roots @ roots.T).flatten()
-        return covariance
-
-    def unidentifiable(self, threshold: float = 1e-12) -> list[Tensor]:
-        """Directions of the free parameters that the data hardly see, worst first.
-
-        Args:
-            threshold: eigenvalue, relative to the largest, of the Hessian scaled to unit diagonal
-                (so the answer does not depend on the parameters' units).
-        Returns:
-            Unit vectors in parameter space, shape (p,) each; empty if all are determined.
-        """
-        free, scale, values, vectors = self._spectrum()
-        found = []
-        for value, vector in zip(values, vectors.T, strict=True):
-            if value <= threshold * values[-1]:
-                direction = torch.zeros_like(self.x)
-                direction[free] = scale * vector
-                found.append(direction / direction.norm())
-        return found
-
-    def _spectrum(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Free mask, 1/sqrt(diag H), eigenvalues (ascending) and vectors of the scaled Hessian."""
-        free = ~(self.at_lower | self.at_upper)
-        return free, *scaled_spectrum(self.hessian[free][:, free])
-
-
-@dataclass(frozen=True, eq=False)
-class ResidualModel:
-    """Quadratic model of a residual function; `cost` is its cheap trial evaluation."""
-
-    residual: Callable[[Tensor], Tensor]
-    jacobian: Callable[[Tensor], Tensor]
-
-    def __call__(self, x: Tensor) -> Quadratic:
-        r = self.residual(x).detach().flatten()
-        J = self.jacobian(x).detach().reshape(r.numel(), x.numel())
-        return Quadratic(0.5 * r @ r, J.T @ r, J.T @ J)
-
-    def cost(self, x: Tensor) -> Tensor:
-        """Half the sum of squares."""
-        r = self.residual(x).detach().flatten()
-        return 0.5 * r @ r
-
-
-def from_residuals(
-    residual: Callable[[Tensor], Tensor], jacobian: Callable[[Tensor], Tensor] | None = None
-) -> ResidualModel:
-    """Quadratic model of the residuals r(x), for `LevenbergMarquardt.minimise`.
-
-    Args:
-        residual: r(x), any shape.
-        jacobian: dr/dx, shape of r plus (p,); forward-mode differentiation if left out.
-    Returns:
-        The model; pass its `cost` method to `minimise` where the Jacobian is expensive.
-    """
-    return ResidualModel(residual, torch.func.jacfwd(residual) if jacobian is None else jacobian)
 
 
 def positive_diagonal(diagonal: Tensor) -> Tensor:

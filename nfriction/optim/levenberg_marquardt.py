@@ -1,7 +1,7 @@
-"""Levenberg-Marquardt on a local quadratic model, with bounds and a result that admits failure.
+"""Levenberg-Marquardt on a local quadratic model, with bounds and an honest status.
 
-The solver asks for cost, gradient and Gauss-Newton Hessian rather than for a residual Jacobian:
-callers that eliminate states block by block or accumulate 40,000 samples in chunks never hold one.
+The solver asks for cost, gradient and Gauss-Newton Hessian instead of a residual Jacobian, so that
+callers may accumulate 40,000 samples in pieces and never hold one.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from nfriction.optim.bounded_qp import bounds_of, minimise_within, on_bounds
+from nfriction.optim import bounded_qp
 from nfriction.optim.least_squares import (
     LeastSquaresResult,
     Quadratic,
@@ -22,14 +22,19 @@ from nfriction.optim.least_squares import (
     Step,
     positive_diagonal,
 )
-from nfriction.optim.linear_algebra import solve_bordered, solve_semidefinite
+from nfriction.optim.linear_algebra import solve_arrowhead, solve_semidefinite
+
+Model = Callable[[Tensor], Quadratic]
+Cost = Callable[[Tensor], Tensor]
+# (x, its quadratic, the step that led there) -> a status that ends the search, or None.
+Callback = Callable[[Tensor, Quadratic, Step], Status | None]
 
 # Fewer blocks than this are solved as fast in one piece.
 MANY = 100
-# Damping is relative to the (unit) scaled diagonal. Beyond LARGEST a step is lost in rounding;
-# a rejection lifts it at least to SMALLEST, where it begins to matter at all. Below FLOOR it no
-# longer keeps rounding from drifting along a singular direction. Only up to FULL is a short step
-# evidence of a minimum rather than of the damping.
+# Damping is relative to the (unit) scaled diagonal. Beyond LARGEST a step is lost in round-off; a
+# rejection raises it at least to SMALLEST, where it begins to matter; below FLOOR it no longer
+# keeps round-off from drifting along a singular direction. Only up to FULL is a short step evidence
+# of a minimum rather than of the damping.
 FLOOR, SMALLEST, FULL, LARGEST = 1e-16, 1e-8, 1.0, 1e16
 
 
@@ -38,13 +43,13 @@ class LevenbergMarquardt:
     """Damped Gauss-Newton minimiser of 1/2 sum r^2 within bounds.
 
     Each step minimises the local quadratic plus damping/2 * |D^(1/2) step|^2. With Marquardt's
-    scaling D is the largest diagonal of the Hessian seen so far, and every test below is made in
-    these units: a fit does not depend on the units of its parameters.
+    scaling D is the largest diagonal of the Hessian so far, and all tests are made in these units:
+    a fit does not depend on the units of its parameters.
 
     Args:
         max_steps: limit of accepted steps.
         gradient_tolerance: largest cosine between the residual and a free Jacobian column.
-        cost_tolerance: relative fall of the cost, predicted and actual, that counts as none.
+        cost_tolerance: relative decrease of the cost, predicted and actual, that counts as none.
         step_tolerance: step over parameters, both scaled, that counts as none.
         initial_damping: relative to D; 0 tries a pure Gauss-Newton step first.
         damping_up: factor after a rejected or poor step, above 1.
@@ -80,13 +85,13 @@ class LevenbergMarquardt:
 
     def minimise(
         self,
-        model: Callable[[Tensor], Quadratic],
+        model: Model,
         x0: Tensor,
         *,
-        cost: Callable[[Tensor], Tensor] | None = None,
+        cost: Cost | None = None,
         lower: Tensor | float | None = None,
         upper: Tensor | float | None = None,
-        callback: Callable[[Tensor, Step], bool | None] | None = None,
+        callback: Callback | None = None,
     ) -> LeastSquaresResult:
         """Minimise from `x0`; never raises for a bad region, an interrupt or non-convergence.
 
@@ -97,7 +102,7 @@ class LevenbergMarquardt:
             x0: start, shape (p,); projected into the bounds.
             cost: half the sum of squares alone, where that is cheaper than `model`; tries steps.
             lower, upper: bounds, shape (p,) or a number; infinite entries are free.
-            callback: called after each accepted step with x and its `Step`; True stops.
+            callback: called after each accepted step; may end the search with a status.
         Returns:
             The best point reached and why the search ended there.
         Raises:
@@ -107,80 +112,77 @@ class LevenbergMarquardt:
             raise ValueError(
                 f"`x0` must be a vector of floats, got {x0.dtype} of shape {tuple(x0.shape)}."
             )
-        low, high = bounds_of(x0, lower, upper)
-        search = _Search(model, cost, x0.detach().clamp(low, high), low, high)
+        low, high = bounded_qp.as_bounds(x0, lower, upper)
+        state = _State(x0.detach().clamp(low, high), low, high, self.initial_damping)
         try:
-            status = self._run(search, callback)
+            state.local = _checked(model(state.x), state.x)
+            status = self._iterate(state, model, cost, callback)
         except KeyboardInterrupt:
             status = "stopped"
-        return search.result(status)
+        return state.result(status)
 
-    def _run(
-        self, search: _Search, callback: Callable[[Tensor, Step], bool | None] | None
+    def _iterate(
+        self, state: _State, model: Model, cost: Cost | None, callback: Callback | None
     ) -> Status:
-        search.start(self.initial_damping)
-        if not search.local.finite:
+        if not state.local.finite:
             return "not_finite"
-        vanished = search.cost * torch.finfo(search.x.dtype).eps ** 2
-        diagonal = search.local.hessian.diagonal()
-        search.scale = diagonal
+        if cost is not None:
+            _compare(float(cost(state.x)), state.cost)
+        vanished = state.cost * torch.finfo(state.x.dtype).eps ** 2
+        diagonal = state.local.hessian.diagonal()
+        state.scale = diagonal
         if self.scaling == "identity" and len(diagonal):
-            search.scale = diagonal.max().expand_as(diagonal)
+            state.scale = diagonal.max().expand_as(diagonal)
         while True:
             if self.scaling == "marquardt":
-                search.scale = torch.maximum(search.scale, diagonal)
-            if search.cost <= vanished or search.gradient_cosine() <= self.gradient_tolerance:
+                state.scale = torch.maximum(state.scale, state.local.hessian.diagonal())
+            if state.cost <= vanished or state.gradient_cosine() <= self.gradient_tolerance:
                 return "converged_gradient"
-            if len(search.history) >= self.max_steps:
+            if len(state.history) >= self.max_steps:
                 return "max_steps"
-            ended = self._advance(search)
+            ended = self._advance(state, model, cost)
+            if ended is None and callback is not None:
+                ended = callback(state.x.clone(), state.local, state.history[-1])
             if ended is not None:
                 return ended
-            diagonal = search.local.hessian.diagonal()
-            if callback is not None and callback(search.x.clone(), search.history[-1]):
-                return "stopped"
 
-    def _advance(self, search: _Search) -> Status | None:
+    def _advance(self, state: _State, model: Model, cost: Cost | None) -> Status | None:
         """Take one step that lowers the cost, raising the damping until there is one."""
-        root = positive_diagonal(search.scale).sqrt()
+        root = positive_diagonal(state.scale).sqrt()
         while True:
-            step = search.bounded_step(root)
-            predicted = search.predicted_fall(step)
-            norm = float((root * step).norm())
+            step = state.damped_step(root)
+            predicted = state.predicted_decrease(step)
+            norm, tolerated = float((root * step).norm()), self.cost_tolerance * state.cost
             # With the damping out of the way, a step too short to matter means a minimum.
-            settled = search.damping <= FULL and norm <= self.step_tolerance * float(
-                (root * search.x).norm()
-            )
-            tolerated = self.cost_tolerance * search.cost
-            fall = search.attempt(step, norm)
-            if fall > 0:
-                gain = fall / max(predicted, 1e-300)
-                flat = search.damping <= FULL and max(fall, predicted) <= tolerated
-                if gain > 0.75 and search.damping > FLOOR:
-                    search.damping /= self.damping_down
+            undamped = state.damping <= FULL
+            settled = undamped and norm <= self.step_tolerance * float((root * state.x).norm())
+            decrease = state.attempt(step, norm, model, cost)
+            if decrease > 0:
+                flat = undamped and max(decrease, predicted) <= tolerated
+                gain = decrease / max(predicted, 1e-300)
+                if gain > 0.75 and state.damping > FLOOR:
+                    state.damping /= self.damping_down
                 elif gain < 0.25:
-                    search.damping = max(search.damping * self.damping_up, SMALLEST)
+                    state.damping = max(state.damping * self.damping_up, SMALLEST)
                 return "converged_cost" if flat else "converged_step" if settled else None
-            if settled and math.isfinite(fall):
+            if settled and math.isfinite(decrease):
                 return "converged_step"
-            if search.damping <= FULL and max(-fall, predicted) <= tolerated:
+            if undamped and max(-decrease, predicted) <= tolerated:
                 return "converged_cost"
-            search.damping = max(search.damping * self.damping_up, SMALLEST)
-            if search.damping > LARGEST:
-                return "stalled" if math.isfinite(fall) else "not_finite"
+            state.damping = max(state.damping * self.damping_up, SMALLEST)
+            if state.damping > LARGEST:
+                return "stalled" if math.isfinite(decrease) else "not_finite"
 
 
 @dataclass
-class _Search:
-    """Where a minimisation stands; `LevenbergMarquardt` decides what to do with it."""
+class _State:
+    """The best point of a search, its quadratic, and the damping of the next step."""
 
-    model: Callable[[Tensor], Quadratic]
-    trial_cost: Callable[[Tensor], Tensor] | None
     x: Tensor
     lower: Tensor
     upper: Tensor
-    damping: float = 0.0
-    evaluations: int = 0
+    damping: float
+    evaluations: int = 1
     history: list[Step] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -193,20 +195,8 @@ class _Search:
     def cost(self) -> float:
         return float(self.local.cost)
 
-    def start(self, damping: float) -> None:
-        self.damping = damping
-        self.local = self._checked(self.model(self.x))
-        self.evaluations += 1
-        if self.trial_cost is not None and self.local.finite:
-            cheap = float(self.trial_cost(self.x))
-            if abs(cheap - self.cost) > 1e-6 * max(abs(cheap), abs(self.cost)):
-                raise ValueError(
-                    f"`cost(x0)` is {cheap:.9g} but `model(x0).cost` is {self.cost:.9g}; "
-                    "both must be half the sum of squared residuals."
-                )
-
     def frozen(self) -> Tensor:
-        """Parameters on a bound that the gradient pushes against it, bool (p,)."""
+        """Parameters that the gradient pushes against their bound, bool (p,)."""
         slope = self.local.gradient
         return ((self.x <= self.lower) & (slope > 0)) | ((self.x >= self.upper) & (slope < 0))
 
@@ -217,46 +207,43 @@ class _Search:
         cosines = torch.where(self.frozen(), 0.0, cosines)
         return float(cosines.max()) if len(cosines) else 0.0
 
-    def bounded_step(self, root: Tensor) -> Tensor:
+    def damped_step(self, root: Tensor) -> Tensor:
         """Minimiser of the damped quadratic within the bounds."""
         system = self.local.hessian / (root[:, None] * root)
         system.diagonal().add_(self.damping)
         low, high = (self.lower - self.x) * root, (self.upper - self.x) * root
-        step = minimise_within(
-            system, self.local.gradient / root, low, high, ~self.frozen(), self._solved
-        )
-        return step / root
+        slope = self.local.gradient / root
+        return bounded_qp.minimise(system, slope, low, high, ~self.frozen(), self._solve) / root
 
-    def _solved(self, matrix: Tensor, right: Tensor, free: Tensor) -> Tensor:
-        """Solution for the free parameters, block by block where the model has blocks."""
+    def _solve(self, matrix: Tensor, right: Tensor, free: Tensor) -> Tensor:
+        """Solution for the free parameters, block by block if the model has blocks."""
         if self.local.blocks is not None:
             first, size = self.local.blocks
             if len(free) - first >= MANY * size and free[first:].all():
-                return solve_bordered(matrix, right, int(free[:first].sum()), size)
+                return solve_arrowhead(matrix, right, int(free[:first].sum()), size)
         return solve_semidefinite(matrix, right)
 
-    def predicted_fall(self, step: Tensor) -> float:
+    def predicted_decrease(self, step: Tensor) -> float:
         return -float(self.local.gradient @ step + 0.5 * step @ (self.local.hessian @ step))
 
-    def attempt(self, step: Tensor, norm: float) -> float:
-        """Move if the cost falls and all is finite; return the fall (-inf where not finite)."""
-        trial = on_bounds(self.x + step, self.lower, self.upper, self.x)
+    def attempt(self, step: Tensor, norm: float, model: Model, cost: Cost | None) -> float:
+        """Move if the cost decreases and all is finite; the decrease (-inf where not finite)."""
+        trial = bounded_qp.snap_to_bounds(self.x + step, self.lower, self.upper, self.x)
         self.evaluations += 1
-        if self.trial_cost is None:
-            there = self._checked(self.model(trial))
-            cost = float(there.cost)
-        else:
-            cost = float(self.trial_cost(trial))
-            if not cost < self.cost:
-                return self.cost - cost if math.isfinite(cost) else -math.inf
-            there = self._checked(self.model(trial))
-        if not (math.isfinite(cost) and there.finite):
+        if cost is not None:
+            value = float(cost(trial))
+            if not value < self.cost:
+                return self.cost - value if math.isfinite(value) else -math.inf
+        there = _checked(model(trial), trial)
+        if cost is None:
+            value = float(there.cost)
+        if not (math.isfinite(value) and there.finite):
             return -math.inf
-        fall = self.cost - cost
-        if fall > 0:
+        decrease = self.cost - value
+        if decrease > 0:
             self.x, self.local = trial, there
-            self.history.append(Step(cost, self.damping, norm))
-        return fall
+            self.history.append(Step(value, self.damping, norm))
+        return decrease
 
     def result(self, status: Status) -> LeastSquaresResult:
         return LeastSquaresResult(
@@ -272,13 +259,22 @@ class _Search:
             history=self.history,
         )
 
-    def _checked(self, local: Quadratic) -> Quadratic:
-        p = len(self.x)
-        if local.gradient.shape != (p,) or local.hessian.shape != (p, p):
-            raise ValueError(
-                f"The model of {p} parameters must give a gradient of shape ({p},) and a Hessian "
-                f"of shape ({p}, {p}), got {tuple(local.gradient.shape)} and "
-                f"{tuple(local.hessian.shape)}."
-            )
-        cost, gradient, hessian = local.cost, local.gradient.detach(), local.hessian.detach()
-        return Quadratic(float(cost), gradient, hessian, local.blocks)
+
+def _compare(cheap: float, cost: float) -> None:
+    if abs(cheap - cost) > 1e-6 * max(abs(cheap), abs(cost)):
+        raise ValueError(
+            f"`cost(x0)` is {cheap:.9g} but `model(x0).cost` is {cost:.9g}; "
+            "both must be half the sum of squared residuals."
+        )
+
+
+def _checked(local: Quadratic, x: Tensor) -> Quadratic:
+    p = len(x)
+    if local.gradient.shape != (p,) or local.hessian.shape != (p, p):
+        raise ValueError(
+            f"The model of {p} parameters must give a gradient of shape ({p},) and a Hessian "
+            f"of shape ({p}, {p}), got {tuple(local.gradient.shape)} and "
+            f"{tuple(local.hessian.shape)}."
+        )
+    cost, gradient, hessian = local.cost, local.gradient.detach(), local.hessian.detach()
+    return Quadratic(float(cost), gradient, hessian, local.blocks)

@@ -1,11 +1,11 @@
-"""Positive semidefinite systems, also those of many parts that share a few unknowns."""
+"""Positive semidefinite systems, also of arrowhead form."""
 
 import torch
 from torch import Tensor
 
 
 def solve_semidefinite(matrix: Tensor, right: Tensor) -> Tensor:
-    """Solve a positive semidefinite system; in singular ones the shortest solution.
+    """Solve a positive semidefinite system; the shortest solution of a singular one.
 
     Args:
         matrix: (p, p).
@@ -23,11 +23,10 @@ def solve_semidefinite(matrix: Tensor, right: Tensor) -> Tensor:
     return (vectors @ (inverse[:, None] * (vectors.T @ sides))).view_as(right)
 
 
-def solve_bordered(matrix: Tensor, right: Tensor, first: int, size: int) -> Tensor:
-    """The same of a matrix that is block diagonal from some row on, block by block.
+def solve_arrowhead(matrix: Tensor, right: Tensor, first: int, size: int) -> Tensor:
+    """Solve a system that is block diagonal from some row on by its Schur complement.
 
-    The blocks' unknowns are eliminated (Schur complement), so that the cost grows with the number
-    of blocks instead of its cube.
+    The cost grows with the number of blocks instead of its cube.
 
     Args:
         matrix: symmetric, (p, p).
@@ -46,7 +45,7 @@ def solve_bordered(matrix: Tensor, right: Tensor, first: int, size: int) -> Tens
     solved = torch.cholesky_solve(
         torch.cat([across, sides[first:].reshape(count, size, -1)], -1), factor
     )
-    # Of the shared rows: what the blocks take of matrix and right sides.
+    # Contribution of the blocks to the shared rows and right sides.
     taken = across.flatten(0, 1).T @ solved.flatten(0, 1)
     shared = solve_semidefinite(
         matrix[:first, :first] - taken[:, :first], sides[:first] - taken[:, first:]

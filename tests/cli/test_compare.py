@@ -121,7 +121,7 @@ def test_initial_states_are_used_and_missing_ones_named(
 
 def test_plant_given_adjusts_nothing_and_drag_adds_terms(bench: Path) -> None:
     terms = []
-    for k, option in enumerate((["--plant", "given"], [], ["--drag"])):
+    for k, option in enumerate((["--no-fit-plant"], [], ["--drag"])):
         out = bench / f"plant{k}"
         assert compare(bench, out, *option, "--max-steps", "1", "--no-figures") == 0
         terms.append(set(results(out)["models"]["NCFM"]["fit"]["plant"]))

@@ -11,7 +11,7 @@ import pytest
 
 from nfriction import cli, rigs
 from nfriction.cli import estimation
-from nfriction.fitting.strategy.constant import WINDOWS
+from nfriction.fitting.options import DEFAULTS
 from tests.cli.benches import compare, pendulum, results
 
 
@@ -21,9 +21,9 @@ def test_what_is_not_given_is_left_to_the_fit() -> None:
     settings = estimation.fit_settings(parser.parse_args(["--rig", "tlrip"]))
     assert "windows" not in settings
     assert settings["drag"] is None
-    assert settings["zeroed"] == "auto"
-    assert settings["continuity"] == "free"
-    assert f"(default: {','.join(f'{w:g}' for w in WINDOWS)})" in " ".join(
+    assert settings["encoder_reference"] == "auto"
+    assert settings["continuity"] == "none"
+    assert f"(default: {','.join(f'{w:g}' for w in DEFAULTS.windows)})" in " ".join(
         parser.format_help().split()
     )
     told = parser.parse_args(
@@ -33,17 +33,17 @@ def test_what_is_not_given_is_left_to_the_fit() -> None:
             "--windows",
             "1,3",
             "--no-drag",
-            "--zeroed",
-            "each",
+            "--encoder-reference",
+            "per_recording",
             "--continuity",
-            "soft",
+            "penalty",
         ]
     )
     settings = estimation.fit_settings(told)
     assert settings["windows"] == (1.0, 3.0)
     assert settings["drag"] is False
-    assert settings["zeroed"] == "each"
-    assert settings["continuity"] == "soft"
+    assert settings["encoder_reference"] == "per_recording"
+    assert settings["continuity"] == "penalty"
 
 
 @pytest.mark.parametrize(

@@ -118,7 +118,7 @@ def test_debug_shows_the_error_itself(bench: Path) -> None:
         (["--rig", "nowhere"], "multiarm-triple"),
         (["--rig", "absent.json"], "absent.json is not there"),
         (["--angles", "sideways"], "absolute,hanging"),
-        (["--plant", "guess"], "--help"),
+        (["--fit-plant=guess"], "--help"),
         (["--columns", "time"], "time=t,q1=enc_1"),
         (["--columns", "speed=v"], "--columns maps time, q1"),
         (["--initial-states", "absent.csv"], "absent.csv"),

@@ -74,7 +74,7 @@ def test_it_tells_the_choice_and_every_candidate():
 
 
 def by_torque(model, plant, recordings, *, motions, start, **_):
-    return fit(model, plant, recordings, motions=motions, method="torque")
+    return fit(model, plant, recordings, motions=motions, method="equation_error")
 
 
 def test_a_model_that_fails_in_a_fold_counts_as_diverged(monkeypatch):

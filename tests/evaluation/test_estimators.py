@@ -19,7 +19,7 @@ pytest.importorskip("sklearn")
 TRUE = [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]]
 STARTS = ((1.6, 0.8), (2.0, 0.2), (1.2, -0.5))
 # Torques are one least squares: what is tested here is the estimator, not the search.
-QUICK = {"method": "torque"}
+QUICK = {"method": "equation_error"}
 
 
 @pytest.fixture(scope="module")

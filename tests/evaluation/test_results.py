@@ -35,7 +35,7 @@ def scored(rmse: float) -> Score:
 def comparison(recording: Recording) -> Comparison:
     """One model that predicts and one that diverges."""
     plant = PendulumChain(mass=[0.15], com=[0.15], length=[0.3], inertia=[1e-4])
-    found = fit(NCFM(1), plant, recording, method="torque")
+    found = fit(NCFM(1), plant, recording, method="equation_error")
     scores = {"no friction": [scored(0.2)], "good": [scored(0.1)], "wild": [scored(np.inf)]}
     fits = {"good": found, "wild": found}
     return Comparison(fits, scores, {}, unit="rad", joint_names=("joint1",))

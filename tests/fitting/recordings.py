@@ -4,7 +4,10 @@ import numpy as np
 import torch
 
 from nfriction import LinearAxis, PendulumChain, Recording, rollout
+from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.friction.model import FrictionModel
+from nfriction.optim.least_squares import LeastSquaresResult
+from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
 from nfriction.recording.angles import AngleConvention
 from nfriction.signals import quantise
 
@@ -48,3 +51,15 @@ def driven_axis(axis: LinearAxis, model: FrictionModel, *, seconds: float = 3.0)
     out = rollout(axis, model, zero, zero, tau[:-1], sample_time=2e-3, substeps=2, gradients=False)
     q = 1e-6 * np.rint(out.q.numpy() / 1e-6)
     return Recording(time, q, tau=tau.numpy(), unit="m", name="axis")
+
+
+def solve(
+    problem: ShootingProblem, start: torch.Tensor, max_steps: int = 30, cost_tolerance: float = 1e-6
+) -> LeastSquaresResult:
+    """The minimum of a shooting problem, without a monitor."""
+    lower, upper = problem.variables.bounds()
+    solver = LevenbergMarquardt(
+        max_steps=max_steps, gradient_tolerance=1e-6, cost_tolerance=cost_tolerance,
+        step_tolerance=1e-8,
+    )  # fmt: skip
+    return solver.minimise(problem.linearise, start, cost=problem.cost, lower=lower, upper=upper)

@@ -6,23 +6,24 @@ import torch
 
 from nfriction import NFLFM
 from nfriction.fitting.data.windows import Windows
-from nfriction.fitting.result.fit_result import trajectory_outcome
+from nfriction.fitting.options import DEFAULTS
+from nfriction.fitting.result.fit_result import result_from_shooting
 from nfriction.fitting.result.identifiability import covariance_root
 from nfriction.fitting.result.uncertainty import CoefficientUncertainty
-from nfriction.fitting.shooting.autocorrelation import band_of, local_noise
-from nfriction.fitting.shooting.problem import TrajectoryProblem, solve_trajectory
+from nfriction.fitting.shooting.autocorrelation import bandwidth, hac_sd
+from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.extrapolation_prior import (
-    ANCHOR_SD,
-    Anchors,
-    anchors_where_unseen,
-    visits,
+    ExtrapolationPrior,
+    prior_on_unvisited_cells,
+    visit_histogram,
 )
 from nfriction.signals import Motion
 from nfriction.simulation.rollout import integrate
-from tests.fitting.recordings import F64, pendulum
+from tests.fitting.recordings import F64, pendulum, solve
 
 FASTEST, STRONGEST = 5.0, 100.0
+ANCHOR_SD = DEFAULTS.unvisited_sd
 
 
 def network(size: float = 0.0) -> NFLFM:
@@ -46,7 +47,7 @@ def swings(*sizes: float) -> Motion:
 def test_small_swings_are_unseen_among_large_ones_and_seen_where_a_joint_made_them():
     schedule = network().schedule
     motions = [swings(1.0, 0.1), swings(1.0, 0.5)]
-    found = anchors_where_unseen(schedule, motions)
+    found = prior_on_unvisited_cells(schedule, motions)
     size = torch.hypot(found.qd / FASTEST, found.qdd / STRONGEST)
     assert found.weight[size[:, 0] < 0.75, 0].all()
     assert not found.weight[(size[:, 0] - 1).abs() < 0.05, 0].any()
@@ -57,7 +58,7 @@ def test_small_swings_are_unseen_among_large_ones_and_seen_where_a_joint_made_th
 
 
 def test_every_sample_is_counted_those_beyond_the_range_at_its_edge():
-    counts = visits(network().schedule, [swings(2.0, 0.5)], 10)
+    counts = visit_histogram(network().schedule, [swings(2.0, 0.5)], 10)
     assert counts.shape == (2, 10, 10)
     assert (counts.sum((1, 2)) == 4000).all()
     assert counts[0, -1].sum() > 2000
@@ -66,7 +67,7 @@ def test_every_sample_is_counted_those_beyond_the_range_at_its_edge():
 
 def test_normal_equations_are_of_the_derivatives_of_the_residuals():
     schedule = network(0.2).schedule
-    held = anchors_where_unseen(schedule, [swings(1.0, 0.5)])
+    held = prior_on_unvisited_cells(schedule, [swings(1.0, 0.5)])
     at, columns = schedule.parameter_vector(), []
     r, (gradient, hessian) = held.residuals(schedule), held.normal_equations(schedule)
     for k in range(len(at)):
@@ -84,7 +85,7 @@ def test_normal_equations_are_of_the_derivatives_of_the_residuals():
 
 def test_a_deviation_counts_in_units_of_the_scale():
     schedule = network().schedule
-    held = anchors_where_unseen(schedule, [swings(1.0, 1.0)])
+    held = prior_on_unvisited_cells(schedule, [swings(1.0, 1.0)])
     torch.testing.assert_close(held.residuals(schedule), torch.zeros_like(held.residuals(schedule)))
     (bias,) = [p for n, p in schedule.named_parameters() if n.endswith("output_bias")]
     with torch.no_grad():
@@ -96,7 +97,7 @@ def test_a_deviation_counts_in_units_of_the_scale():
     assert not found[held.weight == 0].any()
 
 
-def problem(model: NFLFM, held: Anchors | None) -> TrajectoryProblem:
+def problem(model: NFLFM, held: ExtrapolationPrior | None) -> ShootingProblem:
     """Windows of large swings, simulated with a network of its own."""
     g = torch.Generator().manual_seed(5)
     q0 = torch.tensor([[1.6, 0.5], [2.5, -0.4]], dtype=F64)
@@ -106,19 +107,19 @@ def problem(model: NFLFM, held: Anchors | None) -> TrajectoryProblem:
     q = integrate(pendulum(), network(0.3), q0, qd0, tau, step).q
     w = Windows(q, tau, step, torch.ones(2, 61, dtype=F64), q0, qd0)
     jacobian = StepJacobian(pendulum(), model, [])
-    return TrajectoryProblem(jacobian, w, 1e-4, torch.eye(2, dtype=F64), anchors=held)
+    return ShootingProblem(jacobian, model, w, 1e-4, torch.eye(2, dtype=F64), extrapolation=held)
 
 
 @pytest.mark.parametrize("size", [0.0, 0.2])
 def test_what_is_held_is_part_of_the_cost_and_of_its_model(size):
     model = network(size)
-    held = anchors_where_unseen(model.schedule, [swings(1.0, 0.5)])
+    held = prior_on_unvisited_cells(model.schedule, [swings(1.0, 0.5)])
     free, tied = problem(model, None), problem(model, held)
-    x = free.unknowns.start()
-    r, n = held.residuals(model.schedule), tied.unknowns.friction_count
+    x = free.variables.start()
+    r, n = held.residuals(model.schedule), tied.variables.friction_count
     slope, curvature = held.normal_equations(model.schedule)
     torch.testing.assert_close(tied.cost(x) - free.cost(x), 0.5 * r.square().sum())
-    a, b = free.quadratic(x), tied.quadratic(x)
+    a, b = free.linearise(x), tied.linearise(x)
     torch.testing.assert_close(b.gradient[:n] - a.gradient[:n], slope, rtol=1e-7, atol=1e-6)
     difference = b.hessian - a.hessian
     torch.testing.assert_close(difference[:n, :n], curvature, rtol=1e-7, atol=1e-4)
@@ -129,9 +130,10 @@ def test_a_network_fitted_so_deviates_less_where_nothing_was_seen():
     deviation = []
     for tied in (False, True):
         model = network()
-        held = anchors_where_unseen(model.schedule, [swings(1.0, 1.0)])
+        held = prior_on_unvisited_cells(model.schedule, [swings(1.0, 1.0)])
         p = problem(model, held if tied else None)
-        result = solve_trajectory(p, p.unknowns.start())
+        result = solve(p, p.variables.start())
+        model.schedule.set_parameter_vector(p.variables.split(result.x).friction)
         deviation.append(float(held.residuals(model.schedule).square().mean().sqrt()))
         assert float(p.errors(result.x).abs().max()) < 1e-3
     assert deviation[1] < 0.5 * deviation[0]
@@ -139,20 +141,20 @@ def test_a_network_fitted_so_deviates_less_where_nothing_was_seen():
 
 def test_what_is_only_held_is_not_taken_for_told_by_the_data():
     model = network()
-    held = anchors_where_unseen(model.schedule, [swings(1.0, 1.0)])
+    held = prior_on_unvisited_cells(model.schedule, [swings(1.0, 1.0)])
     p = problem(model, held)
-    result = solve_trajectory(p, p.unknowns.start(), max_steps=5)
-    errors, n = p.errors(result.x), p.unknowns.friction_count
+    result = solve(p, p.variables.start(), max_steps=5)
+    errors, n = p.errors(result.x), p.variables.friction_count
     where = (held.weight > 0)[..., None].expand(-1, -1, 2)
 
     def openness(uncertainty: CoefficientUncertainty) -> torch.Tensor:
         return (uncertainty.sd(held.qd, held.qdd) / model.schedule.scale)[where]
 
-    told = openness(trajectory_outcome(p, result, errors, ()).uncertainty)
-    alone = trajectory_outcome(problem(model, None), result, errors, ())
+    told = openness(result_from_shooting(model, p, result, ()).uncertainty)
+    alone = result_from_shooting(model, problem(model, None), result, ())
     torch.testing.assert_close(told, openness(alone.uncertainty))
     # As if the data had said what was held.
-    known = p.told(result.x, local_noise(errors, band_of(p.windows.q)))
+    known = p.information(result.x, hac_sd(errors, bandwidth(p.windows.q)))
     known.data[:n, :n] += held.normal_equations(model.schedule)[1]
     mistaken = openness(CoefficientUncertainty(model.schedule, covariance_root(known)[:n]))
     assert (told >= (1 - 1e-6) * mistaken).all()

@@ -97,8 +97,14 @@ def test_encoders_zeroed_anew_at_the_start_of_each_recording():
     recordings = [driven(plant, law, seed) for seed in (0, 1)]
     recordings = [replace(r, q=r.q - o) for r, o in zip(recordings, off, strict=True)]
     once, each = (
-        fit(CVFM(2, v_smooth=V_SMOOTH), plant, recordings, windows=(1.0,), zeroed=zeroed)
-        for zeroed in ("once", "each")
+        fit(
+            CVFM(2, v_smooth=V_SMOOTH),
+            plant,
+            recordings,
+            windows=(1.0,),
+            encoder_reference=reference,
+        )
+        for reference in ("shared", "per_recording")
     )
     truth = torch.tensor(DRY, dtype=F64)
     assert each.converged, each.status
@@ -115,12 +121,14 @@ def test_a_block_left_out_has_the_zero_of_its_recording():
     moved = [replace(r, q=r.q - o) for r, o in zip(recordings, off, strict=True)]
     splits = [blocked_k_fold(plant, r, 3)[1] for r in moved]
     seen = [split.train.recording for split in splits]
-    found = fit(CVFM(2, v_smooth=V_SMOOTH), plant, seen, windows=(1.0,), zeroed="each")
-    np.testing.assert_allclose(found.zeros, off, atol=3e-3)
+    found = fit(
+        CVFM(2, v_smooth=V_SMOOTH), plant, seen, windows=(1.0,), encoder_reference="per_recording"
+    )
+    np.testing.assert_allclose(found.encoder_offsets, off, atol=3e-3)
     blocks = [split.test for split in splits]
     for error, block in zip(block_errors(found, blocks, 1.0), blocks, strict=True):
         assert error < 2e-3
-        assert block_errors(replace(found, zeros=()), [block], 1.0)[0] > 5 * error
+        assert block_errors(replace(found, encoder_offsets=()), [block], 1.0)[0] > 5 * error
 
 
 def test_recordings_that_all_begin_at_rest_at_zero_are_taken_for_zeroed_there():
@@ -139,16 +147,16 @@ def test_recordings_that_all_begin_at_rest_at_zero_are_taken_for_zeroed_there():
     }
     for name, (given, each) in cases.items():
         found = fit(CVFM(2, v_smooth=V_SMOOTH), plant, given, windows=(0.5,), max_steps=2)
-        assert bool(found.zeros) == each, name
+        assert bool(found.encoder_offsets) == each, name
         assert any("begins at rest" in w for w in found.warnings) == each, name
     further = fit(
         NFCVFM(2, v_smooth=V_SMOOTH), plant, zeroed, windows=(0.5,), max_steps=2,
         start=fit(CVFM(2, v_smooth=V_SMOOTH), plant, zeroed, windows=(0.5,), max_steps=2),
     )  # fmt: skip
-    assert len(further.zeros) == 2
+    assert len(further.encoder_offsets) == 2
     assert sum("begins at rest" in w for w in further.warnings) == 1
     free = [replace(r, tau=None) for r in zeroed]
-    assert not fit(CVFM(2), plant, free, windows=(0.5,), max_steps=1).zeros
+    assert not fit(CVFM(2), plant, free, windows=(0.5,), max_steps=1).encoder_offsets
 
 
 def test_zeroed_at_rest_no_velocity_makes_up_for_friction_at_the_start():
@@ -156,11 +164,12 @@ def test_zeroed_at_rest_no_velocity_makes_up_for_friction_at_the_start():
     plant = geared()
     recording = driven(plant, CVFM(2, DRY, v_smooth=V_SMOOTH), 0)
     starts = {}
-    for zeroed in ("once", "each"):
-        found = fit(CVFM(2, v_smooth=0.5), plant, recording, windows=(0.5, 1.0), zeroed=zeroed)
-        starts[zeroed] = float(found._residuals[0, 0].abs().max())
+    for reference in ("shared", "per_recording"):
+        found = fit(CVFM(2, v_smooth=0.5), plant, recording, windows=(0.5, 1.0),
+                    encoder_reference=reference)  # fmt: skip
+        starts[reference] = float(found.residuals[0, 0].abs().max())
     # Within a step of the encoder where it is held, and far from it where it is not.
-    assert starts["each"] < 4e-4 < starts["once"]
+    assert starts["per_recording"] < 4e-4 < starts["shared"]
 
 
 @pytest.mark.parametrize("kind", [ACVFM, NFCVFM])
@@ -170,9 +179,11 @@ def test_models_that_follow_the_motion_take_the_zeros_of_their_constant_law(kind
     off = ([0.06, -0.08], [-0.03, 0.05])
     recordings = [driven(plant, law, seed) for seed in (0, 1)]
     moved = [replace(r, q=r.q - o) for r, o in zip(recordings, off, strict=True)]
-    found = fit(kind(2, v_smooth=V_SMOOTH), plant, moved, windows=(1.0,), zeroed="each")
-    np.testing.assert_allclose(found.zeros, off, atol=2e-3)
-    np.testing.assert_allclose(found.to_dict()["zeros"], found.zeros)
+    found = fit(
+        kind(2, v_smooth=V_SMOOTH), plant, moved, windows=(1.0,), encoder_reference="per_recording"
+    )
+    np.testing.assert_allclose(found.encoder_offsets, off, atol=2e-3)
+    np.testing.assert_allclose(found.to_dict()["encoder_offsets"], found.encoder_offsets)
     assert found.residual < 1e-3
     assert torch.equal(found.plant.angle_offset, plant.angle_offset)
     for recording, motion in zip(moved, found.motions, strict=True):
@@ -183,23 +194,23 @@ def test_a_start_with_the_zeros_of_other_recordings_is_fitted_anew():
     plant = geared()
     law = CVFM(2, DRY, v_smooth=V_SMOOTH)
     recordings = [driven(plant, law, seed, seconds=2.0) for seed in (0, 1)]
-    settings = {"windows": (0.5,), "zeroed": "each", "max_steps": 2}
+    settings = {"windows": (0.5,), "encoder_reference": "per_recording", "max_steps": 2}
     start = fit(CVFM(2, v_smooth=V_SMOOTH), plant, recordings, **settings)
     found = fit(NFCVFM(2, v_smooth=V_SMOOTH), plant, recordings[:1], start=start, **settings)
-    assert len(start.zeros) == 2
-    assert len(found.zeros) == 1
+    assert len(start.encoder_offsets) == 2
+    assert len(found.encoder_offsets) == 1
     turned = fit(NFCVFM(2, v_smooth=V_SMOOTH), plant, recordings[::-1], start=start, **settings)
-    np.testing.assert_allclose(turned.zeros[0], start.zeros[1], atol=1e-2)
-    assert not np.allclose(turned.zeros, start.zeros, atol=1e-6)
+    np.testing.assert_allclose(turned.encoder_offsets[0], start.encoder_offsets[1], atol=1e-2)
+    assert not np.allclose(turned.encoder_offsets, start.encoder_offsets, atol=1e-6)
 
 
 def test_zeroed_is_refused_where_it_means_nothing():
     plant = geared()
     recording = driven(plant, CVFM(2, DRY, v_smooth=V_SMOOTH), 0, seconds=0.5)
-    with pytest.raises(ValueError, match="`zeroed` must be one of"):
-        fit(CVFM(2), plant, recording, zeroed="never")
-    with pytest.raises(ValueError, match="not from torques"):
-        fit(CVFM(2), plant, recording, zeroed="each", method="torque")
+    with pytest.raises(ValueError, match="`encoder_reference` must be one of"):
+        fit(CVFM(2), plant, recording, encoder_reference="never")
+    with pytest.raises(ValueError, match="needs `method"):
+        fit(CVFM(2), plant, recording, encoder_reference="per_recording", method="equation_error")
 
 
 def test_load_dependent_friction_leaves_more_of_a_geared_mechanism_unexplained():

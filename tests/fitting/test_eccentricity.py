@@ -7,7 +7,7 @@ from nfriction import LFM, LinearAxis, fit
 from tests.fitting.recordings import F64, driven_axis, pendulum, swing
 
 V_SMOOTH = 0.05
-SETTINGS = {"windows": (0.5, 1.0), "drag": False, "eccentricity": None}
+SETTINGS = {"windows": (0.5, 1.0), "drag": False, "eccentricity": "auto"}
 
 
 def model(initial=None):
@@ -55,9 +55,9 @@ def test_encoders_that_are_centred_stay_so():
 def test_it_is_fitted_or_not_as_asked():
     recording = recorded(0.0, seconds=1.0)
     quick = {"windows": (0.5,), "max_steps": 1}
-    assert len(encoder_terms(fit(model(), pendulum(), recording, eccentricity=True, **quick))) == 4
-    assert not encoder_terms(fit(model(), pendulum(), recording, eccentricity=False, **quick))
+    assert len(encoder_terms(fit(model(), pendulum(), recording, eccentricity="on", **quick))) == 4
+    assert not encoder_terms(fit(model(), pendulum(), recording, eccentricity="off", **quick))
     axis = LinearAxis(2.0)
     one = driven_axis(axis, LFM(1, [3.0, 1.0], v_smooth=V_SMOOTH), seconds=0.5)
     with pytest.raises(ValueError, match="no encoders that turn"):
-        fit(LFM(1, v_smooth=V_SMOOTH), axis, one, eccentricity=True, **quick)
+        fit(LFM(1, v_smooth=V_SMOOTH), axis, one, eccentricity="on", **quick)

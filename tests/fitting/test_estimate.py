@@ -24,9 +24,9 @@ from nfriction import (
     rollout,
 )
 from nfriction.fitting.equation_error import fit_torque
+from nfriction.fitting.options import FitOptions
 from nfriction.fitting.shooting.autocorrelation import effective_noise
-from nfriction.fitting.strategy.constant import Settings
-from nfriction.fitting.strategy.continuation import Stage
+from nfriction.fitting.strategy.continuation import HorizonResult
 from nfriction.friction.constant import Constant
 from nfriction.friction.laws import STRIBECK
 from nfriction.friction.model import FrictionModel
@@ -54,7 +54,7 @@ def test_known_friction_is_recovered(convention):
     found = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, fit_plant=False, windows=(1.0,))
     assert_coefficients(found, 0.03)
     assert found.converged
-    assert found.status.startswith("converged")
+    assert found.status.startswith("Converged")
     # What is left over is the encoder's rounding, nothing else.
     assert found.residual == pytest.approx(2 * np.pi / 8192 / 12**0.5, rel=0.2)
     assert found.at_bounds == ()
@@ -69,7 +69,7 @@ def test_what_a_wrong_plant_leaves_over_is_told_whether_or_not_the_rig_says_its_
     for quantum in (None, 2 * np.pi / 8192):
         plant = PendulumChain(**wrong, position_quantum=quantum)
         found = fit(LFM(2), plant, recording, fit_plant=False, windows=(1.0,))
-        told.append([warning for warning in found.warnings if "Left over" in warning])
+        told.append([warning for warning in found.warnings if "Residual:" in warning])
     assert len(told[0]) == 1
     assert told[0] == told[1]
 
@@ -78,7 +78,7 @@ def test_one_motion_tells_friction_better_than_windows_apart():
     """Where nothing is left out of the model."""
     recording = swing(pendulum(), true_model())
     half_widths = []
-    for continuity in ("free", "hard"):
+    for continuity in ("none", "constraint"):
         found = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, fit_plant=False, drag=False,
                     windows=(0.5,), continuity=continuity)  # fmt: skip
         half_widths.append(np.array([i.high - i.low for i in found.intervals]))
@@ -128,9 +128,9 @@ def test_viscous_and_coulomb_friction_at_one_speed_are_named_as_lost():
     q = 1e-6 * np.rint(out.q.numpy() / 1e-6)
     recording = Recording(out.time.numpy(), q, tau=tau, unit="m", name="steady")
     found = fit(LFM(1, v_smooth=V_SMOOTH), axis, recording, windows=(0.5, 1.0), fit_plant=False)
-    (lost,) = found.lost
+    (lost,) = found.unidentifiable
     assert set(lost.split(" with ")) == {"B of joint1", "C of joint1"}
-    assert any("cannot tell" in warning for warning in found.warnings)
+    assert any("Not identifiable" in warning for warning in found.warnings)
     assert all(i.high - i.low > i.value for i in found.intervals)
     viscous, coulomb = found.model.schedule.values[0].tolist()
     assert 0.5123 * viscous + coulomb == pytest.approx(3.0 * 0.5123 + 1.0, rel=0.01)
@@ -144,11 +144,13 @@ def test_a_joint_that_hardly_moves_is_named_as_lost():
     found = fit(
         LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5, 1.0), fit_plant=False
     )
-    assert {"B of joint2", "C of joint2"} <= set(" with ".join(found.lost).split(" with "))
+    assert {"B of joint2", "C of joint2"} <= set(
+        " with ".join(found.unidentifiable).split(" with ")
+    )
     told = {i.name: i for i in found.intervals}
     assert told["C of joint2"].high - told["C of joint2"].low > 0.1
     for name, true in (("B of joint1", 1.5e-3), ("C of joint1", 2.5e-3)):
-        assert name not in found.lost
+        assert name not in found.unidentifiable
         assert told[name].value == pytest.approx(true, rel=0.05)
 
 
@@ -187,27 +189,27 @@ def test_air_drag_is_told_from_joint_friction():
         if drag:
             told = {i.name: i for i in found.intervals}["drag quadratic"]
             assert told.low < 0.05 < told.high
-            assert {"intervals", "lost", "warnings"} <= found.to_dict().keys()
+            assert {"intervals", "unidentifiable", "warnings"} <= found.to_dict().keys()
     assert errors[0] < 0.2 * errors[1]
 
 
 def test_windows_that_are_left_out_are_told(monkeypatch):
-    monkeypatch.setattr(Stage, "lost_since", lambda self, before: True)
+    monkeypatch.setattr(HorizonResult, "lost_motion", lambda self, before, options: True)
     recording = swing(pendulum(), true_model(), seconds=2.0)
     found = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5, 1.0), max_steps=3)
-    assert sum(told.startswith("Windows of 1 s are too long") for told in found.warnings) == 1
+    assert sum(told.startswith("Windows of 1 s were skipped") for told in found.warnings) == 1
     alone = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5,), max_steps=3)
-    assert not any("too long" in told for told in alone.warnings)
+    assert not any("were skipped" in told for told in alone.warnings)
     assert found.residual == pytest.approx(alone.residual, rel=0.2)
     # Whatever starts there says it, too.
     for score in (2.0, 0.0):
-        monkeypatch.setattr("nfriction.fitting.strategy.holdout.Judgement.score", score)
+        monkeypatch.setattr("nfriction.fitting.strategy.holdout.HoldoutScore.score", score)
         network = NFLFM(2, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2)
         further = fit(network, pendulum(), recording, start=found, windows=(0.5,), max_steps=2)
-        assert sum("too long" in told for told in further.warnings) == 1
+        assert sum("were skipped" in told for told in further.warnings) == 1
     # A network is not to follow what its law could not.
-    assert found.left_out == (1.0,)
-    assert fit(network, pendulum(), recording, start=found, max_steps=2).left_out == (1.0,)
+    assert found.skipped_horizons == (1.0,)
+    assert fit(network, pendulum(), recording, start=found, max_steps=2).skipped_horizons == (1.0,)
     stages = set()
     fit(
         network, pendulum(), recording, start=found, windows=(0.5, 1.0, 2.0), max_steps=2,
@@ -218,8 +220,8 @@ def test_windows_that_are_left_out_are_told(monkeypatch):
     later = fit(
         CVFM(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5, 1.0, 1.5), max_steps=3
     )
-    assert later.left_out == (1.0, 1.5)
-    assert sum("too long" in told for told in later.warnings) == 2
+    assert later.skipped_horizons == (1.0, 1.5)
+    assert sum("were skipped" in told for told in later.warnings) == 2
 
 
 def test_irregular_stamps_are_followed():
@@ -231,7 +233,7 @@ def test_irregular_stamps_are_followed():
 
 def test_a_torque_fit_stops_there_and_starts_another():
     recording = swing(pendulum(), true_model(), seconds=2.0)
-    first = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, method="torque")
+    first = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, method="equation_error")
     assert first.steps == 0
     # Accelerations of a coarse encoder bias the friction, but it explains part of the torque.
     assert (first.model.schedule.values >= 0).all()
@@ -240,11 +242,13 @@ def test_a_torque_fit_stops_there_and_starts_another():
     second = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, start=first,
                  motions=first.motions, windows=(1.0,), max_steps=2)  # fmt: skip
     assert second.plant_terms
-    third = fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, method="torque", start=second)
+    third = fit(
+        LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, method="equation_error", start=second
+    )
     assert third.plant is second.plant
     assert third.plant_terms == second.plant_terms
     with pytest.raises(ValueError, match="neuro-fuzzy"):
-        fit(NFLFM(2), pendulum(), recording, method="torque")
+        fit(NFLFM(2), pendulum(), recording, method="equation_error")
 
 
 def test_terms_of_an_earlier_fit_are_taken_by_name():
@@ -331,8 +335,10 @@ def test_what_does_not_match_is_refused():
 
 def test_a_constant_fit_that_others_ask_for_has_the_defaults_of_fit():
     offered = inspect.signature(fit).parameters
-    assert {f.name: f.default for f in fields(Settings)} == {
-        f.name: offered[f.name].default for f in fields(Settings)
+    defaults = {f.name: f.default for f in fields(FitOptions)}
+    own = {"model", "plant", "recordings", "start", "motions", "callback"}
+    assert {name: p.default for name, p in offered.items() if name not in own} == {
+        name: defaults[name] for name in offered if name not in own
     }
 
 
@@ -352,12 +358,12 @@ def test_recordings_without_torque_beside_driven_ones_are_named():
     torque = replace(other, tau=np.full_like(other.q, 1e-3), name="driven")
     for recordings in ([free, torque], [torque, free]):
         with pytest.warns(UserWarning, match=r"no torque is recorded in free, unlike") as said:
-            fit(LFM(2), pendulum(), recordings, method="torque")
+            fit(LFM(2), pendulum(), recordings, method="equation_error")
         assert len([w for w in said if "no torque" in str(w.message)]) == 1
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message="no torque is recorded")
         for alike in ([free, other], [torque, replace(free, tau=np.zeros_like(free.q))]):
-            fit(LFM(2), pendulum(), alike, method="torque")
+            fit(LFM(2), pendulum(), alike, method="equation_error")
 
 
 def test_nothing_is_logged_as_a_warning_in_a_plain_fit(caplog):
@@ -385,7 +391,7 @@ def test_angles_are_written_as_the_plant_says_unless_the_recording_says_otherwis
 def test_a_fitted_model_asks_for_no_gradients_and_may_be_fitted_again():
     recording = swing(pendulum(), true_model(), seconds=0.5)
     model = LFM(2, v_smooth=V_SMOOTH)
-    first = fit(model, pendulum(), recording, method="torque")
+    first = fit(model, pendulum(), recording, method="equation_error")
     assert first.model is model
     assert not model.schedule.raw.requires_grad
     assert (first.residual_unit, first.to_dict()["residual_unit"]) == ("N m", "N m")
@@ -401,7 +407,9 @@ def test_a_fitted_model_asks_for_no_gradients_and_may_be_fitted_again():
 
 def test_a_method_that_is_none_is_named():
     recording = swing(pendulum(), true_model(), seconds=0.5)
-    with pytest.raises(ValueError, match=r"one of \('trajectory', 'torque'\), got 'torqe'"):
+    with pytest.raises(
+        ValueError, match=r"one of \('equation_error', 'output_error'\), got 'torqe'"
+    ):
         fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, method="torqe")
 
 
@@ -477,10 +485,10 @@ def test_a_law_that_torques_mislead_starts_anew_on_the_plant_that_it_found(
     found = fitted()
     assert misled[1] is not misled[0]
     assert found.residual == pytest.approx(2 * np.pi / 8192 / 12**0.5, rel=0.2)
-    better = "nfriction.fitting.strategy.growing._better_start"
-    monkeypatch.setattr(better, lambda search, stage, *rest: stage)
+    better = "nfriction.fitting.strategy.continuation.restart_from_equation_error"
+    monkeypatch.setattr(better, lambda fitter, found, *rest: found)
     monkeypatch.setattr(
-        "nfriction.fitting.strategy.multistart.lowest_of", lambda search, own, *rest: own
+        "nfriction.fitting.strategy.multistart.best_of_starts", lambda fitter, own, *rest: own
     )
     assert fitted().residual > 1.02 * found.residual
 
@@ -501,7 +509,7 @@ def test_a_search_in_vain_from_the_simpler_law_leaves_the_model_as_it_was(monkey
     found = fit(Stribeck(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
     assert simpler
     monkeypatch.setattr(
-        "nfriction.fitting.strategy.multistart.lowest_of", lambda search, own, *rest: own
+        "nfriction.fitting.strategy.multistart.best_of_starts", lambda fitter, own, *rest: own
     )
     simpler.clear()
     alone = fit(Stribeck(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
@@ -527,7 +535,7 @@ def test_a_law_leaves_no_more_over_than_the_simpler_one_in_it(law, monkeypatch):
     )
     assert found.residual <= 1.001 * simpler.residual
     # Its own search lost track of all windows, and so left the longer ones out.
-    assert not any("too long" in warning for warning in found.warnings)
+    assert not any("were skipped" in warning for warning in found.warnings)
 
 
 @pytest.mark.parametrize(

@@ -7,23 +7,25 @@ import pytest
 import torch
 
 from nfriction import LFM, NFLFM, fit
-from nfriction.fitting.data.inputs import mixing_of
-from nfriction.fitting.shooting.problem import TrajectoryProblem
-from nfriction.fitting.strategy.continuation import Refinement
+from nfriction.fitting.data.inputs import measurement_matrix
+from nfriction.fitting.options import DEFAULTS
+from nfriction.fitting.shooting.problem import ShootingProblem
+from nfriction.fitting.shooting.sensitivity import StepJacobian
+from nfriction.fitting.strategy.continuation import ShootingFitter
 from nfriction.fitting.strategy.holdout import (
-    FOLDS,
-    Judgement,
-    error_on,
-    judged_windows,
-    shares_by_joint,
+    HoldoutScore,
+    holdout_rmse,
+    holdout_split,
 )
-from nfriction.fitting.strategy.neurofuzzy_start import settle_on, start_at
+from nfriction.fitting.strategy.neurofuzzy import initialise_from_constant, revert_to_constant
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from tests.fitting.recordings import F64, pendulum, swing
 
 V_SMOOTH = 0.05
 TRUTH = [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]]
 SMALL = {"terms": (2, 2), "head_units": 2}
+FOLDS = DEFAULTS.folds
+NONE = torch.zeros(0, dtype=F64)
 
 
 @pytest.fixture(scope="module")
@@ -37,116 +39,61 @@ def constant():
 def refinement(constant):
     joint, found = constant
     model = NFLFM(2, v_smooth=V_SMOOTH, **SMALL)
-    start_at(model, found, [joint], found.motions)
-    mixing = mixing_of(pendulum(), joint.resolve_convention(pendulum()))
-    return Refinement(pendulum(), model, [joint], mixing, [])
+    model = initialise_from_constant(model, found, [joint], found.motions)
+    measurement = measurement_matrix(pendulum(), joint.resolve_convention(pendulum()))
+    jacobian = StepJacobian(pendulum(), model, [])
+    return ShootingFitter(jacobian, model, [joint], measurement, DEFAULTS)
+
+
+def split(fitter, motions, length):
+    return holdout_split(fitter.recordings, motions, length, FOLDS)
+
+
+def vector(fitter):
+    return fitter.friction.schedule.parameter_vector()
 
 
 def test_windows_are_shared_out_once(constant):
     search, motions = refinement(constant), constant[1].motions
     for length in (0.5, 100.0):
-        seen, held_back = judged_windows(search, motions, length)
+        seen, held_back = split(search, motions, length)
         assert len(held_back) == (len(seen) + len(held_back)) // FOLDS > 0
         spans = sorted((*seen.spans, *held_back.spans))
         samples = [np.arange(first, last) for _, first, last in spans]
         np.testing.assert_array_equal(np.concatenate(samples), np.arange(len(constant[0]) - 1))
 
 
-def rms(residuals):
-    return residuals.square().mean(1).sqrt()
-
-
-def noise(seed, *shape):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=F64)
-
-
-def test_what_helps_one_joint_and_hurts_another_is_taken_on_the_first():
-    slope = torch.tensor([-0.5, 0.5], dtype=F64)
-    shares = shares_by_joint(lambda s: (1.0 + slope * s).expand(9, 2), 2)
-    assert shares.tolist() == [1.0, 0.0]
-
-
-def test_what_a_joint_s_own_gain_costs_another_is_not_taken():
-    # The first joint's part moves the second joint, too; of half of it the second's makes up.
-    def errors(s):
-        return torch.stack([1.0 - 0.5 * s[0], 1.0 + 0.2 * s[0] - 0.1 * s[1]]).expand(9, 2)
-
-    assert shares_by_joint(errors, 2).tolist() == [0.5, 1.0]
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_nothing_is_taken_of_noise_and_all_of_what_is_true(seed):
-    left = noise(seed, 40, 50, 2)
-    useless = noise(100 + seed, 40, 50, 2)
-    assert shares_by_joint(lambda s: rms(left + s * useless), 2).tolist() == [0.0, 0.0]
-    # What is right up to an error as small as what stays behind.
-    right = 3.0 * noise(200 + seed, 40, 50, 2)
-    assert shares_by_joint(
-        lambda s: rms(left + right - s * (right + 0.5 * useless)), 2
-    ).tolist() == [1.0, 1.0]
-
-
-def test_what_overshoots_is_taken_in_part():
-    assert shares_by_joint(lambda s: (0.1 + (0.5 - s).abs()).expand(9, 2), 2).tolist() == [0.5] * 2
-
-
-def test_of_what_serves_alike_the_least_is_taken():
-    assert shares_by_joint(lambda s: torch.ones(9, 3, dtype=F64), 3).tolist() == [0.0] * 3
-
-
-def test_a_single_wild_window_does_not_outvote_the_others():
-    def errors(s):
-        found = (1.0 - 0.5 * s).repeat(40, 1)
-        found[7] = 1.0 + 1000.0 * s
-        return found
-
-    assert shares_by_joint(errors, 2).tolist() == [1.0, 1.0]
-
-
-def test_what_makes_a_window_diverge_is_not_taken():
-    for lost in (torch.nan, torch.inf):
-
-        def errors(s, lost=lost):
-            found = (1.0 - 0.5 * s).repeat(9, 1)
-            found[3] = torch.where(s.amax() > 0.5, lost, found[3])
-            return found
-
-        assert shares_by_joint(errors, 2).tolist() == [0.5, 0.5]
-
-
 def test_a_network_errs_as_its_law_and_by_more_where_it_talks_nonsense(constant):
     search, motions = refinement(constant), constant[1].motions
-    seen, held_back = judged_windows(search, motions, 0.5)
-    none = torch.zeros(0, dtype=F64)
-    of_law = error_on(held_back, replace(search, model=constant[1].model).problem(seen, 1e-3), none)
-    schedule = search.model.schedule
+    seen, held_back = split(search, motions, 0.5)
+    law = replace(search, friction=constant[1].model)
+    of_law = holdout_rmse(held_back, law.problem(seen, 1e-3, vector(law)), vector(law), NONE)
     for value, least, most in ((0.0, 1 - 1e-9, 1 + 1e-9), (1.0, 1.5, np.inf)):
-        schedule.set_parameter_vector(torch.full_like(schedule.parameter_vector(), value))
-        by_network = search.problem(seen, 1e-3)
-        assert least <= error_on(held_back, by_network, none) / of_law <= most
-        assert float(schedule.parameter_vector().mean()) == value
+        network = torch.full_like(vector(search), value)
+        by_network = search.problem(seen, 1e-3, network)
+        assert least <= holdout_rmse(held_back, by_network, network, NONE) / of_law <= most
+    assert not vector(search).any()
 
 
 def test_a_window_is_judged_from_the_state_that_suits_the_fit(constant):
     """A smoother's error at the start says nothing of a law."""
     search, motions = refinement(constant), constant[1].motions
-    seen, held_back = judged_windows(search, motions, 0.5)
-    none = torch.zeros(0, dtype=F64)
-    problem = replace(search, model=constant[1].model).problem(seen, 1e-4)
+    seen, held_back = split(search, motions, 0.5)
+    law = replace(search, friction=constant[1].model)
+    problem = law.problem(seen, 1e-4, vector(law))
     off = replace(held_back, q0=held_back.q0 + 1e-3, qd0=held_back.qd0 - 0.01)
     from_off = replace(problem, windows=off)
-    unsettled = from_off.errors(from_off.unknowns.start(none)).square().mean().sqrt()
-    settled = error_on(off, problem, none)
+    unsettled = from_off.errors(from_off.variables.start()).square().mean().sqrt()
+    settled = holdout_rmse(off, problem, vector(law), NONE)
     assert settled < 0.1 * float(unsettled)
-    assert settled == pytest.approx(error_on(held_back, problem, none), rel=0.05)
+    assert settled == pytest.approx(holdout_rmse(held_back, problem, vector(law), NONE), rel=0.05)
 
 
 def test_a_network_that_diverges_errs_without_end(constant):
     search, motions = refinement(constant), constant[1].motions
-    seen, held_back = judged_windows(search, motions, 0.5)
-    schedule = search.model.schedule
-    schedule.set_parameter_vector(torch.full_like(schedule.parameter_vector(), 1e6))
-    assert error_on(held_back, search.problem(seen, 1e-3), torch.zeros(0, dtype=F64)) == np.inf
+    seen, held_back = split(search, motions, 0.5)
+    wild = torch.full_like(vector(search), 1e6)
+    assert holdout_rmse(held_back, search.problem(seen, 1e-3, wild), wild, NONE) == np.inf
 
 
 @pytest.mark.parametrize(
@@ -155,15 +102,15 @@ def test_a_network_that_diverges_errs_without_end(constant):
 def test_a_network_beats_the_law_that_saw_as_much_and_nears_the_one_that_saw_all(
     same, of_all, kept
 ):
-    assert (Judgement(same, of_all).score <= 1) is kept
+    assert (HoldoutScore(same, of_all).score <= 1) is kept
 
 
 def test_a_model_settles_on_a_coefficient_of_zero(constant):
     search, found = refinement(constant), constant[1]
     zero = replace(found, model=LFM(2, [[0.0, 2e-3]] * 2, v_smooth=V_SMOOTH))
-    settle_on(search.model, zero)
-    rest = search.model.schedule.rest_coefficients()
-    scale = search.model.schedule.scale
+    revert_to_constant(search.friction, zero)
+    rest = search.friction.schedule.rest_coefficients()
+    scale = search.friction.schedule.scale
     assert (rest[:, 0] < 2e-6 * scale[:, 0]).all()
     torch.testing.assert_close(rest[:, 1], torch.full((2,), 2e-3, dtype=F64), rtol=1e-6, atol=0)
 
@@ -174,10 +121,10 @@ def test_a_model_settles_on_a_coefficient_of_zero(constant):
 def test_a_network_that_does_not_win_is_put_back(constant, monkeypatch, ratio, told):
     joint, found = constant
 
-    def error(held_back, problem, vector):
+    def error(test, problem, *_):
         return ratio if isinstance(problem.friction.schedule, NeuroFuzzy) else 1.0
 
-    monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.error_on", error)
+    monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.holdout_rmse", error)
     model = NFLFM(2, v_smooth=V_SMOOTH, **SMALL)
     kept = fit(model, pendulum(), joint, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
     assert kept.model is model
@@ -200,7 +147,7 @@ def test_a_fit_stopped_before_its_network_keeps_the_constant_law(constant):
     kept = fit(
         model, pendulum(), joint, start=found, windows=(0.5,), fit_plant=False, callback=stop
     )
-    assert set(stages) == {"constants, a third held back"}
+    assert set(stages) == {"constant law, hold-out"}
     assert kept.model is model
     assert not kept.converged
     assert "Stopped" in kept.status
@@ -210,7 +157,7 @@ def test_a_fit_stopped_before_its_network_keeps_the_constant_law(constant):
 
 def test_an_interrupt_while_windows_judge_keeps_the_constant_law(constant, monkeypatch):
     joint, found = constant
-    cost = TrajectoryProblem.cost
+    cost = ShootingProblem.cost
     judged = []
 
     def interrupted(problem, x):
@@ -220,8 +167,8 @@ def test_an_interrupt_while_windows_judge_keeps_the_constant_law(constant, monke
         return cost(problem, x)
 
     search = refinement(constant)
-    held_back = len(judged_windows(search, found.motions, 0.5)[1])
-    monkeypatch.setattr(TrajectoryProblem, "cost", interrupted)
+    held_back = len(split(search, found.motions, 0.5)[1])
+    monkeypatch.setattr(ShootingProblem, "cost", interrupted)
     model = NFLFM(2, v_smooth=V_SMOOTH, **SMALL)
     kept = fit(model, pendulum(), joint, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
     assert len(judged) == 1

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nfriction import CVFM, LFM, NFLFM, PendulumChain, Recording, fit
-from nfriction.fitting.data.checks import misgivings
+from nfriction.fitting.data.checks import data_warnings
 from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import COUNTS, pendulum, swing
 
@@ -15,7 +15,7 @@ MODEL = LFM(2, [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]], v_smooth=0.05)
 def said(plant: PendulumChain, *recordings: Recording) -> tuple[str, ...]:
     joint = [r.joint_coordinates(plant) for r in recordings]
     motions = [kalman_smoother(r.time, r.q) for r in joint]
-    return misgivings(plant, recordings, joint, motions)
+    return data_warnings(plant, recordings, joint, motions)
 
 
 def as_plant_says(recording: Recording) -> Recording:
@@ -45,7 +45,7 @@ def test_what_a_torque_may_hold_up_is_not_judged():
 def test_a_fit_says_it_once_and_by_either_method():
     recording = as_plant_says(swing(pendulum(), MODEL, seconds=1.0, convention="absolute,hanging"))
     plant = pendulum(convention=("absolute", "upright"))
-    for settings in ({"method": "torque"}, {"windows": (0.5,), "max_steps": 1}):
+    for settings in ({"method": "equation_error"}, {"windows": (0.5,), "max_steps": 1}):
         found = fit(LFM(2), plant, recording, **settings)
         assert sum("measured from hanging" in told for told in found.warnings) == 1
 
@@ -96,7 +96,7 @@ def test_of_a_motionless_recording_a_fit_knows_nothing():
     plant, rest = resting(0)
     found = fit(LFM(2), plant, rest, windows=(0.5,), fit_plant=False)
     assert found.residual < 1e-12
-    lost = set(" with ".join(found.lost).split(" with "))
+    lost = set(" with ".join(found.unidentifiable).split(" with "))
     assert lost == {f"{c} of joint{j}" for c in "BC" for j in (1, 2)}
     assert any("joint2 never moves" in told for told in found.warnings)
 
@@ -106,7 +106,7 @@ def test_where_nothing_is_left_over_nothing_is_told():
     rest = Recording(np.arange(1000) * 2e-3, np.zeros((1000, 1)))
     found = fit(CVFM(1), plant, rest, windows=(0.5,), drag=False)
     assert found.residual == 0
-    assert {"F_c of joint1", "F_v of joint1", "inertia 11"} < set(found.lost)
+    assert {"F_c of joint1", "F_v of joint1", "inertia 11"} < set(found.unidentifiable)
 
 
 def test_of_an_encoder_that_flickers_a_fit_knows_no_friction():
@@ -114,4 +114,6 @@ def test_of_an_encoder_that_flickers_a_fit_knows_no_friction():
     q = COUNT * (np.random.default_rng(0).random(2000) < 0.5)
     plant = PendulumChain([0.4], [0.4], convention=("absolute", "hanging"))
     found = fit(CVFM(1), plant, Recording(time, q[:, None]), windows=(0.5, 2.0), drag=False)
-    assert {"F_c of joint1", "F_v of joint1"} <= set(" with ".join(found.lost).split(" with "))
+    assert {"F_c of joint1", "F_v of joint1"} <= set(
+        " with ".join(found.unidentifiable).split(" with ")
+    )

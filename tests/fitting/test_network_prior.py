@@ -6,13 +6,14 @@ import pytest
 import torch
 
 from nfriction import LFM, NCFM, NFLFM, NFNCFM, NFStribeck, Stribeck, fit
+from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.identifiability import Interval
-from nfriction.fitting.strategy.continuation import Refinement
-from nfriction.fitting.strategy.neurofuzzy import PRIOR_SHARES
+from nfriction.fitting.strategy.continuation import ShootingFitter
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from tests.fitting.recordings import pendulum, swing
 
 V_SMOOTH = 0.05
+PRIOR_SHARES = DEFAULTS.prior_shares
 SMALL = {"terms": (2, 2), "head_units": 2}
 BRIEF = {"windows": (0.5,), "max_steps": 2}
 
@@ -36,14 +37,13 @@ def test_the_prior_is_the_one_whose_network_predicts_best(constant, monkeypatch,
     recording, found = constant
     seen = []
 
-    def error(held_back, problem, vector):
-        schedule = problem.friction.schedule
-        if not isinstance(schedule, NeuroFuzzy):
+    def error(test, problem, *_):
+        if not isinstance(problem.friction.schedule, NeuroFuzzy):
             return 1.0
-        seen.append(schedule.prior_sd)
+        seen.append(float(problem.friction_prior[1][0]))
         return 0.7 - 0.2 * (len(seen) == best + 1)
 
-    monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.error_on", error)
+    monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.holdout_rmse", error)
     model = NFLFM(2, v_smooth=V_SMOOTH, prior_sd=0.6, **SMALL)
     fit(model, pendulum(), recording, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
     assert seen == pytest.approx([0.6 * share for share in PRIOR_SHARES])
@@ -56,7 +56,7 @@ def test_a_law_that_is_not_linear_has_a_network_too(constant):
     settings = {"windows": (0.5,), "fit_plant": False, "max_steps": 8}
     law = fit(Stribeck(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nfriction.fitting.strategy.holdout.Judgement.score", 0.0)
+        patch.setattr("nfriction.fitting.strategy.holdout.HoldoutScore.score", 0.0)
         model = NFStribeck(2, v_smooth=V_SMOOTH, **SMALL)
         found = fit(model, pendulum(), recording, start=law, **settings)
     assert found.model is model
@@ -69,7 +69,7 @@ def test_the_plant_stays_about_as_near_to_the_laws_as_that_left_it_open(constant
     settings = {"windows": (0.5,), "max_steps": 4}
     law = fit(NCFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
     open_ = {i.name: i.sd for i in law.intervals}
-    monkeypatch.setattr("nfriction.fitting.strategy.holdout.Judgement.score", 0.5)
+    monkeypatch.setattr("nfriction.fitting.strategy.holdout.HoldoutScore.score", 0.5)
 
     def moved() -> float:
         """By how many standard deviations that the law's fit left open, at most."""
@@ -91,27 +91,26 @@ def test_a_plant_is_let_go_only_for_what_windows_held_back_gain(
     seen, trained = [], []
 
     def expected(problem):
-        return [t.prior_sd for t in problem.unknowns.terms]
+        return problem.plant_prior[1].tolist()
 
-    def error(held_back, problem, vector):
-        schedule = problem.friction.schedule
-        if not isinstance(schedule, NeuroFuzzy):
+    def network_sd(problem):
+        return None if problem.friction_prior is None else float(problem.friction_prior[1][0])
+
+    def error(test, problem, friction, plant):
+        if not isinstance(problem.friction.schedule, NeuroFuzzy):
             return 1.0
-        seen.append((expected(problem), schedule.prior_sd, schedule.parameter_vector(), vector))
+        seen.append((expected(problem), network_sd(problem), friction, plant))
         near = expected(problem) == seen[0][0]
         return 0.7 * (1.0 if near else of_near) * (1.0 if len(seen) % 2 else 1.01)
 
-    def search(self, problem, vector, *others):
-        schedule = problem.friction.schedule
-        trained.append(
-            (expected(problem), getattr(schedule, "prior_sd", None), schedule.parameter_vector(),
-             vector)
-        )  # fmt: skip
-        return searched(self, problem, vector, *others)
+    def search(self, problem, start, *others):
+        parts = problem.variables.split(start)
+        trained.append((expected(problem), network_sd(problem), parts.friction, parts.plant))
+        return searched(self, problem, start, *others)
 
-    searched = Refinement.search
-    monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.error_on", error)
-    monkeypatch.setattr(Refinement, "search", search)
+    searched = ShootingFitter.search
+    monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.holdout_rmse", error)
+    monkeypatch.setattr(ShootingFitter, "search", search)
     model = NFLFM(2, v_smooth=V_SMOOTH, **SMALL)
     fit(model, pendulum(), recording, start=law, **BRIEF)
     near, _, free, _ = (trial[0] for trial in seen)
@@ -129,16 +128,16 @@ def test_a_law_that_diverges_lets_go_of_no_plant(with_plant, monkeypatch):
     recording, law = with_plant
     trained = []
 
-    def error(held_back, problem, vector):
+    def error(test, problem, *_):
         return 1.0 if isinstance(problem.friction.schedule, NeuroFuzzy) else math.inf
 
     def search(self, problem, *others):
-        trained.append([t.prior_sd for t in problem.unknowns.terms])
+        trained.append(problem.plant_prior[1].tolist())
         return searched(self, problem, *others)
 
-    searched = Refinement.search
-    monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.error_on", error)
-    monkeypatch.setattr(Refinement, "search", search)
+    searched = ShootingFitter.search
+    monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.holdout_rmse", error)
+    monkeypatch.setattr(ShootingFitter, "search", search)
     fit(NFLFM(2, v_smooth=V_SMOOTH, **SMALL), pendulum(), recording, start=law, **BRIEF)
     free, near, *_ = trained
     assert near != free
@@ -155,12 +154,12 @@ def test_a_network_stopped_before_it_is_judged_gives_way_to_its_law(with_plant, 
         return searched(self, problem, vector, tolerance, name)
 
     def stop(stage, step):
-        return begun.count("a third held back") > place
+        return begun.count("network, hold-out") > place
 
-    searched = Refinement.search
-    monkeypatch.setattr(Refinement, "search", search)
+    searched = ShootingFitter.search
+    monkeypatch.setattr(ShootingFitter, "search", search)
     kept = fit(model, pendulum(), recording, start=law, callback=stop, **BRIEF)
-    assert begun[1:] == ["a third held back"] * (place + 1)
+    assert begun[1:] == ["network, hold-out"] * (place + 1)
     assert not kept.converged
     assert "its constant law is kept" in kept.status
     at = (torch.ones(1, 2, dtype=torch.float64),) * 3

@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from nfriction import LinearAxis, PendulumChain, rigs
-from nfriction.fitting.plant_parameters import RATIO_BOUND, adjusted_buffers, plant_parameters
+from nfriction.fitting.options import DEFAULTS
+from nfriction.fitting.plant_parameters import adjusted_buffers, plant_parameters
 from tests.fitting.recordings import F64, pendulum
 
 
@@ -65,7 +66,7 @@ def test_terms_that_are_not_there_are_not_adjusted():
 
 
 def test_an_arm_has_no_hanging_position_and_no_encoder_terms():
-    links = [n for n in names(rigs.tlrip("free"), driven=(), eccentricity=True) if "enc" in n]
+    links = [n for n in names(rigs.tlrip("free"), driven=(), eccentricity="on") if "enc" in n]
     assert links == [f"encoder {part} {j} [rad]" for j in (2, 3, 4) for part in ("cosine", "sine")]
 
 
@@ -79,7 +80,7 @@ def test_ratios_scale_their_terms_and_nothing_else():
     expected = plant.inertia_coupling.clone()
     expected[1, 1] *= 1.1
     torch.testing.assert_close(coupling, expected)
-    assert all(t.upper == RATIO_BOUND for t in terms if "inertia" in t.name)
+    assert all(t.upper == DEFAULTS.ratio_term[0] for t in terms if "inertia" in t.name)
 
 
 @pytest.mark.parametrize(

@@ -3,16 +3,17 @@
 import pytest
 import torch
 
+from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.shooting.autocorrelation import (
-    LEAST_ALIKE,
-    band_of,
+    bandwidth,
     correlation_time,
-    local_noise,
+    hac_sd,
 )
 
 F64 = torch.float64
 # Motion slower than any of these errors.
 SLOW = 1e-4
+LEAST_ALIKE = DEFAULTS.min_stationary
 
 
 def lasting(phi: float, samples: int = 4000, windows: int = 20, seed: int = 0) -> torch.Tensor:
@@ -32,7 +33,7 @@ def time_of(phi: float) -> float:
 @pytest.mark.parametrize("phi", [0.0, 0.8])
 def test_errors_that_are_alike_count_alike(phi):
     """Rough in each stretch, but right in all."""
-    found = local_noise(0.3 * lasting(phi), SLOW)
+    found = hac_sd(0.3 * lasting(phi), SLOW)
     assert found.shape == (20, 4000, 1)
     assert float(found.square().mean()) == pytest.approx(0.3**2 * time_of(phi), rel=0.12)
 
@@ -43,9 +44,9 @@ def test_rounding_makes_up_for_itself_from_count_to_count():
     q = speed * torch.arange(4000, dtype=F64)[None, :, None]
     residuals = q.round() - q
     sums = residuals.reshape(20, 16, 250).sum(-1)
-    found = local_noise(residuals, SLOW).square().mean()
+    found = hac_sd(residuals, SLOW).square().mean()
     assert float(sums.square().mean()) / 250 < float(found) < 0.5 * residuals.square().mean()
-    stays = local_noise(torch.full((1, 500, 1), 0.3, dtype=F64), SLOW)
+    stays = hac_sd(torch.full((1, 500, 1), 0.3, dtype=F64), SLOW)
     assert float(stays.min()) > 0.3 * (0.5 * 500) ** 0.5
 
 
@@ -54,28 +55,28 @@ def test_a_stretch_where_errors_last_does_not_spoil_the_others():
     residuals = torch.cat([fast[:, :3000], slow[:, :1000]], 1)
     # All over, errors seem to last for longer than they do in most of the window.
     assert correlation_time(residuals) > 5
-    found = local_noise(residuals, SLOW).square()
+    found = hac_sd(residuals, SLOW).square()
     assert float(found[:, : 3000 - LEAST_ALIKE].mean()) == pytest.approx(1.0, rel=0.25)
     assert float(found[:, 3000 + LEAST_ALIKE :].mean()) == pytest.approx(time_of(0.95), rel=0.4)
 
 
 def test_joints_are_told_apart():
     residuals = torch.cat([lasting(0.0), 3 * lasting(0.0, seed=1)], -1)
-    one, three = local_noise(residuals, SLOW).square().mean((0, 1)).tolist()
+    one, three = hac_sd(residuals, SLOW).square().mean((0, 1)).tolist()
     assert three / one == pytest.approx(9.0, rel=0.05)
 
 
 def test_no_error_at_all_is_as_uncertain_as_errors_elsewhere():
     """A free start takes over the one error of a joint at rest; it stays as uncertain."""
     residuals = torch.cat([lasting(0.0, 3000), torch.zeros(20, 1000, 1, dtype=F64)], 1)
-    assert float(local_noise(residuals, SLOW)[:, -1].min()) > 0.8 * LEAST_ALIKE**0.5
-    assert not torch.isnan(local_noise(torch.zeros(2, 300, 1, dtype=F64), SLOW)).any()
+    assert float(hac_sd(residuals, SLOW)[:, -1].min()) > 0.8 * LEAST_ALIKE**0.5
+    assert not torch.isnan(hac_sd(torch.zeros(2, 300, 1, dtype=F64), SLOW)).any()
 
 
 def test_units_do_not_matter_and_windows_may_be_short():
     residuals = lasting(0.5, 1000, 3)
-    torch.testing.assert_close(local_noise(7 * residuals, SLOW), 7 * local_noise(residuals, SLOW))
-    assert local_noise(residuals[:, :50], SLOW).shape == (3, 50, 1)
+    torch.testing.assert_close(hac_sd(7 * residuals, SLOW), 7 * hac_sd(residuals, SLOW))
+    assert hac_sd(residuals[:, :50], SLOW).shape == (3, 50, 1)
 
 
 @pytest.mark.parametrize("period", [200, 500, 700])
@@ -86,11 +87,11 @@ def test_what_swings_with_the_motion_does_not_make_up_for_itself(period):
     phase = torch.rand(400, 1, 1, generator=g, dtype=F64)
     residuals = (2 * torch.pi * (time + phase)).sin()
     q = 0.8 * (2 * torch.pi * time).cos()
-    assert band_of(q) * period == pytest.approx(2.0, rel=0.3)
+    assert bandwidth(q) * period == pytest.approx(2.0, rel=0.3)
     weight = (2 * torch.pi * time).sin()
     spread = (residuals * weight).sum(1).square().mean().sqrt()
-    noise = local_noise(residuals, band_of(q))
+    noise = hac_sd(residuals, bandwidth(q))
     claimed = (noise[:1] * weight).square().sum().sqrt()
-    slow = (local_noise(residuals, SLOW)[:1] * weight).square().sum().sqrt()
+    slow = (hac_sd(residuals, SLOW)[:1] * weight).square().sum().sqrt()
     assert 2.0 * slow < claimed < 1.2 * spread
     assert claimed > 0.3 * spread

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from nfriction import LFM, NFLFM, LinearAxis
+from nfriction import LFM, LinearAxis
 from nfriction.codegen import NoBackend
 from nfriction.fitting.plant_parameters import adjusted_buffers, plant_parameters
-from nfriction.fitting.shooting.sensitivity import CHUNK, StepJacobian, start_slope, step_maps
+from nfriction.fitting.shooting.sensitivity import CHUNK, StepJacobian, Trajectory, propagate
 from nfriction.friction.models import MODELS
 from nfriction.simulation.rk4 import rk4_step
 from nfriction.simulation.rollout import integrate
@@ -101,7 +101,7 @@ def test_the_start_slope_is_the_frictionless_acceleration_s():
     plant = pendulum()
     terms = plant_parameters(plant, driven=(0, 1), largest_torque=1.0)
     q, qd, _, tau, _, vector = samples(2, 2, len(terms))
-    found = start_slope(StepJacobian(plant, LFM(2), terms), q, qd, tau, vector)
+    found = StepJacobian(plant, LFM(2), terms).initial_acceleration(q, qd, tau, vector)
     step = 1e-6
     columns = []
     for i, x in enumerate((q, qd, vector)):
@@ -119,43 +119,35 @@ def test_the_start_slope_is_the_frictionless_acceleration_s():
     torch.testing.assert_close(found, torch.stack(columns, -1), rtol=1e-6, atol=1e-5)
 
 
-@pytest.mark.parametrize("run", [3, 50])
-def test_pieces_of_a_run_are_the_whole(run):
-    plant, model = pendulum(), NFLFM(2, v_smooth=0.5)
-    jacobian = StepJacobian(plant, model, [])
+def rows_of(name, steps, substeps, stride):
+    """Samples of a short motion and the derivatives of the positions there, in one piece."""
+    plant, model = pendulum(), MODELS[name](2, v_smooth=0.5)
     q0, qd0 = torch.ones(2, 2, dtype=F64), torch.zeros(2, 2, dtype=F64)
-    tau, step = torch.zeros(2, 10, 2, dtype=F64), torch.full((2, 10), 1e-3, dtype=F64)
+    tau, step = torch.zeros(2, steps, 2, dtype=F64), torch.full((2, steps), 1e-3, dtype=F64)
     motion = integrate(plant, model, q0, qd0, tau, step)
-    empty = torch.zeros(0, dtype=F64)
-    maps = list(step_maps(jacobian, motion, tau, step, empty, run))
-    whole = next(step_maps(jacobian, motion, tau, step, empty, 10))
-    assert sum(len(m.state) for m in maps) == 10
-    for name in ("state", "parameters", "plant"):
-        joined = torch.cat([getattr(m, name) for m in maps])
-        torch.testing.assert_close(joined, getattr(whole, name), rtol=1e-13, atol=1e-13)
-    assert whole.parameters.shape[-1] == model.schedule.parameter_vector().numel()
+    run = Trajectory(model, torch.zeros(0, dtype=F64), motion, tau, step)
+    pieces = list(propagate(StepJacobian(plant, model, []), run, substeps, stride))
+    samples = [k for part, _ in pieces for k in range(steps // substeps + 1)[part]]
+    return samples, torch.cat([rows[:, :, :2] for _, rows in pieces], 1), pieces[-1][1]
+
+
+@pytest.mark.parametrize("piece", [6, 100])
+def test_pieces_of_a_run_are_the_whole(piece, monkeypatch):
+    _, whole, end = rows_of("NFLFM", 10, 1, 1)
+    monkeypatch.setattr("nfriction.fitting.shooting.sensitivity.PIECE", piece)
+    samples, found, last = rows_of("NFLFM", 10, 1, 1)
+    assert samples == list(range(11))
+    torch.testing.assert_close(found, whole, rtol=1e-13, atol=1e-13)
+    torch.testing.assert_close(last, end, rtol=1e-13, atol=1e-13)
 
 
 @pytest.mark.parametrize("name", ["LFM", "NFLFM"])
-def test_a_block_is_the_chain_of_its_steps(name):
-    """Two blocks of three steps; the seventh step is a block of its own."""
-    plant, model = pendulum(), MODELS[name](2, v_smooth=0.5)
-    jacobian = StepJacobian(plant, model, [])
-    q0, qd0 = torch.ones(2, 2, dtype=F64), torch.zeros(2, 2, dtype=F64)
-    tau, step = torch.zeros(2, 7, 2, dtype=F64), torch.full((2, 7), 1e-3, dtype=F64)
-    motion = integrate(plant, model, q0, qd0, tau, step)
-    empty = torch.zeros(0, dtype=F64)
-    single = next(step_maps(jacobian, motion, tau, step, empty, 7))
-    blocks, rest = step_maps(jacobian, motion, tau, step, empty, 7, block=3)
-    assert len(blocks.state) == 2
-    assert len(rest.state) == 1
-    torch.testing.assert_close(rest.state[0], single.state[6], rtol=1e-13, atol=1e-14)
-    torch.testing.assert_close(rest.parameters[0], single.parameters[6], rtol=1e-13, atol=1e-14)
-    for b in range(2):
-        state = torch.eye(6, dtype=F64).expand(2, -1, -1)
-        parameters = torch.zeros_like(single.parameters[0])
-        for k in range(3 * b, 3 * b + 3):
-            state = single.state[k] @ state
-            parameters = single.state[k] @ parameters + single.parameters[k]
-        torch.testing.assert_close(blocks.state[b], state, rtol=1e-12, atol=1e-14)
-        torch.testing.assert_close(blocks.parameters[b], parameters, rtol=1e-12, atol=1e-14)
+@pytest.mark.parametrize(("substeps", "stride"), [(1, 3), (3, 1), (3, 2)])
+def test_a_block_is_the_chain_of_its_steps(name, substeps, stride):
+    """Also where steps are left after the last whole block."""
+    steps = 21 if substeps > 1 else 7
+    _, every, end = rows_of(name, steps, 1, 1)
+    samples, found, last = rows_of(name, steps, substeps, stride)
+    for k, sample in enumerate(samples):
+        torch.testing.assert_close(found[:, k], every[:, sample * substeps], rtol=1e-12, atol=1e-14)
+    torch.testing.assert_close(last, end, rtol=1e-12, atol=1e-14)

@@ -1,32 +1,34 @@
 """A stage tells its steps, ends where it creeps, and says so."""
 
 import pytest
-import torch
 
 from nfriction import LFM
-from nfriction.fitting.data.inputs import mixing_of
+from nfriction.fitting.data.inputs import measurement_matrix
 from nfriction.fitting.data.windows import cut_windows
-from nfriction.fitting.strategy.continuation import PATIENCE, SETTLED, Refinement, _Watch
+from nfriction.fitting.options import DEFAULTS, FitOptions
+from nfriction.fitting.shooting.sensitivity import StepJacobian
+from nfriction.fitting.strategy.continuation import ShootingFitter, StallMonitor
 from nfriction.optim.least_squares import Step
 from nfriction.signals import kalman_smoother
-from tests.fitting.recordings import F64, pendulum, swing
+from tests.fitting.recordings import pendulum, swing
+
+PATIENCE, SETTLED = DEFAULTS.patience, DEFAULTS.settled_move
 
 
-def stops(costs, tolerance=1e-3, callback=None):
-    """After how many steps the watch ends a search of these costs."""
+def ends(costs, tolerance=1e-3):
+    """The status after each step of a search of these costs."""
     _, problem = short_search()
-    watch, x = _Watch("stage", tolerance, callback, problem), problem.unknowns.start()
+    monitor, x = StallMonitor(problem, tolerance, DEFAULTS), problem.variables.start()
+    local = problem.linearise(x)
     # Damped, so that a point that stays is no rest.
-    return [watch(x, Step(cost, 10.0, 1.0)) for cost in costs], watch
+    return [monitor(x, local, Step(cost, 10.0, 1.0)) for cost in costs]
 
 
 def test_only_a_search_that_creeps_is_ended():
-    falling, watch = stops([0.9**k for k in range(20)])
-    assert not any(falling)
-    assert not watch.creeps
-    creeping, watch = stops([1.0, 0.5] + [0.4 - 1e-5 * k for k in range(10)])
-    assert creeping.index(True) == 2 + PATIENCE
-    assert watch.creeps
+    assert not any(ends([0.9**k for k in range(20)]))
+    creeping = ends([1.0, 0.5] + [0.4 - 1e-5 * k for k in range(10)])
+    assert creeping.index("creeping") == 2 + PATIENCE
+    assert not any(creeping[: 2 + PATIENCE])
 
 
 def test_the_caller_hears_every_step_and_may_stop():
@@ -34,54 +36,53 @@ def test_the_caller_hears_every_step_and_may_stop():
 
     def callback(stage, step):
         heard.append((stage, step.cost))
-        return step.cost < 0.5
+        return len(heard) == 2
 
-    ended, watch = stops([0.9, 0.7, 0.4], callback=callback)
-    assert ended == [False, False, True]
-    assert heard == [("stage", 0.9), ("stage", 0.7), ("stage", 0.4)]
-    assert not watch.creeps
+    search, problem = short_search(callback)
+    ended = search.search(problem, problem.variables.start(), 1e-9, "stage")
+    assert heard == [("stage", step.cost) for step in ended.result.history]
+    assert (ended.stopped, len(heard)) == (True, 2)
 
 
-def short_search():
+def short_search(callback=None):
     """A search of one short swing, and its problem."""
     plant, model = pendulum(), LFM(2, [[1e-3, 1e-3]] * 2, v_smooth=0.05)
     recording = swing(plant, LFM(2, [[2e-3, 3e-3]] * 2, v_smooth=0.05), seconds=1.0)
     motion = kalman_smoother(recording.time, recording.q)
-    mixing = mixing_of(plant, recording.resolve_convention(plant))
-    search = Refinement(plant, model, [recording], mixing, [], max_steps=20)
-    return search, search.problem(cut_windows([recording], [motion], 0.5), 1e-3)
+    measurement = measurement_matrix(plant, recording.resolve_convention(plant))
+    search = ShootingFitter(
+        StepJacobian(plant, model, []), model, [recording], measurement,
+        FitOptions(max_steps=20), callback,
+    )  # fmt: skip
+    windows = cut_windows([recording], [motion], 0.5)
+    return search, search.problem(windows, 1e-3, model.schedule.parameter_vector())
 
 
-@pytest.mark.parametrize(("why", "status"), [("creeps", "creeping"), ("settles", "converged_step")])
-def test_only_a_search_that_settled_claims_convergence(monkeypatch, why, status):
-    def end(self, x, step):
-        setattr(self, why, True)
-        return True
-
-    monkeypatch.setattr(_Watch, "__call__", end)
+@pytest.mark.parametrize("status", ["creeping", "converged_step"])
+def test_only_a_search_that_settled_claims_convergence(monkeypatch, status):
+    monkeypatch.setattr(StallMonitor, "__call__", lambda *_: status)
     search, problem = short_search()
-    ended = search.search(problem, torch.zeros(0, dtype=F64), 1e-9, "")
+    ended = search.search(problem, problem.variables.start(), 1e-9, "")
     assert ended.result.status == status
-    assert ended.result.converged == (why == "settles")
-    assert ended.vector.shape == (0,)
+    assert ended.result.converged == (status == "converged_step")
+    assert ended.parts.plant.shape == (0,)
 
 
 def test_what_is_shared_has_settled_once_it_moves_no_more():
     """Window states may go on; a step that damping cut short is no rest."""
     _, problem = short_search()
-    x = problem.unknowns.start()
-    problem.quadratic(x)
-    spread, count = problem.spread(), problem.unknowns.shared_count
+    x = problem.variables.start()
+    local = problem.linearise(x)
+    sd, count = problem.posterior_sd(local.hessian), problem.variables.shared_count
     far, near, states = x.clone(), x.clone(), x.clone()
-    far[:count] += spread
-    near[:count] += 0.5 * SETTLED * spread
+    far[:count] += sd
+    near[:count] += 0.5 * SETTLED * sd
     states[count:] += 1.0
 
     def settles(points, damping=0.0):
-        watch = _Watch("stage", 0.0, None, problem)
-        for k, point in enumerate(points):
-            watch(point, Step(0.5**k, damping, 1.0))
-        return watch.settles
+        monitor = StallMonitor(problem, 0.0, DEFAULTS)
+        found = [monitor(p, local, Step(0.5**k, damping, 1.0)) for k, p in enumerate(points)]
+        return found[-1] == "converged_step"
 
     assert settles([x, near, x, near])
     assert settles([x, states, x, states])

@@ -5,13 +5,15 @@ import pytest
 import torch
 
 from nfriction import Recording
-from nfriction.fitting.equation_error import EDGE, TorqueFit, fit_torque, friction_torque, prior_sd
+from nfriction.fitting.equation_error import TorqueFit, fit_torque, friction_torque, prior_sd
+from nfriction.fitting.options import DEFAULTS
 from nfriction.friction.laws import LINEAR, NONLINEAR, Coefficient, Law
 from nfriction.friction.models import MODELS
 from nfriction.signals import Motion
 from tests.fitting.recordings import pendulum
 
 V_SMOOTH = 0.05
+EDGE = DEFAULTS.edge
 TRUTH = {
     "NCFM": [[2e-3], [1e-3]],
     "CFM": [[3e-3], [5e-4]],

@@ -8,14 +8,13 @@ import torch
 
 from nfriction import LFM, NFLFM
 from nfriction.fitting.data.windows import Windows
+from nfriction.fitting.options import FitOptions
 from nfriction.fitting.plant_parameters import plant_parameters
-from nfriction.fitting.shooting.problem import TrajectoryProblem, solve_trajectory
-from nfriction.fitting.shooting.propagation import _carried
-from nfriction.fitting.shooting.sensitivity import StepJacobian, StepMaps
-from nfriction.fitting.strategy.continuation import JUMP_SD
+from nfriction.fitting.shooting.problem import ShootingProblem
+from nfriction.fitting.shooting.sensitivity import StepJacobian, _carry
 from nfriction.signals import Motion
 from nfriction.simulation.rollout import integrate
-from tests.fitting.recordings import F64, pendulum
+from tests.fitting.recordings import F64, pendulum, solve
 
 ABSOLUTE = torch.tensor([[1.0, 0.0], [1.0, 1.0]], dtype=F64)
 
@@ -36,13 +35,13 @@ def windows(steps=20, step=2e-3, joined=False) -> Windows:
     return Windows(q, tau, steps_, weight, q0, qd0, spans)
 
 
-def problem(model, substeps=2, stride=1, joined=False, **settings) -> TrajectoryProblem:
+def problem(model, substeps=2, stride=1, joined=False, **settings) -> ShootingProblem:
     plant = pendulum()
     terms = plant_parameters(plant, driven=(0, 1), largest_torque=0.1)
     jacobian = StepJacobian(plant, model, terms)
-    settings = {"jump_sd": (3e-4, 0.01), **settings}
-    return TrajectoryProblem(
-        jacobian, windows(joined=joined), 1e-3, ABSOLUTE, substeps, stride=stride, **settings
+    settings = {"defect_sd": (3e-4, 0.01), **settings}
+    return ShootingProblem(
+        jacobian, model, windows(joined=joined), 1e-3, ABSOLUTE, substeps, stride=stride, **settings
     )
 
 
@@ -58,39 +57,39 @@ def bent(name):
     return model
 
 
-def point(p: TrajectoryProblem) -> torch.Tensor:
+def point(p: ShootingProblem) -> torch.Tensor:
     """Unknowns away from the prior's means, and inside every bound."""
     g = torch.Generator().manual_seed(2)
-    x = p.unknowns.start(torch.full((len(p.unknowns.terms),), 0.02, dtype=F64))
-    x[p.unknowns.shared_count :] += 0.01 * torch.randn(
-        x.numel() - p.unknowns.shared_count, generator=g, dtype=F64
+    x = p.variables.start(torch.full((len(p.variables.terms),), 0.02, dtype=F64))
+    x[p.variables.shared_count :] += 0.01 * torch.randn(
+        x.numel() - p.variables.shared_count, generator=g, dtype=F64
     )
     return x
 
 
-def misfit(p: TrajectoryProblem, x: torch.Tensor) -> torch.Tensor:
-    return torch.cat([p.residuals(x).flatten(), p.jumps(x).flatten()])
+def misfit(p: ShootingProblem, x: torch.Tensor) -> torch.Tensor:
+    return torch.cat([p.residuals(x).flatten(), p.defects(x).flatten()])
 
 
-@pytest.mark.parametrize("zero_sd", [None, torch.full((2, 2), 0.05, dtype=torch.float64)])
+@pytest.mark.parametrize("offset_sd", [None, torch.full((2, 2), 0.05, dtype=torch.float64)])
 @pytest.mark.parametrize("name", ["LFM", "NFLFM"])
 @pytest.mark.parametrize(
     ("substeps", "stride", "joined"),
     [(1, 1, False), (2, 1, True), (2, 3, True), (1, 20, False), (1, 12, True)],
 )
-def test_gradient_and_hessian_against_finite_differences(name, substeps, stride, zero_sd, joined):
+def test_gradient_and_hessian_against_finite_differences(name, substeps, stride, offset_sd, joined):
     """Also where samples are passed over: 3 and 12 leave steps after the last that counts."""
-    p = problem(bent(name), substeps, stride, joined, zero_sd=zero_sd)
+    p = problem(bent(name), substeps, stride, joined, offset_sd=offset_sd)
     x = point(p)
-    found = p.quadratic(x)
+    found = p.linearise(x)
     torch.testing.assert_close(found.cost, p.cost(x))
-    precision, mean = p.unknowns.prior()
+    precision, mean = p.variables.prior()
     columns = []
     for i in range(x.numel()):
         unit = torch.zeros_like(x)
         # Fourth order: truncation and rounding are both far below the tolerance.
         unit[i] = 1e-4 * max(
-            0.1 if i < p.unknowns.friction_count and name == "NFLFM" else 1e-3, float(x[i].abs())
+            0.1 if i < p.variables.friction_count and name == "NFLFM" else 1e-3, float(x[i].abs())
         )
         ends = [misfit(p, x + s * unit) for s in (-2, -1, 1, 2)]
         columns.append((ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * unit[i]))
@@ -121,9 +120,9 @@ def test_a_stride_counts_each_sample_for_those_that_it_passes_over():
 def test_pieces_do_not_show(piece, monkeypatch):
     """However many samples are accumulated at a time, the model of the cost is the same."""
     p = problem(bent("NFLFM"), stride=3)
-    whole = p.quadratic(point(p))
-    monkeypatch.setattr("nfriction.fitting.shooting.propagation.PIECE", piece)
-    parts = p.quadratic(point(p))
+    whole = p.linearise(point(p))
+    monkeypatch.setattr("nfriction.fitting.shooting.sensitivity.PIECE", piece)
+    parts = p.linearise(point(p))
     torch.testing.assert_close(parts.gradient, whole.gradient, rtol=1e-10, atol=1e-10)
     torch.testing.assert_close(parts.hessian, whole.hessian, rtol=1e-10, atol=1e-10)
 
@@ -131,51 +130,52 @@ def test_pieces_do_not_show(piece, monkeypatch):
 def test_padding_counts_for_nothing():
     p = problem(bent("LFM"))
     x = point(p)
-    before = p.quadratic(x)
+    before = p.linearise(x)
     p.windows.q[1, -4:] += 100.0
-    after = p.quadratic(x)
+    after = p.linearise(x)
     assert torch.equal(before.gradient, after.gradient)
     assert float(before.cost) == float(after.cost)
 
 
 def test_residuals_are_counted_in_the_recording_s_coordinates():
     p = problem(bent("LFM"))
-    x = p.unknowns.start()
-    joint = TrajectoryProblem(p.jacobian, p.windows, 1e-3, torch.eye(2, dtype=F64), p.substeps)
+    x = p.variables.start()
+    joint = replace(p, measurement=torch.eye(2, dtype=F64))
     r, own = p.residuals(x), joint.residuals(x)
     torch.testing.assert_close(r[..., 0], own[..., 0])
     torch.testing.assert_close(r[..., 1], own[..., 0] + own[..., 1])
 
 
 def test_an_exact_problem_is_solved_exactly():
-    """Positions without noise: the coefficients come out, and the model is left at them."""
+    """Positions without noise: the coefficients come out, and the model stays as it is."""
     model = LFM(2, [2e-3, 2e-3], v_smooth=0.1)
-    plant = pendulum()
+    before, plant = model.schedule.values, pendulum()
     w = windows(steps=60, step=5e-3)
-    p = TrajectoryProblem(StepJacobian(plant, model, []), w, 1e-7, ABSOLUTE)
-    result = solve_trajectory(p, p.unknowns.start(), cost_tolerance=1e-14)
+    p = ShootingProblem(StepJacobian(plant, model, []), model, w, 1e-7, ABSOLUTE)
+    result = solve(p, p.variables.start(), cost_tolerance=1e-14)
     assert result.converged
     truth = torch.tensor([[4e-3, 3e-3], [2e-3, 1e-3]], dtype=F64)
-    torch.testing.assert_close(model.schedule.values, truth, rtol=1e-4, atol=0)
-    torch.testing.assert_close(p.unknowns.split(result.x)[0].reshape(2, 2), model.schedule.values)
+    found = p.variables.split(result.x).friction.reshape(2, 2)
+    torch.testing.assert_close(found, truth, rtol=1e-4, atol=0)
+    assert torch.equal(model.schedule.values, before)
 
 
 def test_the_prior_of_the_plant_may_be_centred_elsewhere():
     p = problem(bent("LFM"))
-    mean = torch.full((len(p.unknowns.terms),), 0.03, dtype=F64)
-    moved = TrajectoryProblem(p.jacobian, p.windows, 1e-3, ABSOLUTE, 2, plant_mean=mean)
-    x = p.unknowns.start(mean)
-    sd = torch.tensor([t.prior_sd for t in p.unknowns.terms], dtype=F64)
+    mean = torch.full((len(p.variables.terms),), 0.03, dtype=F64)
+    sd = torch.tensor([t.prior_sd for t in p.variables.terms], dtype=F64)
+    moved = replace(p, plant_prior=(mean, sd))
+    x = p.variables.start(mean)
     prior = 0.5 * float(((mean / sd) ** 2).sum())
     assert float(p.cost(x) - moved.cost(x)) == pytest.approx(prior)
 
 
 def test_a_start_at_rest_is_held_and_the_others_are_free():
     p = problem(bent("LFM"))
-    free, mean = p.unknowns.prior()
+    free, mean = p.variables.prior()
     p = replace(p, windows=replace(p.windows, at_rest=(1,)))
-    held, same = p.unknowns.prior()
-    first = p.unknowns.shared_count
+    held, same = p.variables.prior()
+    first = p.variables.shared_count
     torch.testing.assert_close(
         held[first + 4 :].rsqrt(), torch.tensor([1e-4, 1e-4, 1e-3, 1e-3], dtype=F64)
     )
@@ -188,11 +188,11 @@ def test_a_traced_motion_is_the_simulated_one_where_windows_lie():
     w = windows()
     w = replace(w, spans=((0, 0, 20), (0, 20, 36)))
     model, plant = bent("LFM"), pendulum()
-    p = TrajectoryProblem(StepJacobian(plant, model, []), w, 1e-3, ABSOLUTE, substeps=2)
+    p = ShootingProblem(StepJacobian(plant, model, []), model, w, 1e-3, ABSOLUTE, substeps=2)
     x, zero = point(p), np.zeros((40, 2))
     before = Motion(np.arange(40.0), zero, zero, zero)
-    (after,) = p.traced(x, [before])
-    state = p.unknowns.split(x)[2].numpy()
+    (after,) = p.simulated_motions(x, [before])
+    state = p.variables.split(x).states.numpy()
     for window, sample in ((0, 0), (1, 20)):
         np.testing.assert_allclose(after.q[sample], state[window, :2], rtol=0, atol=1e-12)
         np.testing.assert_allclose(after.qd[sample], state[window, 2:], rtol=0, atol=1e-12)
@@ -218,18 +218,18 @@ def halves(noise: float = 1e-3) -> Windows:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("continuity", ["free", "soft", "hard"])
+@pytest.mark.parametrize("continuity", ["none", "penalty", "constraint"])
 def test_windows_come_together_as_far_as_they_are_to(continuity):
     model = LFM(2, [3e-3, 2e-3], v_smooth=0.1)
     jacobian = StepJacobian(pendulum(), model, [])
-    settings = {"noise_sd": 1e-3, "mixing": ABSOLUTE}
-    sd = JUMP_SD[continuity]
-    p = TrajectoryProblem(jacobian, halves(), jump_sd=sd, **settings)
-    result = solve_trajectory(p, p.unknowns.start(), cost_tolerance=1e-10)
+    settings = {"noise_sd": 1e-3, "measurement": ABSOLUTE}
+    sd = FitOptions(continuity=continuity).defect_sd
+    p = ShootingProblem(jacobian, model, halves(), defect_sd=sd, **settings)
+    result = solve(p, p.variables.start(), cost_tolerance=1e-10)
     assert result.converged
-    apart = TrajectoryProblem(jacobian, halves(), jump_sd=(1.0, 1.0), **settings)
-    jump = apart.jumps(result.x).abs().amax(0)
-    assert (jump[:2].max() > 3e-4) == (continuity == "free")
+    apart = replace(p, defect_sd=(1.0, 1.0))
+    jump = apart.defects(result.x).abs().amax(0)
+    assert (jump[:2].max() > 3e-4) == (continuity == "none")
     if sd is not None:
         assert (jump[:2] < 2 * sd[0]).all()
         assert (jump[2:] < 2 * sd[1]).all()
@@ -237,27 +237,27 @@ def test_windows_come_together_as_far_as_they_are_to(continuity):
 
 def test_only_neighbours_in_time_have_seams():
     w = replace(windows(), spans=((0, 0, 20), (1, 20, 36)))
-    assert w.seams() == []
-    assert replace(w, spans=((0, 0, 20), (0, 20, 36))).seams() == [(0, 1)]
-    assert replace(w, spans=((0, 20, 36), (0, 0, 20))).seams() == [(1, 0)]
-    assert replace(w, spans=((0, 0, 20), (0, 21, 36))).seams() == []
-    assert replace(w, spans=()).seams() == []
+    assert w.continuity_pairs() == []
+    assert replace(w, spans=((0, 0, 20), (0, 20, 36))).continuity_pairs() == [(0, 1)]
+    assert replace(w, spans=((0, 20, 36), (0, 0, 20))).continuity_pairs() == [(1, 0)]
+    assert replace(w, spans=((0, 0, 20), (0, 21, 36))).continuity_pairs() == []
+    assert replace(w, spans=()).continuity_pairs() == []
 
 
 @pytest.mark.parametrize("joined", [False, True])
-@pytest.mark.parametrize("zero_sd", [None, torch.full((2, 2), 0.05, dtype=torch.float64)])
-def test_states_are_told_to_be_blocks_only_where_they_are(joined, zero_sd):
-    p = problem(bent("LFM"), joined=joined, zero_sd=zero_sd)
-    found = p.quadratic(point(p))
-    first, count = p.unknowns.shared_count, 2 * p.windows.q0.shape[-1]
+@pytest.mark.parametrize("offset_sd", [None, torch.full((2, 2), 0.05, dtype=torch.float64)])
+def test_states_are_told_to_be_blocks_only_where_they_are(joined, offset_sd):
+    p = problem(bent("LFM"), joined=joined, offset_sd=offset_sd)
+    found = p.linearise(point(p))
+    first, count = p.variables.shared_count, 2 * p.windows.q0.shape[-1]
     across = found.hessian[first : first + count, first + count :]
-    assert (found.blocks is None) == bool(across.any() or zero_sd is not None)
+    assert (found.blocks is None) == bool(across.any() or offset_sd is not None)
     if found.blocks is not None:
         assert found.blocks == (first, count)
 
 
 @pytest.mark.filterwarnings("error")
 def test_derivatives_that_overflow_are_told_to_the_search_alone():
-    maps = StepMaps(*(torch.full((4, 1, 3, n), 1e200, dtype=F64) for n in (3, 1, 0)))
-    _, after = _carried(maps, torch.ones(1, 3, 2, dtype=F64), 2)
+    maps = [torch.full((4, 1, 3, n), 1e200, dtype=F64) for n in (3, 1)]
+    _, after = _carry(*maps, torch.ones(1, 3, 2, dtype=F64), 2)
     assert not torch.isfinite(after).any()

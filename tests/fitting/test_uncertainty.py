@@ -32,7 +32,7 @@ def fits(swings):
     law = fit(LFM(1), *swings, **options)
     with pytest.MonkeyPatch.context() as patch:
         # Nothing is left for a network to find here; it is to be kept all the same.
-        patch.setattr("nfriction.fitting.strategy.holdout.Judgement.score", 0.0)
+        patch.setattr("nfriction.fitting.strategy.holdout.HoldoutScore.score", 0.0)
         return law, fit(NFLFM(1), *swings, start=law, **options)
 
 

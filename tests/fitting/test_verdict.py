@@ -6,13 +6,13 @@ import torch
 from nfriction.fitting.result.identifiability import (
     Information,
     Interval,
-    beyond_need,
+    confidence_intervals,
+    exceeds_drive_torque,
     information,
-    intervals,
-    lost_directions,
-    open_values,
+    null_directions,
     standard_deviations,
     warnings_of,
+    weakly_identified,
 )
 
 F64 = torch.float64
@@ -38,7 +38,7 @@ def test_intervals_of_a_linear_fit_cover_as_often_as_they_say():
     for _ in range(400):
         y = design @ truth + noise * torch.randn(len(design), generator=g, dtype=F64)
         found = torch.linalg.lstsq(design, y[:, None]).solution[:, 0]
-        told = intervals(NAMES, found, sd, -free, free)
+        told = confidence_intervals(NAMES, found, sd, -free, free)
         hits += [i.low <= t <= i.high for i, t in zip(told, truth.tolist(), strict=True)]
     # 1200 trials of 95 %: a standard deviation is 0.6 %.
     assert sum(hits) / len(hits) == pytest.approx(0.95, abs=0.02)
@@ -62,7 +62,7 @@ def test_nothing_is_known_where_the_windows_diverged():
     for score in (None, hessian):
         known = information(hessian, torch.ones(7, dtype=F64), 3, score)
         assert torch.isinf(standard_deviations(known)).all()
-        assert lost_directions(NAMES, known) == NAMES
+        assert null_directions(NAMES, known) == NAMES
 
 
 def test_a_score_as_large_as_the_curvature_changes_nothing():
@@ -97,7 +97,7 @@ def test_intervals_cover_where_residuals_are_not_alike():
         y = sizes * torch.randn(len(design), generator=g, dtype=F64)
         found = torch.linalg.lstsq(design, y[:, None]).solution[:, 0]
         for name, spread in sd.items():
-            told = intervals(NAMES, found, spread, -free, free)
+            told = confidence_intervals(NAMES, found, spread, -free, free)
             hits[name] += [i.low <= 0 <= i.high for i in told]
     covered = {name: sum(hit) / len(hit) for name, hit in hits.items()}
     # 1200 trials of 95 %: a standard deviation is 0.6 %.
@@ -119,7 +119,7 @@ def test_a_singular_direction_and_a_blind_parameter_are_named():
     design, _ = regression()
     design[:, 1] = 2.0 * design[:, 0]
     known = Information(design.T @ design, torch.zeros(3, dtype=F64))
-    (direction,) = lost_directions(NAMES, known)
+    (direction,) = null_directions(NAMES, known)
     assert set(direction.split(" with ")) == {"a", "b"}
     assert torch.isinf(standard_deviations(known)).tolist() == [True, True, False]
     design[:, 1] = 0.0
@@ -129,7 +129,7 @@ def test_a_singular_direction_and_a_blind_parameter_are_named():
         sd = standard_deviations(Information(nearly, known.prior, score))
         assert sd[:2].min() > 1e4
     blind = Information(design.T @ design, torch.tensor([0.0, 1.0, 0.0], dtype=F64))
-    assert lost_directions(NAMES, blind) == ("b",)
+    assert null_directions(NAMES, blind) == ("b",)
     # Its prior still says what it says.
     assert float(standard_deviations(blind)[1]) == pytest.approx(1.0)
 
@@ -138,49 +138,51 @@ def test_a_value_is_open_only_where_others_make_up_for_it():
     design, _ = regression()
     design[:, 1] = design[:, 0] + 0.01 * design[:, 1]
     known = Information(design.T @ design, torch.zeros(3, dtype=F64))
-    assert lost_directions(NAMES, known) == ()
+    assert null_directions(NAMES, known) == ()
     sd = standard_deviations(known)
-    assert open_values(NAMES, 1.5 * sd, known) == ("a", "b")
-    assert open_values(NAMES[:2], 3.0 * sd[:2], known) == ()
+    assert weakly_identified(NAMES, 1.5 * sd, known) == ("a", "b")
+    assert weakly_identified(NAMES[:2], 3.0 * sd[:2], known) == ()
     # One that is told by itself is but small.
-    assert open_values(NAMES, torch.tensor([1e3, 1e3, 0.0], dtype=F64), known) == ()
+    assert weakly_identified(NAMES, torch.tensor([1e3, 1e3, 0.0], dtype=F64), known) == ()
 
 
 def test_a_coefficient_is_open_where_its_interval_outdoes_what_moves_the_joint():
     sd, slope = torch.tensor([1.0, 1.0, 1e-3], dtype=F64), torch.tensor([1.0, -1.0, 1.0], dtype=F64)
     need = torch.tensor([2.0, 1.9, 0.1], dtype=F64)
     # However near to zero the values are.
-    assert beyond_need(NAMES, sd, slope, need) == ("b",)
-    assert beyond_need(NAMES, torch.full_like(sd, torch.inf), slope, need) == NAMES
+    assert exceeds_drive_torque(NAMES, sd, slope, need) == ("b",)
+    assert exceeds_drive_torque(NAMES, torch.full_like(sd, torch.inf), slope, need) == NAMES
 
 
 def test_nothing_is_lost_where_all_is_told():
     design, _ = regression()
-    assert lost_directions(NAMES, Information(design.T @ design, torch.zeros(3, dtype=F64))) == ()
+    assert null_directions(NAMES, Information(design.T @ design, torch.zeros(3, dtype=F64))) == ()
 
 
 def test_intervals_end_at_the_bounds():
     value, sd = torch.tensor([0.1], dtype=F64), torch.tensor([1.0], dtype=F64)
-    (told,) = intervals(("c",), value, sd, torch.zeros(1), torch.full((1,), 0.5))
+    (told,) = confidence_intervals(("c",), value, sd, torch.zeros(1), torch.full((1,), 0.5))
     assert (told.low, told.high) == (0.0, 0.5)
 
 
 def test_warnings_name_what_is_wrong_and_are_silent_otherwise():
-    good = {"converged": True, "at_bounds": (), "lost": (), "residual": 3e-4,
+    good = {"converged": True, "at_bounds": (), "unidentifiable": (), "residual": 3e-4,
             "effective_sd": 3e-4, "quantum": 1e-3, "unit": "rad"}  # fmt: skip
     assert warnings_of(**good) == ()
     bad = warnings_of(**good | {"converged": False, "at_bounds": ["B of joint1"],
-                                "lost": ["drag reach"], "residual": 3e-3})  # fmt: skip
+                                "unidentifiable": ["drag reach"], "residual": 3e-3})  # fmt: skip
     assert len(bad) == 4
     assert "B of joint1" in bad[1]
     assert "drag reach" in bad[2]
-    assert "10 times" in bad[3]
+    assert "10x the encoder resolution" in bad[3]
     none, beyond = warnings_of(**good | {"at_bounds": ["B", "v_s", "C"]}, at_zero=["B", "C"])
     assert none == "At zero: B, C; the data show none."
-    assert beyond == "At a bound: v_s; the data ask for values beyond it."
-    (lost,) = warnings_of(**good | {"at_bounds": ["B"], "lost": ["B of joint1"]}, at_zero=["B"])
-    assert "cannot tell" in lost
-    assert warnings_of(**good, largest_jump=4.9) == ()
+    assert beyond == "At a bound: v_s; the data favour values beyond it."
+    (lost,) = warnings_of(
+        **good | {"at_bounds": ["B"], "unidentifiable": ["B of joint1"]}, at_zero=["B"]
+    )
+    assert "Not identifiable" in lost
+    assert warnings_of(**good, largest_defect=4.9) == ()
     for jump in (6.0, float("inf"), float("nan")):
-        (told,) = warnings_of(**good, largest_jump=jump)
-        assert "do not join" in told
+        (told,) = warnings_of(**good, largest_defect=jump)
+        assert "not continuous" in told

@@ -67,7 +67,7 @@ def still(samples=301, slope=0.0):
 def test_recordings_that_begin_at_rest_start_where_the_encoders_stood():
     recordings, motions = still()
     smoothed = cut_windows(recordings, motions, 1.0)
-    w = cut_windows(recordings, motions, 1.0, from_rest=True)
+    w = cut_windows(recordings, motions, 1.0, rest_speed=0.3)
     assert smoothed.at_rest == ()
     # The first window of each.
     assert w.at_rest == (0, 3)
@@ -83,7 +83,7 @@ def test_recordings_that_begin_at_rest_start_where_the_encoders_stood():
 
 def test_what_moves_from_its_first_sample_is_not_at_rest():
     recordings, motions = still(slope=1.0)
-    w = cut_windows(recordings, motions, 1.0, from_rest=True)
+    w = cut_windows(recordings, motions, 1.0, rest_speed=0.3)
     assert w.at_rest == (3,)
     np.testing.assert_array_equal(w.qd0[0], motions[0].qd[0])
 

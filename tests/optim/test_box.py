@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from nfriction.optim import bounded_qp as box
-from nfriction.optim.bounded_qp import minimise_within
+from nfriction.optim.bounded_qp import minimise
 from nfriction.optim.linear_algebra import solve_semidefinite
 
 F64 = torch.float64
@@ -24,7 +24,7 @@ def problem(loose: int, tight: int, seed: int, rank: int | None = None):
 
 def found(system, slope, low, high) -> torch.Tensor:
     free = torch.ones_like(slope, dtype=torch.bool)
-    return minimise_within(system, slope, low, high, free, lambda a, b, _: solve_semidefinite(a, b))
+    return minimise(system, slope, low, high, free, lambda a, b, _: solve_semidefinite(a, b))
 
 
 def assert_minimum(x, system, slope, low, high) -> None:
@@ -57,7 +57,7 @@ def test_a_singular_system_ends_at_a_minimum_and_soon(rank, monkeypatch):
         given = problem(2, 9, seed, rank)
         asked.clear()
         free = torch.ones(11, dtype=torch.bool)
-        assert_minimum(minimise_within(*given, free, solve), *given)
+        assert_minimum(minimise(*given, free, solve), *given)
         assert len(asked) < 25  # of at most 33 rounds
 
 

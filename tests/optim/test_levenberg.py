@@ -1,16 +1,35 @@
 """Laws of the Levenberg-Marquardt solver."""
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import pytest
 import torch
 from scipy.optimize import lsq_linear
 from torch import Tensor
 
-from nfriction.optim.least_squares import Quadratic, from_residuals
+from nfriction.optim.least_squares import Quadratic, Status
 from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
 
 F64 = torch.float64
+
+
+@dataclass(frozen=True)
+class FromResiduals:
+    """Quadratic model of residuals r(x), its Jacobian in forward mode unless given."""
+
+    residual: Callable[[Tensor], Tensor]
+    jacobian: Callable[[Tensor], Tensor] | None = None
+
+    def __call__(self, x: Tensor) -> Quadratic:
+        r = self.residual(x)
+        J = (self.jacobian or torch.func.jacfwd(self.residual))(x).reshape(r.numel(), x.numel())
+        return Quadratic(0.5 * r @ r, J.T @ r, J.T @ J)
+
+    def cost(self, x: Tensor) -> Tensor:
+        r = self.residual(x)
+        return 0.5 * r @ r
 
 
 def vector(*values: float) -> Tensor:
@@ -40,14 +59,14 @@ def test_nothing_to_fit_is_fitted_at_once(scaling: str) -> None:
     result = solver.minimise(lambda x: Quadratic(2.0, x, x[:, None] * x), vector())
     assert result.converged
     assert result.cost == 2.0
-    assert (result.steps, result.covariance(1.0).shape) == (0, (0, 0))
+    assert result.steps == 0
 
 
 @pytest.mark.parametrize("scaling", ["marquardt", "identity"])
 @pytest.mark.parametrize("start", [(-1.2, 1.0), (6.0, -9.0), (0.0, 0.0)])
 def test_rosenbrock_reaches_its_minimum_from_anywhere(scaling: str, start: tuple) -> None:
     solver = LevenbergMarquardt(scaling=scaling)
-    result = solver.minimise(from_residuals(rosenbrock), vector(*start))
+    result = solver.minimise(FromResiduals(rosenbrock), vector(*start))
     assert result.converged
     torch.testing.assert_close(result.x, vector(1, 1), rtol=1e-10, atol=1e-10)
     costs = [step.cost for step in result.history]
@@ -56,10 +75,9 @@ def test_rosenbrock_reaches_its_minimum_from_anywhere(scaling: str, start: tuple
 
 
 def test_powell_singular_converges_although_its_hessian_is_singular_there() -> None:
-    result = LevenbergMarquardt().minimise(from_residuals(powell_singular), vector(3, -1, 0, 1))
+    result = LevenbergMarquardt().minimise(FromResiduals(powell_singular), vector(3, -1, 0, 1))
     assert result.converged
     assert result.x.abs().max() < 1e-6  # the cost is of fourth order in x
-    assert len(result.unidentifiable(1e-6)) == 2
 
 
 def test_exponential_is_recovered_from_noisy_data_within_its_error() -> None:
@@ -69,11 +87,11 @@ def test_exponential_is_recovered_from_noisy_data_within_its_error() -> None:
     for seed in range(20):
         noise = torch.randn(200, generator=torch.Generator().manual_seed(seed), dtype=F64)
         y = truth[0] * torch.exp(-truth[1] * t) + truth[2] + sigma * noise
-        model = from_residuals(lambda x, y=y: x[0] * torch.exp(-x[1] * t) + x[2] - y)
+        model = FromResiduals(lambda x, y=y: x[0] * torch.exp(-x[1] * t) + x[2] - y)
         result = LevenbergMarquardt().minimise(model, vector(0.5, 0.2, 0.0), cost=model.cost)
         assert result.converged
         error = (result.x - truth).abs()
-        inside += error < 2 * result.covariance(sigma**2).diagonal().sqrt()
+        inside += error < 2 * sigma * torch.linalg.inv(result.hessian).diagonal().sqrt()
     # 95 % of 60 trials: fewer than 50 inside has probability below 1e-3.
     assert inside.sum() >= 50
 
@@ -81,7 +99,7 @@ def test_exponential_is_recovered_from_noisy_data_within_its_error() -> None:
 def test_quadratic_is_solved_in_one_undamped_step() -> None:
     X, y = line()
     result = LevenbergMarquardt(initial_damping=0.0).minimise(
-        from_residuals(lambda w: X @ w - y), vector(-30, 400)
+        FromResiduals(lambda w: X @ w - y), vector(-30, 400)
     )
     assert result.converged
     assert result.steps == 1
@@ -90,7 +108,7 @@ def test_quadratic_is_solved_in_one_undamped_step() -> None:
 
 def test_active_bound_gives_the_constrained_minimum() -> None:
     X, y = line()
-    model = from_residuals(lambda w: X @ w - y)
+    model = FromResiduals(lambda w: X @ w - y)
     result = LevenbergMarquardt().minimise(
         model, vector(0, 0), upper=vector(math.inf, 1.5), lower=-10.0
     )
@@ -99,10 +117,6 @@ def test_active_bound_gives_the_constrained_minimum() -> None:
     # With the slope held at 1.5 the intercept is the mean of what is left.
     assert float(result.x[0]) == pytest.approx(float((y - 1.5 * X[:, 1]).mean()), rel=1e-10)
     assert result.gradient[1] < 0  # Kuhn-Tucker: the gradient pushes outward
-    covariance = result.covariance(1.0)
-    assert covariance[1].isnan().all()
-    assert covariance[:, 1].isnan().all()
-    assert float(covariance[0, 0]) == pytest.approx(1 / len(y), rel=1e-12)
 
 
 def test_strongly_coupled_bounds_satisfy_kuhn_tucker() -> None:
@@ -112,7 +126,7 @@ def test_strongly_coupled_bounds_satisfy_kuhn_tucker() -> None:
         J[:, 1] = J[:, 0] + 0.01 * J[:, 1]
         y = torch.randn(12, generator=generator, dtype=F64)
         result = LevenbergMarquardt().minimise(
-            from_residuals(lambda w, J=J, y=y: J @ w - y),
+            FromResiduals(lambda w, J=J, y=y: J @ w - y),
             torch.zeros(6, dtype=F64),
             lower=-0.1,
             upper=0.2,
@@ -141,7 +155,7 @@ def test_on_coupled_bounds_no_search_ends_short_of_the_minimum() -> None:
         y = torch.randn(12, generator=generator, dtype=F64)
         start = 0.05 + 0.15 * torch.randint(-1, 2, (6,), generator=generator).double()
         result = LevenbergMarquardt().minimise(
-            from_residuals(lambda w, J=J, y=y: J @ w - y), start, lower=-0.1, upper=0.2
+            FromResiduals(lambda w, J=J, y=y: J @ w - y), start, lower=-0.1, upper=0.2
         )
         exact = lsq_linear(J.numpy(), y.numpy(), (-0.1, 0.2), method="bvls", tol=1e-14)
         assert result.converged
@@ -159,7 +173,7 @@ def test_a_parameter_a_rounding_off_its_bound_is_on_it(lower: float) -> None:
         J = J * 10 ** torch.randn(5, generator=generator, dtype=F64)
         y = torch.randn(12, generator=generator, dtype=F64)
         result = LevenbergMarquardt().minimise(
-            from_residuals(lambda w, J=J, y=y: J @ w - y),
+            FromResiduals(lambda w, J=J, y=y: J @ w - y),
             torch.full((5,), 0.05, dtype=F64),
             lower=lower,
             upper=0.2,
@@ -172,31 +186,22 @@ def test_a_parameter_a_rounding_off_its_bound_is_on_it(lower: float) -> None:
 
 def test_start_on_a_bound_leaves_it_when_the_minimum_is_inside() -> None:
     result = LevenbergMarquardt().minimise(
-        from_residuals(rosenbrock), vector(-5, -5), lower=-5.0, upper=5.0
+        FromResiduals(rosenbrock), vector(-5, -5), lower=-5.0, upper=5.0
     )
     assert result.converged
     torch.testing.assert_close(result.x, vector(1, 1), rtol=1e-10, atol=0)
     assert not (result.at_lower | result.at_upper).any()
 
 
-def test_rank_deficiency_is_survived_and_named() -> None:
+def test_rank_deficiency_is_survived() -> None:
     X, y = line()
-    model = from_residuals(lambda w: X[:, 0] * w[0] + X[:, 1] * (w[1] + 2 * w[2]) - y)
+    model = FromResiduals(lambda w: X[:, 0] * w[0] + X[:, 1] * (w[1] + 2 * w[2]) - y)
     result = LevenbergMarquardt().minimise(model, torch.zeros(4, dtype=F64))
     assert result.converged
     fit = torch.linalg.lstsq(X, y).solution
     torch.testing.assert_close(
         torch.stack([result.x[0], result.x[1] + 2 * result.x[2]]), fit, rtol=1e-8, atol=0
     )
-    directions = torch.stack(result.unidentifiable())
-    assert directions.shape == (2, 4)
-    # Nothing but w1 against w2, and w3 that does not occur, moves without a trace.
-    null = torch.stack([vector(0, 2, -1, 0) / 5**0.5, vector(0, 0, 0, 1)])
-    projected = directions @ null.T @ null
-    torch.testing.assert_close(projected, directions, rtol=0, atol=1e-7)
-    deviation = result.covariance(0.01).diagonal().sqrt()
-    assert deviation[0] < 0.1
-    assert (deviation[1:] > 1e3).all()
 
 
 def test_not_a_number_is_a_rejected_step() -> None:
@@ -204,7 +209,7 @@ def test_not_a_number_is_a_rejected_step() -> None:
     def residual(x: Tensor) -> Tensor:
         return torch.stack([x[0].sqrt() - 0.1])
 
-    model = from_residuals(residual)
+    model = FromResiduals(residual)
     for cost in (None, model.cost):
         result = LevenbergMarquardt(initial_damping=0.0).minimise(model, vector(4.0), cost=cost)
         assert result.converged
@@ -213,7 +218,7 @@ def test_not_a_number_is_a_rejected_step() -> None:
 
 
 def test_nothing_finite_is_said_plainly() -> None:
-    at_start = LevenbergMarquardt().minimise(from_residuals(lambda x: x.log()), vector(-1.0))
+    at_start = LevenbergMarquardt().minimise(FromResiduals(lambda x: x.log()), vector(-1.0))
     assert (at_start.status, at_start.converged) == ("not_finite", False)
 
     def island(x: Tensor) -> Quadratic:
@@ -225,7 +230,7 @@ def test_nothing_finite_is_said_plainly() -> None:
 
 
 def test_wrong_derivative_is_a_stall_not_a_success() -> None:
-    model = from_residuals(rosenbrock, lambda x: -torch.func.jacfwd(rosenbrock)(x))
+    model = FromResiduals(rosenbrock, lambda x: -torch.func.jacfwd(rosenbrock)(x))
     result = LevenbergMarquardt().minimise(model, vector(-1.2, 1.0))
     assert (result.status, result.converged) == ("stalled", False)
     assert "derivative" in result.message
@@ -235,30 +240,14 @@ def test_wrong_derivative_is_a_stall_not_a_success() -> None:
 def test_units_of_the_parameters_do_not_matter(powers: tuple[int, int]) -> None:
     # Powers of two scale without rounding, so the two runs agree bit for bit.
     scale = vector(*(2.0**power for power in powers))
-    model, start = from_residuals(rosenbrock), vector(-1.2, 1.0)
+    model, start = FromResiduals(rosenbrock), vector(-1.2, 1.0)
     plain = LevenbergMarquardt().minimise(model, start)
     scaled = LevenbergMarquardt().minimise(
-        from_residuals(lambda x: rosenbrock(x / scale)), start * scale
+        FromResiduals(lambda x: rosenbrock(x / scale)), start * scale
     )
     assert torch.equal(scaled.x / scale, plain.x)
     assert scaled.history == plain.history
     assert scaled.status == plain.status
-
-
-def test_covariance_is_the_one_of_linear_regression() -> None:
-    X, y = line()
-    result = LevenbergMarquardt().minimise(from_residuals(lambda w: X @ w - y), vector(0, 0))
-    variance = 2 * result.cost / (len(y) - 2)
-    t = X[:, 1]
-    slope = variance / (t - t.mean()).square().sum()
-    expected = torch.stack(
-        [
-            torch.stack([variance / len(y) + slope * t.mean() ** 2, -slope * t.mean()]),
-            torch.stack([-slope * t.mean(), slope]),
-        ]
-    )
-    torch.testing.assert_close(result.covariance(variance), expected, rtol=1e-11, atol=0)
-    assert result.unidentifiable() == []
 
 
 def test_given_jacobian_and_cheap_cost_change_nothing() -> None:
@@ -267,8 +256,8 @@ def test_given_jacobian_and_cheap_cost_change_nothing() -> None:
             [torch.stack([-20 * x[0], x.new_tensor(10.0)]), x.new_tensor([-1.0, 0.0])]
         )
 
-    plain = LevenbergMarquardt().minimise(from_residuals(rosenbrock), vector(-1.2, 1))
-    model = from_residuals(rosenbrock, jacobian)
+    plain = LevenbergMarquardt().minimise(FromResiduals(rosenbrock), vector(-1.2, 1))
+    model = FromResiduals(rosenbrock, jacobian)
     cheap = LevenbergMarquardt().minimise(model, vector(-1.2, 1), cost=model.cost)
     torch.testing.assert_close(cheap.x, plain.x, rtol=1e-12, atol=0)
 
@@ -284,21 +273,21 @@ def test_interrupt_returns_the_best_so_far() -> None:
         return rosenbrock(x)
 
     start = vector(-1.2, 1)
-    result = LevenbergMarquardt().minimise(from_residuals(interrupted), start)
+    result = LevenbergMarquardt().minimise(FromResiduals(interrupted), start)
     assert (result.status, result.converged) == ("stopped", False)
     assert result.steps > 0
-    assert result.cost == result.history[-1].cost < float(from_residuals(rosenbrock).cost(start))
+    assert result.cost == result.history[-1].cost < float(FromResiduals(rosenbrock).cost(start))
 
 
 def test_callback_sees_every_step_and_can_stop() -> None:
     seen = []
 
-    def callback(x: Tensor, step: object) -> bool:
+    def callback(x: Tensor, local: Quadratic, step: object) -> Status | None:
         seen.append((x, step))
-        return len(seen) == 3
+        return "stopped" if len(seen) == 3 else None
 
     result = LevenbergMarquardt().minimise(
-        from_residuals(rosenbrock), vector(-1.2, 1), callback=callback
+        FromResiduals(rosenbrock), vector(-1.2, 1), callback=callback
     )
     assert result.status == "stopped"
     assert [step for _, step in seen] == result.history
@@ -306,12 +295,12 @@ def test_callback_sees_every_step_and_can_stop() -> None:
 
 
 def test_step_limit_is_no_convergence() -> None:
-    result = LevenbergMarquardt(max_steps=2).minimise(from_residuals(rosenbrock), vector(-1.2, 1))
+    result = LevenbergMarquardt(max_steps=2).minimise(FromResiduals(rosenbrock), vector(-1.2, 1))
     assert (result.status, result.converged, result.steps) == ("max_steps", False, 2)
 
 
 def test_bad_input_is_refused_at_the_border() -> None:
-    model, start = from_residuals(rosenbrock), vector(0, 0)
+    model, start = FromResiduals(rosenbrock), vector(0, 0)
     solver = LevenbergMarquardt()
     with pytest.raises(ValueError, match="vector"):
         solver.minimise(model, start[None])

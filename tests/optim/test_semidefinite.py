@@ -5,7 +5,7 @@ import torch
 
 from nfriction.optim.least_squares import Quadratic
 from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
-from nfriction.optim.linear_algebra import solve_bordered, solve_semidefinite
+from nfriction.optim.linear_algebra import solve_arrowhead, solve_semidefinite
 
 F64 = torch.float64
 SHARED, SIZE, COUNT = 3, 2, 50
@@ -25,7 +25,7 @@ def bordered(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
 def test_block_by_block_it_is_the_whole_solution():
     jacobian, r = bordered()
     matrix, vector = jacobian.T @ jacobian, jacobian.T @ r
-    found = solve_bordered(matrix, vector, SHARED, SIZE)
+    found = solve_arrowhead(matrix, vector, SHARED, SIZE)
     torch.testing.assert_close(found, torch.linalg.solve(matrix, vector), rtol=0, atol=1e-10)
     torch.testing.assert_close(found, solve_semidefinite(matrix, vector), rtol=0, atol=1e-10)
 
@@ -36,7 +36,7 @@ def test_what_nothing_tells_stays_at_zero(lost):
     jacobian, r = bordered()
     jacobian[:, lost] = 0.0
     matrix, vector = jacobian.T @ jacobian, jacobian.T @ r
-    found = solve_bordered(matrix, vector, SHARED, SIZE)
+    found = solve_arrowhead(matrix, vector, SHARED, SIZE)
     assert float(found[lost]) == pytest.approx(0.0, abs=1e-12)
     torch.testing.assert_close(matrix @ found, vector, rtol=0, atol=1e-9)
 
@@ -70,5 +70,5 @@ def test_an_indefinite_block_falls_back_on_the_whole():
     matrix, vector = jacobian.T @ jacobian, jacobian.T @ r
     at = slice(SHARED, SHARED + SIZE)
     matrix[at, at] = -torch.eye(SIZE, dtype=F64)
-    found = solve_bordered(matrix, vector, SHARED, SIZE)
+    found = solve_arrowhead(matrix, vector, SHARED, SIZE)
     torch.testing.assert_close(found, solve_semidefinite(matrix, vector))

@@ -52,7 +52,7 @@ def test_intervals_are_those_of_the_fit():
     plant = rigs.multiarm_single()
     time = np.linspace(0, 1, 501)
     recording = Recording(time, np.sin(5 * time)[:, None], convention="relative,hanging")
-    found = fit(NCFM(1), plant, recording, method="torque")
+    found = fit(NCFM(1), plant, recording, method="equation_error")
     value = float(found.model.schedule.values)
     (joint,) = plant.joint_names
     told = Interval(f"C_p of {joint}", value, 0.5 * value, 2 * value)

@@ -1,67 +1,67 @@
-"""A fitted model with its verdict: whether the search converged, and what the data tell."""
+"""Result of a fit: model, plant, convergence, confidence intervals and warnings."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.fitting.equation_error import TorqueFit, largest_moved
+from nfriction.fitting.equation_error import TorqueFit, peak_dynamics_torque
+from nfriction.fitting.options import Continuity
 from nfriction.fitting.result.identifiability import (
     Interval,
-    beyond_need,
+    confidence_intervals,
     covariance_root,
-    intervals,
-    lost_directions,
-    open_values,
+    exceeds_drive_torque,
+    null_directions,
     warnings_of,
+    weakly_identified,
 )
 from nfriction.fitting.result.uncertainty import CoefficientUncertainty
-from nfriction.fitting.shooting.autocorrelation import band_of, effective_noise, local_noise
-from nfriction.fitting.shooting.problem import TrajectoryProblem
-from nfriction.friction.constant import Constant
+from nfriction.fitting.shooting.autocorrelation import bandwidth, effective_noise, hac_sd
+from nfriction.fitting.shooting.problem import ShootingProblem
+from nfriction.fitting.shooting.variables import model_at
 from nfriction.friction.model import FrictionModel
 from nfriction.optim.least_squares import LeastSquaresResult
 from nfriction.plant import Plant
 from nfriction.signals import Motion, count_seen
 
-# Whether the windows of a recording make one motion.
-Continuity = Literal["free", "soft", "hard"]
-
-# A lower bound no larger is there for the logarithm of what cannot be negative, in SI.
+# A lower bound no larger exists only for the logarithm of a positive coefficient, in SI.
 NOTHING = 1e-9
 
 
 @dataclass(frozen=True)
 class FitResult:
-    """A fitted model and what is known of the fit.
+    """A fitted model and the quality of its fit.
 
     Attributes:
-        model: the friction model, trained in place; without gradients, so that rollouts take the
-            compiled way. To train it further: `model.requires_grad_(True)`.
+        model: the friction model, trained in place; without gradients, so that rollouts are
+            compiled. To train it further: `model.requires_grad_(True)`.
         plant: the plant with its adjusted terms.
         plant_terms: name, value and bound of each adjusted term.
-        status: `"converged: ..."` or `"not converged: ..."`, and why, in words.
+        status: `"Converged ..."` or `"Not converged: ..."` with the reason.
         converged: whether the search ended at a minimum.
-        residual: root mean square of what the fit left over, in `residual_unit`: of the position
-            error over the training windows, or of the torque where only torques were fitted.
-        at_bounds: names of what ended at a bound.
+        residual: root mean square residual in `residual_unit`: of the positions over the training
+            windows, or of the torque after an equation-error fit.
+        at_bounds: names of parameters at a bound.
         steps: accepted steps of the last stage.
         motions: smoothed motion of each recording, in joint coordinates.
-        intervals: 95 % intervals of constant coefficients and of the plant's terms; residuals
-            that last in time count for as few as they are worth. None for a torque fit.
-        lost: what the data cannot tell, parameters or combinations of them, in words.
-        warnings: what to be wary of, a sentence each.
-        zeros: of encoders that were zeroed anew at the start of each recording, what they fall
-            short of the true positions, in joint coordinates [rad or m]; a row for each recording.
-        uncertainty: standard deviation of the coefficients at any motion; None for a torque fit.
-        continuity: of the windows that were fitted, see `fit`.
-        told: those of the warnings that are of recordings and windows; a fit that starts here says
-            them, too.
-        left_out: lengths of windows that the constant law could not follow [s].
+        residuals: position errors of the training windows [rad; m], (window, sample, joint); empty
+            after an equation-error fit.
+        intervals: 95 % confidence intervals of constant coefficients and plant terms, by the
+            effective sample size of autocorrelated residuals. None after an equation-error fit.
+        unidentifiable: parameters, or combinations `"a with b"`, that the data do not determine.
+        warnings: a sentence each.
+        encoder_offsets: added to the recorded positions to get true ones, in joint coordinates
+            [rad; m], one row a recording; empty unless encoders were zeroed at each.
+        uncertainty: standard deviation of the coefficients at any motion; None after an
+            equation-error fit.
+        continuity: of the fitted windows, see `fit`.
+        data_warnings: warnings about the data; inherited by fits warm-started from this one.
+        skipped_horizons: lengths of windows that the constant law could not follow [s].
     """
 
     model: FrictionModel
@@ -73,35 +73,37 @@ class FitResult:
     at_bounds: tuple[str, ...]
     steps: int
     motions: tuple[Motion, ...]
-    _residuals: Tensor
+    residuals: Tensor
     intervals: tuple[Interval, ...] = ()
-    lost: tuple[str, ...] = ()
+    unidentifiable: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-    zeros: tuple[tuple[float, ...], ...] = ()
+    encoder_offsets: tuple[tuple[float, ...], ...] = ()
     uncertainty: CoefficientUncertainty | None = None
-    continuity: Continuity = "free"
-    told: tuple[str, ...] = ()
-    left_out: tuple[float, ...] = ()
+    continuity: Continuity = "none"
+    data_warnings: tuple[str, ...] = ()
+    skipped_horizons: tuple[float, ...] = ()
 
-    def longest(self, windows: Sequence[float]) -> float:
-        """The last of some windows of growing length that the constant law could follow [s]."""
-        followed = [w for w in windows if w < min(self.left_out, default=math.inf)]
-        return followed[-1] if followed else windows[0]
+    def longest_usable_horizon(self, windows: Sequence[float]) -> float:
+        """The last of growing window lengths that the constant law could follow [s]."""
+        usable = [w for w in windows if w < min(self.skipped_horizons, default=math.inf)]
+        return usable[-1] if usable else windows[0]
 
-    def with_warnings(self, told: Sequence[str]) -> "FitResult":
-        """The same, which tells this of recordings and windows first, and once."""
-        whole = tuple(dict.fromkeys((*told, *self.told)))
-        others = (w for w in self.warnings if w not in whole)
-        return replace(self, told=whole, warnings=(*whole, *others))
+    def with_warnings(self, data_warnings: Sequence[str]) -> "FitResult":
+        """The same with these warnings about the data first, each once."""
+        every = tuple(dict.fromkeys((*data_warnings, *self.data_warnings)))
+        others = (w for w in self.warnings if w not in every)
+        return replace(self, data_warnings=every, warnings=(*every, *others))
 
     @property
     def residual_unit(self) -> str:
-        """Unit of `residual`: of positions (rad, m), or of torques (N m, N) of a torque fit."""
-        if self._residuals.numel():
+        """Unit of `residual`: of positions (rad, m), or of torques (N m, N)."""
+        if self.residuals.numel():
             return self.plant.unit
         return "N" if self.plant.unit == "m" else "N m"
 
     def to_dict(self) -> dict[str, Any]:
+        """Summary for JSON."""
+        offsets = {"encoder_offsets": [list(row) for row in self.encoder_offsets]}
         return {
             "status": self.status,
             "converged": self.converged,
@@ -113,146 +115,148 @@ class FitResult:
                 i.name: [x if math.isfinite(x) else None for x in (i.low, i.high)]
                 for i in self.intervals
             },
-            "lost": list(self.lost),
+            "unidentifiable": list(self.unidentifiable),
             "warnings": list(self.warnings),
-            **({} if self.continuity == "free" else {"continuity": self.continuity}),
-            **({"zeros": [list(zero) for zero in self.zeros]} if self.zeros else {}),
+            **({} if self.continuity == "none" else {"continuity": self.continuity}),
+            **(offsets if self.encoder_offsets else {}),
         }
 
 
-def torque_outcome(
+def result_from_equation_error(
     model: FrictionModel,
-    start: FitResult | None,
     plant: Plant,
+    start: FitResult | None,
     motions: tuple[Motion, ...],
     torque: TorqueFit,
 ) -> FitResult:
-    """The fit of a model whose coefficients come from torques alone."""
+    """The result of a regression on torques, which is written into the model."""
+    model.schedule.set_parameter_vector(torque.coefficients.reshape(-1))
     return FitResult(
-        model.requires_grad_(False),
-        start.plant if start else plant,
-        start.plant_terms if start else (),
-        "converged: linear least squares of the torque",
-        True,
-        float(torque.residual.square().mean().sqrt()),
-        (),
-        0,
-        motions,
-        torch.zeros(0, dtype=torch.float64),
+        model=model.requires_grad_(False),
+        plant=start.plant if start else plant,
+        plant_terms=start.plant_terms if start else (),
+        status="Converged: linear least squares of the torque.",
+        converged=True,
+        residual=float(torque.residual.square().mean().sqrt()),
+        at_bounds=(),
+        steps=0,
+        motions=motions,
+        residuals=torch.zeros(0, dtype=torch.float64),
     )
 
 
-def trajectory_outcome(
-    problem: TrajectoryProblem,
+def result_from_shooting(
+    model: FrictionModel,
+    problem: ShootingProblem,
     result: LeastSquaresResult,
-    residuals: Tensor,
     motions: tuple[Motion, ...],
 ) -> FitResult:
-    """A fit with its verdict, from where the search ended."""
-    plant, unknowns = problem.plant, problem.unknowns
-    vector, count = unknowns.split(result.x)[1], unknowns.shared_count
-    names = problem.friction.schedule.parameter_names(plant.joint_names)
-    names += [t.name for t in unknowns.terms]
-    lower, upper = (bound[:count] for bound in unknowns.bounds())
-    # What was not to be fitted has equal bounds.
-    fitted = lower < upper
-    hit = (result.at_lower | result.at_upper)[:count] & fitted
-    at_bounds = tuple(names[i] for i in hit.nonzero().flatten().tolist())
+    """The result of a search, whose end is written into the model."""
+    plant, variables, x = problem.jacobian.plant, problem.variables, result.x
+    friction, vector, _, offsets = variables.split(x)
+    model.load_state_dict(model_at(problem.friction, friction).state_dict())
+    count, terms = variables.shared_count, variables.terms
+    names = [*model.schedule.parameter_names(plant.joint_names), *(t.name for t in terms)]
+    lower, upper = (bound[:count] for bound in variables.bounds())
+    # Equal bounds: not fitted.
+    hit = (result.at_lower | result.at_upper)[:count] & (lower < upper)
     least = lower.abs() <= NOTHING
-    least[count - len(unknowns.terms) :] = torch.tensor([t.to_none for t in unknowns.terms])
-    none = hit & result.at_lower[:count] & least
-    noise = effective_noise(residuals)
-    told, lost, uncertainty = _told_by_data(problem, result, names, fitted, residuals, motions)
+    least[count - len(terms) :] = torch.tensor([t.to_none for t in terms], dtype=torch.bool)
+    at_bounds, at_zero = (
+        tuple(names[i] for i in mask.nonzero().flatten().tolist())
+        for mask in (hit, hit & result.at_lower[:count] & least)
+    )
+    residuals = problem.errors(x)
     residual = float(residuals.square().mean().sqrt())
+    intervals, unidentifiable, root = _identifiability(problem, result, names, residuals, motions)
     return FitResult(
-        model=problem.friction.requires_grad_(False),
+        model=model.requires_grad_(False),
         plant=problem.plant_at(vector),
         plant_terms=tuple(
-            (t.name, float(v), t.upper) for t, v in zip(unknowns.terms, vector, strict=True)
+            (t.name, float(v), t.upper) for t, v in zip(terms, vector, strict=True)
         ),
-        status=("converged: " if result.converged else "not converged: ") + result.message,
+        status=result.message if result.converged else f"Not converged: {result.message}",
         converged=result.converged,
         residual=residual,
         at_bounds=at_bounds,
         steps=result.steps,
         motions=motions,
-        _residuals=residuals,
-        intervals=told,
-        lost=lost,
-        zeros=tuple(map(tuple, unknowns.split_zeros(result.x).reshape(-1, plant.joints).tolist())),
+        residuals=residuals,
+        intervals=intervals,
+        unidentifiable=unidentifiable,
+        encoder_offsets=tuple(map(tuple, offsets.tolist())),
         warnings=warnings_of(
-            converged=result.converged, at_bounds=at_bounds, lost=lost, residual=residual,
-            effective_sd=noise, quantum=plant.position_quantum or _count_seen(problem),
-            unit=plant.unit, largest_jump=problem.largest_jump(result.x),
-            at_zero=[names[i] for i in none.nonzero().flatten().tolist()],
+            converged=result.converged, at_bounds=at_bounds, unidentifiable=unidentifiable,
+            residual=residual, effective_sd=effective_noise(residuals),
+            quantum=plant.position_quantum or _observed_count(problem), unit=plant.unit,
+            largest_defect=float(problem.defects(x).abs().max()) if problem.pairs else 0.0,
+            at_zero=at_zero, options=problem.options,
         ),
-        uncertainty=uncertainty,
+        uncertainty=None if root is None else CoefficientUncertainty(model.schedule, root),
     )  # fmt: skip
 
 
-def _told_by_data(
-    problem: TrajectoryProblem,
+def _identifiability(
+    problem: ShootingProblem,
     result: LeastSquaresResult,
     names: Sequence[str],
-    fitted: Tensor,
     residuals: Tensor,
     motions: Sequence[Motion],
-) -> tuple[tuple[Interval, ...], tuple[str, ...], CoefficientUncertainty | None]:
-    """Intervals, and what the data cannot tell; of a network, only of the plant's terms.
+) -> tuple[tuple[Interval, ...], tuple[str, ...], Tensor | None]:
+    """Confidence intervals, unidentifiable parameters, and a covariance root of the friction.
 
-    What they leave open of the coefficients comes last.
+    Of a network only its plant terms have intervals, and no parameter counts as unidentifiable.
     """
-    count, noise = problem.unknowns.shared_count, effective_noise(residuals)
-    constant = isinstance(problem.friction.schedule, Constant)
-    # Errors of nothing at all are those of joints that never moved.
-    if not torch.isfinite(result.hessian).all() or not noise > 0:
-        every = fitted.nonzero().flatten().tolist() if constant else []
-        return (), tuple(names[i] for i in every), None
-    # Where a network is only held to its law, the data leave it open: that is not among them.
-    known = problem.told(result.x, local_noise(residuals, band_of(problem.windows.q)))
-    shown = fitted.clone()
-    if not constant:
-        shown[: problem.unknowns.friction_count] = False
-    index = shown.nonzero().flatten()
-    lower, upper = (bound[index] for bound in problem.unknowns.bounds())
-    chosen = [names[i] for i in index.tolist()]
-    fixed = fitted.nonzero().flatten()
-    part = known.subset(fixed)
-    root = torch.zeros(count, len(fixed), dtype=torch.float64)
-    root[fixed] = covariance_root(part)
+    variables, options = problem.variables, problem.options
+    count, friction_count = variables.shared_count, variables.friction_count
+    constant = not problem.friction.schedule.follows_motion
+    lower, upper = (bound[:count] for bound in variables.bounds())
+    fitted = (lower < upper).nonzero().flatten()
+    fitted_names = [names[i] for i in fitted.tolist()]
+    # Residuals of exactly zero are those of joints that never moved.
+    if not torch.isfinite(result.hessian).all() or not effective_noise(residuals) > 0:
+        return (), tuple(fitted_names) if constant else (), None
+    # Without the extrapolation prior: where that alone holds a network, the data do not.
+    sd = hac_sd(residuals, bandwidth(problem.windows.q, options), options)
+    known = problem.information(result.x, sd).subset(fitted)
+    root = torch.zeros(count, len(fitted), dtype=torch.float64)
+    root[fitted] = covariance_root(known)
     sd = root.norm(dim=1)
-    lost: tuple[str, ...] = ()
-    if constant:
-        friction = fixed[fixed < problem.unknowns.friction_count]
-        coefficients = [names[i] for i in friction.tolist()]
-        lost = lost_directions([names[i] for i in fixed.tolist()], part)
-        slope, need = _needs(problem, result, motions)
-        open_ = (
-            *open_values(coefficients, result.x[friction], part),
-            *beyond_need(coefficients, sd[friction], slope[friction], need[friction]),
-        )
-        lost += tuple(n for n in dict.fromkeys(open_) if not any(n in told for told in lost))
-    uncertainty = CoefficientUncertainty(
-        problem.friction.schedule, root[: problem.unknowns.friction_count].clone()
+    shown = fitted if constant else fitted[fitted >= friction_count]
+    intervals = confidence_intervals(
+        [names[i] for i in shown.tolist()], result.x[shown], sd[shown], lower[shown], upper[shown]
     )
-    return intervals(chosen, result.x[index], sd[index], lower, upper), lost, uncertainty
+    unidentifiable: tuple[str, ...] = ()
+    if constant:
+        friction = fitted[fitted < friction_count]
+        coefficients = fitted_names[: len(friction)]
+        unidentifiable = null_directions(fitted_names, known, options)
+        slope, need = _torque_scale(problem, result, motions)
+        weak = (
+            *weakly_identified(coefficients, result.x[friction], known, options),
+            *exceeds_drive_torque(coefficients, sd[friction], slope[friction], need[friction]),
+        )
+        unidentifiable += tuple(
+            name for name in dict.fromkeys(weak) if not any(name in d for d in unidentifiable)
+        )
+    return intervals, unidentifiable, root[:friction_count].clone()
 
 
-def _count_seen(problem: TrajectoryProblem) -> float | None:
-    """Largest of the encoders' counts that the positions show; None where none does."""
-    read = problem.windows.q @ problem.mixing.T
-    seen = float(np.fmax.reduce(count_seen(read.numpy())))
+def _observed_count(problem: ShootingProblem) -> float | None:
+    """Largest of the encoder counts that the positions show; None where none does."""
+    recorded = problem.windows.q @ problem.measurement.T
+    seen = float(np.fmax.reduce(count_seen(recorded.numpy())))
     return None if math.isnan(seen) else seen
 
 
-def _needs(
-    problem: TrajectoryProblem, result: LeastSquaresResult, motions: Sequence[Motion]
+def _torque_scale(
+    problem: ShootingProblem, result: LeastSquaresResult, motions: Sequence[Motion]
 ) -> tuple[Tensor, Tensor]:
-    """Slope of the friction torque by every constant coefficient at its joint's largest speed, and
+    """Derivative of the friction torque by each constant coefficient at its joint's peak speed, and
     the largest torque that moves this joint, (friction parameter,) each.
     """
-    friction, vector = problem.unknowns.split(result.x)[:2]
-    speed, moved = largest_moved(problem.plant_at(vector), motions)
+    friction, vector, _, _ = problem.variables.split(result.x)
+    speed, moved = peak_dynamics_torque(problem.plant_at(vector), motions, problem.options)
     need = torch.maximum(moved, problem.windows.tau.abs().amax((0, 1)))
     table = friction.reshape(len(speed), -1).clone().requires_grad_()
     with torch.enable_grad():

@@ -29,15 +29,10 @@ class CoefficientUncertainty:
 
     @torch.no_grad()
     def sd(self, qd: Tensor, qdd: Tensor) -> Tensor:
-        """Standard deviation of the coefficients at motions.
+        """Standard deviation of the coefficients at motions, (*batch, joint, coefficient).
 
-        Beyond the trained range it is that at the range's edge: a network fades there, but not for
-        knowing better.
-
-        Args:
-            qd, qdd: joint velocity [rad/s] and acceleration [rad/s^2], (*batch, joint).
-        Returns:
-            In the coefficients' units, (*batch, joint, coefficient).
+        Outside the trained range it is that at the range's edge: a network fades there, but not
+        because it is known better. `qd` [rad/s] and `qdd` [rad/s^2] are (*batch, joint).
         """
         shape = qd.shape
         flat = (x.reshape(-1, shape[-1]).split(PIECE) for x in (qd, qdd))

@@ -1,9 +1,9 @@
-"""States of windows eliminated from the rows of the Jacobian, not from their squares.
+"""Marginalisation of window states on the rows of the Jacobian instead of on J^T J.
 
-The end of a chaotic motion moves by 1e10 times what its start does. Beside the squares of such
-derivatives, all that a window tells of anything else is rounding, and no solver brings it back. The
-rows still have it: every window's are triangularised by its state's columns, piece by piece, and
-what falls out below is free of the state and of its growth, so that its squares may be added up.
+The end of a chaotic motion moves by 1e10 times as much as its start. In J^T J the growth of these
+columns swamps all other information; QR of J keeps it. Each window's rows are triangularised by
+its state's columns, piece by piece; the rows below the triangle depend neither on the state nor on
+its growth, so their squares may be summed.
 
 References:
     G. J. Bierman, Factorization Methods for Discrete Sequential Estimation (1977), ch. 5.
@@ -17,211 +17,147 @@ from torch import Tensor
 
 from nfriction.fitting.shooting.normal_equations import Rows
 
-# Rounding of a row, in units of its size and the machine's precision: what errors of this size
-# could have made up is not taken for told. Motions that grow by 1e20 leave nothing else.
-ROUNDING = 30.0
+# Information below so many roundings of a row is discarded; motions that grow by 1e20 leave
+# nothing else.
+ROUNDOFF_UNITS = 30.0
 
 
-@dataclass(frozen=True)
-class Layout:
-    """Columns of windows' rows, and where those stand that are kept when the states are gone.
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """The variables that remain: the shared ones, and the encoder offsets of all recordings.
 
     Attributes:
-        shared: number of unknowns that all windows share; their columns come first.
-        state: number of unknowns of a window's state, whose columns follow.
-        zeros: number of those of its recording's zeros, which come last.
-        size: number of unknowns that are kept: what is shared, and the zeros of all recordings.
-        groups: windows that keep the same unknowns, and where these stand among all that are kept.
+        indices: see `DecisionVariables.indices`.
+        state: number of variables of a window's state.
+        size: number of all variables.
     """
 
-    shared: int
+    indices: Tensor
     state: int
-    zeros: int
     size: int
-    groups: tuple[tuple[Tensor, Tensor], ...]
 
-    @classmethod
-    def of(cls, places: Tensor, state: int, size: int) -> "Layout":
-        """That of unknowns in their usual order.
-
-        Args:
-            places: see `normal_equations`.
-            state: number of unknowns of a window's state.
-            size: number of all unknowns.
-        """
-        shared, states = int(places[0, 0]), len(places) * state
-        members: dict[tuple[int, ...], list[int]] = {}
-        for window, zeros in enumerate((places[:, state:] - states).tolist()):
-            members.setdefault(tuple(zeros), []).append(window)
-        groups = tuple(
-            (torch.tensor(windows), torch.tensor([*range(shared), *zeros]))
-            for zeros, windows in members.items()
-        )
-        return cls(shared, state, places.shape[1] - state, size - states, groups)
+    @property
+    def shared(self) -> int:
+        return int(self.indices[0, 0])
 
     def split(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Columns of the state, and all others, of (*, column)."""
-        common, own, zeros = rows.split([self.shared, self.state, self.zeros], -1)
-        return own, torch.cat([common, zeros], -1) if self.zeros else common
+        """Columns of the state, and of the remaining variables, of (*, column)."""
+        common, own, offsets = rows.tensor_split([self.shared, self.shared + self.state], -1)
+        return own, torch.cat([common, offsets], -1)
 
     def squares(self, rows: Tensor) -> Tensor:
-        """J^T J of rows free of states, (window, row, column), over what is kept, (kept, kept)."""
-        total = torch.zeros(self.size, self.size, dtype=torch.float64)
-        for windows, at in self.groups:
-            flat = rows[windows].flatten(0, 1)
-            total[at[:, None], at] += flat.T @ flat
-        return total
+        """J^T J of rows (window, row, column) without states, (kept, kept)."""
+        states, offsets = len(self.indices) * self.state, self.indices[:, self.state :]
+        if not offsets.shape[1]:
+            flat = rows.flatten(0, 1)
+            return flat.T @ flat
+        total = torch.zeros(self.size - states, self.size - states, dtype=torch.float64)
+        common = torch.arange(self.shared).expand(len(rows), -1)
+        at = torch.cat([common, offsets - states], 1)
+        return total.index_put_((at[:, :, None], at[:, None]), rows.mT @ rows, accumulate=True)
 
 
-@dataclass(frozen=True)
-class Eliminated:
-    """What rows tell when the windows' states follow whatever is kept.
-
-    Attributes:
-        data: curvature over what is kept, less what rounding may have made up, (kept, kept).
-        response: derivatives of each window's state by what is shared and by the zeros of its
-            recording, (window, state, column).
-    """
-
-    data: Tensor
-    response: Tensor
-
-
-def eliminated(
+def marginalize_states(
     rows: Iterable[Rows],
-    layout: Layout,
+    kept: Kept,
     precision: Tensor,
-    seams: Sequence[tuple[int, int]] = (),
-    jump_sd: Tensor | None = None,
-) -> Eliminated:
-    """Eliminate the windows' states by a square-root information filter.
+    pairs: Sequence[tuple[int, int]] = (),
+    defect_sd: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Marginalise the windows' states by a square-root information filter.
 
     Args:
-        rows: of the Jacobian, some samples at a time, in time's order.
-        layout: of their columns.
+        rows: of the Jacobian, in the order of time.
+        kept: the remaining variables.
         precision: of the states' prior, (window, state).
-        seams: pairs of windows of which the second begins where the first ends, in time's order.
-        jump_sd: standard deviations of a jump there, (state,).
+        pairs: see `Windows.continuity_pairs`, in the order of time.
+        defect_sd: standard deviations of the defects, (state,).
+
+    Returns:
+        Curvature above round-off over the remaining variables, (kept, kept), and the derivatives of
+        each window's state by its columns of these, (window, state, column).
     """
     windows, state = precision.shape
-    columns = layout.shared + layout.zeros
+    columns = kept.shared + kept.indices.shape[1] - state
     triangle = precision.sqrt().diag_embed()
     right = torch.zeros(windows, state, columns, dtype=torch.float64)
-    data = torch.zeros(layout.size, layout.size, dtype=torch.float64)
-    # Sums of squares of all rows, by the state and by what is kept.
-    sizes = [torch.zeros(windows, n, dtype=torch.float64) for n in (state, columns)]
+    data = kept.squares(right)
+    # Sums of squares of all rows, by the state and by the remaining variables.
+    sizes = torch.zeros_like(precision), torch.zeros_like(right[:, 0])
     ends = torch.zeros(0, dtype=torch.float64)
     for piece in rows:
-        own, others = layout.split(piece.scaled)
-        triangle, right, free = _triangularised(
+        own, others = kept.split(piece.scaled)
+        triangle, right, free = _triangularise(
             torch.cat([triangle, own], 1), torch.cat([right, others], 1)
         )
-        data += layout.squares(free)
+        data += kept.squares(free)
         for size, part in zip(sizes, (own, others), strict=True):
             size += part.square().sum(1)
         ends = piece.states[:, -1]
     links = torch.zeros_like(triangle)
-    if jump_sd is not None:
-        jumps = layout.split(ends / jump_sd[:, None])
-        data += layout.squares(_joined(triangle, right, links, jumps, seams, jump_sd))
-        before = [w for w, _ in seams]
-        for size, part in zip(sizes, jumps, strict=True):
-            size[before] += part[before].square().sum(1)
-    response = _response(triangle, right, links, seams)
-    unsure = sizes[1] + (sizes[0][..., None] * response.square()).sum(1)
-    return Eliminated(_beyond_rounding(data, layout.squares(unsure.sqrt()[:, None])), response)
+    if defect_sd is not None:
+        start = torch.cat([torch.zeros(state, state), -torch.diag(1 / defect_sd)])
+        free = torch.zeros_like(right)
+        by_state, by_kept = kept.split(ends / defect_sd[:, None])
+        # Pass the information about each window's end on to the next one's start.
+        for w, after in pairs:
+            triangle[w], top, passed = _triangularise(
+                torch.cat([triangle[w], by_state[w]]),
+                torch.cat([start, torch.cat([right[w], by_kept[w]])], 1),
+            )
+            links[w], right[w] = top[:, :state], top[:, state:]
+            triangle[after], right[after], free[after] = _triangularise(
+                torch.cat([triangle[after], passed[:, :state]]),
+                torch.cat([right[after], passed[:, state:]]),
+            )
+            for size, part in zip(sizes, (by_state, by_kept), strict=True):
+                size[w] += part[w].square().sum(0)
+        data += kept.squares(free)
+    # The state at which each window's rows vanish, the last windows first.
+    response = -torch.linalg.solve_triangular(triangle, right, upper=True)
+    for w, after in reversed(pairs):
+        response[w] = -torch.linalg.solve_triangular(
+            triangle[w], right[w] + links[w] @ response[after], upper=True
+        )
+    squares = sizes[1] + (sizes[0][..., None] * response.square()).sum(1)
+    unsure = kept.squares(squares.sqrt()[:, None]).diagonal()
+    return _discard_roundoff(data, unsure), response
 
 
 def score_covariance(
-    rows: Iterable[Rows], layout: Layout, known: Eliminated, precision: Tensor
+    rows: Iterable[Rows], kept: Kept, response: Tensor, precision: Tensor
 ) -> Tensor:
-    """Covariance of the gradient over what is kept, (kept, kept), by rows scaled to its residuals.
-
-    Args:
-        rows, layout, precision: see `eliminated`.
-        known: what that returned.
-    """
-    total = layout.squares(precision.sqrt()[..., None] * known.response)
+    """Covariance of the gradient, (kept, kept), by rows scaled to their own residuals."""
+    total = kept.squares(precision.sqrt()[..., None] * response)
     for piece in rows:
-        own, others = layout.split(piece.scaled)
-        total += layout.squares(others + own @ known.response)
+        own, others = kept.split(piece.scaled)
+        total += kept.squares(others + own @ response)
     return total
 
 
-def _beyond_rounding(data: Tensor, sizes: Tensor) -> Tensor:
-    """Curvature less what rounding may have made up in rows of these squares, each (kept, kept).
+def _discard_roundoff(data: Tensor, sizes: Tensor) -> Tensor:
+    """Curvature above the round-off of rows with these sums of squares (kept,), (kept, kept).
 
-    Of what is all made up nothing is told. It is left open, the worst first, and the others are
-    told with it open, not as if it were known.
+    Variables whose information is below round-off are dropped one by one, worst first, and
+    marginalised out of the rest.
     """
-    made_up = (ROUNDING * torch.finfo(data.dtype).eps) ** 2 * sizes.diagonal()
-    left_open = torch.zeros_like(made_up, dtype=torch.bool)
+    roundoff = (ROUNDOFF_UNITS * torch.finfo(data.dtype).eps) ** 2 * sizes
+    dropped = torch.zeros_like(roundoff, dtype=torch.bool)
     while True:
-        share = torch.where(left_open | (made_up == 0), torch.inf, data.diagonal() / made_up)
+        share = torch.where(dropped | (roundoff == 0), torch.inf, data.diagonal() / roundoff)
         worst = int(share.argmin())
         if not share[worst] <= 1:
             break
         pivot = data[worst, worst]
         if pivot > 0:
             data = data - torch.outer(data[:, worst], data[worst]) / pivot
-        left_open[worst] = True
-        data = torch.where(left_open[:, None] | left_open, 0.0, data)
-    return data - torch.diag(torch.where(left_open, 0.0, made_up))
+        dropped[worst] = True
+        data = torch.where(dropped[:, None] | dropped, 0.0, data)
+    return data - torch.diag(torch.where(dropped, 0.0, roundoff))
 
 
-def _joined(
-    triangle: Tensor,
-    right: Tensor,
-    links: Tensor,
-    jumps: tuple[Tensor, Tensor],
-    seams: Sequence[tuple[int, int]],
-    jump_sd: Tensor,
-) -> Tensor:
-    """Rows free of states that come of joining windows, (window, row, column).
-
-    What a window tells of its end is passed on to the next one's start.
-
-    Args:
-        triangle, right: of each window; changed.
-        links: by each window's successor's state; filled in.
-        jumps: rows of the windows' ends over `jump_sd`, by the state and by what is kept.
-        seams, jump_sd: see `eliminated`.
-    """
-    free = torch.zeros_like(right)
-    state = len(jump_sd)
-    start = torch.cat([torch.zeros(state, state), -torch.diag(1 / jump_sd)])
-    for before, after in seams:
-        own, others = (
-            torch.cat([top[before], end[before]])
-            for top, end in zip((triangle, right), jumps, strict=True)
-        )
-        triangle[before], top, told = _triangularised(own, torch.cat([start, others], 1))
-        links[before], right[before] = top[:, :state], top[:, state:]
-        triangle[after], right[after], free[after] = _triangularised(
-            torch.cat([triangle[after], told[:, :state]]),
-            torch.cat([right[after], told[:, state:]]),
-        )
-    return free
-
-
-def _response(
-    triangle: Tensor, right: Tensor, links: Tensor, seams: Sequence[tuple[int, int]]
-) -> Tensor:
-    """What states are where their rows vanish, by what is kept; the last windows' first."""
-    response = -torch.linalg.solve_triangular(triangle, right, upper=True)
-    for before, after in reversed(seams):
-        response[before] = -torch.linalg.solve_triangular(
-            triangle[before], right[before] + links[before] @ response[after], upper=True
-        )
-    return response
-
-
-def _triangularised(own: Tensor, others: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Rotate rows so that `own` is a triangle above zeros.
-
-    Returns:
-        The triangle, and of the other columns what stands beside it and beside the zeros.
-    """
+def _triangularise(own: Tensor, others: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Rotate rows so that `own` is a triangle above zeros: it, and the others beside both."""
     reflections, factors = torch.geqrf(own)
     turned = torch.ormqr(reflections, factors, others, left=True, transpose=True)
     top, free = turned.tensor_split([own.shape[-1]], -2)

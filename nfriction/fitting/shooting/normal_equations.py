@@ -1,7 +1,4 @@
-"""Normal equations of windows that share parameters and have states of their own.
-
-Unknowns are ordered as [what is shared, states of each window, zeros of each recording].
-"""
+"""Normal equations of windows that share variables and have own ones (states, offsets)."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
@@ -11,14 +8,11 @@ from torch import Tensor
 
 
 class Rows(NamedTuple):
-    """Rows of the Jacobian at some samples of all windows.
+    """Rows of the Jacobian at some samples (`part`) of all windows.
 
-    Attributes:
-        part: which samples.
-        scaled: of the scaled errors, (window, row, column); columns are what is shared, then what
-            `places` of `normal_equations` names.
-        states: of the positions there, and of the velocities at the windows' ends, in joint
-            coordinates, (window, sample, row, column).
+    Columns are the shared variables, then each window's own (`DecisionVariables.indices`). `scaled`
+    are rows of the scaled errors, (window, row, column); `states` those of the positions, and at
+    the end of a window of the velocities, in joint coordinates, (window, sample, row, column).
     """
 
     part: slice
@@ -27,95 +21,83 @@ class Rows(NamedTuple):
 
 
 def scaled_rows(
-    pieces: Iterable[tuple[slice, Tensor]], scale: Tensor, mixing: Tensor, places: Tensor
+    pieces: Iterable[tuple[slice, Tensor]], scale: Tensor, measurement: Tensor, indices: Tensor
 ) -> Iterator[Rows]:
-    """Rows of the Jacobian from derivatives of the positions.
+    """Rows of the Jacobian from derivatives of the positions, see `propagate`.
 
-    Args:
-        pieces: samples and derivatives of the positions there, see `propagated`.
-        scale: what turns an error into a scaled one, (window, sample, joint or 1).
-        mixing: from joint coordinates to those of the errors, (joint, joint).
-        places: see `normal_equations`.
+    `scale` is 1 over the noise of each error, (window, sample, joint or 1).
     """
-    joints, shared, count = len(mixing), int(places[0, 0]), places.shape[1]
+    joints, shared, own = len(measurement), int(indices[0, 0]), indices.shape[1]
     for part, rows in pieces:
-        if count > 2 * joints:
-            # A zero moves the start, and what is measured with it.
+        if own > 2 * joints:
+            # An encoder offset moves the initial position and the measured ones.
             measured = torch.eye(rows.shape[2], joints, dtype=torch.float64)
             rows = torch.cat([rows, rows[..., shared : shared + joints] - measured], -1)
-        scaled = (mixing @ rows[:, :, :joints]) * scale[:, part, :, None]
+        scaled = (measurement @ rows[:, :, :joints]) * scale[:, part, :, None]
         yield Rows(part, scaled.flatten(1, 2), rows)
 
 
 def normal_equations(
-    rows: Iterable[Rows], r: Tensor, places: Tensor, size: int
+    rows: Iterable[Rows], r: Tensor, indices: Tensor, size: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """J^T r and J^T J of all unknowns.
+    """J^T r and J^T J of all variables, and derivatives of the windows' final states.
 
-    Args:
-        rows: of the Jacobian, see `scaled_rows`.
-        r: scaled errors, (window, sample, joint).
-        places: where each window's state, and the zeros of its recording where these are sought,
-            stand among the unknowns, (window, 2 or 3 times joint).
-        size: number of unknowns.
-
-    Returns:
-        Gradient, Hessian, and the derivatives of the states at the windows' ends by what is shared
-        and by what `places` names, (window, 2 joint, ·).
+    `r` are the scaled errors, (window, sample, joint); the last result is (window, 2 joint,
+    column).
     """
-    windows, count = places.shape
-    shared = int(places[0, 0])
+    windows, count = indices.shape
+    shared = int(indices[0, 0])
     gradient = torch.zeros(size, dtype=torch.float64)
     hessian = torch.zeros(size, size, dtype=torch.float64)
     slope = torch.zeros(windows, count, dtype=torch.float64)
-    of_own = torch.zeros(windows, count, count, dtype=torch.float64)
     mixed = torch.zeros(windows, count, shared, dtype=torch.float64)
+    curvature = torch.zeros(windows, count, count, dtype=torch.float64)
     ends = torch.zeros(0, dtype=torch.float64)
     for part, scaled, states in rows:
         common, own = scaled.split([shared, count], -1)
-        left = r[:, part].flatten(1)
-        gradient[:shared] += left.flatten() @ common.flatten(0, 1)
-        slope += (left[:, None] @ own)[:, 0]
-        hessian[:shared, :shared] += common.flatten(0, 1).T @ common.flatten(0, 1)
+        errors, flat = r[:, part].flatten(1), common.flatten(0, 1)
+        gradient[:shared] += errors.flatten() @ flat
+        hessian[:shared, :shared] += flat.T @ flat
+        slope += (errors[:, None] @ own)[:, 0]
         mixed += own.mT @ common
-        of_own += own.mT @ own
+        curvature += own.mT @ own
         ends = states[:, -1]
-    # A window's own state has nothing to do with another's.
-    for w, place in enumerate(places):
-        gradient[place] += slope[w]
-        hessian[place, :shared] += mixed[w]
-        hessian[:shared, place] += mixed[w].T
-        hessian[place[:, None], place] += of_own[w]
+    _scatter(gradient, hessian, indices, slope, mixed, curvature)
     return gradient, hessian, ends
 
 
-def add_jumps(
+def add_defects(
     gradient: Tensor,
     hessian: Tensor,
-    jumps: Tensor,
+    defects: Tensor,
     ends: Tensor,
-    seams: Sequence[tuple[int, int]],
-    places: Tensor,
+    pairs: Sequence[tuple[int, int]],
+    indices: Tensor,
     sd: Tensor,
 ) -> None:
-    """Add jumps from windows' ends to the next one's start to normal equations.
+    """Add the defects between windows to normal equations, in place.
 
-    Args:
-        gradient, hessian, ends, places: see `normal_equations`; the first two are changed.
-        jumps: over their standard deviations, (seam, 2 joint).
-        seams: pairs of windows.
-        sd: standard deviations, (2 joint,).
+    `defects` are over their standard deviations `sd`, (pair, 2 joint) and (2 joint,); `ends` come
+    from `normal_equations`.
     """
-    shared, state = int(places[0, 0]), len(sd)
-    before, after = ([pair[k] for pair in seams] for k in (0, 1))
-    start = -torch.eye(state, dtype=torch.float64).expand(len(seams), -1, -1)
+    shared, state = int(indices[0, 0]), len(sd)
+    before, after = ([pair[k] for pair in pairs] for k in (0, 1))
+    start = -torch.eye(state, dtype=torch.float64).expand(len(pairs), -1, -1)
     rows = torch.cat([ends[before], start], -1) / sd[:, None]
     common, own = rows[..., :shared], rows[..., shared:]
-    gradient[:shared] += jumps.flatten() @ common.flatten(0, 1)
-    hessian[:shared, :shared] += common.flatten(0, 1).T @ common.flatten(0, 1)
-    for k, place in enumerate(torch.cat([places[before], places[after, :state]], -1)):
-        mixed = own[k].T @ common[k]
-        gradient[place] += jumps[k] @ own[k]
-        hessian[place, :shared] += mixed
-        hessian[:shared, place] += mixed.T
-        hessian[place[:, None], place] += own[k].T @ own[k]
+    flat = common.flatten(0, 1)
+    gradient[:shared] += defects.flatten() @ flat
+    hessian[:shared, :shared] += flat.T @ flat
+    both = torch.cat([indices[before], indices[after, :state]], -1)
+    _scatter(gradient, hessian, both, (defects[:, None] @ own)[:, 0], own.mT @ common, own.mT @ own)
+
+
+def _scatter(
+    gradient: Tensor, hessian: Tensor, indices: Tensor, slope: Tensor, mixed: Tensor, own: Tensor
+) -> None:
+    """Add blocks of the windows' own variables where `indices` names them, in place."""
+    rows, shared = indices[:, :, None], torch.arange(mixed.shape[-1])
+    gradient.index_put_((indices,), slope, accumulate=True)
+    hessian.index_put_((rows, shared), mixed, accumulate=True)
+    hessian.index_put_((shared, rows), mixed, accumulate=True)
+    hessian.index_put_((rows, indices[:, None]), own, accumulate=True)

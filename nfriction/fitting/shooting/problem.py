@@ -1,109 +1,141 @@
-"""Output error: friction and plant terms from the positions of simulated windows.
+"""Output error by multiple shooting: a cost and its Gauss-Newton model, without hidden state.
 
-Each window starts from a state of its own (multiple shooting), because the motion of a light
-mechanism forgets its start within seconds. Where one window begins as another ends, the two may
-be made to agree. Parameters and window states are found together by Levenberg-Marquardt with
-exact sensitivities.
+Each window starts from a state of its own, because the motion of a light mechanism forgets its
+start within seconds. Where one window begins as another ends, their defect may be penalised.
+Every method takes the vector of decision variables; neither plant nor friction model changes.
 
 References:
     H. G. Bock, in: Modelling of Chemical Reaction Systems, Springer (1981), 102-125.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from nfriction.fitting.data.windows import Windows
-from nfriction.fitting.plant_parameters import adjusted_buffers
+from nfriction.fitting.options import DEFAULTS, FitOptions
+from nfriction.fitting.plant_parameters import adjusted_plant
 from nfriction.fitting.result.identifiability import Information, information, standard_deviations
-from nfriction.fitting.shooting.marginalization import Layout, eliminated, score_covariance
+from nfriction.fitting.shooting.marginalization import Kept, marginalize_states, score_covariance
 from nfriction.fitting.shooting.normal_equations import (
     Rows,
-    add_jumps,
+    add_defects,
     normal_equations,
     scaled_rows,
 )
-from nfriction.fitting.shooting.propagation import propagated
-from nfriction.fitting.shooting.sensitivity import StepJacobian
-from nfriction.fitting.shooting.variables import Unknowns
-from nfriction.fitting.strategy.extrapolation_prior import Anchors
-from nfriction.friction.neurofuzzy import NeuroFuzzy
-from nfriction.optim.least_squares import LeastSquaresResult, Quadratic, Step
-from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
+from nfriction.fitting.shooting.sensitivity import StepJacobian, Trajectory, propagate
+from nfriction.fitting.shooting.variables import DecisionVariables, model_at
+from nfriction.fitting.strategy.extrapolation_prior import ExtrapolationPrior
+from nfriction.friction.model import FrictionModel
+from nfriction.optim.least_squares import Quadratic
 from nfriction.plant import Plant
 from nfriction.signals import Motion
 from nfriction.simulation.rollout import Rollout, integrate
 
 
-@dataclass
-class TrajectoryProblem:
-    """Sum of squares of the position error over windows, and its quadratic model.
-
-    It is over one vector of all unknowns, see `Unknowns`.
+@dataclass(frozen=True, eq=False)
+class ShootingProblem:
+    """Half the sum of squares of position errors, defects and priors over windows.
 
     Args:
-        jacobian: derivatives of a step, with the mechanism, the friction model whose schedule is
-            varied in place, and the adjustable terms of the plant.
+        jacobian: derivatives of a step; has the plant and its adjustable terms.
+        friction: the friction model at the start, which a search leaves as it is.
         windows: what was measured.
-        noise_sd: standard deviation of a position residual [rad], scale of the priors.
-        mixing: matrix (joint, joint) from joint coordinates to those in which the recording's
-            positions were measured; errors are counted there.
-        substeps: integration steps to a sample.
-        plant_mean: where the prior of the plant's terms is centred; default the plant as given.
-        stride: only every so many-th sample counts, for as many: errors of a model last far
-            longer than a sample, and the sums over many parameters are what a step costs.
-        zero_sd: what is expected of the zeros, (recording, joint) [rad or m]; without it none are
-            sought.
-        jump_sd: by how much position and velocity may jump from the end of a window to the start of
-            the next [rad, rad/s; m, m/s]; without it by as much as they like.
-        anchors: where a neuro-fuzzy schedule is held to its constant law.
+        noise_sd: standard deviation of a position error [rad; m], scale of the priors.
+        measurement: matrix (joint, joint) from joint coordinates to the recorded ones, in which
+            errors count.
+        substeps: integration steps per sample.
+        stride: samples per counted one, which weighs as many: model errors last far longer than a
+            sample, and the sums over many parameters dominate the cost of a step.
+        friction_prior, plant_prior, offset_sd: see `DecisionVariables`.
+        defect_sd: of position and velocity from the end of a window to the start of the next
+            [rad, rad/s; m, m/s]; None leaves windows apart.
+        extrapolation: prior of a neuro-fuzzy schedule where there are no data.
         memory: of the coefficients at the start of each window, (window, joint, state_size), of a
-            schedule that has one. It advances with every step of the integration.
+            schedule with one. It advances with every integration step.
+        options: priors of the initial states.
     """
 
     jacobian: StepJacobian
+    friction: FrictionModel
     windows: Windows
     noise_sd: float
-    mixing: Tensor
+    measurement: Tensor
     substeps: int = 1
-    plant_mean: Tensor | None = None
     stride: int = 1
+    friction_prior: tuple[Tensor, Tensor] | None = None
+    plant_prior: tuple[Tensor, Tensor] | None = None
+    offset_sd: Tensor | None = None
+    defect_sd: tuple[float, float] | None = None
+    extrapolation: ExtrapolationPrior | None = None
     memory: Tensor | None = None
-    zero_sd: Tensor | None = None
-    jump_sd: tuple[float, float] | None = None
-    anchors: Anchors | None = None
+    options: FitOptions = DEFAULTS
 
-    def __post_init__(self) -> None:
-        w = self.windows
-        counted = torch.zeros_like(w.weight)
-        counted[:, :: self.stride] = w.weight[:, :: self.stride] * self.stride**0.5
-        self._scale = counted[..., None] / self.noise_sd
-        self.plant, self.friction = self.jacobian.plant, self.jacobian.friction
-        self.unknowns = Unknowns(
-            self.friction.schedule, self.jacobian.parameters, w, self.plant_mean, self.zero_sd
-        )
-        self.step = w.step.repeat_interleave(self.substeps, 1) / self.substeps
-        self.tau = w.tau.repeat_interleave(self.substeps, 1)
-        self._seams = w.seams() if self.jump_sd else []
-        jump_sd = torch.tensor(self.jump_sd or (torch.inf, torch.inf), dtype=torch.float64)
-        self._jump_sd = jump_sd.repeat_interleave(w.q0.shape[-1])
-        self._simulated: tuple[Tensor, Rollout] | None = None
-        self._hessian = torch.zeros(0, 0, dtype=torch.float64)
+    @cached_property
+    def variables(self) -> DecisionVariables:
+        """Order, bounds and priors of the decision variables."""
+        return DecisionVariables(
+            self.friction.schedule, self.jacobian.terms, self.windows, self.friction_prior,
+            self.plant_prior, self.offset_sd, self.options,
+        )  # fmt: skip
+
+    def cost(self, x: Tensor) -> Tensor:
+        """Half the sum of squares of errors, defects and priors."""
+        return self._cost(x, self._simulate(x))
+
+    def linearise(self, x: Tensor) -> Quadratic:
+        """Cost, gradient and Gauss-Newton Hessian at `x` from one simulation."""
+        run, indices = self._simulate(x, with_memory=True), self.variables.indices()
+        pieces = propagate(self.jacobian, run, self.substeps, self.stride)
+        rows = scaled_rows(pieces, self._scale, self.measurement, indices)
+        errors = self._deviation(x, run) * self._scale
+        gradient, hessian, ends = normal_equations(rows, errors, indices, len(x))
+        if self.pairs:
+            defects = self._defects(x, run)
+            add_defects(gradient, hessian, defects, ends, self.pairs, indices, self._defect_sd)
+        if self.extrapolation is not None:
+            slope, curvature = self.extrapolation.normal_equations(run.friction.schedule)
+            gradient[: len(slope)] += slope
+            hessian[: len(slope), : len(slope)] += curvature
+        precision, mean = self.variables.prior()
+        gradient += precision * (x - mean)
+        hessian.diagonal().add_(precision)
+        # Defects and encoder offsets couple the states of different windows.
+        alone = not self.pairs and not self.variables.offset_count
+        blocks = (self.variables.shared_count, self.variables.state_count) if alone else None
+        return Quadratic(self._cost(x, run), gradient, hessian, blocks)
+
+    def errors(self, x: Tensor) -> Tensor:
+        """Position error at every sample [rad; m], (window, step + 1, joint)."""
+        return self._deviation(x, self._simulate(x)) * self.windows.weight[..., None]
+
+    def residuals(self, x: Tensor) -> Tensor:
+        """Errors of the counted samples over the noise, (window, step + 1, joint)."""
+        return self._deviation(x, self._simulate(x)) * self._scale
+
+    def defects(self, x: Tensor) -> Tensor:
+        """From a window's end to the next one's start over `defect_sd`, (pair, 2 joint)."""
+        return self._defects(x, self._simulate(x))
+
+    @cached_property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Windows whose defects count."""
+        return self.windows.continuity_pairs() if self.defect_sd else []
 
     def plant_at(self, vector: Tensor) -> Plant:
         """The plant with its adjustable terms at a parameter vector."""
-        changed = adjusted_buffers(self.plant, self.jacobian.parameters, vector)
-        return self.plant.replace(**changed) if changed else self.plant
+        return adjusted_plant(self.jacobian.plant, self.jacobian.terms, vector)
 
-    def traced(self, x: Tensor, motions: Sequence[Motion]) -> tuple[Motion, ...]:
-        """The motions with position and velocity from the windows simulated at `x`.
+    def simulated_motions(self, x: Tensor, motions: Sequence[Motion]) -> tuple[Motion, ...]:
+        """The motions with position and velocity of the windows simulated at `x`.
 
-        Longer windows then start from states that a fit has found, not a smoother.
+        Longer windows then start from fitted states instead of a smoother's.
         """
-        run, zeros = self._simulate(x), self.unknowns.zeros(x)
-        run = replace(run, q=run.q - zeros[:, None])
+        run, offsets = self._simulate(x).motion, self.variables.window_offsets(x)
+        run = replace(run, q=run.q - offsets[:, None])
         states = [(m.q.copy(), m.qd.copy()) for m in motions]
         # A sample that two windows share is taken from the later one's fitted start.
         for w, (place, first, last) in enumerate(self.windows.spans):
@@ -112,144 +144,85 @@ class TrajectoryProblem:
                 kept[first : last + 1] = found[w, : n : self.substeps].numpy()
         return tuple(replace(m, q=q, qd=qd) for m, (q, qd) in zip(motions, states, strict=True))
 
-    def errors(self, x: Tensor) -> Tensor:
-        """Position error at every sample of the windows [rad or m], (window, step + 1, joint)."""
-        return self._deviation(x) * self.windows.weight[..., None]
+    def posterior_sd(self, hessian: Tensor) -> Tensor:
+        """Standard deviation of every shared variable by a Gauss-Newton Hessian."""
+        precision, _ = self.variables.prior()
+        return standard_deviations(information(hessian, precision, self.variables.shared_count))
 
-    def residuals(self, x: Tensor) -> Tensor:
-        """Error of the counted samples over the noise, (window, step + 1, joint)."""
-        return self._deviation(x) * self._scale
+    def information(self, x: Tensor, sd: Tensor) -> Information:
+        """Information about the shared variables, given the sd of each error.
 
-    def _deviation(self, x: Tensor) -> Tensor:
-        q = self._simulate(x).q[:, :: self.substeps] - self.unknowns.zeros(x)[:, None]
-        return (q - self.windows.q) @ self.mixing.T
+        `sd` is inflated for autocorrelation, (window, step + 1, joint).
+        """
+        variables, run = self.variables, self._simulate(x, with_memory=True)
+        shared, (precision, _) = variables.shared_count, variables.prior()
+        of_states, of_offsets = variables.split(precision)[2:]
+        kept = Kept(variables.indices(), variables.state_count, len(x))
+        joined = (self.pairs, self._defect_sd) if self.pairs else ((), None)
+        data, response = marginalize_states(self._rows(run, self._scale), kept, of_states, *joined)
+        rows = self._rows(run, self._scale * sd / self.noise_sd)
+        score = score_covariance(rows, kept, response, of_states)
+        prior = torch.cat([precision[:shared], of_offsets.flatten()])
+        return information(data + torch.diag(prior), prior, shared, score)
 
-    def cost(self, x: Tensor) -> Tensor:
-        """Half the sum of squares of residuals, jumps, anchors and prior."""
-        precision, mean = self.unknowns.prior()
-        rows = [self.residuals(x), self.jumps(x)]
-        if self.anchors is not None:
-            rows.append(self.anchors.residuals(self._network(x)))
-        misfit = torch.stack([row.square().sum() for row in rows]).sum()
-        return 0.5 * (misfit + (precision * (x - mean) ** 2).sum())
+    @cached_property
+    def _scale(self) -> Tensor:
+        """Weight of each sample over the noise, (window, step + 1, 1)."""
+        counted = torch.zeros_like(self.windows.weight)
+        counted[:, :: self.stride] = self.windows.weight[:, :: self.stride] * self.stride**0.5
+        return counted[..., None] / self.noise_sd
 
-    def jumps(self, x: Tensor) -> Tensor:
-        """From a window's end to the next one's start, over what is expected, (seam, 2 joint)."""
-        run = self._simulate(x)
-        before, after = ([pair[k] for pair in self._seams] for k in (0, 1))
-        q = run.q[before, -1] - self.unknowns.zeros(x)[before]
-        end = torch.cat([q, run.qd[before, -1]], -1)
-        return (end - self.unknowns.split(x)[2][after]) / self._jump_sd
+    @cached_property
+    def _defect_sd(self) -> Tensor:
+        sd = torch.tensor(self.defect_sd or (torch.inf, torch.inf), dtype=torch.float64)
+        return sd.repeat_interleave(self.windows.q0.shape[-1])
 
-    def largest_jump(self, x: Tensor) -> float:
-        """Over what is expected; 0 where windows have nothing to do with each other."""
-        jumps = self.jumps(x).abs()
-        return float(jumps.max()) if jumps.numel() else 0.0
+    def _simulate(self, x: Tensor, *, with_memory: bool = False) -> Trajectory:
+        """The windows' motion at `x`; the memory of its coefficients only for derivatives."""
+        friction, plant, states, _ = self.variables.split(x)
+        model = model_at(self.friction, friction)
+        q0, qd0 = states.chunk(2, -1)
+        tau = self.windows.tau.repeat_interleave(self.substeps, 1)
+        step = self.windows.step.repeat_interleave(self.substeps, 1) / self.substeps
+        offsets = self.variables.window_offsets(x)
+        motion = self._integrate(self.plant_at(plant), model, q0 + offsets, qd0, tau, step)
+        memory = self._memory_along(model, motion) if with_memory else None
+        return Trajectory(model, plant, motion, tau, step, memory)
 
-    def _network(self, x: Tensor) -> NeuroFuzzy:
-        schedule = self.friction.schedule
-        assert isinstance(schedule, NeuroFuzzy)
-        schedule.set_parameter_vector(self.unknowns.split(x)[0])
-        return schedule
-
-    def quadratic(self, x: Tensor) -> Quadratic:
-        """Gauss-Newton model of the cost at `x`."""
-        r = self.residuals(x)
-        precision, mean = self.unknowns.prior()
-        places = self.unknowns.places()
-        rows = self._rows(x, self._scale)
-        gradient, hessian, ends = normal_equations(rows, r, places, len(x))
-        if self._seams:
-            add_jumps(gradient, hessian, self.jumps(x), ends, self._seams, places, self._jump_sd)
-        if self.anchors is not None:
-            slope, curvature = self.anchors.normal_equations(self._network(x))
-            gradient[: len(slope)] += slope
-            hessian[: len(slope), : len(slope)] += curvature
-        hessian.diagonal().add_(precision)
-        self._hessian = hessian
-        # Neither seams nor zeros make states of windows depend on each other.
-        alone = not self._seams and not self.unknowns.zero_count
-        blocks = (self.unknowns.shared_count, self.unknowns.state_count) if alone else None
-        return Quadratic(self.cost(x), gradient + precision * (x - mean), hessian, blocks)
-
-    def spread(self) -> Tensor:
-        """Standard deviation of every shared parameter by the last quadratic model."""
-        precision, _ = self.unknowns.prior()
-        known = information(self._hessian, precision, self.unknowns.shared_count)
-        return standard_deviations(known)
-
-    def _simulate(self, x: Tensor) -> Rollout:
-        """Motion at `x`; the last one is kept, as a step's cost and model ask for the same."""
-        if self._simulated is not None and torch.equal(self._simulated[0], x):
-            return self._simulated[1]
-        parameters, plant_vector, state = self.unknowns.split(x)
-        self.friction.schedule.set_parameter_vector(parameters)
-        q0, qd0 = state.chunk(2, -1)
-        motion = self._run(self.plant_at(plant_vector), q0 + self.unknowns.zeros(x), qd0)
-        self._simulated = (x.clone(), motion)
-        return motion
-
-    def _run(self, plant: Plant, q0: Tensor, qd0: Tensor) -> Rollout:
-        """Motion of all windows from their first states, with the schedule as it is."""
-        return integrate(plant, self.friction, q0, qd0, self.tau, self.step, memory=self.memory)
+    def _integrate(
+        self, plant: Plant, model: FrictionModel, q0: Tensor, qd0: Tensor, tau: Tensor, step: Tensor
+    ) -> Rollout:
+        return integrate(plant, model, q0, qd0, tau, step, memory=self.memory)
 
     @torch.no_grad()
-    def _states(self, motion: Rollout) -> Tensor | None:
+    def _memory_along(self, model: FrictionModel, motion: Rollout) -> Tensor | None:
         """Memory at every step of a motion, (window, step + 1, joint, state_size)."""
         if self.memory is None:
             return None
         rows = [self.memory]
         for qd, qdd in zip(motion.qd.unbind(1)[1:], motion.qdd.unbind(1)[1:], strict=True):
-            rows.append(self.friction.schedule.advance(qd, qdd, rows[-1]))
+            rows.append(model.schedule.advance(qd, qdd, rows[-1]))
         return torch.stack(rows, 1)
 
-    def told(self, x: Tensor, sd: Tensor) -> Information:
-        """What the data say of the shared parameters, where the errors have their own sizes.
+    def _deviation(self, x: Tensor, run: Trajectory) -> Tensor:
+        q = run.motion.q[:, :: self.substeps] - self.variables.window_offsets(x)[:, None]
+        return (q - self.windows.q) @ self.measurement.T
 
-        Args:
-            x: unknowns.
-            sd: of each error, enlarged for its correlation in time, (window, step + 1, joint).
-        """
-        places, state = self.unknowns.places(), self.unknowns.state_count
-        layout = Layout.of(places, state, len(x))
-        precision, _ = self.unknowns.prior()
-        first = self.unknowns.shared_count
-        of_states = precision[first : len(x) - self.unknowns.zero_count].reshape(-1, state)
-        kept = torch.cat([precision[:first], self.unknowns.split_zeros(precision)])
-        joined = (self._seams, self._jump_sd) if self._seams else ((), None)
-        known = eliminated(self._rows(x, self._scale), layout, of_states, *joined)
-        rows = self._rows(x, self._scale * sd / self.noise_sd)
-        spread = score_covariance(rows, layout, known, of_states)
-        return information(known.data + torch.diag(kept), kept, first, spread)
+    def _defects(self, x: Tensor, run: Trajectory) -> Tensor:
+        before, after = ([pair[k] for pair in self.pairs] for k in (0, 1))
+        q = run.motion.q[before, -1] - self.variables.window_offsets(x)[before]
+        end = torch.cat([q, run.motion.qd[before, -1]], -1)
+        return (end - self.variables.split(x).states[after]) / self._defect_sd
 
-    def _rows(self, x: Tensor, scale: Tensor) -> Iterator[Rows]:
-        """Rows of the Jacobian, some samples at a time; errors count as `scale` says."""
-        motion = self._simulate(x)
-        pieces = propagated(
-            self.jacobian, self.unknowns.friction_count, motion, self.tau, self.step,
-            self.unknowns.split(x)[1], self.substeps, self.stride, self._states(motion),
-        )  # fmt: skip
-        return scaled_rows(pieces, scale, self.mixing, self.unknowns.places())
+    def _cost(self, x: Tensor, run: Trajectory) -> Tensor:
+        squares = [self._deviation(x, run) * self._scale, self._defects(x, run)]
+        if self.extrapolation is not None:
+            squares.append(self.extrapolation.residuals(run.friction.schedule))
+        misfit = torch.stack([row.square().sum() for row in squares]).sum()
+        precision, mean = self.variables.prior()
+        return 0.5 * (misfit + (precision * (x - mean) ** 2).sum())
 
-
-def solve_trajectory(
-    problem: TrajectoryProblem,
-    x0: Tensor,
-    *,
-    max_steps: int = 30,
-    cost_tolerance: float = 1e-6,
-    callback: Callable[[Tensor, Step], bool | None] | None = None,
-) -> LeastSquaresResult:
-    """Minimise a trajectory problem from `x0`, leaving the best parameters in its model."""
-    lower, upper = problem.unknowns.bounds()
-    solver = LevenbergMarquardt(
-        max_steps=max_steps,
-        gradient_tolerance=1e-6,
-        cost_tolerance=cost_tolerance,
-        step_tolerance=1e-8,
-    )
-    result = solver.minimise(
-        problem.quadratic, x0, cost=problem.cost, lower=lower, upper=upper, callback=callback
-    )
-    problem.friction.schedule.set_parameter_vector(problem.unknowns.split(result.x)[0])
-    return result
+    def _rows(self, run: Trajectory, scale: Tensor) -> Iterator[Rows]:
+        """Rows of the Jacobian, some samples at a time."""
+        pieces = propagate(self.jacobian, run, self.substeps, self.stride)
+        return scaled_rows(pieces, scale, self.measurement, self.variables.indices())

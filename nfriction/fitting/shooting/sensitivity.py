@@ -1,23 +1,23 @@
-"""Exact sensitivities of windows of a simulated motion.
+"""Exact sensitivities of simulated windows.
 
-A window's motion is a chain of identical step maps. All step maps are linearised at once, in
-forward mode over a few directions (state, held coefficients, plant terms), and steps between
-samples that count are chained in these directions; a recursion of small matrix products then
-carries the sensitivity through time. The cost hardly depends on how many parameters shape the
-coefficients, so constant and neuro-fuzzy models are fitted alike.
+A window's motion is a chain of identical step maps. All of them are linearised in one kernel call
+by a few directions (state, held coefficients, plant terms); steps between counted samples are
+chained in these directions; a recursion of small matrix products then carries the sensitivities
+through time. The cost hardly depends on the number of friction parameters, so constant and
+neuro-fuzzy models are fitted alike.
 """
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
+import numpy as np
 import torch
-import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from nfriction import codegen
-from nfriction.fitting.plant_parameters import PlantParameter, adjusted_buffers
+from nfriction.fitting.plant_parameters import PlantParameter, adjusted_plant
 from nfriction.friction.model import FrictionModel
 from nfriction.friction.sensitivity import FactoredSensitivity, Sensitivity
 from nfriction.plant import Plant
@@ -26,51 +26,38 @@ from nfriction.simulation.rollout import Rollout
 
 logger = logging.getLogger(__name__)
 
-# Samples linearised together in eager torch: dual numbers should stay in the processor's cache.
+# Samples linearised together in eager torch, which should stay in the processor's cache.
 CHUNK = 1024
-
-
-@dataclass(frozen=True)
-class StepMaps:
-    """Derivatives of the maps of a run of blocks of steps, each (block, window, 3 joint, ·).
-
-    The rows are q, qd and qdd after the block; the columns those before it, the friction model's
-    parameters, and the plant's.
-    """
-
-    state: Tensor
-    parameters: Tensor
-    plant: Tensor
+# Samples, over all windows, whose sensitivities are accumulated together: enough for fast matrix
+# products, few enough for the processor's cache.
+PIECE = 2000
 
 
 class StepJacobian:
-    """Exact derivatives of one step by state, held coefficients and plant parameters.
+    """Exact derivatives of one step by state, held coefficients and plant terms.
 
-    Compiled where there is a compiler (20 to 30 times faster), otherwise by eager dual numbers.
+    Compiled where there is a compiler (20 to 30 times faster), otherwise in eager torch.
 
     Args:
         plant: the mechanism as given.
         friction: the friction model; only its law matters here.
-        parameters: adjustable terms of the plant.
+        terms: adjustable terms of the plant.
     """
 
     def __init__(
-        self,
-        plant: Plant,
-        friction: FrictionModel,
-        parameters: list[PlantParameter],
+        self, plant: Plant, friction: FrictionModel, terms: Sequence[PlantParameter]
     ) -> None:
-        self.plant, self.friction, self.parameters = plant, friction, parameters
+        self.plant, self.friction, self.terms = plant, friction, tuple(terms)
         self._compiled: codegen.CompiledFunction | None = None
         joints, k = plant.joints, len(friction.law.coefficients)
         generator = torch.Generator().manual_seed(0)
-        shapes = ((joints,), (joints,), (joints, k), (joints,), (1,), (len(parameters),))
+        shapes = ((joints,), (joints,), (joints, k), (joints,), (1,), (len(terms),))
         example = [
             scale * torch.rand(shape, generator=generator, dtype=torch.float64)
             for shape, scale in zip(shapes, (1.0, 1.0, 1e-2, 1.0, 1e-3, 1e-2), strict=True)
         ]
         try:
-            self._compiled = codegen.compile_function(self._after, example, jacobian=(0, 1, 2, 5))
+            self._compiled = codegen.compile_function(self._step, example, jacobian=(0, 1, 2, 5))
         except codegen.CodegenError as error:
             logger.warning("fits run slowly, as steps are linearised in eager torch: %s", error)
 
@@ -79,123 +66,133 @@ class StepJacobian:
     ) -> Tensor:
         """Derivatives of (q, qd, qdd) after a step, (sample, 3 joint, direction).
 
-        Directions: q, qd, held coefficients (joint-major), plant parameters.
+        Directions: q, qd, held coefficients (joint-major), plant terms.
         """
         if self._compiled is not None:
             given = (q, qd, held, tau, step, vector[None])
             return torch.from_numpy(self._compiled(*given)[-1])
-        pieces = zip(*(x.split(CHUNK) for x in (q, qd, held, tau, step)), strict=True)
-        return torch.cat([self._eager(a, b, c, d, e, vector) for a, b, c, d, e in pieces])
+        slopes = torch.func.jacfwd(self._step, (0, 1, 2, 5))
+        found = torch.func.vmap(slopes, (0, 0, 0, 0, 0, None), chunk_size=CHUNK)(
+            q, qd, held, tau, step, vector
+        )
+        return torch.cat([slope.flatten(2) for slope in found], -1)
 
-    def _after(
+    def initial_acceleration(self, q: Tensor, qd: Tensor, tau: Tensor, vector: Tensor) -> Tensor:
+        """Derivatives of the first acceleration, which has no friction, by q, qd and plant terms.
+
+        `q`, `qd` and `tau` are (window, joint); the result is (window, joint, direction).
+        """
+
+        def acceleration(q: Tensor, qd: Tensor, vector: Tensor, tau: Tensor) -> Tensor:
+            return adjusted_plant(self.plant, self.terms, vector).forward_dynamics(q, qd, tau)
+
+        slope = torch.func.vmap(torch.func.jacfwd(acceleration, (0, 1, 2)), (0, 0, None, 0))
+        return torch.cat(slope(q, qd, vector, tau), -1)
+
+    def _step(
         self, q: Tensor, qd: Tensor, held: Tensor, tau: Tensor, step: Tensor, vector: Tensor
     ) -> Tensor:
         """State after one step, (*batch, 3 joint)."""
-        buffers = adjusted_buffers(self.plant, self.parameters, vector)
-        plant = self.plant.replace(**buffers) if buffers else self.plant
+        plant = adjusted_plant(self.plant, self.terms, vector)
         return torch.cat(rk4_step(plant, self.friction, q, qd, tau, held, step), -1)
 
-    def _eager(
-        self, q: Tensor, qd: Tensor, held: Tensor, tau: Tensor, step: Tensor, vector: Tensor
-    ) -> Tensor:
-        inputs = (q, qd, held.flatten(1), vector.expand(len(q), -1))
-        unit = torch.eye(sum(x.shape[1] for x in inputs), dtype=q.dtype)
-        count = len(unit)
-        with torch.no_grad(), forward_ad.dual_level():
-            duals = [
-                forward_ad.make_dual(
-                    x.expand(count, *x.shape).contiguous(),
-                    tangent[:, None].expand(count, *x.shape).contiguous(),
-                )
-                for x, tangent in zip(inputs, unit.split([x.shape[1] for x in inputs], 1),
-                                      strict=True)
-            ]  # fmt: skip
-            q_, qd_, held_, vector_ = duals
-            after = self._after(q_, qd_, held_.unflatten(-1, held.shape[1:]), tau, step, vector_)
-            return forward_ad.unpack_dual(after).tangent.permute(1, 2, 0)
 
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Simulated windows with their friction model and plant terms.
 
-def start_slope(
-    jacobian: StepJacobian, q: Tensor, qd: Tensor, tau: Tensor, vector: Tensor
-) -> Tensor:
-    """Derivative of the acceleration known before the first step, which is without friction.
-
-    Args:
-        jacobian: holds the mechanism and its adjustable terms.
-        q, qd, tau: initial state and torque, (window, joint).
-        vector: parameters of the plant.
-
-    Returns:
-        By q, qd and the plant's parameters, (window, joint, direction).
+    `motion` is (window, step + 1, joint), `tau` (window, step, joint), `step` (window, step). The
+    `memory` of the coefficients (window, step, joint, state_size) is held constant in derivatives.
     """
 
-    def acceleration(q: Tensor, qd: Tensor, vector: Tensor, tau: Tensor) -> Tensor:
-        buffers = adjusted_buffers(jacobian.plant, jacobian.parameters, vector)
-        plant = jacobian.plant.replace(**buffers) if buffers else jacobian.plant
-        return plant.forward_dynamics(q, qd, tau)
+    friction: FrictionModel
+    plant_vector: Tensor
+    motion: Rollout
+    tau: Tensor
+    step: Tensor
+    memory: Tensor | None = None
 
-    slope = torch.func.vmap(torch.func.jacfwd(acceleration, (0, 1, 2)), (0, 0, None, 0))
-    return torch.cat(slope(q, qd, vector, tau), -1)
 
-
-def step_maps(
-    jacobian: StepJacobian,
-    motion: Rollout,
-    tau: Tensor,
-    step: Tensor,
-    vector: Tensor,
-    run: int,
-    block: int = 1,
-    states: Tensor | None = None,
-) -> Iterator[StepMaps]:
-    """Linearise windows, `run` blocks of `block` steps at a time, in order.
-
-    What lies between the ends of a block is composed for few directions before the many
-    parameters come in. Steps after the last whole block are a shorter one of their own.
+def propagate(
+    jacobian: StepJacobian, run: Trajectory, substeps: int, stride: int
+) -> Iterator[tuple[slice, Tensor]]:
+    """Derivatives of the positions at every `stride`-th sample, some samples at a time.
 
     Args:
         jacobian: derivatives of one step.
-        motion: of the windows, (window, step + 1, joint).
-        tau: torque held over each step, (window, step, joint).
-        step: [s], (window, step).
-        vector: parameters of the plant.
-        run: blocks to a piece.
-        block: steps to a block.
-        states: memory of the coefficients at every step, (window, step, joint, size), of a
-            schedule that has one; what it owes to the motion is not differentiated.
+        run: the windows' motion.
+        substeps: steps per sample.
+        stride: samples per counted one.
+
+    Yields:
+        Samples, and (window, sample, joint, column) by the friction parameters, the plant terms and
+        the window's initial state. The last piece is the windows' last sample, counted or not, with
+        the rows of its velocities below those of the positions.
     """
-    windows, steps = step.shape
+    windows, steps = run.step.shape
+    joints, plant_count = run.motion.q.shape[-1], len(run.plant_vector)
+    friction_count = run.friction.schedule.parameter_vector().numel()
+    shared = friction_count + plant_count
+    carried = torch.zeros(windows, 3 * joints, shared + 2 * joints, dtype=torch.float64)
+    carried[:, : 2 * joints, shared:] = torch.eye(2 * joints, dtype=torch.float64)
+    carried[:, 2 * joints :, shared:], carried[:, 2 * joints :, friction_count:shared] = (
+        jacobian.initial_acceleration(
+            run.motion.q[:, 0], run.motion.qd[:, 0], run.tau[:, 0], run.plant_vector
+        ).tensor_split([2 * joints], -1)
+    )
+    block = stride * substeps
+    many, whole = block * max(1, PIECE // (windows * block)), steps // block * block
+    sample = 0
+    # Steps after the last whole block are a shorter block of their own.
+    for first, last in pairwise(sorted({*range(0, whole, many), whole, steps})):
+        length = min(block, last - first)
+        q, qd, qdd, tau, step = (
+            _by_block(x[:, first:last], length)
+            for x in (run.motion.q, run.motion.qd, run.motion.qdd, run.tau, run.step[..., None])
+        )
+        memory = None if run.memory is None else _by_block(run.memory[:, first:last], length)
+        held, slope = _coefficients(run.friction, qd, qdd, memory)
+        derivative = jacobian(q, qd, held, tau, step, run.plant_vector)
+        by_state, by_shared = (
+            part.unflatten(0, (-1, windows))
+            for part in _compose(slope, derivative, length, plant_count)
+        )
+        rows, carried = _carry(by_state, by_shared, carried, joints)
+        end = sample + stride * rows.shape[1]
+        yield slice(sample, end, stride), rows
+        sample = end
+    yield slice(steps // substeps, None), carried[:, None, : 2 * joints]
 
-    whole = steps // block * block
-    for start, end in pairwise(sorted({*range(0, whole, run * block), whole, steps})):
-        part, length = slice(start, end), min(block, end - start)
 
-        def samples(x: Tensor, part: slice = part, length: int = length) -> Tensor:
-            return x[:, part].unflatten(1, (-1, length)).transpose(0, 1).flatten(0, 2)
+def _by_block(x: Tensor, length: int) -> Tensor:
+    """(window, step, ...) as (block, window, step within block, ...), in one axis."""
+    return x.unflatten(1, (-1, length)).transpose(0, 1).flatten(0, 2)
 
-        q, qd, qdd = (samples(x) for x in (motion.q, motion.qd, motion.qdd))
-        schedule = jacobian.friction.schedule
-        if states is None:
-            held, slope = schedule(qd, qdd), schedule.sensitivities(qd, qdd)
-        else:
-            memory = samples(states)
-            held = schedule.coefficients_from(qd, qdd, memory)
-            slope = schedule.sensitivities_from(qd, qdd, memory)
-        held = held.detach().expand(*qd.shape, held.shape[-1])
-        derivative = jacobian(q, qd, held, samples(tau), samples(step[..., None]), vector)
-        maps = _compose(slope, derivative, length, len(jacobian.parameters))
-        yield StepMaps(*(m.unflatten(0, (len(m) // windows, windows)) for m in maps))
+
+def _coefficients(
+    friction: FrictionModel, qd: Tensor, qdd: Tensor, memory: Tensor | None
+) -> tuple[Tensor, Sensitivity | FactoredSensitivity]:
+    """Coefficients held over each step, (sample, joint, coefficient), and their derivatives."""
+    schedule = friction.schedule
+    if memory is None:
+        held, slope = schedule(qd, qdd), schedule.sensitivities(qd, qdd)
+    else:
+        held = schedule.coefficients_from(qd, qdd, memory)
+        slope = schedule.sensitivities_from(qd, qdd, memory)
+    return held.detach().expand(*qd.shape, held.shape[-1]), slope
 
 
 def _compose(
     slope: Sensitivity | FactoredSensitivity, derivative: Tensor, block: int, plant_count: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Close the loop from the state through the coefficients, and chain the steps of blocks."""
-    samples, joints = slope.qd.shape[:2]
+) -> tuple[Tensor, Tensor]:
+    """Close the loop from the state through the coefficients, and chain the steps of blocks.
+
+    The results are derivatives of the ends of blocks by the state before, and by what is shared.
+    """
+    samples, joints, k = slope.qd.shape
     by_q, by_qd, by_held, by_plant = derivative.split(
-        [joints, joints, derivative.shape[-1] - 2 * joints - plant_count, plant_count], dim=-1
+        [joints, joints, joints * k, plant_count], dim=-1
     )
-    k = by_held.shape[-1] // joints
     of_joint = by_held.unflatten(-1, (joints, k))
     by_state = torch.cat(
         [
@@ -205,24 +202,34 @@ def _compose(
         ],
         -1,
     )
-    steps = (x.unflatten(0, (samples // block, block)) for x in (by_state, by_held, by_plant))
-    state, held, plant = _chained(*steps)
-    return state, slope.pulled(held.unflatten(-1, (joints, k)).transpose(1, 2)), plant
-
-
-def _chained(state: Tensor, held: Tensor, plant: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Derivatives of the ends of blocks from those of their steps, each (block, step, row, ·).
-
-    Returns:
-        By the state before the block; by what was held over each of its steps, step by step; and
-        by what acts in all of them.
-    """
-    steps = state.shape[1]
-    if steps == 1:
-        return state[:, 0], held, plant[:, 0]
+    state, held, plant = (
+        x.unflatten(0, (samples // block, block)) for x in (by_state, by_held, by_plant)
+    )
+    # From the last step of a block back to its first.
     after, rows, total = state[:, -1], [held[:, -1]], plant[:, -1]
-    for s in range(steps - 2, -1, -1):
+    for s in range(block - 2, -1, -1):
         rows.append(after @ held[:, s])
         total = total + after @ plant[:, s]
         after = after @ state[:, s]
-    return after, torch.stack(rows[::-1], 1), total
+    by_coefficient = torch.stack(rows[::-1], 1).unflatten(-1, (joints, k)).transpose(1, 2)
+    return after, torch.cat([slope.pulled(by_coefficient), total], -1)
+
+
+def _carry(by_state: Tensor, by_shared: Tensor, start: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Carry derivatives of a state (window, row, column) through maps (map, window, row, column).
+
+    The results are the first `count` rows before every map, and all rows after the last.
+    """
+    # Thousands of products of small matrices: NumPy's overhead is a fifth of torch's.
+    state, shared = by_state.numpy(), by_shared.numpy()
+    before = start.numpy().copy()
+    after = np.empty_like(before)
+    rows = np.empty((len(state), len(before), count, before.shape[-1]))
+    # The search rejects a step at which derivatives overflow; a warning would be noise.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for k in range(len(state)):
+            rows[k] = before[:, :count]
+            np.matmul(state[k], before, out=after)
+            after[..., : shared.shape[-1]] += shared[k]
+            before, after = after, before
+    return torch.from_numpy(rows).transpose(0, 1), torch.from_numpy(before)

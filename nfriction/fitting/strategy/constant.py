@@ -1,145 +1,146 @@
-"""Fit the constant law: torques first, then windows of growing length."""
+"""Constant coefficients: regression on torques first, then shooting windows of growing length."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import TypeGuard
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.fitting.data.inputs import (
-    adjustable_terms,
-    constant_schedule,
-    in_joint_coordinates,
-    is_eccentric,
-    mixing_of,
-)
+from nfriction.fitting.data.inputs import adjustable_terms
 from nfriction.fitting.equation_error import TorqueFit, fit_torque, prior_sd
+from nfriction.fitting.fit import FitTask
+from nfriction.fitting.options import Continuity, FitOptions
+from nfriction.fitting.plant_parameters import PlantParameter
 from nfriction.fitting.result.fit_result import (
-    Continuity,
     FitResult,
-    torque_outcome,
-    trajectory_outcome,
+    result_from_equation_error,
+    result_from_shooting,
 )
-from nfriction.fitting.strategy.continuation import JUMP_SD, Callback, Refinement, flat
-from nfriction.fitting.strategy.encoder_eccentricity import may_be_eccentric, richer_by_evidence
-from nfriction.fitting.strategy.growing import through_windows
-from nfriction.fitting.strategy.multistart import from_simpler
+from nfriction.fitting.shooting.sensitivity import StepJacobian
+from nfriction.fitting.strategy.continuation import (
+    ShootingFitter,
+    horizon_continuation,
+    loglik_tolerance,
+)
+from nfriction.fitting.strategy.encoder_eccentricity import richer_by_evidence
+from nfriction.fitting.strategy.multistart import warm_start_from_nested
 from nfriction.friction.constant import Constant
 from nfriction.friction.model import FrictionModel
-from nfriction.plant import Plant
-from nfriction.recording import Recording
-from nfriction.signals import Motion
+from nfriction.plant import PendulumChain, Plant
 
 TOO_LONG = (
-    "Windows of {:g} s are too long for this motion, which forgets its start within them, or for a "
-    "law or plant that is wrong; left out."
+    "Windows of {:g} s were skipped: the motion forgets its start within them, or law or plant are "
+    "wrong."
 )
-# Dry friction of a tenth of a link's largest gravity moment lets it rest up to 0.1 rad off [rad].
-ZERO_SD = 0.05
-# Short windows converge from far away, long ones tell small friction and small drag apart [s].
-WINDOWS = (0.5, 2.0, 5.0)
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What a fit from trajectories is asked for; see `fit`, whose defaults these are."""
+def fit_constant(task: FitTask) -> FitResult:
+    """Fit constant coefficients, by torques and then by simulated windows."""
+    model, options, start = task.model, task.options, task.start
+    begun = start.plant if start else task.plant
+    torque = regression(task, model, begun)
+    if options.method == "equation_error":
+        return result_from_equation_error(model, task.plant, start, task.motions, torque)
 
-    windows: Sequence[float] = WINDOWS
-    fit_plant: bool = True
-    drag: bool | None = None
-    eccentricity: bool | None = False
-    continuity: Continuity = "free"
-    max_steps: int = 30
-    callback: Callback | None = None
+    def equation_error(plant: Plant) -> Tensor:
+        return regression(task, model, plant).coefficients
 
-
-def fit_by_torque(
-    model: FrictionModel,
-    plant: Plant,
-    recordings: Sequence[Recording],
-    motions: tuple[Motion, ...],
-    start: FitResult | None = None,
-) -> FitResult:
-    """The constant coefficients that the torques of the smoothed motion imply.
-
-    Args:
-        model, plant, recordings, motions: see `fit_constant`.
-        start: an earlier fit, whose plant is taken.
-    """
-    joint = in_joint_coordinates(plant, model, recordings)
-    torque = _set_by_torque(model, start.plant if start else plant, joint, motions)
-    return torque_outcome(model, start, plant, motions, torque)
-
-
-def fit_constant(
-    model: FrictionModel,
-    plant: Plant,
-    recordings: Sequence[Recording],
-    motions: tuple[Motion, ...],
-    start: FitResult | None,
-    settings: Settings,
-    *,
-    each: bool,
-) -> FitResult:
-    """The fit of constant coefficients, by torques and then by trajectories.
-
-    Args:
-        model: changed in place.
-        plant: the mechanism as given.
-        recordings: as they are written, all in one convention.
-        motions: the smoothed motion of each, in joint coordinates.
-        start: an earlier fit, whose plant the torques take and whose terms the search starts at.
-        settings: see `fit`.
-        each: whether encoders were zeroed anew at the start of each recording.
-    """
-    joint = in_joint_coordinates(plant, model, recordings)
-    begun = start.plant if start else plant
-    _set_by_torque(model, begun, joint, motions)
-    mixing = mixing_of(plant, recordings[0].resolve_convention(plant))
-    known = {name: value for name, value, _ in start.plant_terms} if start else {}
-    zero_sd = torch.full((len(joint), plant.joints), ZERO_SD, dtype=torch.float64)
-
-    def refinement(eccentric: bool) -> Refinement:
-        terms = adjustable_terms(
-            plant, joint, settings.fit_plant, settings.drag, eccentric, zeroed_once=not each
-        )
-        return Refinement(
-            plant, model, joint, mixing, terms, settings.max_steps, settings.callback,
-            zero_sd if each else None, JUMP_SD[settings.continuity],
-        )  # fmt: skip
-
-    search = refinement(is_eccentric(settings.eccentricity, known))
-    vector = torch.tensor([known.get(t.name, 0.0) for t in search.terms], dtype=torch.float64)
-
-    def by_torque(found: Plant) -> Tensor:
-        return fit_torque(model.law, found, joint, motions, model.v_smooth).coefficients
-
+    eccentric = fits_eccentricity(options, start)
+    fitter = _fitter(task, model, torque, eccentric)
+    friction = torque.coefficients.reshape(-1)
+    plant = known_terms(start, fitter.jacobian.terms)
     linear = all(c.linear or not c.fitted for c in model.law.coefficients)
-    stage, left_out = through_windows(
-        search, settings.windows, vector, motions, None if linear else by_torque
+    found, skipped = horizon_continuation(
+        fitter, friction, plant, task.motions, None if linear else equation_error
     )
-    if (law := model.law.simpler) is not None and stage.result.status != "stopped":
-        simpler = FrictionModel(law, Constant(law, model.joints), model.v_smooth)
-        _set_by_torque(simpler, begun, joint, motions)
-        stage, left_out = from_simpler(
-            search, stage, left_out, simpler, settings.windows, vector, motions, by_torque
-        )
-    undecided = start is None and settings.eccentricity is None
-    possible = settings.fit_plant and may_be_eccentric(plant)
-    if undecided and possible and stage.result.status != "stopped":
-        tolerance = flat(stage.result.cost)
-        stage = richer_by_evidence(stage, refinement(True), tolerance) or stage
-    found = trajectory_outcome(stage.problem, stage.result, stage.residuals, motions)
-    found = replace(found, continuity=settings.continuity, left_out=left_out)
-    return found.with_warnings([TOO_LONG.format(length) for length in left_out])
+    if (law := model.law.simpler) is not None and not found.stopped:
+        contained = FrictionModel(law, Constant(law, model.joints), model.v_smooth)
+        by_torque = regression(task, contained, begun)
+        found, skipped = warm_start_from_nested(
+            (found, skipped), fitter, _fitter(task, contained, by_torque, eccentric),
+            (by_torque.coefficients.reshape(-1), plant), task.motions, equation_error,
+        )  # fmt: skip
+    undecided = start is None and options.eccentricity == "auto" and options.fit_plant
+    if undecided and isinstance(task.plant, PendulumChain) and not found.stopped:
+        richer = _fitter(task, model, torque, eccentric=True)
+        tolerance = loglik_tolerance(found.result.cost, options)
+        found = richer_by_evidence(found, richer, tolerance) or found
+    fitted = result_from_shooting(model, found.problem, found.result, task.motions)
+    fitted = replace(fitted, continuity=options.continuity, skipped_horizons=skipped)
+    return fitted.with_warnings([TOO_LONG.format(length) for length in skipped])
 
 
-def _set_by_torque(
-    model: FrictionModel, plant: Plant, joint: Sequence[Recording], motions: Sequence[Motion]
-) -> TorqueFit:
-    """Set constant coefficients, and how far they may go, by torques."""
-    torque = fit_torque(model.law, plant, joint, motions, model.v_smooth)
-    schedule = constant_schedule(model)
-    schedule.set_coefficients(torque.coefficients)
-    schedule.set_prior_sd(prior_sd(model.law, torque))
-    return torque
+def regression(task: FitTask, model: FrictionModel, plant: Plant) -> TorqueFit:
+    """Constant coefficients that torques imply on a plant."""
+    return fit_torque(model.law, plant, task.recordings, task.motions, model.v_smooth, task.options)
+
+
+def _fitter(
+    task: FitTask, model: FrictionModel, torque: TorqueFit, eccentric: bool
+) -> ShootingFitter:
+    options, plant = task.options, task.plant
+    terms = adjustable_terms(
+        plant, task.recordings, options, eccentric=eccentric, per_recording=task.per_recording
+    )
+    sd = options.encoder_offset_sd
+    shape = (len(task.recordings), plant.joints)
+    return ShootingFitter(
+        StepJacobian(plant, model, terms), model, task.recordings, task.measurement, options,
+        task.callback, friction_prior=constant_prior(model, torque, options),
+        offset_sd=torch.full(shape, sd, dtype=torch.float64) if task.per_recording else None,
+        defect_sd=options.defect_sd,
+    )  # fmt: skip
+
+
+def constant_prior(
+    model: FrictionModel, torque: TorqueFit, options: FitOptions
+) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation of a law's constant coefficients, each (parameter,)."""
+    sd = prior_sd(model.law, torque, options).reshape(-1)
+    return torch.zeros_like(sd), sd
+
+
+def known_terms(start: FitResult | None, terms: Sequence[PlantParameter]) -> Tensor:
+    """Plant terms of an earlier fit by name, 0 where it has none, (term,)."""
+    known = {name: value for name, value, _ in start.plant_terms} if start else {}
+    return torch.tensor([known.get(t.name, 0.0) for t in terms], dtype=torch.float64)
+
+
+def fits_eccentricity(options: FitOptions, start: FitResult | None) -> bool:
+    """Whether a search has encoder terms: as asked, or `"auto"` if an earlier fit has them."""
+    terms = start.plant_terms if start else ()
+    found = any(name.startswith("encoder ") for name, _, _ in terms)
+    return options.eccentricity == "on" or (options.eccentricity == "auto" and found)
+
+
+def is_constant_fit(
+    start: FitResult | None, model: FrictionModel, continuity: Continuity = "none"
+) -> TypeGuard[FitResult]:
+    """Whether a fit is an output-error fit of the model's law with constant coefficients."""
+    return (
+        start is not None
+        and start.model.law == model.law
+        and not start.model.schedule.follows_motion
+        and start.residuals.numel() > 0
+        and start.continuity == continuity
+    )
+
+
+def constant_start(task: FitTask) -> FitResult:
+    """The constant fit of a model's law; `task.start` if it is one of the same recordings."""
+    model, start = task.model, task.start
+    if is_constant_fit(start, model, task.options.continuity) and _offsets_match(start, task):
+        return start
+    constant = FrictionModel(model.law, Constant(model.law, model.joints), model.v_smooth)
+    return fit_constant(replace(task, model=constant)).with_warnings(task.data_warnings)
+
+
+def _offsets_match(start: FitResult, task: FitTask) -> bool:
+    """Whether a fit has encoder offsets of just these recordings, or none where none are sought."""
+    if not task.per_recording:
+        return not start.encoder_offsets
+    pairs = zip(start.motions, task.motions, strict=False)
+    same = all(np.array_equal(a.q, b.q) for a, b in pairs)
+    return len(start.encoder_offsets) == len(task.motions) and same

@@ -1,208 +1,257 @@
-"""Stages of a trajectory fit: windows of one length, searched from where the last stage ended."""
+"""Horizon continuation: shooting windows of growing length, each started at the last end."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from nfriction.fitting.data.inputs import substeps_of
-from nfriction.fitting.data.windows import Windows
-from nfriction.fitting.plant_parameters import PlantParameter
-from nfriction.fitting.result.fit_result import Continuity
+from nfriction.fitting.data.inputs import integration_substeps
+from nfriction.fitting.data.windows import Windows, cut_windows
+from nfriction.fitting.options import FitOptions
 from nfriction.fitting.shooting.autocorrelation import effective_noise
-from nfriction.fitting.shooting.problem import TrajectoryProblem, solve_trajectory
+from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
-from nfriction.fitting.strategy.extrapolation_prior import Anchors
-from nfriction.friction.constant import Constant
+from nfriction.fitting.shooting.variables import Parts, model_at
+from nfriction.fitting.strategy.extrapolation_prior import ExtrapolationPrior
 from nfriction.friction.model import FrictionModel
-from nfriction.optim.least_squares import LeastSquaresResult, Status, Step
-from nfriction.optim.levenberg_marquardt import FULL
+from nfriction.optim.least_squares import LeastSquaresResult, Quadratic, Status, Step
+from nfriction.optim.levenberg_marquardt import FULL, LevenbergMarquardt
 from nfriction.plant import Plant
 from nfriction.recording import Recording
+from nfriction.signals import Motion
 
 Callback = Callable[[str, Step], bool | None]
-
-# By how much position and velocity may jump from the end of a window to the start of the next
-# [rad, rad/s; m, m/s]. Beside the soft ones the positions of short windows count enough for a
-# search from far away to find its way; along the hard ones it would creep.
-JUMP_SD: dict[Continuity, tuple[float, float] | None] = {
-    "free": None, "soft": (3e-4, 0.01), "hard": (1e-6, 3e-5),
-}  # fmt: skip
-
-# Errors that count for less would be rounding [rad or m].
-LEAST_NOISE = 1e-9
-
-# Residuals grow with the windows, but not so much unless the search went astray.
-LOST_TRACK = 10.0
-# Dry friction puts kinks into the cost, along which a search may creep: so many steps in a row
-# that together lower it by no more than their tolerance end it.
-PATIENCE = 3
-# Windows that diverge from their neighbourhood's motion lower the cost long after what they share
-# has settled: so many steps in a row that each move it by no more than this share of its standard
-# deviation end a search, too.
-SETTLED = 0.05
+# Coefficients (joint, coefficient) that torques imply on a plant.
+EquationError = Callable[[Plant], Tensor]
 
 
-@dataclass(frozen=True)
-class Stage:
-    """Where the search ended with windows of one length.
+@dataclass(frozen=True, eq=False)
+class HorizonResult:
+    """The end of a search with windows of one length."""
 
-    Attributes:
-        problem: what was minimised; its model holds the best parameters.
-        result: of the search.
-        residuals: position errors there [rad or m], (window, step + 1, joint).
-    """
-
-    problem: TrajectoryProblem
+    problem: ShootingProblem
     result: LeastSquaresResult
-    residuals: Tensor
+
+    @cached_property
+    def residuals(self) -> Tensor:
+        """Position errors [rad; m], (window, step + 1, joint)."""
+        return self.problem.errors(self.result.x)
+
+    @cached_property
+    def parts(self) -> Parts:
+        """Parameters of friction and plant, window states and encoder offsets."""
+        return self.problem.variables.split(self.result.x)
 
     @property
-    def vector(self) -> Tensor:
-        """Values of the plant's terms."""
-        return self.problem.unknowns.split(self.result.x)[1].clone()
+    def stopped(self) -> bool:
+        """Whether the caller stopped the search."""
+        return self.result.status == "stopped"
 
-    @property
-    def zeros(self) -> Tensor:
-        """Zeros of the recordings in one row; none where they were not sought."""
-        return self.problem.unknowns.split_zeros(self.result.x).clone()
-
-    @property
+    @cached_property
     def noise(self) -> float:
-        """Standard deviation that a residual counts with."""
+        """Standard deviation of a residual, inflated for autocorrelation."""
         return effective_noise(self.residuals)
 
-    def lost_since(self, before: "Stage") -> bool:
-        """Whether longer windows only found that the motion forgets its start within them."""
-        rms = [float(stage.residuals.square().mean().sqrt()) for stage in (before, self)]
-        far = not rms[1] <= LOST_TRACK * rms[0]
-        return far and not self.result.converged
+    def lost_motion(self, before: "HorizonResult", options: FitOptions) -> bool:
+        """Whether the motion forgets its start within the longer windows."""
+        rms = [float(found.residuals.square().mean().sqrt()) for found in (before, self)]
+        return not rms[1] <= options.max_growth * rms[0] and not self.result.converged
+
+    def as_stopped(self) -> "HorizonResult":
+        """The same, reported as stopped by the caller."""
+        return replace(self, result=replace(self.result, status="stopped"))
 
 
-@dataclass(frozen=True)
-class Refinement:
-    """Searches of one model and plant over windows of recordings.
+@dataclass(frozen=True, eq=False)
+class ShootingFitter:
+    """Poses and solves shooting problems of one friction model, plant and set of recordings.
 
-    Args:
-        plant: the mechanism as given.
-        model: the friction model, varied in place.
-        joint: recordings in joint coordinates.
-        mixing: from joint coordinates to the recordings' own.
-        terms: adjustable terms of the plant.
-        max_steps: limit to each stage.
-        callback: told every step with its stage; True stops.
-        zero_sd, jump_sd, anchors: see `TrajectoryProblem`.
+    The recordings are in joint coordinates; `callback` is called with a stage name after every
+    step, True stops; for the other attributes see `ShootingProblem`.
     """
 
-    plant: Plant
-    model: FrictionModel
-    joint: Sequence[Recording]
-    mixing: Tensor
-    terms: list[PlantParameter]
-    max_steps: int = 30
+    jacobian: StepJacobian
+    friction: FrictionModel
+    recordings: Sequence[Recording]
+    measurement: Tensor
+    options: FitOptions
     callback: Callback | None = None
-    zero_sd: Tensor | None = None
-    jump_sd: tuple[float, float] | None = None
-    anchors: Anchors | None = None
-    jacobian: StepJacobian = field(init=False)
+    friction_prior: tuple[Tensor, Tensor] | None = None
+    plant_prior: tuple[Tensor, Tensor] | None = None
+    offset_sd: Tensor | None = None
+    defect_sd: tuple[float, float] | None = None
+    extrapolation: ExtrapolationPrior | None = None
 
-    def __post_init__(self) -> None:
-        jacobian = StepJacobian(self.plant, self.model, self.terms)
-        object.__setattr__(self, "jacobian", jacobian)
+    def cut(self, motions: Sequence[Motion], length: float) -> Windows:
+        """Windows of the recordings, each from the state that a motion has there."""
+        # Encoders that were zeroed where stiction held the links were zeroed at rest.
+        rest_speed = None if self.offset_sd is None else self.options.rest_speed
+        return cut_windows(self.recordings, motions, length, rest_speed=rest_speed)
 
     def problem(
         self,
         windows: Windows,
         noise: float,
-        mean: Tensor | None = None,
+        friction: Tensor,
+        *,
         stride: int = 1,
         far: bool = False,
-    ) -> TrajectoryProblem:
-        """The least-squares problem of windows; see `TrajectoryProblem`.
+    ) -> ShootingProblem:
+        """The problem of windows that starts at these friction parameters.
 
-        From `far`, windows join softly at most.
+        Where the start is `far` away, defects are at most penalised.
         """
-        jump_sd = JUMP_SD["soft"] if far and self.jump_sd else self.jump_sd
-        return TrajectoryProblem(
-            self.jacobian, windows, noise, self.mixing,
-            substeps=substeps_of(self.plant, self.model, self.joint), plant_mean=mean,
-            stride=stride, zero_sd=self.zero_sd, jump_sd=jump_sd,
-            anchors=self.anchors,
+        model = model_at(self.friction, friction)
+        longest_step = max(r.longest_step for r in self.recordings)
+        return ShootingProblem(
+            self.jacobian, model, windows, noise, self.measurement,
+            substeps=integration_substeps(
+                self.jacobian.plant, model, longest_step, self.options
+            ),
+            stride=stride, friction_prior=self.friction_prior, plant_prior=self.plant_prior,
+            offset_sd=self.offset_sd, extrapolation=self.extrapolation, options=self.options,
+            defect_sd=self.options.penalty_sd if far and self.defect_sd else self.defect_sd,
         )  # fmt: skip
 
     def search(
-        self,
-        problem: TrajectoryProblem,
-        vector: Tensor,
-        tolerance: float,
-        name: str,
-        zeros: Tensor | None = None,
-    ) -> Stage:
-        """Minimise from the model's present parameters and plant terms at `vector`.
+        self, problem: ShootingProblem, start: Tensor, tolerance: float, name: str
+    ) -> HorizonResult:
+        """Minimise a problem of this fitter.
 
-        Args:
-            problem: of this refinement.
-            vector: plant terms to start from.
-            tolerance: relative fall of the cost that counts as none.
-            name: of the stage, for the callback.
-            zeros: of each recording, to start from; 0 by default.
+        `tolerance` is the relative decrease of the cost that counts as none, `name` the stage's for
+        the callback.
         """
-        watch = _Watch(name, tolerance, self.callback, problem)
-        result = solve_trajectory(
-            problem, problem.unknowns.start(vector, zeros), max_steps=self.max_steps,
-            callback=watch, cost_tolerance=tolerance,
-        )  # fmt: skip
-        if result.status == "stopped" and (watch.settles or watch.creeps):
-            status: Status = "converged_step" if watch.settles else "creeping"
-            result = replace(result, status=status)
-        return Stage(problem, result, problem.errors(result.x))
+        solver = LevenbergMarquardt(
+            max_steps=self.options.max_steps,
+            gradient_tolerance=self.options.gradient_tolerance,
+            cost_tolerance=tolerance,
+            step_tolerance=self.options.step_tolerance,
+        )
+        lower, upper = problem.variables.bounds()
+        monitor = StallMonitor(problem, tolerance, self.options)
+
+        def report(x: Tensor, local: Quadratic, step: Step) -> Status | None:
+            if self.callback is not None and self.callback(name, step):
+                return "stopped"
+            return monitor(x, local, step)
+
+        result = solver.minimise(
+            problem.linearise, start, cost=problem.cost, lower=lower, upper=upper, callback=report
+        )
+        return HorizonResult(problem, result)
 
 
-class _Watch:
-    """Tells the caller every step, and ends a search that creeps or has settled."""
+class StallMonitor:
+    """Ends a search whose steps creep, or whose shared variables have converged."""
 
-    def __init__(
-        self, name: str, tolerance: float, callback: Callback | None, problem: TrajectoryProblem
-    ) -> None:
-        self.name, self.tolerance, self.callback, self.problem = name, tolerance, callback, problem
+    def __init__(self, problem: ShootingProblem, tolerance: float, options: FitOptions) -> None:
+        self.problem, self.tolerance, self.options = problem, tolerance, options
         self.costs: list[float] = []
         self.before: Tensor | None = None
         self.still = 0
-        self.creeps = self.settles = False
 
-    def __call__(self, x: Tensor, step: Step) -> bool:
-        if self.callback is not None and self.callback(self.name, step):
-            return True
+    def __call__(self, x: Tensor, local: Quadratic, step: Step) -> Status | None:
+        patience = self.options.patience
         self.costs.append(step.cost)
-        if len(self.costs) > PATIENCE:
-            before = self.costs[-1 - PATIENCE]
-            self.creeps = before - step.cost <= PATIENCE * self.tolerance * before
-        self.still = self.still + 1 if self._moved(x, step) <= SETTLED else 0
-        self.settles = self.still >= PATIENCE
-        return self.creeps or self.settles
+        self.still = (
+            self.still + 1 if self._move(x, local, step) <= self.options.settled_move else 0
+        )
+        if not patience:
+            return None
+        if self.still >= patience:
+            return "converged_step"
+        if len(self.costs) <= patience:
+            return None
+        before = self.costs[-1 - patience]
+        return "creeping" if before - step.cost <= patience * self.tolerance * before else None
 
-    def _moved(self, x: Tensor, step: Step) -> float:
-        """By how many standard deviations a full step moved a shared parameter at most."""
-        problem = self.problem
-        if not isinstance(problem.friction.schedule, Constant):
+    def _move(self, x: Tensor, local: Quadratic, step: Step) -> float:
+        """Largest move of a shared variable in a full step, in standard deviations."""
+        if self.problem.friction.schedule.follows_motion:
             return torch.inf
-        shared, self.before, before = x[: problem.unknowns.shared_count], x, self.before
-        # A step that damping cut short is no sign of rest.
+        count = self.problem.variables.shared_count
+        before, self.before = self.before, x
+        # A step that damping cut short shows no convergence.
         if before is None or step.damping > FULL:
             return torch.inf
-        spread = problem.spread()
-        # Chaotic windows leave a curvature of rounding alone, by which nothing would ever move.
-        if torch.isinf(spread).all():
+        sd = self.problem.posterior_sd(local.hessian)
+        # Of chaotic windows the curvature is round-off, by which nothing would ever move.
+        if torch.isinf(sd).all():
             return torch.inf
-        return float(((shared - before[: problem.unknowns.shared_count]) / spread).abs().max())
+        return float(((x - before)[:count] / sd).abs().max())
 
 
-def least(residuals: Tensor, noise: float) -> float:
-    """Cost of residuals counted in what they turned out to be."""
+def horizon_continuation(
+    fitter: ShootingFitter,
+    friction: Tensor,
+    plant: Tensor,
+    motions: tuple[Motion, ...],
+    equation_error: EquationError | None = None,
+    of: str = "",
+) -> tuple[HorizonResult, tuple[float, ...]]:
+    """Search windows of growing length, each from the states and with the noise of the last.
+
+    If a horizon fails, return the previous stage and the skipped horizons.
+
+    Args:
+        fitter: of the model; `options.windows` are the lengths. friction, plant: parameters to
+        start from. motions: smoothed, in joint coordinates. equation_error: repeats the first stage
+        from the coefficients that torques imply on the plant
+            that it found: a nonlinear law has several minima, and on a slightly wrong inertia the
+            torques lead to a worse one.
+        of: ending of the stages' names.
+    """
+    options = fitter.options
+    reached: HorizonResult | None = None
+    offsets: Tensor | None = None
+    noise, simulated = options.first_noise, motions
+    for place, length in enumerate(options.windows):
+        far = reached is None and len(options.windows) > 1
+        problem = fitter.problem(fitter.cut(simulated, length), noise, friction, far=far)
+        start = problem.variables.start(plant, offsets)
+        tolerance = options.loose_tolerance
+        if length == options.windows[-1]:
+            # The cost far from the minimum says nothing about its value; the last stage's does.
+            near = reached and weighted_cost(reached.residuals, noise)
+            tolerance = loglik_tolerance(near or float(problem.cost(start)), options)
+        name = f"{length:g} s windows{of}"
+        found = fitter.search(problem, start, tolerance, name)
+        if reached is None and equation_error is not None and not found.stopped:
+            found = restart_from_equation_error(fitter, found, tolerance, name, equation_error)
+        if reached is not None and found.lost_motion(reached, options):
+            return reached, tuple(options.windows[place:])
+        reached, noise = found, max(found.noise, options.min_noise)
+        friction, plant, _, offsets = found.parts
+        if found.stopped:
+            break
+        simulated = problem.simulated_motions(found.result.x, simulated)
+    assert reached is not None
+    return reached, ()
+
+
+def restart_from_equation_error(
+    fitter: ShootingFitter,
+    found: HorizonResult,
+    tolerance: float,
+    name: str,
+    equation_error: EquationError,
+) -> HorizonResult:
+    """A stage, or the same from the coefficients that torques imply on its plant, if lower."""
+    problem, plant = found.problem, found.parts.plant
+    friction = equation_error(problem.plant_at(plant)).reshape(-1)
+    problem = replace(problem, friction=model_at(problem.friction, friction))
+    start = problem.variables.start(plant, found.parts.offsets)
+    other = fitter.search(problem, start, tolerance, name)
+    return other if other.stopped or other.result.cost < found.result.cost else found
+
+
+def weighted_cost(residuals: Tensor, noise: float) -> float:
+    """Half the sum of squares of residuals over their noise."""
     return float(0.5 * (residuals / noise).square().sum())
 
 
-def flat(cost: float) -> float:
-    """Relative fall of the cost that changes the log likelihood by a tenth."""
-    return 0.1 / max(cost, 1.0)
+def loglik_tolerance(cost: float, options: FitOptions) -> float:
+    """Relative decrease of a cost that no longer matters to the log likelihood."""
+    return options.loglik_tolerance / max(cost, 1.0)

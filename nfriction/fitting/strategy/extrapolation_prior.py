@@ -1,98 +1,96 @@
-"""Anchors of a network: it is held to its constant law at motions that recordings never came near.
+"""Extrapolation prior: a network is pulled to its constant law where the recordings never were.
 
-Fuzzy sets reach far: what they learn of friction at the turning points of large swings they also
-say of small swings, slow and weakly accelerated, of which the recordings tell nothing.
+Fuzzy sets reach far: friction learned at the turning points of large swings also shapes small
+swings, slow and weakly accelerated, of which the recordings show nothing.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation
 from torch import Tensor
 
+from nfriction.fitting.options import DEFAULTS, FitOptions
+from nfriction.friction.coefficients import Schedule
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.signals import Motion
 
-# Cells along each input, how many of them a sample vouches for around its own, and at every how
-# many-th one a network is held where none does.
-CELLS, NEAR, SPACING = 60, 5, 5
-# By how much coefficients may deviate there, in units of their scale.
-ANCHOR_SD = 0.2
-
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Anchors:
-    """Motions of each joint, and where its coefficients are held to those of the constant law.
+class ExtrapolationPrior:
+    """Points of the input range at which coefficients are pulled to those of the constant law.
 
-    Attributes:
-        qd, qdd: velocity and acceleration, (point, joint).
-        weight: 1 where no sample came near, else 0, (point, joint).
+    `qd` and `qdd` are (point, joint), `weight` 1 where no sample came near, else 0, and `sd` the
+    expected deviation in units of the coefficients' scale.
     """
 
     qd: Tensor
     qdd: Tensor
     weight: Tensor
+    sd: float = DEFAULTS.unvisited_sd
 
     @torch.no_grad()
-    def residuals(self, schedule: NeuroFuzzy) -> Tensor:
-        """Deviation of the coefficients over what is expected, in one row."""
-        deviation = schedule(self.qd, self.qdd) - schedule.reference_coefficients()
-        return (deviation * self._factor(schedule)).flatten()
+    def residuals(self, schedule: Schedule) -> Tensor:
+        """Deviation of a neuro-fuzzy schedule's coefficients over `sd`, in one row."""
+        network = cast("NeuroFuzzy", schedule)
+        deviation = network(self.qd, self.qdd) - network.reference_coefficients()
+        return (deviation * self._factor(network)).flatten()
 
-    def normal_equations(self, schedule: NeuroFuzzy) -> tuple[Tensor, Tensor]:
+    def normal_equations(self, schedule: Schedule) -> tuple[Tensor, Tensor]:
         """J^T r and J^T J of the residuals, over the parameter vector."""
-        by, factor = schedule.sensitivities(self.qd, self.qdd), self._factor(schedule)
-        r = self.residuals(schedule).view_as(factor)
+        network = cast("NeuroFuzzy", schedule)
+        by, factor = network.sensitivities(self.qd, self.qdd), self._factor(network)
+        r = self.residuals(network).view_as(factor)
         slopes, count = by.parameters, len(by.joint)
         gradient = torch.zeros(count, dtype=torch.float64)
         hessian = torch.zeros(count, count, dtype=torch.float64)
         # No parameter acts on two joints.
-        for j in range(schedule.joints):
+        for j in range(network.joints):
             own = (by.joint == j).nonzero().squeeze(-1)
-            held = self.weight[:, j] > 0
-            rows = (slopes[held][..., own] * factor[held, j, :, None]).flatten(0, 1)
-            gradient[own] = r[held, j].flatten() @ rows
+            active = self.weight[:, j] > 0
+            rows = (slopes[active][..., own] * factor[active, j, :, None]).flatten(0, 1)
+            gradient[own] = r[active, j].flatten() @ rows
             hessian[own[:, None], own] = rows.T @ rows
         return gradient, hessian
 
-    def _factor(self, schedule: NeuroFuzzy) -> Tensor:
-        return self.weight[..., None] / (ANCHOR_SD * schedule.scale)
+    def _factor(self, network: NeuroFuzzy) -> Tensor:
+        return self.weight[..., None] / (self.sd * network.scale)
 
 
-def anchors_where_unseen(schedule: NeuroFuzzy, motions: Sequence[Motion]) -> Anchors:
-    """Where in a schedule's trained range motions never came near.
+def prior_on_unvisited_cells(
+    schedule: NeuroFuzzy, motions: Sequence[Motion], options: FitOptions = DEFAULTS
+) -> ExtrapolationPrior:
+    """Prior at those points of a schedule's trained range that motions never came near."""
+    from scipy.ndimage import binary_dilation  # slow to import
 
-    Args:
-        schedule: with its range set.
-        motions: smoothed, in joint coordinates.
-    """
-    near = np.stack(
-        [binary_dilation(n > 0, iterations=NEAR) for n in visits(schedule, motions, CELLS)]
-    )
-    places = np.arange(SPACING // 2, CELLS, SPACING)
-    points = (torch.as_tensor(places, dtype=torch.float64) + 0.5) / CELLS
+    visits = visit_histogram(schedule, motions, options.cells)
+    near = np.stack([binary_dilation(n > 0, iterations=options.visited_radius) for n in visits])
+    places = np.arange(options.point_spacing // 2, options.cells, options.point_spacing)
+    points = (torch.as_tensor(places, dtype=torch.float64) + 0.5) / options.cells
     velocity, acceleration = torch.cartesian_prod(points, points).unbind(-1)
     lower, upper = schedule.acceleration_lower, schedule.acceleration_upper
     weight = ~near[:, places[:, None], places].reshape(schedule.joints, -1)
-    return Anchors(
+    return ExtrapolationPrior(
         velocity[:, None] * schedule.velocity_range,
         lower + acceleration[:, None] * (upper - lower),
         torch.as_tensor(weight.T, dtype=torch.float64),
+        options.unvisited_sd,
     )
 
 
-def visits(schedule: NeuroFuzzy, motions: Sequence[Motion], cells: int) -> NDArray[np.float64]:
-    """Samples in each cell of the trained range, those outside in the edge's.
+def visit_histogram(
+    schedule: NeuroFuzzy, motions: Sequence[Motion], cells: int
+) -> NDArray[np.float64]:
+    """Samples in each cell of the trained range; those outside count at its edge.
 
-    Returns:
-        Shape (joint, cell of |velocity|, cell of acceleration).
+    Shape (joint, cell of |velocity|, cell of acceleration).
     """
     qd, qdd = (np.concatenate([getattr(m, name) for m in motions]) for name in ("qd", "qdd"))
     if schedule.along_motion:
-        # Not the network's own passage: at a turning point it runs through accelerations that the
+        # Not the network's smooth sign: at a turning point it runs through accelerations that the
         # motion never had.
         qdd = np.where(qd < 0, -qdd, qdd)
     lower, upper = (getattr(schedule, f"acceleration_{end}").numpy() for end in ("lower", "upper"))

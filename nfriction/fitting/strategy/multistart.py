@@ -1,134 +1,114 @@
-"""A law that is not linear, searched from where the simpler law that it contains ended."""
+"""Several starts for a nonlinear law: its own, and two from the law that it contains."""
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from nfriction.fitting.data.inputs import constant_schedule
 from nfriction.fitting.data.windows import Windows
-from nfriction.fitting.strategy.continuation import LEAST_NOISE, Refinement, Stage, flat, least
-from nfriction.fitting.strategy.growing import through_windows
+from nfriction.fitting.strategy.continuation import (
+    EquationError,
+    HorizonResult,
+    ShootingFitter,
+    horizon_continuation,
+    loglik_tolerance,
+    weighted_cost,
+)
 from nfriction.friction.laws import Law
-from nfriction.friction.model import FrictionModel
-from nfriction.plant import Plant
 from nfriction.signals import Motion
 
 
-def from_simpler(
-    search: Refinement,
-    own: Stage,
-    left_out: tuple[float, ...],
-    simpler: FrictionModel,
-    windows: Sequence[float],
-    vector: Tensor,
+def warm_start_from_nested(
+    own: tuple[HorizonResult, tuple[float, ...]],
+    fitter: ShootingFitter,
+    nested: ShootingFitter,
+    start: tuple[Tensor, Tensor],
     motions: tuple[Motion, ...],
-    by_torque: Callable[[Plant], Tensor],
-) -> tuple[Stage, tuple[float, ...]]:
-    """The lowest end of a law, also looked for from its simpler law's; see `lowest_of`.
+    equation_error: EquationError,
+) -> tuple[HorizonResult, tuple[float, ...]]:
+    """The lowest end of a law and its skipped horizons, also searched from its nested law.
 
     Args:
-        search: of the law.
-        own, left_out: its end, and the lengths of windows left out on the way there.
-        simpler: model of the simpler law, at what torques tell.
-        windows, vector, motions: see `through_windows`.
-        by_torque: coefficients of the law that torques tell on a plant, (joint, coefficient).
-
-    Returns:
-        Its stage, and the lengths of windows left out on the way to it.
+        own: end of the law and the skipped horizons on the way there.
+        fitter, nested: of the law, and of the nested one.
+        start: parameters of the nested law, and of the plant.
+        motions, equation_error: see `horizon_continuation`.
     """
-    base, without = through_windows(
-        replace(search, model=simpler), windows, vector, motions, of=f", {simpler.law.name} law"
-    )
-    lowest = lowest_of(search, own, base, by_torque)
-    return lowest, left_out if lowest.problem is own.problem else without
+    stages = f", {nested.friction.law.name} law"
+    base, skipped = horizon_continuation(nested, *start, motions, of=stages)
+    best = best_of_starts(fitter, own[0], base, equation_error)
+    return best, own[1] if best.problem is own[0].problem else skipped
 
 
-def lowest_of(
-    search: Refinement, own: Stage, simpler: Stage, by_torque: Callable[[Plant], Tensor]
-) -> Stage:
-    """A law's own end, or a lower one that it reaches from where the simpler law ended.
+def best_of_starts(
+    fitter: ShootingFitter,
+    own: HorizonResult,
+    nested: HorizonResult,
+    equation_error: EquationError,
+) -> HorizonResult:
+    """A law's own end, or a lower one that it reaches from where its nested law ended.
 
-    A law that is not linear has several minima, and to which of them torques lead depends on the
-    plant. So it is searched again from what they tell on the simpler law's; and as long as it is
-    above the law that it contains, from there. Priors guide each search; between their ends what is
-    left over counts alone. The model is left with the lowest; with one of longer windows where only
-    the simpler law could follow them.
-
-    Args:
-        search: of the law.
-        own, simpler: its end, and that of the simpler law.
-        by_torque: coefficients of the law that torques tell on a plant, (joint, coefficient).
+    A nonlinear law has several minima, and the plant decides to which of them the torques lead. So
+    it is searched again from the coefficients that they imply on the nested law's plant and, while
+    it is above the nested law, from that law itself. Priors guide each search; the ends are
+    compared by their residuals alone. Longer windows win where only the nested law could follow
+    them.
     """
-    if simpler.result.status == "stopped":
-        return _stopped(own)
-    windows = _from_its_end(simpler)
-    # Where one of the two could not follow the longest windows, what they left over is no measure.
-    alike = windows.spans == own.problem.windows.spans
-    if not alike and len(windows) >= len(own.problem.windows):
+    if nested.stopped:
+        return own.as_stopped()
+    windows, options, law = _windows_from(nested), fitter.options, fitter.friction.law
+    same = windows.spans == own.problem.windows.spans
+    # If one of the two failed at the longest windows, its residuals are no measure.
+    if not same and len(windows) >= len(own.problem.windows):
         return own
-    # By what the worse of the two could not explain, priors would outweigh the data.
-    sizes = (own.noise, simpler.noise, own.problem.noise_sd, simpler.problem.noise_sd)
-    noise = max(min(size for size in sizes if math.isfinite(size)), LEAST_NOISE)
-    schedule, name = constant_schedule(search.model), simpler.problem.friction.law.name
-    told = by_torque(own.problem.plant_at(simpler.vector))
-    known = constant_schedule(simpler.problem.friction).values
-    contained = _left_over(simpler, noise)
-    best, lowest = own, _left_over(own, noise) if alike else math.inf
-    tolerance = flat(min(lowest, contained))
-    for start in (told, _lifted(search.model.law, known, told)):
-        if start is not told and lowest <= contained:
+    # With the larger noise of the two, priors would outweigh the data.
+    sizes = (own.noise, nested.noise, own.problem.noise_sd, nested.problem.noise_sd)
+    noise = max(min(size for size in sizes if math.isfinite(size)), options.min_noise)
+    implied = equation_error(own.problem.plant_at(nested.parts.plant))
+    embedded = embed_nested(law, nested.parts.friction.reshape(len(implied), -1), implied)
+    best, lowest = own, _misfit(own, noise) if same else math.inf
+    limit = _misfit(nested, noise)
+    tolerance = loglik_tolerance(min(lowest, limit), options)
+    for coefficients in (implied, embedded):
+        if coefficients is embedded and lowest <= limit:
             break
-        schedule.set_coefficients(start)
-        problem = search.problem(windows, noise)
-        stage = search.search(
-            problem, simpler.vector, tolerance, f"from the {name} law", simpler.zeros
-        )
-        left, surer = _left_over(stage, noise), _surer(stage, best)
-        if left < lowest * (1 - tolerance) or (surer and left < lowest * (1 + tolerance)):
-            best, lowest = stage, left
-        if stage.result.status == "stopped":
-            best = _stopped(best)
-            break
-    schedule.set_parameter_vector(best.problem.unknowns.split(best.result.x)[0])
+        problem = fitter.problem(windows, noise, coefficients.reshape(-1))
+        start = problem.variables.start(nested.parts.plant, nested.parts.offsets)
+        name = f"from the {nested.problem.friction.law.name} law"
+        found = fitter.search(problem, start, tolerance, name)
+        misfit = _misfit(found, noise)
+        surer = found.result.converged and not best.result.converged
+        if misfit < lowest * (1 - tolerance) or (surer and misfit < lowest * (1 + tolerance)):
+            best, lowest = found, misfit
+        if found.stopped:
+            return best.as_stopped()
     return best
 
 
-def _from_its_end(stage: Stage) -> Windows:
-    """The windows of a stage with the states that it found, but for those that are known."""
-    windows = stage.problem.windows
-    q0, qd0 = (x.clone() for x in stage.problem.unknowns.split(stage.result.x)[2].chunk(2, -1))
+def embed_nested(law: Law, nested: Tensor, shapes: Tensor) -> Tensor:
+    """Coefficients at which a law equals its nested law, (joint, coefficient).
+
+    Those in which the law is nonlinear are taken from `shapes`.
+    """
+    linear = torch.tensor([c.linear for c in law.coefficients])
+    embedded = torch.where(linear, 0.0, shapes)
+    embedded[:, [law.names.index(name) for name in law.shared]] = nested
+    return embedded
+
+
+def _windows_from(found: HorizonResult) -> Windows:
+    """The windows of a stage at the states that it found, except for those that are known."""
+    windows = found.problem.windows
+    states = found.problem.variables.split(found.result.x).states
+    q0, qd0 = (x.clone() for x in states.chunk(2, -1))
     known = list(windows.at_rest)
     q0[known], qd0[known] = windows.q0[known], windows.qd0[known]
     return replace(windows, q0=q0, qd0=qd0)
 
 
-def _left_over(stage: Stage, noise: float) -> float:
-    """Half the sum of squares of residuals and jumps; infinite where the motion diverged."""
-    jumps = 0.5 * float(stage.problem.jumps(stage.result.x).square().sum())
-    left = least(stage.residuals, noise) + jumps
-    return left if math.isfinite(left) else math.inf
-
-
-def _surer(stage: Stage, other: Stage) -> bool:
-    return stage.result.converged and not other.result.converged
-
-
-def _lifted(law: Law, simpler: Tensor, shapes: Tensor) -> Tensor:
-    """Coefficients at which a law is the simpler one that it contains, (joint, coefficient).
-
-    Args:
-        law: the law.
-        simpler: coefficients of the simpler law.
-        shapes: coefficients of the law, of which those are taken in which it is not linear.
-    """
-    linear = torch.tensor([c.linear for c in law.coefficients])
-    lifted = torch.where(linear, 0.0, shapes)
-    lifted[:, [law.names.index(name) for name in law.shared]] = simpler
-    return lifted
-
-
-def _stopped(stage: Stage) -> Stage:
-    return replace(stage, result=replace(stage.result, status="stopped"))
+def _misfit(found: HorizonResult, noise: float) -> float:
+    """Half the sum of squares of residuals and defects; infinite where the motion diverged."""
+    defects = 0.5 * float(found.problem.defects(found.result.x).square().sum())
+    misfit = weighted_cost(found.residuals, noise) + defects
+    return misfit if math.isfinite(misfit) else math.inf

@@ -1,204 +1,240 @@
-"""Fit a neuro-fuzzy model: a network that corrects a constant law, where windows bear it out."""
+"""Neuro-fuzzy coefficients: a network that corrects a constant law, kept if it passes hold-out."""
 
 import copy
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.fitting.data.inputs import (
-    adjustable_terms,
-    at_zeros,
-    in_joint_coordinates,
-    is_eccentric,
-    mixing_of,
+from nfriction.fitting.data.checks import require_motion
+from nfriction.fitting.data.inputs import adjustable_terms, apply_encoder_offsets
+from nfriction.fitting.equation_error import coefficient_scale
+from nfriction.fitting.fit import FitTask
+from nfriction.fitting.options import DEFAULTS, FitOptions
+from nfriction.fitting.result.fit_result import FitResult, result_from_shooting
+from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
+from nfriction.fitting.shooting.sensitivity import StepJacobian
+from nfriction.fitting.strategy.constant import (
+    constant_prior,
+    constant_start,
+    fits_eccentricity,
+    known_terms,
+    regression,
 )
-from nfriction.fitting.data.windows import cut_windows
-from nfriction.fitting.plant_parameters import PlantParameter
-from nfriction.fitting.result.fit_result import FitResult, trajectory_outcome
-from nfriction.fitting.shooting.autocorrelation import effective_noise, stride_of
-from nfriction.fitting.shooting.problem import TrajectoryProblem
-from nfriction.fitting.strategy.constant import Settings
-from nfriction.fitting.strategy.continuation import JUMP_SD, Refinement, Stage, flat, least
-from nfriction.fitting.strategy.extrapolation_prior import anchors_where_unseen
-from nfriction.fitting.strategy.holdout import WORTH, Judgement, error_on, judged_windows
-from nfriction.fitting.strategy.neurofuzzy_start import settle_on, start_at
+from nfriction.fitting.strategy.continuation import (
+    HorizonResult,
+    ShootingFitter,
+    loglik_tolerance,
+    weighted_cost,
+)
+from nfriction.fitting.strategy.extrapolation_prior import prior_on_unvisited_cells
+from nfriction.fitting.strategy.holdout import HoldoutScore, holdout_rmse, holdout_split
 from nfriction.friction.model import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
-from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
-# Priors of a network that are tried, over its own: windows held back choose among them.
-PRIOR_SHARES = (1.0, 1 / 3)
 INTERRUPTED = "Stopped before the network was found; its constant law is kept."
 
 
-def fit_network(
-    model: FrictionModel,
-    plant: Plant,
-    recordings: Sequence[Recording],
-    motions: tuple[Motion, ...],
-    start: FitResult,
-    settings: Settings,
-) -> FitResult:
-    """The fit of a neuro-fuzzy model from that of its constant law.
-
-    Args:
-        model, plant: see `fit`.
-        recordings, motions: as they are; the zeros that the constant fit found are added here.
-        start: the constant fit.
-        settings: see `fit`; of the windows the last serves that the constant fit could follow.
-    """
-    given, moved = at_zeros(start.zeros, plant, recordings, motions)
-    joint = in_joint_coordinates(plant, model, given)
-    start_at(model, start, joint, moved)
-    known = {name: value for name, value, _ in start.plant_terms}
-    terms = adjustable_terms(
-        plant, joint, settings.fit_plant, settings.drag,
-        is_eccentric(settings.eccentricity, known), zeroed_once=not start.zeros,
-    )  # fmt: skip
-    mixing = mixing_of(plant, recordings[0].resolve_convention(plant))
-    assert isinstance(model.schedule, NeuroFuzzy)
-    # From smoothed states at full length a search creeps along hard seams.
-    jump_sd = None if settings.continuity == "free" else JUMP_SD["soft"]
-    free = Refinement(
-        plant, model, joint, mixing, terms, settings.max_steps, settings.callback,
-        jump_sd=jump_sd, anchors=anchors_where_unseen(model.schedule, moved),
-    )  # fmt: skip
-    near = replace(free, terms=_as_open_as(start, terms))
-    vector = torch.tensor([known.get(t.name, 0.0) for t in terms], dtype=torch.float64)
-    differ = [t.prior_sd for t in near.terms] != [t.prior_sd for t in terms]
-    searches = (near, free) if differ else (near,)
-    try:
-        found = _refined(searches, start, vector, start.longest(settings.windows), moved)
-    except KeyboardInterrupt:
-        found = _constant_kept(near, start, INTERRUPTED, converged=False)
-    found = replace(
-        found, motions=motions, zeros=start.zeros, continuity=settings.continuity,
-        left_out=start.left_out,
-    )  # fmt: skip
-    return found.with_warnings(start.told)
-
-
-def _as_open_as(start: FitResult, terms: Sequence[PlantParameter]) -> list[PlantParameter]:
-    """Terms that are expected as near to where a fit found them as it left them open.
-
-    Within the motion recorded a plant and a network may make up for each other; beyond it, where
-    the network fades, such a plant is wrong.
-    """
-    left = {i.name: i.sd for i in start.intervals}
-    return [replace(t, prior_sd=min(t.prior_sd, left.get(t.name, math.inf))) for t in terms]
-
-
-def _refined(
-    searches: Sequence[Refinement],
-    start: FitResult,
-    vector: Tensor,
-    length: float,
-    motions: tuple[Motion, ...],
-) -> FitResult:
-    """Refine a network that starts at a constant fit, and keep it where it earns its place.
-
-    Of searches that leave the plant ever freer, a freer one must earn its place, too.
-    """
-    free = searches[-1]
-    # What the constant law left over, at the same window length, is the noise that the prior is
-    # weighed against; its own cost is the one in which the gain of a step is judged.
-    noise, stride = effective_noise(start._residuals), stride_of(start._residuals)
-    tolerance = flat(least(start._residuals, noise))
-    seen, held_back = judged_windows(free, motions, length)
-    law = replace(free, model=copy.deepcopy(start.model), anchors=None)
-    same = law.search(
-        law.problem(seen, noise, vector, stride), vector, tolerance, "constants, a third held back"
+def fit_neurofuzzy(task: FitTask) -> FitResult:
+    """Fit a neuro-fuzzy model from the constant fit of its law, see `fit`."""
+    require_motion(task.plant, task.recordings)
+    options, start = task.options, constant_start(task)
+    law_prior = constant_prior(start.model, regression(task, start.model, task.plant), options)
+    recordings, motions = apply_encoder_offsets(
+        start.encoder_offsets, task.plant, task.recordings, task.motions
     )
-    if same.result.status == "stopped":
-        raise KeyboardInterrupt
-    law_of_all = replace(law, model=start.model).problem(held_back, noise, vector, stride)
-    laws = [
-        error_on(held_back, problem, found)
-        for problem, found in ((same.problem, same.vector), (law_of_all, vector))
-    ]
-
-    def judge(network: Stage) -> Judgement:
-        error = error_on(held_back, network.problem, network.vector)
-        return Judgement(*(error / law if math.isfinite(error) else math.inf for law in laws))
-
-    best: _Trial | None = None
-    for search in searches:
-        part = search.problem(seen, noise, vector, stride)
-        trial = _best_prior(search, part, vector, tolerance, judge)
-        if best is None or trial.judgement.score < WORTH * best.judgement.score:
-            best = trial
-    assert best is not None
-    if best.judgement.score > 1:
-        return _constant_kept(best.search, start, str(best.judgement))
-    search, found = best.search, best.taken_up()
-    whole = search.problem(cut_windows(search.joint, motions, length), noise, vector, stride)
-    stage = search.search(whole, found, tolerance, f"{length:g} s windows")
-    return trajectory_outcome(stage.problem, stage.result, stage.residuals, motions)
-
-
-class _Trial(NamedTuple):
-    """A network trained on some windows and judged on others, and how it was trained."""
-
-    judgement: Judgement
-    search: Refinement
-    prior_sd: float
-    network: Tensor
-    vector: Tensor
-
-    def taken_up(self) -> Tensor:
-        """Terms of the plant; the model is left with the network and its prior."""
-        schedule = self.search.model.schedule
-        assert isinstance(schedule, NeuroFuzzy)
-        schedule.prior_sd = self.prior_sd
-        schedule.set_parameter_vector(self.network)
-        return self.vector
+    network = initialise_from_constant(task.model, start, recordings, motions, options)
+    schedule = cast("NeuroFuzzy", network.schedule)
+    terms = adjustable_terms(
+        task.plant, recordings, options, eccentric=fits_eccentricity(options, start),
+        per_recording=bool(start.encoder_offsets),
+    )  # fmt: skip
+    plant_sd = torch.tensor([t.prior_sd for t in terms], dtype=torch.float64)
+    free = ShootingFitter(
+        StepJacobian(task.plant, network, terms), network, recordings, task.measurement, options,
+        task.callback, plant_prior=(known_terms(start, terms), plant_sd),
+        # From smoothed states at full length a search creeps along constraints.
+        defect_sd=None if options.continuity == "none" else options.penalty_sd,
+        extrapolation=prior_on_unvisited_cells(schedule, motions, options),
+    )  # fmt: skip
+    law = replace(free, friction=start.model, friction_prior=law_prior, extrapolation=None)
+    validation = _Validation(law, start, motions, start.longest_usable_horizon(options.windows))
+    best = validation.best_trial(_with_narrowed_priors(free, start))
+    if best is None:
+        found = _constant_kept(task, network, start, INTERRUPTED, converged=False)
+    elif best.score.score > 1:
+        found = _constant_kept(task, network, start, str(best.score))
+    else:
+        end = validation.fit_all(best)
+        found = result_from_shooting(task.model, end.problem, end.result, motions)
+        cast("NeuroFuzzy", task.model.schedule).prior_sd = best.prior_sd
+    found = replace(
+        found, motions=task.motions, encoder_offsets=start.encoder_offsets,
+        continuity=options.continuity, skipped_horizons=start.skipped_horizons,
+    )  # fmt: skip
+    return found.with_warnings(start.data_warnings)
 
 
-def _best_prior(
-    search: Refinement,
-    part: TrajectoryProblem,
-    vector: Tensor,
-    tolerance: float,
-    judge: Callable[[Stage], Judgement],
-) -> _Trial:
-    """Train under each prior, of which the schedule keeps its own: the best trial.
+def input_range(
+    motions: Sequence[Motion], along_motion: bool, options: FitOptions = DEFAULTS
+) -> tuple[Tensor, Tensor]:
+    """Largest |velocity| of motions, (joint,), and limits of their acceleration, (joint, 2)."""
+    qd, qdd = (np.concatenate([getattr(m, name) for m in motions]) for name in ("qd", "qdd"))
+    along = qdd * np.sign(qd) if along_motion else qdd
+    limits = np.quantile(along, options.acceleration_quantiles, axis=0)
+    return torch.as_tensor(np.abs(qd).max(0)), torch.as_tensor(limits.T)
 
-    Raises:
-        KeyboardInterrupt: if stopped: half trained and unjudged, a network is worth nothing.
+
+def initialise_from_constant(
+    model: FrictionModel,
+    constant: FitResult,
+    recordings: Sequence[Recording],
+    motions: Sequence[Motion],
+    options: FitOptions = DEFAULTS,
+) -> FrictionModel:
+    """A copy of a neuro-fuzzy model at a constant fit of its law, over the range of the motion.
+
+    Its network is zero; recordings and motions are in joint coordinates.
     """
-    schedule = search.model.schedule
-    assert isinstance(schedule, NeuroFuzzy)
-    widest, trials = schedule.prior_sd, []
-    try:
-        for share in PRIOR_SHARES:
-            # From nothing: on from another prior's end a search stays near it, and judges that.
-            schedule.set_parameter_vector(torch.zeros_like(schedule.parameter_vector()))
-            schedule.prior_sd = share * widest
-            stage = search.search(part, vector, tolerance, "a third held back")
-            if stage.result.status == "stopped":
-                raise KeyboardInterrupt
-            network = schedule.parameter_vector()
-            trials.append(_Trial(judge(stage), search, schedule.prior_sd, network, stage.vector))
-    finally:
-        schedule.prior_sd = widest
-    return min(trials, key=lambda trial: trial.judgement.score)
+    network = copy.deepcopy(model)
+    schedule = cast("NeuroFuzzy", network.schedule)
+    scale = coefficient_scale(model, constant.plant, recordings, motions)
+    schedule.set_range(*input_range(motions, schedule.along_motion, options))
+    schedule.set_reference(constant.model.schedule.coefficient_sets()["always"], scale)
+    schedule.set_parameter_vector(torch.zeros_like(schedule.parameter_vector()))
+    return network
+
+
+def revert_to_constant(
+    model: FrictionModel, constant: FitResult, options: FitOptions = DEFAULTS
+) -> None:
+    """Set a neuro-fuzzy model to a constant fit of its law; coefficients of zero stay so."""
+    schedule = cast("NeuroFuzzy", model.schedule)
+    values = constant.model.schedule.coefficient_sets()["always"]
+    schedule.set_reference(values, schedule.scale, options.zero_reference)
+    schedule.set_parameter_vector(torch.zeros_like(schedule.parameter_vector()))
+
+
+def _with_narrowed_priors(free: ShootingFitter, start: FitResult) -> tuple[ShootingFitter, ...]:
+    """Fitters with ever wider priors of the plant: the posterior sd of the constant fit first.
+
+    Within the recorded motion plant and network can compensate each other; outside, where the
+    network fades, such a plant is wrong.
+    """
+    assert free.plant_prior is not None
+    mean, sd = free.plant_prior
+    posterior = {i.name: i.sd for i in start.intervals}
+    narrow = sd.new_tensor([posterior.get(t.name, math.inf) for t in free.jacobian.terms])
+    narrow = torch.minimum(sd, narrow)
+    near = replace(free, plant_prior=(mean, narrow))
+    return (near,) if torch.equal(narrow, sd) else (near, free)
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """A network trained on some windows, its score on the others, and its priors."""
+
+    score: HoldoutScore
+    fitter: ShootingFitter
+    prior_sd: float
+    end: HorizonResult
+
+
+class _Validation:
+    """Networks judged against a constant law on hold-out windows of one length [s]."""
+
+    def __init__(
+        self, law: ShootingFitter, start: FitResult, motions: tuple[Motion, ...], length: float
+    ) -> None:
+        assert law.plant_prior is not None
+        self.law, self.motions, self.length, self.options = law, motions, length, law.options
+        self.plant = law.plant_prior[0]
+        self.train, self.test = holdout_split(law.recordings, motions, length, self.options.folds)
+        # The noise against which the priors weigh is the residual of the constant law at the same
+        # horizon; its cost scales the tolerance.
+        self.noise = effective_noise(start.residuals)
+        self.stride = decimation(start.residuals, self.options)
+        cost = weighted_cost(start.residuals, self.noise)
+        self.tolerance = loglik_tolerance(cost, self.options)
+
+    def best_trial(self, fitters: Sequence[ShootingFitter]) -> _Trial | None:
+        """The best of all priors; wider plant priors must earn their place. None if stopped."""
+        values = self.law.friction.schedule.parameter_vector()
+        same = self._search(self.law, values, "constant law, hold-out")
+        of_same = self._error(same)
+        if of_same is None:
+            return None
+        of_all = holdout_rmse(self.test, same.problem, values, self.plant)
+        if of_all is None:
+            return None
+        best: _Trial | None = None
+        for fitter in fitters:
+            trials = []
+            for share in self.options.prior_shares:
+                trial = self._trial(fitter, share, of_same, of_all)
+                if trial is None:
+                    return None
+                trials.append(trial)
+            trial = min(trials, key=lambda trial: trial.score.score)
+            limit = math.inf if best is None else self.options.max_ratio_same * best.score.score
+            if best is None or trial.score.score < limit:
+                best = trial
+        return best
+
+    def fit_all(self, trial: _Trial) -> HorizonResult:
+        """The network of a trial, fitted to all windows."""
+        windows = trial.fitter.cut(self.motions, self.length)
+        problem = trial.fitter.problem(
+            windows, self.noise, trial.end.parts.friction, stride=self.stride
+        )
+        start = problem.variables.start(trial.end.parts.plant)
+        return trial.fitter.search(problem, start, self.tolerance, f"{self.length:g} s windows")
+
+    def _trial(
+        self, fitter: ShootingFitter, share: float, of_same: float, of_all: float
+    ) -> _Trial | None:
+        """A network under a prior, from zero: from another prior's end it would stay there."""
+        widest = cast("NeuroFuzzy", fitter.friction.schedule).prior_sd
+        zeros = torch.zeros_like(fitter.friction.schedule.parameter_vector())
+        prior = (zeros, torch.full_like(zeros, share * widest))
+        fitter = replace(fitter, friction_prior=prior)
+        end = self._search(fitter, zeros, "network, hold-out")
+        error = self._error(end)
+        if error is None:
+            return None
+        ratios = [error / law if math.isfinite(error) else math.inf for law in (of_same, of_all)]
+        score = HoldoutScore(ratios[0], ratios[1], self.options)
+        return _Trial(score, fitter, share * widest, end)
+
+    def _search(self, fitter: ShootingFitter, friction: Tensor, name: str) -> HorizonResult:
+        """Search of the training windows."""
+        problem = fitter.problem(self.train, self.noise, friction, stride=self.stride)
+        start = problem.variables.start(self.plant)
+        return fitter.search(problem, start, self.tolerance, name)
+
+    def _error(self, end: HorizonResult) -> float | None:
+        """Hold-out RMSE of a search; None if it was stopped, half trained and unjudged."""
+        if end.stopped:
+            return None
+        return holdout_rmse(self.test, end.problem, end.parts.friction, end.parts.plant)
 
 
 def _constant_kept(
-    search: Refinement, start: FitResult, note: str, *, converged: bool = True
+    task: FitTask, network: FrictionModel, start: FitResult, note: str, *, converged: bool = True
 ) -> FitResult:
     """The constant fit as the neuro-fuzzy model's."""
-    settle_on(search.model, start)
+    revert_to_constant(network, start, task.options)
+    task.model.load_state_dict(network.state_dict())
     return replace(
         start,
-        model=search.model.requires_grad_(False),
-        status=f"{start.status} {note}" if converged else f"not converged: {note}",
+        model=task.model.requires_grad_(False),
+        status=f"{start.status} {note}" if converged else f"Not converged: {note}",
         converged=start.converged and converged,
         warnings=(*start.warnings, note),
     )

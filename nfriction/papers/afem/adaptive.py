@@ -55,6 +55,7 @@ class Adaptive(Tabulated):
     """
 
     state_size: int = 2
+    fit_strategy = "nfriction.papers.afem.fit_adaptive:fit_task"
     handles_range = True
 
     # An acceleration beyond this many upper thresholds is no more than high: one wild value must

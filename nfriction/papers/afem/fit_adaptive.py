@@ -8,21 +8,17 @@ import torch
 
 from nfriction.fitting.data.inputs import (
     adjustable_terms,
-    at_zeros,
-    in_joint_coordinates,
-    listed,
-    mixing_of,
-    motions_of,
-    substeps_of,
-    told_of,
+    apply_encoder_offsets,
+    integration_substeps,
 )
-from nfriction.fitting.data.windows import checked_lengths, cut_windows
-from nfriction.fitting.result.fit_result import FitResult, trajectory_outcome
+from nfriction.fitting.data.windows import cut_windows
+from nfriction.fitting.fit import FitTask, prepare_task
+from nfriction.fitting.options import EncoderReference, FitOptions
+from nfriction.fitting.result.fit_result import FitResult, result_from_shooting
 from nfriction.fitting.shooting.autocorrelation import effective_noise
-from nfriction.fitting.shooting.problem import solve_trajectory
 from nfriction.fitting.shooting.sensitivity import StepJacobian
-from nfriction.fitting.strategy.constant import Settings
-from nfriction.fitting.strategy.constant_start import constant_start
+from nfriction.fitting.strategy.constant import constant_start, known_terms
+from nfriction.fitting.strategy.continuation import ShootingFitter
 from nfriction.friction.model import FrictionModel
 from nfriction.optim.least_squares import Step
 from nfriction.papers.afem.adaptive import Adaptive
@@ -35,6 +31,8 @@ from nfriction.recording import Recording
 from nfriction.signals import Motion
 
 AdaptiveMethod = Literal["gauss-newton", "pattern", "sqp"]
+# Relative decrease of the cost that ends the search by class.
+TOLERANCE = 1e-6
 
 
 def fit_adaptive(
@@ -83,51 +81,87 @@ def fit_adaptive(
     References:
         TLRIP paper, AFEM.
     """
-    given = listed(model, plant, recordings)
     if method not in get_args(AdaptiveMethod):
         raise ValueError(f"`method` must be one of {get_args(AdaptiveMethod)}, got {method!r}.")
     if not isinstance(model.schedule, Adaptive):
         raise ValueError(f"{type(model).__name__} is no adaptive model; use `fit`.")
     if not prior_sd > 0:
         raise ValueError(f"`prior_sd` must be positive, got {prior_sd}.")
-    windows = checked_lengths(windows)
-    joint = in_joint_coordinates(plant, model, given)
-    moved = motions_of(joint, motions)
-    asked = Settings(windows, fit_plant, drag, max_steps=max_steps, callback=callback)
-    constant = constant_start(model, plant, given, moved, start, asked)
-    raw, length = moved, constant.longest(windows)
-    given, moved = at_zeros(constant.zeros, plant, given, moved)
-    joint = in_joint_coordinates(plant, model, given)
+    # A start is taken with the encoder offsets that it found, or none.
+    reference: EncoderReference = "auto"
+    if start is not None:
+        reference = "per_recording" if start.encoder_offsets else "shared"
+    options = FitOptions(
+        windows=windows, fit_plant=fit_plant, drag=drag, encoder_reference=reference,
+        max_steps=max_steps,
+    )  # fmt: skip
+    task = prepare_task(model, plant, recordings, options, start, motions, callback)
+    constant = constant_start(task)
     if method != "gauss-newton":
-        settings = {"horizon": length, "prior_sd": prior_sd, **search_settings}
+        given, moved = apply_encoder_offsets(
+            constant.encoder_offsets, plant, task.recordings, task.motions
+        )
+        settings = {
+            "horizon": constant.longest_usable_horizon(options.windows), "prior_sd": prior_sd,
+            **search_settings,
+        }  # fmt: skip
         found = fit_by_search(
-            model, plant, given, method=method, start=replace(constant, zeros=()), motions=moved,
-            classes=classes, **settings,
+            model, plant, given, method=method, start=replace(constant, encoder_offsets=()),
+            motions=moved, classes=classes, **settings,
         )  # fmt: skip
-        return replace(found, motions=raw, zeros=constant.zeros, left_out=constant.left_out)
+        return _as_recorded(found, task, constant)
     if search_settings:
         raise ValueError(f"{sorted(search_settings)} are settings of a search, not of {method!r}.")
+    return _by_class(task, constant, classes, prior_sd)
+
+
+def fit_task(task: FitTask) -> FitResult:
+    """Fit an adaptive model as `nfriction.fit` does: no eccentricity, and windows apart."""
+    options = replace(task.options, eccentricity="off", continuity="none")
+    task = replace(task, options=options)
+    return _by_class(task, constant_start(task), None, PRIOR_SD)
+
+
+def _by_class(
+    task: FitTask, constant: FitResult, classes: AccelerationClasses | None, prior_sd: float
+) -> FitResult:
+    """Coefficients by class by output error, from a constant fit."""
+    model, plant, options = task.model, task.plant, task.options
+    assert isinstance(model.schedule, Adaptive)
+    length = constant.longest_usable_horizon(options.windows)
+    joint, moved = apply_encoder_offsets(
+        constant.encoder_offsets, plant, task.recordings, task.motions
+    )
     classes = adopt_classes(model.schedule, classes, joint, moved, plant)
-    terms = adjustable_terms(plant, joint, fit_plant, drag, zeroed_once=not constant.zeros)
-    known = {name: value for name, value, _ in constant.plant_terms}
-    vector = torch.tensor([known.get(t.name, 0.0) for t in terms], dtype=torch.float64)
+    terms = adjustable_terms(plant, joint, options, per_recording=bool(constant.encoder_offsets))
+    vector = known_terms(constant, terms)
+    sd = torch.tensor([t.prior_sd for t in terms], dtype=torch.float64)
     labelled = labelled_model(model, constant, joint, moved, prior_sd)
     cut = cut_windows(joint, moved, length)
     problem = LabelledProblem(
-        StepJacobian(plant, labelled, terms), cut, effective_noise(constant._residuals),
-        mixing_of(plant, given[0].resolve_convention(plant)),
-        substeps=substeps_of(plant, labelled, joint), plant_mean=vector,
-        classes=driving_classes(classes, cut),
+        StepJacobian(plant, labelled, terms), labelled, cut, effective_noise(constant.residuals),
+        task.measurement,
+        substeps=integration_substeps(plant, labelled, max(r.longest_step for r in joint)),
+        plant_prior=(vector, sd), classes=driving_classes(classes, cut),
     )  # fmt: skip
-    told = told_of(callback, f"{length:g} s windows, by class")
-    result = solve_trajectory(
-        problem, problem.unknowns.start(vector), max_steps=max_steps, callback=told
-    )
-    residuals = problem.errors(result.x)
-    found = trajectory_outcome(problem, result, residuals, moved)
-    states = problem.unknowns.split(result.x)[2].chunk(2, -1)
+    fitter = ShootingFitter(
+        problem.jacobian, labelled, joint, task.measurement, replace(options, patience=0),
+        task.callback,
+    )  # fmt: skip
+    name = f"{length:g} s windows, by class"
+    result = fitter.search(problem, problem.variables.start(vector), TOLERANCE, name).result
+    found = result_from_shooting(labelled, problem, result, moved)
+    states = problem.variables.split(result.x).states.chunk(2, -1)
     found = settled(
         model, labelled, classes, constant, found, replace(cut, q0=states[0], qd0=states[1]),
-        problem.mixing, problem.substeps, constant.residual,
+        problem.measurement, problem.substeps, constant.residual,
     )  # fmt: skip
-    return replace(found, motions=raw, zeros=constant.zeros, left_out=constant.left_out)
+    return _as_recorded(found, task, constant)
+
+
+def _as_recorded(found: FitResult, task: FitTask, constant: FitResult) -> FitResult:
+    """A fit with the motions as recorded and what the constant fit found of encoders."""
+    return replace(
+        found, motions=task.motions, encoder_offsets=constant.encoder_offsets,
+        skipped_horizons=constant.skipped_horizons,
+    )  # fmt: skip

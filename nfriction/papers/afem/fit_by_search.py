@@ -6,20 +6,14 @@ from typing import get_args
 import torch
 from torch import Tensor
 
-from nfriction.fitting.data.inputs import (
-    constant_schedule,
-    in_joint_coordinates,
-    listed,
-    mixing_of,
-    motions_of,
-    substeps_of,
-)
+from nfriction.fitting.data.inputs import integration_substeps
 from nfriction.fitting.data.windows import cut_windows
-from nfriction.fitting.equation_error import natural_scale
+from nfriction.fitting.equation_error import coefficient_scale
+from nfriction.fitting.fit import prepare_task
+from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.shooting.autocorrelation import effective_noise
-from nfriction.fitting.strategy.constant import Settings, fit_by_torque
-from nfriction.fitting.strategy.constant_start import constant_start
+from nfriction.fitting.strategy.constant import constant_start, fit_constant
 from nfriction.friction.coefficients import Tabulated
 from nfriction.friction.constant import Constant
 from nfriction.friction.model import FrictionModel
@@ -96,24 +90,28 @@ def fit_by_search(
         raise ValueError(
             f"a search fits constant or adaptive coefficients, not {type(schedule).__name__}."
         )
-    if start is not None and start.zeros:
-        raise ValueError("a search takes no zeros of recordings; start from a fit without them.")
-    given = listed(model, plant, recordings)
-    joint = in_joint_coordinates(plant, model, given)
-    moved = motions_of(joint, motions)
+    if start is not None and start.encoder_offsets:
+        raise ValueError("a search takes no encoder offsets; start from a fit without them.")
+    adaptive = isinstance(schedule, Adaptive)
+    options = FitOptions(
+        "output_error" if adaptive else "equation_error",
+        encoder_reference="auto" if start is None else "shared",
+    )
+    task = prepare_task(model, plant, recordings, options, start, motions)
+    joint, moved = task.recordings, task.motions
     if isinstance(schedule, Adaptive):
-        constant = constant_start(model, plant, given, moved, start, Settings())
+        constant = constant_start(task)
         classes = adopt_classes(schedule, classes, joint, moved, plant)
         varied = labelled_model(model, constant, joint, moved, prior_sd)
     else:
-        constant = start or fit_by_torque(model, plant, given, moved)
-        schedule.set_coefficients(constant_schedule(constant.model).values)
+        constant = start or fit_constant(task)
+        schedule.set_coefficients(constant.model.schedule.coefficient_sets()["always"])
         varied = model
     span = max(float(r.time[-1] - r.time[0]) for r in joint)
     cut = cut_windows(joint, moved, span if horizon is None else horizon)
     error = PositionError(
-        constant.plant, varied, cut, mixing_of(plant, given[0].resolve_convention(plant)),
-        substeps=substeps_of(plant, varied, joint),
+        constant.plant, varied, cut, task.measurement,
+        substeps=integration_substeps(plant, varied, max(r.longest_step for r in joint)),
         drive=None if classes is None else driving_classes(classes, cut),
         threads=threads or available_threads(),
     )  # fmt: skip
@@ -145,7 +143,7 @@ def fit_by_search(
         at_bounds=tuple(n for n, h in zip(names, hit.tolist(), strict=True) if h),
         steps=result.iterations,
         motions=moved,
-        _residuals=residuals,
+        residuals=residuals,
     )
     if classes is None:
         return found
@@ -162,7 +160,7 @@ def _box(
     schedule = model.schedule
     assert isinstance(schedule, Tabulated)
     values = schedule.values
-    natural = natural_scale(model, constant.plant, joint, motions)
+    natural = coefficient_scale(model, constant.plant, joint, motions)
     natural = natural.reshape(len(natural), *(1,) * (values.ndim - 2), -1)
     log = torch.tensor([not c.linear for c in model.law.coefficients]).expand_as(values)
     scale = torch.maximum(values.abs(), natural)

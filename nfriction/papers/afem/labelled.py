@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from nfriction.fitting.data.inputs import constant_schedule
 from nfriction.fitting.data.windows import Windows
-from nfriction.fitting.equation_error import natural_scale
+from nfriction.fitting.equation_error import coefficient_scale
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.fitting.shooting.problem import TrajectoryProblem
+from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.friction.model import FrictionModel
 from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.afem.classes import AccelerationClasses
@@ -46,8 +45,8 @@ class Labelled(Adaptive):
         return self._mean, self._sd
 
 
-@dataclass
-class LabelledProblem(TrajectoryProblem):
+@dataclass(frozen=True, eq=False)
+class LabelledProblem(ShootingProblem):
     """A trajectory problem whose coefficients follow given classes.
 
     Args:
@@ -56,13 +55,13 @@ class LabelledProblem(TrajectoryProblem):
 
     classes: Tensor | None = None
 
-    def _run(self, plant: Plant, q0: Tensor, qd0: Tensor) -> Rollout:
+    def _integrate(
+        self, plant: Plant, model: FrictionModel, q0: Tensor, qd0: Tensor, tau: Tensor, step: Tensor
+    ) -> Rollout:
         assert self.classes is not None
         classes = self.classes.repeat_interleave(self.substeps, 1)
-        motion = integrate(
-            plant, self.friction, q0, qd0, self.tau, self.step,
-            measured=(torch.zeros_like(classes), classes),
-        )  # fmt: skip
+        measured = (torch.zeros_like(classes), classes)
+        motion = integrate(plant, model, q0, qd0, tau, step, measured=measured)
         # What a step's derivatives are taken at must be what drove it.
         return replace(motion, qdd=torch.cat([classes, classes[:, -1:]], 1))
 
@@ -75,8 +74,8 @@ def labelled_model(
     prior_sd: float,
 ) -> FrictionModel:
     """The model with given classes, at the constant law's coefficients."""
-    values = constant_schedule(constant.model).values
-    natural = natural_scale(model, constant.plant, joint, motions)
+    values = constant.model.schedule.coefficient_sets()["always"]
+    natural = coefficient_scale(model, constant.plant, joint, motions)
     sd = prior_sd * torch.maximum(values.abs(), natural)
     # Where neither tells a size, the coefficient stays free.
     sd = torch.where(sd > 0, sd, torch.inf)

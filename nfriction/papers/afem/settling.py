@@ -7,7 +7,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from nfriction.fitting.data.inputs import constant_schedule
 from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction.model import FrictionModel
@@ -59,7 +58,7 @@ def settled(
     schedule = model.schedule
     assert isinstance(schedule, Adaptive)
     assert isinstance(labelled.schedule, Labelled)
-    flat = constant_schedule(constant.model).values[:, None]
+    flat = constant.model.schedule.coefficient_sets()["always"][:, None]
     table = labelled.schedule.values
     table = torch.stack([row[of] for row, of in zip(table, classes.stands_for, strict=True)])
     model.requires_grad_(False)
@@ -73,10 +72,10 @@ def settled(
         if rms <= baseline:
             part = "" if share == 1.0 else f" {share:g} of the way from the constant law is taken."
             taken = replace(
-                found, model=model, residual=rms, _residuals=residuals,
+                found, model=model, residual=rms, residuals=residuals,
                 status=found.status + part + _said(classes),
             )  # fmt: skip
-            return taken.with_warnings(constant.told)
+            return taken.with_warnings(constant.data_warnings)
     schedule.set_coefficients(flat.expand(-1, len(CLASSES), -1))
     return replace(
         constant, model=model,

@@ -1,19 +1,27 @@
 """Neuro-fuzzy corrections of an adaptive model, kept as far as they help on what they never saw."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 
 import torch
 from torch import Tensor
 
-from nfriction.fitting.data.inputs import in_joint_coordinates, mixing_of, substeps_of, told_of
-from nfriction.fitting.equation_error import natural_scale
-from nfriction.fitting.result.fit_result import FitResult, trajectory_outcome
-from nfriction.fitting.shooting.autocorrelation import effective_noise, stride_of
-from nfriction.fitting.shooting.problem import TrajectoryProblem, solve_trajectory
+from nfriction.fitting.data.inputs import (
+    in_joint_coordinates,
+    integration_substeps,
+    measurement_matrix,
+)
+from nfriction.fitting.equation_error import coefficient_scale
+from nfriction.fitting.options import DEFAULTS, FitOptions
+from nfriction.fitting.result.fit_result import FitResult, result_from_shooting
+from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
+from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
-from nfriction.fitting.strategy.holdout import FOLDS, cut_for_folds, shares_by_joint
-from nfriction.fitting.strategy.neurofuzzy_start import range_of
+from nfriction.fitting.strategy.continuation import ShootingFitter
+from nfriction.fitting.strategy.holdout import cut_for_folds
+from nfriction.fitting.strategy.neurofuzzy import input_range
 from nfriction.friction.model import FrictionModel
 from nfriction.optim.least_squares import Step
 from nfriction.papers.afem.adaptive import Adaptive
@@ -22,6 +30,11 @@ from nfriction.recording import Recording
 
 # Relative fall of the cost that ends the search: only its neighbourhood matters to a correction.
 LOOSE = 1e-3
+FOLDS = 3
+# Candidate shares of a correction.
+SHARES = (0.0, 0.25, 0.5, 1.0)
+# Standard errors by which a gain must be significant: 95 % of a normal distribution.
+SIGNIFICANCE = 2.0
 
 
 def refine_adaptive(
@@ -60,32 +73,33 @@ def refine_adaptive(
     joint = in_joint_coordinates(plant, model, list(recordings))
     _start_at(model, adaptive, joint)
     known = [schedule.states(torch.as_tensor(m.qd), torch.as_tensor(m.qdd)) for m in motions]
-    substeps = substeps_of(plant, model, joint)
-    cut = cut_for_folds(joint, motions, length)
-    whole = TrajectoryProblem(
-        StepJacobian(plant, model, []), cut, effective_noise(adaptive._residuals),
-        mixing_of(plant, recordings[0].resolve_convention(plant)), substeps,
-        stride=stride_of(adaptive._residuals),
+    substeps = integration_substeps(plant, model, max(r.longest_step for r in joint))
+    cut = cut_for_folds(joint, motions, length, FOLDS)
+    whole = ShootingProblem(
+        StepJacobian(plant, model, []), model, cut, effective_noise(adaptive.residuals),
+        measurement_matrix(plant, recordings[0].resolve_convention(plant)), substeps,
+        stride=decimation(adaptive.residuals),
         memory=torch.stack([known[place][first] for place, first, _ in cut.spans]),
     )  # fmt: skip
     # The memory advances with every step of the integration while the search lasts.
     sample_time = schedule.adaptive.sample_time
     schedule.adaptive.set_sample_time(sample_time / substeps)
-    told = told_of(callback, f"{length:g} s windows, correction by class")
-    begun, shares = _cross_fitted(whole, max_steps, told)
+    fitter = ShootingFitter(
+        whole.jacobian, model, joint, whole.measurement,
+        FitOptions(max_steps=max_steps, patience=0), callback,
+    )  # fmt: skip
+    name = f"{length:g} s windows, correction by class"
+    begun, shares = _cross_fitted(whole, fitter, name)
     part = shares[schedule.joint_of_parameters()]
     if part.any():
-        schedule.set_parameter_vector(begun)
-        result = solve_trajectory(
-            whole, whole.unknowns.start(), max_steps=max_steps, cost_tolerance=LOOSE, callback=told
-        )
+        start = whole.variables.start(friction=begun)
+        result = fitter.search(whole, start, LOOSE, name).result
         result.x[: len(begun)] *= part
     if not part.any() or not _serves(whole, result.x[: len(begun)]):
-        schedule.set_parameter_vector(torch.zeros_like(begun))
         schedule.adaptive.set_sample_time(sample_time)
         note = "The correction serves no better: the adaptive model is kept."
         return replace(adaptive, model=model, status=f"{adaptive.status} {note}")
-    found = trajectory_outcome(whole, result, whole.errors(result.x), motions)
+    found = result_from_shooting(model, whole, result, motions)
     schedule.adaptive.set_sample_time(sample_time)
     parts = zip(shares.tolist(), plant.joint_names, strict=True)
     taken = ", ".join(f"{share:g} of {name}'s" for share, name in parts)
@@ -110,16 +124,14 @@ def _start_at(model: FrictionModel, adaptive: FitResult, joint: Sequence[Recordi
     schedule, reference = model.schedule, adaptive.model.schedule
     assert isinstance(schedule, AdaptiveNeuroFuzzy)
     assert isinstance(reference, Adaptive)
-    scale = natural_scale(model, adaptive.plant, joint, adaptive.motions)
+    scale = coefficient_scale(model, adaptive.plant, joint, adaptive.motions)
     schedule.set_adaptive(reference, scale)
-    schedule.set_range(*range_of(adaptive.motions, schedule.deviation.along_motion))
+    schedule.set_range(*input_range(adaptive.motions, schedule.deviation.along_motion))
     model.requires_grad_(False)
 
 
 def _cross_fitted(
-    whole: TrajectoryProblem,
-    max_steps: int,
-    told: Callable[[Tensor, Step], bool | None] | None,
+    whole: ShootingProblem, fitter: ShootingFitter, name: str
 ) -> tuple[Tensor, Tensor]:
     """The mean of corrections learned from parts, and what share of them each joint is to take."""
     schedule, windows, memory = whole.friction.schedule, whole.windows, whole.memory
@@ -133,13 +145,10 @@ def _cross_fitted(
             replace(whole, windows=windows.subset(chosen), memory=memory[chosen])
             for chosen in (fold != k, fold == k)
         )
-        schedule.set_parameter_vector(zero)
-        result = solve_trajectory(
-            seen, seen.unknowns.start(), max_steps=max_steps, cost_tolerance=LOOSE, callback=told
-        )
-        learned.append(seen.unknowns.split(result.x)[0].clone())
+        found = fitter.search(seen, seen.variables.start(friction=zero), LOOSE, name)
+        learned.append(found.parts.friction)
         unseen.append(rest)
-        if result.status == "stopped":
+        if found.stopped:
             break
     of_joint = schedule.joint_of_parameters()
 
@@ -147,11 +156,11 @@ def _cross_fitted(
         parts = [_errors(p, shares[of_joint] * v) for p, v in zip(unseen, learned, strict=True)]
         return torch.cat(parts)
 
-    shares = shares_by_joint(errors, schedule.joints)
+    shares = stacking_weights(errors, schedule.joints)
     return torch.stack(learned).mean(0), shares
 
 
-def _serves(whole: TrajectoryProblem, vector: Tensor) -> bool:
+def _serves(whole: ShootingProblem, vector: Tensor) -> bool:
     """Whether a correction is no worse on any joint over the very windows it learned from.
 
     What shares of the parts' corrections do, the same shares of another need not do.
@@ -160,7 +169,47 @@ def _serves(whole: TrajectoryProblem, vector: Tensor) -> bool:
     return bool((ratio.log().mean(0) <= 0).all())
 
 
-def _errors(problem: TrajectoryProblem, vector: Tensor) -> Tensor:
+def _errors(problem: ShootingProblem, vector: Tensor) -> Tensor:
     """Root mean square error of windows from their smoothed starts, (window, joint)."""
-    problem.friction.schedule.set_parameter_vector(vector)
-    return problem.errors(problem.unknowns.start()).square().mean(1).sqrt()
+    start = problem.variables.start(friction=vector)
+    return problem.errors(start).square().mean(1).sqrt()
+
+
+def stacking_weights(errors: Callable[[Tensor], Tensor], joints: int) -> Tensor:
+    """Share of a correction that each joint takes, by hold-out windows.
+
+    The criterion is the mean over windows of the log ratio of errors with to those without the
+    correction, so that a single diverging window does not outvote the others. The best shares make
+    no joint worse and lower the mean over joints most, at the upper end of its confidence
+    interval; an insignificant gain is none. First the same share is tried for all joints, then
+    each joint's own until none changes.
+
+    Args:
+        errors: root mean square errors at given shares (joint,), shape (window, joint).
+        joints: their number.
+
+    Returns:
+        Shares between 0 and 1, (joint,).
+    """
+
+    def log_errors(shares: tuple[float, ...]) -> Tensor:
+        found = errors(torch.tensor(shares, dtype=torch.float64))
+        return found.clamp_min(DEFAULTS.min_noise).log().nan_to_num(torch.inf, torch.inf)
+
+    without = log_errors((0.0,) * joints)
+
+    @cache
+    def change(shares: tuple[float, ...]) -> float:
+        ratio = log_errors(shares) - without
+        own = ratio.mean(1)
+        found = own.mean() + SIGNIFICANCE * own.std() / len(own) ** 0.5
+        return float(found) if bool((ratio.mean(0) <= 0).all()) else math.inf
+
+    best = min(((share,) * joints for share in SHARES), key=change)
+    before = None
+    while best != before:
+        before = best
+        for j in range(joints):
+            trials = ((*best[:j], share, *best[j + 1 :]) for share in SHARES)
+            best = min(trials, key=change)
+    return torch.tensor(best, dtype=torch.float64)

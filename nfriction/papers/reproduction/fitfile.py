@@ -29,12 +29,12 @@ def save_fit(found: FitResult, path: Path, recordings: Sequence[Recording]) -> N
     with replacing(path.with_suffix(".npz")) as temporary, temporary.open("wb") as file:
         np.savez(
             file,
-            residuals=found._residuals.numpy(),
+            residuals=found.residuals.numpy(),
             term_names=np.array(names, dtype=str),
             term_values=np.array(values, dtype=np.float64),
             term_bounds=np.array(bounds, dtype=np.float64),
             steps=np.array(found.steps),
-            left_out=np.array(found.left_out, dtype=np.float64),
+            left_out=np.array(found.skipped_horizons, dtype=np.float64),
             interval_names=np.array([i.name for i in found.intervals], dtype=str),
             intervals=np.array([(i.value, i.low, i.high) for i in found.intervals]).reshape(-1, 3),
         )
@@ -70,9 +70,9 @@ def load_fit(path: Path, motions: Sequence[Motion]) -> FitResult:
             at_bounds=tuple(told["at_bounds"]),
             steps=int(kept["steps"]),
             motions=tuple(motions),
-            _residuals=torch.as_tensor(kept["residuals"]),
+            residuals=torch.as_tensor(kept["residuals"]),
             intervals=tuple(Interval(name, *ends) for name, ends in told_of),
-            lost=tuple(told["lost"]),
+            unidentifiable=tuple(told["unidentifiable"]),
             warnings=tuple(told["warnings"]),
-            left_out=tuple(kept["left_out"].tolist()),
+            skipped_horizons=tuple(kept["left_out"].tolist()),
         )

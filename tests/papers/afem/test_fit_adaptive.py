@@ -128,25 +128,25 @@ def test_gradient_by_class_against_finite_differences(substeps):
     terms = plant_parameters(plant, driven=(0, 1), largest_torque=0.1)
     of = windows()
     classes = (torch.arange(of.tau.numel()).reshape(of.tau.shape) // 7 % 3).to(F64)
-    p = LabelledProblem(StepJacobian(plant, given, terms), of, 1e-3, ABSOLUTE, substeps=substeps,
-                        classes=classes)  # fmt: skip
+    jacobian = StepJacobian(plant, given, terms)
+    p = LabelledProblem(jacobian, given, of, 1e-3, ABSOLUTE, substeps=substeps, classes=classes)
     x = point(p)
-    gradient = p.quadratic(x).gradient
-    for i in range(p.unknowns.shared_count):
+    gradient = p.linearise(x).gradient
+    for i in range(p.variables.shared_count):
         step = torch.zeros_like(x)
         step[i] = 1e-6
         slope = (p.cost(x + step) - p.cost(x - step)) / 2e-6
         assert float(gradient[i]) == pytest.approx(float(slope), rel=2e-4, abs=1e-2)
     # Every class of both joints had a say.
-    assert (gradient[: p.unknowns.friction_count].abs() > 1e-6).all()
+    assert (gradient[: p.variables.friction_count].abs() > 1e-6).all()
 
 
 def test_what_does_not_fit_is_refused(case):
     plant, train, _, motions, constant = case
     with pytest.raises(ValueError, match="no adaptive model"):
         fit_adaptive(NFLFM(2), plant, train)
-    with pytest.raises(ValueError, match="not to torques"):
-        fit(ALFM(2), plant, train, method="torque")
+    with pytest.raises(ValueError, match="output_error"):
+        fit(ALFM(2), plant, train, method="equation_error")
     with pytest.raises(ValueError, match="method"):
         fitted(case, method="simplex")
     with pytest.raises(ValueError, match="seed"):

@@ -5,7 +5,7 @@ import torch
 
 from nfriction import ALFM, LFM, NFLFM, fit
 from nfriction.evaluation.score import score
-from nfriction.fitting.shooting.problem import TrajectoryProblem
+from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.friction.laws import LINEAR
 from nfriction.friction.model import FrictionModel
@@ -124,15 +124,15 @@ def test_gradient_with_a_memory_is_the_cost_s_derivative():
     model.requires_grad_(False)
     w = windows()
     memory = model.schedule.initial_state(w.qd0, torch.full_like(w.qd0, 20.0))
-    p = TrajectoryProblem(
-        StepJacobian(pendulum(), model, []), w, 1e-3, ABSOLUTE, stride=4, memory=memory
+    p = ShootingProblem(
+        StepJacobian(pendulum(), model, []), model, w, 1e-3, ABSOLUTE, stride=4, memory=memory
     )
     g = torch.Generator().manual_seed(1)
-    x = p.unknowns.start()
-    x[: p.unknowns.friction_count] = 0.1 * torch.randn(
-        p.unknowns.friction_count, generator=g, dtype=F64
+    x = p.variables.start()
+    x[: p.variables.friction_count] = 0.1 * torch.randn(
+        p.variables.friction_count, generator=g, dtype=F64
     )
-    found = p.quadratic(x)
+    found = p.linearise(x)
     assert float(found.cost) == pytest.approx(float(p.cost(x)))
     for _ in range(4):
         along = torch.randn(x.shape, generator=g, dtype=F64)

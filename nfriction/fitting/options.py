@@ -1,0 +1,220 @@
+"""Options of a fit: the user's choices, and every constant that shapes its result."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+Method = Literal["equation_error", "output_error"]
+Eccentricity = Literal["off", "on", "auto"]
+# When incremental encoders were set to zero: before all recordings, or at the start of each.
+EncoderReference = Literal["auto", "shared", "per_recording"]
+# Defects between shooting windows: free, penalised, or enforced.
+Continuity = Literal["none", "penalty", "constraint"]
+
+CHOICES = {
+    "method": get_args(Method),
+    "eccentricity": get_args(Eccentricity),
+    "encoder_reference": get_args(EncoderReference),
+    "continuity": get_args(Continuity),
+}
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """Settings of a fit.
+
+    The fields up to `max_steps` are the user's, see `nfriction.fit`; the others are tuning
+    constants with their reasons. Lengths and speeds are in m for sliding joints. A `..._term` is
+    the bound of a plant term and the standard deviation of its prior, both around the given plant.
+
+    Raises:
+        ValueError: if a choice does not exist, or two exclude each other.
+    """
+
+    method: Method = "output_error"
+    # Short horizons converge from far away; long ones separate small friction from small drag [s].
+    windows: Sequence[float] = (0.5, 2.0, 5.0)
+    fit_plant: bool = True
+    drag: bool | None = None
+    eccentricity: Eccentricity = "off"
+    encoder_reference: EncoderReference = "auto"
+    continuity: Continuity = "none"
+    max_steps: int = 30
+
+    # --- Data.
+    # Faster over its first sample, a recording does not begin at rest [rad/s]; an encoder that
+    # flickers by one count at 500 Hz seems to move at 0.2 rad/s.
+    rest_speed: float = 0.3
+    # An encoder that was just set to zero may flicker by some of its counts [rad].
+    zero_reading: float = 2e-3
+    # Below so many counts, quantisation is most of a joint's apparent motion.
+    min_counts: int = 10
+    # Wrong vertical reference: a free swing then seems to need twice its weight in friction, which
+    # on the public benches is 40 times the friction torque and more.
+    reference_ratio: float = 5.0
+    # More substeps would mean a sign function too steep for the sample time.
+    max_substeps: int = 8
+
+    # --- Equation error.
+    # Smoothers know less at the ends of a record, so this much of each is dropped [s].
+    edge: float = 0.02
+    # Ridge relative to the data's information: none where the data are informative, and no runaway
+    # where they are not (an offset and a sign that never changes).
+    ridge: float = 1e-6
+    # Share of the torque attributed to friction even where no law explains any of it.
+    min_explained: float = 0.01
+
+    # --- Terms of the plant.
+    # Inertia and gravity terms of a bench are known to about a tenth; bound as in the data cards.
+    ratio_term: tuple[float, float] = (0.3, 0.1)
+    # Lengths between joints come from a drawing or a ruler.
+    length_term: tuple[float, float] = (0.1, 0.01)
+    # The zero of an encoder is known to about a degree [rad].
+    angle_term: tuple[float, float] = (0.1, 0.02)
+    # A disc sits on its shaft within some hundredths of a millimetre, at a radius of 1 cm [rad].
+    eccentricity_term: tuple[float, float] = (0.02, 0.002)
+    # Torque constants of two drives of a kind differ by up to a tenth.
+    gain_term: tuple[float, float] = (0.3, 0.1)
+    # A gear stage loses some hundredths of the torque, a worm much more.
+    loss_term: tuple[float, float] = (0.5, 0.05)
+    # Bias of a current sensor over the largest torque; the prior is narrow because, with dry
+    # friction, an offset and a wrong zero of an angle are nearly equivalent.
+    offset_term: tuple[float, float] = (0.3, 0.01)
+    # Asymmetry of a guide over the ratio of the largest force to the largest speed.
+    asymmetry_term: tuple[float, float] = (1.0, 0.1)
+    # Drag of a slender bar is 0.5 rho c_d width, below 0.1 N s^2/m^3.
+    drag_term: tuple[float, float] = (1.0, 0.05)
+    # How far the last link extends into the air is rarely measured: lower, upper, sd [link length].
+    reach_term: tuple[float, float, float] = (-0.7, 1.0, 0.3)
+
+    # --- Shooting problem.
+    # Initial states come from a smoother and are off by far less; their prior only prevents a
+    # window from running away [rad, rad/s].
+    start_sd: tuple[float, float] = (0.01, 0.3)
+    # At rest: about the quantisation error. A free initial velocity would absorb the friction
+    # while the links break loose.
+    rest_sd: tuple[float, float] = (1e-4, 1e-3)
+    # Dry friction of a tenth of the gravity moment holds a link up to 0.1 rad off [rad].
+    encoder_offset_sd: float = 0.05
+    # Defects of position and velocity [rad, rad/s]. Beside a penalty this weak, short windows
+    # still converge from far away.
+    penalty_sd: tuple[float, float] = (3e-4, 0.01)
+    # From far away a search along such a tight constraint would creep.
+    constraint_sd: tuple[float, float] = (1e-6, 3e-5)
+
+    # --- Search.
+    gradient_tolerance: float = 1e-6
+    step_tolerance: float = 1e-8
+    # Relative decrease that ends a search whose result is only a start for the next.
+    loose_tolerance: float = 1e-4
+    # Decrease of the cost that ends the last search: a tenth in log likelihood.
+    loglik_tolerance: float = 0.1
+    # Dry friction puts kinks into the cost along which steps creep; so many in a row that gain no
+    # more than their tolerance end a search.
+    patience: int = 3
+    # Divergent windows keep lowering the cost long after the shared parameters have converged:
+    # stop when these move by less than so many sd, `patience` times in a row.
+    settled_move: float = 0.05
+    # Error of typical models before a fit has measured it [rad].
+    first_noise: float = 1e-3
+    # Smaller errors are rounding [rad].
+    min_noise: float = 1e-9
+    # Growth of the error from one horizon to the next that means a search lost the motion.
+    max_growth: float = 10.0
+
+    # --- Hold-out of a network.
+    # Every so many-th window is held out, so that all sizes of the motion are represented.
+    folds: int = 3
+    # Search for the initial states of hold-out windows: few unknowns, close by.
+    holdout_steps: int = 6
+    holdout_tolerance: float = 1e-4
+    # Maximum hold-out RMSE ratio to the law fitted on the same windows.
+    max_ratio_same: float = 0.8
+    # Maximum hold-out RMSE ratio to the law fitted on all windows, which it would replace.
+    max_ratio_all: float = 1.1
+    # Candidate priors, relative to the network's own.
+    prior_shares: tuple[float, ...] = (1.0, 1 / 3)
+
+    # --- Extrapolation prior of a network.
+    # Grid cells along velocity and acceleration, cells around a visited one that count as
+    # visited, and the spacing of the prior's points.
+    cells: int = 60
+    visited_radius: int = 5
+    point_spacing: int = 5
+    # Deviation expected at unvisited points, in units of the coefficients' scale.
+    unvisited_sd: float = 0.2
+    # Quantiles of the acceleration that bound a network's inputs; the rest are outliers.
+    acceleration_quantiles: tuple[float, float] = (0.001, 0.999)
+    # Reference of a coefficient that is to remain zero, in units of its scale: above rounding,
+    # without effect on a simulation.
+    zero_reference: float = 1e-6
+
+    # --- Autocorrelation of the residuals.
+    # Counted samples within a correlation time, and the most that are skipped: a network leaves
+    # shorter correlations than its constant law.
+    samples_per_correlation: int = 8
+    max_decimation: int = 20
+    # Stretches within which residuals count as stationary, in correlation times, and their least
+    # length in samples: shorter ones say too little about the correlation within them.
+    stationary_times: float = 20
+    min_stationary: int = 500
+    # Lags of the spectral density, in correlation times, and their least share of a stretch.
+    lag_times: float = 20
+    min_lag_share: float = 0.1
+    # Share of the motion's power that its bandwidth holds, and the harmonics of it that friction
+    # and inertia add.
+    band_power: float = 0.999
+    band_harmonics: int = 2
+
+    # --- Uncertainty.
+    # A direction is unidentifiable if its information is below that of its parameters alone by
+    # the square of this factor.
+    null_ratio: float = 1e3
+    # An estimate whose interval includes zero is unidentifiable if conditioning on the others
+    # shrinks its sd by this factor; otherwise it is just small.
+    conditional_ratio: float = 30.0
+    # Entries below this share of a direction's largest are not named.
+    named_share: float = 0.3
+    # Residuals above this many times the quantisation noise are model error.
+    model_error_ratio: float = 3.0
+    # Windows are continuous while no defect exceeds this many sd.
+    max_defect: float = 5.0
+
+    def __post_init__(self) -> None:
+        for name, allowed in CHOICES.items():
+            value = getattr(self, name)
+            if value not in allowed:
+                raise ValueError(f"`{name}` must be one of {allowed}, got {value!r}.")
+        object.__setattr__(self, "windows", _checked_lengths(self.windows))
+        if self.method == "equation_error":
+            if self.encoder_reference == "per_recording":
+                raise ValueError(
+                    '`encoder_reference="per_recording"` needs `method="output_error"`.'
+                )
+            if self.continuity != "none":
+                raise ValueError(f'`continuity="{self.continuity}"` needs `method="output_error"`.')
+
+    @property
+    def defect_sd(self) -> tuple[float, float] | None:
+        """Standard deviation of the defects that `continuity` asks for; None for free windows."""
+        found = {"none": None, "penalty": self.penalty_sd, "constraint": self.constraint_sd}
+        return found[self.continuity]
+
+
+def _checked_lengths(windows: object) -> tuple[float, ...]:
+    """Window lengths [s]: at least one, finite and positive."""
+    try:
+        # Texts are no lengths, though Python converts some to numbers.
+        lengths = tuple(float(1.0 * w) for w in windows)  # type: ignore[attr-defined]
+    except TypeError:
+        lengths = ()
+    if not lengths or not all(0 < w < math.inf for w in lengths):
+        raise ValueError(
+            f"`windows` must be positive lengths [s] such as (0.5, 2.0), got {windows!r}; a single "
+            f"one is (2.0,)."
+        )
+    return lengths
+
+
+DEFAULTS = FitOptions()
