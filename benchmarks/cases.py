@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from nfriction import NFLFM, FrictionModel, PendulumChain, rigs
-from nfriction.friction.constant import Constant
+from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law, smooth_sign
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 

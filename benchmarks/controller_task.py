@@ -25,14 +25,21 @@ from torch import Tensor, nn
 from nfriction.fuzzy import Anfis, AnfisRBF, RBFNetwork
 from nfriction.fuzzy import train_hybrid as hybrid
 from nfriction.papers.controller.mamdani import MamdaniController, paper_controller
-from nfriction.papers.nffem.train_network import controller_targets, train_on_controller
+from nfriction.papers.nffem.train_network import (
+    TrainingOptions,
+    controller_targets,
+    train_on_controller,
+)
 
 Predictor = Callable[[Tensor], Tensor]
 
 
-def trained(build: Callable[[], nn.Module], controller: MamdaniController, **options) -> Predictor:
+def trained(
+    build: Callable[[], nn.Module], controller: MamdaniController, samples: int, **options
+) -> Predictor:
     network = build()
-    train_on_controller(network, controller, **options)
+    chosen = TrainingOptions(**options)
+    train_on_controller(network, controller, samples=samples, options=chosen)
     return lambda x: network(x.unsqueeze(1))[:, 0]
 
 

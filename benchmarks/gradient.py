@@ -195,8 +195,9 @@ def regularised(repeats: int) -> None:
     import torch
 
     from nfriction.fuzzy import RBFNetwork
-    from nfriction.optim.evidence import bayesian_regularisation
-    from nfriction.optim.jacobian import per_sample_jacobian, trainable
+    from nfriction.optim.evidence import EvidenceOptions
+    from nfriction.optim.jacobian import normal_equations, trainable
+    from nfriction.optim.regularisation import bayesian_regularisation
 
     torch.set_num_threads(1)
     random = torch.Generator().manual_seed(0)
@@ -207,22 +208,21 @@ def regularised(repeats: int) -> None:
         ("a width a unit", one_width_a_unit()),
         ("a width per axis", RBFNetwork(1)),
     ):
-        written = per_sample_jacobian(network, trainable(network), x[:50])
-        plain = per_sample_jacobian(
+        written = normal_equations(network, trainable(network), x[:50], y[:50])
+        plain = normal_equations(
             lambda p, inputs, n=network: torch.func.functional_call(n, dict(p), (inputs,)),
             trainable(network),
             x[:50],
+            y[:50],
         )
-        if not torch.allclose(written, plain, rtol=1e-10, atol=1e-10):
-            raise SystemExit("the written Jacobian is not the automatic one")
+        if not torch.allclose(written.JtJ, plain.JtJ, rtol=1e-10, atol=1e-10):
+            raise SystemExit("the written derivatives are not the automatic ones")
         stamps = [(timing.CLOCK(), time.perf_counter())]
-        bayesian_regularisation(
-            network,
-            x,
-            y,
+        options = EvidenceOptions(
             max_steps=3 * repeats,
             callback=lambda _, s=stamps: s.append((timing.CLOCK(), time.perf_counter())),
         )
+        bayesian_regularisation(network, x, y, options=options)
         steps, walls = (
             sorted(1e3 * (b[i] - a[i]) for a, b in pairwise(stamps[1:])) for i in range(2)
         )

@@ -18,9 +18,9 @@ from nfriction.evaluation.score import score
 from nfriction.fitting.fit import fit
 from nfriction.fitting.options import EncoderReference
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction.constant import Constant
-from nfriction.friction.model import FrictionModel
-from nfriction.friction.models import model_by_name
+from nfriction.friction.coefficients import Constant
+from nfriction.friction.models import FrictionModel
+from nfriction.friction.registry import model_by_name
 from nfriction.plant import Plant
 
 State = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -153,7 +153,7 @@ def real(
                 left = fold.left if blocks == 1 else with_fitted_offsets(fits[-1], fold.left)
                 rows[m].add(start, fits[-1].plant, model, left)
             # The peer knows no gaps and one zero for all.
-            whole = [r[a : b + 1] for r in fold.fitted for a, b in r.spans]
+            whole = [r[a : b + 1] for r in fold.fitted for a, b in r.segments]
             states = [first_state(data, of, r) if blocks == 1 else None for r in whole]
             for m in models if peer else ():
                 if is_constant(m):

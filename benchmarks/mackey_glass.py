@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from nfriction.fuzzy import Anfis, train_hybrid
-from nfriction.papers.nffem.train_network import train_network
+from nfriction.papers.nffem.train_network import TrainingOptions, train_network
 
 Predictor = Callable[[Tensor], Tensor]
 
@@ -73,7 +73,7 @@ def by_evidence(x: Tensor, y: Tensor, terms: int, starts: int, steps: int) -> Pr
             anfis.init_grid(x.amin(0), x.amax(0))
             fit = train_network(
                 anfis, x.unsqueeze(1), y.unsqueeze(1),
-                starts=starts, search_steps=search_steps, max_steps=steps,
+                TrainingOptions(starts=starts, search_steps=search_steps, max_steps=steps),
             )[0].evidence  # fmt: skip
             if fit.log_evidence > best:
                 best, chosen = fit.log_evidence, anfis

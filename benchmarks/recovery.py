@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from nfriction import FrictionModel, PendulumChain, Recording, rollout
 from nfriction.fitting.fit import fit
 from nfriction.fitting.plant_parameters import adjusted_buffers, plant_parameters
-from nfriction.friction.constant import Constant
+from nfriction.friction.coefficients import Constant
 from nfriction.signals import kalman_smoother, quantise
 
 Array = NDArray[np.float64]

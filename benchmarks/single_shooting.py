@@ -18,7 +18,7 @@ from scipy.optimize import least_squares
 from nfriction import Recording
 from nfriction.fitting.fit import fit
 from nfriction.fitting.plant_parameters import PlantParameter, adjusted_buffers, plant_parameters
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.simulation.rk4 import required_substeps
 from nfriction.simulation.rollout import rollout
 

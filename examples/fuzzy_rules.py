@@ -9,8 +9,8 @@ import torch
 from nfriction import plots
 from nfriction.fuzzy import RBFNetwork
 from nfriction.papers.controller.mamdani import MamdaniController
-from nfriction.papers.controller.rulefile import parse_rules
-from nfriction.papers.nffem.train_network import train_on_controller
+from nfriction.papers.controller.rules import parse_rules
+from nfriction.papers.nffem.train_network import TrainingOptions, train_on_controller
 
 RULES = """{
   "format": "nfriction-rules/1",
@@ -49,7 +49,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Few steps and samples suffice for a look; the papers take 40,000 samples.
     network = RBFNetwork(1, 2, 10, 2)
     samples, steps = (500, 3) if arguments.quick else (4000, 30)
-    train_on_controller(network, controller, samples=samples, max_steps=steps)
+    options = TrainingOptions(max_steps=steps)
+    train_on_controller(network, controller, samples=samples, options=options)
     x = torch.rand(2000, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(9))
     x = (controller.lower + (controller.upper - controller.lower) * x) * controller.si_factor
     wanted = controller(x[:, 0], x[:, 1])

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nfriction import FrictionModel, PendulumChain, Recording, export, fit, rollout
-from nfriction.friction.constant import Constant
+from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
 
 

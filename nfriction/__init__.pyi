@@ -10,12 +10,6 @@ from .evaluation.score import Score as Score
 from .evaluation.score import score as score
 from .fitting.fit import fit as fit
 from .fitting.result.fit_result import FitResult as FitResult
-from .friction.model import FrictionModel as FrictionModel
-from .friction.models import ACFM as ACFM
-from .friction.models import ACVFM as ACVFM
-from .friction.models import ALFM as ALFM
-from .friction.models import ANCFM as ANCFM
-from .friction.models import ANLFM as ANLFM
 from .friction.models import CFM as CFM
 from .friction.models import CVFM as CVFM
 from .friction.models import LFM as LFM
@@ -26,6 +20,7 @@ from .friction.models import NFLFM as NFLFM
 from .friction.models import NFNCFM as NFNCFM
 from .friction.models import NFNLFM as NFNLFM
 from .friction.models import NLFM as NLFM
+from .friction.models import FrictionModel as FrictionModel
 from .friction.models import NFStribeck as NFStribeck
 from .friction.models import Stribeck as Stribeck
 from .io.model_file import load as load
@@ -35,6 +30,11 @@ from .io.model_file import save as save
 from .io.model_info import ModelInfo as ModelInfo
 from .papers.afem.fit_adaptive import fit_adaptive as fit_adaptive
 from .papers.afem.fit_by_search import fit_by_search as fit_by_search
+from .papers.afem.models import ACFM as ACFM
+from .papers.afem.models import ACVFM as ACVFM
+from .papers.afem.models import ALFM as ALFM
+from .papers.afem.models import ANCFM as ANCFM
+from .papers.afem.models import ANLFM as ANLFM
 from .plant import LinearAxis as LinearAxis
 from .plant import PendulumChain as PendulumChain
 from .plant import Plant as Plant

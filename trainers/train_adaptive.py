@@ -3,20 +3,16 @@
     python trainers/train_adaptive.py run1.csv run2.csv --rig rig.json --model ALFM
     python trainers/train_adaptive.py --twin tlrip --model ANLFM --method pattern
 
-`--resume` after a Ctrl-C or a kill: the constant fit that comes first is read where it was
-finished, a pattern search goes on from its last iteration, the other methods begin their stage
-anew. Each way the result is that of a run that nobody ended.
+After a Ctrl-C or a kill, `--resume` reads the constant fit, which comes first, where it was
+finished; a pattern search continues from its last iteration, the other methods start their stage
+again. The result is that of an uninterrupted run.
 """
 
 import sys
 from collections.abc import Sequence
 
-from nfriction.evaluation.results import model_info
-from nfriction.fitting.fit import fit
-from nfriction.friction.models import model_by_name
-from nfriction.papers.afem.fit_adaptive import fit_adaptive
-from nfriction.papers.afem.fit_by_search import fit_by_search
 from nfriction.papers.reproduction import training
+from nfriction.papers.reproduction.stages import fit_by_class, fit_constant, fit_searched
 
 
 def train(argv: Sequence[str] | None) -> str:
@@ -26,29 +22,15 @@ def train(argv: Sequence[str] | None) -> str:
                         default="gauss-newton")  # fmt: skip
     parser.add_argument("--max-evaluations", type=int, default=5000, help="of a search")
     given = parser.parse_args(argv)
-    training_run = training.Training(given)
-    data = training_run.data()
-    settings = {
-        "motions": data.motions, "windows": given.windows, "max_steps": given.max_steps,
-        "fit_plant": given.plant == "fit",
-    }  # fmt: skip
-    law = model_by_name(given.model.removeprefix("A"))(data.plant.joints)
-    constant = training_run.stage("constant", data, lambda tell: fit(
-        law, data.plant, data.train, callback=tell, **settings
-    ))  # fmt: skip
-    model = model_by_name(given.model)(data.plant.joints)
+    workspace, bench = training.start(
+        given, search_horizon=given.windows[-1], search_evaluations=given.max_evaluations
+    )
     if given.method == "gauss-newton":
-        found = training_run.stage("adaptive", data, lambda tell: fit_adaptive(
-            model, data.plant, data.train, start=constant, callback=tell, **settings
-        ))  # fmt: skip
+        found = fit_by_class(workspace, bench, given.model)
     else:
-        found = training_run.stage("adaptive", data, lambda tell: fit_by_search(
-            model, data.plant, data.train, method=given.method, start=constant,
-            motions=data.motions, horizon=given.windows[-1], seed=given.seed,
-            max_evaluations=given.max_evaluations, state=training_run.search_state(),
-            callback=training_run.keep_search(tell),
-        ))  # fmt: skip
-    return training_run.finish(data, found.model, model_info(found, data.train), found.plant)
+        constant = fit_constant(workspace, bench, given.model.removeprefix("A"))
+        found = fit_searched(workspace, bench, given.model, given.method, start=constant)
+    return training.finish(given, bench, found)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

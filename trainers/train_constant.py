@@ -5,19 +5,16 @@
     python trainers/train_constant.py --twin rtip --model LFM --method pattern
 
 The last two are the second paper's estimation (80 s): NCFM by sequential quadratic programming,
-LFM and NLFM by pattern search of the simulated position. `--resume` after a Ctrl-C or a kill: a
-pattern search goes on from its last iteration; the other methods, which take seconds to minutes,
-begin anew. Each way the result is that of a run that nobody ended.
+LFM and NLFM by pattern search of the simulated position. After a Ctrl-C or a kill, `--resume`
+continues a pattern search from its last iteration; the other methods, which take seconds to
+minutes, start again. The result is that of an uninterrupted run.
 """
 
 import sys
 from collections.abc import Sequence
 
-from nfriction.evaluation.results import model_info
-from nfriction.fitting.fit import fit
-from nfriction.friction.models import model_by_name
-from nfriction.papers.afem.fit_by_search import fit_by_search
 from nfriction.papers.reproduction import training
+from nfriction.papers.reproduction.stages import fit_constant, fit_searched
 
 
 def train(argv: Sequence[str] | None) -> str:
@@ -28,21 +25,14 @@ def train(argv: Sequence[str] | None) -> str:
                         help="length of the windows that a search simulates [s]")  # fmt: skip
     parser.add_argument("--max-evaluations", type=int, default=5000, help="of a search")
     given = parser.parse_args(argv)
-    training_run = training.Training(given)
-    data = training_run.data()
-    model = model_by_name(given.model)(data.plant.joints)
+    workspace, bench = training.start(
+        given, search_horizon=given.horizon, search_evaluations=given.max_evaluations
+    )
     if given.method == "trajectory":
-        found = training_run.stage("constant", data, lambda tell: fit(
-            model, data.plant, data.train, motions=data.motions, windows=given.windows,
-            max_steps=given.max_steps, fit_plant=given.plant == "fit", callback=tell,
-        ))  # fmt: skip
+        found = fit_constant(workspace, bench, given.model)
     else:
-        found = training_run.stage("constant", data, lambda tell: fit_by_search(
-            model, data.plant, data.train, method=given.method, motions=data.motions,
-            horizon=given.horizon, max_evaluations=given.max_evaluations, seed=given.seed,
-            state=training_run.search_state(), callback=training_run.keep_search(tell),
-        ))  # fmt: skip
-    return training_run.finish(data, found.model, model_info(found, data.train), found.plant)
+        found = fit_searched(workspace, bench, given.model, given.method)
+    return training.finish(given, bench, found)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -5,23 +5,18 @@
 
 Both fit the constant law, then coefficients by class of acceleration. Ours corrects these by an
 ANFIS layer with a radial basis head, on trajectories. The papers span a fuzzy controller with them
-and teach a radial basis network what it says on 40,000 samples a joint. `--resume` after a Ctrl-C
-or a kill reads the stages that were finished and begins the one that was not anew, with the same
+and train a radial basis network on its outputs for 40,000 samples a joint. After a Ctrl-C or a
+kill, `--resume` reads the stages that were finished and starts the others again, with the same
 result.
 """
 
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 from nfriction.evaluation.results import model_info
-from nfriction.fitting.fit import fit
-from nfriction.friction.models import model_by_name
-from nfriction.papers.afem.fit_adaptive import fit_adaptive
-from nfriction.papers.nffem.refine_adaptive import refine_adaptive
 from nfriction.papers.reproduction import training
-from nfriction.papers.reproduction.procedure import papers_neuro_fuzzy
+from nfriction.papers.reproduction.stages import fit_by_class, fit_network, network_by_controller
 
 
 def train(argv: Sequence[str] | None) -> str:
@@ -31,33 +26,15 @@ def train(argv: Sequence[str] | None) -> str:
     parser.add_argument("--samples", type=int, default=40_000,
                         help="of the papers' controller, a joint")  # fmt: skip
     given = parser.parse_args(argv)
-    training_run = training.Training(given)
-    data = training_run.data()
-    settings = {
-        "motions": data.motions, "windows": given.windows, "max_steps": given.max_steps,
-        "fit_plant": given.plant == "fit",
-    }  # fmt: skip
-    name, joints = given.model.removeprefix("NF"), data.plant.joints
-    constant = training_run.stage("constant", data, lambda tell: fit(
-        model_by_name(name)(joints), data.plant, data.train, callback=tell, **settings
-    ))  # fmt: skip
-    adaptive = training_run.stage("adaptive", data, lambda tell: fit_adaptive(
-        model_by_name(f"A{name}")(joints), data.plant, data.train, start=constant,
-        callback=tell, **settings
-    ))  # fmt: skip
+    workspace, bench = training.start(given, controller_samples=given.samples)
     if given.procedure == "ours":
-        options: dict[str, Any] = {"network": "by_class"}
-        found = training_run.stage("neuro-fuzzy", data, lambda tell: refine_adaptive(
-            model_by_name(given.model)(joints, **options), adaptive, data.train,
-            length=given.windows[-1], max_steps=given.max_steps, callback=tell
-        ))  # fmt: skip
-        return training_run.finish(data, found.model, model_info(found, data.train), found.plant)
-    model = papers_neuro_fuzzy(
-        adaptive.model, data.motions, samples=given.samples, seed=given.seed,
-        progress=sys.stderr.isatty(),
-    )  # fmt: skip
-    info = replace(model_info(adaptive, data.train), fit={"status": "by the papers' procedure"})
-    return training_run.finish(data, model, info, adaptive.plant)
+        found = fit_network(workspace, bench, given.model)
+        return training.finish(given, bench, found)
+    law = given.model.removeprefix("NF")
+    adaptive = fit_by_class(workspace, bench, f"A{law}")
+    model = network_by_controller(workspace, bench, law, progress=sys.stderr.isatty())
+    info = replace(model_info(adaptive, bench.train), fit={"status": "by the papers' procedure"})
+    return training.write(given, bench, model, info, adaptive.plant)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Sequence
 
-from nfriction.papers.twin.command import main as build_twin
+from nfriction.papers.twin.dataset import main as build_twin
 
 
 def main(argv: Sequence[str] | None = None) -> int:

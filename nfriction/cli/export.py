@@ -8,7 +8,7 @@ from nfriction.cli import estimation, names
 from nfriction.cli.console import Parser, UsageError, check_writable, seconds
 
 if TYPE_CHECKING:
-    from nfriction.friction.model import FrictionModel
+    from nfriction.friction.models import FrictionModel
     from nfriction.io.model_info import ModelInfo
 
 EXAMPLE = """example:

@@ -1,15 +1,14 @@
-"""Names that options take, without their makers, which load torch.
+"""Names that options take; importing them needs no torch.
 
-A test holds them equal to `friction.MODELS` and `rigs.names()`.
+A test holds `RIGS` equal to `rigs.names()`.
 """
 
 import argparse
 from pathlib import Path
 
-MODELS = (
-    "NCFM", "LFM", "NLFM", "CFM", "CVFM", "Stribeck", "ANCFM", "ALFM", "ANLFM", "ACFM", "ACVFM",
-    "NFNCFM", "NFLFM", "NFNLFM", "NFCFM", "NFCVFM", "NFStribeck",
-)  # fmt: skip
+from nfriction.friction.registry import model_names
+
+MODELS = model_names()
 RIGS = (
     "tlrip", "rtip", "multiarm-single", "multiarm-double", "multiarm-triple",
     "dfki-A0", "dfki-C0", "dfki-C1", "emps", "xl330",

@@ -37,17 +37,17 @@ def run(arguments: argparse.Namespace) -> int:
     """Run what is not finished, then print and write everything."""
     from dataclasses import replace
 
-    from nfriction.papers.reproduction import report
-    from nfriction.papers.reproduction.running import reproduce
-    from nfriction.papers.reproduction.settings import FULL, QUICK
+    from nfriction.papers.reproduction import tables
+    from nfriction.papers.reproduction.run import reproduce
+    from nfriction.papers.reproduction.workspace import FULL, QUICK
 
     check_writable(arguments.out)
     settings = replace(QUICK if arguments.quick else FULL, seed=arguments.seed)
     workspace = reproduce(
         arguments.out, settings, jobs=arguments.jobs, progress=sys.stderr.isatty()
     )
-    report.write_tables(workspace, command=arguments.command_line)
-    print(report.text(workspace))
+    tables.write_tables(workspace, command=arguments.command_line)
+    print(tables.text(workspace))
     if not arguments.no_figures:
         from nfriction.papers.reproduction.figures import draw_all
 

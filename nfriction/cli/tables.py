@@ -6,7 +6,7 @@ from nfriction.evaluation import tables
 from nfriction.evaluation.compare import NO_FRICTION, Comparison, coefficients_by_set
 from nfriction.evaluation.cross_validation import Selection
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 
 LEGEND = (
     "free run: one simulation over the whole recording; windows: simulations restarted every 1, 2 "

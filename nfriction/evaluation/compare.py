@@ -11,7 +11,7 @@ from nfriction.evaluation.parallel import Data, Progress, fit_models
 from nfriction.evaluation.score import HORIZONS, Score, score
 from nfriction.fitting.data.inputs import warn_of_undriven
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import kalman_smoother

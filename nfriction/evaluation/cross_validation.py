@@ -16,7 +16,7 @@ from nfriction.fitting.data.checks import looks_zeroed_per_recording
 from nfriction.fitting.data.inputs import apply_encoder_offsets
 from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction.models import model_by_name
+from nfriction.friction.registry import model_by_name
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion, kalman_smoother
@@ -201,7 +201,7 @@ def _part(motion: Motion, mask: NDArray[np.bool_]) -> Motion:
 
 def longest_segment(recording: Recording) -> float:
     """Duration of the longest segment without a gap [s]."""
-    return max(float(recording.time[b] - recording.time[a]) for a, b in recording.spans)
+    return max(float(recording.time[b] - recording.time[a]) for a, b in recording.segments)
 
 
 def with_fitted_offsets(found: FitResult, blocks: Sequence[TimeBlock]) -> list[TimeBlock]:

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion, kalman_smoother
@@ -182,7 +182,7 @@ class _Simulator:
         off = np.zeros((1, joints)) if count is None else count * np.eye(joints + 1, joints, -1)
         q = np.broadcast_to(self.motion.q, (len(off), *self.motion.q.shape)).copy()
         diverged_at = math.inf
-        for first, last in self.recording.spans:
+        for first, last in self.recording.segments:
             if first > 0:
                 q0, qd0 = self.motion.q[first], self.motion.qd[first]
             run, lost = self._simulate(q0 + off, qd0, np.arange(first, last))
@@ -194,7 +194,7 @@ class _Simulator:
         """Samples (window, sample) of windows that follow each other, and positions there."""
         starts: list[int] = []
         length = len(self.time)
-        for first, last in self.recording.spans:
+        for first, last in self.recording.segments:
             stamps = self.time[first : last + 1] - self.time[first]
             # A stretch a few samples short of a whole number of windows still gives that number.
             count = int(stamps[-1] / horizon + 0.02)

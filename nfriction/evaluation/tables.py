@@ -7,7 +7,7 @@ from itertools import zip_longest
 
 from nfriction.evaluation.compare import NO_FRICTION, PART_NAMES, Comparison, Part
 from nfriction.evaluation.cross_validation import Selection
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.io.model_info import ModelInfo, describe
 
 Value = str | float

@@ -13,7 +13,7 @@ from nfriction.export.c_dialect import ControllerC, bits, is_identifier
 from nfriction.export.c_source import source_of
 from nfriction.export.contract import COEFFICIENT_SLACK, Contract, contract_of
 from nfriction.export.controller import controller_of
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.io.atomic import write_atomically
 from nfriction.io.model_info import ModelInfo
 

@@ -16,7 +16,7 @@ from nfriction.export.filtered import FilteredController
 from nfriction.export.parity import COEFFICIENT_SLACK, Parity, compare
 from nfriction.export.points import draw, trials
 from nfriction.export.unfiltered import NOT_FINITE, OUTSIDE, SATURATED, Controller, MemoryController
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.io import strict_json
 from nfriction.io.model_info import ModelInfo, describe
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from nfriction.export.filtered import FilteredController
 from nfriction.export.unfiltered import Controller, MemoryController, memory_of
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.io.model_info import ModelInfo
 from nfriction.signals import SecondOrderLowPass
 

@@ -15,7 +15,7 @@ from nfriction.export.filtered import FilteredController
 from nfriction.export.flat_numbers import NumberByNumber
 from nfriction.export.flat_tensors import TensorByTensor
 from nfriction.friction.coefficients import Schedule
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 
 

@@ -15,8 +15,8 @@ from nfriction.export.errors import ExportError, first_line
 from nfriction.export.onnx_graph import OnnxGraph
 from nfriction.export.program import exported, run_stateful, silent
 from nfriction.export.unfiltered import Controller, MemoryController, for_single_precision
-from nfriction.friction.model import FrictionModel
-from nfriction.io.atomic import replacing
+from nfriction.friction.models import FrictionModel
+from nfriction.io.atomic import atomic_write
 from nfriction.io.model_info import ModelInfo
 
 # Old enough for runtimes in the field; nothing newer is needed.
@@ -78,7 +78,7 @@ def onnx(
         program = exported(controller).run_decompositions()
     graph = OnnxGraph(program, inputs, outputs, REAL[dtype])
     file = _model_file(package, graph, inputs, outputs, contract)
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_bytes(file.SerializeToString(deterministic=True))
         contract, run = open_onnx(temporary)
         parity = verify(run, contract)

@@ -20,9 +20,9 @@ from nfriction.export.filtered import FilteredController
 from nfriction.export.harmless import refuse_harmful_program
 from nfriction.export.points import draw
 from nfriction.export.unfiltered import Controller, MemoryController
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.io import strict_json
-from nfriction.io.atomic import replacing
+from nfriction.io.atomic import atomic_write
 from nfriction.io.model_info import ModelInfo
 
 # All that an archive of ours holds.
@@ -81,7 +81,7 @@ def pt2(
     buffer = io.BytesIO()  # into memory, so that the temporary file's name is not kept inside
     with silent():
         torch.export.save(program, buffer, extra_files={METADATA: contract.to_json()})
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_bytes(buffer.getvalue())
         contract, run = open_pt2(temporary)
         parity = verify(run, contract)

@@ -14,7 +14,7 @@ from nfriction.export.contract import Contract, ContractError
 from nfriction.export.errors import ExportError
 from nfriction.export.program import open_pt2
 from nfriction.export.script import open_torchscript
-from nfriction.io import sandbox as apart
+from nfriction.io import sandbox
 
 OPENERS = {".pt": open_torchscript, ".pt2": open_pt2}
 # Processor time [s]: to begin with, and for a sample of a controller with a state.
@@ -49,22 +49,22 @@ def _run(path: Path, batches: Sequence[Sequence[Tensor]], folder: Path) -> list[
     seconds = STARTING + BY_SAMPLE * sum(len(batch[0]) for batch in batches)
     asked = {"path": str(path.absolute()), "batches": [len(batch) for batch in batches]}
     try:
-        apart.run(__name__, asked, folder, seconds=seconds)
+        sandbox.run_isolated(__name__, asked, folder, seconds=seconds)
         with np.load(folder / _OUTPUTS, allow_pickle=False) as found:
             return [
                 tuple(torch.from_numpy(found[f"{k}_{i}"]) for i in range(3))
                 for k in range(len(batches))
             ]
-    except apart.RefusedError as error:
+    except sandbox.InvalidFile as error:
         raise ExportError(str(error)) from None
-    except (apart.PerishedError, OSError, ValueError, LookupError, TypeError) as error:
+    except (sandbox.WorkerDied, OSError, ValueError, LookupError, TypeError) as error:
         raise ExportError(f"{path}: cannot be run ({error}).") from None
 
 
 def main() -> None:
     """What the process does."""
     torch.set_num_threads(1)
-    apart.serve(work, refusals=(ExportError, ContractError), room=ROOM)
+    sandbox.worker_main(work, refusals=(ExportError, ContractError), memory=ROOM)
 
 
 def work(asked: Mapping[str, Any], folder: Path) -> None:

@@ -19,8 +19,8 @@ from nfriction.export.filtered import FilteredController
 from nfriction.export.flat import shortened
 from nfriction.export.harmless import refuse_harmful_script, refuse_harmful_source
 from nfriction.export.unfiltered import Controller, MemoryController
-from nfriction.friction.model import FrictionModel
-from nfriction.io.atomic import replacing
+from nfriction.friction.models import FrictionModel
+from nfriction.io.atomic import atomic_write
 from nfriction.io.model_info import ModelInfo
 
 # Largest difference from the model over the largest torque: sums may be taken in another order.
@@ -73,7 +73,7 @@ def torchscript(
     with _silent():
         scripted = _compile(controller)
         torch.jit.save(scripted, buffer, _extra_files={METADATA: contract.to_json()})
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_bytes(buffer.getvalue())
         with _silent():
             loaded = torch.jit.load(str(temporary))

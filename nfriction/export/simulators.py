@@ -15,7 +15,7 @@ from torch import Tensor
 
 from nfriction.export.robot_xml import mjcf_snippet, patched, urdf_snippet
 from nfriction.export.unfiltered import memory_of
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.io.atomic import write_atomically
 from nfriction.io.model_info import ModelInfo
 from nfriction.signals import Motion

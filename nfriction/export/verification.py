@@ -21,7 +21,7 @@ from nfriction.export.onnx_file import open_onnx
 from nfriction.export.points import draw
 from nfriction.export.runner import open_apart
 from nfriction.export.unfiltered import Controller, MemoryController
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.io.model_info import ModelInfo, parameter_hash
 
 LARGEST_FILE = 256 * 2**20

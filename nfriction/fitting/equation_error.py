@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.friction.laws import Law
-from nfriction.friction.model import V_SMOOTH, FrictionModel
+from nfriction.friction.models import V_SMOOTH, FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
@@ -96,7 +96,7 @@ def fit_torque(
             f"{names}: too few samples, {len(qd)} are left {options.edge:g} s away from the ends "
             f"for {len(law.coefficients)} coefficients a joint; record for longer."
         )
-    nonlinear = {i: c.search for i, c in enumerate(law.coefficients) if not c.linear}
+    nonlinear = {i: c.initial_grid for i, c in enumerate(law.coefficients) if not c.linear}
     candidates = []
     for values in itertools.product(*nonlinear.values()):
         fixed = dict(zip(nonlinear, values, strict=True))
@@ -183,7 +183,7 @@ def prior_sd(law: Law, torque: TorqueFit, options: FitOptions = DEFAULTS) -> Ten
 
     Infinite without a prior; the torque that the law explains is the scale.
     """
-    shares = torch.tensor([c.share for c in law.coefficients], dtype=torque.torque.dtype)
+    shares = torch.tensor([c.prior_scale for c in law.coefficients], dtype=torque.torque.dtype)
     # On a light mechanism most of the torque is an error of inertia terms and smoothing.
     explained = (torque.torque.square() - torque.residual.square()).clamp_min(0.0).sqrt()
     explained = torch.maximum(explained, options.min_explained * torque.torque)

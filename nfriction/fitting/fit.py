@@ -25,7 +25,7 @@ from nfriction.fitting.options import (
     Method,
 )
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Step
 from nfriction.plant import PendulumChain, Plant
 from nfriction.recording import Recording

@@ -1,8 +1,8 @@
-"""Schedules: how the coefficients of a law follow the motion.
+"""Schedules: the coefficients of a law as a function of the motion.
 
 A schedule is a module that maps joint velocity and acceleration to the coefficients of a law,
-shape (*batch, joint) -> (*batch, joint, coefficient). Fits see it through `parameter_vector`,
-`bounds` and `sensitivities`, so any schedule can be estimated from torques or trajectories.
+shape (*batch, joint) -> (*batch, joint, coefficient). A fit sees it through `parameter_vector`,
+`bounds` and `sensitivities`, so every schedule can be estimated from torques and trajectories.
 """
 
 import math
@@ -13,11 +13,11 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from nfriction.friction.laws import Coefficient, Law
-from nfriction.friction.sensitivity import FactoredSensitivity, Sensitivity
+from nfriction.friction.laws import Law
+from nfriction.friction.sensitivity import Sensitivity
 from nfriction.fuzzy.rules import FuzzyRules
 
-# Smallest value a positive coefficient takes: far below any torque that a sensor can tell.
+# Smallest value of a positive coefficient: far below the resolution of any torque sensor.
 SMALLEST = 1e-12
 
 
@@ -31,11 +31,11 @@ class Schedule(nn.Module, ABC):
     Attributes:
         coefficient_names: names of the last axis.
         fitted_mask: which coefficients are estimated by default.
-        limits: between what values a fit may move each coefficient.
+        limits: lower and upper bound of each coefficient in a fit.
         positive: which coefficients are positive by physics, a buffer (coefficient,).
-        state_size: numbers a joint that the schedule carries from one sample to the next. At
-            every sample a simulation or controller calls `advance` (`initial_state` at the
-            first), then `coefficients_from`, and holds these coefficients until the next.
+        state_size: size of each joint's hidden state. At every sample a simulation or controller
+            calls `advance` (`initial_state` at the first), then `coefficients_from`, and holds
+            these coefficients until the next.
         follows_motion: False where the coefficients are constants.
         handles_range: True where the schedule itself handles inputs outside its trained range;
             exports clamp the inputs of any other.
@@ -61,7 +61,13 @@ class Schedule(nn.Module, ABC):
         self.joints = joints
         self.coefficient_names = list(law.names)
         self.fitted_mask = [c.fitted for c in law.coefficients]
-        self.limits = [_limits(c) for c in law.coefficients]
+        self.limits = [
+            # Ten times beyond the start values, a change hardly shows in the range of the motion.
+            (0.1 * min(c.initial_grid), 10.0 * max(c.initial_grid))
+            if c.initial_grid
+            else (SMALLEST if c.positive else -math.inf, math.inf)
+            for c in law.coefficients
+        ]
         positive = torch.tensor([c.positive for c in law.coefficients])
         self.register_buffer("positive", positive, persistent=False)
 
@@ -69,40 +75,34 @@ class Schedule(nn.Module, ABC):
     def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
         """Coefficients at velocity and acceleration of shape (*batch, joint).
 
-        Shape (*batch, joint, coefficient), or without the batch where the motion does not matter.
+        Shape (*batch, joint, coefficient), or without the batch where they are constants.
         """
 
     def initial_state(self, qd: Tensor, qdd: Tensor) -> Tensor:
-        """Memory after the first sample, shape (*batch, joint, state_size)."""
+        """Hidden state after the first sample, shape (*batch, joint, state_size)."""
         return qd.new_zeros((*qd.shape, 0))
 
     def advance(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
-        """Memory after a sample at velocity and acceleration (*batch, joint), without look-ahead.
-
-        Args:
-            qd: joint velocity [rad/s].
-            qdd: joint acceleration [rad/s^2].
-            state: memory after the sample before, (*batch, joint, state_size).
-        """
+        """Hidden state after a sample (*batch, joint), given `state` after the one before."""
         return state
 
     def coefficients_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
-        """Coefficients at a sample and the memory after it, (*batch, joint, coefficient).
+        """Coefficients at a sample, given the hidden state after it, (*batch, joint, coefficient).
 
-        `forward` is this with the memory of a first sample.
+        `forward` is this with the state of a first sample.
         """
         coefficients: Tensor = self(qd, qdd)
         return coefficients
 
     def states(self, qd: Tensor, qdd: Tensor) -> Tensor:
-        """Memory after every sample of a motion (sample, joint): (sample, joint, state_size)."""
+        """Hidden state after every sample of a motion (sample, joint): (sample, joint, state)."""
         rows = [self.initial_state(qd[0], qdd[0])]
         for v, a in zip(qd[1:], qdd[1:], strict=True):
             rows.append(self.advance(v, a, rows[-1]))
         return torch.stack(rows)
 
     def rest_coefficients(self) -> Tensor:
-        """Every set of coefficients that may hold at rest, (*set, joint, coefficient)."""
+        """Every set of coefficients that is possible at rest, (*set, joint, coefficient)."""
         like = next(self.parameters(), torch.zeros((), dtype=torch.float64))
         rest = torch.zeros(self.joints, dtype=like.dtype, device=like.device)
         coefficients: Tensor = self(rest, torch.zeros_like(rest))
@@ -122,18 +122,14 @@ class Schedule(nn.Module, ABC):
 
     @abstractmethod
     def parameter_vector(self) -> Tensor:
-        """What a fit varies, flat; a copy."""
+        """The parameters that a fit varies, flat; a copy."""
 
     @abstractmethod
     def set_parameter_vector(self, vector: Tensor) -> None:
         """Write a vector of the form that `parameter_vector` gives."""
 
     def parameter_names(self, joint_names: Sequence[str]) -> list[str]:
-        """What each entry of the parameter vector is, in words for a person.
-
-        Args:
-            joint_names: one per joint.
-        """
+        """A readable name for each entry of the parameter vector, given a name per joint."""
         return [f"parameter {k + 1}" for k in range(self.parameter_vector().numel())]
 
     @abstractmethod
@@ -146,17 +142,15 @@ class Schedule(nn.Module, ABC):
         return torch.zeros_like(vector), torch.full_like(vector, torch.inf)
 
     @abstractmethod
-    def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity | FactoredSensitivity:
+    def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
         """Derivatives of the coefficients at motions of shape (sample, joint)."""
 
-    def sensitivities_from(
-        self, qd: Tensor, qdd: Tensor, state: Tensor
-    ) -> Sensitivity | FactoredSensitivity:
-        """Derivatives of `coefficients_from`, the memory (sample, joint, state_size) held."""
+    def sensitivities_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Sensitivity:
+        """Derivatives of `coefficients_from` at a fixed hidden state (sample, joint, state)."""
         return self.sensitivities(qd, qdd)
 
     def within_range(self, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor]:
-        """The nearest motion of which the schedule was told anything."""
+        """The motion clamped to the trained range."""
         return qd, qdd
 
     def options(self) -> dict[str, Any]:
@@ -164,26 +158,18 @@ class Schedule(nn.Module, ABC):
         return {}
 
 
-def _limits(coefficient: Coefficient) -> tuple[float, float]:
-    """Between what values a fit may move a coefficient."""
-    if coefficient.search:
-        # Ten times beyond what is tried, its effect no longer shows in the range of the motion.
-        return 0.1 * min(coefficient.search), 10.0 * max(coefficient.search)
-    return (SMALLEST if coefficient.positive else -math.inf), math.inf
-
-
 class Tabulated(Schedule):
-    """A table of coefficients, from which the motion may choose.
+    """A table of coefficients, one cell of which applies at a time.
 
-    Positive coefficients live in log space. A fit varies the coefficients themselves, bounded
-    below by zero, because the logarithm's gradient dies where a coefficient belongs at zero.
+    Positive coefficients are stored as logarithms. A fit varies the coefficients themselves,
+    bounded below by zero, because the logarithm's gradient vanishes where a coefficient is zero.
 
     Args:
         law: the law whose coefficients these are.
         joints: number of joints.
         initial: start values in SI, the table's whole shape, (joint, coefficient) or
-            (coefficient,); default 1e-3 (search middle where the torque is not linear in it, zero
-            where signed).
+            (coefficient,); default 1e-3 (the middle of the initial grid of a nonlinear one, zero of
+            a signed one).
         cells: shape of the table of one joint.
     """
 
@@ -197,11 +183,12 @@ class Tabulated(Schedule):
         super().__init__(law, joints)
         shape = (joints, *cells, len(law.names))
         self.raw = nn.Parameter(torch.zeros(shape, dtype=torch.float64))
-        default = [
-            c.search[len(c.search) // 2] if c.search else (1e-3 if c.positive else 0.0)
-            for c in law.coefficients
-        ]
-        self.set_coefficients(default if initial is None else initial)
+        if initial is None:
+            initial = [
+                c.initial_grid[len(c.initial_grid) // 2] if c.initial_grid else 1e-3 * c.positive
+                for c in law.coefficients
+            ]
+        self.set_coefficients(initial)
 
     def table(self) -> Tensor:
         """The coefficients with their gradient, shape (joint, *cells, coefficient)."""
@@ -210,7 +197,7 @@ class Tabulated(Schedule):
     @property
     def values(self) -> Tensor:
         """The coefficients, shape (joint, *cells, coefficient)."""
-        return torch.where(self.positive, torch.exp(self.raw), self.raw).detach()
+        return self.table().detach()
 
     @torch.no_grad()
     def set_coefficients(self, values: Tensor | Sequence) -> None:
@@ -220,7 +207,7 @@ class Tabulated(Schedule):
             ValueError: if the shape does not fit, a coefficient is not finite, or one that is
                 positive by physics is negative.
         """
-        given = self._numbers(values)
+        given = self._broadcast(values)
         bad = ~torch.isfinite(given) | (self.positive & (given < 0))
         if bad.any():
             where = tuple(int(i) for i in bad.nonzero()[0])
@@ -230,10 +217,10 @@ class Tabulated(Schedule):
                 f"{' and not negative' if self.positive[k] else ''}, got {given[where]:g}."
             )
         raw = torch.where(self.positive, torch.log(given.clamp_min(SMALLEST)), given)
-        # exp(log(x)) may miss x in its last digits; what stays the same keeps its bits.
+        # exp(log(x)) may differ from x in its last digits; unchanged coefficients keep their bits.
         self.raw.copy_(torch.where(given == self.values, self.raw, raw))
 
-    def _numbers(self, values: Tensor | Sequence) -> Tensor:
+    def _broadcast(self, values: Tensor | Sequence) -> Tensor:
         """Given coefficients as a tensor (joint, *cells, coefficient)."""
         try:
             given = torch.as_tensor(values, dtype=self.raw.dtype, device=self.raw.device)
@@ -265,11 +252,41 @@ class Tabulated(Schedule):
     def bounds(self) -> tuple[Tensor, Tensor]:
         values = self.values
         fitted = torch.tensor(self.fitted_mask, device=values.device)
-        lower, upper = (
-            torch.tensor(limits, dtype=values.dtype, device=values.device).expand_as(values)
-            for limits in zip(*self.limits, strict=True)
-        )
+        lower, upper = values.new_tensor(self.limits).unbind(-1)
         return (
             torch.where(fitted, lower, values).reshape(-1),
             torch.where(fitted, upper, values).reshape(-1),
         )
+
+
+class Constant(Tabulated):
+    """Coefficients that do not depend on the motion.
+
+    Args:
+        law: the law whose coefficients these are.
+        joints: number of joints.
+        initial: start values in SI, shape (joint, coefficient) or (coefficient,); default as in
+            `Tabulated`.
+    """
+
+    follows_motion = False
+    handles_range = True
+    fit_strategy = "nfriction.fitting.strategy.constant:fit_constant"
+
+    def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        return self.table()
+
+    def coefficient_sets(self) -> dict[str, Tensor]:
+        return {"always": self.values}
+
+    def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
+        k = self.raw.shape[-1]
+        identity = torch.eye(k, dtype=self.raw.dtype, device=self.raw.device)
+        zero = self.raw.new_zeros(()).expand(*qd.shape, k)
+        one = self.raw.new_ones(()).expand(*qd.shape, 1)
+        return Sensitivity(((identity.expand(*qd.shape, k, k), one),), zero, zero)
+
+    def extra_repr(self) -> str:
+        columns = [f"{v:.4g}" for v in self.values.mean(0)]
+        mean = ", ".join(f"{n}={v}" for n, v in zip(self.coefficient_names, columns, strict=True))
+        return f"joints={self.joints}, mean {mean}"

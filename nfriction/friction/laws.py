@@ -1,8 +1,19 @@
-"""Friction laws: pure elementwise functions of velocity, load and coefficients.
+"""Friction laws: elementwise functions of velocity, load and coefficients.
 
-A law maps joint velocity, normal load and a stack of coefficients (last axis) to the friction
-torque on the left-hand side of `M(q) qdd + bias(q, qd) + tau_f = tau`. Every law here scripts,
-exports and broadcasts; a user's own law is one such function wrapped in `Law`.
+A law gives the friction torque tau_f on the left-hand side of
+
+    M(q) qdd + bias(q, qd) + tau_f = tau.
+
+Every law here is a function `(qd, load, coefficients, v_smooth) -> tau_f` of
+
+    qd            joint velocity [rad/s], shape (*batch, joint)
+    load          normal load over its value at rest, |N| / (m g) [-], shaped like `qd`
+    coefficients  shape (*batch, joint, coefficient), in the order that the function documents
+    v_smooth      velocity over which the sign of the velocity changes [rad/s]
+    tau_f         friction torque [N m], shape (*batch, joint)
+
+and scripts, exports and broadcasts. For a sliding axis read m for rad and N for N m. A law of your
+own is one such function with a description of its coefficients, a `Law`.
 """
 
 import math
@@ -17,60 +28,59 @@ TorqueFunction = Callable[[Tensor, Tensor, Tensor, float], Tensor]
 
 @dataclass(frozen=True)
 class Coefficient:
-    """One coefficient of a law, as the papers name it.
+    """One coefficient of a law.
 
     Attributes:
         name: symbol, e.g. `"B"`.
-        unit: SI unit for a revolute joint; for a sliding axis read N for N m and m for rad.
+        unit: SI unit for a revolute joint.
         positive: positive by physics, hence kept positive by construction.
-        linear: the torque is linear in it, so least squares finds it directly.
-        search: candidate values tried by the torque fit where the torque is not linear in it.
+        linear: the torque is linear in it, so linear least squares estimates it.
+        initial_grid: start values to try where the torque is not linear in it.
         fitted: estimated by default; otherwise kept at its initial value.
-        share: how much of the joint's friction a fit expects of it, as the standard deviation of a
-            prior around zero over the root mean square of the friction that the torques tell;
-            infinite for no prior. For what most joints have little of, and short recordings seem
-            to show.
+        prior_scale: standard deviation of a prior around zero, relative to the root mean square of
+            the joint's friction torque; infinite for no prior. Use it where most joints have little
+            of an effect that short recordings seem to show.
 
     Raises:
-        ValueError: if the torque is not linear in it and there is nothing to search, or a prior.
+        ValueError: if a nonlinear coefficient has no initial grid, or has a prior.
     """
 
     name: str
     unit: str
     positive: bool = True
     linear: bool = True
-    search: tuple[float, ...] = ()
+    initial_grid: tuple[float, ...] = ()
     fitted: bool = True
-    share: float = math.inf
+    prior_scale: float = math.inf
 
     def __post_init__(self) -> None:
-        if not self.linear and not self.search:
+        if not self.linear and not self.initial_grid:
             raise ValueError(
-                f"coefficient {self.name!r} is not linear, so `search` needs values to try for it."
+                f"coefficient {self.name!r} is not linear, so `initial_grid` needs values to try."
             )
-        if not self.share > 0 or (self.share < math.inf and not self.linear):
+        if not self.prior_scale > 0 or (self.prior_scale < math.inf and not self.linear):
             raise ValueError(
-                f"`share` of {self.name!r} must be positive, and is for coefficients in which the "
-                f"torque is linear; got {self.share}."
+                f"`prior_scale` of {self.name!r} must be positive, and is for coefficients in "
+                f"which the torque is linear; got {self.prior_scale}."
             )
 
 
 @dataclass(frozen=True)
 class Law:
-    """A friction law: its torque function and what its coefficients are.
+    """A friction law: its torque function and a description of its coefficients.
 
     Attributes:
         name: name of the law.
-        coefficients: description of each entry of the coefficients' last axis, in order.
+        coefficients: in the order of the coefficients' last axis.
         torque: `(qd, load, coefficients, v_smooth) -> tau_f`, elementwise and scriptable.
-        simpler: a law that this one contains: the same torque where all but the coefficients
-            `shared` with it are zero, or shape what is zero then. For laws that are not linear
-            and have several minima: a fit also starts from where the simpler one ended.
-        shared: names here of the simpler law's coefficients, in its order.
+        nested_law: a simpler law that this one contains: the torque is the same where all
+            coefficients but `nested_coefficients` are zero, or only shape such a term. A law with
+            several minima is also fitted from where its nested law's fit ended.
+        nested_coefficients: names, here, of the nested law's coefficients, in its order.
 
     Raises:
-        ValueError: if there is no coefficient, two bear the same name, or what is shared does not
-            fit the simpler law.
+        ValueError: if there is no coefficient, two have the same name, or the nested coefficients
+            do not match the nested law.
 
     Examples:
         >>> def drag(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
@@ -81,28 +91,27 @@ class Law:
     name: str
     coefficients: tuple[Coefficient, ...]
     torque: TorqueFunction
-    simpler: "Law | None" = None
-    shared: tuple[str, ...] = ()
+    nested_law: "Law | None" = None
+    nested_coefficients: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.names or len(set(self.names)) < len(self.names):
             raise ValueError(
                 f"law {self.name!r} needs coefficients with names of their own, got {self.names}."
             )
-        if not isinstance(self.simpler, Law | None):
-            raise TypeError(f"`simpler` must be a Law, got {self.simpler!r}.")
-        wanted = self.simpler.coefficients if self.simpler else ()
-        own = {c.name: c for c in self.coefficients}
-        once = len(set(self.shared)) == len(self.shared) == len(wanted)
-        if not once or not set(self.shared) <= set(own):
+        if not isinstance(self.nested_law, Law | None):
+            raise TypeError(f"`nested_law` must be a Law, got {self.nested_law!r}.")
+        wanted = self.nested_law.coefficients if self.nested_law else ()
+        own, named = {c.name: c for c in self.coefficients}, self.nested_coefficients
+        if not len(set(named)) == len(named) == len(wanted) or not set(named) <= set(own):
             raise ValueError(
-                f"law {self.name!r} must name its own {len(wanted)} of {self.names} that a simpler "
-                f"law has, got `shared`={self.shared}."
+                f"law {self.name!r} must name the {len(wanted)} of its coefficients {self.names} "
+                f"that its nested law has, got `nested_coefficients`={named}."
             )
-        for name, other in zip(self.shared, wanted, strict=True):
+        for name, other in zip(named, wanted, strict=True):
             if own[name].positive and not other.positive:
                 raise ValueError(
-                    f"{name!r} of law {self.name!r} is positive, {other.name!r} of the simpler one "
+                    f"{name!r} of law {self.name!r} is positive, {other.name!r} of the nested law "
                     "may be negative; let both be the same."
                 )
 
@@ -120,14 +129,7 @@ def smooth_sign(qd: Tensor, v_smooth: float) -> Tensor:
 def viscous(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
     """Viscous friction `C_p qd` (NCFM).
 
-    Args:
-        qd: joint velocity [rad/s], shape (*batch, joint).
-        load: normal load over its value at rest [-]; not used by this law.
-        coefficients: C_p [N m s/rad], shape (*batch, joint, 1).
-        v_smooth: velocity over which the sign turns [rad/s]; not used by this law.
-
-    Returns:
-        Friction torque [N m], shape (*batch, joint).
+    Coefficients: C_p [N m s/rad].
 
     References:
         TLRIP paper, viscous model; second paper's NCFM (Table I).
@@ -138,14 +140,7 @@ def viscous(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> 
 def coulomb(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
     """Coulomb friction `F_c sgn(qd)` (CFM).
 
-    Args:
-        qd: joint velocity [rad/s], shape (*batch, joint).
-        load: normal load over its value at rest [-]; not used by this law.
-        coefficients: F_c [N m], shape (*batch, joint, 1).
-        v_smooth: velocity over which the sign turns [rad/s].
-
-    Returns:
-        Friction torque [N m], shape (*batch, joint).
+    Coefficients: F_c [N m].
 
     References:
         Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30 (1994), section 2.
@@ -156,14 +151,7 @@ def coulomb(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> 
 def coulomb_viscous(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
     """Coulomb plus viscous friction `F_c sgn(qd) + F_v qd` (CVFM).
 
-    Args:
-        qd: joint velocity [rad/s], shape (*batch, joint).
-        load: normal load over its value at rest [-]; not used by this law.
-        coefficients: F_c [N m] and F_v [N m s/rad], shape (*batch, joint, 2).
-        v_smooth: velocity over which the sign turns [rad/s].
-
-    Returns:
-        Friction torque [N m], shape (*batch, joint).
+    Coefficients: F_c [N m], F_v [N m s/rad].
 
     References:
         Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30 (1994), section 2.
@@ -175,14 +163,7 @@ def coulomb_viscous(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: fl
 def linear(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
     """Viscous plus load-dependent Coulomb friction `B qd + C load sgn(qd)` (LFM).
 
-    Args:
-        qd: joint velocity [rad/s], shape (*batch, joint).
-        load: `|N| / (m g)` [-], shape like `qd`.
-        coefficients: B [N m s/rad] and C [N m], shape (*batch, joint, 2).
-        v_smooth: velocity over which the sign turns [rad/s].
-
-    Returns:
-        Friction torque [N m], shape (*batch, joint).
+    Coefficients: B [N m s/rad], C [N m].
 
     References:
         TLRIP paper, eqs. (26)-(29), with the load taken as |N|/(m g) so that C is a torque.
@@ -196,15 +177,7 @@ def nonlinear(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -
 
     `f_o + f_c sgn(qd) + f_v qd + f_a arctan(f_b qd)`; passive where `f_o = 0`.
 
-    Args:
-        qd: joint velocity [rad/s], shape (*batch, joint).
-        load: normal load over its value at rest [-]; not used by this law.
-        coefficients: f_o [N m], f_c [N m], f_v [N m s/rad], f_a [N m], f_b [s/rad],
-            shape (*batch, joint, 5).
-        v_smooth: velocity over which the sign turns [rad/s].
-
-    Returns:
-        Friction torque [N m], shape (*batch, joint).
+    Coefficients: f_o [N m], f_c [N m], f_v [N m s/rad], f_a [N m], f_b [s/rad].
 
     References:
         Second paper's NLFM (Table III); TLRIP paper's NLFM.
@@ -216,18 +189,10 @@ def nonlinear(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -
 def stribeck(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
     """Generalised Stribeck friction: `(F_c + F_d exp(-|qd/v_s|^delta)) sgn(qd) + F_v qd`.
 
-    `F_d = F_s - F_c` is what breakaway adds to Coulomb friction, so positive coefficients make
-    the law passive.
+    `F_d = F_s - F_c` is the excess of breakaway over Coulomb friction, so positive coefficients
+    make the law passive.
 
-    Args:
-        qd: joint velocity [rad/s], shape (*batch, joint).
-        load: normal load over its value at rest [-]; not used by this law.
-        coefficients: F_c [N m], F_d [N m], F_v [N m s/rad], v_s [rad/s], delta [-],
-            shape (*batch, joint, 5).
-        v_smooth: velocity over which the sign turns [rad/s].
-
-    Returns:
-        Friction torque [N m], shape (*batch, joint).
+    Coefficients: F_c [N m], F_d [N m], F_v [N m s/rad], v_s [rad/s], delta [-].
 
     References:
         Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30 (1994), eq. (8).
@@ -256,28 +221,29 @@ LINEAR = Law("linear", (Coefficient("B", "N m s/rad"), Coefficient("C", "N m")),
 NONLINEAR = Law(
     "nonlinear",
     (
-        Coefficient("f_o", "N m", positive=False, share=0.03),
+        # Most joints have hardly any offset, and few data seem to show one.
+        Coefficient("f_o", "N m", positive=False, prior_scale=0.03),
         Coefficient("f_c", "N m"),
         Coefficient("f_v", "N m s/rad"),
         Coefficient("f_a", "N m"),
-        Coefficient("f_b", "s/rad", linear=False, search=(0.1, 0.3, 1.0, 3.0, 10.0)),
+        Coefficient("f_b", "s/rad", linear=False, initial_grid=(0.1, 0.3, 1.0, 3.0, 10.0)),
     ),
     nonlinear,
-    simpler=COULOMB_VISCOUS,
-    shared=("f_c", "f_v"),
+    nested_law=COULOMB_VISCOUS,
+    nested_coefficients=("f_c", "f_v"),
 )
 
 STRIBECK = Law(
     "stribeck",
     (
         Coefficient("F_c", "N m"),
-        # Of a spike at rest that is narrower than the sign's passage data tell next to nothing.
-        Coefficient("F_d", "N m", share=1.0),
+        # A peak at rest that is narrower than the sign's passage hardly shows in the data.
+        Coefficient("F_d", "N m", prior_scale=1.0),
         Coefficient("F_v", "N m s/rad"),
-        Coefficient("v_s", "rad/s", linear=False, search=(0.03, 0.1, 0.3, 1.0, 3.0)),
-        Coefficient("delta", "-", linear=False, search=(2.0,), fitted=False),
+        Coefficient("v_s", "rad/s", linear=False, initial_grid=(0.03, 0.1, 0.3, 1.0, 3.0)),
+        Coefficient("delta", "-", linear=False, initial_grid=(2.0,), fitted=False),
     ),
     stribeck,
-    simpler=COULOMB_VISCOUS,
-    shared=("F_c", "F_v"),
+    nested_law=COULOMB_VISCOUS,
+    nested_coefficients=("F_c", "F_v"),
 )

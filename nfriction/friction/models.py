@@ -1,31 +1,124 @@
-"""The named friction models: laws with constant, adaptive or neuro-fuzzy coefficients."""
+"""Friction models: a law with coefficients, `tau_f = model(qd, qdd, load)`."""
 
-from collections.abc import Mapping, Sequence
-from typing import Literal
+import math
+from collections.abc import Callable, Sequence
+from pkgutil import resolve_name
+from typing import Any
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
 from nfriction.friction import laws
-from nfriction.friction.coefficients import Schedule
-from nfriction.friction.constant import Constant
+from nfriction.friction.coefficients import Constant, Schedule
 from nfriction.friction.laws import Law
-from nfriction.friction.model import V_SMOOTH, FrictionModel
-from nfriction.friction.neurofuzzy import PRIOR_SD, NeuroFuzzy
-from nfriction.papers.afem.adaptive import Adaptive
-from nfriction.papers.nffem.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
-from nfriction.papers.nffem.rbf_coefficients import RadialBasis
+
+# Velocity over which the sign changes [rad/s]; larger values creep, smaller ones make RK4 unstable.
+V_SMOOTH = 3e-3
 
 
-class ConstantModel(FrictionModel):
-    """A law with constant coefficients; the named models below are its public forms.
+class FrictionModel(nn.Module):
+    """Friction torque of the joints of a mechanism.
+
+    Args:
+        law: the friction law.
+        schedule: its coefficients as a function of the motion.
+        v_smooth: velocity over which the sign of the velocity changes, `sgn(v) = tanh(v/v_smooth)`
+            [rad/s; m/s for a sliding axis].
+
+    Shape:
+        qd, qdd, load: (*batch, joint); output (*batch, joint).
+
+    Raises:
+        ValueError: if `v_smooth` is not positive, or law and schedule name other coefficients.
+
+    Examples:
+        >>> model = LFM(joints=3, initial=[1e-3, 2e-3])
+        >>> qd = torch.ones(3, dtype=torch.float64)
+        >>> model(qd, torch.zeros_like(qd), torch.ones_like(qd))
+        tensor([0.0030, 0.0030, 0.0030], dtype=torch.float64, grad_fn=<AddBackward0>)
+    """
+
+    def __init__(self, law: Law, schedule: Schedule, v_smooth: float = V_SMOOTH) -> None:
+        super().__init__()
+        if not 0 < v_smooth < math.inf:
+            raise ValueError(f"`v_smooth` must be positive and finite [rad/s], got {v_smooth}.")
+        if tuple(schedule.coefficient_names) != law.names:
+            raise ValueError(
+                f"the schedule gives {', '.join(schedule.coefficient_names)}, but the law "
+                f"{law.name!r} takes {', '.join(law.names)}; make it for this law."
+            )
+        self.law = law
+        self.schedule = schedule
+        self.v_smooth = float(v_smooth)
+        self.joints = schedule.joints
+        self.state_size = schedule.state_size
+        # TorchScript compiles a function held as an attribute; it would refuse the Law itself.
+        self.law_torque = law.torque
+
+    def forward(self, qd: Tensor, qdd: Tensor, load: Tensor) -> Tensor:
+        """Friction torque [N m] at velocity [rad/s], acceleration [rad/s^2] and load [-]."""
+        if qd.shape[-1] != self.joints:
+            raise ValueError(
+                f"`qd` must be (*batch, joint) with {self.joints} joints, got last axis "
+                f"{qd.shape[-1]}."
+            )
+        return self.law_torque(qd, load, self.schedule(qd, qdd), self.v_smooth)
+
+    def coefficients(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        """Coefficients of the law at a motion, (*batch, joint, coefficient); see `Schedule`."""
+        return self.schedule(qd, qdd)
+
+    def initial_state(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        """Hidden state after the first sample, (*batch, joint, state_size); see `Schedule`."""
+        return self.schedule.initial_state(qd, qdd)
+
+    def advance(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
+        """Hidden state after a sample, from that after the sample before."""
+        return self.schedule.advance(qd, qdd, state)
+
+    def coefficients_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
+        """Coefficients of the law at a sample, given the hidden state after it."""
+        return self.schedule.coefficients_from(qd, qdd, state)
+
+    def torque(self, qd: Tensor, load: Tensor, coefficients: Tensor) -> Tensor:
+        """Friction torque for given coefficients, which a simulation holds over a step."""
+        return self.law_torque(qd, load, coefficients, self.v_smooth)
+
+    def zero_velocity_damping(self) -> Tensor:
+        """Slope of the torque over velocity at rest under unit load [N m s/rad], (joint,).
+
+        It decides whether an explicit integrator is stable near standstill. The largest, where
+        several sets of coefficients are possible at rest.
+        """
+        held = self.schedule.rest_coefficients().detach()
+        rest = held.new_zeros(held.shape[:-1])
+        load = torch.ones_like(rest)
+        with torch.enable_grad():
+            qd = rest.requires_grad_()
+            # A law is elementwise, so the sum's gradient is each joint's slope.
+            slope = torch.autograd.grad(self.torque(qd, load, held).sum(), qd)[0]
+        return slope.reshape(-1, self.joints).amax(0)
+
+    def options(self) -> dict[str, Any]:
+        """Constructor arguments beyond `joints` and `v_smooth`, as plain JSON."""
+        return self.schedule.options()
+
+    def extra_repr(self) -> str:
+        return f"law={self.law.name}, joints={self.joints}, v_smooth={self.v_smooth:g}"
+
+
+class NamedModel(FrictionModel):
+    """A law and a kind of coefficients under one name.
 
     Args:
         joints: number of joints.
         initial: start values in SI, shape (joint, coefficient) or (coefficient,).
         v_smooth: see `FrictionModel`.
+        options: of the coefficients, see their class.
     """
 
     definition: Law
+    make_schedule: Callable[..., Schedule]
 
     def __init__(
         self,
@@ -33,8 +126,16 @@ class ConstantModel(FrictionModel):
         initial: Tensor | Sequence | None = None,
         *,
         v_smooth: float = V_SMOOTH,
+        **options: Any,
     ) -> None:
-        super().__init__(self.definition, Constant(self.definition, joints, initial), v_smooth)
+        schedule = self.make_schedule(self.definition, joints, initial, **options)
+        super().__init__(self.definition, schedule, v_smooth)
+
+
+class ConstantModel(NamedModel):
+    """A law with constant coefficients; it has no options."""
+
+    make_schedule = Constant
 
 
 class NCFM(ConstantModel):
@@ -50,16 +151,16 @@ class LFM(ConstantModel):
 
 
 class CFM(ConstantModel):
-    """Coulomb friction with a constant F_c, and nothing viscous.
+    """Coulomb friction with a constant F_c and no viscous term.
 
-    The law of ball bearings whose links swing in air: what grows with velocity is the air's.
+    The law of ball bearings whose links swing in air: there, only air drag grows with velocity.
     """
 
     definition = laws.COULOMB
 
 
 class CVFM(ConstantModel):
-    """Coulomb plus viscous friction with constants F_c and F_v, whatever the load.
+    """Coulomb plus viscous friction with constants F_c and F_v, independent of the load.
 
     The usual law of geared drives, whose dry friction is that of the gear and not of the joint's
     own bearing.
@@ -80,122 +181,31 @@ class Stribeck(ConstantModel):
     definition = laws.STRIBECK
 
 
-class AdaptiveModel(FrictionModel):
-    """A law with constant coefficients for each class of acceleration: low, medium, high.
+# Coefficients by networks, as model files name them. The papers' own are resolved by name, because
+# the core does not import them.
+NETWORKS = {
+    "anfis": "nfriction.friction.neurofuzzy:NeuroFuzzy",
+    "by_class": "nfriction.papers.nffem.adaptive_neurofuzzy:AdaptiveNeuroFuzzy",
+    "rbf": "nfriction.papers.nffem.rbf_coefficients:RBFCoefficients",
+}
+
+
+class NeuroFuzzyModel(NamedModel):
+    """A law with coefficients from an ANFIS layer with a radial basis head, `NeuroFuzzy`.
 
     Args:
-        joints: number of joints.
-        initial: start values in SI, shape (joint, class, coefficient), (joint, coefficient) or
-            (coefficient,).
-        v_smooth: see `FrictionModel`.
-        hysteresis, time_constant, sample_time: see `Adaptive`.
+        joints, initial, v_smooth: see `NamedModel`; training starts from constants `initial`.
+        network: `"anfis"`; `"rbf"`: the papers' network alone, see `RBFCoefficients`; `"by_class"`:
+            a network that corrects coefficients by class, see `AdaptiveNeuroFuzzy`.
+        options: of the coefficients, e.g. `terms=(7, 5)`.
     """
 
-    definition: Law
-
-    def __init__(
-        self,
-        joints: int,
-        initial: Tensor | Sequence | None = None,
-        *,
-        v_smooth: float = V_SMOOTH,
-        hysteresis: float = 0.2,
-        time_constant: float = 2.0,
-        sample_time: float = 1e-3,
-    ) -> None:
-        schedule = Adaptive(
-            self.definition,
-            joints,
-            initial,
-            hysteresis=hysteresis,
-            time_constant=time_constant,
-            sample_time=sample_time,
-        )
-        super().__init__(self.definition, schedule, v_smooth)
-
-
-class ANCFM(AdaptiveModel):
-    """Viscous friction, its constant one for each class of acceleration (TLRIP paper)."""
-
-    definition = laws.VISCOUS
-
-
-class ACFM(AdaptiveModel):
-    """Coulomb friction, F_c for each class of acceleration."""
-
-    definition = laws.COULOMB
-
-
-class ACVFM(AdaptiveModel):
-    """Coulomb plus viscous friction, F_c and F_v for each class of acceleration."""
-
-    definition = laws.COULOMB_VISCOUS
-
-
-class ALFM(AdaptiveModel):
-    """Viscous plus load-dependent Coulomb friction, B and C for each class (TLRIP paper)."""
-
-    definition = laws.LINEAR
-
-
-class ANLFM(AdaptiveModel):
-    """Five constants f_o, f_c, f_v, f_a, f_b for each class of acceleration (TLRIP paper)."""
-
-    definition = laws.NONLINEAR
-
-
-class NeuroFuzzyModel(FrictionModel):
-    """A law whose coefficients an ANFIS layer with a radial basis head gives.
-
-    Args:
-        joints: number of joints.
-        initial: constant reference from which training starts, as in `ConstantModel`.
-        v_smooth: see `FrictionModel`.
-        terms, head_units, acceleration, interpretable, prior_sd: see `NeuroFuzzy`.
-        network: `"rbf"` takes the papers' network alone (`RadialBasis`) in place of the ANFIS
-            layer with its head; `head_units` are its units, and sets it has none. `"by_class"`
-            lets the network deviate from coefficients by class (`AdaptiveNeuroFuzzy`).
-        memory: options of its `Adaptive` part.
-    """
-
-    definition: Law
-
-    def __init__(
-        self,
-        joints: int,
-        initial: Tensor | Sequence | None = None,
-        *,
-        v_smooth: float = V_SMOOTH,
-        terms: Sequence[int] = (5, 5),
-        head_units: int = 10,
-        acceleration: Literal["along_motion", "signed"] = "along_motion",
-        interpretable: bool = False,
-        prior_sd: float = PRIOR_SD,
-        network: Literal["anfis", "by_class", "rbf"] = "anfis",
-        memory: Mapping[str, float] | None = None,
-    ) -> None:
-        schedule: Schedule
-        if network == "rbf":
-            schedule = RadialBasis(
-                self.definition, joints, initial, units=head_units, acceleration=acceleration
-            )
-        elif network in ("anfis", "by_class"):
-            kind = NeuroFuzzy if network == "anfis" else AdaptiveNeuroFuzzy
-            schedule = kind(
-                self.definition,
-                joints,
-                initial,
-                terms=terms,
-                head_units=head_units,
-                acceleration=acceleration,
-                interpretable=interpretable,
-                prior_sd=prior_sd,
-            )
-        else:
-            raise ValueError(f'`network` must be "anfis", "by_class" or "rbf", got {network!r}.')
-        if isinstance(schedule, AdaptiveNeuroFuzzy) and memory is not None:
-            schedule.set_memory(**memory)
-        super().__init__(self.definition, schedule, v_smooth)
+    @staticmethod
+    def make_schedule(*args: Any, network: str = "anfis", **options: Any) -> Schedule:
+        if network not in NETWORKS:
+            raise ValueError(f"`network` must be one of {sorted(NETWORKS)}, got {network!r}.")
+        schedule: Schedule = resolve_name(NETWORKS[network])(*args, **options)
+        return schedule
 
 
 class NFNCFM(NeuroFuzzyModel):
@@ -232,25 +242,3 @@ class NFStribeck(NeuroFuzzyModel):
     """Generalised Stribeck friction with neuro-fuzzy F_c, F_d, F_v, v_s and delta."""
 
     definition = laws.STRIBECK
-
-
-NamedModel = type[ConstantModel] | type[AdaptiveModel] | type[NeuroFuzzyModel]
-
-MODELS: dict[str, NamedModel] = {
-    model.__name__: model
-    for model in (
-        NCFM, LFM, NLFM, CFM, CVFM, Stribeck, ANCFM, ALFM, ANLFM, ACFM, ACVFM,
-        NFNCFM, NFLFM, NFNLFM, NFCFM, NFCVFM, NFStribeck,
-    )
-}  # fmt: skip
-
-
-def model_by_name(name: str) -> NamedModel:
-    """The named model's class.
-
-    Raises:
-        ValueError: if no model has that name; the message lists the names.
-    """
-    if name not in MODELS:
-        raise ValueError(f"no friction model is called {name!r}; there are {', '.join(MODELS)}.")
-    return MODELS[name]

@@ -6,28 +6,55 @@ from typing import Any, Final, Literal
 import torch
 from torch import Tensor, nn
 
-from nfriction.friction.coefficients import Schedule
-from nfriction.friction.constant import Constant
+from nfriction.friction.coefficients import Constant, Schedule
 from nfriction.friction.laws import Law
-from nfriction.friction.sensitivity import FactoredSensitivity
-from nfriction.friction.smooth import fading, fading_slope, soft_positive, soft_positive_inverse
+from nfriction.friction.sensitivity import Sensitivity
 from nfriction.fuzzy import AnfisRBF
 from nfriction.fuzzy.rules import FuzzyRules
 
-# Below a thousandth of its scale a coefficient is as good as zero, and must be able to rise.
+# A coefficient below a thousandth of its scale starts there: from zero it could not rise.
 LEAST_RATIO = 1e-3
-# A third of it, and a network that is too stiff to follow large swings is wrong at smaller ones: on
-# later, smaller swings of a real pendulum it left 6.8 mrad instead of 3.0, its constant law 5.3.
+# With a third of it the network is too stiff to follow large swings, and then wrong at smaller
+# ones: on later swings of a real pendulum 6.8 mrad instead of 3.0 (its constant law: 5.3).
 PRIOR_SD = 0.3
 
 
+def smooth_relu(u: Tensor, roundness: float) -> Tensor:
+    """A positive number for every u, and u itself away from zero: `(u + sqrt(u^2 + 4 r^2)) / 2`."""
+    return 0.5 * (u + torch.sqrt(u * u + 4.0 * roundness * roundness))
+
+
+def smooth_relu_inverse(y: Tensor, roundness: float) -> Tensor:
+    """The u for which `smooth_relu(u, roundness)` is y > 0."""
+    return y - roundness * roundness / y
+
+
+def taper(beyond: Tensor, reach: float) -> Tensor:
+    """1 within a range and 0 from `reach` outside it on, `(1 - |e|^2 / reach^2)^2` between.
+
+    Args:
+        beyond: e, the distance of each input from its range, (..., input).
+        reach: positive.
+    """
+    beyond = beyond / reach
+    rest = (1.0 - (beyond * beyond).sum(-1)).clamp_min(0.0)
+    return rest * rest
+
+
+def taper_slope(beyond: Tensor, reach: float) -> Tensor:
+    """Derivative of `taper` by each input's distance from its range, (..., input)."""
+    beyond = beyond / reach
+    rest = (1.0 - (beyond * beyond).sum(-1, keepdim=True)).clamp_min(0.0)
+    return -4.0 / reach * rest * beyond
+
+
 class NeuroFuzzy(Schedule):
-    """An ANFIS layer and a radial basis head give the coefficients of a law.
+    """Coefficients from an ANFIS layer with a radial basis head.
 
     Inputs are |velocity| and acceleration, scaled to their trained range and clamped to it. The
     network's output is the deviation from a constant reference, in units of a scale; it starts at
     zero, so an untrained model *is* the constant law, and a prior around zero pulls toward it.
-    Beyond the trained range the deviation fades, and the constant law is left.
+    Beyond the trained range the deviation tapers off to the constant law.
 
     Args:
         law: the law whose coefficients these are.
@@ -35,8 +62,8 @@ class NeuroFuzzy(Schedule):
         initial: reference coefficients in SI, (joint, coefficient) or (coefficient,).
         terms: fuzzy sets of velocity and of acceleration.
         head_units: units of the radial basis head.
-        acceleration: `"along_motion"` takes qdd sgn(qd), so that both directions of turning are
-            alike; `"signed"` takes qdd as the papers do.
+        acceleration: `"along_motion"` takes qdd sgn(qd), so that friction is the same in both
+            directions; `"signed"` takes qdd as the papers do.
         interpretable: keep the sets ordered, in range and overlapping.
         prior_sd: standard deviation of the network's parameters around zero, in units of the
             coefficients' scale; a fit also tries a third of it.
@@ -45,10 +72,10 @@ class NeuroFuzzy(Schedule):
         TLRIP paper, neuro-fuzzy friction estimation (5 x 5 sets, 25 rules, 10 radial basis units).
     """
 
-    # Final, so that TorchScript takes them for constants.
+    # Final makes them constants for TorchScript.
     roundness: Final[float] = 0.005  # of the positive map, in units of a coefficient's scale
-    reach: Final[float] = 0.5  # how far beyond its trained range the network counts, in ranges
-    turn: Final[float] = 3e-3  # where qdd sgn(qd) turns, in units of the velocity's range
+    reach: Final[float] = 0.5  # distance from the trained range where it is zero, in ranges
+    turn: Final[float] = 3e-3  # width of the sign of qdd sgn(qd), in ranges of the velocity
 
     fit_strategy = "nfriction.fitting.strategy.neurofuzzy:fit_neurofuzzy"
     handles_range = True
@@ -105,29 +132,26 @@ class NeuroFuzzy(Schedule):
         return torch.stack([velocity.abs(), (qdd - self.acceleration_lower) / span], -1)
 
     def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
-        return self.deviating(self.reference, qd, qdd)
+        return self.residual_coefficients(self.reference, qd, qdd)
 
-    def deviating(self, reference: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-        """Coefficients where the network deviates from a reference in its own units."""
-        x, weight = self._seen(qd, qdd)
-        return self._coefficients(reference + weight * self.network(x))
+    def residual_coefficients(self, reference: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+        """Coefficients where the network's output is added to a reference in its own units."""
+        x, weight = self._clamped_inputs(qd, qdd)
+        return self.to_coefficients(reference + weight * self.network(x))
 
-    def _seen(self, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor]:
-        """Inputs as the network takes them, and the weight of what it says (*batch, joint, 1)."""
+    def _clamped_inputs(self, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor]:
+        """Inputs of the network, and the weight of its output (*batch, joint, 1)."""
         scaled = self.scaled(qd, qdd)
         x = scaled.clamp(0.0, 1.0)
-        return x, fading(scaled - x, self.reach).unsqueeze(-1)
+        return x, taper(scaled - x, self.reach).unsqueeze(-1)
 
-    def at_reference(self, reference: Tensor) -> Tensor:
-        """Coefficients at a reference in the network's own units, without the network."""
-        return self._coefficients(reference)
-
-    def _coefficients(self, u: Tensor) -> Tensor:
-        return self.scale * torch.where(self.positive, soft_positive(u, self.roundness), u)
+    def to_coefficients(self, u: Tensor) -> Tensor:
+        """Coefficients in SI from the network's own units."""
+        return self.scale * torch.where(self.positive, smooth_relu(u, self.roundness), u)
 
     def reference_coefficients(self) -> Tensor:
         """Coefficients of the constant law from which the network deviates, in SI."""
-        return self._coefficients(self.reference)
+        return self.to_coefficients(self.reference)
 
     def coefficient_sets(self) -> dict[str, Tensor]:
         return super().coefficient_sets() | {"reference": self.reference_coefficients().detach()}
@@ -140,7 +164,7 @@ class NeuroFuzzy(Schedule):
         # Every pair of centres is a sample, velocity's slower, all joints at once.
         v, a = (c.clamp(0.0, 1.0).T for c in centres)
         pairs = [v.repeat_interleave(self.terms[1], 0), a.repeat(self.terms[0], 1)]
-        found = self._coefficients(self.reference + self.network(torch.stack(pairs, -1)))
+        found = self.to_coefficients(self.reference + self.network(torch.stack(pairs, -1)))
         span = (upper - lower)[..., None]
         return FuzzyRules(
             lower,
@@ -157,13 +181,11 @@ class NeuroFuzzy(Schedule):
     ) -> None:
         """Set the constant law from which the network deviates.
 
-        A positive coefficient below `least` of its scale becomes so much of it.
-
         Args:
             values: coefficients in SI, (joint, coefficient).
-            scale: how far a coefficient may deviate, (joint, coefficient); at least its value,
+            scale: unit of the deviation of a coefficient, (joint, coefficient); at least its value,
                 which is also the default (1 where that is zero).
-            least: by default what lets a coefficient rise from zero in training.
+            least: smallest ratio of a positive coefficient to its scale; smaller ones are raised.
         """
         values = values.to(self.reference)
         size = values.abs()
@@ -171,7 +193,7 @@ class NeuroFuzzy(Schedule):
             size = torch.maximum(size, scale.to(size))
         self.scale.copy_(torch.where(size > 0, size, torch.ones_like(size)))
         ratio = values / self.scale
-        lifted = soft_positive_inverse(ratio.clamp_min(least), self.roundness)
+        lifted = smooth_relu_inverse(ratio.clamp_min(least), self.roundness)
         self.reference.copy_(torch.where(self.positive, lifted, ratio))
 
     @torch.no_grad()
@@ -180,7 +202,7 @@ class NeuroFuzzy(Schedule):
         velocity: Tensor | Sequence[float] | float,
         acceleration: Tensor | Sequence[float],
     ) -> None:
-        """Set the trained range, beyond which the network fades.
+        """Set the trained range, beyond which the network's output tapers off.
 
         Args:
             velocity: largest |velocity| of each joint [rad/s], (joint,) or one for all.
@@ -210,15 +232,15 @@ class NeuroFuzzy(Schedule):
         if self.along_motion:
             sign = torch.tanh(qd / self.velocity_range / self.turn)
         held = (sign * qdd).clamp(self.acceleration_lower, self.acceleration_upper)
-        # At rest the network sees no acceleration, whatever it is.
+        # At rest the network's input is zero for every acceleration.
         return qd, torch.where(sign == 0, qdd, held / sign)
 
     def trained(self) -> tuple[nn.Parameter, nn.Parameter]:
         """The parameters that a trajectory fit varies, each (joint, coefficient, ...).
 
-        They are what enters the coefficients linearly, or nearly so: the rules' planes and the
-        weights of the head. The head's bias stays at zero: the rules' constants say the same, and
-        the prior would pull but half as much on a parameter that is there twice.
+        These are the ones that enter the coefficients almost linearly: the rules' planes and the
+        weights of the head. The head's bias stays zero: it would double the rules' constants, and
+        halve the prior on them.
         """
         return self.network.anfis.consequents, self.network.head.output_weight
 
@@ -256,31 +278,29 @@ class NeuroFuzzy(Schedule):
         return torch.where(fitted, -free, vector), torch.where(fitted, free, vector)
 
     def prior(self) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation of the parameter vector."""
         vector = self.parameter_vector()
         return torch.zeros_like(vector), torch.full_like(vector, self.prior_sd)
 
-    def sensitivities(self, qd: Tensor, qdd: Tensor) -> FactoredSensitivity:
-        return self.deviating_sensitivities(self.reference, qd, qdd)
+    def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
+        return self.residual_sensitivities(self.reference, qd, qdd)
 
     @torch.no_grad()
     def slopes(self, qd: Tensor, qdd: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """Derivatives of the coefficients by the joint's own velocity and acceleration.
 
-        With x the scaled inputs, u the reference plus the network's outputs n of x clamped, times
-        their weight w, v = qd / v_max and t = tanh(v / turn), which stands for 1 where acceleration
-        is signed:
+        With x the scaled inputs, u the reference plus w n, n the network's outputs at x clamped, w
+        their weight, v = qd / v_max and t = tanh(v / turn) (1 where acceleration is signed):
 
             du/dx   = w dn/dx within the range, n dw/dx beyond it,
             dc/dqd  = dc/du (du/dx_1 sgn(v) / v_max + du/dx_2 qdd dt/dqd / span),
             dc/dqdd = dc/du du/dx_2 t / span.
 
-        The positive map s(u) with roundness r has the slope s^2 / (s^2 + r^2), which its value
-        tells.
+        The slope of s = smooth_relu(u) with roundness r is s^2 / (s^2 + r^2).
 
         Args:
             qd, qdd: shape (*batch, joint).
-            coefficients: there, (*batch, joint, coefficient).
+            coefficients: at this motion, (*batch, joint, coefficient).
+
         Returns:
             Each (*batch, joint, coefficient).
         """
@@ -303,30 +323,28 @@ class NeuroFuzzy(Schedule):
         x = scaled.clamp(0.0, 1.0)
         beyond = scaled - x
         by_x = self.network.input_jacobian(x.reshape(-1, self.joints, 2)).permute(3, 0, 1, 2)
-        weight = fading(beyond, self.reach)[..., None] * (beyond == 0.0)
-        slope = fading_slope(beyond, self.reach)
+        weight = taper(beyond, self.reach)[..., None] * (beyond == 0.0)
+        slope = taper_slope(beyond, self.reach)
         by_x = by_x.reshape(*x.shape[:-1], -1, 2) * weight[..., None, :]
         return by_x + self.network(x)[..., None] * slope[..., None, :]
 
     @torch.no_grad()
-    def deviating_sensitivities(
-        self, reference: Tensor, qd: Tensor, qdd: Tensor
-    ) -> FactoredSensitivity:
-        """Derivatives of what `deviating` gives, the reference held."""
+    def residual_sensitivities(self, reference: Tensor, qd: Tensor, qdd: Tensor) -> Sensitivity:
+        """Derivatives of `residual_coefficients` at a fixed reference."""
         anfis, head = self.network.anfis, self.network.head
-        x, weight = self._seen(qd, qdd)
+        x, weight = self._clamped_inputs(qd, qdd)
         y = anfis(x)
         both = torch.cat([x, y], -1)
         with torch.enable_grad():
             u = (reference + weight * (y + head(both))).detach().requires_grad_()
-            coefficients = self._coefficients(u)
+            coefficients = self.to_coefficients(u)
             (by_u,) = torch.autograd.grad(coefficients.sum(), u)
         by_u = by_u * weight
         own = torch.eye(y.shape[-1], dtype=y.dtype, device=y.device)
-        # The head sees the rules' outputs too.
+        # The rules' outputs are inputs of the head, too.
         by_y = head.input_jacobian(both)[:, :, x.shape[-1] :].permute(3, 0, 1, 2)
         by_qd, by_qdd = self.slopes(qd, qdd, coefficients)
-        return FactoredSensitivity(
+        return Sensitivity(
             (
                 (by_u[..., None] * (own + by_y), anfis.regressors(x)),
                 (by_u[..., None] * own, head.activations(both)),

@@ -4,9 +4,9 @@ from nfriction.fuzzy.anfis import Anfis
 from nfriction.fuzzy.anfis_rbf import AnfisRBF
 from nfriction.fuzzy.hybrid import HybridResult, hybrid_step, train_hybrid
 from nfriction.fuzzy.membership import FuzzySet, coverage, sets_from_ranges
-from nfriction.fuzzy.rbf import RBFHead, RBFNetwork
+from nfriction.fuzzy.rbf import RBFNetwork
 
 __all__ = [
-    "Anfis", "AnfisRBF", "FuzzySet", "HybridResult", "RBFHead", "RBFNetwork", "coverage",
+    "Anfis", "AnfisRBF", "FuzzySet", "HybridResult", "RBFNetwork", "coverage",
     "hybrid_step", "sets_from_ranges", "train_hybrid",
 ]  # fmt: skip

@@ -1,17 +1,20 @@
 """ANFIS: a Takagi-Sugeno layer with learnable memberships, groups (joints) stacked."""
 
+import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
-from nfriction.fuzzy import anfis_jacobian
-from nfriction.fuzzy.factored_jacobian import dense_jacobian
-from nfriction.fuzzy.layout import to_columns, to_rows
-from nfriction.fuzzy.least_squares import ridge
+from nfriction.fuzzy.grouped import LinearOutputModule, input_range, ridge, to_columns, to_rows
 from nfriction.fuzzy.membership import HALF_WIDTH_OF_GAUSSIAN, log_bell, log_gaussian
-from nfriction.fuzzy.partition import FreePartition, OrderedPartition
-from nfriction.fuzzy.placement import crossing_half_widths, even_centres, quantile_centres
+from nfriction.fuzzy.partition import (
+    FreePartition,
+    OrderedPartition,
+    crossing_half_widths,
+    even_centres,
+    quantile_centres,
+)
 
 MAX_RULES = 100_000
 
@@ -19,7 +22,7 @@ Range = float | Sequence[float] | Tensor
 """A bound of each input: what broadcasts to (groups, inputs)."""
 
 
-class Anfis(nn.Module):
+class Anfis(LinearOutputModule):
     """First-order (or zero-order) Takagi-Sugeno layer, several independent groups in one tensor.
 
     Each input has its own sets, shared by the rules; a rule picks one set of each input, so there
@@ -63,9 +66,7 @@ class Anfis(nn.Module):
         _check_sizes(groups, inputs, self.terms, outputs, order, kind)
         self.groups, self.inputs, self.outputs, self.order = groups, inputs, outputs, order
         self.kind, self.interpretable = kind, interpretable
-        self.rules = 1
-        for count in self.terms:
-            self.rules *= count
+        self.rules = math.prod(self.terms)
         partition: FreePartition | OrderedPartition = FreePartition(groups, self.terms, dtype)
         if interpretable:
             half_width = HALF_WIDTH_OF_GAUSSIAN if kind == "gaussian" else 1.0
@@ -116,19 +117,8 @@ class Anfis(nn.Module):
         """
         return to_rows(self.strength_columns(to_columns(x)), x)
 
-    def regressors(self, x: Tensor) -> Tensor:
-        """Features in which the layer is linear, shape (*batch, groups, rules * columns).
-
-        The output is their product with `consequents`, flattened over its last two dimensions.
-        """
-        strength = self.firing_strength(x)
-        if self.order == 0:
-            return strength
-        terms = torch.cat([x, torch.ones_like(x[..., :1])], -1)
-        return (strength.unsqueeze(-1) * terms.unsqueeze(-2)).flatten(-2)
-
     def rule_outputs(self, x: Tensor) -> Tensor:
-        """What each rule says on its own, shape (*batch, groups, outputs, rules)."""
+        """Output of each rule alone, shape (*batch, groups, outputs, rules)."""
         batch = x.shape[:-2]
         constants = self.consequents[..., -1].expand(batch + self.consequents.shape[:-1])
         if self.order == 0:
@@ -171,62 +161,107 @@ class Anfis(nn.Module):
         On a full grid the softmax of the summed log memberships is the product of one softmax for
         each input: the same numbers with sum(terms) exponentials instead of prod(terms).
         """
-        return self.strengths_of(self.set_shares(columns))
-
-    def set_shares(self, columns: Tensor) -> list[Tensor]:
-        """Memberships over their sum, one tensor (groups, terms, samples) for each input."""
-        return [torch.softmax(log, 1) for log in self._log_memberships(columns)]
-
-    def strengths_of(self, shares: list[Tensor]) -> Tensor:
-        """Product of one share of each input for every rule, shape (groups, rules, samples)."""
+        shares = [torch.softmax(log, 1) for log in self._log_memberships(columns)]
         strengths = shares[0]
         for own in shares[1:]:
             strengths = (strengths.unsqueeze(2) * own.unsqueeze(1)).flatten(1, 2)
         return strengths
 
-    def jacobian(self, x: Tensor) -> Tensor:
-        """Derivative of every output by every trained parameter, as solvers ask for it.
-
-        Args:
-            x: inputs, shape (samples, groups, inputs).
-        Returns:
-            Shape (samples, groups * outputs, parameters), parameters in the order of
-            `named_parameters`.
-        """
-        return dense_jacobian(self.jacobian_columns(x), self.jacobian_maps(), self.outputs)
-
-    def input_jacobian(self, x: Tensor) -> Tensor:
-        """Derivative of every output by the inputs of its group.
-
-        Args:
-            x: inputs, shape (samples, groups, inputs).
-        Returns:
-            Shape (groups, outputs, inputs, samples).
-        """
-        return anfis_jacobian.input_jacobian(self, x)[1]
-
+    @torch.no_grad()
     def regressor_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
-        """`regressors` with the samples last, (groups, regressors, samples), written to `out`."""
-        return anfis_jacobian.regressor_columns(self, x, out)
+        """Each rule's strength times the inputs and 1, (groups, rules * columns, samples)."""
+        u = to_columns(x)
+        count = self.rules * self.consequents.shape[-1]
+        out = u.new_empty(u.shape[0], count, u.shape[2]) if out is None else out
+        self._write_regressors(out, self.strength_columns(u), self._terms(u))
+        return out
 
+    @torch.no_grad()
     def jacobian_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
-        """What the derivatives of all outputs combine, first the regressors.
+        """The regressors, then for each output Q h, Q h z and, for bells, Q dlog m / dlog b.
+
+        With normalised strengths s_r = prod_i p_i[t_i(r)] and rule outputs f_kr, the output y_k
+        moves with the log membership of set t of input i by
+
+            Q_kit = sum over the rules r that use the set of s_r f_kr - p_i[t] y_k,
+
+        and the log memberships with z = (x - c)/a: by -h, where h = z for Gaussians.
 
         Args:
             x: inputs, shape (samples, groups, inputs).
-            out: where to write the result, its shape; fresh memory costs more than the arithmetic.
+            out: of the result's shape; fresh memory costs more than the arithmetic.
         Returns:
-            Shape (groups, columns, samples).
+            Shape (groups, regressors + outputs * (2 or 3) sets, samples).
         """
-        return anfis_jacobian.jacobian_columns(self, x, out)
+        u = to_columns(x)
+        shared, own = self._column_counts
+        shape = (u.shape[0], shared + self.outputs * own, u.shape[2])
+        F = u.new_empty(shape) if out is None else out
+        strengths, terms = self.strength_columns(u), self._terms(u)
+        self._write_regressors(F[:, :shared], strengths, terms)
+        z, h, by_slope = self._premises(u)
+        # The strengths' sums over the rules that use a set are the sets' shares p.
+        uses = _incidence(self.terms).to(u)
+        shares = uses @ strengths
+        sets = F[:, shared:].unflatten(1, (self.outputs, own // z.shape[1], z.shape[1]))
+        for k in range(self.outputs):
+            weighted = torch.bmm(self.consequents[:, k], terms).mul_(strengths)
+            Q = (uses @ weighted).addcmul_(shares, weighted.sum(1, keepdim=True), value=-1.0)
+            torch.mul(Q, h, out=sets[:, k, 0])
+            torch.mul(sets[:, k, 0], z, out=sets[:, k, 1])
+            if by_slope is not None:
+                torch.mul(Q, by_slope, out=sets[:, k, 2])
+        return F
+
+    @torch.no_grad()
+    def jacobian_maps(self) -> dict[str, Tensor]:
+        """By name of each trained parameter (groups, outputs, columns, entries of a group)."""
+        shared, own = self._column_counts
+        output, regressor = (torch.eye(n).to(self.consequents) for n in (self.outputs, shared))
+        blocks = {"consequents": (0, torch.einsum("ab,uv->aubv", output, regressor).flatten(2))}
+        sets = {f"partition.{name}": rows for name, rows in self.partition.jacobian().items()}
+        slopes = torch.eye(sum(self.terms)).to(output).expand(self.groups, -1, -1)
+        # d (centres, widths, slopes), of which each output has columns of its own.
+        if self.log_slopes is not None:
+            sets["log_slopes"] = torch.cat([torch.zeros_like(slopes).repeat(1, 2, 1), slopes], 1)
+        for name, rows in sets.items():
+            padded = torch.nn.functional.pad(rows, (0, 0, 0, own - rows.shape[1]))
+            block = torch.einsum("ab,gce->gabce", output, padded).flatten(2, 3)
+            blocks[name] = shared, block
+        return self._placed(blocks, shared + self.outputs * own)
 
     def readout(self) -> Tensor:
-        """The consequents as (groups, outputs, regressors): outputs of the first columns."""
+        """The consequents as (groups, outputs, regressors)."""
         return self.consequents.flatten(2)
 
-    def jacobian_maps(self) -> dict[str, Tensor]:
-        """How `jacobian_columns` combine, (groups, outputs, columns, entries of a group)."""
-        return anfis_jacobian.jacobian_maps(self)
+    @property
+    def _column_counts(self) -> tuple[int, int]:
+        """Shared columns of the consequents, and columns of the sets for each output."""
+        shared = self.rules * self.consequents.shape[-1]
+        return shared, (2 if self.log_slopes is None else 3) * sum(self.terms)
+
+    def _terms(self, u: Tensor) -> Tensor:
+        """Factors of a rule's consequents: the inputs and 1, or 1."""
+        one = torch.ones_like(u[:, :1])
+        return torch.cat([u, one], 1) if self.order == 1 else one
+
+    def _write_regressors(self, out: Tensor, strengths: Tensor, terms: Tensor) -> None:
+        by_rule = out.unflatten(1, (strengths.shape[1], terms.shape[1]))
+        torch.mul(strengths.unsqueeze(2), terms.unsqueeze(1), out=by_rule)
+
+    def _premises(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """z, h = -dlog m/dz and, for bells, dlog m/dlog b, each (groups, sets, samples)."""
+        centres, widths = (part.unsqueeze(-1) for part in self.sets())
+        z = torch.repeat_interleave(u, torch.tensor(self.terms, device=u.device), 1)
+        z = z.sub_(centres).div_(widths)
+        if self.log_slopes is None:
+            return z, z, None
+        slope = torch.exp(self.log_slopes).unsqueeze(-1)
+        one = torch.ones_like(slope)
+        outside = -slope * torch.expm1(log_bell(z, 0.0 * one, one, slope))
+        # The same hair above zero as in the membership.
+        square = z * z + 1e-37
+        return z, 2.0 * outside * z / square, -outside * square.log()
 
     def init_grid(self, lower: Range, upper: Range) -> None:
         """Evenly spaced sets from `lower` to `upper`, neighbours crossing at 0.5.
@@ -240,7 +275,7 @@ class Anfis(nn.Module):
         self._take_crossing(even_centres(self.terms, low, high), low, high)
 
     def init_from_data(self, x: Tensor) -> None:
-        """Sets where the samples are: centres half way between quantiles and an even grid.
+        """Place sets by the samples: centres half way between quantiles and an even grid.
 
         Quantiles alone would pile the sets up where a recording rests. Neighbours cross at 0.5 or
         a little more.
@@ -291,7 +326,7 @@ class Anfis(nn.Module):
 
     @torch.no_grad()
     def init_constant(self, values: Tensor) -> None:
-        """Make every rule say `values`, broadcastable to (groups, outputs): a constant layer."""
+        """Give every rule the output `values`, broadcastable to (groups, outputs)."""
         self.consequents.zero_()
         self.consequents[..., -1] = values.unsqueeze(-1)
 
@@ -310,11 +345,11 @@ class Anfis(nn.Module):
             y: wanted outputs, shape (*batch, groups, outputs).
             prior_precision: over the noise precision, a number or broadcastable to (groups,
                 rules * columns). The default is that of the recursive least squares of Jang's
-                paper, which starts from a covariance of 1e6. With 0, what the samples do not
-                determine stays at the prior.
+                paper, which starts from a covariance of 1e6. With 0, undetermined directions stay
+                at the prior.
             prior: consequents to shrink toward, broadcastable to theirs; default zero.
         Raises:
-            ValueError: if the samples are none or not finite.
+            ValueError: no samples, or samples that are not finite.
         """
         features = self.regressors(x).reshape(-1, self.groups, self.consequents[0, 0].numel())
         targets = y.reshape(-1, self.groups, self.outputs)
@@ -324,22 +359,10 @@ class Anfis(nn.Module):
         self.consequents.copy_(weights.mT.reshape(self.consequents.shape))
 
     def _range(
-        self,
-        lower: Range,
-        upper: Range,
-        allow_equal: bool = False,
+        self, lower: Range, upper: Range, *, allow_equal: bool = False
     ) -> tuple[Tensor, Tensor]:
-        like = self.consequents.detach()
-        low = torch.as_tensor(lower, dtype=like.dtype, device=like.device)
-        high = torch.as_tensor(upper, dtype=like.dtype, device=like.device)
-        low, high = low.expand(self.groups, self.inputs), high.expand(self.groups, self.inputs)
-        sound = (high >= low) if allow_equal else (high > low)
-        if not bool((sound & torch.isfinite(high - low)).all()):
-            raise ValueError(
-                f"every input needs a finite range with `lower` < `upper`, got {low.tolist()} and "
-                f"{high.tolist()}; an input that never varies should be left out."
-            )
-        return low, high
+        like = self.consequents.detach().new_empty(self.groups, self.inputs)
+        return input_range(lower, upper, like, allow_equal=allow_equal)
 
     def _pack(self, name: str, pieces: Sequence[Tensor]) -> Tensor:
         shapes = [tuple(piece.shape) for piece in pieces]
@@ -376,12 +399,17 @@ def _check_sizes(
         raise ValueError(
             f"`terms` needs a positive number of sets for each of {inputs} inputs, got {terms}."
         )
-    rules = 1
-    for count in terms:
-        rules *= count
+    rules = math.prod(terms)
     if rules > MAX_RULES:
         raise ValueError(f"{terms} sets make {rules} rules, more than {MAX_RULES}; use fewer sets.")
     if order not in (0, 1):
         raise ValueError(f"`order` is 0 (constant consequents) or 1 (linear ones), got {order}.")
     if kind not in ("gaussian", "bell"):
         raise ValueError(f'`kind` is "gaussian" or "bell", got {kind!r}.')
+
+
+def _incidence(terms: list[int]) -> Tensor:
+    """1 where a rule uses a set, shape (sets, rules); the last input's set runs fastest."""
+    choice = torch.cartesian_prod(*(torch.arange(n) for n in terms)).reshape(-1, len(terms))
+    rows = [torch.nn.functional.one_hot(choice[:, i], n).T for i, n in enumerate(terms)]
+    return torch.cat(rows)

@@ -5,16 +5,15 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from nfriction.fuzzy import anfis_jacobian
 from nfriction.fuzzy.anfis import Anfis
-from nfriction.fuzzy.layout import to_columns
-from nfriction.fuzzy.rbf import RBFHead
+from nfriction.fuzzy.grouped import GroupedModule, input_range
+from nfriction.fuzzy.rbf import RBFNetwork
 
 
-class AnfisRBF(nn.Module):
+class AnfisRBF(GroupedModule):
     """ANFIS layer plus an RBF head on [inputs, ANFIS outputs] that adds a correction.
 
-    The ANFIS carries the fit, the head refines it; a fresh head is zero.
+    The ANFIS carries the fit, the head refines it; the output of a fresh head is zero.
 
     Args:
         groups, inputs, terms, outputs, order, kind, interpretable: of the layer, see `Anfis`.
@@ -48,49 +47,14 @@ class AnfisRBF(nn.Module):
             interpretable=interpretable,
             dtype=dtype,
         )
-        self.head = RBFHead(groups, inputs + outputs, units, outputs, seed=seed, dtype=dtype)
+        self.head = RBFNetwork(groups, inputs + outputs, units, outputs, seed=seed, dtype=dtype)
+        # A fresh head changes nothing.
+        nn.init.zeros_(self.head.output_weight)
 
     def forward(self, x: Tensor) -> Tensor:
         """Outputs, shape (*batch, groups, outputs), of inputs (*batch, groups, inputs)."""
         y = self.anfis(x)
         return y + self.head(torch.cat([x, y], -1))
-
-    @torch.no_grad()
-    def jacobian(self, x: Tensor) -> Tensor:
-        """Derivative of every output by every trained parameter, as solvers ask for it.
-
-        Args:
-            x: inputs, shape (samples, groups, inputs).
-        Returns:
-            Shape (samples, groups * outputs, parameters), parameters in the order of
-            `named_parameters`.
-        """
-        y = self.anfis(x)
-        seen = torch.cat([x, y], -1)
-        # (groups, outputs, parameter, sample): what the layer says, and through the head again.
-        said = self.anfis.jacobian(x).permute(1, 2, 0).unflatten(0, (self.groups, self.outputs))
-        by_input = self.head.input_jacobian(seen)[:, :, self.inputs :]
-        J = said.clone()
-        for j in range(self.outputs):
-            J.addcmul_(by_input[:, :, j].unsqueeze(2), said[:, j].unsqueeze(1))
-        head = self.head.jacobian(seen).permute(1, 2, 0)
-        return torch.cat([J.flatten(0, 1), head], 1).permute(2, 0, 1)
-
-    @torch.no_grad()
-    def input_jacobian(self, x: Tensor) -> Tensor:
-        """Derivative of every output by the inputs of its group.
-
-        Args:
-            x: inputs, shape (samples, groups, inputs).
-        Returns:
-            Shape (groups, outputs, inputs, samples).
-        """
-        y, said = anfis_jacobian.input_jacobian(self.anfis, x)
-        through = self.head.input_jacobian(torch.cat([to_columns(x), y], 1).movedim(-1, 0))
-        found = said + through[:, :, : self.inputs]
-        for j in range(self.outputs):
-            found.addcmul_(through[:, :, self.inputs + j].unsqueeze(2), said[:, j].unsqueeze(1))
-        return found
 
     def init_grid(self, lower: float | Tensor, upper: float | Tensor, seed: int = 0) -> None:
         """Even sets over the inputs' range, the head's centres drawn from it (outputs: ±1).
@@ -100,23 +64,18 @@ class AnfisRBF(nn.Module):
             seed: of the head's centres.
         """
         self.anfis.init_grid(lower, upper)
-        like = self.anfis.consequents.detach()
-        ones = like.new_ones(self.groups, self.outputs)
-        low = torch.as_tensor(lower, dtype=like.dtype, device=like.device).expand(
-            self.groups, self.inputs
-        )
-        high = torch.as_tensor(upper, dtype=like.dtype, device=like.device).expand(
-            self.groups, self.inputs
-        )
+        centres = self.head.centres[:, 0].detach()
+        low, high = input_range(lower, upper, centres[:, : self.inputs])
+        ones = torch.ones_like(centres[:, self.inputs :])
         self.head.init_range(torch.cat([low, -ones], 1), torch.cat([high, ones], 1), seed)
 
     @torch.no_grad()
     def init_head(self, x: Tensor, seed: int = 0) -> None:
-        """Place the head's units where the samples `x` lead; its output stays as it is."""
+        """Place the head's units by the samples `x`; its output layer stays unchanged."""
         self.head.init_kmeans(torch.cat([x, self.anfis(x)], -1), seed)
 
     @torch.no_grad()
     def solve_head(self, x: Tensor, y: Tensor, prior_precision: float | Tensor = 1e-6) -> None:
-        """Least squares of the head's output layer on what the ANFIS leaves of `y`."""
+        """Least squares of the head's output layer on the ANFIS's residual of `y`."""
         carried = self.anfis(x)
         self.head.solve_output(torch.cat([x, carried], -1), y - carried, prior_precision)

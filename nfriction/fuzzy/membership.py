@@ -1,4 +1,4 @@
-"""Fuzzy sets: membership functions, the sets a range of values stands for, and their coverage.
+"""Fuzzy sets: membership functions, sets from printed ranges, and their coverage.
 
 The functions work elementwise on tensors of any shape that broadcast, keep dtype and device, and
 script. Those that begin with `log_` stay finite where the membership itself underflows.
@@ -160,9 +160,9 @@ class FuzzySet:
 def sets_from_ranges(
     names: Sequence[str], ranges: Sequence[tuple[float, float]]
 ) -> tuple[FuzzySet, ...]:
-    """Gaussian sets from the range [low, high] that each of them is said to span.
+    """Gaussian sets from the range [low, high] that each of them spans.
 
-    A table of ranges does not tell the shape. Chosen here: an interior set is centred in its range
+    A table of ranges leaves the shape open. Chosen here: an interior set is centred in its range
     with sigma = range/4, so that it has fallen to 0.135 at the ends; the first and last sets are
     shoulders at the outer end of their range with sigma = range/2, so that they fall to the same
     0.135 at the inner end.

@@ -28,9 +28,22 @@ class FreePartition(nn.Module):
 
     @torch.no_grad()
     def assign(self, centres: Tensor, widths: Tensor, lower: Tensor, upper: Tensor) -> None:
-        """Take these sets over, shape (groups, sets); the ranges are not needed."""
+        """Take sets over, shape (groups, sets); the ranges are not needed."""
         self.centres.copy_(centres)
         self.log_widths.copy_(widths.log())
+
+    @torch.no_grad()
+    def jacobian(self) -> dict[str, Tensor]:
+        """d (centres, widths) / d parameter over the width, (groups, 2 sets, sets), by name.
+
+        Written out: the first automatic derivative of a process takes two seconds to load.
+        """
+        inverse = torch.exp(-self.log_widths)
+        zero = torch.zeros_like(inverse).diag_embed()
+        return {
+            "centres": torch.cat([inverse.diag_embed(), zero], 1),
+            "log_widths": torch.cat([zero, torch.ones_like(inverse).diag_embed()], 1),
+        }
 
 
 class OrderedPartition(nn.Module):
@@ -92,7 +105,7 @@ class OrderedPartition(nn.Module):
 
     @torch.no_grad()
     def assign(self, centres: Tensor, widths: Tensor, lower: Tensor, upper: Tensor) -> None:
-        """Take the nearest ordered partition over: bounds that are met or broken are kept by 2 %.
+        """Take the nearest ordered partition over; bounds are kept by a margin of 2 %.
 
         Args:
             centres, widths: shape (groups, sets).
@@ -116,3 +129,60 @@ class OrderedPartition(nn.Module):
             self.log_widths[:, start : start + terms] = half.log()
             self.spacings[:, start + i : start + i + terms + 1] = torch.logit(share)
             start += terms
+
+    @torch.no_grad()
+    def jacobian(self) -> dict[str, Tensor]:
+        """d (centres, widths) / d parameter over the width, (groups, 2 sets, entries), by name."""
+        parameters = {name: value.detach() for name, value in self.named_parameters()}
+
+        def sets(values: dict[str, Tensor]) -> Tensor:
+            return torch.cat(torch.func.functional_call(self, values, ()), 1)
+
+        found = torch.func.jacrev(sets)(parameters)
+        widths = self()[1].repeat(1, 2).unsqueeze(-1)
+        # A group's sets depend on its own parameters only.
+        return {n: J.diagonal(dim1=0, dim2=2).movedim(-1, 0) / widths for n, J in found.items()}
+
+
+def even_centres(terms: list[int], lower: Tensor, upper: Tensor) -> list[Tensor]:
+    """Centres from `lower` to `upper` (groups, inputs); for each input (groups, terms)."""
+    centres = []
+    for i, count in enumerate(terms):
+        low, span = lower[:, i, None], (upper - lower)[:, i, None]
+        centres.append(low + span * _fractions(count).to(lower))
+    return centres
+
+
+def quantile_centres(terms: list[int], samples: Tensor) -> list[Tensor]:
+    """Evenly spaced quantiles of samples (samples, groups, inputs), extremes included."""
+    centres = []
+    for i, count in enumerate(terms):
+        # By sorting, since `torch.quantile` refuses large inputs.
+        ascending = samples[:, :, i].sort(0).values
+        ranks = (_fractions(count) * (len(ascending) - 1)).round().long()
+        centres.append(ascending[ranks.to(samples.device)].T)
+    return centres
+
+
+def crossing_half_widths(centres: list[Tensor], span: Tensor) -> list[Tensor]:
+    """Half-widths by which neighbours overlap at 0.5 or more: half of the wider adjacent gap.
+
+    Args:
+        centres: for each input, ascending, shape (groups, terms).
+        span: of each input (groups, inputs); a set alone gets half of it.
+    """
+    half_widths = []
+    for i, c in enumerate(centres):
+        if c.shape[1] == 1:
+            half_widths.append(0.5 * span[:, i, None])
+        else:
+            gaps = c.diff(dim=1)
+            padded = torch.cat([gaps[:, :1], gaps, gaps[:, -1:]], 1)
+            half_widths.append(0.5 * torch.maximum(padded[:, :-1], padded[:, 1:]))
+    return half_widths
+
+
+def _fractions(count: int) -> Tensor:
+    if count == 1:
+        return torch.full((1,), 0.5, dtype=torch.float64)
+    return torch.linspace(0, 1, count, dtype=torch.float64)

@@ -1,17 +1,17 @@
-"""Radial basis functions: the paper's 2-10-2 network, and the head on an ANFIS layer."""
+"""Radial basis functions, such as the paper's 2-10-2 network."""
 
 from typing import Final
 
 import torch
 from torch import Tensor, nn
 
-from nfriction.fuzzy.factored_jacobian import dense_jacobian, trained
-from nfriction.fuzzy.layout import to_columns, to_rows
-from nfriction.fuzzy.least_squares import ridge
-from nfriction.fuzzy.radial_centres import kmeans_centres, nearest_spread, selected_centres
+from nfriction.fuzzy.grouped import LinearOutputModule, input_range, ridge, to_columns, to_rows
+
+# Orthogonal least squares takes so many evenly thinned candidates and samples.
+_CANDIDATES, _SAMPLES = 500, 5000
 
 
-class RBFNetwork(nn.Module):
+class RBFNetwork(LinearOutputModule):
     """Gaussian units with a width per axis and a linear output layer, groups stacked.
 
     `y = output_weight · exp(-Σ_i ((x_i - c_i)/s_i)^2 / 2) + output_bias`. A fresh network has its
@@ -31,7 +31,7 @@ class RBFNetwork(nn.Module):
         TLRIP paper, section on the neuro-fuzzy models (2-10-2).
     """
 
-    # A unit 24 widths away says 5e-131, as good as nothing. Numbers that underflow would cost fifty
+    # A unit 24 widths away gives 5e-131, nearly nothing. Numbers that underflow would cost fifty
     # times the arithmetic, in the exponential and again in every product.
     least_exponent: Final[float] = -300.0
 
@@ -75,43 +75,9 @@ class RBFNetwork(nn.Module):
         """Outputs of the Gaussian units, shape (*batch, groups, units)."""
         return to_rows(self._activations(x), x)
 
-    def regressors(self, x: Tensor) -> Tensor:
-        """Features in which the output is linear: the units and 1, (*batch, groups, units + 1)."""
-        return torch.cat([self.activations(x), torch.ones_like(x[..., :1])], -1)
-
-    def jacobian(self, x: Tensor) -> Tensor:
-        """Derivative of every output by every trained parameter, as solvers ask for it.
-
-        Args:
-            x: inputs, shape (samples, groups, inputs).
-        Returns:
-            Shape (samples, groups * outputs, parameters), parameters in the order of
-            `named_parameters`.
-        """
-        return dense_jacobian(self.jacobian_columns(x), self.jacobian_maps(), self.outputs)
-
-    @torch.no_grad()
-    def input_jacobian(self, x: Tensor) -> Tensor:
-        """Derivative of every output by the inputs of its group.
-
-        Args:
-            x: inputs, shape (samples, groups, inputs).
-        Returns:
-            Shape (groups, outputs, inputs, samples).
-        """
-        phi, precision = self._activations(x), torch.exp(-2.0 * self.log_widths)
-
-        def weighted(factor: Tensor) -> Tensor:
-            rows = (self.output_weight.unsqueeze(2) * factor.mT.unsqueeze(1)).flatten(1, 2)
-            return torch.bmm(rows, phi).unflatten(1, (self.outputs, self.inputs))
-
-        # phi (c - x) / s^2, split so that each part is one product of matrices.
-        moved = weighted(precision).mul_(to_columns(x).unsqueeze(1))
-        return weighted(self.centres * precision).sub_(moved)
-
     @torch.no_grad()
     def regressor_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
-        """`regressors` with the samples last, (groups, units + 1, samples), written to `out`."""
+        """The units and 1, (groups, units + 1, samples), written to `out`."""
         constant, quadratic, powers = self._expanded(x)
         if out is None:
             out = powers.new_empty(len(powers), self.units + 1, powers.shape[2])
@@ -122,13 +88,11 @@ class RBFNetwork(nn.Module):
 
     @torch.no_grad()
     def jacobian_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
-        """What the derivatives of all outputs combine: the regressors, phi d and phi d^2.
-
-        Here d = x - c. `jacobian_maps` says how they combine.
+        """The regressors, phi d and phi d^2 with d = x - c.
 
         Args:
             x: inputs, shape (samples, groups, inputs).
-            out: where to write the result, its shape; fresh memory costs more than the arithmetic.
+            out: of the result's shape; fresh memory costs more than the arithmetic.
         Returns:
             Shape (groups, units + 1 + 2 units inputs, samples).
         """
@@ -138,7 +102,7 @@ class RBFNetwork(nn.Module):
         moving = F[:, shared:].unflatten(1, (2, self.units, self.inputs))
         d = torch.sub(columns.unsqueeze(1), self.centres.unsqueeze(-1), out=moving[:, 0])
         squares = torch.mul(d, d, out=moving[:, 1])
-        # The differences are asked for anyway, so that the exponents take nothing else.
+        # The exponents need nothing but these differences.
         factor = -0.5 * torch.exp(-2.0 * self.log_widths).unsqueeze(-1)
         phi = torch.mul(squares[:, :, 0], factor[:, :, 0], out=F[:, : self.units])
         for i in range(1, self.inputs):
@@ -149,19 +113,13 @@ class RBFNetwork(nn.Module):
         return F
 
     def readout(self) -> Tensor:
-        """The output layer, (groups, outputs, units + 1): outputs of the first columns."""
+        """Weights and bias, (groups, outputs, units + 1)."""
         return torch.cat([self.output_weight, self.output_bias.unsqueeze(-1)], -1)
 
     @torch.no_grad()
     def jacobian_maps(self) -> dict[str, Tensor]:
-        """How `jacobian_columns` combine to the derivatives by each trained parameter.
-
-        d y_k = sum_u w_ku (phi d / s^2 dc + phi d^2 / s^2 dlog s) + phi_u dw_ku + db_k.
-
-        Returns:
-            For each trained parameter (groups, outputs, columns, entries of a group).
-        """
-        groups, units, inputs = self.centres.shape
+        """d y_k = sum_u w_ku (phi d / s^2 dc + phi d^2 / s^2 dlog s) + phi_u dw_ku + db_k."""
+        units, inputs = self.units, self.inputs
         moving, columns = units * inputs, (2 * inputs + 1) * units + 1
         weight = self.output_weight.detach().repeat_interleave(inputs, 2)
         slope = torch.diag_embed(weight * torch.exp(-2.0 * self.log_widths).flatten(1).unsqueeze(1))
@@ -172,24 +130,16 @@ class RBFNetwork(nn.Module):
             "output_weight": (0, torch.einsum("ab,uv->aubv", own, one).flatten(2)),
             "output_bias": (units, own.unsqueeze(1)),
         }
-        maps = {}
-        for name in trained(self):
-            start, block = blocks[name]
-            maps[name] = weight.new_zeros(groups, self.outputs, columns, block.shape[-1])
-            maps[name][:, :, start : start + block.shape[-2]] = block
-        return maps
+        return self._placed(blocks, columns)
 
     def _activations(self, x: Tensor) -> Tensor:
         """Units' outputs, shape (groups, units, samples)."""
-        return torch.exp(self._exponents(x))
-
-    def _exponents(self, x: Tensor) -> Tensor:
-        """Logarithms of the units' outputs, shape (groups, units, samples)."""
         constant, quadratic, powers = self._expanded(x)
-        return torch.baddbmm(constant, quadratic, powers).clamp(min=self.least_exponent)
+        exponents = torch.baddbmm(constant, quadratic, powers).clamp(min=self.least_exponent)
+        return torch.exp(exponents)
 
     def _expanded(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Constants, coefficients and powers of the inputs whose product the exponents are.
+        """Constants, coefficients and powers of the inputs: the exponents as a product.
 
         The square is expanded into a product of matrices, 12 times faster on 40,000 samples than
         differences of every sample and centre. Taken about the mean centre it costs digits only by
@@ -216,22 +166,10 @@ class RBFNetwork(nn.Module):
             lower, upper: range of each input, broadcastable to (groups, inputs).
             seed: of the draw.
         """
-        like = self.centres[:, 0].detach()
-        low = (
-            torch.as_tensor(lower, dtype=like.dtype, device=like.device)
-            .expand_as(like)
-            .unsqueeze(1)
-        )
-        span = (
-            torch.as_tensor(upper, dtype=like.dtype, device=like.device)
-            .expand_as(like)
-            .unsqueeze(1)
-            - low
-        )
-        if not bool(((span > 0) & torch.isfinite(span)).all()):
-            raise ValueError("every input needs a finite range with `lower` < `upper`.")
+        low, high = input_range(lower, upper, self.centres[:, 0].detach())
+        low, span = low.unsqueeze(1), (high - low).unsqueeze(1)
         random = torch.Generator().manual_seed(seed)
-        drawn = torch.rand(self.centres.shape, generator=random, dtype=torch.float64).to(like)
+        drawn = torch.rand(self.centres.shape, generator=random, dtype=torch.float64).to(low)
         self.centres.copy_(low + span * drawn)
         self.log_widths.copy_((0.5 * span).log().expand_as(self.centres))
 
@@ -246,9 +184,9 @@ class RBFNetwork(nn.Module):
         """
         samples = self._samples(x)
         for group in range(self.groups):
-            centres = kmeans_centres(samples[:, group], self.units, seed)
+            centres = _kmeans(samples[:, group], self.units, seed)
             self.centres[group] = centres
-            self.log_widths[group] = nearest_spread(centres, samples[:, group], overlap).log()
+            self.log_widths[group] = _nearest_spread(centres, samples[:, group], overlap).log()
 
     @torch.no_grad()
     def init_ols(self, x: Tensor, y: Tensor, width: float = 1.5) -> None:
@@ -263,7 +201,7 @@ class RBFNetwork(nn.Module):
         targets = y.reshape(-1, self.groups, self.outputs)
         for group in range(self.groups):
             scale = width * samples[:, group].std(0)
-            centres = selected_centres(samples[:, group], targets[:, group], self.units, scale)
+            centres = _selected(samples[:, group], targets[:, group], self.units, scale)
             self.centres[group] = centres
             self.log_widths[group] = scale.log().expand_as(centres)
 
@@ -302,18 +240,59 @@ class RBFNetwork(nn.Module):
         return samples
 
 
-class RBFHead(RBFNetwork):
-    """An RBF network that begins as zero: adding it to a model changes nothing at the start."""
+def _kmeans(samples: Tensor, units: int, seed: int) -> Tensor:
+    """Centres of `units` clusters, shape (units, inputs), inputs weighed by their deviation."""
+    from scipy.cluster.vq import kmeans2  # slow to import, and seldom needed
 
-    def __init__(
-        self,
-        groups: int,
-        inputs: int,
-        units: int = 10,
-        outputs: int = 2,
-        *,
-        seed: int = 0,
-        dtype: torch.dtype = torch.float64,
-    ) -> None:
-        super().__init__(groups, inputs, units, outputs, seed=seed, dtype=dtype)
-        nn.init.zeros_(self.output_weight)
+    scale = samples.std(0)
+    centres, _ = kmeans2((samples / scale).cpu().numpy(), units, iter=50, minit="++", seed=seed)
+    return torch.as_tensor(centres).to(samples) * scale
+
+
+def _nearest_spread(centres: Tensor, samples: Tensor, overlap: float, nearest: int = 2) -> Tensor:
+    """Widths proportional to the mean distance to the nearest other centres, (units, inputs).
+
+    Distances are in units of each input's standard deviation.
+    """
+    scale = samples.std(0)
+    if len(centres) == 1:
+        return overlap * scale.expand_as(centres)
+    distance = torch.cdist(centres / scale, centres / scale)
+    # The smallest distance is that of a centre to itself.
+    spread = distance.sort(1).values[:, 1 : nearest + 1].mean(1, keepdim=True)
+    return overlap * spread.clamp(min=1e-3) * scale
+
+
+def _selected(samples: Tensor, targets: Tensor, units: int, widths: Tensor) -> Tensor:
+    """Samples chosen one by one so that each explains the most of the targets' residual.
+
+    References:
+        Chen, Cowan and Grant (1991), Orthogonal least squares learning algorithm for radial basis
+        function networks, IEEE Transactions on Neural Networks 2(2), eqs. (22)-(30).
+    """
+    samples, targets = _thin(samples, _SAMPLES), _thin(targets, _SAMPLES)
+    candidates = _thin(samples, _CANDIDATES)
+    columns = torch.exp(-0.5 * torch.cdist(samples / widths, candidates / widths) ** 2)
+    power = (columns**2).sum(0)
+    columns, left = columns - columns.mean(0), targets - targets.mean(0)
+    left = left / left.norm(dim=0).clamp(min=torch.finfo(left.dtype).tiny)
+    chosen: list[int] = []
+    for _ in range(units):
+        energy = (columns**2).sum(0)
+        gain = ((columns.T @ left) ** 2).sum(1) / energy.clamp(min=torch.finfo(left.dtype).tiny)
+        # The rest of a direction that the chosen units span is rounding noise.
+        gain[energy < 1e-10 * power] = -1.0
+        gain[chosen] = -2.0
+        best = int(gain.argmax())
+        chosen.append(best)
+        direction = columns[:, best : best + 1] / energy[best].sqrt()
+        columns = columns - direction @ (direction.T @ columns)
+        left = left - direction @ (direction.T @ left)
+    return candidates[chosen]
+
+
+def _thin(rows: Tensor, most: int) -> Tensor:
+    if len(rows) <= most:
+        return rows
+    picks = torch.linspace(0, len(rows) - 1, most, dtype=torch.float64, device=rows.device)
+    return rows[picks.round().long()]

@@ -1,7 +1,13 @@
-"""Saving and loading: one JSON file holds the parameters and what is needed to use them safely."""
+"""Model files: one JSON file holds the parameters and what is needed to use them safely.
 
+A file is checked for form, size and damage before a model is made of it; no code in it is run.
+"""
+
+import hashlib
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -9,16 +15,42 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nfriction.friction.model import FrictionModel
-from nfriction.friction.models import MODELS, model_by_name
+from nfriction.friction.models import FrictionModel
+from nfriction.friction.registry import model_by_name, model_names
+from nfriction.io import strict_json
 from nfriction.io.atomic import write_atomically
-from nfriction.io.model_content import ModelFileError, checksum_of, read_model_file, short
-from nfriction.io.model_info import ModelInfo, describe
+from nfriction.io.model_info import FORMAT, SCHEMA, ModelInfo, describe
 from nfriction.plant import Plant
 from nfriction.plant.rigfile import from_dict
 
-# What building a mechanism from foreign JSON may raise.
+# A neuro-fuzzy model of ten joints takes less than a megabyte.
+LARGEST_FILE = 64 * 2**20
+MOST_JOINTS, DEEPEST = 1000, 32
+# Errors of building a mechanism from foreign JSON.
 _UNFIT = (ValueError, TypeError, AttributeError, RuntimeError, OverflowError)
+# Type of every entry, by key.
+_ENTRIES: dict[str, type | tuple[type, ...]] = {
+    "model": str,
+    "law": str,
+    "joints": int,
+    "v_smooth": float,
+    "options": dict,
+    "coefficients": list,
+    "parameter_hash": str,
+    "joint_names": list,
+    "unit": str,
+    "sample_time": (float, int, type(None)),
+    "input_ranges": dict,
+    "training_data": dict,
+    "rig": (dict, type(None)),
+    "fit": dict,
+    "state": dict,
+    "checksum": str,
+}
+
+
+class ModelFileError(ValueError):
+    """A model file is absent, damaged or no model file."""
 
 
 def save(model: FrictionModel, path: str | Path, info: ModelInfo | None = None) -> Path:
@@ -27,14 +59,14 @@ def save(model: FrictionModel, path: str | Path, info: ModelInfo | None = None) 
     Args:
         model: a friction model.
         path: file to write; an existing one is replaced, missing folders are made.
-        info: what to say of the model besides its parameters.
+        info: facts about the model besides its parameters.
 
     Returns:
         The path.
 
     Raises:
-        ValueError: if a parameter is not finite, or `info` is not plain JSON.
-        OSError: if the file cannot be written.
+        ValueError: a parameter is not finite, or `info` is not plain JSON.
+        OSError: the file cannot be written.
     """
     state = model.state_dict()
     for name, value in state.items():
@@ -43,100 +75,146 @@ def save(model: FrictionModel, path: str | Path, info: ModelInfo | None = None) 
     content = describe(model, info or ModelInfo())
     content["state"] = {name: value.tolist() for name, value in state.items()}
     try:
-        # Once through JSON, so that the checksum sees what a reader will see.
+        # Through JSON, so that the checksum is of what a reader will see.
         content = json.loads(json.dumps(content, allow_nan=False))
     except (TypeError, ValueError) as error:
         raise ValueError(f"`info` must be plain JSON with finite numbers: {error}.") from error
-    content["checksum"] = checksum_of(content)
+    content["checksum"] = _checksum(content)
     return write_atomically(path, json.dumps(content, indent=1).encode())
 
 
 def load(path: str | Path, into: FrictionModel | None = None) -> FrictionModel:
-    """Read a model file; no code of the file is ever run.
+    """Read a model file.
 
-    A new model comes without gradients, so that rollouts take the compiled way. To train it
-    further: `model.requires_grad_(True)`.
+    A new model comes without gradients, so that rollouts are compiled. To train it further:
+    `model.requires_grad_(True)`.
 
     Args:
         path: file that `save` wrote.
         into: model to fill, for a law or schedule of one's own; default a new one of the named
-            models. It is left as it is where the file does not fit, and keeps its gradients.
+            models. It stays unchanged if the file does not fit, and keeps its gradients.
 
     Returns:
-        The model; `load_info` gives what the file says of it, `load_plant` the mechanism.
+        The model; `load_info` gives its description, `load_plant` the mechanism.
 
     Raises:
-        ModelFileError: if the file is absent, damaged, of another schema, or of another model.
+        ModelFileError: the file is absent, damaged, of another schema, or of another model.
     """
     content = read_model_file(path)
-    model = _named_model(path, content) if into is None else into
-    _check_same_model(path, content, model)
-    given, expected = content["state"], model.state_dict()
-    if given.keys() != expected.keys():
-        odd = sorted(given.keys() ^ expected.keys())
-        raise ModelFileError(f"{path}: parameters are missing or not the model's: {short(odd)}.")
-    state = {name: _parameter(path, name, given[name], value) for name, value in expected.items()}
-    _check_finite(path, model, state)
+    with _naming(path):
+        model = _named_model(content) if into is None else into
+        _check_same_model(content, model)
+        given, expected = content["state"], model.state_dict()
+        if given.keys() != expected.keys():
+            odd = sorted(given.keys() ^ expected.keys())
+            raise ValueError(f"parameters are missing or not the model's: {_short(odd)}.")
+        state = {name: _parameter(name, given[name], value) for name, value in expected.items()}
+        _check_torque(model, state)
     model.load_state_dict(state)
     return model.requires_grad_(False) if into is None else model
 
 
 def load_info(path: str | Path) -> ModelInfo:
-    """What a model file says besides the parameters.
+    """Read the description in a model file: everything besides the parameters.
 
     Raises:
-        ModelFileError: if the file is absent or damaged.
+        ModelFileError: the file is absent or damaged.
     """
     content = read_model_file(path)
-    try:
+    with _naming(path):
         return ModelInfo(**{f.name: content[f.name] for f in fields(ModelInfo)})
-    except ValueError as error:
-        raise ModelFileError(f"{path}: {error}") from error
 
 
 def load_plant(path: str | Path) -> Plant:
-    """The mechanism that a model was fitted with, terms adjusted by the fit included.
+    """Read the mechanism that a model was fitted with, fitted plant parameters included.
 
     Raises:
-        ModelFileError: if the file is absent or damaged, or says nothing of the mechanism.
+        ModelFileError: the file is absent or damaged, or does not describe the mechanism.
     """
     content = read_model_file(path)
     rig, joints = content["rig"], content["joints"]
-    if rig is None:
-        raise ModelFileError(
-            f"{path}: says nothing of the mechanism; save with "
-            "`ModelInfo(rig=plant.to_dict())` to have it there."
-        )
-    mass = rig.get("mass")
-    # The matrices of a chain take memory with the square of its links.
-    if isinstance(mass, list) and len(mass) > joints:
-        raise ModelFileError(f"{path}: `rig` has {len(mass)} masses, the model {joints} joints.")
-    try:
-        plant = from_dict(rig)
-    except _UNFIT as error:
-        raise ModelFileError(f"{path}: `rig` is no mechanism ({short(error)}).") from error
-    if plant.joints != joints:
-        raise ModelFileError(f"{path}: `rig` has {plant.joints} joints, the model {joints}.")
-    return plant
+    with _naming(path):
+        if rig is None:
+            raise ValueError(
+                "does not describe the mechanism; save with "
+                "`ModelInfo(rig=plant.to_dict())` to include it."
+            )
+        mass = rig.get("mass")
+        # The matrices of a chain grow with the square of its links.
+        if isinstance(mass, list) and len(mass) > joints:
+            raise ValueError(f"`rig` has {len(mass)} masses, the model {joints} joints.")
+        try:
+            plant = from_dict(rig)
+        except _UNFIT as error:
+            raise ValueError(f"`rig` is no mechanism ({_short(error)}).") from error
+        if plant.joints != joints:
+            raise ValueError(f"`rig` has {plant.joints} joints, the model {joints}.")
+        return plant
 
 
-def _named_model(path: str | Path, content: Mapping[str, Any]) -> FrictionModel:
-    name = content["model"]
-    if name not in MODELS:
-        raise ModelFileError(
-            f"{path}: {short(name)} is none of the named models ({', '.join(MODELS)}); make the "
-            "model yourself and pass it as `into`."
-        )
+def read_model_file(path: str | Path) -> dict[str, Any]:
+    """Content of a model file, checked for form, size and damage.
+
+    Raises:
+        ModelFileError: it is no sound model file.
+    """
+    path = Path(path)
+    with _naming(path):
+        if path.exists() and not path.is_file():
+            raise ValueError("not a file.")
+        size = path.stat().st_size
+        if size > LARGEST_FILE:
+            raise ValueError(f"{size} bytes are too many for a model file.")
+        try:
+            content = strict_json.parse(path.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise ValueError(f"not a model file, or cut short ({error}).") from error
+        if not isinstance(content, dict) or content.get("format") != FORMAT:
+            raise ValueError("not a model file of nfriction.")
+        if content.get("schema") != SCHEMA:
+            raise ValueError(
+                f"schema {_short(content.get('schema'))} is not {SCHEMA}; another version wrote it."
+            )
+        for key, kind in _ENTRIES.items():
+            value = content.get(key)
+            # JSON's true is an int to Python.
+            if key not in content or not isinstance(value, kind) or isinstance(value, bool):
+                raise ValueError(f"`{key}` is missing or of the wrong type.")
+        if content.pop("checksum") != _checksum(content):
+            raise ValueError("the checksum does not match; damaged or edited.")
+        _check_sizes(content, size)
+        _check_names(content)
+        _check_depth([v for k, v in content.items() if k != "state"])
+    return content
+
+
+@contextmanager
+def _naming(path: str | Path) -> Iterator[None]:
+    """Raise errors of the block as `ModelFileError` with the file's name."""
     try:
-        return model_by_name(name)(
-            content["joints"], v_smooth=content["v_smooth"], **content["options"]
-        )
+        yield
+    except FileNotFoundError:
+        raise ModelFileError(f"{path}: no such file.") from None
+    except OSError as error:
+        raise ModelFileError(f"{path}: cannot be read ({error.strerror}).") from error
+    except RecursionError:
+        raise ModelFileError(f"{path}: nested too deeply for a model file.") from None
     except (ValueError, TypeError) as error:
         raise ModelFileError(f"{path}: {error}") from error
 
 
-def _check_same_model(path: str | Path, content: Mapping[str, Any], model: FrictionModel) -> None:
-    """A file must describe the model that it fills."""
+def _named_model(content: Mapping[str, Any]) -> FrictionModel:
+    name = content["model"]
+    if name not in model_names():
+        raise ValueError(
+            f"{_short(name)} is none of the named models ({', '.join(model_names())}); make the "
+            "model yourself and pass it as `into`."
+        )
+    make = model_by_name(name)
+    return make(content["joints"], v_smooth=content["v_smooth"], **content["options"])
+
+
+def _check_same_model(content: Mapping[str, Any], model: FrictionModel) -> None:
     names = [c.get("name") if isinstance(c, dict) else None for c in content["coefficients"]]
     pairs = {
         "law": (content["law"], model.law.name),
@@ -147,30 +225,72 @@ def _check_same_model(path: str | Path, content: Mapping[str, Any], model: Frict
     }
     for key, (ours, theirs) in pairs.items():
         if ours != theirs:
-            raise ModelFileError(
-                f"{path}: `{key}` is {short(ours)} in the file, {short(theirs)} in the model."
+            raise ValueError(
+                f"`{key}` is {_short(ours)} in the file, {_short(theirs)} in the model."
             )
 
 
-def _check_finite(path: str | Path, model: FrictionModel, state: Mapping[str, Tensor]) -> None:
-    """Refuse parameters that are finite and yet, through an exponential, make no finite torque."""
+def _check_torque(model: FrictionModel, state: Mapping[str, Tensor]) -> None:
+    """Refuse finite parameters whose exponentials overflow."""
     qd, qdd, load = torch.tensor([[0.0, 0.5], [0.0, 0.0], [1.0, 1.0]], dtype=torch.float64)
     inputs = tuple(x[:, None].expand(-1, model.joints) for x in (qd, qdd, load))
     with torch.no_grad():
         torque = torch.func.functional_call(model, dict(state), inputs)
     if not torque.isfinite().all():
-        raise ModelFileError(f"{path}: with its parameters the model gives no finite torque.")
+        raise ValueError("with its parameters the model gives no finite torque.")
 
 
-def _parameter(path: str | Path, name: str, given: Any, expected: Tensor) -> Tensor:
-    """A parameter of a file as a tensor of the expected shape."""
+def _parameter(name: str, given: Any, expected: Tensor) -> Tensor:
     try:
         value = torch.tensor(given, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise ModelFileError(f"{path}: parameter `{name}` is no array of numbers.") from error
+        raise ValueError(f"parameter `{name}` is no array of numbers.") from error
     if value.shape != expected.shape or not torch.isfinite(value).all():
-        raise ModelFileError(
-            f"{path}: parameter `{name}` must be finite of shape {tuple(expected.shape)}, got "
-            f"shape {tuple(value.shape)}."
+        raise ValueError(
+            f"parameter `{name}` must be finite of shape {tuple(expected.shape)}, got shape "
+            f"{tuple(value.shape)}."
         )
     return value
+
+
+def _checksum(content: Mapping[str, Any]) -> str:
+    """SHA-256 of JSON content in any layout."""
+    canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(canonical.encode()).hexdigest()
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def _check_names(content: Mapping[str, Any]) -> None:
+    names, digests, step = (content[k] for k in ("joint_names", "training_data", "sample_time"))
+    if not all(isinstance(n, str) for n in names) or len(names) not in (0, content["joints"]):
+        raise ValueError(f"`joint_names` must be {content['joints']} texts, or none.")
+    if not all(isinstance(digest, str) for digest in digests.values()):
+        raise ValueError("`training_data` must map names to digests.")
+    if step is not None and not 0 < step < 1e6:
+        raise ValueError(f"`sample_time` must be positive seconds, got {_short(step)}.")
+
+
+def _check_depth(content: list[Any]) -> None:
+    """Refuse content nested too deeply to be copied and written again."""
+    for _ in range(DEEPEST):
+        nested = [value for value in content if isinstance(value, (dict, list))]
+        parts = [v.values() if isinstance(v, dict) else v for v in nested]
+        content = [value for part in parts for value in part]
+    if content:
+        raise ValueError("nested too deeply for a model file.")
+
+
+def _check_sizes(content: Mapping[str, Any], size: int) -> None:
+    """Refuse networks larger than the file, before they take memory."""
+    joints, options = content["joints"], content["options"]
+    terms = options.get("terms", [])
+    terms = terms if isinstance(terms, list) else [terms]
+    sizes = [joints, options.get("head_units", 1), *terms]
+    sound = all(isinstance(n, int) and not isinstance(n, bool) and n > 0 for n in sizes)
+    # Each rule and each unit has at least one number in the file.
+    if not sound or joints > MOST_JOINTS or joints * max(sizes[1], math.prod(terms)) > size:
+        raise ValueError(f"a network of sizes {_short(sizes)} is refused.")

@@ -1,4 +1,4 @@
-"""What a model file says: the model's form, units, and where it came from."""
+"""Description of a model: its form, units, and origin, as plain JSON."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.version import __version__
 
 FORMAT, SCHEMA = "nfriction model", 1
@@ -16,7 +16,7 @@ FORMAT, SCHEMA = "nfriction model", 1
 
 @dataclass(frozen=True)
 class ModelInfo:
-    """What a model file says besides the parameters.
+    """Facts about a model besides its parameters.
 
     Attributes:
         joint_names: in the order of the last axis; empty where joints have no names.
@@ -29,7 +29,7 @@ class ModelInfo:
         fit: how the fit ended.
 
     Raises:
-        ValueError: if the unit is neither.
+        ValueError: another unit.
     """
 
     joint_names: Sequence[str] = ()
@@ -59,7 +59,7 @@ def describe(model: FrictionModel, info: ModelInfo) -> dict[str, Any]:
     """Everything a model file holds except the parameters, as plain JSON.
 
     Raises:
-        ValueError: if the names of the joints are not one a joint.
+        ValueError: not one name for each joint.
     """
     if info.joint_names and len(info.joint_names) != model.joints:
         raise ValueError(
@@ -86,5 +86,4 @@ def describe(model: FrictionModel, info: ModelInfo) -> dict[str, Any]:
 
 
 def _unit(revolute: str, position: str) -> str:
-    """A unit for a revolute joint as that for a joint whose position is in `position`."""
     return revolute if position == "rad" else revolute.replace("N m", "N").replace("rad", "m")

@@ -1,7 +1,6 @@
-"""A process of its own for work that may perish of the file it is given.
+"""Worker processes for libraries that a foreign file may crash, hang or corrupt.
 
-Libraries that read what others wrote can be ended by it (SIGSEGV), be kept busy for ever, or have
-their memory spoilt. `run` starts such work, `serve` is what the process does.
+`run_isolated` starts one and waits for it; `worker_main` is what the worker runs.
 """
 
 import contextlib
@@ -18,12 +17,12 @@ from multiprocessing.spawn import get_executable
 from pathlib import Path
 from typing import Any
 
-# How much longer than its processor time a busy machine may take.
+# Wall time allowed, over processor time: a busy machine is slow.
 BUSY = 10.0
 _REFUSAL = "refusal.txt"
-# Bytes of room to a byte that it may write into a file.
-_WRITTEN = 4
-# Python puts the folder where the user stands first in the path; what lies there is no module.
+# Share of the address space that one written file may take.
+_FILE_SHARE = 4
+# Python puts the working directory first in the path; a file there must not shadow a module.
 _START = """import sys
 sys.path[:] = [place for place in sys.path if place]
 from {module} import main
@@ -31,95 +30,93 @@ main()
 """
 
 
-class PerishedError(ValueError):
-    """The process was ended by a signal or an error, or did not end in time."""
+class WorkerDied(ValueError):  # noqa: N818 - an exit, as in ProcessLookupError's family
+    """The worker was ended by a signal or an error, or ran out of time."""
 
 
-class RefusedError(ValueError):
-    """The process read the file, and says what is wrong with it."""
+class InvalidFile(ValueError):  # noqa: N818 - it names the finding
+    """The worker read the file and refused it; the message is the worker's."""
 
 
-def run(module: str, asked: Mapping[str, Any], folder: Path, *, seconds: float) -> None:
-    """Let a module's `main` work in a process of its own, and wait for it.
+def run_isolated(module: str, task: Mapping[str, Any], folder: Path, *, seconds: float) -> None:
+    """Run a module's `main` in a worker process and wait for it.
 
     Args:
-        module: full name; its `main()` calls `serve`.
-        asked: what to do, plain JSON.
-        folder: empty, for its results; its temporary files go there, too.
-        seconds: of processor time that it may take, imports included.
+        module: full name; its `main()` calls `worker_main`.
+        task: plain JSON.
+        folder: empty; takes the results and the worker's temporary files.
+        seconds: processor time limit [s], imports included.
 
     Raises:
-        RefusedError: in its own words.
-        PerishedError: it was ended by a signal, by an error of its own, or by the time; says how.
+        InvalidFile: the worker refused the file.
+        WorkerDied: the worker ended otherwise than by returning.
     """
-    # What this process imports from, the other does, too.
-    places = os.pathsep.join(place or os.getcwd() for place in sys.path)
+    path = os.pathsep.join(place or os.getcwd() for place in sys.path)
     temporary = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(folder))
-    told = {"folder": str(folder), "seconds": seconds, "asked": dict(asked)}
-    with tempfile.TemporaryFile() as words:
+    request = {"folder": str(folder), "seconds": seconds, "task": dict(task)}
+    with tempfile.TemporaryFile() as errors:
         try:
             ended = subprocess.run(
                 [get_executable(), "-c", _START.format(module=module)],
-                input=json.dumps(told).encode(), stdout=subprocess.DEVNULL, stderr=words,
-                env=os.environ | temporary | {"PYTHONPATH": places}, timeout=BUSY * seconds,
+                input=json.dumps(request).encode(), stdout=subprocess.DEVNULL, stderr=errors,
+                env=os.environ | temporary | {"PYTHONPATH": path}, timeout=BUSY * seconds,
                 check=False,
             )  # fmt: skip
         except subprocess.TimeoutExpired:
-            raise PerishedError("it does not come to an end") from None
+            raise WorkerDied("it does not come to an end") from None
         refusal = folder / _REFUSAL
         if refusal.exists():
-            raise RefusedError(refusal.read_text(encoding="utf-8", errors="replace"))
+            raise InvalidFile(refusal.read_text(encoding="utf-8", errors="replace"))
         if ended.returncode:
-            words.seek(max(0, words.seek(0, os.SEEK_END) - 1000))
-            raise PerishedError(_end(ended.returncode, words.read()))
+            errors.seek(max(0, errors.seek(0, os.SEEK_END) - 1000))
+            raise WorkerDied(_cause(ended.returncode, errors.read()))
 
 
-def serve(
+def worker_main(
     work: Callable[[Mapping[str, Any], Path], None],
     *,
     refusals: tuple[type[Exception], ...],
-    room: int,
+    memory: int,
 ) -> None:
-    """Do what standard input asks for, within limits.
+    """Do the task on standard input within limits of time and memory.
 
     Args:
-        work: takes what is asked and the folder for results.
-        refusals: errors of it that tell of the file.
-        room: address space that it may take [bytes]; no file that it writes takes over a quarter.
+        work: function of the task and the folder for results.
+        refusals: its errors that are about the file; `run_isolated` raises them as `InvalidFile`.
+        memory: limit of the address space [bytes]; a written file may take a quarter of it.
     """
-    told = json.load(sys.stdin)
-    folder = Path(told["folder"])
-    _limit(told["seconds"], room)
+    request = json.load(sys.stdin)
+    folder = Path(request["folder"])
+    _limit(request["seconds"], memory)
     try:
-        work(told["asked"], folder)
+        work(request["task"], folder)
     except refusals as error:
-        why = str(error)[:1000]
-        (folder / _REFUSAL).write_text(why, encoding="utf-8", errors="replace")
+        reason = str(error)[:1000]
+        (folder / _REFUSAL).write_text(reason, encoding="utf-8", errors="replace")
 
 
-def _limit(seconds: float, room: int) -> None:
-    """Bound processor time and memory, where the system can; what is bounded closer stays so."""
+def _limit(seconds: float, memory: int) -> None:
+    """Bound processor time and memory where the system can, and never loosen a bound."""
     try:
         import resource
     except ImportError:
         return
     bounds = {
         resource.RLIMIT_CPU: math.ceil(time.process_time() + seconds),
-        resource.RLIMIT_AS: room,
-        resource.RLIMIT_FSIZE: room // _WRITTEN,
+        resource.RLIMIT_AS: memory,
+        resource.RLIMIT_FSIZE: memory // _FILE_SHARE,
         resource.RLIMIT_CORE: 0,
     }
-    for what, bound in bounds.items():
-        soft, hard = resource.getrlimit(what)
+    for kind, bound in bounds.items():
+        soft, hard = resource.getrlimit(kind)
         known = [x for x in (soft, hard) if x != resource.RLIM_INFINITY]
         with contextlib.suppress(ValueError, OSError):
-            resource.setrlimit(what, (min([bound, *known]), hard))
+            resource.setrlimit(kind, (min([bound, *known]), hard))
 
 
-def _end(status: int, words: bytes) -> str:
-    """How a process ended: the signal, or its last words."""
+def _cause(status: int, errors: bytes) -> str:
     if status < 0:
         name = signal.Signals(-status).name
         return "it does not come to an end" if name == "SIGXCPU" else name
-    lines = words.decode(errors="replace").strip().splitlines()
+    lines = errors.decode(errors="replace").strip().splitlines()
     return lines[-1][:200] if lines else f"exit status {status}"

@@ -1,159 +1,383 @@
-"""Bayesian regularisation of a module: weights, noise level, a prior precision per group.
+"""Evidence maximisation: least squares with one prior precision for each group of parameters.
 
-`maximise_evidence` does the same for whatever accumulates normal equations, a trajectory fit for
-instance; the convention for alpha, beta and gamma is that of `posterior`.
+Gauss-Newton steps on the parameters w alternate with MacKay's updates of the precisions. Only
+normal equations are needed, from wherever they come.
+
+The precisions alpha (by group) and beta have no halves, as in `posterior`.
+
+References:
+    D. J. C. MacKay, Neural Computation 4 (1992) 415-472; F. D. Foresee and M. T. Hagan,
+    Gauss-Newton approximation to Bayesian learning, ICNN 1997.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from fnmatch import fnmatchcase
-from typing import Literal
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal, TypeAlias
 
 import torch
 from torch import Tensor, nn
+from tqdm.auto import tqdm
 
-from nfriction.optim import jacobian as jac
-from nfriction.optim.evidence_result import EvidenceResult, EvidenceState
-from nfriction.optim.jacobian import NormalEquations
-from nfriction.optim.marginal import maximise_evidence
+from nfriction.optim.jacobian import Function, NormalEquations, jacobian_pieces
+from nfriction.optim.posterior import (
+    EvidenceProblem,
+    Posterior,
+    factorise,
+    group_sums,
+    posterior,
+    reestimate,
+)
+
+Status = Literal["converged", "noise_floor", "max_steps", "stalled", "not_finite", "stopped"]
+
+MESSAGES: dict[str, str] = {
+    "converged": "Converged: parameters, alpha, beta and gamma are at a maximum of the evidence.",
+    "noise_floor": "The residuals reached the given noise floor.",
+    "max_steps": "The step limit was reached before convergence.",
+    "stalled": "No step lowers the objective although its gradient is not small.",
+    "not_finite": "The errors or their Jacobian are not finite, at the start or at every step.",
+    "stopped": "Stopped by the callback or by an interrupt; the parameters are the best reached.",
+}
+LARGEST_DAMPING = 1e10
 
 
-def bayesian_regularisation(
-    model: nn.Module,
-    x: Tensor,
-    y: Tensor,
-    *,
-    groups: Mapping[str, str | Sequence[str]] | None = None,
-    prior: Mapping[str, Tensor | float] | Literal["initial"] | None = None,
-    weights: Tensor | None = None,
-    max_steps: int = 300,
-    tolerance: float = 1e-3,
-    noise_floor: float = 0.0,
-    initial_damping: float = 0.005,
-    chunk: int | None = None,
-    state: EvidenceState | None = None,
-    callback: Callable[[EvidenceState], bool | None] | None = None,
-    progress: bool = False,
-) -> EvidenceResult:
-    """Train a module in place on samples, with Bayesian regularisation and no validation set.
-
-    Every trainable parameter is shrunk toward its prior value with the strength that its group
-    deserves by the evidence. The weights are written when the fit ends, also if an interrupt or
-    the callback ends it; a fit that fails from the start leaves the module as it was.
+@dataclass(frozen=True, eq=False)
+class EvidenceState:
+    """State of a run, from which it can be resumed bit for bit.
 
     Args:
-        model: outputs of sample i depend on sample i only; an own `jacobian(x)` is used (see
-            `per_sample_jacobian`).
-        x: inputs, shape (n, ...).
-        y: targets, shape of the model's output.
-        groups: group name -> pattern(s) of parameter names ("rules.*"); by default each named
-            parameter is a group of its own.
-        prior: values w0 by parameter name, 0 where missing; "initial" for the present weights.
-        weights: factors of the squared errors, shape (n,) or that of `y`; 0 leaves one out.
-        max_steps, tolerance, initial_damping, callback, progress: see `maximise_evidence`.
-        noise_floor: standard deviation below which an error is not worth fitting, unit of `y`.
-        chunk: samples differentiated at once.
-        state: of an earlier result or callback, to go on bit for bit from there.
-    Returns:
-        Weights, alpha, beta, gamma, log evidence, error bars and how the fit ended.
-    Raises:
-        ValueError: if samples, groups or prior do not fit the model.
+        w: parameters, shape (p,).
+        alpha: prior precisions, shape (groups,); None before the first step.
+        beta: noise precision.
+        damping: mu of the next step.
+        step: accepted steps so far.
     """
-    parameters = jac.trainable(model)
-    if not parameters:
-        raise ValueError("`model` has no parameter that requires a gradient.")
-    jac.check_samples(x, y, weights)
-    if not (torch.isfinite(x).all() and torch.isfinite(y).all()):
-        raise ValueError("`x` and `y` must be finite; drop the samples that are not.")
-    names, index = group_index(parameters, groups)
-    used = torch.ones_like(y) if weights is None else _per_error(weights, y)
-    used = used[used > 0]
-    # Errors within the rounding of the targets are no information about anything.
-    rounding = torch.finfo(y.dtype).eps * float(y.square().mean().sqrt())
-    # Samples last in memory, as layers take them: kernels are vectorised over samples.
-    x, y = (part.movedim(0, -1).contiguous().movedim(-1, 0) for part in (x, y))
 
-    def equations(w: Tensor) -> NormalEquations:
-        return jac.normal_equations(model, jac.unflatten(w, parameters), x, y, weights, chunk)
+    w: Tensor
+    alpha: Tensor | None = None
+    beta: float = 1.0
+    damping: float = 0.005
+    step: int = 0
 
-    def squares(w: Tensor) -> Tensor:
-        return jac.sum_of_squares(model, jac.unflatten(w, parameters), x, y, weights)
+    def state_dict(self) -> dict[str, Any]:
+        """Plain dictionary for `torch.save`; loads with `weights_only=True`."""
+        return asdict(self)
 
-    result = maximise_evidence(
-        equations,
-        jac.flatten(parameters),
-        samples=used.numel(),
-        squares=squares,
-        groups=index,
-        names=names,
-        prior=_prior_vector(parameters, prior),
-        log_weights=float(used.log().sum()),
-        max_steps=max_steps,
-        tolerance=tolerance,
-        noise_floor=max(noise_floor, rounding),
-        initial_damping=initial_damping,
-        state=state,
-        callback=callback,
-        progress=progress,
-    )
-    best = jac.unflatten(result.w.clone(), parameters)
-    with torch.no_grad():
-        for name, parameter in model.named_parameters():
-            if name in best:
-                parameter.copy_(best[name])
-    return replace(result, model=model, parameters=best)
+    @classmethod
+    def from_state_dict(cls, state: Mapping[str, Any]) -> EvidenceState:
+        """Inverse of `state_dict`."""
+        return cls(**state)
 
 
-def group_index(
-    parameters: Mapping[str, Tensor], groups: Mapping[str, str | Sequence[str]] | None
-) -> tuple[list[str], Tensor]:
-    """Group names and the group of every entry of `flatten(parameters)`, int64.
+Callback: TypeAlias = Callable[[EvidenceState], "bool | None"]
 
+
+@dataclass(frozen=True)
+class EvidenceOptions:
+    """Settings of a run.
+
+    Args:
+        max_steps: limit of accepted steps, those of a resumed state included.
+        tolerance: of convergence: relative error of alpha = gamma / 2E_g and beta =
+            (n - gamma) / 2E_D, and gain of a full Gauss-Newton step in nats.
+        noise_floor: standard deviation of the errors at which fitting ends.
+        initial_damping: mu of the first step.
+        callback: called after each accepted step with the state; True stops.
+        progress: show a bar.
     Raises:
-        ValueError: unless every parameter matches the patterns of exactly one group.
+        ValueError: a tolerance or damping that is not positive.
     """
-    patterns = {
-        group: [given] if isinstance(given, str) else list(given)
-        for group, given in (groups or {name: name for name in parameters}).items()
-    }
-    index = []
-    for name, value in parameters.items():
-        found = [
-            number
-            for number, given in enumerate(patterns.values())
-            if any(fnmatchcase(name, pattern) for pattern in given)
-        ]
-        if len(found) != 1:
+
+    max_steps: int = 300
+    tolerance: float = 1e-3
+    noise_floor: float = 0.0
+    initial_damping: float = 0.005
+    callback: Callback | None = None
+    progress: bool = False
+
+    def __post_init__(self) -> None:
+        if self.tolerance <= 0 or self.initial_damping <= 0:
             raise ValueError(
-                f"Parameter {name!r} matches {len(found)} of the groups {patterns}; every "
-                f"trainable parameter needs exactly one. Parameters: {list(parameters)}."
+                "`tolerance` and `initial_damping` must be positive, got "
+                f"{self.tolerance} and {self.initial_damping}."
             )
-        index.append(torch.full((value.numel(),), found[0], device=value.device))
-    joined = torch.cat(index)
-    empty = [group for number, group in enumerate(patterns) if not (joined == number).any()]
-    if empty:
-        raise ValueError(f"Groups {empty} match no parameter of {list(parameters)}.")
-    return list(patterns), joined
 
 
-def _per_error(weights: Tensor, y: Tensor) -> Tensor:
-    return weights.reshape(weights.shape + (1,) * (y.ndim - weights.ndim)).expand_as(y)
+@dataclass(frozen=True, eq=False)
+class EvidenceResult:
+    """Outcome of a fit by evidence; read `converged` before believing it.
+
+    Args:
+        status: reason for the end; `message` gives it in words.
+        w: parameters in one vector, shape (p,).
+        alpha, gamma: prior precision and effective parameters, by group.
+        beta: noise precision; the noise has the standard deviation `noise_std`.
+        error_squares: E_D, weighted.
+        parameter_squares: E_g = sum (w - w0)^2, by group.
+        samples: n, number of errors that E_D sums.
+        log_evidence: in nats with all constants: models of the same data can be compared by it.
+        covariance: posterior covariance of the parameters, shape (p, p).
+        steps: accepted steps.
+        history: log evidence before each step.
+        state: for resuming.
+        model, parameters: differentiated by `predictive_std`, if known.
+    """
+
+    status: Status
+    w: Tensor
+    alpha: dict[str, float]
+    beta: float
+    gamma: dict[str, float]
+    error_squares: float
+    parameter_squares: dict[str, float]
+    samples: int
+    log_evidence: float
+    covariance: Tensor
+    steps: int
+    history: list[float]
+    state: EvidenceState
+    model: nn.Module | Function | None = None
+    parameters: dict[str, Tensor] = field(default_factory=dict)
+
+    @property
+    def converged(self) -> bool:
+        """Whether the fit ended at a maximum of the evidence or at the noise floor."""
+        return self.status in ("converged", "noise_floor")
+
+    @property
+    def message(self) -> str:
+        """The status in words."""
+        return MESSAGES[self.status]
+
+    @property
+    def noise_std(self) -> float:
+        """Standard deviation of the noise on an error of weight 1, in the targets' unit."""
+        return math.sqrt(0.5 / self.beta)
+
+    @property
+    def effective_parameters(self) -> float:
+        """Sum of gamma over the groups."""
+        return sum(self.gamma.values())
+
+    def predictive_std(self, x: Tensor, noise: bool = True) -> Tensor:
+        """Standard deviation of the outputs at `x` by the uncertainty of parameters and noise.
+
+        Args:
+            x: inputs, shape (m, ...).
+            noise: include that of a new measurement (of weight 1), or only that of the function.
+        Returns:
+            Shape of the outputs, (m, *outputs).
+        """
+        if self.model is None:
+            raise ValueError(
+                "This fit was made from normal equations and knows no model; use `covariance` "
+                "with the Jacobian of your outputs."
+            )
+        floor = 0.5 / self.beta if noise else 0.0
+        deviations = []
+        for _, output, jacobians in jacobian_pieces(self.model, self.parameters, x):
+            variance = torch.stack([((J @ self.covariance) * J).sum(-1) for J in jacobians], -1)
+            deviations.append((variance.clamp(min=0) + floor).sqrt().view_as(output))
+        return torch.cat(deviations)
 
 
-def _prior_vector(
-    parameters: Mapping[str, Tensor], prior: Mapping[str, Tensor | float] | str | None
-) -> Tensor:
-    if isinstance(prior, str):
-        if prior != "initial":
-            raise ValueError(f'`prior` is a mapping, "initial" or None, got {prior!r}.')
-        return jac.flatten(parameters).clone()
-    given = prior or {}
-    unknown = sorted(set(given) - set(parameters))
-    if unknown:
-        raise ValueError(f"`prior` names {unknown}; trainable are {list(parameters)}.")
-    centres = {
-        name: torch.zeros_like(value) + given.get(name, 0.0) for name, value in parameters.items()
-    }
-    return jac.flatten(centres)
+def maximise_evidence(
+    problem: EvidenceProblem,
+    w: Tensor,
+    options: EvidenceOptions | None = None,
+    state: EvidenceState | None = None,
+) -> EvidenceResult:
+    """Fit parameters, noise precision and one prior precision per group to normal equations.
+
+    A step solves (S + mu diag S) d = -(beta J^T e + alpha (w - w0)) and is taken if
+    beta E_D + sum alpha_g E_g falls; else, or where errors are not finite, mu*10. Then come new
+    alpha and beta, and mu/10 if the first trial fell about as predicted. The damping is relative to
+    the diagonal, so that the units of the parameters do not matter; the first step has hardly any
+    prior, as in Foresee and Hagan.
+
+    Args:
+        problem: errors and priors.
+        w: start, shape (p,).
+        options: settings.
+        state: to be resumed; replaces `w`.
+    Raises:
+        ValueError: a state of another problem.
+    """
+    options = EvidenceOptions() if options is None else options
+    start = EvidenceState(w.detach().clone(), damping=options.initial_damping)
+    state = start if state is None else state
+    groups = len(problem.names)
+    if state.w.shape != w.shape or (state.alpha is not None and len(state.alpha) != groups):
+        raise ValueError(
+            f"`state` has {len(state.w)} parameters and alpha {state.alpha}; this fit has "
+            f"{len(w)} parameters in the groups {list(problem.names)}."
+        )
+    fit = _Fit(problem, options, state)
+    try:
+        status = fit.run()
+    except KeyboardInterrupt:
+        status = "stopped"
+    return fit.result(status)
+
+
+class _Fit:
+    """A run of `maximise_evidence`."""
+
+    def __init__(
+        self, problem: EvidenceProblem, options: EvidenceOptions, state: EvidenceState
+    ) -> None:
+        self.problem, self.options, self.state = problem, options, state
+        self.noise_floor = max(options.noise_floor, 1e-15)
+        p = len(state.w)
+        # An interrupt of the first evaluation must still find something to report.
+        nan = state.w.new_full((p,), math.nan)
+        self.local = NormalEquations(nan.diag(), nan, nan.sum())
+        self.history: list[float] = []
+        self.not_finite = False
+
+    def run(self) -> Status:
+        options, callback = self.options, self.options.callback
+        self.local = self.problem.equations(self.state.w)
+        if not self.local.finite:
+            return "not_finite"
+        if self.state.alpha is None:
+            self._start()
+        with tqdm(
+            total=options.max_steps, initial=self.state.step, disable=not options.progress,
+            unit="step",
+        ) as bar:  # fmt: skip
+            while True:
+                known = self.posterior()
+                self.history.append(known.log_evidence)
+                if self._settled(known):
+                    return "converged"
+                unexplained = self.problem.samples - float(known.gamma.sum())
+                if float(self.local.squares) <= unexplained * self.noise_floor**2:
+                    return "noise_floor"
+                if self.state.step >= options.max_steps:
+                    return "max_steps"
+                if self.state.step > 0:
+                    self._reestimate(known)
+                failed = self._advance()
+                if failed is not None:
+                    return failed
+                bar.set_postfix(log_evidence=f"{self.history[-1]:.6g}", refresh=False)
+                bar.update()
+                if callback is not None and callback(self.state):
+                    return "stopped"
+
+    def posterior(self) -> Posterior:
+        assert self.state.alpha is not None
+        return posterior(self.problem, self.local, self.state.w, self.state.alpha, self.state.beta)
+
+    def _start(self) -> None:
+        """Noise as large as the errors and a prior far below the data."""
+        problem, local = self.problem, self.local
+        beta = problem.samples / max(2 * float(local.squares), 1e-300)
+        beta = min(beta, 0.5 / self.noise_floor**2)
+        count = len(problem.names)
+        sizes = group_sums(torch.ones_like(local.Jte), problem.groups, count)
+        curvature = group_sums(local.JtJ.diagonal(), problem.groups, count) / sizes
+        # A group without influence at the start has no curvature to compare with.
+        curvature = torch.where(curvature > 0, curvature, local.JtJ.diagonal().mean())
+        alpha = 1e-6 * beta * torch.where(curvature > 0, curvature, 1.0)
+        self.state = replace(self.state, alpha=alpha, beta=beta)
+
+    def _settled(self, known: Posterior) -> bool:
+        """Whether the log evidence is stationary in w, log alpha and log beta."""
+        alpha, gamma, tolerance = self.state.alpha, known.gamma, self.options.tolerance
+        assert alpha is not None
+        off = (gamma - 2 * alpha * known.parameter_squares).abs() / gamma.clamp(min=1)
+        unexplained = self.problem.samples - float(gamma.sum())
+        noise_off = abs(unexplained - 2 * self.state.beta * float(self.local.squares))
+        return (
+            known.newton_decrement <= tolerance
+            and bool((off <= tolerance).all())
+            and noise_off <= tolerance * max(unexplained, 1.0)
+        )
+
+    def _reestimate(self, known: Posterior) -> None:
+        assert self.state.alpha is not None
+        largest = 0.5 / self.noise_floor**2
+        alpha, beta = reestimate(self.problem, known, self.local, self.state.alpha, largest)
+        self.state = replace(self.state, alpha=alpha, beta=beta)
+
+    def _advance(self) -> Status | None:
+        """Take one step that lowers the objective, with as much damping as that needs."""
+        state, problem, local = self.state, self.problem, self.local
+        assert state.alpha is not None
+        precision = state.alpha[problem.groups]
+        offset = state.w - problem.prior
+        system = state.beta * local.JtJ + precision.diag()
+        slope = state.beta * local.Jte + precision * offset
+        objective = float(state.beta * local.squares + precision @ offset.square())
+        rounding = 64 * torch.finfo(slope.dtype).eps * objective
+        damping = state.damping
+        while damping <= LARGEST_DAMPING:
+            scale, factor = factorise(system + damping * system.diagonal().diag())
+            step = -scale * torch.cholesky_solve((scale * slope)[:, None], factor)[:, 0]
+            predicted = -float(2 * slope @ step + step @ (system @ step))
+            if damping <= 1 and predicted <= rounding:
+                # The parameters are optimal for these alpha and beta: only those change.
+                self.state = replace(state, step=state.step + 1)
+                return None
+            found = self._attempt(state.w + step, precision, objective)
+            if found is not None:
+                there, fall = found
+                # After a rejected trial, or a poor model, less damping would cost another trial.
+                if fall > 0.75 * predicted and damping <= state.damping:
+                    damping = max(damping / 10, 1e-15)
+                elif fall < 0.25 * predicted:
+                    damping *= 4
+                self.local = there
+                self.state = replace(state, w=state.w + step, damping=damping, step=state.step + 1)
+                return None
+            damping *= 10
+        return "not_finite" if self.not_finite else "stalled"
+
+    def _attempt(
+        self, w: Tensor, precision: Tensor, objective: float
+    ) -> tuple[NormalEquations, float] | None:
+        """Normal equations at `w` and the objective's fall, if all is finite and there is one."""
+        beta, problem = self.state.beta, self.problem
+        shrinkage = float(precision @ (w - problem.prior).square())
+        if problem.squares is not None:
+            cheap = float(beta * problem.squares(w)) + shrinkage
+            self.not_finite = not math.isfinite(cheap)
+            if not cheap < objective:
+                return None
+        there = problem.equations(w)
+        self.not_finite = not there.finite
+        # The sum that the next objective starts from decides, not its cheap twin.
+        fall = objective - float(beta * there.squares) - shrinkage
+        return (there, fall) if fall > 0 and not self.not_finite else None
+
+    def result(self, status: Status) -> EvidenceResult:
+        state, names = self.state, self.problem.names
+        alpha = self.problem.prior.new_full((len(names),), math.nan)
+        known = Posterior(self.local.JtJ * math.nan, alpha, math.nan, math.nan, alpha)
+        if state.alpha is not None:
+            alpha = state.alpha
+            known = self.posterior() if self.local.finite else known
+
+        def named(values: Tensor) -> dict[str, float]:
+            return dict(zip(names, values.tolist(), strict=True))
+
+        return EvidenceResult(
+            status=status,
+            w=state.w,
+            alpha=named(alpha),
+            beta=state.beta,
+            gamma=named(known.gamma),
+            error_squares=float(self.local.squares),
+            parameter_squares=named(known.parameter_squares),
+            samples=self.problem.samples,
+            log_evidence=known.log_evidence,
+            covariance=known.covariance,
+            steps=state.step,
+            history=self.history,
+            state=state,
+        )

@@ -6,11 +6,17 @@ halves. Minus the log posterior is beta E_D + sum_g alpha_g E_g, so the noise ha
 covariance S^-1 / 2 with S = beta J^T J + diag(alpha), and at the maximum of the evidence
 
     alpha_g = gamma_g / (2 E_g),    beta = (n - gamma) / (2 E_D).
+
+References:
+    D. J. C. MacKay, Neural Computation 4 (1992) 415-472; F. D. Foresee and M. T. Hagan,
+    Gauss-Newton approximation to Bayesian learning, ICNN 1997.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -22,14 +28,43 @@ from nfriction.optim.jacobian import NormalEquations
 LARGEST_RATIO = 1e12
 
 
+@dataclass(frozen=True, eq=False)
+class EvidenceProblem:
+    """Errors to be fitted, and priors of the parameters.
+
+    Args:
+        equations: J^T J, J^T e and E_D = sum e^2 at given parameters.
+        samples: number n of errors that E_D sums.
+        prior: w0, shape (p,).
+        groups: group of each parameter, 0 ... groups - 1, int64, shape (p,).
+        names: of the groups.
+        squares: E_D alone, where that is cheaper; tries the steps.
+        log_weights: sum of the logarithms of the errors' weights.
+    Raises:
+        ValueError: no samples.
+    """
+
+    equations: Callable[[Tensor], NormalEquations]
+    samples: int
+    prior: Tensor
+    groups: Tensor
+    names: Sequence[str]
+    squares: Callable[[Tensor], Tensor] | None = None
+    log_weights: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.samples < 1:
+            raise ValueError(f"`samples` must be positive, got {self.samples}.")
+
+
 class Posterior(NamedTuple):
-    """What the data say at given parameters, `alpha` and `beta`.
+    """Gauss-Laplace posterior at given parameters, alpha and beta.
 
     Args:
         covariance: of the parameters, (2 S)^-1, shape (p, p).
         gamma: effective (well determined) parameters of each group, shape (groups,).
         log_evidence: log p(data | alpha, beta) in nats, with all its constants.
-        newton_decrement: what a full Gauss-Newton step would gain in log posterior, in nats.
+        newton_decrement: gain of a full Gauss-Newton step in log posterior, in nats.
         parameter_squares: E_g, shape (groups,).
     """
 
@@ -41,49 +76,38 @@ class Posterior(NamedTuple):
 
 
 def posterior(
-    equations: NormalEquations,
-    offset: Tensor,
-    groups: Tensor,
-    alpha: Tensor,
-    beta: float,
-    samples: int,
-    log_weights: float = 0.0,
+    problem: EvidenceProblem, local: NormalEquations, w: Tensor, alpha: Tensor, beta: float
 ) -> Posterior:
     """Posterior, effective parameters and log evidence; exact where the model is linear.
 
     Args:
-        equations: J^T J, J^T e and E_D at the parameters w.
-        offset: w - w0, distance from the prior's centre, shape (p,).
-        groups: group of each parameter, 0 ... groups - 1, shape (p,), int64.
+        problem: errors and priors.
+        local: J^T J, J^T e and E_D at the parameters `w`.
+        w: parameters, shape (p,).
         alpha: prior precision (halved) of each group, shape (groups,), positive.
         beta: noise precision (halved), positive.
-        samples: n, how many errors E_D sums.
-        log_weights: sum of the logarithms of the errors' weights.
-    References:
-        D. J. C. MacKay, Neural Computation 4 (1992) 415-472; F. D. Foresee and M. T. Hagan,
-        Gauss-Newton approximation to Bayesian learning, ICNN 1997.
     """
+    groups, offset, count = problem.groups, w - problem.prior, len(alpha)
     precision = alpha[groups]
-    system = beta * equations.JtJ + precision.diag()
-    scale, factor = factorise(system)
+    scale, factor = factorise(beta * local.JtJ + precision.diag())
     inverse = scale[:, None] * torch.cholesky_inverse(factor) * scale
-    slope = beta * equations.Jte + precision * offset
-    squares = group_sums(offset.square(), groups, len(alpha))
+    slope = beta * local.Jte + precision * offset
+    squares = group_sums(offset.square(), groups, count)
     # The diagonal of S^-1 (beta J^T J) equals 1 - alpha (S^-1)_ii, but keeps its digits where the
-    # prior rules and the difference would be rounding.
-    determined = beta * (inverse * equations.JtJ).sum(1)
-    sizes = group_sums(torch.ones_like(offset), groups, len(alpha))
+    # prior dominates and the difference would be rounding.
+    determined = beta * (inverse * local.JtJ).sum(1)
+    sizes = group_sums(torch.ones_like(offset), groups, count)
     log_determinant = 2 * factor.diagonal().log().sum() - 2 * scale.log().sum()
     log_evidence = (
-        -beta * equations.squares
+        -beta * local.squares
         - alpha @ squares
-        + 0.5 * (samples * math.log(beta / math.pi) + log_weights)
+        + 0.5 * (problem.samples * math.log(beta / math.pi) + problem.log_weights)
         + 0.5 * sizes @ alpha.log()
         - 0.5 * log_determinant
     )
     return Posterior(
         covariance=inverse / 2,
-        gamma=group_sums(determined, groups, len(alpha)).clamp(min=0),
+        gamma=group_sums(determined, groups, count).clamp(min=0),
         log_evidence=float(log_evidence),
         newton_decrement=float(slope @ (inverse @ slope)),
         parameter_squares=squares,
@@ -91,26 +115,25 @@ def posterior(
 
 
 def reestimate(
+    problem: EvidenceProblem,
     known: Posterior,
-    equations: NormalEquations,
-    groups: Tensor,
+    local: NormalEquations,
     alpha: Tensor,
-    samples: int,
     largest_beta: float = math.inf,
 ) -> tuple[Tensor, float]:
     """MacKay's fixed-point update: alpha_g = gamma_g / (2 E_g), beta = (n - gamma) / (2 E_D).
 
-    A group that has not left its prior's centre keeps its alpha, for it says nothing yet.
+    A group that has not left its prior's centre keeps its alpha: it has no information yet.
 
     Args:
+        problem, local, alpha: those of the posterior `known`.
         known: `posterior` at the present alpha and beta.
-        equations, groups, alpha, samples: those it was computed from.
-        largest_beta: limit that a known noise floor sets.
+        largest_beta: limit by a known noise floor.
     Returns:
         The new alpha, shape (groups,), and beta.
     """
-    curvature = group_sums(equations.JtJ.diagonal(), groups, len(alpha))
-    beta = float((samples - known.gamma.sum()).clamp(min=1e-3) / (2 * equations.squares))
+    curvature = group_sums(local.JtJ.diagonal(), problem.groups, len(alpha))
+    beta = float((problem.samples - known.gamma.sum()).clamp(min=1e-3) / (2 * local.squares))
     beta = min(beta, largest_beta)
     limit = LARGEST_RATIO * beta * curvature
     limit = torch.where(limit > 0, limit, alpha)
@@ -125,7 +148,7 @@ def factorise(system: Tensor) -> tuple[Tensor, Tensor]:
     scaled = scale[:, None] * system * scale
     factor, failed = torch.linalg.cholesky_ex(scaled)
     if failed:
-        # Singular to rounding: lift the eigenvalues by what rounding may have taken from them.
+        # Singular to rounding: lift the eigenvalues by the size of that rounding.
         lift = 10 * len(system) * torch.finfo(system.dtype).eps
         factor, _ = torch.linalg.cholesky_ex(scaled + lift * torch.eye(len(system)).to(scaled))
     return scale, factor

@@ -13,7 +13,7 @@ from scipy.ndimage import binary_dilation, gaussian_filter
 from nfriction.fitting.result.identifiability import NORMAL_95
 from nfriction.fitting.result.uncertainty import CoefficientUncertainty
 from nfriction.friction.laws import Coefficient
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.fuzzy.rules import FuzzyRules
 from nfriction.plots import style
 from nfriction.plots.fuzzy import draw_map, fuzzy_rules, input_labels

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from nfriction.fitting.equation_error import friction_torque
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Step
 from nfriction.plant import Plant
 from nfriction.plots import style

@@ -1,8 +1,8 @@
 """Recordings of a mechanism: validated arrays in SI units, from files and tables and back."""
 
-from nfriction.recording.record import Recording, Unit
+from nfriction.recording.record import Recording, RecordingWarning, Unit
 from nfriction.recording.states import read_initial_states
-from nfriction.recording.validation import MINIMUM_SAMPLES, RecordingWarning, is_uniform
+from nfriction.recording.validation import MINIMUM_SAMPLES, is_uniform
 
 __all__ = [
     "MINIMUM_SAMPLES",

@@ -1,4 +1,4 @@
-"""How a file writes joint positions, and the way to the library's joint coordinates and back.
+"""Angle conventions of recordings, and their conversion to joint coordinates and back.
 
 Joint coordinates: the first link's angle from upright (0 is up), every further link's angle
 relative to the link before it. A free arm's angle about the vertical comes first and has no
@@ -22,7 +22,7 @@ MeasuredFrom = Literal["upright", "hanging"]
 
 
 class Mechanism(Protocol):
-    """What tells how a mechanism's encoders write, and in which unit: every plant does."""
+    """The convention and unit of a mechanism's encoders, which every plant has."""
 
     @property
     def convention(self) -> Sequence[str]: ...
@@ -36,13 +36,13 @@ class Mechanism(Protocol):
 
 @dataclass(frozen=True)
 class AngleConvention:
-    """How joint positions are written; the default is the library's own.
+    """A convention of joint positions; the default is the library's joint coordinates.
 
     Angles are not wrapped or unwrapped. Torques are joint torques in every convention.
 
     Args:
-        angles: every link's angle to the link before it, or to the vertical.
-        measured_from: where the zero of the angles to the vertical is.
+        angles: of every link, relative to the link before it or absolute, to the vertical.
+        measured_from: zero of the angles to the vertical.
     """
 
     angles: Angles = "relative"
@@ -74,17 +74,15 @@ class AngleConvention:
 
     @classmethod
     def of(cls, given: ConventionLike) -> AngleConvention:
-        """Convention from whatever says one.
+        """Convention of a plant, or from words as `parse` takes them, in one string or several.
 
-        Args:
-            given: a convention, words as `parse` takes them, in one string or several, or a plant.
         Raises:
             ValueError: anything else.
         """
-        said = getattr(given, "convention", given)
-        if isinstance(said, cls):
-            return said
-        words = [said] if isinstance(said, str) else said
+        found = getattr(given, "convention", given)
+        if isinstance(found, cls):
+            return found
+        words = [found] if isinstance(found, str) else found
         if isinstance(words, Sequence) and all(isinstance(word, str) for word in words):
             return cls.parse(",".join(words))
         raise ValueError(
@@ -103,7 +101,7 @@ class AngleConvention:
             first_link: column of the first link; columns before it (a free arm) stay as they are.
         """
         joint = self.rate_to_joint(q, first_link)
-        # Differences of absolute angles do not see where those are measured from.
+        # It cancels in the differences of absolute angles.
         joint[..., first_link : first_link + 1] += self._first_zero
         return joint
 
@@ -129,7 +127,7 @@ class AngleConvention:
 
     @property
     def _first_zero(self) -> float:
-        """Where the first angle's zero lies, as an angle from upright [rad]."""
+        """The first angle's zero as an angle from upright [rad]."""
         return math.pi if self.measured_from == "hanging" else 0.0
 
 

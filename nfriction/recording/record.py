@@ -1,4 +1,4 @@
-"""Recording: what an encoder log says, validated, in SI units, one column per joint."""
+"""Recording: an encoder log, validated, in SI units, one column per joint."""
 
 from __future__ import annotations
 
@@ -14,24 +14,17 @@ from numpy.typing import NDArray
 
 from nfriction.io import formats
 from nfriction.recording.angles import AngleConvention, ConventionLike, Mechanism
-from nfriction.recording.validation import (
-    RecordingWarning,
-    check_content,
-    check_shapes,
-    frozen,
-    gaps_in,
-    is_uniform,
-    warn_of_columns,
-    warn_of_gaps,
-    warn_of_units,
-    warn_of_wrapping,
-)
+from nfriction.recording.validation import check, doubts, gaps, is_uniform, read_only
 
 if TYPE_CHECKING:
     import pandas as pd
 
 Array = NDArray[np.float64]
 Unit = Literal["rad", "m"]
+
+
+class RecordingWarning(UserWarning):
+    """A recording is valid but looks as if its units were not SI, lacks columns, or has gaps."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -41,21 +34,19 @@ class Recording:
     Arrays are copied to read-only float64. Irregular time stamps are allowed and kept. Two
     recordings hold the same data when their `digest()` agree.
 
-    A recording need not say how its angles are written: it is then taken to be written as the
-    mechanism's encoders write, which every plant knows. Motion simulated in joint coordinates is
-    not, so of that say `convention="relative,upright"`.
+    Without a convention, angles are read as the plant's encoders write them. Motion simulated in
+    joint coordinates needs `convention="relative,upright"`.
 
     Args:
         time: [s], increasing, shape (time,).
-        q: position [rad, or m where `unit` says so], shape (time, joint).
+        q: position [rad, or m by `unit`], shape (time, joint).
         tau: joint torque [N m, or N], shape like `q`.
         qd: measured velocity [rad/s, or m/s], shape like `q`.
         names: one name per joint, "joint1" … by default.
-        convention: how `q` and `qd` are written, or None for as the plant says; words such as
-            "absolute,hanging" or a plant become an `AngleConvention`. Torques are joint torques
-            in every convention.
+        convention: of `q` and `qd`, or None for the plant's; words such as "absolute,hanging" or a
+            plant become an `AngleConvention`. Torques are joint torques in every convention.
         unit: of position.
-        name: what to call the recording, such as the file's stem.
+        name: of the recording, such as the file's stem.
     Raises:
         ValueError: arrays that do not fit together, NaN or infinity, stamps that do not increase,
             fewer than 8 samples.
@@ -74,23 +65,16 @@ class Recording:
     name: str = ""
 
     def __post_init__(self) -> None:
-        for key in ("time", "q", "tau", "qd"):
-            if getattr(self, key) is not None:
-                object.__setattr__(self, key, frozen(getattr(self, key), key))
-        if self.q.ndim != 2:
-            raise ValueError(
-                f"`q` must be (time, joint), got shape {self.q.shape}; "
-                f"a single joint is `q[:, None]`."
-            )
-        if self.convention is not None:
-            object.__setattr__(self, "convention", AngleConvention.of(self.convention))
-        names = tuple(self.names) or tuple(f"joint{k + 1}" for k in range(self.joints))
-        object.__setattr__(self, "names", names)
-        check_shapes(self)
-        check_content(self)
-        warn_of_units(self)
-        warn_of_gaps(self)
-        warn_of_wrapping(self)
+        arrays = {key: getattr(self, key) for key in ("time", "q", "tau", "qd")}
+        arrays = {k: None if x is None else read_only(x, k) for k, x in arrays.items()}
+        convention = None if self.convention is None else AngleConvention.of(self.convention)
+        joints = np.shape(arrays["q"])[-1] if np.ndim(arrays["q"]) else 0
+        names = tuple(self.names) or tuple(f"joint{k + 1}" for k in range(joints))
+        for key, value in (arrays | {"convention": convention, "names": names}).items():
+            object.__setattr__(self, key, value)
+        check(arrays, self.names, self.unit)
+        for finding, remedy in doubts(self.time, self.q, self.names, self.unit):
+            self._warn(finding, remedy, stacklevel=4)
 
     @property
     def joints(self) -> int:
@@ -108,26 +92,21 @@ class Recording:
         return float(np.median(np.diff(self.time)))
 
     @property
-    def spans(self) -> list[tuple[int, int]]:
+    def segments(self) -> list[tuple[int, int]]:
         """First and last sample of each stretch without a gap in time, two samples at least."""
-        gaps = gaps_in(self.time)
-        first, last = [0, *(gaps + 1).tolist()], [*gaps.tolist(), len(self.time) - 1]
+        pauses = gaps(self.time).tolist()
+        first, last = [0, *(k + 1 for k in pauses)], [*pauses, len(self.time) - 1]
         return [(a, b) for a, b in zip(first, last, strict=True) if a < b]
 
     @property
     def longest_step(self) -> float:
         """Longest step between samples, gaps aside [s]."""
-        step = np.diff(self.time)
-        return float(np.delete(step, gaps_in(self.time)).max())
+        return float(np.delete(np.diff(self.time), gaps(self.time)).max())
 
     @property
     def is_uniform(self) -> bool:
         """Whether all steps are alike but for the rounding of the stamps."""
         return is_uniform(self.time)
-
-    @property
-    def _said(self) -> str | None:
-        return None if self.convention is None else str(self.convention)
 
     def __len__(self) -> int:
         return len(self.time)
@@ -138,14 +117,12 @@ class Recording:
         return (
             f"Recording({self.name!r}, joints={list(self.names)}, samples={len(self)}, "
             f"duration={self.duration:.6g} s, sample_time={self.sample_time:.4g} s {stamps}, "
-            f"convention={self._said or 'that of the plant'!r}, unit={self.unit!r}, with={extras})"
+            f"convention={str(self.convention or 'that of the plant')!r}, unit={self.unit!r}, "
+            f"with={extras})"
         )
 
     def __getitem__(self, samples: slice | NDArray[np.bool_]) -> Recording:
-        """Samples as a recording, `recording[100:200]` or `recording[recording.time < 3]`.
-
-        The stamps stay.
-        """
+        """Samples as a recording, `recording[100:200]` or `recording[recording.time < 3]`."""
         if not isinstance(samples, slice):
             samples = np.asarray(samples)
             if samples.dtype != np.bool_ or samples.shape != self.time.shape:
@@ -156,10 +133,10 @@ class Recording:
                 )
         tau = None if self.tau is None else self.tau[samples]
         qd = None if self.qd is None else self.qd[samples]
-        return self.derived(time=self.time[samples], q=self.q[samples], tau=tau, qd=qd)
+        return self._replace(time=self.time[samples], q=self.q[samples], tau=tau, qd=qd)
 
-    def derived(self, **changes: Any) -> Recording:
-        """A recording made of this one, whose oddities were told when this one was made."""
+    def _replace(self, **changes: Any) -> Recording:
+        """A copy with changes, without the warnings that this recording has given."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RecordingWarning)
             return replace(self, **changes)
@@ -184,9 +161,7 @@ class Recording:
         return [self.window(start, start + length) for start in starts]
 
     def resolve_convention(self, plant: Mechanism) -> AngleConvention:
-        """How this recording of a plant is written: as it says itself, else as the plant says.
-
-        Sliding joints have no angles; for them it is the convention that changes nothing.
+        """The recording's own convention, else the plant's; for sliding joints the default one.
 
         Raises:
             ValueError: the recording is in metres and the plant turns, or the other way round.
@@ -204,28 +179,28 @@ class Recording:
         """The same motion in joint coordinates: first angle from upright, the others relative.
 
         Args:
-            plant: whose recording this is; may be left out where the recording says its convention
-                and its first column is a link's.
+            plant: the recorded one; optional where the recording has a convention and its first
+                column is a link's.
         Raises:
-            ValueError: neither recording nor plant say how the angles are written, or their units
-                differ.
+            ValueError: neither recording nor plant have a convention, or their units differ.
         """
         convention = self.convention if plant is None else self.resolve_convention(plant)
         if self.unit == "m":
             return self
         if convention is None:
             raise ValueError(
-                "the recording does not say how its angles are written; give the plant, or read "
+                "the recording has no angle convention; give the plant, or read "
                 "it with convention='absolute,hanging' or the like."
             )
         first_link = 0 if plant is None else plant.first_link
         qd = None if self.qd is None else convention.rate_to_joint(self.qd, first_link)
         q = convention.position_to_joint(self.q, first_link)
-        return self.derived(q=q, qd=qd, convention=AngleConvention())
+        return self._replace(q=q, qd=qd, convention=AngleConvention())
 
     def digest(self) -> str:
         """SHA-256 of the content in hexadecimal: arrays, joint names, convention and unit."""
-        digest = hashlib.sha256(repr((self.names, self._said, self.unit)).encode())
+        convention = None if self.convention is None else str(self.convention)
+        digest = hashlib.sha256(repr((self.names, convention, self.unit)).encode())
         for key in ("time", "q", "tau", "qd"):
             values = getattr(self, key)
             digest.update(f"{key} {None if values is None else values.shape}".encode())
@@ -235,7 +210,7 @@ class Recording:
         return digest.hexdigest()
 
     def to_pandas(self) -> pd.DataFrame:
-        """Table with columns time, q1 …, qd1 …, tau1 …; `attrs` tell unit, names and convention."""
+        """Table with columns time, q1 …, qd1 …, tau1 …; `attrs` hold unit, names and convention."""
         import pandas as pd  # slow to import
 
         columns = {"time": self.time}
@@ -244,8 +219,7 @@ class Recording:
             if values is not None:
                 columns |= {f"{key}{k + 1}": values[:, k] for k in range(self.joints)}
         table = pd.DataFrame(columns)
-        names = ", ".join(self.names)
-        table.attrs = {"unit": self.unit, "names": names}
+        table.attrs = {"unit": self.unit, "names": ", ".join(self.names)}
         if self.convention is not None:
             table.attrs["convention"] = str(self.convention)
         return table
@@ -272,43 +246,43 @@ class Recording:
                 colon, {"time": "t:ms", "q1": "enc_1:deg"}. Units: s, ms, us, ns; rad, mrad, deg,
                 rev, counts/8192 (any number a revolution), m, mm; these per second, rpm; N m,
                 mN m, N, mN.
-            degrees: positions and velocities that say no unit are in degrees.
+            degrees: positions and velocities without a unit are in degrees.
             convention: of the angles, such as "absolute,hanging" or ("absolute", "hanging"), an
                 `AngleConvention`, or a plant; else `table.attrs["convention"]`, else None: that
                 of the plant in whose fit or score the recording is used.
             unit: of position; else `table.attrs["unit"]`, else rad.
-            name: what to call the recording.
+            name: of the recording.
         Warns:
             RecordingWarning: velocity or torque of some joints only, columns that look like torque
                 and are not read; and as `Recording`.
         """
         attributes = table.attrs
-        said = attributes.get("convention") if convention is None else convention
+        convention = attributes.get("convention") if convention is None else convention
         arrays, slides, remarks = formats.table_arrays(table, columns, degrees=degrees)
-        told: Unit | None = None if slides is None else "m" if slides else "rad"
+        found: Unit | None = None if slides is None else "m" if slides else "rad"
         written = attributes.get("unit")
         if degrees and written == "deg":
-            written = None  # which says the same
-        unit = unit or written or told or "rad"
-        if told and told != unit:
+            written = None
+        unit = unit or written or found or "rad"
+        if found and found != unit:
             raise ValueError(
-                f"`unit` is {unit!r}, but the columns say {told!r}; drop one of the two."
+                f"`unit` is {unit!r}, but the columns are in {found!r}; drop one of the two."
             )
         if degrees and unit == "m":
             raise ValueError("`degrees=True` needs angles, but `unit` is 'm'; drop one of the two.")
-        given = str(attributes.get("names", "")).split(",")
-        names = [part.strip() for part in given if part.strip()]
+        names = [part.strip() for part in str(attributes.get("names", "")).split(",")]
         recording = cls(
             time=arrays["time"],
             q=arrays["q"],
             tau=arrays.get("tau"),
             qd=arrays.get("qd"),
-            names=tuple(names),
-            convention=None if said is None else AngleConvention.of(said),
+            names=tuple(filter(None, names)),
+            convention=None if convention is None else AngleConvention.of(convention),
             unit=unit,
             name=name,
         )
-        warn_of_columns(recording, remarks)
+        for finding, remedy in remarks:
+            recording._warn(finding, remedy, stacklevel=3)
         return recording
 
     @classmethod
@@ -322,14 +296,17 @@ class Recording:
         unit: Unit | None = None,
         name: str | None = None,
     ) -> Recording:
-        """Recording from a .csv (.csv.gz, .tsv, .txt), .parquet, .npz, .mat, .h5 or .mf4 file.
+        """Recording from a file: CSV, TSV, TXT, Parquet, NPZ, MATLAB, HDF5 or MDF4.
+
+        The ending selects the format: .csv, .csv.gz, .tsv, .txt, .parquet, .npz, .mat, .h5, .hdf5
+        or .mf4.
 
         A CSV file may begin with comment lines `# convention: absolute,hanging` and `# unit: rad`;
-        arguments override what the file says. Cells may be separated by commas, semicolons, tabs
+        arguments override the file. Cells may be separated by commas, semicolons, tabs
         or blanks, as the header is; numbers may have a decimal comma where no comma separates. A
         row of units under the header, or units in it as in `time [ms]`, are followed. Arrays of
-        .mat and .h5 files are named by their path, `data.Y.q1`, `enc[0]`; what dSPACE ControlDesk
-        recorded, by its name. The name is the file's without its ending.
+        .mat and .h5 files are named by their path, `data.Y.q1`, `enc[0]`; signals of dSPACE
+        ControlDesk by their names. The name is the file's without its ending.
 
         Args:
             path: of the file.
@@ -352,10 +329,15 @@ class Recording:
                 name=formats.stem(path) if name is None else name,
             )
         except ValueError as error:
-            told = str(error)
-            told = told if len(told) <= 2000 else f"{told[:1997]}..."  # it may cite the file
-            raise ValueError(f"'{path}': {told}") from error
+            reason = str(error)
+            # It may quote the file.
+            reason = reason if len(reason) <= 2000 else f"{reason[:1997]}..."
+            raise ValueError(f"'{path}': {reason}") from error
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write to .csv, .csv.gz, .parquet or .npz, whole or not at all; `read` gives it back."""
+        """Write to .csv, .csv.gz, .parquet or .npz atomically; `read` gives it back."""
         formats.write_table(self.to_pandas(), path)
+
+    def _warn(self, finding: str, remedy: str, *, stacklevel: int) -> None:
+        label = f"recording '{self.name}': " if self.name else ""
+        warnings.warn(f"{label}{finding}; {remedy}.", RecordingWarning, stacklevel=stacklevel)

@@ -1,4 +1,4 @@
-"""Initial states: where each recording's free run starts."""
+"""Initial states of free runs."""
 
 from __future__ import annotations
 
@@ -64,5 +64,5 @@ def read_initial_states(
 
 
 def _listed(names: Iterable[str]) -> str:
-    """Names that come from a file, so of any number and length."""
+    """Names from a file, which may be many and long."""
     return ", ".join(str(name)[:60] for name in list(names)[:30])

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 
 _SPEEDS = {
     1: ("any",),

@@ -13,11 +13,10 @@ import numpy as np
 from nfriction.evaluation.compare import SCHEMA, Comparison, Part
 from nfriction.evaluation.cross_validation import Candidate, Selection
 from nfriction.evaluation.score import Score
-from nfriction.friction.model import FrictionModel
-from nfriction.friction.models import MODELS
+from nfriction.friction.models import FrictionModel
+from nfriction.friction.registry import model_names
 from nfriction.io import strict_json
-from nfriction.io.model_content import ModelFileError
-from nfriction.io.model_file import load, load_info
+from nfriction.io.model_file import ModelFileError, load, load_info
 from nfriction.io.model_info import ModelInfo
 from nfriction.report.figures import Figure, read_figures
 
@@ -240,7 +239,7 @@ def _models(
     """Models whose files can be read; of our own names, so that no path is made of others."""
     found: dict[str, tuple[FrictionModel, ModelInfo]] = {}
     notes = []
-    for name in (name for name in fits if name in MODELS):
+    for name in (name for name in fits if name in model_names()):
         path = folder / "models" / f"{name}.json"
         try:
             model, info = load(path), load_info(path)

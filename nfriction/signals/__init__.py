@@ -1,8 +1,8 @@
 """From encoder positions to motion: quantisation, causal velocity, smoothing, initial states.
 
-Two ways lead from positions to velocity and acceleration. The causal way (`causal_motion`) is what
-a controller runs: frequency counting and a second-order IIR filter. The smoothers
-(`savitzky_golay`, `kalman_smoother`) see the whole record and serve the fit.
+Velocity and acceleration come causally (`causal_motion`), as in a controller, by frequency counting
+and a second-order IIR filter, or for a fit from smoothers of the whole record (`savitzky_golay`,
+`kalman_smoother`).
 
 Arrays are (time, joint); time is (time,) in seconds; positions are in radians (or metres).
 """

@@ -1,4 +1,4 @@
-"""Motion as a controller sees it: frequency counting and a second-order low-pass filter."""
+"""Causal motion, as in a controller: frequency counting and a second-order low-pass filter."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nfriction.signals.encoder import frequency_counting, quantise
-from nfriction.signals.motion import Motion, checked
+from nfriction.signals.motion import Motion, check_motion
 
 Array = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ class SecondOrderLowPass:
         return np.array([b0, 2 * b0, b0]), np.array([1.0, a1, a2])
 
     def init(self, value: ArrayLike) -> Array:
-        """State (2, *value) of a filter that has rested at `value`."""
+        """State (2, *value) of a filter at rest at `value`."""
         b, a = self.coefficients
         value = np.asarray(value, dtype=np.float64)
         return np.stack([(1 - b[0]) * value, (b[2] - a[2]) * value])
@@ -88,11 +88,11 @@ def causal_motion(
     offset: float = 0.0,
     damping: float = math.sqrt(0.5),
 ) -> Motion:
-    """Motion as a controller sees it, from past and present samples alone.
+    """Motion from past and present samples alone, as in a controller.
 
     Velocity is frequency counting through the low-pass filter; acceleration is the difference of
-    that velocity through the same filter again. The filter runs at the median step, also where the
-    stamps jitter, as one in a controller does.
+    that velocity through the same filter again. The filter runs at the median step even if the
+    stamps jitter, as a controller's does.
 
     Args:
         time: [s], shape (time,).
@@ -106,7 +106,7 @@ def causal_motion(
     References:
         TLRIP paper: frequency counting, then a second-order IIR filter.
     """
-    time, q = checked(time, q)
+    time, q = check_motion(time, q)
     low_pass = SecondOrderLowPass(cutoff_hz, float(np.median(np.diff(time))), damping)
     qd = low_pass(frequency_counting(time, q, counts_per_revolution, offset=offset))
     rate = np.zeros_like(qd)

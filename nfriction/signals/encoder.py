@@ -1,4 +1,4 @@
-"""What an incremental encoder says: counts, and velocity from the time between edges."""
+"""Incremental encoders: quantisation, counts, and velocity from the time between edges."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nfriction.signals.motion import checked
+from nfriction.signals.motion import check_motion
 
 Array = NDArray[np.float64]
 
-# Changes of one count, of joints that turn, are this share of all that are not zero.
+# Least share of one-count changes among all changes of a moving joint.
 REPEATED = 0.01
 # Positions written with few digits make one count now larger, now smaller, by this share.
 ALIKE = 0.05
-# Of the way that a joint goes: no encoder has so many counts, smaller changes are of arithmetic.
+# Share of a joint's range: no encoder has so many counts, smaller changes are rounding.
 ROUNDING = 1e-9
 
 
 def quantise(q: ArrayLike, counts_per_revolution: float, *, offset: float = 0.0) -> Array:
-    """Position as an incremental encoder reports it: the nearest of its evenly spaced counts.
+    """Position of an incremental encoder: the nearest of its evenly spaced counts.
 
     Args:
         q: position [rad], any shape.
@@ -34,10 +34,10 @@ def quantise(q: ArrayLike, counts_per_revolution: float, *, offset: float = 0.0)
 
 
 def count_seen(q: ArrayLike) -> Array:
-    """One count of each joint's encoder as its positions show it, (joint,), NaN where they do not.
+    """Estimate one count of each joint's encoder, (joint,), NaN where positions do not show it.
 
-    It is the smallest change from a sample to the next, where a hundredth of the changes are alike:
-    noise and numbers written with many digits have a smallest change, too, but it hardly repeats.
+    It is the smallest change from a sample to the next if a hundredth of the changes equal it:
+    the smallest change of noise, or of numbers with many digits, hardly repeats.
 
     Args:
         q: positions as they were read [rad or m], shape (..., time, joint).
@@ -63,10 +63,10 @@ def frequency_counting(
 ) -> Array:
     """Causal velocity from the time between encoder edges.
 
-    The velocity is the way between the last two samples that saw an edge, over the time between
-    those edges. While no further edge comes, the joint cannot have moved by more than a count, so
-    the speed falls as one count over the time since the last edge. An edge crossed back and forth
-    counts as no way at all. Before the second edge the velocity is zero.
+    The velocity is the distance between the last two edges over the time between them. Without a
+    further edge the joint cannot have moved by more than a count, so the speed falls as one count
+    over the time since the last edge. An edge crossed back and forth is no distance. Before the
+    second edge the velocity is zero.
 
     Args:
         time: sample times [s], shape (time,).
@@ -78,7 +78,7 @@ def frequency_counting(
     Returns:
         Velocity [rad/s], shape (time, joint).
     """
-    time, q = checked(time, q)
+    time, q = check_motion(time, q)
     quantum = _quantum(counts_per_revolution)
     counts = np.rint((q - offset) / quantum)
     latched = np.broadcast_to(time[:, None], q.shape) if edge_time is None else edge_time
@@ -100,7 +100,7 @@ def frequency_counting(
         last = np.searchsorted(edges, np.arange(len(q)), side="right") - 2
         known = last >= 0
         v = at_edge[last[known]]
-        # |v| · waited is the way since the edge at that speed: beyond one count it slows down.
+        # |v| · waited is the distance since the edge at that speed; beyond one count it is less.
         waited = time[known] - moment[last[known] + 1]
         way = np.abs(v) * waited
         velocity[known, joint] = v * quantum / np.maximum(way, quantum)

@@ -1,23 +1,26 @@
-"""Motion from a Rauch-Tung-Striebel smoother."""
+"""Rauch-Tung-Striebel smoother of a joint whose jerk changes by white noise alone.
+
+Noise and bandwidth are estimated by maximum likelihood from the innovations of its Kalman filter.
+"""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nfriction.recording import is_uniform
-from nfriction.signals.constant_jerk import (
-    ORDER,
-    constant_jerk,
-    covariances,
-    filtered_means,
-    priors,
-    same,
-)
-from nfriction.signals.likelihood import most_likely
-from nfriction.signals.motion import Motion, checked
+from nfriction.signals.motion import Motion, check_motion
 
 Array = NDArray[np.float64]
+
+# State: position, velocity, acceleration, jerk.
+ORDER = 4
+# Time constants after which a state carries no information on the next: a longer gap between
+# samples counts as this long, for its own powers would leave nothing but rounding.
+FARTHEST = 1000.0
+_FACTORIAL = np.array([math.factorial(k) for k in range(ORDER)])
 
 
 def kalman_smoother(
@@ -28,10 +31,10 @@ def kalman_smoother(
 ) -> Motion:
     """Motion from a Rauch-Tung-Striebel smoother with a constant-jerk model (non-causal).
 
-    Between samples the jerk would stay constant but for white noise on its rate; positions carry
-    white measurement noise. What is not given is taken from the record, joint by joint: the ratio
-    of the two noises by maximum likelihood, the measurement noise with it, at least the
-    uncertainty quantum/√12 of the encoder. Irregular stamps are followed exactly.
+    The jerk's rate is white noise, and so is the error of the positions. Parameters that are not
+    given are estimated joint by joint: the ratio of the two noises by maximum likelihood, and with
+    it the measurement noise, at least the quantisation error quantum/√12 of the encoder. Irregular
+    stamps are followed exactly.
 
     Args:
         time: [s], shape (time,).
@@ -45,7 +48,7 @@ def kalman_smoother(
         with Applications to Tracking and Navigation (2001), ch. 6 (kinematic models driven by
         white noise).
     """
-    time, q = checked(time, q)
+    time, q = check_motion(time, q)
     step = float(np.median(np.diff(time)))
     # Stamps that differ by rounding are taken as equal: steady gains are fast.
     steps = np.full(len(time) - 1, step) if is_uniform(time) else np.diff(time)
@@ -54,7 +57,7 @@ def kalman_smoother(
     density = None if jerk_density is None else _per_joint(jerk_density, joints, "jerk_density")
     centred = q - q[0]
     if sigma is None or density is None:
-        sigma, bandwidth = most_likely(steps, centred, sigma, density)
+        sigma, bandwidth = _most_likely(steps, centred, sigma, density)
     if density is not None:
         bandwidth = (density / (sigma**2 * step)) ** (1 / (2 * ORDER))
     # In units of 1/bandwidth and sigma every joint has the same well-scaled problem.
@@ -67,19 +70,17 @@ def kalman_smoother(
 
 
 def _smooth(delta: Array, process: Array, y: Array) -> tuple[Array, Array]:
-    """Means and variances (time, joint, order) of the smoothed state of every joint.
+    """Means and variances (time, joint, order) of the smoothed state, in units of the noise.
 
-    Args:
-        delta: steps times bandwidth, (time - 1, joint).
-        process: spectral density of the driving noise in those units, (joint,).
-        y: positions over their noise, (time, joint).
+    Steps `delta` (time - 1, joint) are times the bandwidth, `process` (joint,) is the density of
+    the driving noise in those units.
     """
-    transition, diffusion = constant_jerk(delta, process)
+    transition, diffusion = _model(delta, process)
     spans = np.concatenate([np.zeros((1, delta.shape[1])), np.cumsum(delta, axis=0)])
     series = y[..., None]
-    mean, covariance = priors(spans, series)
-    predicted, filtered, settled = covariances(transition, diffusion, covariance)
-    means = filtered_means(transition, predicted, mean, series)
+    mean, covariance = _initial(spans, series)
+    predicted, filtered, settled = _covariances(transition, diffusion, covariance)
+    means = _filter(transition, predicted, mean, series)
     gain = np.linalg.solve(predicted[1:], transition @ filtered[:-1]).swapaxes(-1, -2)
     means[:-1] -= gain @ (transition @ means[:-1])
     for k in range(len(y) - 2, -1, -1):
@@ -88,11 +89,173 @@ def _smooth(delta: Array, process: Array, y: Array) -> tuple[Array, Array]:
     k = len(y) - 2
     while k >= 0:
         filtered[k] += gain[k] @ filtered[k + 1] @ gain[k].swapaxes(-1, -2)
-        if k > settled and same(filtered[k], filtered[k + 1]):
+        if k > settled and _settled(filtered[k], filtered[k + 1]):
             filtered[settled:k] = filtered[k]
             k = settled
         k -= 1
     return means[..., 0], np.diagonal(filtered, axis1=-2, axis2=-1)
+
+
+def _most_likely(
+    steps: Array, q: Array, sigma: Array | None, density: Array | None
+) -> tuple[Array, Array]:
+    """Measurement noise and the smoother's bandwidth [1/s] of every joint by maximum likelihood.
+
+    The bandwidth is (density / (sigma² step))^(1/8), the rate at which the smoother forgets. The
+    search is on a grid, with up to eight stretches of the record as independent series.
+    """
+    step = float(np.median(steps))
+    length = min(len(q), 1000)
+    first = np.linspace(0, len(q) - length, min(8, len(q) // length)).astype(int)
+    grid = np.geomspace(2e-3, 2.0, 19)  # bandwidth · step
+    stretches = first + np.arange(length)[:, None]
+    delta = steps[stretches[:-1], None] / step * grid
+    y = q[stretches]
+    if np.all(delta == delta[:1, :1]):
+        # Equal steps: all stretches share their covariances.
+        delta, y = delta[:, :1], y.reshape(length, 1, -1)
+    misfit, volume = _innovations(delta, y)
+    misfit = misfit.reshape(len(grid), -1, q.shape[1]).sum(axis=1)
+    volume = volume * (len(first) / delta.shape[1])
+    count = (length - 1) * len(first)
+    floor = _resolution(q) ** 2 / 12
+    if sigma is not None:
+        variance = np.broadcast_to(sigma**2, misfit.shape)
+    elif density is not None:
+        variance = density * step ** (2 * ORDER - 1) / grid[:, None] ** (2 * ORDER)
+        variance = np.maximum(variance, floor)
+    else:
+        variance = np.maximum(misfit / count, floor)
+    cost = count * np.log(variance) + volume[:, None] + misfit / variance
+    best = _lowest(cost)
+    rows = np.arange(len(grid))
+    bandwidth = np.exp(np.interp(best, rows, np.log(grid))) / step
+    log_variance = [
+        np.interp(row, rows, column) for row, column in zip(best, np.log(variance).T, strict=True)
+    ]
+    return np.exp(0.5 * np.array(log_variance)), bandwidth
+
+
+def _innovations(delta: Array, y: Array) -> tuple[Array, Array]:
+    """Squared innovations over their variance (grid, joint), and the variances' logarithms (grid,).
+
+    Steps are (time - 1, stretch, grid), positions `y` (time, stretch, joint) in units of their
+    noise up to a factor.
+    """
+    transition, diffusion = _model(delta, np.median(delta, axis=(0, 1)))
+    spans = np.concatenate([np.zeros((1, *delta.shape[1:])), np.cumsum(delta, axis=0)])
+    series = np.broadcast_to(y[:, :, None], (*y.shape[:2], delta.shape[2], y.shape[2]))
+    mean, covariance = _initial(spans, series)
+    predicted, _, _ = _covariances(transition, diffusion, covariance)
+    means = _filter(transition, predicted, mean, series)
+    ahead = (transition[..., :1, :] @ means[:-1])[..., 0, :]
+    variance = predicted[1:, ..., 0, 0] + 1
+    misfit = ((series[1:] - ahead) ** 2 / variance[..., None]).sum(axis=(0, 1))
+    return misfit, np.log(variance).sum(axis=(0, 1))
+
+
+def _lowest(cost: Array) -> Array:
+    """Fractional row of every column's minimum: the vertex of a parabola through three rows."""
+    row = np.argmin(cost, axis=0)
+    inner = np.clip(row, 1, len(cost) - 2)
+    below, here, above = (cost[inner + k, np.arange(cost.shape[1])] for k in (-1, 0, 1))
+    bend = below - 2 * here + above
+    shift = 0.5 * (below - above) / np.where(bend > 0, bend, np.inf)
+    return np.where(row == inner, inner + shift, row)
+
+
+def _resolution(q: Array) -> Array:
+    """Smallest change of position between two samples of every joint, at least rounding error."""
+    change = np.abs(np.diff(q, axis=0))
+    smallest = np.where(change > 0, change, np.inf).min(axis=0)
+    rounding = np.finfo(np.float64).eps * np.maximum(np.abs(q).max(axis=0), 1.0)
+    return np.where(np.isfinite(smallest), np.maximum(smallest, rounding), rounding)
+
+
+def _model(delta: Array, process: Array) -> tuple[Array, Array]:
+    """Transition matrices and process noise of steps `delta`, each delta.shape + (order, order)."""
+    if np.all(delta == delta[:1]) and len(delta) > 1:
+        one = _model(delta[:1], process)
+        shape = (*delta.shape, ORDER, ORDER)
+        return np.broadcast_to(one[0], shape), np.broadcast_to(one[1], shape)
+    delta = np.minimum(delta, FARTHEST)
+    order = np.arange(ORDER)
+    ahead = order - order[:, None]
+    powers = delta[..., None, None] ** np.maximum(ahead, 0)
+    transition = np.where(ahead >= 0, powers / _FACTORIAL[np.maximum(ahead, 0)], 0.0)
+    last = ORDER - 1 - order
+    exponent = last + last[:, None] + 1
+    share = 1 / (_FACTORIAL[last] * _FACTORIAL[last][:, None] * exponent)
+    diffusion = process[..., None, None] * share * delta[..., None, None] ** exponent
+    return transition, diffusion
+
+
+def _initial(spans: Array, y: Array) -> tuple[Array, Array]:
+    """Prior mean (..., order, series) and covariance of the first state, from a cubic at the start.
+
+    The covariance is a hundredfold of the fit's own: weak beside the record, yet well scaled.
+    """
+    mean = np.empty((*y.shape[1:-1], ORDER, y.shape[-1]))
+    covariance = np.empty((*spans.shape[1:], ORDER, ORDER))
+    for index in np.ndindex(*spans.shape[1:]):
+        span = spans[(slice(None), *index)]
+        # Within three time constants the model is close to a cubic.
+        near = max(int(np.searchsorted(span, 3.0, side="right")), 2 * ORDER)
+        # A sample errs by its noise and by the motion's departure from the cubic, which dominates
+        # behind a gap.
+        weight = 1 / np.sqrt(1 + _model(span[:near], np.ones(1))[1][..., 0, 0])
+        basis = span[:near, None] ** np.arange(ORDER) / _FACTORIAL
+        inverse = np.linalg.pinv(basis * weight[:, None])
+        mean[index] = inverse @ (y[(slice(near), *index)] * weight[:, None])
+        covariance[index] = 100 * inverse @ inverse.T
+    return mean, covariance
+
+
+def _covariances(transition: Array, diffusion: Array, first: Array) -> tuple[Array, Array, int]:
+    """Predicted and filtered covariances (time, ..., order, order) for unit measurement noise.
+
+    The third value is the sample from which both are constant.
+    """
+    n = len(transition) + 1
+    predicted = np.empty((n, *first.shape))
+    filtered = np.empty_like(predicted)
+    repeats = np.all(transition[1:] == transition[:1])
+    identity = np.eye(ORDER)
+    predicted[0] = first
+    for k in range(n):
+        if k:
+            before = transition[k - 1] @ filtered[k - 1] @ transition[k - 1].swapaxes(-1, -2)
+            predicted[k] = before + diffusion[k - 1]
+        gain = _gain(predicted[k])
+        # Joseph's form keeps the covariance positive.
+        keep = identity - gain * identity[0]
+        filtered[k] = keep @ predicted[k] @ keep.swapaxes(-1, -2) + gain @ gain.swapaxes(-1, -2)
+        if repeats and k and _settled(filtered[k], filtered[k - 1]):
+            predicted[k:], filtered[k:] = predicted[k], filtered[k]
+            return predicted, filtered, k
+    return predicted, filtered, n
+
+
+def _settled(new: Array, old: Array) -> bool:
+    size = np.abs(old).max(axis=(-2, -1), keepdims=True)
+    return bool((np.abs(new - old) <= 1e-9 * size).all())
+
+
+def _gain(predicted: Array) -> Array:
+    """Kalman gain (..., order, 1) of a position with unit noise."""
+    return predicted[..., :1] / (predicted[..., :1, :1] + 1)
+
+
+def _filter(transition: Array, predicted: Array, mean: Array, y: Array) -> Array:
+    """Filtered means (time, ..., order, series) of positions `y` (time, ..., series)."""
+    gain = _gain(predicted)
+    keep = np.eye(ORDER) - gain * np.eye(ORDER)[0]
+    carry = keep[1:] @ transition
+    means = gain * y[..., None, :]
+    means[0] += keep[0] @ mean
+    for k in range(1, len(y)):
+        means[k] += carry[k - 1] @ means[k - 1]
+    return means
 
 
 def _per_joint(value: ArrayLike, joints: int, name: str) -> Array:

@@ -1,4 +1,4 @@
-"""Motion: position, velocity and acceleration over time, and what every way to it asks for."""
+"""Motion: position, velocity and acceleration over time."""
 
 from __future__ import annotations
 
@@ -35,7 +35,12 @@ class Motion:
         return f"Motion(joints={joints}, samples={samples}, duration={duration:.6g} s{known})"
 
 
-def checked(time: ArrayLike, q: ArrayLike) -> tuple[Array, Array]:
+def check_motion(time: ArrayLike, q: ArrayLike) -> tuple[Array, Array]:
+    """Time (time,) and positions (time, joint) as float64, checked.
+
+    Raises:
+        ValueError: wrong shapes, fewer than 8 samples, NaN, or time that does not increase.
+    """
     time, q = np.asarray(time, dtype=np.float64), np.asarray(q, dtype=np.float64)
     if q.ndim != 2 or time.shape != q.shape[:1]:
         raise ValueError(
@@ -46,6 +51,6 @@ def checked(time: ArrayLike, q: ArrayLike) -> tuple[Array, Array]:
         raise ValueError(f"at least 8 samples are needed, got {len(time)}.")
     if not (np.isfinite(q).all() and np.isfinite(time).all() and np.all(np.diff(time) > 0)):
         raise ValueError(
-            "`time` and `q` must be finite and `time` increasing; `Recording` tells where not."
+            "`time` and `q` must be finite and `time` increasing; `Recording` shows where not."
         )
     return time, q

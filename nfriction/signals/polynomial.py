@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nfriction.recording import is_uniform
-from nfriction.signals.motion import Motion, checked
+from nfriction.signals.motion import Motion, check_motion
 
 Array = NDArray[np.float64]
 
@@ -18,7 +18,7 @@ def savitzky_golay(time: ArrayLike, q: ArrayLike, window_s: float = 0.06, order:
 
     The window holds a fixed odd number of samples; at both ends it stays inside the record and the
     polynomial is read off its side. Irregular stamps get a polynomial of their own each, and none
-    reaches over a gap longer than `window_s`: what lies on either side is a record by itself.
+    reaches over a gap longer than `window_s`: the two sides are separate records.
 
     Args:
         time: [s], shape (time,).
@@ -32,7 +32,7 @@ def savitzky_golay(time: ArrayLike, q: ArrayLike, window_s: float = 0.06, order:
     References:
         Savitzky and Golay, Analytical Chemistry 36 (1964) 1627.
     """
-    time, q = checked(time, q)
+    time, q = check_motion(time, q)
     step = float(np.median(np.diff(time)))
     if order < 2:
         raise ValueError(f"`order` must be at least 2 to have an acceleration, got {order}.")
@@ -92,7 +92,7 @@ def initial_state(
     Returns:
         Position [rad] and velocity [rad/s], each (joint,).
     """
-    time, q = checked(time, q)
+    time, q = check_motion(time, q)
     if not duration > 0:
         raise ValueError(f"`duration` must be positive, got {duration}.")
     start = float(time[0]) if start is None else start

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from nfriction.friction.coefficients import Schedule
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.simulation.compiled import NoFriction
 from nfriction.simulation.protocols import remembering
 from nfriction.simulation.rk4 import acceleration

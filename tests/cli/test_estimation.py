@@ -151,8 +151,8 @@ def test_stamps_in_milliseconds_are_told(bench: Path, capsys, monkeypatch) -> No
 @pytest.mark.parametrize(
     ("header", "said"),
     [
-        ("time,q1,q2,tau2", "column tau1 is missing, so nothing is taken to drive that joint; if "
-         "something does, name it with --columns tau1=NAME."),
+        ("time,q1,q2,tau2", "no column tau1, so that joint is assumed to be passive; if "
+         "it is driven, name it with --columns tau1=NAME."),
         ("time,q1,q2,torque1", "column torque1 looks like torque and is not read; if it is, name "
          'it with --columns "tau1=torque1".'),
     ],

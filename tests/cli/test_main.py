@@ -11,7 +11,8 @@ import pytest
 
 from nfriction import cli, rigs
 from nfriction.cli import demo, names
-from nfriction.friction.models import MODELS, NCFM
+from nfriction.friction.models import NCFM
+from nfriction.friction.registry import model_names
 from nfriction.io.model_file import save
 from nfriction.papers import twin
 from nfriction.plant import robotfile
@@ -30,7 +31,7 @@ def example(parser: argparse.ArgumentParser) -> list[str]:
 
 
 def test_names_are_those_of_the_library() -> None:
-    assert list(MODELS) == list(names.MODELS)
+    assert list(model_names()) == list(names.MODELS)
     assert rigs.names() == list(names.RIGS)
     assert names.models(names.DEFAULT_MODELS)
     assert (".json", ".toml", *robotfile.ENDINGS) == names.RIG_FILES

@@ -104,7 +104,7 @@ def test_blocks_cover_a_recording_and_share_their_ends_with_the_rest():
         shared = np.intersect1d(block.recording.time, rest.recording.time)
         assert len(shared) == (2 if k == 1 else 1)
         assert len(rest.recording) + len(block.recording) == len(recording) + len(shared)
-        assert len(rest.recording.spans) == (2 if k == 1 else 1)
+        assert len(rest.recording.segments) == (2 if k == 1 else 1)
         for part in (block, rest):
             np.testing.assert_array_equal(part.motion.time, part.recording.time)
 
@@ -149,7 +149,7 @@ def test_what_is_left_of_a_recording_is_no_reason_to_warn():
     with warnings.catch_warnings():
         warnings.simplefilter("error", RecordingWarning)
         middle = blocked_k_fold(pendulum(), recording, 3)[1].train
-        assert len(middle.recording.joint_coordinates(pendulum()).spans) == 2
+        assert len(middle.recording.joint_coordinates(pendulum()).segments) == 2
 
 
 def test_bad_input_is_refused():

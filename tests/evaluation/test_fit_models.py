@@ -11,7 +11,7 @@ from nfriction import Recording, fit
 from nfriction.evaluation import parallel
 from nfriction.evaluation.parallel import Data, dependency_levels, fit_models, warm_starts
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction.models import MODELS, model_by_name
+from nfriction.friction.registry import model_by_name, model_names
 from nfriction.signals import kalman_smoother
 from tests.cli.benches import pendulum, swing
 
@@ -25,7 +25,9 @@ def data() -> Data:
     return Data([recording], [kalman_smoother(joint.time, joint.q)])
 
 
-@pytest.mark.parametrize("names", [list(MODELS), list(MODELS)[::-1], ["NFLFM", "ALFM"], ["LFM"]])
+@pytest.mark.parametrize(
+    "names", [list(model_names()), list(model_names())[::-1], ["NFLFM", "ALFM"], ["LFM"]]
+)
 def test_every_start_is_there_before_it_is_needed(names: list[str]) -> None:
     origin = warm_starts(names)
     fitted: set[str | None] = {None}
@@ -44,7 +46,7 @@ def test_networks_and_classes_start_from_the_constant_fit_of_their_law() -> None
         assert origin[second] == first
     assert warm_starts(["NFLFM", "NCFM"]) == {"NFLFM": "NCFM", "NCFM": None}
     # All models at once take three rounds, not one to each.
-    assert len(list(dependency_levels(warm_starts(list(MODELS))))) == 3
+    assert len(list(dependency_levels(warm_starts(list(model_names()))))) == 3
 
 
 def same(one: FitResult, other: FitResult) -> bool:

@@ -11,9 +11,9 @@ import torch
 from nfriction import LFM, PendulumChain, score
 from nfriction.evaluation.compare import Comparison
 from nfriction.evaluation.score import RMSE, Score
-from nfriction.friction.constant import Constant
+from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from tests.fitting.recordings import pendulum, swing
 
 MODEL = LFM(2, [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]], v_smooth=0.05)

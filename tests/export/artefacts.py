@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor
 
-from nfriction.friction.constant import Constant
+from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import LINEAR, Law
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.io.model_info import ModelInfo
 from tests.friction.samples import randomise
 

@@ -21,10 +21,10 @@ from nfriction.export.controller import controller_of
 from nfriction.export.errors import ExportError
 from nfriction.export.points import draw
 from nfriction.export.unfiltered import NOT_FINITE, OUTSIDE, SATURATED
-from nfriction.friction.constant import Constant
+from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
-from nfriction.friction.model import FrictionModel
-from nfriction.friction.models import MODELS
+from nfriction.friction.models import FrictionModel
+from nfriction.friction.registry import model_by_name, model_names
 from nfriction.io.model_info import ModelInfo
 
 STUBS = Path(__file__).parent / "stubs"
@@ -55,7 +55,7 @@ INFO = ModelInfo(
 def random_model(name: str, joints: int = 3, seed: int = 0) -> FrictionModel:
     """A named model, every parameter off its start."""
     random = torch.Generator().manual_seed(seed)
-    kind = MODELS[name]
+    kind = model_by_name(name)
     initial = INITIAL[kind(1).law.name]
     factors = 1.0 + 0.3 * torch.rand(joints, len(initial), generator=random, dtype=torch.float64)
     model = kind(joints, factors * torch.tensor(initial, dtype=torch.float64))
@@ -98,7 +98,7 @@ def points(controller, dtype: str, count: int):
 
 
 cases = pytest.mark.parametrize("dtype", ["float64", "float32"])
-names = pytest.mark.parametrize("name", list(MODELS))
+names = pytest.mark.parametrize("name", list(model_names()))
 few = pytest.mark.parametrize("name", ["Stribeck", "ALFM", "NFLFM"])  # one of each kind
 
 

@@ -8,8 +8,7 @@ from nfriction.export.flat import flattened, shortened
 from nfriction.export.flat_numbers import NumberByNumber, _deepest
 from nfriction.export.flat_tensors import TensorByTensor
 from nfriction.friction.laws import NONLINEAR
-from nfriction.friction.model import FrictionModel
-from nfriction.friction.models import NFLFM, NFNCFM, NFNLFM
+from nfriction.friction.models import NFLFM, NFNCFM, NFNLFM, FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from tests.friction.samples import randomise
 

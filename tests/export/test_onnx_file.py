@@ -17,10 +17,9 @@ from nfriction.export.contract import ContractError, compare, run_through, verif
 from nfriction.export.controller import controller_of
 from nfriction.export.onnx_file import open_onnx
 from nfriction.export.points import draw
-from nfriction.friction.constant import Constant
+from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
-from nfriction.friction.model import FrictionModel
-from nfriction.friction.models import LFM
+from nfriction.friction.models import LFM, FrictionModel
 from nfriction.io.model_info import ModelInfo
 from tests.export.artefacts import INFO, rising
 from tests.friction.samples import named_models

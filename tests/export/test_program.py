@@ -13,7 +13,7 @@ from nfriction.export.contract import ContractError, compare, run_through, verif
 from nfriction.export.controller import controller_of
 from nfriction.export.points import draw
 from nfriction.export.program import open_pt2
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from tests.export.artefacts import INFO, rising
 from tests.friction.samples import motion, named_models
 

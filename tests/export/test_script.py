@@ -16,10 +16,9 @@ from nfriction.export.contract import compare, run_through, verify
 from nfriction.export.controller import controller_of
 from nfriction.export.points import draw
 from nfriction.export.script import open_torchscript, sample_inputs
-from nfriction.friction.constant import Constant
+from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law, TorqueFunction
-from nfriction.friction.model import FrictionModel
-from nfriction.friction.models import LFM, NFLFM
+from nfriction.friction.models import LFM, NFLFM, FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.io.model_info import ModelInfo, parameter_hash
 from tests.export.artefacts import INFO, rising

@@ -9,8 +9,9 @@ import pytest
 import torch
 
 from nfriction.export import collapse, mjcf, urdf
-from nfriction.friction.models import ALFM, LFM, NCFM, NFLFM, NLFM
+from nfriction.friction.models import LFM, NCFM, NFLFM, NLFM
 from nfriction.io.model_info import ModelInfo
+from nfriction.papers.afem.models import ALFM
 from nfriction.signals import Motion
 from tests.friction.samples import randomise
 

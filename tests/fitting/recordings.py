@@ -5,7 +5,7 @@ import torch
 
 from nfriction import LinearAxis, PendulumChain, Recording, rollout
 from nfriction.fitting.shooting.problem import ShootingProblem
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import LeastSquaresResult
 from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
 from nfriction.recording.angles import AngleConvention

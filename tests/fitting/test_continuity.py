@@ -7,7 +7,7 @@ from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.strategy import continuation as stages
 from nfriction.fitting.strategy.constant import is_constant_fit
-from nfriction.friction.constant import Constant
+from nfriction.friction.coefficients import Constant
 from tests.fitting.recordings import pendulum, swing
 
 V_SMOOTH = 0.05

@@ -8,9 +8,9 @@ import torch
 
 from nfriction import LFM, NLFM, PendulumChain, Recording, fit, rollout
 from nfriction.evaluation.cross_validation import block_errors, blocked_k_fold
-from nfriction.friction.constant import Constant
-from nfriction.friction.model import FrictionModel
-from nfriction.friction.models import ACVFM, CFM, CVFM, NFCVFM
+from nfriction.friction.coefficients import Constant
+from nfriction.friction.models import CFM, CVFM, NFCVFM, FrictionModel
+from nfriction.papers.afem.models import ACVFM
 from nfriction.signals import quantise
 from tests.fitting.recordings import F64, pendulum, swing
 
@@ -237,7 +237,7 @@ def fitted_offset(plant, truth, recording, share):
     """The offset of a fit, expected to be within a share of the friction."""
     law = truth.law
     if share is not None:
-        expected = tuple(replace(c, share=share) if c.name == "f_o" else c
+        expected = tuple(replace(c, prior_scale=share) if c.name == "f_o" else c
                          for c in law.coefficients)  # fmt: skip
         law = replace(law, coefficients=expected)
     model = FrictionModel(law, Constant(law, 2), V_SMOOTH)

@@ -27,9 +27,9 @@ from nfriction.fitting.equation_error import fit_torque
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.fitting.strategy.continuation import HorizonResult
-from nfriction.friction.constant import Constant
+from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import STRIBECK
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.papers.afem.fit_adaptive import fit_adaptive
 from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import F64, driven_axis, pendulum, swing
@@ -468,7 +468,7 @@ def test_stribeck_friction_is_found_again_on_a_plant_that_is_a_tenth_off():
 
 def mine(joints, **settings):
     """A law of one's own that does not say what it contains."""
-    law = replace(STRIBECK, name="mine", simpler=None, shared=())
+    law = replace(STRIBECK, name="mine", nested_law=None, nested_coefficients=())
     return FrictionModel(law, Constant(law, joints), **settings)
 
 
@@ -501,7 +501,7 @@ def test_a_search_in_vain_from_the_simpler_law_leaves_the_model_as_it_was(monkey
     def by_torque(law, plant, *rest):
         found = fit_torque(law, plant, *rest)
         if not simpler:
-            simpler.extend([1] if law.simpler is None else [])
+            simpler.extend([1] if law.nested_law is None else [])
             return found
         return replace(found, coefficients=torch.tensor(POOR, dtype=F64))
 
@@ -523,7 +523,7 @@ def test_a_law_leaves_no_more_over_than_the_simpler_one_in_it(law, monkeypatch):
 
     def by_torque(law, plant, *rest):
         found = fit_torque(law, plant, *rest)
-        if law.simpler is None:
+        if law.nested_law is None:
             return found
         return replace(found, coefficients=0 * found.coefficients + 10.0)
 

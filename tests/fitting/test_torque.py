@@ -8,7 +8,7 @@ from nfriction import Recording
 from nfriction.fitting.equation_error import TorqueFit, fit_torque, friction_torque, prior_sd
 from nfriction.fitting.options import DEFAULTS
 from nfriction.friction.laws import LINEAR, NONLINEAR, Coefficient, Law
-from nfriction.friction.models import MODELS
+from nfriction.friction.registry import model_by_name
 from nfriction.signals import Motion
 from tests.fitting.recordings import pendulum
 
@@ -39,7 +39,7 @@ def moved(model, plant, *, driven=True):
 @pytest.mark.parametrize("name", TRUTH)
 def test_noiseless_torques_give_the_exact_coefficients(name):
     plant = pendulum()
-    model = MODELS[name](2, TRUTH[name], v_smooth=V_SMOOTH)
+    model = model_by_name(name)(2, TRUTH[name], v_smooth=V_SMOOTH)
     recording, motion, tau_f = moved(model, plant)
     found = fit_torque(model.law, plant, [recording], [motion], V_SMOOTH)
     truth = torch.tensor(TRUTH[name], dtype=torch.float64)
@@ -52,7 +52,7 @@ def test_noiseless_torques_give_the_exact_coefficients(name):
 
 def test_the_torque_of_a_motion_leaves_the_ends_out():
     plant = pendulum()
-    model = MODELS["LFM"](2, TRUTH["LFM"], v_smooth=V_SMOOTH)
+    model = model_by_name("LFM")(2, TRUTH["LFM"], v_smooth=V_SMOOTH)
     recording, motion, tau_f = moved(model, plant)
     qd, load, torque = friction_torque(plant, recording, motion)
     inside = (recording.time > EDGE - 1e-9) & (recording.time < recording.time[-1] - EDGE + 1e-9)
@@ -66,8 +66,8 @@ def test_the_torque_of_a_motion_leaves_the_ends_out():
 
 
 def test_too_few_samples_are_refused():
-    plant, law = pendulum(), MODELS["LFM"](2, TRUTH["LFM"]).law
-    recording, motion, _ = moved(MODELS["LFM"](2, TRUTH["LFM"]), plant)
+    plant, law = pendulum(), model_by_name("LFM")(2, TRUTH["LFM"]).law
+    recording, motion, _ = moved(model_by_name("LFM")(2, TRUTH["LFM"]), plant)
     ends = 2 * round(EDGE / 2e-3)
     for count, enough in ((12, False), (ends + 2, False), (ends + 10, True)):
         part = Motion(*(x[:count] for x in (motion.time, motion.q, motion.qd, motion.qdd)))
@@ -80,7 +80,7 @@ def test_too_few_samples_are_refused():
 
 def test_recordings_are_weighed_together_by_their_samples():
     plant = pendulum()
-    models = [MODELS["NCFM"](2, [c], v_smooth=V_SMOOTH) for c in (1e-3, 3e-3)]
+    models = [model_by_name("NCFM")(2, [c], v_smooth=V_SMOOTH) for c in (1e-3, 3e-3)]
     parts = [moved(m, plant) for m in models]
     both = fit_torque(models[0].law, plant, [p[0] for p in parts], [p[1] for p in parts], V_SMOOTH)
     torch.testing.assert_close(both.coefficients, torch.full((2, 1), 2e-3, dtype=torch.float64))
@@ -88,7 +88,7 @@ def test_recordings_are_weighed_together_by_their_samples():
 
 def test_what_is_positive_by_physics_stays_so():
     plant = pendulum()
-    model = MODELS["NLFM"](2, [-5e-3, 1e-3, 1e-3, 0.0, 1.0], v_smooth=V_SMOOTH)
+    model = model_by_name("NLFM")(2, [-5e-3, 1e-3, 1e-3, 0.0, 1.0], v_smooth=V_SMOOTH)
     recording, motion, _ = moved(model, plant)
     backwards = Recording(recording.time, recording.q, tau=2 * np.asarray(
         plant.inverse_dynamics(*(torch.as_tensor(x) for x in (motion.q, motion.qd, motion.qdd)))
@@ -107,7 +107,7 @@ def test_what_joints_have_little_of_is_expected_near_zero_in_units_of_the_fricti
     for k, coefficient in enumerate(law.coefficients):
         assert torch.isfinite(sd[:, k]).all() == (coefficient.name == shy)
         # 0.6 left over and 0.8 explained add in the square.
-        torch.testing.assert_close(sd[:, k], coefficient.share * 0.8 * size)
+        torch.testing.assert_close(sd[:, k], coefficient.prior_scale * 0.8 * size)
     assert (prior_sd(law, TorqueFit(nothing, size, size)) > 0).all()
 
 
@@ -116,7 +116,7 @@ def test_a_law_that_gives_no_number_is_named_with_joint_and_velocity():
         return coefficients[..., 0] * qd.sqrt()  # NaN where the joint turns back
 
     plant = pendulum()
-    recording, motion, _ = moved(MODELS["NCFM"](2, TRUTH["NCFM"]), plant)
+    recording, motion, _ = moved(model_by_name("NCFM")(2, TRUTH["NCFM"]), plant)
     law = Law("root", (Coefficient("R", "N m"),), root)
     with pytest.raises(ValueError, match=r"law 'root' gives nan where R is 1, at joint \d, vel"):
         fit_torque(law, plant, [recording], [motion], V_SMOOTH)

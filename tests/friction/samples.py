@@ -13,8 +13,8 @@ from nfriction.friction.laws import (
     Coefficient,
     Law,
 )
-from nfriction.friction.model import FrictionModel
-from nfriction.friction.models import MODELS
+from nfriction.friction.models import FrictionModel
+from nfriction.friction.registry import model_by_name, model_names
 
 LAWS = (VISCOUS, COULOMB, COULOMB_VISCOUS, LINEAR, NONLINEAR, STRIBECK)
 
@@ -50,8 +50,8 @@ def randomise(model: torch.nn.Module, spread: float = 1.0, seed: int = 0) -> Non
 
 def named_models(joints: int = 3) -> dict[str, FrictionModel]:
     """Every named model, moved off its start, and the neuro-fuzzy one with every option."""
-    models: dict[str, FrictionModel] = {name: make(joints) for name, make in MODELS.items()}
-    models["NFLFM, other options"] = MODELS["NFLFM"](
+    models: dict[str, FrictionModel] = {name: model_by_name(name)(joints) for name in model_names()}
+    models["NFLFM, other options"] = model_by_name("NFLFM")(
         joints, [1e-3, 2e-3], v_smooth=1e-2, terms=(3, 2), head_units=4, acceleration="signed",
         interpretable=True, prior_sd=0.1,
     )  # fmt: skip

@@ -150,12 +150,12 @@ def test_the_exponent_of_stribeck_is_kept_by_default() -> None:
 
 
 def test_a_law_is_refused_that_could_not_be_fitted_or_told() -> None:
-    with pytest.raises(ValueError, match="search"):
+    with pytest.raises(ValueError, match="initial_grid"):
         Coefficient("v_s", "rad/s", linear=False)
-    with pytest.raises(ValueError, match="`share` of 'v_s' must be positive, and is for"):
-        Coefficient("v_s", "rad/s", linear=False, search=(1.0,), share=0.1)
-    with pytest.raises(ValueError, match="`share`"):
-        Coefficient("f_o", "N m", share=0.0)
+    with pytest.raises(ValueError, match="`prior_scale` of 'v_s' must be positive, and is for"):
+        Coefficient("v_s", "rad/s", linear=False, initial_grid=(1.0,), prior_scale=0.1)
+    with pytest.raises(ValueError, match="`prior_scale`"):
+        Coefficient("f_o", "N m", prior_scale=0.0)
     with pytest.raises(ValueError, match="names of their own"):
         Law("twice", (Coefficient("B", "N m"), Coefficient("B", "N m")), linear)
     with pytest.raises(ValueError, match="names of their own"):
@@ -164,28 +164,28 @@ def test_a_law_is_refused_that_could_not_be_fitted_or_told() -> None:
 
 def test_a_law_names_what_it_shares_with_a_simpler_one():
     own = (Coefficient("a", "N m"), Coefficient("b", "N m s/rad"))
-    assert Law("more", own, coulomb_viscous, LINEAR, ("b", "a")).shared == ("b", "a")
+    assert Law("more", own, coulomb_viscous, LINEAR, ("b", "a")).nested_coefficients == ("b", "a")
     wrong = ((), ("a",), ("a", "c"), ("a", "b", "a"))
     for simpler, shared in (*((LINEAR, names) for names in wrong), (None, ("a",))):
-        with pytest.raises(ValueError, match="law 'more' must name its own"):
+        with pytest.raises(ValueError, match="law 'more' must name the"):
             Law("more", own, coulomb_viscous, simpler, shared)
 
 
 def test_a_law_refuses_a_simpler_one_that_it_cannot_follow():
-    with pytest.raises(TypeError, match="`simpler` must be a Law, got 'linear'"):
+    with pytest.raises(TypeError, match="`nested_law` must be a Law, got 'linear'"):
         Law("more", (Coefficient("a", "N m"),), coulomb_viscous, "linear", ("a",))
     signed = Law("signed", (Coefficient("o", "N m", positive=False),), coulomb)
-    with pytest.raises(ValueError, match="'a' of law 'more' is positive, 'o' of the simpler"):
+    with pytest.raises(ValueError, match="'a' of law 'more' is positive, 'o' of the nested"):
         Law("more", (Coefficient("a", "N m"),), coulomb, signed, ("a",))
 
 
 @pytest.mark.parametrize("law", [NONLINEAR, STRIBECK])
 def test_a_law_is_the_simpler_one_where_nothing_else_is_left(law):
-    simpler = law.simpler
+    simpler = law.nested_law
     qd, load = torch.linspace(-3, 3, 7, dtype=torch.float64), torch.ones(7, dtype=torch.float64)
     values = torch.tensor([0.3, 0.2], dtype=torch.float64)
     lifted = torch.tensor([0.0 if c.linear else 0.7 for c in law.coefficients], dtype=torch.float64)
-    lifted[[law.names.index(name) for name in law.shared]] = values
+    lifted[[law.names.index(name) for name in law.nested_coefficients]] = values
     torch.testing.assert_close(
         law.torque(qd, load, lifted.expand(7, -1), 0.1),
         simpler.torque(qd, load, values.expand(7, -1), 0.1),

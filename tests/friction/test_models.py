@@ -3,12 +3,11 @@
 import pytest
 import torch
 
-from nfriction.friction.coefficients import Schedule
-from nfriction.friction.constant import Constant
+from nfriction.friction.coefficients import Constant, Schedule
 from nfriction.friction.laws import LINEAR, VISCOUS
-from nfriction.friction.model import FrictionModel
-from nfriction.friction.models import LFM, MODELS, NFLFM, NLFM, model_by_name
+from nfriction.friction.models import LFM, NFLFM, NLFM, FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
+from nfriction.friction.registry import model_by_name, model_names
 from nfriction.friction.sensitivity import Sensitivity
 from tests.friction.samples import QUADRATIC, motion, named_models, normal, quadratic
 
@@ -178,6 +177,6 @@ def test_a_schedule_for_another_law_is_refused() -> None:
 
 
 def test_models_are_found_by_name() -> None:
-    assert all(model_by_name(name) is make for name, make in MODELS.items())
+    assert all(model_by_name(name).__name__ == name for name in model_names())
     with pytest.raises(ValueError, match=r"'LFN'; there are NCFM, LFM, .*NFNLFM"):
         model_by_name("LFN")

@@ -9,11 +9,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.func import functional_call, jacrev
 
-from nfriction.friction.constant import Constant
+from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import LINEAR, NONLINEAR, STRIBECK, VISCOUS
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import LEAST_RATIO, NeuroFuzzy
-from nfriction.friction.sensitivity import Sensitivity
 from tests.friction.samples import LAWS, QUADRATIC, motion, normal, randomise
 
 every_law = pytest.mark.parametrize("law", [*LAWS, QUADRATIC], ids=lambda law: law.name)
@@ -242,13 +241,14 @@ def test_parameter_sensitivities_are_the_whole_jacobian(acceleration: str, inter
     assert not found.parameters.requires_grad
 
 
-def test_factored_sensitivities_are_pulled_as_if_multiplied_out() -> None:
+def test_factored_sensitivities_are_contracted_as_if_multiplied_out() -> None:
     schedule = trained(NONLINEAR, 2, terms=(3, 2), head_units=4)
     qd, qdd, _ = motion(6, 2)
     found = schedule.sensitivities(qd, qdd)
-    whole = Sensitivity(found.parameters, found.joint, found.qd, found.qdd)
     held = torch.randn(3, 4, 2, 2, 5, generator=torch.Generator().manual_seed(3), dtype=qd.dtype)
-    torch.testing.assert_close(found.pulled(held), whole.pulled(held), rtol=1e-12, atol=1e-14)
+    whole, samples = found.parameters.unflatten(0, (3, 2)), held[..., found.joint, :]
+    expected = torch.einsum("bskp,brspk->brp", whole, samples)
+    torch.testing.assert_close(found.contract(held), expected, rtol=1e-12, atol=1e-14)
 
 
 def central(function: Callable[[Tensor], Tensor], x: Tensor, step: float) -> Tensor:

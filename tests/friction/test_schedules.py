@@ -5,8 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nfriction.friction.coefficients import SMALLEST
-from nfriction.friction.constant import Constant
+from nfriction.friction.coefficients import SMALLEST, Constant
 from nfriction.friction.laws import LINEAR, NONLINEAR, STRIBECK, VISCOUS, Law
 from tests.friction.samples import LAWS, QUADRATIC, motion, normal
 
@@ -104,8 +103,8 @@ def test_bounds_keep_what_is_not_fitted_and_the_sign_of_the_rest(law: Law) -> No
             assert (upper[:, k] == torch.inf).all()
         elif c.fitted:  # free well beyond what is tried, but not without end
             assert (lower[:, k] > 0).all()
-            assert (lower[:, k] < min(c.search)).all()
-            assert (upper[:, k] > max(c.search)).all()
+            assert (lower[:, k] < min(c.initial_grid)).all()
+            assert (upper[:, k] > max(c.initial_grid)).all()
             assert torch.isfinite(upper[:, k]).all()
         else:
             assert torch.equal(lower[:, k], schedule.values[:, k])
@@ -163,16 +162,3 @@ def test_parameter_names_say_where_a_parameter_acts(law: Law) -> None:
     for joint, row in zip(["shoulder", "elbow"], schedule.values.tolist(), strict=True):
         for coefficient, value in zip(law.names, row, strict=True):
             assert names[round(value) - 1] == f"{coefficient} of {joint}"
-
-
-def test_what_a_fit_expects_is_no_part_of_the_model() -> None:
-    schedule = Constant(NONLINEAR, 2)
-    before = schedule.state_dict()
-    mean, sd = schedule.prior()
-    assert not mean.any()
-    assert torch.isinf(sd).all()
-    expected = torch.full((2, 5), torch.inf, dtype=torch.float64)
-    expected[:, 0] = torch.tensor([1e-4, 2e-4])
-    schedule.set_prior_sd(expected)
-    assert torch.equal(schedule.prior()[1], expected.reshape(-1))
-    assert schedule.state_dict().keys() == before.keys()

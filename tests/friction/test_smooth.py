@@ -5,13 +5,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nfriction.friction.smooth import fading, fading_slope, soft_positive, soft_positive_inverse
+from nfriction.friction.neurofuzzy import smooth_relu, smooth_relu_inverse, taper, taper_slope
 from tests.friction.samples import normal
 
 
 @given(st.floats(-1e100, 1e100), st.floats(1e-6, 1.0))
 def test_the_positive_map_is_positive_and_hardly_changes_what_is(u: float, roundness: float):
-    y = soft_positive(torch.tensor(u, dtype=torch.float64), roundness)
+    y = smooth_relu(torch.tensor(u, dtype=torch.float64), roundness)
     assert y >= 0
     assert y >= u
     assert abs(float(y) - max(u, 0.0)) <= roundness * (1 + 1e-9) + 1e-15 * abs(u)
@@ -19,16 +19,16 @@ def test_the_positive_map_is_positive_and_hardly_changes_what_is(u: float, round
 
 @given(st.floats(1e-2, 1e6))
 def test_the_positive_map_is_undone(y: float) -> None:
-    u = soft_positive_inverse(torch.tensor(y, dtype=torch.float64), 0.05)
+    u = smooth_relu_inverse(torch.tensor(y, dtype=torch.float64), 0.05)
     # For y below the roundness, u is negative and up to 25 times as large: two digits are lost.
-    assert float(soft_positive(u, 0.05)) == pytest.approx(y, rel=1e-13)
+    assert float(smooth_relu(u, 0.05)) == pytest.approx(y, rel=1e-13)
 
 
 @pytest.mark.parametrize("reach", [0.5, 2.0])
-def test_fading_goes_from_one_to_nothing_without_a_corner(reach: float) -> None:
+def test_taper_goes_from_one_to_nothing_without_a_corner(reach: float) -> None:
     direction = torch.tensor([0.6, -0.8], dtype=torch.float64)
     distance = torch.linspace(0.0, 2 * reach, 4001, dtype=torch.float64)[:, None]
-    weight = fading(distance * direction, reach)
+    weight = taper(distance * direction, reach)
     assert weight[0] == 1
     assert float(weight[1000]) == pytest.approx((1 - 0.25) ** 2)
     assert (weight[2000:] == 0).all()
@@ -42,7 +42,7 @@ def test_fading_goes_from_one_to_nothing_without_a_corner(reach: float) -> None:
 
 def test_slope_of_fading_is_that_of_automatic_differentiation() -> None:
     beyond = (0.4 * normal(200, 3)).requires_grad_()
-    (expected,) = torch.autograd.grad(fading(beyond, 0.7).sum(), beyond)
-    found = fading_slope(beyond, 0.7).detach()
+    (expected,) = torch.autograd.grad(taper(beyond, 0.7).sum(), beyond)
+    found = taper_slope(beyond, 0.7).detach()
     torch.testing.assert_close(found, expected)
     assert 20 < (expected.norm(dim=1) > 0).sum() < 180

@@ -265,7 +265,7 @@ def test_unsound_options_and_samples_are_refused() -> None:
 
 @pytest.mark.parametrize("options", VARIANTS)
 @pytest.mark.parametrize("terms", [(5,), (4, 3), (2, 3, 2)])
-def test_the_input_jacobian_is_the_automatic_one(options: dict, terms: tuple[int, ...]) -> None:
+def test_the_input_jacobian_is_each_output_s_own(options: dict, terms: tuple[int, ...]) -> None:
     layer = random_layer(terms=terms, **options)
     x = samples(20, 3, len(terms)).requires_grad_()
     y = layer(x)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from nfriction.fuzzy import AnfisRBF, RBFHead, RBFNetwork
+from nfriction.fuzzy import AnfisRBF, RBFNetwork
 
 FLOAT64 = torch.float64
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
@@ -91,7 +91,7 @@ def test_output_layer_is_stationary(prior_precision: float) -> None:
 
 
 @pytest.mark.parametrize("kind", ["network", "combined"])
-def test_the_input_jacobian_is_the_automatic_one(kind: str) -> None:
+def test_the_input_jacobian_is_each_output_s_own(kind: str) -> None:
     network = shaken(RBFNetwork(3) if kind == "network" else AnfisRBF(3, 2, (4, 3), 2))
     x = samples(20, 3, 2).requires_grad_()
     y = network(x)
@@ -158,7 +158,7 @@ def test_more_units_fit_better(place: str) -> None:
 def test_a_head_changes_nothing_at_the_start_and_improves_when_solved() -> None:
     x = samples(500, 2, 2)
     y = surface(x)
-    assert (RBFHead(2, 4, outputs=3)(samples(5, 2, 4)) == 0).all()
+    assert (AnfisRBF(2, 1, (3,), 3).head(samples(5, 2, 4)) == 0).all()
     model = AnfisRBF(2, 2, [3, 3], 2, units=15)
     model.init_grid(-1.0, 1.0)
     model.anfis.solve_consequents(x, y)

@@ -12,13 +12,18 @@ import pytest
 import torch
 
 from nfriction import PendulumChain, __version__, rollout, score
-from nfriction.friction.constant import Constant
+from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
-from nfriction.friction.model import FrictionModel
-from nfriction.friction.models import LFM, NCFM, NFLFM, NFNLFM, NLFM
+from nfriction.friction.models import LFM, NCFM, NFLFM, NFNLFM, NLFM, FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
-from nfriction.io.model_content import ModelFileError, read_model_file
-from nfriction.io.model_file import load, load_info, load_plant, save
+from nfriction.io.model_file import (
+    ModelFileError,
+    load,
+    load_info,
+    load_plant,
+    read_model_file,
+    save,
+)
 from nfriction.io.model_info import ModelInfo, describe, parameter_hash
 from tests.fitting.recordings import pendulum, swing
 from tests.friction.samples import QUADRATIC, motion, named_models, quadratic, randomise
@@ -127,7 +132,7 @@ def test_a_loaded_model_is_compiled_by_default_and_trained_on_demand(tmp_path: P
 @pytest.mark.parametrize(
     ("rig", "message"),
     [
-        (None, "says nothing of the mechanism"),
+        (None, "does not describe the mechanism"),
         ({}, "no mechanism .*missing keys"),
         ({"kind": ["chain"]}, "no mechanism"),
         ({"kind": "chain", "mass": [1.0] * 100, "length": [1.0] * 100}, "100 masses"),

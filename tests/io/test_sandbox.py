@@ -6,17 +6,17 @@ from pathlib import Path
 
 import pytest
 
-from nfriction.io import sandbox as apart
+from nfriction.io import sandbox
 
 WORK = """
 import os, pathlib, sys, tempfile, time
-from nfriction import apart
+from nfriction.io import sandbox
 
-def work(asked, folder):
+def work(task, folder):
     {body}
 
 def main():
-    apart.serve(work, refusals=(KeyError,), room=2**33)
+    sandbox.worker_main(work, refusals=(KeyError,), memory=2**33)
 """
 Run = Callable[..., Path]
 posix = pytest.mark.skipif(sys.platform == "win32", reason="signals and limits of POSIX")
@@ -29,16 +29,16 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     folder = tmp_path / "results"
     folder.mkdir()
 
-    def start(body: str, seconds: float = 60.0, **asked: object) -> Path:
+    def start(body: str, seconds: float = 60.0, **task: object) -> Path:
         (tmp_path / "works_apart.py").write_text(WORK.format(body=body))
-        apart.run("works_apart", asked, folder, seconds=seconds)
+        sandbox.run_isolated("works_apart", task, folder, seconds=seconds)
         return folder
 
     return start
 
 
 def test_results_lie_in_the_folder(run: Run) -> None:
-    folder = run('(folder / "out").write_text(asked["what"])', what="Lösung")
+    folder = run('(folder / "out").write_text(task["what"])', what="Lösung")
     assert (folder / "out").read_text() == "Lösung"
 
 
@@ -48,7 +48,7 @@ def test_temporary_files_lie_there_too(run: Run) -> None:
 
 
 def test_a_refusal_is_passed_on(run: Run) -> None:
-    with pytest.raises(apart.RefusedError, match="no such channel"):
+    with pytest.raises(sandbox.InvalidFile, match="no such channel"):
         run('raise KeyError("no such channel")')
 
 
@@ -64,17 +64,17 @@ def test_a_refusal_is_passed_on(run: Run) -> None:
     ],
 )
 def test_how_it_perished_is_told(run: Run, body: str, said: str) -> None:
-    with pytest.raises(apart.PerishedError, match=said):
+    with pytest.raises(sandbox.WorkerDied, match=said):
         run(body)
 
 
 @posix
 def test_processor_time_is_bounded(run: Run) -> None:
-    with pytest.raises(apart.PerishedError, match="does not come to an end"):
+    with pytest.raises(sandbox.WorkerDied, match="does not come to an end"):
         run("while True: pass", seconds=1.0)
 
 
 def test_waiting_is_bounded(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(apart, "BUSY", 3.0)
-    with pytest.raises(apart.PerishedError, match="does not come to an end"):
+    monkeypatch.setattr(sandbox, "BUSY", 3.0)
+    with pytest.raises(sandbox.WorkerDied, match="does not come to an end"):
         run("time.sleep(600)", seconds=1.0)

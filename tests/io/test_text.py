@@ -89,7 +89,7 @@ def test_lengths_make_a_sliding_axis(tmp_path: Path) -> None:
     np.testing.assert_allclose(back.q, Q * [1e-3, 1.0], rtol=4e-16)
     with pytest.raises(ValueError, match="all be angles or all be lengths"):
         read(tmp_path, text, columns={"q1": "x:mm", "q2": "y:deg"})
-    with pytest.raises(ValueError, match="`unit` is 'rad', but the columns say 'm'"):
+    with pytest.raises(ValueError, match="`unit` is 'rad', but the columns are in 'm'"):
         read(tmp_path, text, columns={"q1": "x:mm", "q2": "y:m"}, unit="rad")
 
 
@@ -162,7 +162,7 @@ def test_units_that_contradict_are_refused(tmp_path: Path) -> None:
     text = written(",", False, "time [s]{0}q1 [rad]{0}q2 [rad]")
     with pytest.raises(ValueError, match=r"`degrees=True`, but column q1 \[rad\]"):
         read(tmp_path, text, degrees=True)
-    with pytest.raises(ValueError, match="said to be in 'deg', but the file says"):
+    with pytest.raises(ValueError, match="given as 'deg', but the file says"):
         read(tmp_path, text, columns={"q1": "q1 [rad]:deg"})
 
 
@@ -182,7 +182,7 @@ def test_what_unpacks_to_far_more_is_refused(
 ) -> None:
     path = tmp_path / "run.csv.gz"
     path.write_bytes(gzip.compress(b"time,q1\n" + b"0,0\n" * 100_000))
-    monkeypatch.setattr("nfriction.io.formats.limits.LARGEST", 100_000)
+    monkeypatch.setattr("nfriction.io.formats.files.LARGEST", 100_000)
     with pytest.raises(ValueError, match="unpacked bytes, more than 100000 are read"):
         Recording.read(path)
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from nfriction.io.formats.units import is_unit, slides, to_si
+from nfriction.io.formats.selection import is_unit, slides, to_si
 
 
 @pytest.mark.parametrize(

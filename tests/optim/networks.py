@@ -24,25 +24,6 @@ class RadialBasis(nn.Module):
         return phi @ self.weights + self.bias
 
 
-class AnalyticRadialBasis(RadialBasis):
-    """The same with a hand-written Jacobian, laid out (output, parameter, sample) in memory."""
-
-    def jacobian(self, x: Tensor) -> Tensor:
-        units, precision = len(self.log_widths), torch.exp(-2 * self.log_widths)[:, None]
-        offset = x.T[:, None, :] - self.centres.T[:, :, None]
-        squares = offset[0].square() + offset[1].square()
-        phi = torch.exp(-squares * precision)
-        slope = 2 * precision * phi
-        J = x.new_zeros(2, 5 * units + 2, len(x))
-        for k, block in enumerate(J):
-            weight = self.weights[:, k, None]
-            block[: 2 * units].view(units, 2, -1).copy_((weight * slope * offset).transpose(0, 1))
-            torch.mul(weight * slope, squares, out=block[2 * units : 3 * units])
-            block[3 * units + k : 5 * units : 2] = phi
-            block[5 * units + k] = 1
-        return J.permute(2, 0, 1)
-
-
 class Tanh(nn.Module):
     """1-S-1 network with tanh units, spread over [-1, 1] at the start (Nguyen and Widrow)."""
 
@@ -58,12 +39,6 @@ class Tanh(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         return torch.tanh(x[:, None] * self.w1 + self.b1) @ self.w2 + self.b2
 
-    def jacobian(self, x: Tensor) -> Tensor:
-        hidden = torch.tanh(x[:, None] * self.w1 + self.b1)
-        slope = (1 - hidden.square()) * self.w2
-        one = torch.ones_like(x)[:, None]
-        return torch.cat([slope * x[:, None], slope, hidden, one], 1)[:, None]
-
 
 class Linear(nn.Module):
     """f = X w, with the coefficients w in one or two parameters, a and b."""
@@ -76,9 +51,6 @@ class Linear(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         return x @ torch.cat(list(self.parameters()))
-
-    def jacobian(self, x: Tensor) -> Tensor:
-        return x[:, None]
 
 
 def noise(seed: int, *shape: int) -> Tensor:

@@ -8,9 +8,15 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from nfriction.optim.evidence import bayesian_regularisation, group_index, maximise_evidence
-from nfriction.optim.evidence_result import EvidenceResult, EvidenceState
+from nfriction.optim.evidence import (
+    EvidenceOptions,
+    EvidenceResult,
+    EvidenceState,
+    maximise_evidence,
+)
 from nfriction.optim.jacobian import NormalEquations, flatten, trainable
+from nfriction.optim.posterior import EvidenceProblem
+from nfriction.optim.regularisation import bayesian_regularisation, group_index
 from tests.optim.networks import F64, Linear, RadialBasis, Tanh, noise, triangle_wave
 
 ONE = {"all": "*"}
@@ -25,7 +31,9 @@ def regression(seed: int, n: int = 60) -> tuple[Tensor, Tensor]:
 
 def test_identities_hold_at_convergence() -> None:
     x, y = triangle_wave(0)
-    fit = bayesian_regularisation(Tanh(3, seed=1), x, y, tolerance=1e-7, max_steps=2000)
+    fit = bayesian_regularisation(
+        Tanh(3, seed=1), x, y, options=EvidenceOptions(tolerance=1e-7, max_steps=2000)
+    )
     assert fit.converged
     for group, alpha in fit.alpha.items():
         shrinkage = 2 * alpha * fit.parameter_squares[group]
@@ -48,7 +56,9 @@ def test_effective_parameters_saturate_as_units_are_added() -> None:
     gamma, evidence = {}, {}
     for units in (1, 2, 3, 4, 6, 10):
         fits = [
-            bayesian_regularisation(Tanh(units, seed), x, y, groups=ONE, max_steps=150)
+            bayesian_regularisation(
+                Tanh(units, seed), x, y, groups=ONE, options=EvidenceOptions(max_steps=150)
+            )
             for seed in range(3)
         ]
         best = max(fits, key=lambda fit: fit.log_evidence)
@@ -66,7 +76,9 @@ def test_linear_regression_reaches_the_maximum_of_its_closed_form() -> None:
     X, y = regression(0)
     weights = 0.5 + noise(9, 60).square()
     prior = {"a": 0.2, "b": 0.01 * noise(8, 8)}
-    fit = bayesian_regularisation(Linear(3, 8), X, y, weights=weights, prior=prior, tolerance=1e-9)
+    fit = bayesian_regularisation(
+        Linear(3, 8), X, y, weights=weights, prior=prior, options=EvidenceOptions(tolerance=1e-9)
+    )
     assert fit.converged
     centre = torch.cat([torch.full((3,), 0.2, dtype=F64), prior["b"]])
 
@@ -111,7 +123,7 @@ def coverage(seed: int, x: Tensor, clean: Tensor) -> tuple[Tensor, Tensor]:
     """Shares of the function and of new measurements within their 95 % error bars."""
     y = clean + 0.1 * noise(seed, len(x))
     model = Tanh(4, seed)
-    fit = bayesian_regularisation(model, x, y, max_steps=200)
+    fit = bayesian_regularisation(model, x, y, options=EvidenceOptions(max_steps=200))
     with torch.no_grad():
         error = model(x) - clean
     fresh = error + 0.1 * noise(seed + 100_000, len(x))
@@ -142,20 +154,26 @@ def test_error_bars_of_a_linear_model_cover_what_they_claim() -> None:
 
 def test_resumed_fit_is_the_uninterrupted_one_bit_for_bit() -> None:
     x, y = triangle_wave(0)
-    whole = bayesian_regularisation(Tanh(4, 0), x, y, max_steps=30, tolerance=1e-12)
+    whole = bayesian_regularisation(
+        Tanh(4, 0), x, y, options=EvidenceOptions(max_steps=30, tolerance=1e-12)
+    )
     kept: list[EvidenceState] = []
 
     def keep(state: EvidenceState) -> bool:
         kept.append(state)
         return state.step == 11
 
-    first = bayesian_regularisation(Tanh(4, 0), x, y, tolerance=1e-12, callback=keep)
+    first = bayesian_regularisation(
+        Tanh(4, 0), x, y, options=EvidenceOptions(tolerance=1e-12, callback=keep)
+    )
     assert (first.status, first.converged) == ("stopped", False)
     file = io.BytesIO()
     torch.save(kept[-1].state_dict(), file)
     file.seek(0)
     state = EvidenceState.from_state_dict(torch.load(file, weights_only=True))
-    second = bayesian_regularisation(Tanh(4, 99), x, y, max_steps=30, tolerance=1e-12, state=state)
+    second = bayesian_regularisation(
+        Tanh(4, 99), x, y, state=state, options=EvidenceOptions(max_steps=30, tolerance=1e-12)
+    )
     assert torch.equal(second.w, whole.w)
     assert (second.alpha, second.beta) == (whole.alpha, whole.beta)
     assert second.log_evidence == whole.log_evidence
@@ -167,12 +185,12 @@ def test_interrupt_keeps_what_was_reached() -> None:
     calls = 0
 
     class Interrupted(Tanh):
-        def jacobian(self, inputs: Tensor) -> Tensor:
+        def forward(self, inputs: Tensor) -> Tensor:
             nonlocal calls
             calls += 1
             if calls == 9:
                 raise KeyboardInterrupt
-            return super().jacobian(inputs)
+            return super().forward(inputs)
 
     model = Interrupted(4, 0)
     before = float((model(x).detach() - y).square().sum())
@@ -188,12 +206,12 @@ def test_error_of_the_model_leaves_it_as_it_was() -> None:
     calls = 0
 
     class Broken(Tanh):
-        def jacobian(self, inputs: Tensor) -> Tensor:
+        def forward(self, inputs: Tensor) -> Tensor:
             nonlocal calls
             calls += 1
             if calls == 5:
                 raise RuntimeError("broken")
-            return super().jacobian(inputs)
+            return super().forward(inputs)
 
     model = Broken(4, 0)
     before = copy.deepcopy(model.state_dict())
@@ -240,7 +258,7 @@ def test_noise_floor_ends_the_fit() -> None:
         model = RadialBasis(4, seed=1)
         for parameter in model.parameters():
             parameter.add_(0.05)
-    fit = bayesian_regularisation(model, x, y, noise_floor=1e-3)
+    fit = bayesian_regularisation(model, x, y, options=EvidenceOptions(noise_floor=1e-3))
     assert (fit.status, fit.converged) == ("noise_floor", True)
     rms = math.sqrt(fit.error_squares / fit.samples)
     assert 0 < rms <= 1e-3
@@ -267,8 +285,10 @@ def test_prior_holds_what_the_data_do_not_see() -> None:
 
 def test_units_of_the_targets_shift_the_evidence_by_their_jacobian() -> None:
     X, y = regression(1)
-    plain = bayesian_regularisation(Linear(3, 8), X, y, tolerance=1e-9)
-    scaled = bayesian_regularisation(Linear(3, 8), X, 1000 * y, tolerance=1e-9)
+    plain = bayesian_regularisation(Linear(3, 8), X, y, options=EvidenceOptions(tolerance=1e-9))
+    scaled = bayesian_regularisation(
+        Linear(3, 8), X, 1000 * y, options=EvidenceOptions(tolerance=1e-9)
+    )
     assert plain.converged
     assert scaled.converged
     torch.testing.assert_close(scaled.w, 1000 * plain.w, rtol=1e-6, atol=0)
@@ -286,9 +306,8 @@ def test_normal_equations_alone_suffice() -> None:
         e = X @ w - y
         return NormalEquations(X.T @ X, X.T @ e, e @ e)
 
-    alone = maximise_evidence(
-        equations, torch.zeros(11, dtype=F64), samples=60, groups=index, names=names
-    )
+    start = torch.zeros(11, dtype=F64)
+    alone = maximise_evidence(EvidenceProblem(equations, 60, start, index, names), start)
     module = bayesian_regularisation(Linear(3, 8), X, y)
     torch.testing.assert_close(alone.w, module.w, rtol=1e-9, atol=0)
     assert math.isclose(alone.log_evidence, module.log_evidence, rel_tol=1e-9)
@@ -323,7 +342,7 @@ def test_bad_input_is_refused_at_the_border() -> None:
     with pytest.raises(ValueError, match="initial"):
         fit(prior="start")
     with pytest.raises(ValueError, match="positive"):
-        fit(tolerance=0.0)
+        EvidenceOptions(tolerance=0.0)
     with pytest.raises(ValueError, match="finite"):
         bayesian_regularisation(Linear(3, 8), X, y * math.nan)
     with pytest.raises(ValueError, match="same number"):

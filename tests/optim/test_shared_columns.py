@@ -7,15 +7,15 @@ import torch
 from torch import Tensor, nn
 
 from nfriction.fuzzy import Anfis, AnfisRBF, RBFNetwork
-from nfriction.optim import shared_columns
-from nfriction.optim.evidence import bayesian_regularisation
+from nfriction.optim.evidence import EvidenceOptions
 from nfriction.optim.jacobian import (
+    CHUNK_ENTRIES,
     NormalEquations,
     normal_equations,
-    per_sample_jacobian,
+    shares_columns,
     trainable,
 )
-from nfriction.optim.shared_columns import shares_columns
+from nfriction.optim.regularisation import bayesian_regularisation
 from tests.optim.networks import F64, RadialBasis, noise
 
 LAYERS = {
@@ -52,22 +52,23 @@ def assert_same(got: NormalEquations, wanted: NormalEquations) -> None:
 
 
 @pytest.mark.parametrize("groups", [1, 2])
-@pytest.mark.parametrize("kind", [*LAYERS, "head"])
-def test_written_jacobians_are_those_of_reverse_differentiation(kind: str, groups: int) -> None:
-    build = LAYERS.get(kind, lambda g: AnfisRBF(g, 2, [3, 2], 2, units=3))
-    network, x = shaken(build(groups)), noise(0, 20, groups, 2)
-    parameters = trainable(network)
-    wanted = torch.func.jacrev(
-        lambda values: torch.func.functional_call(network, values, (x,)).flatten(1)
-    )(parameters)
-    joined = torch.cat([block.flatten(2) for block in wanted.values()], -1)
-    torch.testing.assert_close(network.jacobian(x), joined, rtol=1e-12, atol=1e-12)
-    # What the solver asks for: other values than the module's own, and some of them frozen.
-    parameters = trainable(frozen_first(network))
-    offset = {name: value + 0.1 for name, value in parameters.items()}
-    written = per_sample_jacobian(network, offset, x)
-    plain = per_sample_jacobian(automatic(network), offset, x)
-    torch.testing.assert_close(written, plain, rtol=1e-12, atol=1e-12)
+@pytest.mark.parametrize("kind", LAYERS)
+def test_columns_and_maps_make_the_jacobian_of_reverse_differentiation(
+    kind: str, groups: int
+) -> None:
+    network, x = shaken(LAYERS[kind](groups)), noise(0, 20, groups, 2)
+    wanted = torch.func.jacrev(lambda values: torch.func.functional_call(network, values, (x,)))(
+        trainable(network)
+    )
+    columns, maps = network.jacobian_columns(x), network.jacobian_maps()
+    assert list(maps) == list(wanted)
+    for name, block in wanted.items():
+        found = torch.einsum("gcs,gkce->sgke", columns, maps[name])
+        for group in range(groups):
+            own = block[:, group, :, group].flatten(2)
+            torch.testing.assert_close(found[:, group], own, rtol=1e-12, atol=1e-12)
+    first = network.readout() @ columns[:, : network.readout().shape[2]]
+    torch.testing.assert_close(first.movedim(-1, 0), network(x), rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("weighted", ["not", "by sample", "by error"])
@@ -99,13 +100,10 @@ def test_regularisation_takes_the_columns_where_they_are_offered() -> None:
             calls += 1
             return super().jacobian_columns(x, out)
 
-        def jacobian(self, x: Tensor) -> Tensor:
-            raise AssertionError("the whole Jacobian was asked for")
-
     x = noise(0, 200, 1, 2)
     y = torch.stack([x[..., 0] ** 2, x.prod(-1)], -1) + 0.1 * noise(1, 200, 1, 2)
     ours, plain = Watched(1, units=3), RBFNetwork(1, units=3)
-    fit = bayesian_regularisation(ours, x, y, max_steps=15)
+    fit = bayesian_regularisation(ours, x, y, options=EvidenceOptions(max_steps=15))
     assert calls >= 16
 
     class Plain(nn.Module):
@@ -118,7 +116,7 @@ def test_regularisation_takes_the_columns_where_they_are_offered() -> None:
         def forward(self, x: Tensor) -> Tensor:
             return self.network(x)
 
-    same = bayesian_regularisation(Plain(), x, y, max_steps=15)
+    same = bayesian_regularisation(Plain(), x, y, options=EvidenceOptions(max_steps=15))
     # Rounding, grown over 15 steps of a nonlinear search.
     assert fit.log_evidence == pytest.approx(same.log_evidence, rel=1e-6)
     torch.testing.assert_close(fit.w, same.w, rtol=1e-5, atol=1e-6)
@@ -135,7 +133,7 @@ def test_the_columns_of_a_long_recording_stay_in_bounded_memory() -> None:
     network = Watched(1)
     normal_equations(network, trainable(network), noise(0, 50_000, 1, 2), noise(1, 50_000, 1, 2))
     assert sum(sizes) == 50_000
-    assert max(sizes) * (10 + 1 + 40 + 2) <= shared_columns.CHUNK_ENTRIES
+    assert max(sizes) * (10 + 1 + 40 + 2) <= CHUNK_ENTRIES
 
 
 def test_misfits_and_modules_without_columns() -> None:

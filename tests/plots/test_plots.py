@@ -19,7 +19,8 @@ from nfriction import plots
 from nfriction.evaluation.compare import NO_FRICTION, Comparison
 from nfriction.evaluation.score import RMSE, Score
 from nfriction.fitting.fit import fit
-from nfriction.friction.models import LFM, MODELS, NCFM, NFLFM, NFNCFM, NFNLFM, NLFM
+from nfriction.friction.models import LFM, NCFM, NFLFM, NFNCFM, NFNLFM, NLFM
+from nfriction.friction.registry import model_names
 from nfriction.optim.least_squares import Step
 from nfriction.papers.controller.mamdani import paper_controller
 from nfriction.plant import LinearAxis, rigs
@@ -145,7 +146,7 @@ def test_bars_are_as_high_as_the_errors(unit, spread):
 
 def test_bars_hold_every_model_of_four_joints_and_runs_that_all_diverged():
     columns = ["arm", "joint2", "joint3", "joint4", "all"]
-    many = pd.DataFrame(0.02, index=[NO_FRICTION, *MODELS], columns=columns)
+    many = pd.DataFrame(0.02, index=[NO_FRICTION, *model_names()], columns=columns)
     assert_tidy(plots.rmse_bars(many, "rad"))
     ax = plots.rmse_bars(many * np.inf, "rad").axes[0]
     assert texts(ax).count("diverged") == many.size
@@ -350,6 +351,10 @@ def test_save_all_writes_every_figure_and_leaves_matplotlib_alone(tmp_path):
 
 
 def test_all_models_are_told_apart_by_marker_and_by_dashes():
-    looks = [style.looks(MODELS)[name] for name in MODELS]
-    assert len({(look.line["color"], look.marker["marker"]) for look in looks}) == len(MODELS)
-    assert len({(look.line["color"], str(look.line["linestyle"])) for look in looks}) == len(MODELS)
+    looks = [style.looks(model_names())[name] for name in model_names()]
+    assert len({(look.line["color"], look.marker["marker"]) for look in looks}) == len(
+        model_names()
+    )
+    assert len({(look.line["color"], str(look.line["linestyle"])) for look in looks}) == len(
+        model_names()
+    )

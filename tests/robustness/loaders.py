@@ -31,13 +31,13 @@ from nfriction.export.errors import ExportError
 from nfriction.export.onnx_file import open_onnx
 from nfriction.export.program import open_pt2
 from nfriction.export.script import open_torchscript
-from nfriction.io.formats import mdf, mdf_reader
-from nfriction.io.model_content import ModelFileError
-from nfriction.io.model_file import load, load_info, load_plant
+from nfriction.io.formats import matlab, mdf
+from nfriction.io.formats.worker import load_signals, save_signals
+from nfriction.io.model_file import ModelFileError, load, load_info, load_plant
 from nfriction.io.model_info import parameter_hash
 from nfriction.papers.controller.fis import load_fis
 from nfriction.papers.controller.mamdani import MamdaniController
-from nfriction.papers.controller.rulefile import format_rules, load_rules, parse_rules
+from nfriction.papers.controller.rules import format_rules, load_rules, parse_rules
 from nfriction.plant import rigfile
 from nfriction.recording import Recording, read_initial_states
 from nfriction.recording.angles import AngleConvention
@@ -294,15 +294,20 @@ def _mdf_samples(folder: Path) -> list[bytes]:
     return [path.read_bytes()]
 
 
-def _read_mdf(path: Path) -> None:
-    """What the process for it does; what asammdf raises ends that process."""
-    folder = path.parent / "read"
-    folder.mkdir(exist_ok=True)
-    try:
-        mdf_reader.read({"path": str(path), "sources": []}, folder)
-        mdf.table_of(folder)
-    except Exception as error:
-        raise ValueError(f"{path}: {error}") from error
+def _as_a_worker(module: Any) -> Callable[[Path], None]:
+    """Read a file as a worker process does; whatever the library raises ends that process."""
+
+    def load(path: Path) -> None:
+        folder = path.parent / "read"
+        folder.mkdir(exist_ok=True)
+        try:
+            save_signals(module.read_signals(path, []), folder)
+            found = Recording.from_pandas(load_signals(folder).table())
+        except Exception as error:
+            raise ValueError(f"{path}: {str(error)[:1000]}") from error
+        _check_recording(found)
+
+    return load
 
 
 # Rigs, rules, states.
@@ -567,9 +572,9 @@ LOADERS: dict[str, Loader] = {
         Loader("npz", ".npz", _written(".npz"), _read_recording, _damage_npz),
         Loader("parquet", ".parquet", _written(".parquet"), _read_recording, _damage_parquet,
                needs="pyarrow"),
-        Loader("mat", ".mat", _matlab_samples, _read_recording, _damage_matlab),
+        Loader("mat", ".mat", _matlab_samples, _as_a_worker(matlab), _damage_matlab, apart=True),
         Loader("hdf5", ".h5", _hdf5_samples, _read_recording, _damage_hdf5, needs="h5py"),
-        Loader("mdf", ".mf4", _mdf_samples, _read_mdf, damage_bytes, needs="asammdf",
+        Loader("mdf", ".mf4", _mdf_samples, _as_a_worker(mdf), damage_bytes, needs="asammdf",
                apart=True),
         Loader("initial_states", ".csv", lambda _: [_STATES], _read_states, damage_text),
         Loader("rig_json", ".json", _json_samples(*_RIGS), _read_rig, damage_json),

@@ -15,9 +15,9 @@ import pytest
 
 from nfriction import LFM, ModelInfo, save
 from nfriction.export import torchscript
-from nfriction.io.atomic import replacing, write_atomically
+from nfriction.io.atomic import atomic_write, write_atomically
 from nfriction.papers.controller.mamdani import paper_controller
-from nfriction.papers.controller.rulefile import save_rules
+from nfriction.papers.controller.rules import save_rules
 from nfriction.plant import rigs
 from nfriction.recording import Recording
 from nfriction.recording.angles import AngleConvention
@@ -159,7 +159,7 @@ def test_a_block_that_fails_leaves_nothing(tmp_path: Path) -> None:
     path = tmp_path / "a" / "file"
 
     def fail() -> None:
-        with replacing(path) as unfinished:
+        with atomic_write(path) as unfinished:
             unfinished.write_text("half")
             raise KeyError("in its middle")
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nfriction.io.formats import limits
-from nfriction.papers.controller.rulefile import load_rules
+from nfriction.io.formats import files
+from nfriction.papers.controller.rules import load_rules
 from nfriction.plant import rigs
 from nfriction.recording import Recording, read_initial_states
 from tests.robustness.fuzz import fuzz
@@ -185,11 +185,11 @@ def test_states_and_rules_name_their_file_and_are_brief(tmp_path: Path) -> None:
 
 
 def test_what_unpacks_without_end_is_refused() -> None:
-    unpacked = 2 * limits.UNSUSPECTED
-    limits.refuse_bomb(limits.UNSUSPECTED, 1)
-    limits.refuse_bomb(unpacked, unpacked // limits.LARGEST_RATIO + 1)
+    unpacked = 2 * files.UNSUSPECTED
+    files.refuse_bomb(files.UNSUSPECTED, 1)
+    files.refuse_bomb(unpacked, unpacked // files.LARGEST_RATIO + 1)
     with pytest.raises(ValueError, match="times its size"):
-        limits.refuse_bomb(unpacked, unpacked // limits.LARGEST_RATIO - 1)
+        files.refuse_bomb(unpacked, unpacked // files.LARGEST_RATIO - 1)
 
 
 @pytest.mark.parametrize("ending", [".csv.gz", ".npz", ".mat", ".h5", ".parquet"])
@@ -197,7 +197,7 @@ def test_small_files_of_many_zeros_are_refused(
     ending: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Megabytes of zeros in a few kilobytes, where so much would be too much."""
-    monkeypatch.setattr(limits, "UNSUSPECTED", 2**20)
+    monkeypatch.setattr(files, "UNSUSPECTED", 2**20)
     path = tmp_path / f"run{ending}"
     _write_bomb(path, 500_000)
     assert path.stat().st_size < 2**16

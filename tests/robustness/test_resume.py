@@ -12,7 +12,6 @@ from pathlib import Path
 from random import Random
 
 import pytest
-
 from nfriction.papers.afem.search import SearchState
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -22,7 +21,8 @@ STAGES = ["train_neurofuzzy.py", "--seconds", "1", "--windows", "0.5", "--max-st
           "--model", "NFNCFM"]  # fmt: skip
 REPRODUCE = """
 import sys
-from nfriction.papers.reproduction import Settings, reproduce
+from nfriction.papers.reproduction.run import reproduce
+from nfriction.papers.reproduction.workspace import Settings
 if __name__ == "__main__":
     reproduce(sys.argv[1], Settings(
         tlrip_seconds=1.0, rtip_seconds=1.0, windows=(0.5,), max_steps=1, network_steps=1,
@@ -105,12 +105,12 @@ class Kept:
         for path in files:
             if path.suffix == ".json":
                 json.loads(path.read_text())  # none is half of one
-            if path.name == "search-state.json":
-                state = SearchState.from_dict(json.loads(path.read_text()))
+            if path.name.endswith("-search.json"):
+                state = SearchState.from_dict(json.loads(path.read_text())["result"])
                 assert state.evaluations >= self.evaluations
                 self.evaluations = state.evaluations
             # The result is written anew by a run that only reads its stages.
-            elif path.parent.name in ("checkpoints", "stages"):
+            elif path.parent.name == "stages":
                 model = path.with_suffix(".json")
                 if model.exists():  # which is written last
                     self.finished[path] = path.read_bytes()
@@ -124,10 +124,8 @@ def test_a_trainer_that_is_ended_again_and_again(
     words = [str(ROOT / "trainers" / options[0]), *options[1:], "--out"]
     whole([*words, str(tmp_path / "whole")])
     folder = tmp_path / "ended"
-    broken_off(
-        [*words, str(folder), "--resume"], folder, folder / "checkpoints" / "options.json",
-        seed, 4, Kept(),
-    )  # fmt: skip
+    started = folder / "checkpoints" / "stages" / "options.json"
+    broken_off([*words, str(folder), "--resume"], folder, started, seed, 4, Kept())
     model = f"{options[options.index('--model') + 1]}.json"
     assert (folder / model).read_bytes() == (tmp_path / "whole" / model).read_bytes()
 
@@ -156,7 +154,7 @@ def test_a_reproduction_that_is_ended_again_and_again(tmp_path: Path) -> None:
 def test_ctrl_c_ends_with_what_was_reached_and_says_where(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     process = begin([str(ROOT / "trainers" / SEARCH[0]), *SEARCH[1:], "--out", str(folder)])
-    state = folder / "checkpoints" / "search-state.json"
+    state = folder / "checkpoints" / "stages" / "LFM-search.json"
     deadline = time.monotonic() + 200
     while not state.exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.01)

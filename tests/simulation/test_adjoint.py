@@ -6,7 +6,7 @@ from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from nfriction import NFLFM, PendulumChain, rollout
-from nfriction.friction.models import MODELS
+from nfriction.friction.registry import model_by_name, model_names
 from nfriction.simulation import adjoint
 
 F64 = torch.float64
@@ -71,9 +71,11 @@ def assert_equal_gradients(plant, model, **settings) -> None:
         torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-11 * float(b.abs().max() + 1e-3))
 
 
-@pytest.mark.parametrize("name", [*(n for n in MODELS if not n.startswith("A")), "user", None])
+@pytest.mark.parametrize(
+    "name", [*(n for n in model_names() if not n.startswith("A")), "user", None]
+)
 def test_every_model(name):
-    model = Coupled() if name == "user" else name and MODELS[name](2, v_smooth=0.5)
+    model = Coupled() if name == "user" else name and model_by_name(name)(2, v_smooth=0.5)
     assert_equal_gradients(CHAIN, model)
 
 
@@ -137,7 +139,7 @@ def test_what_reads_tensors_of_others_is_recorded():
 
 
 def test_a_memory_is_recorded():
-    model = MODELS["ALFM"](2, v_smooth=0.5)
+    model = model_by_name("ALFM")(2, v_smooth=0.5)
     assert_equal_gradients(CHAIN, model)
 
 

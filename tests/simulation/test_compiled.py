@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from nfriction import LFM, NFLFM, PendulumChain, codegen, rollout
-from nfriction.friction.constant import Constant
+from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import LINEAR, Law, linear
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.simulation import compiled
 
 F64 = torch.float64

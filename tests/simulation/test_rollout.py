@@ -10,10 +10,10 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from nfriction import LFM, NFLFM, LinearAxis, PendulumChain, rollout
-from nfriction.friction.constant import Constant
+from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
-from nfriction.friction.model import FrictionModel
-from nfriction.friction.models import MODELS
+from nfriction.friction.models import FrictionModel
+from nfriction.friction.registry import model_by_name, model_names
 from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.simulation.rk4 import required_substeps, stability_limit
 
@@ -40,11 +40,11 @@ def smooth_model() -> FrictionModel:
 def named_model(name: str) -> FrictionModel:
     # A signed coefficient of zero would have no scale, and a network's offset move everything.
     initial = [1e-3, 1e-3, 1e-3, 1e-3, 1.0] if name == "NFNLFM" else None
-    model = MODELS[name](2, initial, v_smooth=0.05)
+    model = model_by_name(name)(2, initial, v_smooth=0.05)
     generator = torch.Generator().manual_seed(3)
     if isinstance(model.schedule, Adaptive):
         # Classes far apart, and a memory short enough to change them within a thousand steps.
-        model = MODELS[name](2, v_smooth=0.05, time_constant=0.1, sample_time=5e-4)
+        model = model_by_name(name)(2, v_smooth=0.05, time_constant=0.1, sample_time=5e-4)
         with torch.no_grad():
             model.schedule.raw.add_(
                 0.7 * torch.randn(model.schedule.raw.shape, generator=generator, dtype=F64)
@@ -69,7 +69,9 @@ def run(model, q0=Q0, qd0=QD0, plant=CHAIN, **settings):
 @pytest.mark.parametrize("friction", [False, True])
 def test_order_of_convergence_is_four(friction):
     # A law without load, whose absolute value has kinks.
-    model = MODELS["NLFM"](2, [1e-4, 1e-3, 2e-3, 1e-3, 0.5], v_smooth=2.0) if friction else None
+    model = (
+        model_by_name("NLFM")(2, [1e-4, 1e-3, 2e-3, 1e-3, 0.5], v_smooth=2.0) if friction else None
+    )
 
     def end(steps):
         out = run(model, sample_time=0.8 / steps, steps=steps, backend="c")
@@ -87,9 +89,9 @@ def test_frictionless_energy_is_kept():
     assert float((energy - energy[0]).abs().max()) < 1e-7 * float(energy.abs().max())
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", model_names())
 def test_passive_friction_never_adds_energy(name):
-    model = named_model(name) if name != "NFNLFM" else MODELS[name](2, v_smooth=0.05)
+    model = named_model(name) if name != "NFNLFM" else model_by_name(name)(2, v_smooth=0.05)
     if name == "ANLFM":
         with torch.no_grad():
             model.schedule.raw[..., 0] = 0.0  # f_o pushes, so it is no dissipation
@@ -102,7 +104,7 @@ def test_passive_friction_never_adds_energy(name):
 def test_a_force_on_an_axis_against_the_closed_form():
     """m qdd = u - b qd from rest: qd = u/b (1 - exp(-b t / m))."""
     axis, b, u = LinearAxis(2.0), 3.0, 1.5
-    model = MODELS["NCFM"](1, [b])
+    model = model_by_name("NCFM")(1, [b])
     tau = torch.full((500, 1), u, dtype=F64)
     out = run(model, torch.zeros(1, dtype=F64), torch.zeros(1, dtype=F64), axis, tau=tau)
     exact = u / b * (1 - torch.exp(-b / 2.0 * out.time))
@@ -151,7 +153,9 @@ def test_torques_or_steps_alone_may_bring_the_batch(backend):
 
 # Eager torch takes a second or more for a thousand steps, so the default run has one of each kind.
 OFTEN = ("LFM", "ALFM", "NFLFM", "user")
-NAMES = [n if n in OFTEN else pytest.param(n, marks=pytest.mark.slow) for n in (*MODELS, "user")]
+NAMES = [
+    n if n in OFTEN else pytest.param(n, marks=pytest.mark.slow) for n in (*model_names(), "user")
+]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -183,7 +187,7 @@ def recorded(steps: int) -> dict:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*MODELS, "user"])
+@pytest.mark.parametrize("name", [*model_names(), "user"])
 def test_c_and_numba_agree(name):
     model = FrictionModel(DRAG, Constant(DRAG, 2), 1.0) if name == "user" else named_model(name)
     for given in ({"sample_time": 5e-4, "steps": 1000}, recorded(1000)):
@@ -218,7 +222,7 @@ class Reads(TorchDispatchMode):
         return operation(*args, **(kwargs or {}))
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", model_names())
 def test_no_value_is_asked_for_within_the_loop(name):
     counts = []
     for steps in (3, 9):
@@ -395,16 +399,16 @@ def test_the_stability_limit_is_where_rk4_turns_unstable():
     """An axis with viscous friction just below the limit dies out, just above it grows."""
     axis = LinearAxis(0.5)
     limit = float(stability_limit(axis, 1e-3))
-    assert required_substeps(axis, MODELS["NCFM"](1, [limit]), 1e-3) == 1
+    assert required_substeps(axis, model_by_name("NCFM")(1, [limit]), 1e-3) == 1
     start = torch.zeros(1, dtype=F64), torch.ones(1, dtype=F64)
     ends = []
     for factor in (0.99, 1.0):
-        model = MODELS["NCFM"](1, [factor * limit])
+        model = model_by_name("NCFM")(1, [factor * limit])
         ends.append(float(run(model, *start, axis, steps=500).qd[-1].abs()))
     assert ends[0] < 0.1
     assert ends[1] == pytest.approx(1.0, abs=0.2)
     with pytest.raises(ValueError, match="too steep"):
-        run(MODELS["NCFM"](1, [1.01 * limit]), *start, axis, steps=5)
+        run(model_by_name("NCFM")(1, [1.01 * limit]), *start, axis, steps=5)
 
 
 # Gradients

@@ -62,17 +62,17 @@ def test_a_model_is_trained_written_and_read_by_resume(
 
 
 def test_checkpoints_of_other_options_are_refused(tmp_path: Path) -> None:
-    def start(*words: str) -> training.Training:
+    def start(*words: str) -> None:
         given = training.parser("").parse_args([*words, "--out", str(tmp_path)])
-        return training.Training(given)
+        training.checkpoints(given)
 
     start("--seed", "3")
     start("--seed", "3", "--resume")
     with pytest.raises(ValueError, match="other options"):
         start("--seed", "4", "--resume")
-    (tmp_path / "checkpoints" / "constant.json").write_text("of an earlier run")
+    (tmp_path / "checkpoints" / "stages" / "NLFM.json").write_text("of an earlier run")
     start("--seed", "4")  # anew
-    assert not (tmp_path / "checkpoints" / "constant.json").exists()
+    assert not (tmp_path / "checkpoints" / "stages" / "NLFM.json").exists()
 
 
 def test_recordings_need_a_rig(tmp_path: Path) -> None:
@@ -94,7 +94,7 @@ def test_every_kind_of_model_is_trained(
 ) -> None:
     train(script, *QUICK, "--model", model, "--out", tmp_path, *options)
     assert type(load(tmp_path / f"{model}.json")).__name__ == model
-    assert (tmp_path / "checkpoints" / "constant.json").exists()
+    assert (tmp_path / "checkpoints" / "stages" / "NCFM-fit.json").exists()
 
 
 @pytest.mark.slow
@@ -104,13 +104,13 @@ def test_a_search_that_is_ended_goes_on_to_the_same_result(tmp_path: Path, how: 
     folder = tmp_path / "ended"
     words = [sys.executable, str(TRAINERS / SEARCH[0]), *SEARCH[1:], "--out", str(folder)]
     process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    state = folder / "checkpoints" / "search-state.json"
+    state = folder / "checkpoints" / "stages" / "LFM-search.json"
     deadline = time.monotonic() + 120
     while not state.exists() and time.monotonic() < deadline and process.poll() is None:
         time.sleep(0.005)
     process.send_signal(how)
     assert process.wait(60) != 0
-    assert 0 < json.loads(state.read_text())["evaluations"] < 400
+    assert 0 < json.loads(state.read_text())["result"]["evaluations"] < 400
     assert not (folder / "LFM.json").exists()
     train(*SEARCH, "--out", folder, "--resume")
     ours, theirs = (load(f / "LFM.json").state_dict() for f in (folder, tmp_path / "whole"))

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.plant_parameters import PlantParameter, plant_parameters
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.plant import LinearAxis, PendulumChain, Plant
 from nfriction.recording import Recording
 from nfriction.recording.angles import AngleConvention
@@ -175,7 +175,7 @@ def apply_encoder_offsets(
         return list(recordings), tuple(motions)
     matrix = measurement_matrix(plant, recordings[0].resolve_convention(plant)).numpy()
     rows = [np.array(row) for row in offsets]
-    shifted = [r.derived(q=r.q + matrix @ row) for r, row in zip(recordings, rows, strict=True)]
+    shifted = [r._replace(q=r.q + matrix @ row) for r, row in zip(recordings, rows, strict=True)]
     return shifted, tuple(replace(m, q=m.q + row) for m, row in zip(motions, rows, strict=True))
 
 

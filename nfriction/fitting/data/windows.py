@@ -106,7 +106,7 @@ def cut_windows(
 
 def _cut(recording: Recording, length: float) -> Iterator[tuple[int, int]]:
     """First and last sample of each window."""
-    for first, last in recording.spans:
+    for first, last in recording.segments:
         duration = recording.time[last] - recording.time[first]
         count = max(1, int(duration / length + 0.5))
         if count > last - first:

@@ -24,7 +24,7 @@ from nfriction.fitting.result.uncertainty import CoefficientUncertainty
 from nfriction.fitting.shooting.autocorrelation import bandwidth, effective_noise, hac_sd
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.variables import model_at
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import LeastSquaresResult
 from nfriction.plant import Plant
 from nfriction.signals import Motion, count_seen

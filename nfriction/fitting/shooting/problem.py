@@ -29,7 +29,7 @@ from nfriction.fitting.shooting.normal_equations import (
 from nfriction.fitting.shooting.sensitivity import StepJacobian, Trajectory, propagate
 from nfriction.fitting.shooting.variables import DecisionVariables, model_at
 from nfriction.fitting.strategy.extrapolation_prior import ExtrapolationPrior
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Quadratic
 from nfriction.plant import Plant
 from nfriction.signals import Motion

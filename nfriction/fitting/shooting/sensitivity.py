@@ -18,8 +18,8 @@ from torch import Tensor
 
 from nfriction import codegen
 from nfriction.fitting.plant_parameters import PlantParameter, adjusted_plant
-from nfriction.friction.model import FrictionModel
-from nfriction.friction.sensitivity import FactoredSensitivity, Sensitivity
+from nfriction.friction.models import FrictionModel
+from nfriction.friction.sensitivity import Sensitivity
 from nfriction.plant import Plant
 from nfriction.simulation.rk4 import rk4_step
 from nfriction.simulation.rollout import Rollout
@@ -171,7 +171,7 @@ def _by_block(x: Tensor, length: int) -> Tensor:
 
 def _coefficients(
     friction: FrictionModel, qd: Tensor, qdd: Tensor, memory: Tensor | None
-) -> tuple[Tensor, Sensitivity | FactoredSensitivity]:
+) -> tuple[Tensor, Sensitivity]:
     """Coefficients held over each step, (sample, joint, coefficient), and their derivatives."""
     schedule = friction.schedule
     if memory is None:
@@ -183,7 +183,7 @@ def _coefficients(
 
 
 def _compose(
-    slope: Sensitivity | FactoredSensitivity, derivative: Tensor, block: int, plant_count: int
+    slope: Sensitivity, derivative: Tensor, block: int, plant_count: int
 ) -> tuple[Tensor, Tensor]:
     """Close the loop from the state through the coefficients, and chain the steps of blocks.
 
@@ -212,7 +212,7 @@ def _compose(
         total = total + after @ plant[:, s]
         after = after @ state[:, s]
     by_coefficient = torch.stack(rows[::-1], 1).unflatten(-1, (joints, k)).transpose(1, 2)
-    return after, torch.cat([slope.pulled(by_coefficient), total], -1)
+    return after, torch.cat([slope.contract(by_coefficient), total], -1)
 
 
 def _carry(by_state: Tensor, by_shared: Tensor, start: Tensor, count: int) -> tuple[Tensor, Tensor]:

@@ -12,7 +12,7 @@ from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.plant_parameters import PlantParameter
 from nfriction.friction.coefficients import Schedule
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 
 
 def model_at(model: FrictionModel, vector: Tensor) -> FrictionModel:

@@ -26,8 +26,8 @@ from nfriction.fitting.strategy.continuation import (
 )
 from nfriction.fitting.strategy.encoder_eccentricity import richer_by_evidence
 from nfriction.fitting.strategy.multistart import warm_start_from_nested
-from nfriction.friction.constant import Constant
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.coefficients import Constant
+from nfriction.friction.models import FrictionModel
 from nfriction.plant import PendulumChain, Plant
 
 TOO_LONG = (
@@ -55,7 +55,7 @@ def fit_constant(task: FitTask) -> FitResult:
     found, skipped = horizon_continuation(
         fitter, friction, plant, task.motions, None if linear else equation_error
     )
-    if (law := model.law.simpler) is not None and not found.stopped:
+    if (law := model.law.nested_law) is not None and not found.stopped:
         contained = FrictionModel(law, Constant(law, model.joints), model.v_smooth)
         by_torque = regression(task, contained, begun)
         found, skipped = warm_start_from_nested(

@@ -15,7 +15,7 @@ from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.shooting.variables import Parts, model_at
 from nfriction.fitting.strategy.extrapolation_prior import ExtrapolationPrior
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import LeastSquaresResult, Quadratic, Status, Step
 from nfriction.optim.levenberg_marquardt import FULL, LevenbergMarquardt
 from nfriction.plant import Plant

@@ -93,7 +93,7 @@ def embed_nested(law: Law, nested: Tensor, shapes: Tensor) -> Tensor:
     """
     linear = torch.tensor([c.linear for c in law.coefficients])
     embedded = torch.where(linear, 0.0, shapes)
-    embedded[:, [law.names.index(name) for name in law.shared]] = nested
+    embedded[:, [law.names.index(name) for name in law.nested_coefficients]] = nested
     return embedded
 
 

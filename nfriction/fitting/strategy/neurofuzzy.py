@@ -33,7 +33,7 @@ from nfriction.fitting.strategy.continuation import (
 )
 from nfriction.fitting.strategy.extrapolation_prior import prior_on_unvisited_cells
 from nfriction.fitting.strategy.holdout import HoldoutScore, holdout_rmse, holdout_split
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.recording import Recording
 from nfriction.signals import Motion

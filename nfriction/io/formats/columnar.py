@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from nfriction.io.formats.limits import MOST_COLUMNS, refuse_bomb
+from nfriction.io.formats.files import MOST_COLUMNS, refuse_bomb
 from nfriction.io.formats.text import ATTRIBUTES
 
 _HEADER = re.compile(
@@ -26,7 +26,7 @@ def read_parquet(path: Path, _: object = ()) -> pd.DataFrame:
     from pyarrow.parquet import ParquetFile
 
     content = io.BytesIO(path.read_bytes())
-    # Equal numbers pack to almost nothing, so the file's size tells little.
+    # Equal numbers compress to almost nothing, so the file's size is no bound.
     metadata = ParquetFile(content).metadata
     if metadata.num_columns > MOST_COLUMNS:
         raise ValueError(f"it has more than {MOST_COLUMNS} columns")
@@ -34,8 +34,8 @@ def read_parquet(path: Path, _: object = ()) -> pd.DataFrame:
     try:
         table = pd.read_parquet(content, engine="pyarrow")
     except (KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"what it says of its columns is damaged: {error!r}") from error
-    # What else a stranger wrote there pandas would copy at every step.
+        raise ValueError(f"the description of its columns is damaged: {error!r}") from error
+    # pandas copies all attributes at every step, so foreign ones are dropped.
     table.attrs = {k: table.attrs[k] for k in ATTRIBUTES if isinstance(table.attrs.get(k), str)}
     return table
 
@@ -80,8 +80,8 @@ def read_npz(path: Path, _: object = ()) -> pd.DataFrame:
 def _array(content: bytes) -> np.ndarray:
     """A vector, a matrix or a text of a `.npy` file.
 
-    NumPy's reader takes the header for Python, objects and records for data, and makes room for
-    what the header claims; here the header has one form, and what it claims must be there.
+    NumPy's reader evaluates the header, accepts objects and records, and allocates the claimed
+    size; here the header has one form, and its claims must match the data.
     """
     if content[:6] != b"\x93NUMPY" or len(content) < 12:
         raise ValueError("it holds something that is no array")
@@ -96,7 +96,7 @@ def _array(content: bytes) -> np.ndarray:
     if len(shape) > 2 or math.prod(shape) * form.itemsize != len(data):
         raise ValueError(f"an array in it has {len(data)} bytes, which do not fit its shape")
     if form.kind == "U":
-        # NumPy makes strings of code points that are none, which end the interpreter later on.
+        # NumPy accepts invalid code points, which crash the interpreter later.
         order = "be" if form.byteorder == ">" else "le"
         return np.array(bytes(data).decode(f"utf-32-{order}").rstrip("\0"))
     return np.frombuffer(data, form).reshape(shape, order="F" if columns_first == b"True" else "C")

@@ -1,4 +1,4 @@
-"""Files of recordings: which reader an ending needs, and writing whole or not at all."""
+"""Files of recordings: the reader for each ending, limits of size, atomic writing."""
 
 from __future__ import annotations
 
@@ -6,48 +6,54 @@ import csv
 import os
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-
-import pandas as pd
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING
 
 from nfriction.io.atomic import write_atomically
-from nfriction.io.formats import columnar, hdf5, matlab, mdf, text
 
-_Reader = Callable[[Path, Sequence[str]], pd.DataFrame]
-_Writer = Callable[[pd.DataFrame], bytes]
+if TYPE_CHECKING:
+    import pandas as pd
 
-_READERS: dict[str, _Reader] = {
-    ".csv": text.read_csv,
-    ".csv.gz": text.read_csv_gz,
-    ".tsv": text.read_csv,
-    ".txt": text.read_csv,
-    ".parquet": columnar.read_parquet,
-    ".npz": columnar.read_npz,
-    ".mat": matlab.read_mat,
-    ".h5": hdf5.read_hdf5,
-    ".hdf5": hdf5.read_hdf5,
-    ".mf4": mdf.read_mdf,
+# An hour of ten joints at 1 kHz with torque and velocity, as numbers [bytes].
+LARGEST = 2**30
+MOST_COLUMNS = 2000
+# Measurements compress to a tenth, perhaps; to this share only what is nearly constant.
+UNSUSPECTED, LARGEST_RATIO = 2**26, 200
+
+# Modules and functions by ending, imported on use.
+_READERS = {
+    ".csv": "text:read_csv",
+    ".csv.gz": "text:read_csv_gz",
+    ".tsv": "text:read_csv",
+    ".txt": "text:read_csv",
+    ".parquet": "columnar:read_parquet",
+    ".npz": "columnar:read_npz",
+    ".mat": "matlab:read_mat",
+    ".h5": "hdf5:read_hdf5",
+    ".hdf5": "hdf5:read_hdf5",
+    ".mf4": "mdf:read_mdf",
 }
-_WRITERS: dict[str, _Writer] = {
-    ".csv": text.write_csv,
-    ".csv.gz": text.write_csv_gz,
-    ".parquet": columnar.write_parquet,
-    ".npz": columnar.write_npz,
+_WRITERS = {
+    ".csv": "text:write_csv",
+    ".csv.gz": "text:write_csv_gz",
+    ".parquet": "columnar:write_parquet",
+    ".npz": "columnar:write_npz",
 }
-# What the readers raise on broken content; ValueError covers pandas' parser, pyarrow and Unicode,
-# NotImplementedError and RuntimeError archives of unknown versions or behind a password.
+# Errors of the readers on broken content. ValueError covers pandas' parser, pyarrow and Unicode;
+# NotImplementedError and RuntimeError archives of unknown versions or with a password.
 _BROKEN = (ValueError, OSError, OverflowError, NotImplementedError, RuntimeError,
            zipfile.BadZipFile, zlib.error, EOFError, csv.Error)  # fmt: skip
 
 
 def read_table(path: str | os.PathLike[str], sources: Sequence[str] = ()) -> pd.DataFrame:
-    """The table in a file; the file's ending tells its format.
+    """Read the table in a file; the ending selects the format.
 
     Args:
         path: of the file.
-        sources: names of what is wanted, perhaps with a unit after a colon; formats that hold much
-            else give only these and what bears our own names.
+        sources: wanted columns, perhaps with a unit after a colon; formats that hold much else give
+            only these and those with names of ours.
     Raises:
         FileNotFoundError: there is no such file.
         ImportError: a format whose library is not installed.
@@ -60,27 +66,28 @@ def read_table(path: str | os.PathLike[str], sources: Sequence[str] = ()) -> pd.
     if path.stat().st_size == 0:
         raise ValueError(f"'{path}' is empty; a recording has a header and samples.")
     try:
-        return reader(path, sources)
+        table: pd.DataFrame = resolve_name(f"{__package__}.{reader}")(path, sources)
     except _BROKEN as error:
-        told = str(error)
-        told = told if len(told) <= 500 else f"{told[:497]}..."  # it may cite what is in the file
+        reason = str(error)
+        # It may quote the file.
+        reason = reason if len(reason) <= 500 else f"{reason[:497]}..."
         raise ValueError(
-            f"'{path}' is truncated, ragged or not what its ending says ({told}); "
-            f"mend or fetch it again."
+            f"'{path}' is truncated, ragged or not what its ending says ({reason}); "
+            f"repair or fetch it again."
         ) from error
+    return table
 
 
 def write_table(table: pd.DataFrame, path: str | os.PathLike[str]) -> None:
-    """Write a table whole or not at all; the file's ending tells the format.
-
-    Missing folders are made.
+    """Write a table atomically; the ending selects the format. Missing folders are made.
 
     Raises:
         ValueError: an unknown ending.
         OSError: the file cannot be written.
     """
     path = Path(path)
-    write_atomically(path, _WRITERS[_ending(path, _WRITERS, "written")](table))
+    writer = resolve_name(f"{__package__}.{_WRITERS[_ending(path, _WRITERS, 'written')]}")
+    write_atomically(path, writer(table))
 
 
 def stem(path: str | os.PathLike[str]) -> str:
@@ -89,10 +96,33 @@ def stem(path: str | os.PathLike[str]) -> str:
     return name[: -len(_ending(Path(path), _READERS, "read"))]
 
 
-def _ending(path: Path, known: dict[str, _Reader] | dict[str, _Writer], done: str) -> str:
+def most_unpacked(packed: int) -> int:
+    """Largest unpacked size [bytes] accepted from a file of this size."""
+    return min(LARGEST, max(UNSUSPECTED, LARGEST_RATIO * packed))
+
+
+def refuse_bomb(unpacked: int, packed: int) -> None:
+    """Raise ValueError where a file unpacks to far more [bytes] than measurements would."""
+    refuse_size(unpacked, "unpacked bytes")
+    if unpacked > most_unpacked(packed):
+        raise ValueError(
+            f"it unpacks to {unpacked} bytes or more, {unpacked // max(packed, 1)} times its size, "
+            f"as no recording does; if it is one, write it uncompressed"
+        )
+
+
+def refuse_size(count: int, unit: str = "bytes") -> None:
+    """Raise ValueError where a file is larger than any recording."""
+    if count > LARGEST:
+        raise ValueError(
+            f"it holds {count} {unit}, more than {LARGEST} are read; cut it into parts"
+        )
+
+
+def _ending(path: Path, known: Iterable[str], verb: str) -> str:
     for ending in known:
         if path.name.lower().endswith(ending):
             return ending
     raise ValueError(
-        f"'{path}' must end in one of {', '.join(known)}, the formats that are {done}."
+        f"'{path}' must end in one of {', '.join(known)}, the formats that are {verb}."
     )

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
-from nfriction.io.formats.limits import refuse_bomb
-from nfriction.io.formats.nested import DEEPEST, MOST, nested_table
+from nfriction.io.formats.files import refuse_bomb
+from nfriction.io.formats.nested import DEEPEST, MOST, choose_signals
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
@@ -34,7 +36,7 @@ def read_hdf5(path: Path, sources: Sequence[str] = ()) -> pd.DataFrame:
             content = _Reader(file, path.stat().st_size).group(file, 0)
     except (OSError, RuntimeError, KeyError, TypeError, MemoryError) as error:
         raise ValueError(f"h5py cannot read it: {error}") from error
-    return nested_table(content, sources, slashes=True)
+    return choose_signals(content, sources, slashes=True).table()
 
 
 class _Reader:
@@ -47,12 +49,12 @@ class _Reader:
         self.bytes = 0
 
     def group(self, group: Any, depth: int) -> dict[str, Any]:
-        # MATLAB keeps what references lead to in "#refs#".
+        # MATLAB keeps the targets of references in "#refs#".
         names = [name for name in group if not name.startswith("#")]
         return {
             name: self.item(group[name], depth + 1)
             for name in names
-            # Links may lead out of the file, so only what lies here is read.
+            # Other links may lead out of the file.
             if type(group.get(name, getlink=True)).__name__ == "HardLink"
         }
 
@@ -69,20 +71,18 @@ class _Reader:
             return self._referred(item, depth)
         if item.dtype.kind not in "fiub" or item.shape is None:
             return None
-        # Samples that lie in other files are not ours to read.
-        if item.external or item.is_virtual:
+        # Never read other files; an empty array stores its shape in place of samples.
+        if item.external or item.is_virtual or item.attrs.get("MATLAB_empty"):
             return None
-        if item.attrs.get("MATLAB_empty"):
-            return None  # what is stored is its shape
         values = np.asarray(item[()])
         kind = item.attrs.get("MATLAB_class")
         if kind == b"char":
             return "".join(map(chr, values.ravel().tolist()))
-        # MATLAB counts columns first, so a matrix lies here turned.
+        # MATLAB stores column by column, so matrices appear transposed.
         return values if kind is None else values.T
 
     def _referred(self, item: Any, depth: int) -> list[Any]:
-        """What the references of a cell, or of a field of an array of structs, lead to."""
+        """Targets of the references of a cell, or of a field of an array of structs."""
         import h5py
 
         if h5py.check_ref_dtype(item.dtype) is not h5py.Reference:
@@ -94,7 +94,7 @@ class _Reader:
 
 
 def _struct_array(content: dict[str, Any]) -> dict[str, Any] | list[dict[str, Any]]:
-    """Fields that are all lists of one length are an array of structs, written field by field."""
+    """Turn fields that are all lists of one length into the array of structs that they were."""
     lengths = {len(value) if isinstance(value, list) else -1 for value in content.values()}
     if len(lengths) != 1 or -1 in lengths:
         return content

@@ -1,27 +1,20 @@
-"""ASAM MDF measurement files (.mf4) through asammdf, read in a process of its own.
-
-A damaged file can end the process that reads it, keep it busy for ever, or spoil its memory.
-"""
+"""ASAM MDF measurement files (.mf4), read by asammdf in a worker process."""
 
 from __future__ import annotations
 
-import json
-import tempfile
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
-from nfriction.io import sandbox as apart
-from nfriction.io.formats.limits import refuse_size
-from nfriction.io.formats.nested import signals_table
+from nfriction.io.formats.nested import Signals, asked_names
+from nfriction.io.formats.selection import OURS
+from nfriction.io.formats.worker import read_in_worker, read_main
 
-# Processor time of the reader [s]: to import what it needs, and for a byte.
-STARTING, BY_BYTE = 20.0, 1e-7
-TABLE = "table.npz"
-_READER = "nfriction.io.formats.mdf_reader"
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def read_mdf(path: Path, sources: Sequence[str] = ()) -> pd.DataFrame:
@@ -29,29 +22,55 @@ def read_mdf(path: Path, sources: Sequence[str] = ()) -> pd.DataFrame:
 
     Raises:
         ImportError: asammdf is not installed.
-        ValueError: no MDF file, one that asammdf cannot bear, or channels that were not sampled
+        ValueError: no MDF file, one that asammdf cannot read, or channels that were not sampled
             together.
     """
     if find_spec("asammdf") is None:
         raise ImportError(
             "MDF files need asammdf: pip install nfriction[mdf]; or export them as .csv or .mat."
         )
-    size = path.stat().st_size
-    refuse_size(size)
-    asked = {"path": str(path.absolute()), "sources": list(sources)}
-    with tempfile.TemporaryDirectory() as folder:
-        try:
-            apart.run(_READER, asked, Path(folder), seconds=STARTING + BY_BYTE * size)
-            return table_of(Path(folder))
-        except (apart.PerishedError, OSError, EOFError, LookupError, TypeError) as error:
-            raise ValueError(f"asammdf cannot read it ({error})") from None
+    return read_in_worker(__name__, "asammdf", path, sources)
 
 
-def table_of(folder: Path) -> pd.DataFrame:
-    """What the reader left in its folder."""
-    with np.load(folder / TABLE, allow_pickle=False) as held:
-        told = json.loads(str(held["told"]))
-        columns = {name: held[f"c{k}"] for k, name in enumerate(told["names"])}
-    found = signals_table(columns, told["channels"])
-    found.attrs["units"] = told["units"]
-    return found
+def main() -> None:
+    """Read a file in a worker process."""
+    read_main(read_signals)
+
+
+def read_signals(path: Path, sources: Sequence[str]) -> Signals:
+    """Signals of a file; asammdf's own errors on damage pass."""
+    from asammdf import MDF
+
+    with MDF(path) as file:
+        return choose_channels(file, sources)
+
+
+def choose_channels(file: Any, sources: Sequence[str]) -> Signals:
+    """Channels of an open file that were sampled together.
+
+    Raises:
+        ValueError: channels that make no recording.
+    """
+    places = dict(file.channels_db)
+    columns: dict[str, Any] = {}
+    units: dict[str, str] = {}
+    stamps: Any = None
+    # Each group has a channel of stamps, often called "time"; they come with every signal, too.
+    ours = {name for name in places if OURS.fullmatch(name) and name != "time"}
+    for name in sorted(ours | asked_names(set(places), sources)):
+        if len(places[name]) > 1:
+            raise ValueError(f"channel {name} is there more than once")
+        signal = file.get(name)
+        if stamps is not None and not np.array_equal(stamps, signal.timestamps):
+            raise ValueError(
+                f"channel {name} was not sampled together with {next(iter(columns))}; export the "
+                "measurement on one raster, such as by asammdf's `MDF.resample`"
+            )
+        if np.ndim(signal.samples) != 1:
+            raise ValueError(f"channel {name} holds arrays instead of numbers")
+        stamps, columns[name] = signal.timestamps, signal.samples
+        if signal.unit:
+            units[name] = str(signal.unit)
+    if stamps is not None:
+        columns.setdefault("time", stamps)
+    return Signals(columns, sorted(places), units)

@@ -2,40 +2,59 @@
 
 from __future__ import annotations
 
+import math
 import re
+import unicodedata
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
-from nfriction.io.formats.units import canonical_unit, is_unit, slides, to_si
+if TYPE_CHECKING:
+    import pandas as pd
 
 Array = NDArray[np.float64]
 
 OURS = re.compile(r"time|(q|qd|tau)[1-9]\d{0,3}", re.ASCII)
-# What people call a torque, a number and a unit behind it; "torque_on" and "taut" are none.
+# Usual names of a torque, with a number and a unit behind; "torque_on" and "taut" are none.
 _LIKE_TORQUE = re.compile(
     r"(torque|drehmoment|(?<![a-z])(tau|force))(_(cmd|command|meas|measured))?[\W_]*\d*\s*([\[(].*)?$",
     re.IGNORECASE,
 )
 
+_TURN = 2 * math.pi
+_ROTATION = {"rad": 1.0, "mrad": 1e3, "deg": 180 / math.pi, "rev": 1 / _TURN}
+# How many of each unit make one of SI: values are divided, so that milliseconds stay exact.
+_PER_SI: dict[str, dict[str, float]] = {
+    "time": {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9},
+    "q": _ROTATION | {"m": 1.0, "mm": 1e3},
+    "qd": {f"{unit}/s": per for unit, per in _ROTATION.items()}
+    | {"rpm": 60 / _TURN, "m/s": 1.0, "mm/s": 1e3},
+    "tau": {"N m": 1.0, "mN m": 1e3, "N": 1.0, "mN": 1e3},
+}
+_SPELLINGS = {
+    "°": "deg", "°/s": "deg/s", "degree": "deg", "degrees": "deg", "degrees/s": "deg/s",
+    "Grad": "deg", "Grad/s": "deg/s", "radian": "rad", "radians": "rad", "radians/s": "rad/s",
+    "1/min": "rpm", "U/min": "rpm", "Nm": "N m", "N*m": "N m", "N.m": "N m", "mNm": "mN m",
+    "sec": "s", "msec": "ms", "μs": "us",
+}  # fmt: skip
+
 
 class Source(NamedTuple):
-    """A column of a table and the unit it is said to be in."""
+    """A column of a table and its unit, None if unknown."""
 
     column: str
     unit: str | None
 
 
 class Arrays(NamedTuple):
-    """What a table holds of a recording, in SI.
+    """Arrays of a recording in SI.
 
     Attributes:
         values: time, q; qd where every joint has it; tau where any has, zero for the others.
-        slides: whether positions are said to be lengths; None where nothing is said.
-        remarks: what may be wrong with the choice of columns, and the mend of each.
+        slides: whether positions are lengths; None if unknown.
+        remarks: doubts about the choice of columns, and the remedy of each.
     """
 
     values: dict[str, Array]
@@ -51,7 +70,7 @@ def table_arrays(
     Args:
         table: with columns time, q1 …, perhaps qd1 …, tau1 …; others are ignored.
         columns: the table's name for ours where they differ, perhaps with a unit: "enc_1:deg".
-        degrees: positions and velocities that say no unit are in degrees.
+        degrees: positions and velocities without a unit are in degrees.
     Raises:
         ValueError: a column or unit that is missing, unknown or contradicts another, or a column
             named for a joint that is not there.
@@ -61,7 +80,7 @@ def table_arrays(
     columns = {key: str(name) for key, name in (columns or {}).items()}
     sources = _sources(table, columns)
     joints = max((int(key[1:]) for key in sources if re.fullmatch(r"q\d+", key)), default=1)
-    # Of a lone q9999 one missing column tells enough.
+    # Of a lone q9999 one missing column is message enough.
     needed = ["time", *(f"q{k + 1}" for k in range(min(joints, len(sources) + 1)))]
     missing = [key for key in dict.fromkeys((*needed, *columns)) if key not in sources]
     if missing:
@@ -76,14 +95,14 @@ def table_arrays(
     arrays = {"time": _column(table, "time", sources["time"])}
     for key in ("q", "qd", "tau"):
         group = [sources.get(f"{key}{k + 1}") for k in range(joints)]
-        # A joint without a motor has no torque to log; a velocity that nobody logged is not zero.
+        # A joint without a motor has no torque to log; an unlogged velocity is not zero.
         if all(group) or (key == "tau" and any(group)):
             stack = [_joint_column(table, key, source, degrees) for source in group]
             arrays[key] = np.stack(stack, axis=1)
-    said = [s.unit for key, s in sources.items() if re.fullmatch(r"q\d+", key) and s.unit]
-    kinds = {slides(unit) for unit in said}
+    units = [s.unit for key, s in sources.items() if re.fullmatch(r"q\d+", key) and s.unit]
+    kinds = {slides(unit) for unit in units}
     if len(kinds) > 1:
-        raise ValueError(f"positions must all be angles or all be lengths, got {', '.join(said)}.")
+        raise ValueError(f"positions must all be angles or all be lengths, got {', '.join(units)}.")
     return Arrays(arrays, kinds.pop() if kinds else None, _remarks(table, sources, joints))
 
 
@@ -96,17 +115,72 @@ def parse_source(spec: str, names: set[str]) -> Source | None:
 
 
 def column_numbers(table: pd.DataFrame, column: str) -> Array:
-    """A column as float64; empty cells are NaN, a cell that is no number is named."""
+    """A column as float64; empty cells are NaN.
+
+    Raises:
+        ValueError: a cell is no number; names it.
+    """
     cells = table[column].to_numpy(dtype=object, na_value=np.nan)
     try:
         return cells.astype(np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        row = next(row for row, cell in enumerate(cells) if not _is_number(cell))
+        row = next(row for row, cell in enumerate(cells) if not is_number(cell))
         shown = repr(cells[row])
         raise ValueError(
             f"column {column}, row {row} (counted from 0 below the header) must be a number, "
             f"got {shown if len(shown) < 80 else shown[:77] + '...'}."
         ) from error
+
+
+def is_number(cell: object) -> bool:
+    """Whether Python reads a cell as a float."""
+    try:
+        float(cell)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        return False
+    return True
+
+
+def canonical_unit(text: str) -> str:
+    """A unit in our spelling, without the brackets and signs of a file."""
+    text = unicodedata.normalize("NFKC", text).strip().strip("[]()").strip()
+    return _SPELLINGS.get(text, text)
+
+
+def is_unit(text: str) -> bool:
+    """Whether text is a unit of some column."""
+    return any(_per_si(kind, text) is not None for kind in _PER_SI)
+
+
+def slides(unit: str) -> bool:
+    """Whether a position in this unit is that of a sliding joint."""
+    return canonical_unit(unit) in ("m", "mm")
+
+
+def to_si(kind: str, values: Array, unit: str) -> Array:
+    """Values in SI.
+
+    Args:
+        kind: "time", "q", "qd" or "tau".
+        values: any shape.
+        unit: s, ms, us, ns; rad, mrad, deg, rev, counts/8192 (any count a revolution), m, mm; those
+            per second, rpm; N m, mN m, N, mN.
+    Raises:
+        ValueError: no unit of that kind.
+    """
+    per = _per_si(kind, unit)
+    if per is None:
+        known = ", ".join(_PER_SI[kind]) + (", counts/N" if kind == "q" else "")
+        raise ValueError(f"{unit!r} is no unit of {kind}; known are {known}.")
+    return values if per == 1.0 else values / per
+
+
+def _per_si(kind: str, unit: str) -> float | None:
+    unit = canonical_unit(unit)
+    counts = re.fullmatch(r"counts?/([1-9][0-9]{0,11})", unit)
+    if counts and kind == "q":
+        return int(counts[1]) / _TURN
+    return _PER_SI[kind].get(unit)
 
 
 def _sources(table: pd.DataFrame, columns: dict[str, str]) -> dict[str, Source]:
@@ -131,25 +205,32 @@ def _sources(table: pd.DataFrame, columns: dict[str, str]) -> dict[str, Source]:
 
 
 def _known(table: pd.DataFrame, aliases: dict[str, str], source: Source) -> Source:
-    """A source by the table's own name for it, with the unit that the file says."""
+    """A source by the table's own name for it, with the unit in the file."""
     column = aliases.get(source.column, source.column)
     if column in table.attrs.get("repeated", ()) or (table.columns == column).sum() > 1:
         raise ValueError(f"column {column} is there more than once; rename one of them.")
-    said = _texts(table, "units").get(column)
-    if source.unit and said and not is_unit(said):
-        said = None  # a word of the user's own; what he says counts
-    if source.unit and said and canonical_unit(said) != canonical_unit(source.unit):
+    written = _texts(table, "units").get(column)
+    units = {canonical_unit(unit) for unit in (source.unit, written) if unit and is_unit(unit)}
+    if source.unit and len(units) > 1:
         raise ValueError(
-            f"column {column} is said to be in {source.unit!r}, but the file says {said!r}."
+            f"column {column} is given as {source.unit!r}, but the file says {written!r}."
         )
-    return Source(column, source.unit or said)
+    return Source(column, source.unit or written)
 
 
 def _joint_column(table: pd.DataFrame, key: str, source: Source | None, degrees: bool) -> Array:
-    """A joint's numbers in SI, zeros where the table has none."""
+    """A joint's numbers in SI; zero without a source."""
     if source is None:
         return np.zeros(len(table))
-    return _column(table, key, _default_unit(key, source, degrees))
+    if degrees and key in ("q", "qd"):
+        unit = "deg" if key == "q" else "deg/s"
+        if source.unit and canonical_unit(source.unit) != unit:
+            raise ValueError(
+                f"`degrees=True`, but column {source.column} is given as {source.unit!r}; "
+                f"drop one of the two."
+            )
+        source = Source(source.column, unit)
+    return _column(table, key, source)
 
 
 def _number(name: str) -> int:
@@ -161,26 +242,25 @@ def _number(name: str) -> int:
 def _remarks(
     table: pd.DataFrame, sources: dict[str, Source], joints: int
 ) -> tuple[tuple[str, str], ...]:
-    """What may be wrong where velocity or torque is not there for every joint."""
     lacking = {
         key: [f"{key}{k + 1}" for k in range(joints) if f"{key}{k + 1}" not in sources]
         for key in ("qd", "tau")
     }
-    told = []
+    remarks = []
     if 0 < len(lacking["qd"]) < joints:
         finding = f"column {', '.join(lacking['qd'])} is missing, so no measured velocity is read"
-        told.append((finding, "name or drop those of all joints"))
+        remarks.append((finding, "name or drop those of all joints"))
     free = lacking["tau"]
     if 0 < len(free) < joints:
-        finding = f"column {', '.join(free)} is missing, so nothing is taken to drive that joint"
-        told.append((finding, f'if something does, name it with columns={{"{free[0]}": "..."}}'))
+        finding = f"no column {', '.join(free)}, so that joint is assumed to be passive"
+        remarks.append((finding, f'if it is driven, name it with columns={{"{free[0]}": "..."}}'))
     unread = _unread_torques(table, sources) if free else []
     if unread:
         own = f"tau{_number(unread[0])}"
-        mend = f'columns={{"{own if own in free else free[0]}": "{unread[0]}"}}'
+        remedy = f'columns={{"{own if own in free else free[0]}": "{unread[0]}"}}'
         finding = f"column {', '.join(unread[:3])} looks like torque and is not read"
-        told.append((finding, f"if it is, name it with {mend}"))
-    return tuple(told)
+        remarks.append((finding, f"if it is, name it with {remedy}"))
+    return tuple(remarks)
 
 
 def _unread_torques(table: pd.DataFrame, sources: dict[str, Source]) -> list[str]:
@@ -192,18 +272,6 @@ def _unread_torques(table: pd.DataFrame, sources: dict[str, Source]) -> list[str
         for name in names
         if name not in read and _LIKE_TORQUE.search(name) and f"tau{_number(name)}" not in sources
     ]
-
-
-def _default_unit(key: str, source: Source, degrees: bool) -> Source:
-    if not degrees or key not in ("q", "qd"):
-        return source
-    unit = "deg" if key == "q" else "deg/s"
-    if source.unit and canonical_unit(source.unit) != unit:
-        raise ValueError(
-            f"`degrees=True`, but column {source.column} is said to be in {source.unit!r}; "
-            f"drop one of the two."
-        )
-    return Source(source.column, unit)
 
 
 def _column(table: pd.DataFrame, kind: str, source: Source) -> Array:
@@ -235,11 +303,3 @@ def _texts(table: pd.DataFrame, key: str) -> dict[str, str]:
     """A mapping among a table's attributes, which may come from a foreign file."""
     given = table.attrs.get(key)
     return {str(k): str(v) for k, v in given.items()} if isinstance(given, dict) else {}
-
-
-def _is_number(cell: object) -> bool:
-    try:
-        float(cell)  # type: ignore[arg-type]
-    except (TypeError, ValueError, OverflowError):
-        return False
-    return True

@@ -2,7 +2,7 @@
 
 The header decides the separator: a tab if it has one, else a semicolon, else a comma, else blanks.
 Between commas numbers have a decimal point; between other separators a comma in a number is a
-decimal comma, never one of thousands. What does not fit these rules is refused.
+decimal comma, never one of thousands. All else is refused.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from nfriction.io.formats.limits import MOST_COLUMNS, most_unpacked, refuse_bomb, refuse_size
-from nfriction.io.formats.units import is_unit
+from nfriction.io.formats.files import MOST_COLUMNS, most_unpacked, refuse_bomb, refuse_size
+from nfriction.io.formats.selection import is_number, is_unit
 
 ATTRIBUTES = ("convention", "unit", "names")
 
@@ -46,7 +46,7 @@ def write_csv(table: pd.DataFrame) -> bytes:
 
 
 def write_csv_gz(table: pd.DataFrame) -> bytes:
-    # Without the moment of writing, equal recordings make equal files.
+    # Without the time of writing, equal recordings make equal files.
     return gzip.compress(write_csv(table), mtime=0)
 
 
@@ -54,9 +54,9 @@ def parse_csv(text: str) -> pd.DataFrame:
     """Table of a CSV text.
 
     Raises:
-        ValueError: no header, rows that do not fit it, or numbers that may be read in two ways.
+        ValueError: no header, rows that do not fit it, or ambiguous numbers.
     """
-    # Only whole lines are comments: a name such as "enc #1" is none.
+    # Only whole lines are comments, for a column may be called "enc #1".
     content = [line for line in io.StringIO(text) if line.strip() and not _is_comment(line)]
     if not content:
         raise ValueError("it has no header")
@@ -69,7 +69,7 @@ def parse_csv(text: str) -> pd.DataFrame:
     table = pd.read_csv(
         io.StringIO("".join(content)),
         sep=r"\s+" if separator == " " else separator,
-        # Text, for Python's float() is exact where the parser's own default is not.
+        # As text: Python's float() is exact, the parser's default is not.
         dtype=str,
         skipinitialspace=True,
     )
@@ -79,21 +79,21 @@ def parse_csv(text: str) -> pd.DataFrame:
             "separated by semicolons or tabs"
         )
     names = [cell.strip() for cell in header]
-    table.columns = _told_apart(str(column).strip() for column in table.columns)
+    table.columns = _unique(str(column).strip() for column in table.columns)
     # An ending separator makes a last column without name or content.
     unnamed = [c for c in table.columns if c.startswith("Unnamed: ") and table[c].isna().all()]
     table = table.drop(columns=unnamed)
     table, units = _without_units_row(table)
     if separator != ",":
         table = _with_decimal_points(table)
-    aliases = {}
+    aliases: dict[str, str] = {}
     for column in table.columns:
         # "time [s]" may also be called "time".
-        told = re.fullmatch(r"(.*\S)\s*(\[[^\[\]]*\]|\([^()]*\))", column)
-        if told and is_unit(told[2]):
-            units.setdefault(column, told[2])
-            if told[1] not in table.columns and told[1] not in aliases:
-                aliases[told[1]] = column
+        named = re.fullmatch(r"(.*\S)\s*(\[[^\[\]]*\]|\([^()]*\))", column)
+        if named and is_unit(named[2]):
+            units.setdefault(column, named[2])
+            if named[1] not in table.columns:
+                aliases.setdefault(named[1], column)
     repeated = sorted(n for n, count in Counter(names).items() if n and count > 1)
     table.attrs.update(_comments(text), units=units, aliases=aliases, repeated=repeated)
     return table
@@ -108,12 +108,12 @@ def _decoded(content: bytes) -> str:
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
-        # What older loggers write; every byte is a letter there.
+        # Of older loggers; there every byte is a letter.
         return content.decode("latin-1")
 
 
 def _comments(text: str) -> dict[str, str]:
-    """What comment lines before the header say."""
+    """Settings in comment lines before the header."""
     found = {}
     for line in io.StringIO(text):
         if not _is_comment(line):
@@ -129,13 +129,13 @@ def _is_comment(line: str) -> bool:
 
 
 def _separator(header: str, rows: list[str]) -> str:
-    """The separator that the header tells, where the rows beneath do not contradict it."""
+    """The header's separator, unless the rows contradict it."""
     found = next((s for s in _SEPARATORS if s in header), None)
     if found is None:
-        # Rows of one cell are a table of one column; blanks separate only what has several.
+        # A header of one word makes a table of one column.
         found = " " if len(header.split()) > 1 else ","
     for row in rows:
-        # A separator that ranks before the header's is none that a number could hold.
+        # A separator that ranks before the header's cannot be part of a number.
         higher = _SEPARATORS[: _SEPARATORS.index(found)] if found in _SEPARATORS else _SEPARATORS
         other = next((s for s in higher if s in row and '"' not in row), None)
         if other is not None and not (found == " " and other == ","):
@@ -161,8 +161,8 @@ def _with_decimal_points(table: pd.DataFrame) -> pd.DataFrame:
     return table.assign(**changed)
 
 
-def _told_apart(names: Iterable[str]) -> list[str]:
-    """Names of which none is there twice, as pandas makes them before blanks are stripped."""
+def _unique(names: Iterable[str]) -> list[str]:
+    """Names made unique as pandas does, but after blanks are stripped."""
     found: dict[str, None] = {}
     for name in names:
         own, k = name, 0
@@ -173,7 +173,7 @@ def _told_apart(names: Iterable[str]) -> list[str]:
 
 
 def _all_numbers_with(cells: pd.Series, form: re.Pattern[str], sign: str) -> bool:
-    """Whether the cells are numbers and some are written with this decimal sign."""
+    """Whether some cells have this decimal sign, and all that have are numbers."""
     holding = cells[cells.str.contains(sign, regex=False, na=False)]
     return len(holding) > 0 and bool(holding.str.fullmatch(form).all())
 
@@ -183,18 +183,10 @@ def _without_units_row(table: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, str
     if table.empty:
         return table, {}
     first = {c: str(cell).strip() for c, cell in table.iloc[0].items() if isinstance(cell, str)}
-    if not first or any(_is_number(cell) for cell in first.values()):
+    if not first or any(is_number(cell) for cell in first.values()):
         return table, {}
     if not any(is_unit(cell) for cell in first.values()):
         return table, {}
     silent = {"", "[]", "[-]", "()", "(-)", "-"}
     units = {str(c): cell for c, cell in first.items() if cell not in silent}
     return table.iloc[1:].reset_index(drop=True), units
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True

@@ -14,7 +14,7 @@ from nfriction.friction.sensitivity import Sensitivity
 CLASSES = ("low", "medium", "high")
 
 
-def fading_peak(size: Tensor, fading: Tensor | float) -> Tensor:
+def peak_envelope(size: Tensor, fading: Tensor | float) -> Tensor:
     """Causal envelope of a series: `e_k = max(size_k, fading e_(k-1))`.
 
     Args:
@@ -55,7 +55,7 @@ class Adaptive(Tabulated):
     """
 
     state_size: int = 2
-    fit_strategy = "nfriction.papers.afem.fit_adaptive:fit_task"
+    fit_strategy = "nfriction.papers.afem.fit_adaptive:fit_by_class"
     handles_range = True
 
     # An acceleration beyond this many upper thresholds is no more than high: one wild value must
@@ -196,7 +196,7 @@ class Adaptive(Tabulated):
         size = torch.cat([first, qdd[1:].abs()]).nan_to_num(0.0)
         # As the envelope never exceeds its ceiling, neither need what goes into it.
         size = torch.minimum(size, self.ceiling * self.thresholds[:, 1])
-        envelope = fading_peak(size, self.fading)
+        envelope = peak_envelope(size, self.fading)
         at_least = self._count(envelope, self.thresholds * self.band).T.tolist()
         at_most = self._count(envelope, self.thresholds / self.band).T.tolist()
         start = self._count(envelope[0], self.thresholds).tolist()
@@ -222,15 +222,15 @@ class Adaptive(Tabulated):
 
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
         """Derivatives at motions (sample, joint), each sample taken for a first one."""
-        joints, cells, k = self.raw.shape
+        _, cells, k = self.raw.shape
         known = self.initial_state(qd, qdd).select(-1, 1)
         options = torch.arange(cells, dtype=known.dtype, device=known.device)
         chosen = (known[..., None] == options).to(self.raw.dtype)  # (sample, joint, class)
         identity = torch.eye(k, dtype=self.raw.dtype, device=self.raw.device)
-        parameters = torch.einsum("sjc,kl->skjcl", chosen, identity).flatten(2)
-        joint = torch.arange(joints, device=self.raw.device).repeat_interleave(cells * k)
+        by_cell = torch.einsum("sjc,kl->sjkcl", chosen, identity).flatten(3)
         zero = self.raw.new_zeros(()).expand(*qd.shape, k)
-        return Sensitivity(parameters, joint, zero, zero)
+        one = self.raw.new_ones(()).expand(*qd.shape, 1)
+        return Sensitivity(((by_cell, one),), zero, zero)
 
     def options(self) -> dict[str, Any]:
         return {

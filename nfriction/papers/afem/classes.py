@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nfriction.papers.afem.adaptive import CLASSES, Adaptive, fading_peak
+from nfriction.papers.afem.adaptive import CLASSES, Adaptive, peak_envelope
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
@@ -23,13 +23,43 @@ Array = NDArray[np.float64]
 # By recording, by joint: (class, start [s], end [s]).
 Intervals = Mapping[str, Mapping[str, Sequence[tuple[str, float, float]]]]
 
-# A windowed peak that varies less than this tells nothing about classes.
+# With less variation than this ratio the windowed peak has no classes.
 LEAST_VARIATION = 1.5
 # Below this [rad/s^2] a joint does not accelerate; keeps logarithms finite.
 STILL = 1e-6
-# Accelerations below a hundredth of a joint's largest are one class of "nothing happens": a joint
-# that creeps to its rest would else have a class, and all that swings only two.
+# Smaller accelerations, relative to a joint's largest, count as this: otherwise creeping to rest
+# would be a class of its own, and only two would be left for all swings.
 DYNAMIC_RANGE = 1e-2
+
+
+@dataclass(frozen=True)
+class ClassOptions:
+    """How classes are found, and how far their coefficients may deviate.
+
+    Attributes:
+        thresholds: given ones [rad/s^2], (joint, 2) or (2,), instead of searched ones.
+        intervals: given ones, by recording and joint; samples outside belong to the nearest.
+        window: length of the moving window [s], longer than half a swing.
+        least: a class with less data than this takes its neighbour's coefficients [s].
+        prior_sd: standard deviation of a class around the constant law, in units of a coefficient
+            that explains a third of the friction (or of the coefficient itself, if larger).
+
+    Raises:
+        ValueError: if the standard deviation is not positive.
+    """
+
+    thresholds: Tensor | Sequence | None = None
+    intervals: Intervals | None = None
+    window: float = 1.0
+    least: float = 0.5
+    prior_sd: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not self.prior_sd > 0:
+            raise ValueError(f"`prior_sd` must be positive, got {self.prior_sd}.")
+
+
+DEFAULTS = ClassOptions()
 
 
 @dataclass(frozen=True)
@@ -39,9 +69,9 @@ class AccelerationClasses:
     Attributes:
         thresholds: between low and medium, medium and high [rad/s^2], (joint, 2).
         labels: class of every sample, 0 to 2, (sample, joint) of each recording.
-        stands_for: class whose coefficients each class takes: itself, or a neighbour where the
-            recordings say too little of it, (joint, class).
-        notes: what was found lacking, in words.
+        stands_for: class whose coefficients each class takes: itself, or a neighbour where there
+            are too few data of it, (joint, class).
+        notes: joints and classes with too few data, in words.
         recordings: names of the recordings.
         joints: names of the joints.
         times: stamps of each recording [s].
@@ -91,28 +121,21 @@ def find_classes(
     recordings: Sequence[Recording],
     motions: Sequence[Motion],
     joints: Sequence[str],
-    *,
-    thresholds: Tensor | Sequence | None = None,
-    intervals: Intervals | None = None,
-    window: float = 1.0,
-    least: float = 0.5,
+    options: ClassOptions = DEFAULTS,
 ) -> AccelerationClasses:
     """Find classes of acceleration and set the schedule to them.
 
-    The peak of |qdd| within a moving window says how violent the motion is; two thresholds part
-    its logarithm where the variance within the three classes is least (Otsu). The class of each
-    sample is then the one that the schedule would have known there; with given intervals it is
-    theirs, and the thresholds are those that tell these intervals apart best.
+    Two thresholds divide the logarithm of the peak of |qdd| within a moving window so that the
+    variance within the three classes is least (Otsu). The class of each sample is then the one
+    that the schedule has there; with given intervals it is theirs, and the thresholds are those
+    that separate these intervals best.
 
     Args:
         schedule: its thresholds, swing rate and sample time are set.
         recordings: in joint coordinates.
         motions: smoothed motion of each recording.
         joints: names of the joints.
-        thresholds: given ones [rad/s^2], (joint, 2) or (2,), instead of searched ones.
-        intervals: given ones, by recording and joint; what lies outside belongs to the nearest.
-        window: length of the moving window [s], longer than half a swing.
-        least: a class with less data than this takes its neighbour's coefficients [s].
+        options: given classes, or how to find them.
 
     Raises:
         ValueError: if no joint's acceleration varies enough to have classes, sample times differ,
@@ -124,22 +147,22 @@ def find_classes(
     qd = [torch.as_tensor(m.qd, dtype=torch.float64) for m in motions]
     rate = torch.cat(qdd).square().mean(0).sqrt() / torch.cat(qd).square().mean(0).sqrt()
     notes: list[str] = []
-    if intervals is not None:
-        labels = [_labels(intervals, r, joints) for r in recordings]
-        parted = _parting(labels, [fading_peak(a.abs(), schedule.fading) for a in qdd])
-        schedule.set_classes(parted, rate.nan_to_num(0.0, 0.0))
-    else:
-        found = (
-            thresholds if thresholds is not None else _searched(qdd, step, window, joints, notes)
-        )
-        schedule.set_classes(found, rate.nan_to_num(0.0, 0.0))
+    labels, thresholds = None, options.thresholds
+    if options.intervals is not None:
+        labels = [_labels(options.intervals, r, joints) for r in recordings]
+        envelopes = [peak_envelope(a.abs(), schedule.fading) for a in qdd]
+        thresholds = _separating(labels, envelopes)
+    elif thresholds is None:
+        thresholds = _by_otsu(qdd, step, options.window, joints, notes)
+    schedule.set_classes(thresholds, rate.nan_to_num(0.0, 0.0))
+    if labels is None:
         labels = [schedule.classes(v, a) for v, a in zip(qd, qdd, strict=True)]
     together = torch.cat(labels)
     seconds = torch.stack([(together == c).sum(0) for c in range(len(CLASSES))], -1) * step
     return AccelerationClasses(
         thresholds=schedule.thresholds.clone(),
         labels=tuple(labels),
-        stands_for=_merged(seconds, least, joints, notes),
+        stands_for=_merged(seconds, options.least, joints, notes),
         notes=tuple(notes),
         recordings=tuple(r.name for r in recordings),
         joints=tuple(joints),
@@ -148,7 +171,7 @@ def find_classes(
 
 
 def otsu(values: Array, bins: int = 128) -> tuple[float, float]:
-    """Two thresholds that part values into three classes of least variance.
+    """Two thresholds that divide values into three classes of least variance.
 
     References:
         N. Otsu, IEEE Trans. SMC 9 (1979), for three classes.
@@ -166,7 +189,7 @@ def otsu(values: Array, bins: int = 128) -> tuple[float, float]:
 
     spread = between(np.zeros_like(i), i) + between(i, j) + between(j, np.full_like(j, bins))
     best = spread >= spread.max() * (1 - 1e-12)
-    # Anywhere between two heaps is as good; the middle is farthest from both.
+    # All thresholds between two clusters are equal; the middle is farthest from both.
     low = int(np.median(i[best]))
     same = best & (i == i[best][np.abs(i[best] - low).argmin()])
     return float(edges[i[same][0]]), float(edges[int(np.median(j[same]))])
@@ -182,9 +205,10 @@ def _sample_time(recordings: Sequence[Recording]) -> float:
     return float(np.median(steps))
 
 
-def _searched(
+def _by_otsu(
     qdd: Sequence[Tensor], step: float, window: float, joints: Sequence[str], notes: list[str]
 ) -> list[tuple[float, float]]:
+    """Thresholds of each joint for the peak of |qdd| within a moving window [s]."""
     from scipy.ndimage import maximum_filter1d  # slow to import
 
     width = max(1, round(window / step))
@@ -220,37 +244,36 @@ def _labels(intervals: Intervals, recording: Recording, joints: Sequence[str]) -
         )
     columns = []
     for joint in joints:
-        away = np.full((len(own[joint]), len(recording.time)), np.inf)
-        for row, (known, start, end) in zip(away, own[joint], strict=True):
+        for known, start, end in own[joint]:
             if known not in CLASSES or not end > start:
                 raise ValueError(
                     f"an interval is (class, start, end) with a class of {CLASSES} and end > "
                     f"start [s], got {(known, start, end)} for {joint}."
                 )
-            inside = (recording.time >= start) & (recording.time < end)
-            gap = np.maximum(start - recording.time, recording.time - end)
-            row[:] = np.where(inside, -1.0, np.maximum(gap, 0.0))
+        time = recording.time
+        starts, ends = (np.array([row[i] for row in own[joint]])[:, None] for i in (1, 2))
+        gap = np.maximum(np.maximum(starts - time, time - ends), 0.0)
+        gap[(time >= starts) & (time < ends)] = -1.0
         order = np.array([CLASSES.index(known) for known, _, _ in own[joint]])
-        columns.append(torch.as_tensor(order[away.argmin(0)]))
+        columns.append(torch.as_tensor(order[gap.argmin(0)]))
     return torch.stack(columns, -1)
 
 
-def _parting(labels: Sequence[Tensor], envelopes: Sequence[Tensor]) -> Tensor:
+def _separating(labels: Sequence[Tensor], envelopes: Sequence[Tensor]) -> Tensor:
     """Thresholds of the envelope that agree best with given labels, (joint, 2)."""
     known, envelope = torch.cat(list(labels)), torch.cat(list(envelopes)).clamp_min(STILL)
     rows = []
-    for j in range(known.shape[1]):
-        size = envelope[:, j]
-        grid = torch.exp(torch.linspace(float(size.min().log()), float(size.max().log()), 200,
-                                        dtype=size.dtype))  # fmt: skip
+    for of_joint, size in zip(known.T, envelope.T, strict=True):
+        ends = size.aminmax()
+        low, high = (float(e.log10()) for e in ends)
+        grid = torch.logspace(low, high, 200, dtype=size.dtype)
         above = size[:, None] > grid
         row = []
         for border in range(2):
-            upper = (known[:, j] > border)[:, None]
-            # Each side counts alike, however long it lasted.
-            wrong = (above & ~upper).sum(0) / (~upper).sum().clamp_min(1) + (~above & upper).sum(
-                0
-            ) / upper.sum().clamp_min(1)
+            upper = of_joint > border
+            # Both sides have the same weight, however long they lasted.
+            wrong = above[~upper].double().mean(0).nan_to_num()
+            wrong += (~above)[upper].double().mean(0).nan_to_num()
             row.append(float(grid[int(wrong.argmin())]))
         rows.append([row[0], max(row)])
     return torch.tensor(rows, dtype=torch.float64)

@@ -11,8 +11,6 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from nfriction.papers.afem.space import Space
-
 Status = Literal["mesh_tolerance", "max_evaluations", "not_finite", "stopped"]
 
 MESSAGES: dict[str, str] = {
@@ -25,12 +23,94 @@ MESSAGES: dict[str, str] = {
 Objective = Callable[[Tensor], Tensor]
 
 
+@dataclass(frozen=True, eq=False)
+class VariableScaling:
+    """Map between the caller's variables and those of a search, which are of order 1.
+
+    Attributes:
+        lower, upper: bounds, (d,).
+        scale: a change of each variable that counts as large; in decades where logarithmic.
+        logarithmic: variables searched by their logarithm, bool.
+    """
+
+    lower: Tensor
+    upper: Tensor
+    scale: Tensor
+    logarithmic: Tensor
+
+    @classmethod
+    def build(
+        cls,
+        x0: Tensor,
+        lower: Tensor | float | None = None,
+        upper: Tensor | float | None = None,
+        scale: Tensor | float | None = None,
+        logarithmic: Tensor | Sequence[bool] | bool = False,
+    ) -> VariableScaling:
+        """The scaling of a search from `x0`; see `PatternSearch.minimise`."""
+        if x0.ndim != 1 or len(x0) == 0 or not x0.is_floating_point():
+            raise ValueError(
+                f"`x0` must be a vector of floats, got {x0.dtype} of shape {tuple(x0.shape)}."
+            )
+
+        def vector(name: str, value: Any, dtype: torch.dtype = x0.dtype) -> Tensor:
+            given = torch.as_tensor(value, dtype=dtype, device=x0.device)
+            if given.shape not in ((), x0.shape):
+                raise ValueError(
+                    f"`{name}` must be one value or {len(x0)}, got shape {tuple(given.shape)}."
+                )
+            return given.expand_as(x0)
+
+        low = vector("lower", -math.inf if lower is None else lower)
+        high = vector("upper", math.inf if upper is None else upper)
+        log = vector("logarithmic", logarithmic, torch.bool)
+        if not (low <= high).all():
+            raise ValueError("`lower` must not exceed `upper`, and neither may be NaN.")
+        start = x0.detach().clamp(low, high)
+        if not torch.isfinite(start).all() or (log & (start <= 0)).any():
+            raise ValueError(
+                f"`x0` must be finite, and positive where logarithmic, got {x0.tolist()}."
+            )
+        # A lower bound of zero is no bound to a logarithm.
+        unbounded = log & (low <= 0)
+        low = torch.where(unbounded, -math.inf, low)
+        unit = cls(low, high, torch.ones_like(start), log)
+        width = unit.to_unit(high) - unit.to_unit(torch.where(unbounded, torch.nan, low))
+        default = torch.where(log | (start == 0), 1.0, start.abs())
+        usable = torch.isfinite(width) & (width > 0)
+        chosen = torch.where(usable, width, default) if scale is None else vector("scale", scale)
+        if not (torch.isfinite(chosen) & (chosen > 0)).all():
+            raise ValueError(f"`scale` must be positive and finite, got {chosen.tolist()}.")
+        return cls(low, high, chosen, log)
+
+    def to_unit(self, x: Tensor) -> Tensor:
+        """The search's variables from the caller's."""
+        return torch.where(self.logarithmic, x.log10(), x) / self.scale
+
+    def from_unit(self, u: Tensor) -> Tensor:
+        """The caller's variables from the search's, within the bounds."""
+        x = u * self.scale
+        return torch.where(self.logarithmic, 10.0**x, x).clamp(self.lower, self.upper)
+        # A variable at its bound is there to the last bit, however the logarithm is rounded.
+        x = torch.where(u <= self.to_unit(self.lower), self.lower, x)
+        return torch.where(u >= self.to_unit(self.upper), self.upper, x)
+
+    def project(self, u: Tensor) -> Tensor:
+        """The nearest point within the bounds, in the search's variables."""
+        low = torch.where(self.lower == -math.inf, -math.inf, self.to_unit(self.lower))
+        return u.clamp(low, self.to_unit(self.upper))
+
+    def tensor(self, values: list[float]) -> Tensor:
+        """Numbers of a `PatternState` as a tensor."""
+        return torch.tensor(values, dtype=self.scale.dtype, device=self.scale.device)
+
+
 @dataclass(eq=True)
 class PatternState:
-    """All that a search needs to go on exactly where it stood, in plain types.
+    """Everything that a search needs to continue bit for bit, in plain types.
 
     Args:
-        x: best point in the unit cube of the bounds or scales.
+        x: best point, in the search's variables.
         value: objective there; infinite before the first evaluation.
         mesh: mesh size in the same units.
         last_step: the last successful move, zero if there was none.
@@ -65,22 +145,15 @@ class PatternResult:
         x: best point, shape (d,), in the caller's units.
         value: objective there.
         status: why the search ended; `message` says it in words.
-        evaluations, iterations: what it cost.
-        mesh: final mesh size relative to the bounds or scales.
-        at_lower, at_upper: which variables lie on a bound, bool, shape (d,).
-        history: (evaluations, value, mesh) after each iteration.
-        state: for resuming.
+        at_lower, at_upper: variables on a bound, bool, shape (d,).
+        state: counts and history, and for resuming.
     """
 
     x: Tensor
     value: float
     status: Status
-    evaluations: int
-    iterations: int
-    mesh: float
     at_lower: Tensor
     at_upper: Tensor
-    history: list[tuple[int, float, float]]
     state: PatternState
 
     @property
@@ -94,27 +167,29 @@ class PatternResult:
         return MESSAGES[self.status]
 
 
+Callback = Callable[[PatternState], "bool | None"]
+
+
 @dataclass(frozen=True)
 class PatternSearch:
     """Settings of a generalised pattern search.
 
-    Each iteration polls x + mesh * directions in one call of the objective, moves to the best
-    point if it is better and expands the mesh, else contracts it. Points outside the bounds are
-    moved onto them; points of the poll that coincide with x are still evaluated, so that every
-    call has the same number of rows.
+    Each iteration polls x ± mesh along every axis in one call of the objective, moves to the best
+    point and doubles the mesh if that is better than x, else contracts the mesh. Points outside the
+    bounds are moved onto them; those that coincide with x are still evaluated, so that every call
+    has the same number of rows.
 
     Args:
         max_evaluations: limit of points evaluated; a call that would pass it is not made.
         mesh_tolerance: mesh size, relative to the range of each variable, that ends the search.
         initial_mesh: first mesh size, in the same units.
-        expansion, contraction: factors of the mesh after success and failure.
-        basis: "2d" polls both ways along every axis, "minimal" d axes and their negative sum.
-        rotate: turn the basis at random in every iteration (seeded), as mesh-adaptive search
-            does: a ridge or a kink askew to the axes cannot stop it then.
-        choice: "best" of the poll, or "first" in poll order that is better (the poll is one
-            batch in either case, so "first" saves no evaluation; it follows the last success).
+        contraction: factor of the mesh after a failure.
+        rotate: turn the axes at random in every iteration (seeded), as mesh-adaptive search does,
+            so that a ridge or a kink askew to the axes cannot stop it.
         speculate: add one point beyond x along the last successful step to each poll.
         seed: of the rotations.
+        progress: show a bar of evaluations.
+
     References:
         V. Torczon, SIAM J. Optim. 7 (1997); C. Audet and J. E. Dennis, SIAM J. Optim. 17 (2006).
     """
@@ -122,35 +197,24 @@ class PatternSearch:
     max_evaluations: int = 10_000
     mesh_tolerance: float = 1e-6
     initial_mesh: float = 0.25
-    expansion: float = 2.0
     contraction: float = 0.5
-    basis: Literal["2d", "minimal"] = "2d"
     rotate: bool = False
-    choice: Literal["best", "first"] = "best"
     speculate: bool = False
     seed: int = 0
+    progress: bool = False
 
     def __post_init__(self) -> None:
-        if not (self.expansion >= 1 > self.contraction > 0):
-            raise ValueError(
-                "`expansion` must be at least 1 and `contraction` between 0 and 1, got "
-                f"{self.expansion} and {self.contraction}."
-            )
+        if not 0 < self.contraction < 1:
+            raise ValueError(f"`contraction` must be between 0 and 1, got {self.contraction}.")
         if not (self.mesh_tolerance > 0 and self.initial_mesh > 0):
             raise ValueError(
                 "`mesh_tolerance` and `initial_mesh` must be positive, got "
                 f"{self.mesh_tolerance} and {self.initial_mesh}."
             )
-        if self.basis not in ("2d", "minimal") or self.choice not in ("best", "first"):
-            raise ValueError(
-                '`basis` is "2d" or "minimal" and `choice` "best" or "first", got '
-                f"{self.basis!r} and {self.choice!r}."
-            )
 
     def poll_size(self, dimension: int) -> int:
         """Points in each call of the objective after the first (which has one)."""
-        directions = 2 * dimension if self.basis == "2d" else dimension + 1
-        return directions + self.speculate
+        return 2 * dimension + self.speculate
 
     def minimise(
         self,
@@ -160,10 +224,9 @@ class PatternSearch:
         lower: Tensor | float | None = None,
         upper: Tensor | float | None = None,
         scale: Tensor | float | None = None,
-        logarithmic: Sequence[bool] | bool = False,
+        logarithmic: Tensor | Sequence[bool] | bool = False,
         state: PatternState | None = None,
-        callback: Callable[[PatternState], bool | None] | None = None,
-        progress: bool = False,
+        callback: Callback | None = None,
     ) -> PatternResult:
         """Minimise from `x0`.
 
@@ -176,71 +239,71 @@ class PatternSearch:
                 range between the bounds, else the size of x0, else 1. In decades for
                 logarithmic variables.
             logarithmic: variables searched by their logarithm; they must be positive.
-            state: of an earlier search, to go on bit for bit from there; replaces `x0`.
+            state: of an earlier search, to continue bit for bit; replaces `x0`.
             callback: called after each iteration with the live state (keep its `to_dict()`);
                 True stops.
-            progress: show a bar of evaluations.
+
         Returns:
             The best point found and why the search ended.
+
         Raises:
             ValueError: if shapes, bounds or scales do not fit, or the objective's shape is wrong.
         """
-        space = Space.build(x0, lower, upper, scale, logarithmic)
+        scaling = VariableScaling.build(x0, lower, upper, scale, logarithmic)
         if state is None:
-            start = space.to_unit(x0.clamp(space.lower, space.upper))
+            start = scaling.to_unit(x0.clamp(scaling.lower, scaling.upper))
             state = PatternState(start.tolist(), math.inf, self.initial_mesh, [0.0] * len(x0))
         else:
             state = PatternState.from_dict(state.to_dict())
         if len(state.x) != len(x0):
             raise ValueError(f"`state` has {len(state.x)} variables, `x0` has {len(x0)}.")
-        with tqdm(
-            total=self.max_evaluations, initial=state.evaluations, disable=not progress
-        ) as bar:
-            try:
-                status = self._run(objective, space, state, callback, bar)
-            except KeyboardInterrupt:
-                status = "stopped"
-        return _result(space, state, status)
+        try:
+            status = self._run(objective, scaling, state, callback)
+        except KeyboardInterrupt:
+            status = "stopped"
+        x = scaling.from_unit(scaling.tensor(state.x))
+        return PatternResult(x, state.value, status, x <= scaling.lower, x >= scaling.upper, state)
 
     def _run(
         self,
         objective: Objective,
-        space: Space,
+        scaling: VariableScaling,
         state: PatternState,
-        callback: Callable[[PatternState], bool | None] | None,
-        bar: tqdm[Any],
+        callback: Callback | None,
     ) -> Status:
         if state.evaluations == 0:
             if self.max_evaluations < 1:
                 return "max_evaluations"
-            state.value = float(_evaluate(objective, space, space.tensor(state.x)[None])[0])
+            state.value = float(_evaluate(objective, scaling, scaling.tensor(state.x)[None])[0])
             state.evaluations = 1
-        while state.mesh >= self.mesh_tolerance:
-            if state.evaluations + self.poll_size(len(state.x)) > self.max_evaluations:
-                return "max_evaluations"
-            self._iterate(objective, space, state)
-            bar.set_postfix(value=f"{state.value:.6g}", mesh=f"{state.mesh:.1e}", refresh=False)
-            bar.update(state.evaluations - bar.n)
-            if callback is not None and callback(state):
-                return "stopped"
+        with tqdm(
+            total=self.max_evaluations, initial=state.evaluations, disable=not self.progress
+        ) as bar:
+            while state.mesh >= self.mesh_tolerance:
+                if state.evaluations + self.poll_size(len(state.x)) > self.max_evaluations:
+                    return "max_evaluations"
+                self._iterate(objective, scaling, state)
+                bar.set_postfix(value=f"{state.value:.6g}", mesh=f"{state.mesh:.1e}", refresh=False)
+                bar.update(state.evaluations - bar.n)
+                if callback is not None and callback(state):
+                    return "stopped"
         return "mesh_tolerance" if math.isfinite(state.value) else "not_finite"
 
-    def _iterate(self, objective: Objective, space: Space, state: PatternState) -> None:
-        x, last = space.tensor(state.x), space.tensor(state.last_step)
-        steps = state.mesh * self._directions(len(x), state.iterations).to(x)
-        # The last success comes first: "first" and ties then keep going the same way.
+    def _iterate(self, objective: Objective, scaling: VariableScaling, state: PatternState) -> None:
+        x, last = scaling.tensor(state.x), scaling.tensor(state.last_step)
+        axes = self._axes(len(x), state.iterations).to(x)
+        steps = state.mesh * torch.cat([axes, -axes])
+        # The direction of the last success comes first: ties then keep going the same way.
         steps = steps[(steps @ last).argsort(descending=True, stable=True)]
         if self.speculate:
             steps = torch.cat([last[None], steps])
-        candidates = space.project(x + steps)
-        values = _evaluate(objective, space, candidates)
-        better = values < state.value
-        if better.any():
-            # argmax of booleans is the first True; argmin the first of equal values.
-            chosen = int(values.argmin() if self.choice == "best" else better.int().argmax())
-            state.last_step = (candidates[chosen] - x).tolist()
-            state.x, state.value = candidates[chosen].tolist(), float(values[chosen])
-            state.mesh = min(state.mesh * self.expansion, max(1.0, self.initial_mesh))
+        candidates = scaling.project(x + steps)
+        values = _evaluate(objective, scaling, candidates)
+        best = int(values.argmin())
+        if values[best] < state.value:
+            state.last_step = (candidates[best] - x).tolist()
+            state.x, state.value = candidates[best].tolist(), float(values[best])
+            state.mesh = min(2.0 * state.mesh, max(1.0, self.initial_mesh))
         else:
             state.last_step = [0.0] * len(x)
             state.mesh *= self.contraction
@@ -248,22 +311,19 @@ class PatternSearch:
         state.iterations += 1
         state.history.append((state.evaluations, state.value, state.mesh))
 
-    def _directions(self, d: int, iteration: int) -> Tensor:
-        """Unit poll directions (m, d) of this iteration: a positive spanning set."""
-        axes = torch.eye(d, dtype=torch.float64)
-        if self.rotate:
-            # A generator of its own per iteration: a resumed search needs no generator state.
-            generator = torch.Generator().manual_seed(self.seed * 1_000_003 + iteration)
-            axes, triangle = torch.linalg.qr(
-                torch.randn(d, d, generator=generator, dtype=torch.float64)
-            )
-            axes = axes * triangle.diagonal().sign()
-        back = -axes if self.basis == "2d" else -axes.sum(0, keepdim=True) / d**0.5
-        return torch.cat([axes, back])
+    def _axes(self, d: int, iteration: int) -> Tensor:
+        """Unit poll directions (d, d) of this iteration."""
+        if not self.rotate:
+            return torch.eye(d, dtype=torch.float64)
+        # A generator of its own per iteration: a resumed search needs no generator state.
+        generator = torch.Generator().manual_seed(self.seed * 1_000_003 + iteration)
+        drawn = torch.randn(d, d, generator=generator, dtype=torch.float64)
+        axes, triangle = torch.linalg.qr(drawn)
+        return axes * triangle.diagonal().sign()
 
 
-def _evaluate(objective: Objective, space: Space, candidates: Tensor) -> Tensor:
-    values = torch.as_tensor(objective(space.from_unit(candidates))).detach()
+def _evaluate(objective: Objective, scaling: VariableScaling, candidates: Tensor) -> Tensor:
+    values = torch.as_tensor(objective(scaling.from_unit(candidates))).detach()
     if values.shape != candidates.shape[:1]:
         raise ValueError(
             f"`objective` must give one value per candidate, shape ({len(candidates)},), got "
@@ -271,19 +331,3 @@ def _evaluate(objective: Objective, space: Space, candidates: Tensor) -> Tensor:
         )
     values = values.to(candidates)
     return torch.where(torch.isfinite(values), values, math.inf)
-
-
-def _result(space: Space, state: PatternState, status: Status) -> PatternResult:
-    x = space.from_unit(space.tensor(state.x))
-    return PatternResult(
-        x=x,
-        value=state.value,
-        status=status,
-        evaluations=state.evaluations,
-        iterations=state.iterations,
-        mesh=state.mesh,
-        at_lower=x <= space.lower,
-        at_upper=x >= space.upper,
-        history=state.history,
-        state=state,
-    )

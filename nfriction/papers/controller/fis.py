@@ -8,12 +8,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nfriction.fuzzy.membership import FuzzySet
-from nfriction.papers.controller.rulebase import ANY, Rule, RuleBase, Variable
-from nfriction.papers.controller.rulefile import MAX_BYTES, shortened
+from nfriction.papers.controller.rules import (
+    ANY,
+    Rule,
+    RuleBase,
+    Variable,
+    read_text,
+    shortened,
+)
 
 _METHODS = {"AndMethod": "min", "ImpMethod": "min", "AggMethod": "max", "DefuzzMethod": "centroid"}
 
-# MATLAB's function: our shape, and where our numbers stand in its list.
+# MATLAB's function: our shape, and the places of our numbers in its list.
 _FUNCTIONS = {
     "gaussmf": ("gaussian", (1, 0)),
     "gauss2mf": ("two_sided_gaussian", (1, 0, 3, 2)),
@@ -28,7 +34,7 @@ _RULE = re.compile(r"([-\d\s]+),([-\d\s]+)\(([^()]*)\)\s*:\s*([12])\s*")
 
 @dataclass(frozen=True)
 class _FileVariable:
-    """A variable as the file has it: rules name its sets by their place."""
+    """A variable whose sets have the file's order, by which rules refer to them."""
 
     name: str
     universe: tuple[float, float]
@@ -52,10 +58,9 @@ class _Line:
 def load_fis(path: str | Path, units: Sequence[str] = ("deg/s", "deg/s^2")) -> RuleBase:
     """Rule base from a `.fis` file; see `parse_fis`."""
     path = Path(path)
-    if path.stat().st_size > MAX_BYTES:
-        raise ValueError(f"{path.name}: rule files are at most {MAX_BYTES} bytes.")
+    text = read_text(path)
     try:
-        return parse_fis(path.read_text(encoding="utf-8"), units)
+        return parse_fis(text, units)
     except ValueError as error:
         raise ValueError(f"{path.name}: {shortened(error)}") from error
 
@@ -69,9 +74,9 @@ def parse_fis(text: str, units: Sequence[str] = ("deg/s", "deg/s^2")) -> RuleBas
 
     Args:
         text: of the file.
-        units: of the inputs, which the format does not tell; "1" for none.
+        units: of the inputs, which the format does not contain; "1" for none.
     Raises:
-        ValueError: naming the line, if the text is no such system.
+        ValueError: no such system; names the line.
     """
     sections = _sections(text)
     system = sections.get("System", {})
@@ -134,7 +139,6 @@ def _check_system(system: dict[str, _Line]) -> None:
 
 
 def _variables(sections: dict[str, dict[str, _Line]], kind: str, count: int) -> list[_FileVariable]:
-    """Variables of a kind, in the file's order."""
     variables = []
     for index in range(1, count + 1):
         heading = f"{kind}{index}"
@@ -197,7 +201,10 @@ def _rules(
 
 
 def _named(line: _Line, text: str, variables: list[_FileVariable]) -> tuple[str, ...]:
-    numbers = [int(part) for part in _split(line, text)]
+    parts = text.split()
+    if not all(re.fullmatch(r"-?\d{1,6}", part) for part in parts):
+        raise line.error("terms are whole numbers.")
+    numbers = [int(part) for part in parts]
     if len(numbers) != len(variables):
         raise line.error(
             f"{len(numbers)} terms for {[variable.name for variable in variables]}; 0 for any."
@@ -210,13 +217,6 @@ def _named(line: _Line, text: str, variables: list[_FileVariable]) -> tuple[str,
             raise line.error(f"{variable.name!r} has no set {number}.")
         names.append(variable.sets[number - 1].name if number else ANY)
     return tuple(names)
-
-
-def _split(line: _Line, text: str) -> list[str]:
-    parts = text.split()
-    if not all(re.fullmatch(r"-?\d{1,6}", part) for part in parts):
-        raise line.error("terms are whole numbers.")
-    return parts
 
 
 def _numbers(line: _Line, text: str) -> tuple[float, ...]:

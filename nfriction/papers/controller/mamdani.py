@@ -1,16 +1,99 @@
 """The papers' fuzzy controller: rule table, min and max, centroid; differentiable and batched."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib import resources
 
 import torch
 from torch import Tensor, nn
 
-from nfriction.papers.controller.linguistic import LinguisticTerms
-from nfriction.papers.controller.rulebase import ANY, SI_FACTOR, RuleBase
-from nfriction.papers.controller.rulefile import parse_rules
-from nfriction.papers.controller.rulereport import RuleReport, rule_report
+from nfriction.fuzzy.membership import FuzzySet, bell, coverage, trapezoid, two_sided_gaussian
+from nfriction.papers.controller.rules import ANY, SI_FACTOR, RuleBase, Variable, parse_rules
 
 _SAMPLES_AT_ONCE = 512  # the clipped output sets of this many fit a core's cache
+# Families of membership functions.
+_GAUSSIAN, _BELL, _TRAPEZOID = 0, 1, 2
+_POINTS = 2001
+COVERED = 0.5
+"""Membership that some set should have everywhere."""
+
+
+@dataclass(frozen=True)
+class InputCoverage:
+    """Coverage of one input.
+
+    Attributes:
+        name, unit: of the variable.
+        least: smallest of the largest memberships over the universe.
+        gaps: intervals of the universe, in `unit`, where no set holds at 0.5.
+        poorly_covered: share of the samples that fall where no set holds at 0.5.
+        outside: share of the samples beyond the universe.
+    """
+
+    name: str
+    unit: str
+    least: float
+    gaps: tuple[tuple[float, float], ...]
+    poorly_covered: float
+    outside: float
+
+
+@dataclass(frozen=True)
+class RuleReport:
+    """Gaps in the coverage of the inputs, and rules never fired by a recording.
+
+    Attributes:
+        inputs: one for each input.
+        fired: strength from which a rule counts as fired.
+        never_fired: conditions of the rules that never do.
+        rules, samples: numbers of them.
+    """
+
+    inputs: tuple[InputCoverage, ...]
+    fired: float
+    never_fired: tuple[tuple[str, ...], ...]
+    rules: int
+    samples: int
+
+    def __str__(self) -> str:
+        lines = [f"{self.samples} samples, {self.rules} rules"]
+        for entry in self.inputs:
+            lines.append(
+                f"{entry.name} [{entry.unit}]: coverage at least {entry.least:.3f}, "
+                f"{entry.poorly_covered:.1%} of the samples below {COVERED}, "
+                f"{entry.outside:.1%} outside the universe"
+            )
+            lines += [f"  gap from {low:.6g} to {high:.6g}" for low, high in entry.gaps]
+        lines.append(f"{len(self.never_fired)} rules never reach a strength of {self.fired}")
+        lines += ["  " + " and ".join(condition) for condition in self.never_fired]
+        return "\n".join(lines)
+
+
+class LinguisticTerms(nn.Module):
+    """Memberships of one variable in all of its sets; scripts and exports."""
+
+    numbers: Tensor
+    families: list[int]
+
+    def __init__(self, sets: Sequence[FuzzySet]) -> None:
+        super().__init__()
+        families, numbers = zip(*(_canonical(term) for term in sets), strict=True)
+        self.families = list(families)
+        self.register_buffer("numbers", torch.tensor(numbers, dtype=torch.float64))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Memberships, shape (terms, *x.shape)."""
+        held: list[Tensor] = []
+        for term, family in enumerate(self.families):
+            p = self.numbers[term]
+            # Numbers and not their names, for TorchScript sees no globals.
+            if family == 0:
+                held.append(two_sided_gaussian(x, p[0], p[1], p[2], p[3]))
+            elif family == 1:
+                held.append(bell(x, p[0], p[1], p[2]))
+            else:
+                held.append(trapezoid(x, p[0], p[1], p[2], p[3]))
+        return torch.stack(held)
 
 
 class MamdaniController(nn.Module):
@@ -103,7 +186,7 @@ class MamdaniController(nn.Module):
             fired: strength from which a rule counts as fired.
         """
         x = torch.stack([qd.abs(), qdd], -1).reshape(-1, 2) / self.si_factor
-        return rule_report(
+        return _rule_report(
             self.rule_base, x, self.memberships(x), self.rule_strengths(x), fired=fired
         )
 
@@ -143,8 +226,8 @@ def paper_controller(
 ) -> MamdaniController:
     """The TLRIP paper's controller of B and C for its joint 2, 3 or 4 (linear friction model).
 
-    The rules were printed for joint 2 and serve all three; the C terms of NM x VF and ZE x VF
-    (both L) are a best reading of the print.
+    The rules were printed for joint 2 and are used for all three; the C terms of NM x VF and ZE x
+    VF (both L) are a best reading of the print.
 
     References:
         TLRIP paper, Table 4 (sets) and Table 5 (rules).
@@ -198,3 +281,61 @@ def _output_sets(
         offset = universe - 0.5 * (universe[0] + universe[-1])
         moments[o] = torch.stack([weights, weights * offset])
     return shapes, moments
+
+
+def _canonical(term: FuzzySet) -> tuple[int, tuple[float, ...]]:
+    """Family of a set and its four numbers: an infinite sigma makes a shoulder."""
+    p = term.parameters
+    if term.shape == "gaussian":
+        return _GAUSSIAN, (p[0], p[1], p[0], p[1])
+    if term.shape == "left_shoulder":
+        return _GAUSSIAN, (p[0], float("inf"), p[0], p[1])
+    if term.shape == "right_shoulder":
+        return _GAUSSIAN, (p[0], p[1], p[0], float("inf"))
+    if term.shape == "two_sided_gaussian":
+        return _GAUSSIAN, p
+    if term.shape == "bell":
+        return _BELL, (*p, 0.0)
+    if term.shape == "triangle":
+        return _TRAPEZOID, (p[0], p[1], p[1], p[2])
+    return _TRAPEZOID, p
+
+
+def _rule_report(
+    rules: RuleBase, x: Tensor, memberships: list[Tensor], strengths: Tensor, *, fired: float
+) -> RuleReport:
+    """Report on samples `x` (samples, inputs) with their memberships and rule strengths."""
+    if len(x) == 0 or not bool(torch.isfinite(x).all()):
+        raise ValueError("the recording must have samples, all finite; drop the others first.")
+    inputs = tuple(
+        _input_coverage(variable, x[:, i], memberships[i])
+        for i, variable in enumerate(rules.inputs)
+    )
+    strongest = strengths.amax(0)
+    never = tuple(
+        rule.given
+        for rule, strength in zip(rules.rules, strongest.tolist(), strict=True)
+        if strength < fired
+    )
+    return RuleReport(inputs, fired, never, len(rules.rules), len(x))
+
+
+def _input_coverage(variable: Variable, x: Tensor, memberships: Tensor) -> InputCoverage:
+    low, high = variable.universe
+    universe = torch.linspace(low, high, _POINTS, dtype=torch.float64)
+    held = torch.stack([term(universe) for term in variable.sets], -1)
+    return InputCoverage(
+        name=variable.name,
+        unit=variable.unit,
+        least=float(coverage(held)),
+        gaps=_intervals(universe, held.amax(-1) < COVERED),
+        poorly_covered=float((memberships.amax(-1) < COVERED).double().mean()),
+        outside=float(((x < low) | (x > high)).double().mean()),
+    )
+
+
+def _intervals(universe: Tensor, inside: Tensor) -> tuple[tuple[float, float], ...]:
+    """First and last point of every run of True."""
+    edges = torch.nn.functional.pad(inside.long(), (1, 1)).diff()
+    starts, ends = (edges == 1).nonzero()[:, 0], (edges == -1).nonzero()[:, 0] - 1
+    return tuple(zip(universe[starts].tolist(), universe[ends].tolist(), strict=True))

@@ -1,18 +1,17 @@
 """Coefficients by class of acceleration, corrected by a neuro-fuzzy function of the motion."""
 
-from collections.abc import Sequence
-from typing import Any, Final, Literal
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
 
 import torch
 from torch import Tensor
 
 from nfriction.friction.coefficients import Schedule
 from nfriction.friction.laws import Law
-from nfriction.friction.neurofuzzy import LEAST_RATIO, PRIOR_SD, NeuroFuzzy
-from nfriction.friction.sensitivity import FactoredSensitivity
-from nfriction.friction.smooth import soft_positive_inverse
+from nfriction.friction.neurofuzzy import LEAST_RATIO, NeuroFuzzy, smooth_relu_inverse
+from nfriction.friction.sensitivity import Sensitivity
 from nfriction.fuzzy.membership import HALF_WIDTH_OF_GAUSSIAN
-from nfriction.fuzzy.placement import crossing_half_widths
+from nfriction.fuzzy.partition import crossing_half_widths
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
 
 # Powers of an even spacing from zero by which sets of velocity and acceleration are placed.
@@ -31,7 +30,8 @@ class AdaptiveNeuroFuzzy(Schedule):
         law: the law whose coefficients these are.
         joints: number of joints.
         initial: coefficients at the start, as in `Adaptive`.
-        terms, head_units, acceleration, interpretable, prior_sd: of the network, see `NeuroFuzzy`.
+        memory: options of the classes, see `Adaptive`.
+        network: options of the network, see `NeuroFuzzy`.
 
     Attributes:
         adaptive: the reference by class, with its memory.
@@ -52,19 +52,13 @@ class AdaptiveNeuroFuzzy(Schedule):
         joints: int,
         initial: Tensor | Sequence | None = None,
         *,
-        terms: Sequence[int] = (5, 5),
-        head_units: int = 10,
-        acceleration: Literal["along_motion", "signed"] = "along_motion",
-        interpretable: bool = False,
-        prior_sd: float = PRIOR_SD,
+        memory: Mapping[str, float] | None = None,
+        **network: Any,
     ) -> None:
         super().__init__(law, joints)
         self._law = law
-        self.adaptive = Adaptive(law, joints, initial)
-        self.deviation = NeuroFuzzy(
-            law, joints, self.adaptive.values.mean(1), terms=terms, head_units=head_units,
-            acceleration=acceleration, interpretable=interpretable, prior_sd=prior_sd,
-        )  # fmt: skip
+        self.adaptive = Adaptive(law, joints, initial, **(memory or {}))
+        self.deviation = NeuroFuzzy(law, joints, self.adaptive.values.mean(1), **network)
 
     def set_memory(self, **options: float) -> None:
         """Set hysteresis, time constant and sample time of the classes, see `Adaptive`."""
@@ -125,15 +119,15 @@ class AdaptiveNeuroFuzzy(Schedule):
         base = self.adaptive.coefficients_from(qd, qdd, state)
         reference = self._lifted(base)
         # As a difference, so that a network of zeros leaves the adaptive schedule to the last bit.
-        moved = self.deviation.deviating(reference, qd, qdd)
-        corrected = base + (moved - self.deviation.at_reference(reference))
+        moved = self.deviation.residual_coefficients(reference, qd, qdd)
+        corrected = base + (moved - self.deviation.to_coefficients(reference))
         return torch.where(self.positive, corrected.clamp_min(0.0), corrected)
 
     def _lifted(self, base: Tensor) -> Tensor:
         """The class's coefficients in the network's units, those of zero free to rise."""
         ratio = base / self.deviation.scale
         least = torch.full_like(ratio, self.least_ratio)
-        lifted = soft_positive_inverse(torch.maximum(ratio, least), self.deviation.roundness)
+        lifted = smooth_relu_inverse(torch.maximum(ratio, least), self.deviation.roundness)
         return torch.where(self.positive, lifted, ratio)
 
     def states(self, qd: Tensor, qdd: Tensor) -> Tensor:
@@ -172,13 +166,13 @@ class AdaptiveNeuroFuzzy(Schedule):
         """Of the network: zero, where the adaptive schedule is all there is."""
         return self.deviation.prior()
 
-    def sensitivities(self, qd: Tensor, qdd: Tensor) -> FactoredSensitivity:
+    def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
         """Derivatives at motions (sample, joint), each sample taken for a first one."""
         return self.sensitivities_from(qd, qdd, self.initial_state(qd, qdd))
 
-    def sensitivities_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> FactoredSensitivity:
+    def sensitivities_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Sensitivity:
         reference = self._lifted(self.adaptive.coefficients_from(qd, qdd, state)).detach()
-        return self.deviation.deviating_sensitivities(reference, qd, qdd)
+        return self.deviation.residual_sensitivities(reference, qd, qdd)
 
     def within_range(self, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor]:
         return self.deviation.within_range(qd, qdd)

@@ -13,10 +13,9 @@ import torch
 from torch import Tensor
 
 from nfriction.fuzzy import Anfis, RBFNetwork
-from nfriction.optim.jacobian import flatten, trainable, unflatten
+from nfriction.optim.jacobian import CHUNK_ENTRIES, flatten, trainable, unflatten
 from nfriction.optim.least_squares import Quadratic
 from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
-from nfriction.optim.shared_columns import CHUNK_ENTRIES
 
 LINEAR = ("consequents", "output_weight", "output_bias")
 """Parameters in which a layer is linear; its leading columns are their regressors."""

@@ -6,14 +6,13 @@ from typing import Any, Final, Literal
 import torch
 from torch import Tensor, nn
 
-from nfriction.friction.coefficients import Schedule
-from nfriction.friction.constant import Constant
+from nfriction.friction.coefficients import Constant, Schedule
 from nfriction.friction.laws import Law
 from nfriction.friction.sensitivity import Sensitivity
 from nfriction.fuzzy import RBFNetwork
 
 
-class RadialBasis(Schedule):
+class RBFCoefficients(Schedule):
     """A radial basis network of |velocity| and acceleration gives the coefficients of a law.
 
     Its numbers are those of the network itself, in SI, so what was trained on a controller's
@@ -25,8 +24,8 @@ class RadialBasis(Schedule):
         law: the law whose coefficients these are.
         joints: number of joints.
         initial: coefficients at the start in SI, (joint, coefficient) or (coefficient,).
-        units: of each joint's network; the papers take 10.
-        acceleration: `"signed"` takes qdd as the papers do, `"along_motion"` qdd sgn(qd).
+        head_units: units of each joint's network; the papers take 10.
+        acceleration: `"along_motion"` takes qdd sgn(qd), `"signed"` qdd as the papers do.
 
     References:
         TLRIP paper, neuro-fuzzy friction estimation (2-10-2 network a joint).
@@ -48,8 +47,8 @@ class RadialBasis(Schedule):
         joints: int,
         initial: Tensor | Sequence | None = None,
         *,
-        units: int = 10,
-        acceleration: Literal["along_motion", "signed"] = "signed",
+        head_units: int = 10,
+        acceleration: Literal["along_motion", "signed"] = "along_motion",
     ) -> None:
         super().__init__(law, joints)
         if acceleration not in ("along_motion", "signed"):
@@ -57,8 +56,8 @@ class RadialBasis(Schedule):
                 f'`acceleration` must be "along_motion" or "signed", got {acceleration!r}.'
             )
         self.along_motion = acceleration == "along_motion"
-        self.units = units
-        self.network = RBFNetwork(joints, 2, units, len(law.names))
+        self.head_units = head_units
+        self.network = RBFNetwork(joints, 2, head_units, len(law.names))
         values = Constant(law, joints, initial).values
         for name, start in (
             ("input_lower", torch.tensor([0.0, -200.0], dtype=values.dtype).repeat(joints, 1)),
@@ -134,7 +133,7 @@ class RadialBasis(Schedule):
     def bounds(self) -> tuple[Tensor, Tensor]:
         vector = self.parameter_vector()
         mask = torch.tensor(self.fitted_mask, device=vector.device)[:, None]
-        fitted = mask.expand(self.joints, -1, self.units + 1).reshape(-1)
+        fitted = mask.expand(self.joints, -1, self.head_units + 1).reshape(-1)
         free = torch.full_like(vector, torch.inf)
         return torch.where(fitted, -free, vector), torch.where(fitted, free, vector)
 
@@ -146,7 +145,6 @@ class RadialBasis(Schedule):
         free = ((y > self.output_lower) & (y < self.output_upper)).to(y.dtype)
         moving = ((x > self.input_lower) & (x < self.input_upper)).to(y.dtype)
         own = torch.eye(y.shape[-1], dtype=y.dtype, device=y.device)
-        layer = torch.einsum("sjk,ko,sju->skjou", free, own, self.network.regressors(x))
         by_input = self.network.input_jacobian(x).permute(3, 0, 1, 2)
         by_speed, by_qdd = (by_input * free[..., None] * moving[:, :, None]).unbind(-1)
         by_qd = by_speed * qd.sign()[..., None]
@@ -155,18 +153,12 @@ class RadialBasis(Schedule):
             sign = torch.tanh(qd / turn)
             by_qd = by_qd + by_qdd * (qdd * (1.0 - sign * sign) / turn)[..., None]
             by_qdd = by_qdd * sign[..., None]
-        joint = torch.arange(self.joints, device=qd.device)
-        return Sensitivity(
-            layer.flatten(2),
-            joint.repeat_interleave(layer[0, 0, 0].numel()),
-            by_qd,
-            by_qdd,
-        )
+        return Sensitivity(((free[..., None] * own, self.network.regressors(x)),), by_qd, by_qdd)
 
     def options(self) -> dict[str, Any]:
         return {
             "network": "rbf",
-            "head_units": self.units,
+            "head_units": self.head_units,
             "acceleration": "along_motion" if self.along_motion else "signed",
         }
 

@@ -22,7 +22,7 @@ from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.continuation import ShootingFitter
 from nfriction.fitting.strategy.holdout import cut_for_folds
 from nfriction.fitting.strategy.neurofuzzy import input_range
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Step
 from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.nffem.adaptive_neurofuzzy import AdaptiveNeuroFuzzy

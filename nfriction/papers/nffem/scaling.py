@@ -1,7 +1,8 @@
-"""Inputs and outputs of a network in units of their range, and the network back in their own."""
+"""One group of a network, and its change between own and scaled units."""
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass
 
 import torch
@@ -11,6 +12,20 @@ from nfriction.fuzzy import Anfis, AnfisRBF, RBFNetwork
 from nfriction.fuzzy.partition import FreePartition
 
 FuzzyNetwork = Anfis | AnfisRBF | RBFNetwork
+
+
+def one_group(network: FuzzyNetwork, group: int) -> FuzzyNetwork:
+    """A network of its own with the values of one group of `network`."""
+    single: FuzzyNetwork = deepcopy(network)
+    for module in single.modules():
+        if isinstance(module, Anfis | AnfisRBF | RBFNetwork):
+            module.groups = 1
+        for name, value in list(module.named_parameters(recurse=False)):
+            part = value.detach()[group : group + 1].clone()
+            setattr(module, name, nn.Parameter(part, requires_grad=value.requires_grad))
+        for name, buffer in list(module.named_buffers(recurse=False)):
+            setattr(module, name, buffer[group : group + 1].clone())
+    return single
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,10 +74,9 @@ class Scaling:
 
 @torch.no_grad()
 def to_own_units(network: nn.Module, scaling: Scaling) -> None:
-    """Turn a network between scaled inputs and outputs into the same one between own, in place.
+    """Rewrite a network of scaled inputs and outputs as the same one in own units, in place.
 
-    Exact, not refitted: centres, widths and output layers are rewritten. `scaling.inverse()` leads
-    back. Whatever the parameters were meant to be relative to (a prior) is not carried over.
+    Exact: centres, widths and output layers are rewritten. `scaling.inverse()` reverts it.
 
     Raises:
         TypeError: for other networks than `Anfis`, `AnfisRBF` and `RBFNetwork`.

@@ -1,4 +1,4 @@
-"""Fuzzy networks trained by Bayesian regularisation, on samples or on what a controller says.
+"""Fuzzy networks trained by Bayesian regularisation, on samples or on a controller's outputs.
 
 The papers' last step: a rule-table controller is sampled over its universes, and a network learns
 its outputs, without a validation set. Groups (joints) are trained one after the other.
@@ -6,21 +6,68 @@ its outputs, without a validation set. Groups (joints) are trained one after the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
 from nfriction.fuzzy import Anfis, AnfisRBF, RBFNetwork
-from nfriction.optim.evidence_result import EvidenceResult, EvidenceState
+from nfriction.optim.evidence import EvidenceOptions, EvidenceResult
+from nfriction.optim.jacobian import trainable
+from nfriction.optim.regularisation import bayesian_regularisation
 from nfriction.papers.controller.mamdani import MamdaniController
-from nfriction.papers.nffem.network_group import NetworkGroup
-from nfriction.papers.nffem.scaling import FuzzyNetwork, Scaling
-
-Callback = Callable[[EvidenceState], "bool | None"]
+from nfriction.papers.nffem.projection import LINEAR, project
+from nfriction.papers.nffem.scaling import FuzzyNetwork, Scaling, one_group, to_own_units
 
 GAUSSIAN = ("gaussian", "left_shoulder", "right_shoulder")
+# Size of the random move to another start, in units of the scaled inputs or of logarithms.
+SHAKE = 0.3
+# The few samples of the search leave the sets almost where all samples want them.
+REFINING_STEPS, PROJECTED_STEPS = 10, 3
+# Steps times samples that a start is regularised for, to be ranked by its evidence: the precisions
+# are first estimated after one step and good enough for a ranking after another, but few samples
+# need many steps and cost little.
+RANKING_EFFORT = 120_000
+
+
+@dataclass(frozen=True)
+class TrainingOptions(EvidenceOptions):
+    """Settings of a training; those of Bayesian regularisation are in scaled units.
+
+    Sets (or units) are first moved with the output layer eliminated, from several starts, on few
+    samples and then a little on all; the start with the largest evidence is regularised.
+
+    Attributes:
+        seed: of the samples of controllers, and of the starts after the first: shaken sets, or
+            k-means anew.
+        starts: how many.
+        search_samples, search_steps: evenly thinned samples, and steps, to compare starts with.
+            Without regularisation these steps overfit where samples are hardly more than
+            parameters; `search_steps=0` then often ends at a larger evidence.
+        max_steps: limit of the steps of Bayesian regularisation on all samples.
+
+    Raises:
+        ValueError: if there is no start or no sample, or see `EvidenceOptions`.
+    """
+
+    max_steps: int = 30
+    seed: int = 0
+    starts: int = 1
+    search_samples: int = 4000
+    search_steps: int = 50
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.starts < 1 or self.search_samples < 1:
+            raise ValueError(
+                "`starts` and `search_samples` must be at least 1, got "
+                f"{self.starts}, {self.search_samples}."
+            )
+
+
+DEFAULTS = TrainingOptions()
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +84,7 @@ class NetworkFit:
     scaling: Scaling
 
     def predictive_std(self, x: Tensor, noise: bool = True) -> Tensor:
-        """Standard deviation of the outputs that parameters and noise leave open, in own units.
+        """Standard deviation of the outputs by parameters and noise, in the samples' units.
 
         Args:
             x: inputs of this group, shape (samples, inputs).
@@ -52,7 +99,7 @@ class NetworkFit:
 def controller_targets(
     controller: MamdaniController, samples: int = 40_000, seed: int = 0
 ) -> tuple[Tensor, Tensor]:
-    """Inputs drawn evenly over a controller's universes, and what it says to them.
+    """Inputs drawn evenly over a controller's universes, and its outputs.
 
     Args:
         controller: as the papers', of |velocity| and acceleration, or any other.
@@ -75,17 +122,9 @@ def train_on_controller(
     controllers: MamdaniController | Sequence[MamdaniController],
     *,
     samples: int = 40_000,
-    seed: int = 0,
-    starts: int = 1,
-    search_samples: int = 4000,
-    search_steps: int = 50,
-    max_steps: int = 30,
-    tolerance: float = 1e-3,
-    noise_floor: float = 0.0,
-    callback: Callback | None = None,
-    progress: bool = False,
+    options: TrainingOptions = DEFAULTS,
 ) -> list[NetworkFit]:
-    """Teach a network, in place, what fuzzy controllers say: the papers' neuro-fuzzy step.
+    """Train a network, in place, on the outputs of fuzzy controllers: the papers' last step.
 
     An ANFIS starts from a controller's own sets where it has as many, else from an even grid over
     the universes; a radial basis network from units chosen by orthogonal least squares.
@@ -93,11 +132,12 @@ def train_on_controller(
     Args:
         network: from inputs in SI to outputs in SI, a group for each controller.
         controllers: one for each group.
-        samples, seed: see `controller_targets`; group g draws with seed + g.
-        starts, search_samples, search_steps: see `train_network`.
-        max_steps, tolerance, noise_floor, callback, progress: likewise.
+        samples: see `controller_targets`; group g draws with seed + g.
+        options: see `train_network`.
+
     Returns:
         A fit for each group; fewer if an interrupt or the callback ended the training.
+
     References:
         TLRIP paper, neuro-fuzzy friction estimation (40,000 samples a joint, 2-10-2 network).
     """
@@ -109,100 +149,51 @@ def train_on_controller(
             f"the network needs {network.groups} controllers of {network.inputs} inputs and "
             f"{network.outputs} outputs, got {[(c.inputs, c.outputs) for c in given]}."
         )
-    drawn = [controller_targets(c, samples, seed + g) for g, c in enumerate(given)]
+    drawn = [controller_targets(c, samples, options.seed + g) for g, c in enumerate(given)]
     x, y = (torch.stack(parts, 1) for parts in zip(*drawn, strict=True))
     if isinstance(network, RBFNetwork):
         network.init_ols(x, y, width=0.5)
     else:
         _take_sets(network.anfis if isinstance(network, AnfisRBF) else network, given)
-    return train_network(
-        network,
-        x,
-        y,
-        seed=seed,
-        starts=starts,
-        search_samples=search_samples,
-        search_steps=search_steps,
-        max_steps=max_steps,
-        tolerance=tolerance,
-        noise_floor=noise_floor,
-        callback=callback,
-        progress=progress,
-    )
+    return train_network(network, x, y, options)
 
 
 def train_network(
-    network: FuzzyNetwork,
-    x: Tensor,
-    y: Tensor,
-    *,
-    seed: int = 0,
-    starts: int = 1,
-    search_samples: int = 4000,
-    search_steps: int = 50,
-    max_steps: int = 30,
-    tolerance: float = 1e-3,
-    noise_floor: float = 0.0,
-    callback: Callback | None = None,
-    progress: bool = False,
+    network: FuzzyNetwork, x: Tensor, y: Tensor, options: TrainingOptions = DEFAULTS
 ) -> list[NetworkFit]:
     """Train a network in place on samples by Bayesian regularisation, each group for itself.
 
-    Sets (or units) are first moved with the output layer eliminated, from several starts, on few
-    samples and then a little on all; the start with the largest evidence goes on. Every kind of
-    parameter has its own prior: centres, widths and their like around where that start placed
-    them, output layers around zero (in scaled units).
+    Every kind of parameter has its own prior: centres, widths and their like around where the best
+    start placed them, output layers around zero (in scaled units).
 
     Args:
-        network: as its sets (or units) should start; of the output layer no start is needed.
+        network: as its sets (or units) should start; the output layer needs no start.
         x: inputs, shape (samples, groups, inputs).
         y: targets, shape (samples, groups, outputs).
-        seed: of the starts after the first: shaken sets, or k-means anew.
-        starts: how many.
-        search_samples, search_steps: evenly thinned samples, and steps, to compare starts with.
-            Without regularisation these steps overfit where samples are hardly more than
-            parameters; `search_steps=0` then often ends at a larger evidence.
-        max_steps: limit of the steps of Bayesian regularisation on all samples.
-        tolerance, noise_floor, callback, progress: see `maximise_evidence`; in scaled units.
+        options: starts, steps and the callback.
+
     Returns:
         A fit for each group; fewer if an interrupt or the callback ended the training. The groups
-        that come after it then stand at the least-squares output layer for their first sets.
+        after it then have the least-squares output layer for their first sets.
+
     Raises:
         ValueError: if samples do not fit the network, are not finite, or an input never varies.
     """
     _check(network, x, y)
-    if starts < 1 or search_samples < 1:
-        raise ValueError(
-            f"`starts` and `search_samples` must be at least 1, got {starts}, {search_samples}."
-        )
     scaling = Scaling.of(x, y)
     x, y = scaling.inputs(x), scaling.outputs(y)
-    tasks = [
-        NetworkGroup(
-            network, g, scaling, x[:, g : g + 1].contiguous(), y[:, g : g + 1].contiguous()
-        )
-        for g in range(network.groups)
-    ]
+    groups = [NetworkGroup(network, g, scaling, x, y) for g in range(network.groups)]
     # All groups get a usable network before the long part, which an interrupt may end.
-    for task in tasks:
-        task.solve_linear(search_samples)
+    for group in groups:
+        group.solve_linear(options.search_samples)
     fits: list[NetworkFit] = []
-    for task in tasks:
+    for group in groups:
         try:
-            prior = task.search(seed, starts, search_samples, search_steps, max_steps)
-            result = task.regularise(
-                prior,
-                seed,
-                max_steps=max_steps,
-                tolerance=tolerance,
-                noise_floor=noise_floor,
-                callback=callback,
-                progress=progress,
-            )
+            result = group.regularise(group.search(options), options)
         except KeyboardInterrupt:
             break
-        task.write_back()
-        fits.append(NetworkFit(result, task.scaling))
+        group.write_back()
+        fits.append(NetworkFit(result, group.scaling))
         if result.status == "stopped":
             break
     return fits
@@ -222,19 +213,15 @@ def _take_sets(anfis: Anfis, controllers: Sequence[MamdaniController]) -> None:
     if not alike:
         anfis.init_grid(lower, upper)
         return
-    given: list[list[Tensor]] = []
-    for number in (0, 1):
-        given.append(
-            [
-                torch.tensor(
-                    [[term.parameters[number] for term in inputs[i].sets] for inputs in variables],
-                    dtype=torch.float64,
-                ).to(lower)
-                * torch.stack([c.si_factor[i : i + 1] for c in controllers])
-                for i in range(anfis.inputs)
-            ]
-        )
-    anfis.init_from_sets(*given, lower=lower, upper=upper)
+    centres, widths = [], []
+    for i in range(anfis.inputs):
+        # (group, set, parameter), centre and width first.
+        own = [[term.parameters[:2] for term in inputs[i].sets] for inputs in variables]
+        factor = torch.stack([c.si_factor[i] for c in controllers])[:, None]
+        centre, width = lower.new_tensor(own).unbind(-1)
+        centres.append(centre * factor)
+        widths.append(width * factor)
+    anfis.init_from_sets(centres, widths, lower=lower, upper=upper)
 
 
 def _check(network: nn.Module, x: Tensor, y: Tensor) -> None:
@@ -250,3 +237,132 @@ def _check(network: nn.Module, x: Tensor, y: Tensor) -> None:
         )
     if len(x) == 0 or not (torch.isfinite(x).all() and torch.isfinite(y).all()):
         raise ValueError("`x` and `y` need samples, all finite; drop those with NaN or infinity.")
+
+
+class NetworkGroup:
+    """One group (joint) of a network in training, in scaled units.
+
+    Args:
+        network: of any number of groups; written to by `write_back` only.
+        group: which of them.
+        scaling: of all groups.
+        x, y: samples of all groups, scaled, (samples, groups, inputs) and (..., outputs).
+    """
+
+    def __init__(
+        self, network: FuzzyNetwork, group: int, scaling: Scaling, x: Tensor, y: Tensor
+    ) -> None:
+        rows = slice(group, group + 1)
+        self.network, self.group = network, group
+        self.x, self.y = x[:, rows].contiguous(), y[:, rows].contiguous()
+        self.scaling = Scaling(*(part[rows] for part in vars(scaling).values()))
+        self.layer = one_group(network, group)
+        to_own_units(self.layer, self.scaling.inverse())
+
+    @property
+    def carrier(self) -> Anfis | RBFNetwork:
+        """The layer that is placed first; a head comes after."""
+        return self.layer.anfis if isinstance(self.layer, AnfisRBF) else self.layer
+
+    def solve_linear(self, samples: int) -> None:
+        """Least-squares output layer for the present sets, written into the network."""
+        x, y = self._thinned(samples)
+        if isinstance(self.carrier, Anfis):
+            self.carrier.solve_consequents(x, y)
+        else:
+            self.carrier.solve_output(x, y)
+        if isinstance(self.layer, AnfisRBF):
+            nn.init.zeros_(self.layer.head.output_weight)
+            nn.init.zeros_(self.layer.head.output_bias)
+        self.write_back()
+
+    def search(self, options: TrainingOptions) -> dict[str, Tensor]:
+        """Give the carrier the start of the largest evidence; return where its sets started."""
+        few = self._thinned(options.search_samples)
+        refining = REFINING_STEPS if options.starts == 1 else PROJECTED_STEPS
+        ranking = max(3, min(options.max_steps, RANKING_EFFORT // len(self.x)))
+        best, prior = -float("inf"), _moving(self.carrier)
+        found = deepcopy(self.carrier.state_dict())
+        for number in range(options.starts):
+            trial = deepcopy(self.carrier)
+            if number > 0:
+                _restart(trial, few[0], options.seed + number)
+            start = _moving(trial)
+            project(trial, *few, options.search_steps)
+            if len(few[0]) < len(self.x):
+                project(trial, self.x, self.y, refining)
+            evidence = 0.0
+            if options.starts > 1:
+                # On all samples: on few, the start that overfits them would win.
+                ranked = EvidenceOptions(max_steps=ranking)
+                evidence = _regularised(trial, self.x, self.y, start, ranked).log_evidence
+            if evidence > best:
+                best, prior, found = evidence, start, deepcopy(trial.state_dict())
+        self.carrier.load_state_dict(found)
+        return prior
+
+    def regularise(self, prior: dict[str, Tensor], options: TrainingOptions) -> EvidenceResult:
+        """Bayesian regularisation on all samples, after placing a head where there is one."""
+        if isinstance(self.layer, AnfisRBF):
+            self.layer.init_head(self.x, options.seed)
+            self.layer.solve_head(self.x, self.y)
+            prior = {f"anfis.{name}": value for name, value in prior.items()}
+            prior |= {f"head.{name}": value for name, value in _moving(self.layer.head).items()}
+        return _regularised(self.layer, self.x, self.y, prior, options)
+
+    def _thinned(self, most: int) -> tuple[Tensor, Tensor]:
+        """At most `most` samples, evenly spaced."""
+        every = -(-len(self.x) // most)
+        return self.x[::every].contiguous(), self.y[::every].contiguous()
+
+    @torch.no_grad()
+    def write_back(self) -> None:
+        """Copy the layer into its group of the network, in the samples' own units."""
+        own = deepcopy(self.layer)
+        to_own_units(own, self.scaling)
+        ours = self.network.state_dict(keep_vars=True)
+        for name, value in own.state_dict().items():
+            ours[name][self.group : self.group + 1] = value
+
+
+def _regularised(
+    layer: FuzzyNetwork, x: Tensor, y: Tensor, prior: dict[str, Tensor], options: EvidenceOptions
+) -> EvidenceResult:
+    """Bayesian regularisation with a prior of its own for each kind of parameter."""
+    parameters = trainable(layer)
+    groups: dict[str, list[str]] = {}
+    for name in parameters:
+        groups.setdefault(_kind(name), []).append(name)
+    wanted = {name: value for name, value in prior.items() if name in parameters}
+    return bayesian_regularisation(layer, x, y, groups=groups, prior=wanted, options=options)
+
+
+def _kind(name: str) -> str:
+    """The prior that a parameter belongs to."""
+    part = {"spacings": "centres", "log_widths": "widths", "log_slopes": "slopes"}
+    last = name.rsplit(".", 1)[-1]
+    kind = "outputs" if last.startswith("output_") else part.get(last, last)
+    return f"head {kind}" if name.startswith("head.") else kind
+
+
+def _moving(layer: nn.Module) -> dict[str, Tensor]:
+    """Copies of the parameters that place sets or units."""
+    return {
+        name: value.detach().clone()
+        for name, value in layer.named_parameters()
+        if not name.endswith(LINEAR)
+    }
+
+
+@torch.no_grad()
+def _restart(layer: Anfis | RBFNetwork, x: Tensor, seed: int) -> None:
+    """Another start: units by k-means anew, sets shaken."""
+    if isinstance(layer, RBFNetwork):
+        layer.init_kmeans(x, seed)
+        return
+    random = torch.Generator().manual_seed(seed)
+    for name, value in layer.named_parameters():
+        if value.requires_grad and not name.endswith(LINEAR):
+            drawn = torch.randn(value.shape, generator=random, dtype=torch.float64)
+            size = 0.5 * SHAKE if name.endswith("centres") else SHAKE
+            value.add_(size * drawn.to(value))

@@ -1,24 +1,31 @@
-"""The papers' figures from what the stages found."""
+"""The papers' figures from the results of a reproduction."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from nfriction.evaluation.score import RMSE, Score
-from nfriction.io.atomic import replacing
+from nfriction.io.atomic import atomic_write
 from nfriction.io.model_file import load
 from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.controller.mamdani import paper_controller
-from nfriction.papers.reproduction import drawing as papers
-from nfriction.papers.reproduction import printed, tables
+from nfriction.papers.controller.rules import Variable
+from nfriction.papers.reproduction import tables
 from nfriction.papers.reproduction.stages import ADAPTIVE, LAWS, NEURO_FUZZY, SECOND_PAPER
 from nfriction.papers.reproduction.workspace import Array, Workspace
 from nfriction.plant import rigs
-from nfriction.plots import controller_surface, positions, rmse_bars
+from nfriction.plots import controller_surface, positions, rmse_bars, style
 from nfriction.recording import Recording
 from nfriction.simulation.rollout import rollout
 
@@ -26,7 +33,9 @@ DPI = 150
 SHOWN, SECOND_SHOWN = "test_hanging", "test_bent"
 """Held-out recordings that the figures show: the poses of the papers' own model checks."""
 INERTIA_SECONDS = 5.0
-"""Beyond this a frictionless swing from upright tells rounding rather than inertia."""
+"""Beyond this a frictionless swing from upright shows rounding rather than inertia."""
+CLASS_COLOURS = {"low": "#eef3f7", "medium": "#cfe0ec", "high": "#a3c4dc"}
+_POINTS = 600  # of a membership's line
 
 
 def draw_all(workspace: Workspace, *, progress: bool = False) -> list[Path]:
@@ -40,7 +49,7 @@ def draw_all(workspace: Workspace, *, progress: bool = False) -> list[Path]:
     for name, draw in tqdm(drawers.items(), unit="figure", disable=not progress, leave=False):
         figure = draw()
         path = workspace.folder / "figures" / f"{name}.png"
-        with replacing(path) as temporary:
+        with atomic_write(path) as temporary:
             figure.savefig(temporary, dpi=DPI, format="png")
         figure.clear()
         written.append(path)
@@ -48,27 +57,32 @@ def draw_all(workspace: Workspace, *, progress: bool = False) -> list[Path]:
 
 
 def figures(workspace: Workspace) -> dict[str, Callable[[], Figure]]:
-    """What draws each figure, by the name of its file."""
-    found: dict[str, Callable[[], Figure]] = {
-        "fig_02_inertia": inertia_cases,
-        "fig_04_experiment": lambda: experiment(workspace),
-        "fig_07_memberships": lambda: papers.controller_memberships(paper_controller(2)),
-        "fig_08_surfaces": lambda: controller_surface(paper_controller(2)),
+    """The function that draws each figure, by the name of its file."""
+    groups = {
+        f"fig_{11 + joint}_joint_{joint + 2}": partial(model_groups, workspace, joint)
+        for joint in range(3)
     }
-    for joint in range(3):
-        found[f"fig_{11 + joint}_joint_{joint + 2}"] = lambda j=joint: model_groups(workspace, j)  # type: ignore[misc]
-    found["fig_14_rmse"] = lambda: error_bars(workspace)
-    found["second_fig_3_motion"] = lambda: papers.recorded_motion(workspace.bench("rtip").train)
-    for number, law in zip((5, 6, 7), LAWS, strict=True):
-        found[f"second_fig_{number}_{law}"] = lambda n=law: second_positions(workspace, n)  # type: ignore[misc]
-    found["second_fig_8_rmse"] = lambda: rmse_bars(
-        tables.rmse(workspace, SECOND_PAPER).rename(lambda name: name.removeprefix("rtip-")), "rad"
-    )
-    return found
+    seconds = {
+        f"second_fig_{number}_{law}": partial(second_positions, workspace, law)
+        for number, law in zip((5, 6, 7), LAWS, strict=True)
+    }
+    return {
+        "fig_02_inertia": inertia_cases,
+        "fig_04_experiment": partial(experiment, workspace),
+        "fig_07_memberships": controller_memberships,
+        "fig_08_surfaces": lambda: controller_surface(paper_controller(2)),
+        **groups,
+        "fig_14_rmse": partial(error_bars, workspace),
+        "second_fig_3_motion": partial(recorded_motion, workspace),
+        **seconds,
+        "second_fig_8_rmse": lambda: rmse_bars(
+            tables.rmse(workspace, SECOND_PAPER).set_axis(list(LAWS)), "rad"
+        ),
+    }
 
 
 def inertia_cases() -> Figure:
-    """A frictionless swing of the TLRIP rig by what its inertia is taken to be.
+    """Frictionless swings of the TLRIP rig, a panel a joint, for three cases of inertia.
 
     Links as point masses, as slender rods with the printed Izz, and with a full tensor. With the
     arm fixed the motion stays in a plane and only Izz enters, so the last two coincide.
@@ -85,51 +99,116 @@ def inertia_cases() -> Figure:
     }
     q0 = torch.deg2rad(torch.tensor([20.0, 30.0, 40.0], dtype=torch.float64))
     steps = round(INERTIA_SECONDS * 1000)
-    runs = {
-        name: rollout(plant, None, q0, torch.zeros_like(q0), sample_time=1e-3, steps=steps)
-        for name, plant in cases.items()
-    }
-    time = next(iter(runs.values())).time.numpy()
-    motions = {name: run.q.numpy() for name, run in runs.items()}
-    return papers.free_swings(time, motions, printed.JOINTS)
+    figure, axes = style.panels(3, 1, style.PAGE, 4.3, sharex=True)
+    looks = style.looks(cases)
+    handles: list[Any] = []
+    # Later lines are thinner, so that lines that coincide can be distinguished.
+    for (label, plant), width in zip(cases.items(), (2.2, 1.6, 1.0), strict=True):
+        run = rollout(plant, None, q0, torch.zeros_like(q0), sample_time=1e-3, steps=steps)
+        line = looks[label].line | {"linewidth": width}
+        for ax, q in zip(axes[:, 0], run.q.numpy().T, strict=True):
+            ax.plot(run.time.numpy(), q, **line)
+        handles.append(Line2D([], [], **line))
+    _joint_axes(axes[:, 0].tolist(), tables.JOINTS, "rad")
+    figure.align_ylabels(axes[:, 0])
+    style.legend(figure, handles, list(cases))
+    return figure
 
 
 def experiment(workspace: Workspace) -> Figure:
-    """The friction experiment, smoothed, with the classes of acceleration found in it.
+    """Position, velocity and acceleration of the friction experiment, a column a joint.
+
+    Shaded by the class of acceleration found; a strip at the top shows the printed classes.
 
     References:
         TLRIP paper, Fig. 4 and Table 6.
     """
     bench = workspace.bench("tlrip")
-    recording = next(r for r in bench.train if r.name == "train_hanging")
+    motion = next(m for _, r, m in bench.parts() if r.name == "train_hanging")
     schedule = load(workspace.model(ADAPTIVE[-1])).schedule
     assert isinstance(schedule, Adaptive)
-    smooth = bench.motions[recording.name]
-    classes = schedule.classes(torch.tensor(smooth.qd), torch.tensor(smooth.qdd)).numpy()
-    return papers.motion_with_classes(
-        smooth, classes, printed.JOINTS,
-        printed=printed.TABLE_6,
-    )  # fmt: skip
+    classes = schedule.classes(torch.tensor(motion.qd), torch.tensor(motion.qdd)).numpy()
+    figure, axes = style.panels(3, len(tables.JOINTS), style.PAGE, 4.6, sharex=True)
+    rows = (
+        ("position [rad]", motion.q),
+        ("velocity [rad/s]", motion.qd),
+        ("acceleration [rad/s²]", motion.qdd),
+    )
+    labels = list(CLASS_COLOURS)
+    for joint, name in enumerate(tables.JOINTS):
+        for ax, (label, values) in zip(axes[:, joint], rows, strict=True):
+            for first, last, known in _runs(classes[:, joint]):
+                span = motion.time[first], motion.time[last]
+                ax.axvspan(*span, color=CLASS_COLOURS[labels[known]], linewidth=0, zorder=0)
+            ax.plot(motion.time, values[:, joint], color=style.INK, linewidth=0.6)
+            ax.grid(False)
+            ax.yaxis.set_major_locator(MaxNLocator(4))
+            ax.set_xlim(motion.time[0], motion.time[-1])
+            if joint == 0:
+                ax.set_ylabel(label)
+        style.title(axes[0, joint], name)
+        axes[-1, joint].set_xlabel("time [s]")
+        _strip(axes[0, joint], tables.TABLE_6[name])
+    figure.align_ylabels(axes[:, 0])
+    handles: list[Any] = [Patch(facecolor=colour) for colour in CLASS_COLOURS.values()]
+    texts = [f"{known} acceleration" for known in labels]
+    texts[-1] += "; strip at the top: as printed"
+    style.legend(figure, handles, texts)
+    return figure
+
+
+def controller_memberships() -> Figure:
+    """Fuzzy sets of the inputs and outputs of joint 2's controller, a panel each.
+
+    References:
+        TLRIP paper, Fig. 7 and Table 4.
+    """
+    rules = paper_controller(2).rule_base
+    figure, axes = style.panels(2, 2, style.PAGE, 3.6, sharey=True)
+    for row, variables in zip(axes, (rules.inputs, rules.outputs), strict=True):
+        for ax, variable in zip(row, variables, strict=True):
+            _sets(ax, variable)
+        row[0].set_ylabel("membership [-]")
+    return figure
 
 
 def model_groups(workspace: Workspace, joint: int) -> Figure:
-    """Measured and simulated position of one joint by kind of model.
+    """Measured and simulated position of one joint, a column a kind of model, error below.
 
     References:
         TLRIP paper, Figs. 11 to 13.
     """
     bench = workspace.bench("tlrip")
     recording = next(r for r in bench.test if r.name == SHOWN)
-    kinds: Mapping[str, tuple[str, ...]] = {
-        "constant": tuple(LAWS),
-        "adaptive": ADAPTIVE,
-        "neuro-fuzzy": NEURO_FUZZY,
-    }
-    groups = {
-        kind: {name: workspace.arrays(name)[SHOWN] for name in names}
-        for kind, names in kinds.items()
-    }
-    return papers.positions_by_group(recording, joint, groups)
+    groups = {"constant": tuple(LAWS), "adaptive": ADAPTIVE, "neuro-fuzzy": NEURO_FUZZY}
+    q = {n: workspace.arrays(n)[SHOWN][:, joint] for names in groups.values() for n in names}
+    measured = recording.q[:, joint]
+    span = float(np.ptp(measured)) or 1.0
+    figure, axes = style.panels(
+        2, len(groups), style.PAGE, 3.4, sharex=True, sharey="row", height_ratios=[1.5, 1]
+    )
+    # The groups are side by side, so the models of each take the same looks.
+    looks = [look for name, look in style.looks(LAWS).items() if name in LAWS]
+    errors = np.concatenate(list(q.values())) - np.tile(measured, len(q))
+    largest = float(np.abs(errors[np.isfinite(errors)]).max(initial=0.0))
+    shown = min(largest, 0.5 * span) or span
+    factor, unit = style.scaled(recording.unit, shown)
+    for (group, models), (above, below) in zip(groups.items(), axes.T, strict=True):
+        above.plot(recording.time, measured, **style.MEASURED)
+        for look, model in zip(looks, models, strict=True):
+            above.plot(recording.time, q[model], **look.line)
+            below.plot(recording.time, factor * (q[model] - measured), **look.line)
+        style.title(above, group)
+        below.set_xlabel("time [s]")
+    axes[0, 0].set_ylim(measured.min() - 0.25 * span, measured.max() + 0.25 * span)
+    axes[1, 0].set_ylim(style.padded(-factor * shown, factor * shown))
+    axes[0, 0].set_ylabel(f"{recording.names[joint]} [{recording.unit}]")
+    axes[1, 0].set_ylabel(f"error [{unit}]")
+    figure.align_ylabels(axes[:, 0])
+    handles = [Line2D([], [], **line) for line in (style.MEASURED, *(x.line for x in looks))]
+    labels = [", ".join(models) for models in zip(*groups.values(), strict=True)]
+    style.legend(figure, handles, ["measured", *labels])
+    return figure
 
 
 def error_bars(workspace: Workspace) -> Figure:
@@ -138,8 +217,28 @@ def error_bars(workspace: Workspace) -> Figure:
     References:
         TLRIP paper, Fig. 14.
     """
-    models = [*LAWS, *ADAPTIVE, *NEURO_FUZZY]
-    return rmse_bars(tables.rmse(workspace, models), "rad")
+    return rmse_bars(tables.rmse(workspace, tables.NINE), "rad")
+
+
+def recorded_motion(workspace: Workspace) -> Figure:
+    """Measured positions on the second paper's rig, a panel a joint, a column a recording.
+
+    References:
+        RTIP paper, Fig. 3.
+    """
+    recordings = workspace.bench("rtip").train
+    joints = recordings[0].joints
+    figure, axes = style.panels(
+        joints, len(recordings), style.PAGE, 0.3 + 1.2 * joints, sharex="col", sharey="row"
+    )
+    for column, recording in zip(axes.T, recordings, strict=True):
+        for ax, q in zip(column, recording.q.T, strict=True):
+            ax.plot(recording.time, q, color=style.INK, linewidth=0.7)
+        style.title(column[0], recording.name.replace("_", " "))
+        column[-1].set_xlabel("time [s]")
+    _joint_axes(axes[:, 0].tolist(), recordings[0].names, recordings[0].unit)
+    figure.align_ylabels(axes[:, 0])
+    return figure
 
 
 def second_positions(workspace: Workspace, law: str) -> Figure:
@@ -148,14 +247,13 @@ def second_positions(workspace: Workspace, law: str) -> Figure:
     References:
         RTIP paper, Figs. 5 to 7.
     """
-    bench = workspace.bench("rtip")
-    recording = next(r for r in bench.test if r.name == SECOND_SHOWN)
+    recording = next(r for r in workspace.bench("rtip").test if r.name == SECOND_SHOWN)
     simulated = workspace.arrays(f"rtip-{law}")[SECOND_SHOWN]
     return positions(recording, {law: _score(recording, simulated)})
 
 
 def _score(recording: Recording, simulated: Array) -> Score:
-    """What a figure needs of a score, from simulated positions."""
+    """A score without windows, from simulated positions."""
     lost = ~np.isfinite(simulated).all(-1)
     return Score(
         recording=recording.name,
@@ -166,3 +264,55 @@ def _score(recording: Recording, simulated: Array) -> Score:
         simulated=simulated,
         diverged_at=float(recording.time[lost.argmax()]) if lost.any() else np.inf,
     )
+
+
+def _joint_axes(axes: Sequence[Axes], names: Sequence[str], unit: str) -> None:
+    for ax, name in zip(axes, names, strict=True):
+        ax.set_ylabel(f"{name} [{unit}]")
+        ax.yaxis.set_major_locator(MaxNLocator(4))
+        ax.margins(x=0.01)
+    axes[-1].set_xlabel("time [s]")
+
+
+def _sets(ax: Axes, variable: Variable) -> None:
+    low, high = variable.universe
+    x = torch.linspace(low, high, _POINTS, dtype=torch.float64)
+    is_input = "deg" in variable.unit
+    factor, unit = (1.0, variable.unit) if is_input else style.scaled(variable.unit, [low, high])
+    colours = style.COLOURS
+    for k, term in enumerate(variable.sets):
+        y = term(x).numpy()
+        ax.plot(factor * x.numpy(), y, color=colours[k % len(colours)], linewidth=1.2)
+        peak = float(x[int(np.argmax(y))]) if term.shape == "gaussian" else term.core
+        side = {"left_shoulder": "left", "right_shoulder": "right"}.get(term.shape, "center")
+        ax.annotate(
+            term.name, (factor * peak, 1.0), xytext=(0, 2), textcoords="offset points",
+            ha=side, fontsize=style.SMALL, color=colours[k % len(colours)],
+        )  # fmt: skip
+    ax.set_ylim(0, 1.12)
+    ax.set_yticks([0, 0.5, 1])
+    ax.set_xlim(factor * low, factor * high)
+    ax.xaxis.set_major_locator(MaxNLocator(5))
+    name = style.symbol(variable.name) if len(variable.name) == 1 else variable.name
+    ax.set_xlabel(f"{name} [{unit.replace('^2', '²')}]")
+
+
+def _runs(values: NDArray[np.int64]) -> list[tuple[int, int, int]]:
+    """First and last sample of every run of equal values, with the value."""
+    edges = np.flatnonzero(np.diff(values)) + 1
+    firsts, lasts = [0, *edges.tolist()], [*edges.tolist(), len(values) - 1]
+    return [(a, b, int(values[a])) for a, b in zip(firsts, lasts, strict=True)]
+
+
+def _strip(ax: Axes, intervals: Sequence[tuple[str, float, float]]) -> None:
+    """Intervals as a strip along the upper edge of a panel."""
+    right = ax.get_xlim()[1]
+    for known, start, stop in intervals:
+        if start >= right:
+            continue
+        ax.axvspan(
+            start, min(stop, right), ymin=0.93, facecolor=CLASS_COLOURS[known],
+            edgecolor=style.INK, linewidth=0.4, zorder=4,
+        )  # fmt: skip
+    low, high = ax.get_ylim()
+    ax.set_ylim(low, high + 0.1 * (high - low))

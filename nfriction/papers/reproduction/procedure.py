@@ -1,21 +1,20 @@
 """The papers' own neuro-fuzzy procedure: coefficients by class → fuzzy controller → network."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from nfriction.friction.laws import Law
-from nfriction.friction.model import FrictionModel
-from nfriction.friction.models import MODELS, NeuroFuzzyModel
+from nfriction.friction.models import FrictionModel, NeuroFuzzyModel
+from nfriction.friction.registry import model_by_name, model_names
 from nfriction.fuzzy import FuzzySet, RBFNetwork, sets_from_ranges
-from nfriction.optim.evidence_result import EvidenceState
 from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.controller.mamdani import MamdaniController, paper_controller
-from nfriction.papers.controller.rulebase import Rule, RuleBase, Variable
-from nfriction.papers.nffem.rbf_coefficients import RadialBasis
-from nfriction.papers.nffem.train_network import train_on_controller
+from nfriction.papers.controller.rules import Rule, RuleBase, Variable
+from nfriction.papers.nffem.rbf_coefficients import RBFCoefficients
+from nfriction.papers.nffem.train_network import DEFAULTS, TrainingOptions, train_on_controller
 from nfriction.signals import Motion
 
 Ranges = list[tuple[float, float]]
@@ -30,9 +29,7 @@ def papers_neuro_fuzzy(
     *,
     samples: int = 40_000,
     units: int = 10,
-    seed: int = 0,
-    callback: Callable[[EvidenceState], bool | None] | None = None,
-    progress: bool = False,
+    options: TrainingOptions = DEFAULTS,
 ) -> NeuroFuzzyModel:
     """The neuro-fuzzy model of an adaptive one, by the papers' procedure.
 
@@ -45,8 +42,7 @@ def papers_neuro_fuzzy(
         motions: of the recordings behind it, in joint coordinates.
         samples: a joint.
         units: of the network.
-        seed: of the samples.
-        callback, progress: see `train_on_controller`.
+        options: of its training, see `train_on_controller`.
 
     Returns:
         A model of the same law with the network for its schedule, without gradients.
@@ -69,9 +65,7 @@ def papers_neuro_fuzzy(
         np.concatenate([m.qdd for m in motions]),
     )
     network = RBFNetwork(joints, 2, units, len(law.names))
-    train_on_controller(
-        network, controllers, samples=samples, seed=seed, callback=callback, progress=progress
-    )
+    train_on_controller(network, controllers, samples=samples, options=options)
     model = _neuro_fuzzy_class(law)(
         joints,
         adaptive.schedule.values.mean(1),
@@ -80,7 +74,7 @@ def papers_neuro_fuzzy(
         acceleration="signed",
         network="rbf",
     )
-    assert isinstance(model.schedule, RadialBasis)
+    assert isinstance(model.schedule, RBFCoefficients)
     inputs = torch.stack(
         [torch.stack([end(c) for c in controllers]) for end in (_lower_inputs, _upper_inputs)]
     )
@@ -194,7 +188,7 @@ def _upper_inputs(controller: MamdaniController) -> Tensor:
 
 
 def _neuro_fuzzy_class(law: Law) -> type[NeuroFuzzyModel]:
-    for model in MODELS.values():
+    for model in map(model_by_name, model_names()):
         if issubclass(model, NeuroFuzzyModel) and model.definition is law:
             return model
     raise ValueError(f"there is no neuro-fuzzy model of the law {law.name!r}.")

@@ -1,35 +1,38 @@
-"""What a reproduction consists of: stages, each finished for itself from those before it."""
+"""The stages of a reproduction: fits, each kept when it is finished, and their scores."""
 
 import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from nfriction.evaluation.compare import coefficient_summary
 from nfriction.evaluation.results import model_info
+from nfriction.evaluation.score import RMSE, score
 from nfriction.export import ExportError, torchscript
 from nfriction.fitting.fit import fit
+from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction.model import FrictionModel
-from nfriction.friction.models import model_by_name
+from nfriction.friction.models import FrictionModel
+from nfriction.friction.registry import model_by_name
 from nfriction.io.model_file import load, load_info, save
 from nfriction.io.model_info import ModelInfo
 from nfriction.papers import twin
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
 from nfriction.papers.afem.fit_adaptive import fit_adaptive
-from nfriction.papers.afem.fit_by_search import fit_by_search
-from nfriction.papers.afem.search import SearchMethod
+from nfriction.papers.afem.fit_by_search import SearchMethod, SearchOptions, fit_by_search
 from nfriction.papers.nffem.refine_adaptive import refine_adaptive
-from nfriction.papers.reproduction.fitfile import load_fit, save_fit
-from nfriction.papers.reproduction.judging import judge
+from nfriction.papers.nffem.train_network import TrainingOptions
 from nfriction.papers.reproduction.procedure import papers_neuro_fuzzy
-from nfriction.papers.reproduction.workspace import Array, Bench, Workspace
-from nfriction.signals import kalman_smoother
+from nfriction.papers.reproduction.workspace import Array, Bench, Workspace, smoothed
+from nfriction.recording import Recording
+from nfriction.signals import causal_motion
+from nfriction.simulation.rk4 import required_substeps
+from nfriction.simulation.rollout import rollout
 
 logger = logging.getLogger(__name__)
 
@@ -42,6 +45,8 @@ PAPERS_WAY = tuple(f"{name}-papers" for name in NEURO_FUZZY)
 SECOND_PAPER = tuple(f"rtip-{law}" for law in LAWS)
 SEARCH: dict[str, SearchMethod] = {"NCFM": "sqp", "LFM": "pattern", "NLFM": "pattern"}
 """How the second paper estimates each model."""
+COUNTS = 8192
+"""Counts a revolution of the papers' encoders, four edges to each of 2048 lines."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +56,7 @@ class Stage:
     Attributes:
         name: of its files.
         needs: stages that come before it.
-        run: does it, given the workspace; returns what was found, as plain JSON.
+        run: does it, given the workspace; returns its result, plain JSON.
     """
 
     name: str
@@ -64,13 +69,14 @@ def stages() -> dict[str, Stage]:
     found = [Stage(f"twin-{name}", (), partial(make_twin, name=name)) for name in twin.names()]
     for law in reversed(LAWS):
         found += [
-            Stage(law, ("twin-tlrip",), partial(constant, name=law)),
-            Stage(f"A{law}", (law,), partial(adaptive, law=law)),
-            Stage(f"NF{law}", (f"A{law}",), partial(neuro_fuzzy, law=law)),
+            Stage(law, ("twin-tlrip",), partial(fitted, fit=fit_constant, name=law)),
+            Stage(f"A{law}", (law,), partial(fitted, fit=fit_by_class, name=f"A{law}")),
+            Stage(f"NF{law}", (f"A{law}",), partial(fitted, fit=fit_network, name=f"NF{law}")),
             Stage(f"NF{law}-papers", (f"A{law}",), partial(papers_way, law=law)),
             Stage(f"rtip-{law}", ("twin-rtip",), partial(second_paper, law=law)),
         ]
-    found.append(Stage("Stribeck", ("twin-tlrip",), partial(constant, name="Stribeck")))
+    constant = partial(fitted, fit=fit_constant, name="Stribeck")
+    found.append(Stage("Stribeck", ("twin-tlrip",), constant))
     return {stage.name: stage for stage in found}
 
 
@@ -88,93 +94,119 @@ def make_twin(workspace: Workspace, name: str) -> dict[str, Any]:
     settings = workspace.settings
     duration = {"tlrip": settings.tlrip_seconds, "rtip": settings.rtip_seconds}[name]
     made = twin.build(name, workspace.folder / "twin" / name, seed=settings.seed, duration=duration)
+    motions = smoothed(made.plant, list(made.recordings.values()))
     arrays: dict[str, Array] = {}
-    for label, recording in made.recordings.items():
-        joint = recording.joint_coordinates(made.plant)
-        motion = kalman_smoother(joint.time, joint.q)
+    for label, motion in zip(made.recordings, motions, strict=True):
         arrays |= {f"{label}_{key}": getattr(motion, key) for key in ("q", "qd", "qdd")}
     workspace.write_arrays(f"twin-{name}", arrays)
     return {"recordings": {label: r.digest() for label, r in made.recordings.items()}}
 
 
-def constant(workspace: Workspace, name: str) -> dict[str, Any]:
-    """Fit a model with constant coefficients on trajectories."""
-    bench, settings = workspace.bench("tlrip"), workspace.settings
-    found = fit(
-        model_by_name(name)(bench.plant.joints), bench.plant, bench.train,
-        windows=settings.windows, max_steps=settings.max_steps, fit_plant=False,
-        motions=bench.train_motions,
-    )  # fmt: skip
-    save_fit(found, _fit_file(workspace, name), bench.train)
-    return _finish(workspace, name, bench, found)
+def fit_constant(workspace: Workspace, bench: Bench, name: str) -> FitResult:
+    """A model with constant coefficients, fitted to trajectories."""
+    settings = workspace.settings
+    model = model_by_name(name)(bench.plant.joints)
+    return workspace.fit(name, bench, lambda step: fit(
+        model, bench.plant, bench.train, windows=settings.windows, max_steps=settings.max_steps,
+        fit_plant=settings.fit_plant, motions=bench.train_motions, callback=step,
+    ))  # fmt: skip
 
 
-def adaptive(workspace: Workspace, law: str) -> dict[str, Any]:
-    """Fit a model with coefficients by class of acceleration, starting at its constant fit."""
-    bench, settings = workspace.bench("tlrip"), workspace.settings
-    name = f"A{law}"
-    found = fit_adaptive(
-        model_by_name(name)(bench.plant.joints), bench.plant, bench.train,
-        windows=settings.windows, max_steps=settings.max_steps, fit_plant=False,
-        start=_kept_fit(workspace, law, bench), motions=bench.train_motions,
-    )  # fmt: skip
-    save_fit(found, _fit_file(workspace, name), bench.train)
-    return _finish(workspace, name, bench, found)
+def fit_by_class(workspace: Workspace, bench: Bench, name: str) -> FitResult:
+    """A model with coefficients by class of acceleration, from its constant fit."""
+    settings = workspace.settings
+    start = fit_constant(workspace, bench, name.removeprefix("A"))
+    model = model_by_name(name)(bench.plant.joints)
+    options = FitOptions(
+        windows=settings.windows, fit_plant=settings.fit_plant, max_steps=settings.max_steps
+    )
+    return workspace.fit(name, bench, lambda step: fit_adaptive(
+        model, bench.plant, bench.train, options=options, start=start,
+        motions=bench.train_motions, callback=step,
+    ))  # fmt: skip
 
 
-def neuro_fuzzy(workspace: Workspace, law: str) -> dict[str, Any]:
-    """Fit a neuro-fuzzy model our way: a network corrects the adaptive model, on trajectories."""
-    bench, settings = workspace.bench("tlrip"), workspace.settings
-    name = f"NF{law}"
+def fit_network(workspace: Workspace, bench: Bench, name: str) -> FitResult:
+    """A neuro-fuzzy model our way: a network corrects the adaptive model, on trajectories."""
+    settings = workspace.settings
+    start = fit_by_class(workspace, bench, f"A{name.removeprefix('NF')}")
     options: dict[str, Any] = {
-        "network": "by_class",
-        "terms": settings.terms,
-        "head_units": settings.head_units,
-    }
+        "network": "by_class", "terms": settings.terms, "head_units": settings.head_units
+    }  # fmt: skip
     model = model_by_name(name)(bench.plant.joints, **options)
-    found = refine_adaptive(
-        model, _kept_fit(workspace, f"A{law}", bench), bench.train,
-        length=settings.windows[-1], max_steps=settings.network_steps,
+    return workspace.fit(name, bench, lambda step: refine_adaptive(
+        model, start, bench.train, length=settings.windows[-1],
+        max_steps=settings.network_steps, callback=step,
+    ))  # fmt: skip
+
+
+def fit_searched(
+    workspace: Workspace,
+    bench: Bench,
+    name: str,
+    method: SearchMethod,
+    *,
+    start: FitResult | None = None,
+    threads: int | None = None,
+) -> FitResult:
+    """A model fitted by a search on the simulated position, resumed where it was interrupted."""
+    settings, law = workspace.settings, name.removeprefix("rtip-")
+    options = SearchOptions(
+        method, settings.search_horizon, max_evaluations=settings.search_evaluations,
+        seed=settings.seed, threads=threads, state=workspace.search_state(name),
     )  # fmt: skip
+    return workspace.fit(name, bench, lambda step: fit_by_search(
+        model_by_name(law)(bench.plant.joints), bench.plant, bench.train, options=options,
+        start=start, motions=bench.train_motions, callback=workspace.keep_search(name, step),
+    ))  # fmt: skip
+
+
+def network_by_controller(
+    workspace: Workspace, bench: Bench, law: str, *, progress: bool = False
+) -> FrictionModel:
+    """A neuro-fuzzy model the papers' way, from the coefficients by class."""
+    settings = workspace.settings
+    return papers_neuro_fuzzy(
+        load(workspace.model(f"A{law}")), bench.train_motions,
+        samples=settings.controller_samples,
+        options=TrainingOptions(seed=settings.seed, progress=progress),
+    )  # fmt: skip
+
+
+def fitted(
+    workspace: Workspace, fit: Callable[[Workspace, Bench, str], FitResult], name: str
+) -> dict[str, Any]:
+    """Result of a fit on the TLRIP twin."""
+    bench = workspace.bench("tlrip")
+    return _finish(workspace, name, bench, fit(workspace, bench, name))
+
+
+def second_paper(workspace: Workspace, law: str) -> dict[str, Any]:
+    """Result of a search on the second paper's rig."""
+    bench, name = workspace.bench("rtip"), f"rtip-{law}"
+    found = fit_searched(workspace, bench, name, SEARCH[law], threads=1)
     return _finish(workspace, name, bench, found)
 
 
 def papers_way(workspace: Workspace, law: str) -> dict[str, Any]:
-    """Make a neuro-fuzzy model the papers' way, from the coefficients by class."""
-    bench, settings = workspace.bench("tlrip"), workspace.settings
-    model = papers_neuro_fuzzy(
-        load(workspace.model(f"A{law}")),
-        bench.train_motions,
-        samples=settings.controller_samples,
-        seed=settings.seed,
-    )
+    """Result of the papers' own neuro-fuzzy procedure."""
+    bench, name = workspace.bench("tlrip"), f"NF{law}-papers"
+    model = network_by_controller(workspace, bench, law)
     way = {"procedure": "classes, fuzzy controller, network by Bayesian regularisation"}
     info = replace(load_info(workspace.model(f"A{law}")), fit=way)
-    return _keep(workspace, f"NF{law}-papers", bench, model, info)
-
-
-def second_paper(workspace: Workspace, law: str) -> dict[str, Any]:
-    """Estimate a model on the second paper's rig by a search on the simulated position."""
-    bench, settings = workspace.bench("rtip"), workspace.settings
-    found = fit_by_search(
-        model_by_name(law)(bench.plant.joints), bench.plant, bench.train, method=SEARCH[law],
-        horizon=settings.search_horizon, max_evaluations=settings.search_evaluations,
-        seed=settings.seed, threads=1, motions=bench.train_motions,
-    )  # fmt: skip
-    return _finish(workspace, f"rtip-{law}", bench, found)
+    save(model, workspace.model(name), info)
+    return _judged(workspace, name, bench, model, info)
 
 
 def _finish(workspace: Workspace, stage: str, bench: Bench, found: FitResult) -> dict[str, Any]:
-    """Keep a fitted model; see `_keep`."""
     info = model_info(found, bench.train)
-    return {"fit": found.to_dict()} | _keep(workspace, stage, bench, found.model, info)
+    return {"fit": found.to_dict()} | _judged(workspace, stage, bench, found.model, info)
 
 
-def _keep(
+def _judged(
     workspace: Workspace, stage: str, bench: Bench, model: FrictionModel, info: ModelInfo
 ) -> dict[str, Any]:
-    """Write a model and its TorchScript, judge it, and say what it is."""
-    save(model, workspace.model(stage), info)
+    """Scores and coefficients of a model, which is exported as TorchScript."""
     if workspace.settings.torchscript:
         script = workspace.model(stage).with_suffix(".pt")
         try:
@@ -182,7 +214,7 @@ def _keep(
         except ExportError as error:
             script.unlink(missing_ok=True)  # an earlier run's would pass for this one's
             logger.warning("%s was not exported: %s", stage, " ".join(str(error).split()))
-    scores, simulated = judge(bench, bench.plant, model)
+    scores, simulated = judge(bench, model)
     workspace.write_arrays(stage, simulated)
     return {"scores": scores, "coefficients": coefficient_summary(model)} | _classes(model)
 
@@ -201,10 +233,48 @@ def _classes(model: FrictionModel) -> dict[str, Any]:
     }
 
 
-def _kept_fit(workspace: Workspace, stage: str, bench: Bench) -> FitResult:
-    """The finished fit of a stage, as a start for the models that build on it."""
-    return load_fit(_fit_file(workspace, stage), bench.train_motions)
+def judge(bench: Bench, model: FrictionModel) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Position errors on every recording by name, and simulated positions of the test recordings.
+
+    The coefficients are driven by the simulated motion, which is honest, and also by the measured
+    one, as in the papers; with constant coefficients the two are the same.
+    """
+    scores: dict[str, Any] = {}
+    simulated: dict[str, Array] = {}
+    for split, recording, motion in bench.parts():
+        name, state = recording.name, bench.states[recording.name]
+        found = score(bench.plant, model, recording, motion=motion, initial_state=state)
+        driven = found.simulated
+        if model.schedule.follows_motion:
+            driven = driven_by_measurement(bench, model, recording)
+        error = RMSE.of(driven - recording.q).to_dict()
+        scores[name] = found.to_dict() | {"split": split, "measured_drive": error}
+        if split == "test":
+            simulated |= {name: found.simulated, f"{name}_measured_drive": driven}
+    return scores, simulated
 
 
-def _fit_file(workspace: Workspace, stage: str) -> Path:
-    return workspace.folder / "stages" / f"{stage}-fit.json"
+def driven_by_measurement(bench: Bench, model: FrictionModel, recording: Recording) -> Array:
+    """Positions of a free run whose coefficients follow the measured motion, as in the papers.
+
+    Velocity and acceleration are those that a controller has: frequency counting and filters.
+
+    Returns:
+        Positions in the recording's convention, (sample, joint).
+
+    References:
+        TLRIP paper, friction experiment (2048 pulses, frequency counting, second-order filter).
+    """
+    plant, (q0, qd0) = bench.plant, bench.states[recording.name]
+    convention, first = recording.resolve_convention(plant), plant.first_link
+    joint = recording.joint_coordinates(plant)
+    motion = causal_motion(joint.time, joint.q, COUNTS)
+    step = np.diff(joint.time)
+    start = convention.position_to_joint(q0, first), convention.rate_to_joint(qd0, first)
+    with torch.no_grad():
+        run = rollout(
+            plant, model, *map(torch.tensor, start), sample_time=torch.tensor(step),
+            substeps=required_substeps(plant, model, float(step.max())), drive="measured",
+            measured=(torch.tensor(motion.qd[:-1]), torch.tensor(motion.qdd[:-1])),
+        )  # fmt: skip
+    return convention.position_from_joint(run.q.numpy(), first)

@@ -1,13 +1,20 @@
-"""The papers' tables from what the stages found, beside the printed ones."""
+"""The papers' tables: our numbers beside the printed ones, as CSV, JSON and text.
 
-from collections.abc import Sequence
+The papers' recordings were never published, so the printed numbers cannot be reproduced to the
+digit: they come from another machine. Units of the position errors are not printed; radians are
+presumed.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 
-from nfriction.papers.reproduction import printed
+from nfriction.io.atomic import write_atomically
 from nfriction.papers.reproduction.stages import (
     ADAPTIVE,
     CONSTANT,
@@ -15,22 +22,74 @@ from nfriction.papers.reproduction.stages import (
     NEURO_FUZZY,
     PAPERS_WAY,
     SECOND_PAPER,
+    stages,
 )
 from nfriction.papers.reproduction.workspace import Workspace
 
 Drive = Literal["free_run", "measured_drive"]
 
+
+JOINTS = ("joint 2", "joint 3", "joint 4")
+
+TABLE_10: dict[str, tuple[float, float, float]] = {
+    "ANCFM": (0.1397, 1.8105, 0.6995),
+    "ALFM": (0.1127, 1.8032, 0.6743),
+    "ANLFM": (0.0983, 0.1115, 0.6248),
+    "NFNCFM": (0.1259, 0.8105, 0.5480),
+    "NFLFM": (0.0987, 0.1794, 0.4372),
+    "NFNLFM": (0.0829, 0.0986, 0.3304),
+}
+"""TLRIP paper, Table 10: position RMSE by model and joint."""
+
+TABLE_6: dict[str, tuple[tuple[str, float, float], ...]] = {
+    "joint 2": (("high", 0.0, 7.0), ("medium", 7.0, 14.0), ("low", 14.0, 40.0)),
+    "joint 3": (("high", 0.0, 6.0), ("medium", 6.0, 16.0), ("low", 16.0, 40.0)),
+    "joint 4": (
+        ("low", 0.0, 1.3),
+        ("high", 1.3, 4.5),
+        ("medium", 4.5, 13.0),
+        ("low", 13.0, 30.0),
+    ),
+}
+"""TLRIP paper, Table 6: class of acceleration, from and to [s]."""
+
+SECOND_COEFFICIENTS: dict[str, dict[str, tuple[float, float, float]]] = {
+    "NCFM": {"C_p": (5.6178e-4, 2.9319e-10, 9.0673e-4)},
+    "LFM": {
+        "B": (6.1865e-4, 3.1009e-7, 2.2292e-4),
+        "C": (2.7550e-5, 4.9864e-9, 0.0168),
+    },
+    "NLFM": {
+        "f_o": (0.0038, 1.5280e-6, 0.001),
+        "f_c": (9.5940e-4, 8.8846e-4, 0.0165),
+        "f_v": (0.0011, 0.0315, 0.0577),
+        "f_a": (0.0869, 0.1876, 7.2715e-4),
+        "f_b": (0.0159, 0.1876, 0.0456),
+    },
+}
+"""RTIP paper, Tables I to III: coefficients by model and joint."""
+
+SECOND_TABLE_4: dict[str, tuple[float, float, float]] = {
+    "NCFM": (0.0052, 0.0071, 0.0085),
+    "LFM": (0.0049, 0.0065, 0.0079),
+    "NLFM": (0.0025, 0.0047, 0.0035),
+}
+"""RTIP paper, Table IV: position RMSE by model and joint."""
+
 NINE = (*LAWS, *ADAPTIVE, *NEURO_FUZZY)
 """Three laws, constant, adaptive and neuro-fuzzy."""
+TLRIP = (*CONSTANT, *ADAPTIVE, *NEURO_FUZZY, *PAPERS_WAY)
+# The paper's neuro-fuzzy rows are also shown beside those made its own way.
+_PRINTED_10 = TABLE_10 | {f"{name}-papers": TABLE_10[name] for name in NEURO_FUZZY}
 
 
 @dataclass(frozen=True)
 class Order:
-    """Whether neuro-fuzzy <= adaptive <= constant for each law on every joint.
+    """Verdict on neuro-fuzzy <= adaptive <= constant for each law on every joint.
 
     Attributes:
-        broken: where not, in words.
-        best: the best of the nine by joint, those that tie joined by an equals sign.
+        broken: exceptions, in words.
+        best: the best of the nine by joint, ties joined by an equals sign.
     """
 
     broken: tuple[str, ...]
@@ -38,7 +97,7 @@ class Order:
 
     @property
     def holds(self) -> bool:
-        """Everywhere."""
+        """Whether there is no exception."""
         return not self.broken
 
     def __str__(self) -> str:
@@ -60,9 +119,11 @@ def rmse(
     rows = {}
     for name in models:
         scores = workspace.found(name)["scores"].values()
-        errors = [_numbers(s[drive]["joints"]) for s in scores if s["split"] == split]
+        joints = [s[drive]["joints"] for s in scores if s["split"] == split]
+        # A diverged simulation has no number: its error is infinite.
+        errors = [[np.inf if e is None else e for e in row] for row in joints]
         rows[name] = np.sqrt(np.mean(np.square(errors), axis=0))
-    return pd.DataFrame.from_dict(rows, orient="index", columns=list(printed.JOINTS))
+    return _table(rows)
 
 
 def table_10(workspace: Workspace, drive: Drive = "free_run") -> pd.DataFrame:
@@ -71,12 +132,11 @@ def table_10(workspace: Workspace, drive: Drive = "free_run") -> pd.DataFrame:
     References:
         TLRIP paper, Table 10.
     """
-    ours = rmse(workspace, [*CONSTANT, *ADAPTIVE, *NEURO_FUZZY, *PAPERS_WAY], drive=drive)
-    return _beside(ours, {**printed.TABLE_10, **_papers_rows(printed.TABLE_10)})
+    return _beside(rmse(workspace, TLRIP, drive=drive), _table(_PRINTED_10))
 
 
 def table_11(workspace: Workspace) -> pd.DataFrame:
-    """What adaptive and neuro-fuzzy coefficients save against simpler ones of the law [%].
+    """Error reduction by adaptive and neuro-fuzzy coefficients over simpler ones of the law [%].
 
     The print of the paper's Table 11 is not at hand; its side follows from its Table 10, which has
     no constant models.
@@ -84,24 +144,18 @@ def table_11(workspace: Workspace) -> pd.DataFrame:
     References:
         TLRIP paper, Table 11.
     """
-    ours = rmse(workspace, [*CONSTANT, *ADAPTIVE, *NEURO_FUZZY, *PAPERS_WAY])
-    theirs = pd.DataFrame.from_dict(
-        {**printed.TABLE_10, **_papers_rows(printed.TABLE_10)},
-        orient="index",
-        columns=list(printed.JOINTS),
-    )
-    pairs = [
-        pair
-        for law in LAWS
-        for pair in (
-            (f"A{law}", law),
-            (f"NF{law}", law),
-            (f"NF{law}", f"A{law}"),
-            (f"NF{law}-papers", f"A{law}"),
-        )
-    ]
 
     def saved(table: pd.DataFrame) -> pd.DataFrame:
+        pairs = [
+            pair
+            for law, by_class, network in zip(LAWS, ADAPTIVE, NEURO_FUZZY, strict=True)
+            for pair in (
+                (by_class, law),
+                (network, law),
+                (network, by_class),
+                (f"{network}-papers", by_class),
+            )
+        ]
         rows = {
             f"{better} against {worse}": 100.0 * (1.0 - table.loc[better] / table.loc[worse])
             for better, worse in pairs
@@ -109,7 +163,7 @@ def table_11(workspace: Workspace) -> pd.DataFrame:
         }
         return pd.DataFrame(rows).T
 
-    return _beside(saved(ours), {str(k): list(v) for k, v in saved(theirs).iterrows()})
+    return _beside(saved(rmse(workspace, TLRIP)), saved(_table(_PRINTED_10)))
 
 
 def second_coefficients(workspace: Workspace, law: str) -> pd.DataFrame:
@@ -119,8 +173,7 @@ def second_coefficients(workspace: Workspace, law: str) -> pd.DataFrame:
         RTIP paper, Tables I to III.
     """
     found = workspace.found(f"rtip-{law}")["coefficients"]
-    ours = pd.DataFrame.from_dict(found, orient="index", columns=list(printed.JOINTS))
-    return _beside(ours, printed.SECOND_COEFFICIENTS[law])
+    return _beside(_table(found), _table(SECOND_COEFFICIENTS[law]))
 
 
 def second_table_4(workspace: Workspace, split: str = "test") -> pd.DataFrame:
@@ -129,32 +182,35 @@ def second_table_4(workspace: Workspace, split: str = "test") -> pd.DataFrame:
     References:
         RTIP paper, Table IV.
     """
-    ours = rmse(workspace, SECOND_PAPER, split=split)
-    ours.index = pd.Index(list(LAWS))
-    return _beside(ours, printed.SECOND_TABLE_4)
+    ours = rmse(workspace, SECOND_PAPER, split=split).set_axis(list(LAWS))
+    return _beside(ours, _table(SECOND_TABLE_4))
+
+
+def _table(rows: Mapping[str, Any]) -> pd.DataFrame:
+    return pd.DataFrame.from_dict(dict(rows), orient="index", columns=list(JOINTS))
+
+
+def _beside(ours: pd.DataFrame, theirs: pd.DataFrame) -> pd.DataFrame:
+    """Two tables side by side; rows that the paper lacks are empty there."""
+    return pd.concat({"ours": ours, "printed": theirs.reindex(ours.index)}, axis=1)
 
 
 def order(workspace: Workspace) -> Order:
     """Whether the papers' order of models holds on test releases, joint by joint."""
-    return order_of(rmse(workspace, NINE))
-
-
-def order_of(table: pd.DataFrame) -> Order:
-    """The same for a table of errors with a row for each of the nine models."""
+    table = rmse(workspace, NINE)
     error = {str(model): np.asarray(table.loc[model], dtype=float) for model in table.index}
-    joints = [str(joint) for joint in table.columns]
     broken = [
         f"{better} {1e3 * e:.4g} > {worse} {1e3 * limit:.4g} mrad on {joint}"
         for law in LAWS
         for better, worse in ((f"A{law}", law), (f"NF{law}", f"A{law}"))
-        for joint, e, limit in zip(joints, error[better], error[worse], strict=True)
-        # What diverged is no number, and not in order.
+        for joint, e, limit in zip(JOINTS, error[better], error[worse], strict=True)
+        # A diverged simulation is never in order.
         if not e <= limit or np.isinf(e)
     ]
-    # Models that share the least error, as one that was left at the other's coefficients, tie.
+    # Models tie where one was left at the other's coefficients.
     best = {
         joint: " = ".join(m for m, e in error.items() if e[k] == min(x[k] for x in error.values()))
-        for k, joint in enumerate(joints)
+        for k, joint in enumerate(JOINTS)
     }
     return Order(tuple(broken), best)
 
@@ -162,42 +218,81 @@ def order_of(table: pd.DataFrame) -> Order:
 def long_table(workspace: Workspace) -> pd.DataFrame:
     """Every error as one row."""
     rows: list[dict[str, Any]] = []
-    for rig, models in (
-        ("tlrip", [*CONSTANT, *ADAPTIVE, *NEURO_FUZZY, *PAPERS_WAY]),
-        ("rtip", list(SECOND_PAPER)),
-    ):
+    for rig, models in (("tlrip", TLRIP), ("rtip", SECOND_PAPER)):
         for model in models:
             for recording, entry in workspace.found(model)["scores"].items():
                 errors = {"free run": entry["free_run"], "measured drive": entry["measured_drive"]}
                 errors |= {f"{h} s windows": e for h, e in entry["windows"].items()}
+                about = {
+                    "rig": rig, "model": model.removeprefix("rtip-"), "recording": recording,
+                    "split": entry["split"],
+                }  # fmt: skip
                 for kind, error in errors.items():
-                    joints = zip(printed.JOINTS, error["joints"], strict=True)
+                    joints = zip(JOINTS, error["joints"], strict=True)
                     for joint, value in (*joints, ("all", error["all"])):
-                        rows.append(
-                            {
-                                "rig": rig,
-                                "model": model.removeprefix("rtip-"),
-                                "recording": recording,
-                                "split": entry["split"],
-                                "kind": kind,
-                                "joint": joint,
-                                "rmse [rad]": np.inf if value is None else value,
-                            }
-                        )
+                        value = np.inf if value is None else value
+                        rows.append(about | {"kind": kind, "joint": joint, "rmse [rad]": value})
     return pd.DataFrame(rows)
 
 
-def _numbers(values: Sequence[float | None]) -> list[float]:
-    """A diverged simulation has no number: its error is infinite."""
-    return [np.inf if v is None else v for v in values]
+def all_tables(workspace: Workspace) -> dict[str, tuple[str, pd.DataFrame]]:
+    """The papers' tables with their titles, by the name of their file."""
+    settings = workspace.settings
+    error = "position RMSE [mrad] on test releases, free runs of"
+    methods = ("sequential quadratic programming", "pattern search", "pattern search")
+    found = {
+        "table_10": (
+            f"Table 10: {error} {settings.tlrip_seconds:g} s, coefficients driven by the "
+            "simulated motion",
+            table_10(workspace),
+        ),
+        "table_10_measured_drive": (
+            "Table 10 again, coefficients driven by the measured motion as in the paper [mrad]",
+            table_10(workspace, "measured_drive"),
+        ),
+        "table_11": ("Table 11: error saved [%]", table_11(workspace)),
+    }
+    for number, law, method in zip(("I", "II", "III"), LAWS, methods, strict=True):
+        found[f"second_table_{number.lower()}"] = (
+            f"second paper, Table {number}: {law} by {method}",
+            second_coefficients(workspace, law),
+        )
+    found["second_table_iv"] = (
+        f"second paper, Table IV: {error} {settings.rtip_seconds:g} s",
+        second_table_4(workspace),
+    )
+    return found
 
 
-def _papers_rows(table: dict[str, Any]) -> dict[str, Any]:
-    """The paper's neuro-fuzzy rows also stand beside those made its own way."""
-    return {f"{name}-papers": table[name] for name in NEURO_FUZZY}
+def write_tables(workspace: Workspace, *, command: str = "") -> list[Path]:
+    """Write `tables/*.csv`, `rmse.csv` with every error, and `results.json`."""
+    verdict = order(workspace)
+    results = {
+        "command": command,
+        "settings": workspace.settings.to_dict(),
+        "order": {"holds": verdict.holds, "broken": list(verdict.broken), "best": verdict.best},
+        "stages": {name: workspace.found(name) for name in stages()},
+    }
+    content = {
+        "rmse.csv": long_table(workspace).to_csv(index=False),
+        "results.json": json.dumps(results, indent=1, allow_nan=False),
+    }
+    for name, (_, table) in all_tables(workspace).items():
+        flat = table.set_axis([f"{column[1]}, {column[0]}" for column in table.columns], axis=1)
+        content[f"tables/{name}.csv"] = flat.to_csv(index_label="row")
+    return [write_atomically(workspace.folder / n, t.encode()) for n, t in content.items()]
 
 
-def _beside(ours: pd.DataFrame, theirs: dict[str, Any]) -> pd.DataFrame:
-    """Two tables side by side; rows that the paper has not stay empty there."""
-    other = pd.DataFrame.from_dict(theirs, orient="index", columns=ours.columns)
-    return pd.concat({"ours": ours, "printed": other.reindex(ours.index)}, axis=1)
+def text(workspace: Workspace) -> str:
+    """All tables beside the printed ones, and whether the papers' order of models holds."""
+    parts = []
+    for title, table in all_tables(workspace).values():
+        shown = 1e3 * table if "[mrad]" in title else table
+        written = shown.to_string(float_format=lambda x: f"{x:.4g}", na_rep="")
+        parts.append(f"{title}\n{written}")
+    parts.append(
+        "printed: the papers' numbers, from recordings that were never published and another "
+        "machine's friction;\nours: simulated twins. -papers: made by the papers' own procedure "
+        "(fuzzy controller, 2-10-2 network)."
+    )
+    return "\n\n".join([*parts, str(order(workspace))])

@@ -1,4 +1,4 @@
-"""What the scripts in `trainers/` share: options, data, stages with checkpoints, progress."""
+"""Shared by the scripts in `trainers/`: options, recordings, and the end of a run."""
 
 import argparse
 import json
@@ -6,34 +6,28 @@ import shutil
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
-from typing import Any, Literal
+from typing import Literal, NoReturn
 
 import torch
-from tqdm import tqdm
 
-from nfriction.evaluation.score import Score, score
+from nfriction.evaluation.results import model_info
+from nfriction.evaluation.score import score
 from nfriction.export import torchscript
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction.model import FrictionModel
-from nfriction.io.atomic import write_atomically
+from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import save
 from nfriction.io.model_info import ModelInfo
 from nfriction.papers import twin
-from nfriction.papers.afem.search import SearchState
-from nfriction.papers.reproduction.fitfile import load_fit, save_fit
+from nfriction.papers.reproduction.workspace import Bench, Settings, Workspace, smoothed
 from nfriction.plant import Plant, rigs
 from nfriction.recording import Recording
 from nfriction.recording.angles import AngleConvention
-from nfriction.signals import Motion, kalman_smoother
 
-# What does not change the result.
+# Options that do not change the result.
 _IRRELEVANT = ("out", "resume")
-# What shells expect of a program that a Ctrl-C ended.
+# Exit status that shells expect of a program that Ctrl-C ended.
 INTERRUPTED = 130
-Tell = Callable[..., None]
 
 
 def parser(description: str) -> argparse.ArgumentParser:
@@ -59,159 +53,94 @@ def parser(description: str) -> argparse.ArgumentParser:
     return made
 
 
-@dataclass(frozen=True, eq=False)
-class Data:
-    """What a training works on.
-
-    Attributes:
-        plant: the mechanism.
-        train, test: recordings; files given are all trained on.
-        motions: smoothed motions of `train`.
-        states: exact q0 and qd0 of a twin's recordings.
-    """
-
-    plant: Plant
-    train: list[Recording]
-    test: list[Recording]
-    motions: list[Motion]
-    states: dict[str, Any]
-
-
-class Training:
-    """One run of a trainer in a folder: stages that are kept as soon as they are done.
-
-    A stage that was ended in its middle, by Ctrl-C or by force, is done again by `--resume`; one
-    that was finished is read. A pattern search goes on where it stood. Either way the result is
-    that of a run that nobody ended.
+def start(given: argparse.Namespace, **settings: object) -> tuple[Workspace, Bench]:
+    """The checkpoints of a run and its recordings.
 
     Args:
-        arguments: of a `parser()`.
+        given: of a `parser()`.
+        settings: further `Settings` than those that all trainers have.
 
     Raises:
         ValueError: if the checkpoints to resume from were made with other options.
     """
-
-    def __init__(self, arguments: argparse.Namespace) -> None:
-        self.arguments = arguments
-        self.folder: Path = arguments.out
-        self._checkpoints = self.folder / "checkpoints"
-        options = {k: v for k, v in vars(arguments).items() if k not in _IRRELEVANT}
-        text = json.dumps(options, default=str, indent=1, sort_keys=True)
-        mark = self._checkpoints / "options.json"
-        if not arguments.resume:
-            shutil.rmtree(self._checkpoints, ignore_errors=True)
-        elif mark.exists() and mark.read_text(encoding="utf-8") != text:
-            raise ValueError(
-                f"{mark}: made with other options; repeat them, or start anew without --resume."
-            )
-        write_atomically(mark, text.encode())
-        _end_when_interrupted(self.folder)
-
-    def data(self) -> Data:
-        """The recordings given, or the twin's."""
-        given = self.arguments
-        if not given.recordings:
-            made = twin.make(
-                given.twin, seed=given.seed, duration=given.seconds, progress=sys.stderr.isatty()
-            )
-            plant: Plant = made.plant
-            train, test = made.part("train"), made.part("test")
-            states: dict[str, Any] = dict(made.initial_states)
-        else:
-            if given.rig is None:
-                raise ValueError("recordings need --rig, a rig file or the name of one.")
-            plant = rigs.by_name(given.rig) if given.rig in rigs.names() else rigs.read(given.rig)
-            convention = AngleConvention.parse(given.angles or ",".join(plant.convention))
-            unit: Literal["rad", "m"] = "m" if plant.unit == "m" else "rad"
-            train, test, states = [], [], {}
-            for path in given.recordings:
-                train.append(
-                    Recording.read(path, degrees=given.degrees, convention=convention, unit=unit)
-                )
-        joint = [r.joint_coordinates(plant) for r in train]
-        motions = [kalman_smoother(r.time, r.q) for r in joint]
-        return Data(plant, train, test, motions, states)
-
-    def stage(self, name: str, data: Data, make: Callable[[Tell], FitResult]) -> FitResult:
-        """The fit of a stage: read where it is finished, made and kept where not.
-
-        Args:
-            name: of the checkpoint.
-            data: what it is fitted to.
-            make: does it; given what to call after every step.
-        """
-        path = self._checkpoints / f"{name}.json"
-        if path.exists():
-            return load_fit(path, data.motions)
-        with tqdm(desc=name, unit=" steps", disable=not sys.stderr.isatty()) as bar:
-
-            def tell(*about: object) -> None:
-                if about and isinstance(about[0], str):
-                    bar.set_description(f"{name}, {about[0]}")
-                bar.update()
-
-            found = make(tell)
-        save_fit(found, path, data.train)
-        return found
-
-    def search_state(self) -> SearchState | None:
-        """Where an unfinished pattern search stands; None at its start."""
-        path = self._checkpoints / "search-state.json"
-        if not path.exists():
-            return None
-        return SearchState.from_dict(json.loads(path.read_text(encoding="utf-8")))
-
-    def keep_search(self, tell: Tell) -> Callable[[SearchState], None]:
-        """A callback that keeps every state of a pattern search."""
-
-        def keep(state: SearchState) -> None:
-            tell()
-            if state.pattern is not None:
-                content = json.dumps(state.to_dict()).encode()
-                write_atomically(self._checkpoints / "search-state.json", content)
-
-        return keep
-
-    def finish(
-        self,
-        data: Data,
-        model: FrictionModel,
-        info: ModelInfo,
-        plant: Plant | None = None,
-    ) -> str:
-        """Write the model and its TorchScript, score it, and say so in words."""
-        name = type(model).__name__
-        path = save(model, self.folder / f"{name}.json", info)
-        torchscript(model, path.with_suffix(".pt"), info)
-        lines = [f"{name}: {info.fit.get('status', 'made')}"]
-        motions = dict(zip((r.name for r in data.train), data.motions, strict=True))
-        for kind, recordings in (("train", data.train), ("test", data.test)):
-            for recording in recordings:
-                found = score(
-                    plant or data.plant, model, recording,
-                    motion=motions.get(recording.name),
-                    initial_state=data.states.get(recording.name),
-                )  # fmt: skip
-                lines.append(f"{recording.name}, {kind}: {_errors(found, data.plant.unit)}")
-        return "\n".join([*lines, f"wrote {path} and {path.with_suffix('.pt')}"])
+    workspace = checkpoints(given, **settings)
+    signal.signal(signal.SIGINT, lambda *_: _end(given.out))
+    return workspace, _bench(given)
 
 
-def _errors(found: Score, unit: str) -> str:
-    joints = ", ".join(f"{1e3 * e:.4g}" for e in found.free_run.joints)
-    return f"position RMSE of the free run by joint {joints} m{unit}"
+def checkpoints(given: argparse.Namespace, **settings: object) -> Workspace:
+    """Checkpoints that `--resume` goes on from, or none."""
+    options = {k: v for k, v in vars(given).items() if k not in _IRRELEVANT}
+    made = Settings(
+        seed=given.seed, windows=tuple(given.windows), max_steps=given.max_steps,
+        network_steps=given.max_steps, fit_plant=given.plant == "fit",
+        origin=json.dumps(options, default=str, sort_keys=True), **settings,  # type: ignore[arg-type]
+    )  # fmt: skip
+    folder = given.out / "checkpoints"
+    workspace = Workspace(folder, made, progress=sys.stderr.isatty())
+    if not given.resume:
+        shutil.rmtree(folder, ignore_errors=True)
+    elif workspace.begun("options") and workspace.result("options") is None:
+        raise ValueError(
+            f"{folder}: made with other options; repeat them, or start anew without --resume."
+        )
+    workspace.finish("options", made.to_dict())
+    return workspace
 
 
-def _end_when_interrupted(folder: Path) -> None:
+def _bench(given: argparse.Namespace) -> Bench:
+    """The recordings given, or the twin's; files given are all trained on."""
+    if not given.recordings:
+        made = twin.make(
+            given.twin, seed=given.seed, duration=given.seconds, progress=sys.stderr.isatty()
+        )
+        train, test = made.part("train"), made.part("test")
+        motions = smoothed(made.plant, [*train, *test])
+        return Bench(made.plant, train, test, motions, made.initial_states)
+    if given.rig is None:
+        raise ValueError("recordings need --rig, a rig file or the name of one.")
+    plant = rigs.by_name(given.rig) if given.rig in rigs.names() else rigs.read(given.rig)
+    convention = AngleConvention.parse(given.angles or ",".join(plant.convention))
+    unit: Literal["rad", "m"] = "m" if plant.unit == "m" else "rad"
+    train = [
+        Recording.read(path, degrees=given.degrees, convention=convention, unit=unit)
+        for path in given.recordings
+    ]
+    return Bench(plant, train, [], smoothed(plant, train), {})
+
+
+def finish(given: argparse.Namespace, bench: Bench, found: FitResult) -> str:
+    """Write a fitted model, see `write`."""
+    return write(given, bench, found.model, model_info(found, bench.train), found.plant)
+
+
+def write(
+    given: argparse.Namespace, bench: Bench, model: FrictionModel, info: ModelInfo, plant: Plant
+) -> str:
+    """Write a model and its TorchScript, and report its errors."""
+    name = type(model).__name__
+    path = save(model, given.out / f"{name}.json", info)
+    torchscript(model, path.with_suffix(".pt"), info)
+    lines = [f"{name}: {info.fit.get('status', 'made')}"]
+    for split, recording, motion in bench.parts():
+        state = bench.states.get(recording.name)
+        found = score(plant, model, recording, motion=motion, initial_state=state)
+        joints = ", ".join(f"{1e3 * e:.4g}" for e in found.free_run.joints)
+        lines.append(
+            f"{recording.name}, {split}: position RMSE of the free run by joint {joints} "
+            f"m{plant.unit}"
+        )
+    return "\n".join([*lines, f"wrote {path} and {path.with_suffix('.pt')}"])
+
+
+def _end(folder: Path) -> NoReturn:
     # Solvers keep their best point on a KeyboardInterrupt, which would pass for a finished stage.
-    def end(_signal: int, _frame: FrameType | None) -> None:
-        sys.stderr.write(f"\ninterrupted; what was reached is in {folder}, go on with --resume\n")
-        sys.exit(INTERRUPTED)
-
-    signal.signal(signal.SIGINT, end)
+    sys.stderr.write(f"\ninterrupted; what was reached is in {folder}, go on with --resume\n")
+    sys.exit(INTERRUPTED)
 
 
 def run(train: Callable[[Sequence[str] | None], str], argv: Sequence[str] | None = None) -> str:
-    """What a trainer's body says, run with one thread; its errors end the script in one line."""
+    """The report of a trainer, run on one thread; errors end it with one line."""
     # Several threads make small tensors up to 100 times slower.
     torch.set_num_threads(1)
     try:

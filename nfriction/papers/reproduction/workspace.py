@@ -1,92 +1,187 @@
-"""The folder of a reproduction: what is finished in it, written whole or not at all."""
+"""The folder of a run: its settings, its recordings, and what is finished in it."""
 
+import hashlib
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, astuple, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import torch
 from numpy.typing import NDArray
+from tqdm import tqdm
 
-from nfriction.io.atomic import replacing, write_atomically
-from nfriction.papers.reproduction.settings import Settings
-from nfriction.plant import PendulumChain, rigs
+from nfriction.evaluation.results import model_info
+from nfriction.fitting.result.fit_result import FitResult
+from nfriction.fitting.result.identifiability import Interval
+from nfriction.io.atomic import atomic_write, write_atomically
+from nfriction.io.model_file import load, load_plant, save
+from nfriction.papers.afem.fit_by_search import SearchState
+from nfriction.papers.twin.releases import Split
+from nfriction.plant import Plant, rigs
 from nfriction.recording import Recording, read_initial_states
-from nfriction.signals import Motion
+from nfriction.signals import Motion, kalman_smoother
+from nfriction.version import __version__
 
 Array = NDArray[np.float64]
+Callback = Callable[..., None]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that the results of a run depend on.
+
+    Attributes:
+        seed: of the encoders' errors, the controllers' samples and the searches.
+        tlrip_seconds, rtip_seconds: length of each twin's recordings; the papers took 40 and 80.
+        windows: lengths of the fits' windows [s].
+        max_steps: of the fits, at each length.
+        network_steps: of the neuro-fuzzy models' fits.
+        terms, head_units: of the neuro-fuzzy models.
+        controller_samples: a joint, on which the papers' network learns.
+        search_horizon: length of the windows that a search simulates [s].
+        search_evaluations: most simulations of a search on the position error.
+        fit_plant: adjust inertia and gravity terms, too.
+        torchscript: export every model.
+        origin: of the recordings, and further options, of a run on other data than the twins.
+    """
+
+    seed: int = 0
+    tlrip_seconds: float = 40.0
+    rtip_seconds: float = 80.0
+    windows: tuple[float, ...] = (0.5, 2.0)
+    max_steps: int = 30
+    network_steps: int = 8
+    terms: tuple[int, int] = (5, 5)
+    head_units: int = 10
+    controller_samples: int = 40_000
+    search_horizon: float = 5.0
+    search_evaluations: int = 1500
+    fit_plant: bool = False
+    torchscript: bool = True
+    origin: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON."""
+        return asdict(self) | {"windows": list(self.windows), "terms": list(self.terms)}
+
+    def digest(self) -> str:
+        """Marks a result as made with these settings by this version."""
+        content = json.dumps(self.to_dict() | {"version": __version__}, sort_keys=True)
+        return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+
+FULL = Settings()
+"""As the papers: recordings of 40 and 80 s."""
+
+QUICK = Settings(
+    tlrip_seconds=10.0,
+    rtip_seconds=10.0,
+    max_steps=5,
+    network_steps=2,
+    terms=(3, 3),
+    head_units=5,
+    controller_samples=2000,
+    search_evaluations=200,
+)
+"""A look at everything within two minutes; the figures are then not the papers'."""
 
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """A twin as its files tell it.
+    """A rig without friction and its recordings.
 
     Attributes:
-        plant: the rig without friction.
+        plant: the rig.
         train, test: recordings to fit on and to judge by.
-        states: q0 and qd0 at the release by recording, exact.
-        motions: smoothed motion by recording, in joint coordinates.
+        motions: smoothed motion of each, training first, in joint coordinates.
+        states: exact q0 and qd0 by recording, where known.
     """
 
-    plant: PendulumChain
+    plant: Plant
     train: list[Recording]
     test: list[Recording]
-    states: dict[str, tuple[Array, Array]]
-    motions: dict[str, Motion]
+    motions: list[Motion]
+    states: Mapping[str, tuple[Array, Array]]
 
     @property
     def train_motions(self) -> list[Motion]:
         """In the order of `train`."""
-        return [self.motions[r.name] for r in self.train]
+        return self.motions[: len(self.train)]
+
+    def parts(self) -> list[tuple[Split, Recording, Motion]]:
+        """Every recording with its split and its motion."""
+        splits: tuple[tuple[Split, list[Recording]], ...] = (
+            ("train", self.train), ("test", self.test)
+        )  # fmt: skip
+        motions = iter(self.motions)
+        return [(split, r, next(motions)) for split, part in splits for r in part]
+
+
+def smoothed(plant: Plant, recordings: Sequence[Recording]) -> list[Motion]:
+    """Smoothed motions in joint coordinates."""
+    joint = [r.joint_coordinates(plant) for r in recordings]
+    return [kalman_smoother(r.time, r.q) for r in joint]
 
 
 @dataclass(frozen=True)
 class Workspace:
-    """Where a reproduction keeps its files, and the settings that they were made with.
+    """The files of a run and the settings that they are made with.
 
-    A stage is finished where its file bears these very settings; that file is the last that the
-    stage writes, so one that was killed has simply not begun.
+    A stage is finished where its file bears these settings; that file is the last one that the
+    stage writes, so a stage that was killed counts as not begun.
+
+    Attributes:
+        folder: where all files go.
+        settings: of the run.
+        progress: show a bar for each fit.
     """
 
     folder: Path
     settings: Settings
+    progress: bool = False
 
-    def result(self, stage: str) -> dict[str, Any] | None:
-        """What a finished stage found; None where it is not finished with these settings."""
+    def result(self, stage: str) -> Any:
+        """Result of a finished stage; None where it is not finished with these settings."""
         try:
             content = json.loads(self._file(stage, "json").read_text(encoding="utf-8"))
         except (FileNotFoundError, json.JSONDecodeError, UnicodeDecodeError):
             return None
         if not isinstance(content, dict) or content.get("settings") != self.settings.digest():
             return None
-        result: dict[str, Any] = content["result"]
-        return result
+        return content["result"]
+
+    def begun(self, stage: str) -> bool:
+        """Whether a stage has a result, be it of other settings."""
+        return self._file(stage, "json").exists()
 
     def found(self, stage: str) -> dict[str, Any]:
-        """What a stage found.
+        """Result of a stage.
 
         Raises:
             ValueError: if it is not finished.
         """
-        result = self.result(stage)
+        result: dict[str, Any] | None = self.result(stage)
         if result is None:
             raise ValueError(f"{self.folder}: the stage {stage!r} is not finished; run it first.")
         return result
 
     def finish(self, stage: str, result: Mapping[str, Any]) -> None:
-        """Mark a stage as finished with what it found, plain JSON."""
+        """Mark a stage as finished with its result, plain JSON."""
         content = {"stage": stage, "settings": self.settings.digest(), "result": result}
         text = json.dumps(content, indent=1, allow_nan=False)
         write_atomically(self._file(stage, "json"), text.encode())
 
-    def write_arrays(self, stage: str, arrays: Mapping[str, Array]) -> None:
+    def write_arrays(self, stage: str, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Keep arrays beside a stage's result; to be called before `finish`."""
-        with replacing(self._file(stage, "npz")) as temporary, temporary.open("wb") as file:
+        # The result of other settings would otherwise pass for that of these arrays.
+        self._file(stage, "json").unlink(missing_ok=True)
+        with atomic_write(self._file(stage, "npz")) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
 
-    def arrays(self, stage: str) -> dict[str, Array]:
+    def arrays(self, stage: str) -> dict[str, NDArray[Any]]:
         """The arrays of a finished stage."""
         with np.load(self._file(stage, "npz")) as kept:
             return {name: kept[name] for name in kept.files}
@@ -95,25 +190,94 @@ class Workspace:
         """Model file of a stage."""
         return self.folder / "models" / f"{stage}.json"
 
+    def fit(self, stage: str, bench: Bench, make: Callable[[Callback], FitResult]) -> FitResult:
+        """The fit of a stage: read where it is finished, else made and kept.
+
+        Args:
+            stage: names its files.
+            bench: the recordings fitted.
+            make: fits, given a callback for every step.
+        """
+        name, path = f"{stage}-fit", self.model(stage)
+        if (kept := self.result(name)) is not None:
+            return _restored(kept, path, self.arrays(name), bench)
+        with tqdm(desc=stage, unit=" steps", disable=not self.progress) as bar:
+
+            def step(*about: object) -> None:
+                if about and isinstance(about[0], str):
+                    bar.set_description(f"{stage}, {about[0]}")
+                bar.update()
+
+            found = make(step)
+        self.write_arrays(name, _tables(found))
+        save(found.model, path, model_info(found, bench.train))
+        plain = {f.name: getattr(found, f.name) for f in fields(found) if f.name not in _APART}
+        self.finish(name, plain)
+        return found
+
+    def search_state(self, stage: str) -> SearchState | None:
+        """Where an unfinished search of a stage is to go on; None at its start."""
+        state = self.result(f"{stage}-search")
+        return None if state is None else SearchState.from_dict(state)
+
+    def keep_search(self, stage: str, step: Callback) -> Callable[[SearchState], None]:
+        """A callback that keeps every state of a pattern search."""
+
+        def keep(state: SearchState) -> None:
+            step()
+            if state.pattern is not None:
+                self.finish(f"{stage}-search", state.to_dict())
+
+        return keep
+
     def bench(self, twin: str) -> Bench:
         """A finished twin."""
         folder = self.folder / "twin" / twin
         plant = rigs.read(folder / "rig.json")
-        assert isinstance(plant, PendulumChain)
         convention = ",".join(plant.convention)
-        recordings: dict[str, Recording] = {}
         parts: dict[str, list[Recording]] = {"train": [], "test": []}
         for row in pd.read_csv(folder / "recordings.csv", dtype=str).to_dict("records"):
-            recording = Recording.read(folder / row["file"], convention=convention)
-            recordings[row["id"]] = recording
-            parts[row["split"]].append(recording)
+            parts[row["split"]].append(Recording.read(folder / row["file"], convention=convention))
         kept = self.arrays(f"twin-{twin}")
-        motions = {
-            name: Motion(r.time, kept[f"{name}_q"], kept[f"{name}_qd"], kept[f"{name}_qdd"])
-            for name, r in recordings.items()
-        }
+        motions = [
+            Motion(r.time, kept[f"{r.name}_q"], kept[f"{r.name}_qd"], kept[f"{r.name}_qdd"])
+            for r in (*parts["train"], *parts["test"])
+        ]
         states = read_initial_states(folder / "recordings.csv")
-        return Bench(plant, parts["train"], parts["test"], states, motions)
+        return Bench(plant, parts["train"], parts["test"], motions, states)
 
     def _file(self, stage: str, suffix: str) -> Path:
         return self.folder / "stages" / f"{stage}.{suffix}"
+
+
+# Fields of a fit that are kept as arrays or in its model file; the others are plain JSON.
+_APART = ("model", "plant", "motions", "uncertainty", "residuals", "plant_terms", "intervals")
+_TERM = [("name", "U200"), ("value", float), ("bound", float)]
+_INTERVAL = [("name", "U200"), ("value", float), ("low", float), ("high", float)]
+
+
+def _tables(found: FitResult) -> dict[str, NDArray[Any]]:
+    return {
+        "residuals": found.residuals.numpy(),
+        "plant_terms": np.array(list(found.plant_terms), dtype=_TERM),
+        "intervals": np.array([astuple(i) for i in found.intervals], dtype=_INTERVAL),
+    }
+
+
+def _restored(
+    kept: Mapping[str, Any], path: Path, arrays: Mapping[str, NDArray[Any]], bench: Bench
+) -> FitResult:
+    plain = {name: _tuples(value) for name, value in kept.items()}
+    return FitResult(
+        model=load(path),
+        plant=load_plant(path),
+        motions=tuple(bench.train_motions),
+        residuals=torch.as_tensor(arrays["residuals"]),
+        plant_terms=tuple(arrays["plant_terms"].tolist()),
+        intervals=tuple(Interval(*row) for row in arrays["intervals"].tolist()),
+        **plain,
+    )
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value

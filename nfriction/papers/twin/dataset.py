@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
+import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,9 +14,8 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from nfriction.io.atomic import replacing
+from nfriction.io.atomic import atomic_write
 from nfriction.io.formats import write_table
-from nfriction.papers.twin.encoder import Encoder, jitter
 from nfriction.papers.twin.mechanics import Links, TrueMotion, simulate
 from nfriction.papers.twin.releases import Split, specification
 from nfriction.plant import PendulumChain, rigs
@@ -27,9 +29,55 @@ JITTER = 5e-6  # standard deviation of the moment of sampling [s]
 QUICK_DURATION = 10.0  # of recordings for a quick look [s]
 
 
+@dataclass(frozen=True)
+class Encoder:
+    """An incremental encoder whose four edges to a line are counted.
+
+    Attributes:
+        lines: to a revolution.
+        eccentricity: amplitude of the error that repeats every revolution [counts].
+        phase: angle at which that error crosses zero [rad].
+        edges: displacement of each of the four edges of a line [counts], within ± 0.5.
+    """
+
+    lines: int = 2048
+    eccentricity: float = 0.0
+    phase: float = 0.0
+    edges: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+
+    @property
+    def quantum(self) -> float:
+        """Angle of one count [rad]."""
+        return math.tau / (4 * self.lines)
+
+    @classmethod
+    def drawn(cls, random: np.random.Generator, lines: int = 2048) -> Encoder:
+        """An encoder of usual quality: eccentric by 0.3 counts, edges off by 0.05 counts (rms)."""
+        phase = float(random.uniform(0.0, math.tau))
+        first, second, third, fourth = (0.05 * random.standard_normal(4)).tolist()
+        return cls(lines, 0.3, phase, (first, second, third, fourth))
+
+    def read(self, q: Array) -> Array:
+        """Positions [rad] that the counter reads at true positions, any shape."""
+        place = q / self.quantum + self.eccentricity * np.sin(q - self.phase)
+        count = np.floor(place + 0.5)
+        # The edge below a count lies half a count down, displaced.
+        edges = np.array(self.edges)
+        below = count - 0.5 + edges[count.astype(np.int64) % 4]
+        above = count + 0.5 + edges[(count.astype(np.int64) + 1) % 4]
+        return self.quantum * (count + (place >= above) - (place < below))
+
+
+def jitter(random: np.random.Generator, samples: int, deviation: float) -> Array:
+    """Delay of each sample [s], (samples,): normal, cut at three deviations, zero at the first."""
+    late = deviation * np.clip(random.standard_normal(samples), -3.0, 3.0)
+    late[0] = 0.0
+    return late
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Twin:
-    """Recordings of a rig that does not exist, and what is true about them.
+    """Recordings of a rig that does not exist, and the truth behind them.
 
     Attributes:
         name: of the twin.
@@ -59,7 +107,7 @@ def make(
 
     Args:
         name: "tlrip" or "rtip".
-        seed: draws the encoders' errors and the clock's jitter; the motion has no chance in it.
+        seed: of the encoders' errors and the clock's jitter; the motion itself is deterministic.
         duration: of each recording [s]; by default the experiment's own. A shorter twin is the
             beginning of a longer one.
         progress: show a progress bar.
@@ -72,7 +120,7 @@ def make(
     if samples < MINIMUM_SAMPLES:
         raise ValueError(
             f"`duration` must be at least {MINIMUM_SAMPLES / RATE} s, got {duration}; "
-            f"{QUICK_DURATION:g} s serves for a quick look."
+            f"{QUICK_DURATION:g} s is enough for a quick look."
         )
     plant = specified.rig()
     links = Links.of(plant)
@@ -136,10 +184,27 @@ def build(
         for key in ("q", "qd", "tau_f")
     }
     # Not compressed: the last bits of floats do not shrink, and trying takes longest of all.
-    with replacing(folder / "truth.npz") as unfinished, unfinished.open("wb") as file:
+    with atomic_write(folder / "truth.npz") as unfinished, unfinished.open("wb") as file:
         np.savez(file, **arrays)
     write_table(_overview(twin), folder / "recordings.csv")
     return twin
+
+
+def main(name: str, argv: Sequence[str] | None = None) -> int:
+    """Command line of the builders in `datasets/`: build a twin and print a summary."""
+    parser = argparse.ArgumentParser(description=f"Build the recordings of the {name} twin.")
+    parser.add_argument("--out", type=Path, default=Path(f"runs/{name}_twin"), help="folder")
+    parser.add_argument("--seed", type=int, default=0, help="of encoder errors and jitter")
+    parser.add_argument(
+        "--quick", action="store_true", help=f"recordings of {QUICK_DURATION:g} s only"
+    )
+    arguments = parser.parse_args(argv)
+    duration = QUICK_DURATION if arguments.quick else None
+    twin = build(name, arguments.out, seed=arguments.seed, duration=duration, progress=True)
+    for label, recording in twin.recordings.items():
+        print(f"{label:16} {twin.splits[label]:9} {len(recording)} samples")
+    print(f"written to {arguments.out}")
+    return 0
 
 
 def _record(
@@ -149,7 +214,7 @@ def _record(
     plant: PendulumChain,
     label: str,
 ) -> Recording:
-    """What the rig's computer logs of a motion; its stamps are those of an even clock."""
+    """A motion as the rig's computer logs it; its stamps are those of an even clock."""
     convention = AngleConvention.of(plant)
     late = late[:, None]
     moved = motion.q + late * (motion.qd + 0.5 * late * motion.qdd)

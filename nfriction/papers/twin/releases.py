@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from nfriction.papers.twin.friction import HiddenFriction, Vector
+from nfriction.papers.twin.mechanics import HiddenFriction, Vector
 from nfriction.plant import PendulumChain, rigs
 
 Split = Literal["train", "test"]

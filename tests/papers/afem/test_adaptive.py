@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nfriction.friction.laws import LINEAR, NONLINEAR
-from nfriction.friction.models import ALFM
-from nfriction.papers.afem.adaptive import Adaptive, fading_peak
+from nfriction.papers.afem.adaptive import Adaptive, peak_envelope
+from nfriction.papers.afem.models import ALFM
 from tests.friction.samples import motion, normal
 
 F64 = torch.float64
@@ -60,7 +60,7 @@ def test_a_peak_fades_with_the_time_constant() -> None:
     envelope = made.states(torch.zeros_like(qdd), qdd)[:, 0, 0]
     exact = 90.0 * torch.exp(-0.01 / 0.5 * torch.arange(101, dtype=F64))
     torch.testing.assert_close(envelope, exact, rtol=1e-12, atol=0)
-    torch.testing.assert_close(fading_peak(qdd.abs(), made.fading)[:, 0], exact)
+    torch.testing.assert_close(peak_envelope(qdd.abs(), made.fading)[:, 0], exact)
 
 
 def test_hysteresis_does_not_chatter_where_its_absence_does() -> None:

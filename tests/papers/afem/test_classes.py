@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from nfriction import Recording
-from nfriction.friction.models import ALFM
-from nfriction.papers.afem.classes import find_classes, otsu
+from nfriction.papers.afem.classes import ClassOptions, find_classes, otsu
+from nfriction.papers.afem.models import ALFM
 from nfriction.signals import Motion
 
 STEP = 2e-3
@@ -25,7 +25,7 @@ def swinging(*sections, seed=0, name="swing"):
 def found_in(*pieces, **settings):
     schedule = ALFM(2, time_constant=0.5).schedule
     recordings, motions = zip(*pieces, strict=True)
-    return schedule, find_classes(schedule, recordings, motions, JOINTS, **settings)
+    return schedule, find_classes(schedule, recordings, motions, JOINTS, ClassOptions(**settings))
 
 
 DYING = ((6.0, 200.0), (8.0, 30.0), (16.0, 3.0))

@@ -5,13 +5,15 @@ import torch
 
 from nfriction import LFM, NFLFM, fit
 from nfriction.evaluation.score import score
+from nfriction.fitting.options import FitOptions
 from nfriction.fitting.plant_parameters import plant_parameters
 from nfriction.fitting.shooting.sensitivity import StepJacobian
-from nfriction.friction.model import FrictionModel
-from nfriction.friction.models import ALFM
-from nfriction.papers.afem.classes import find_classes
+from nfriction.friction.models import FrictionModel
+from nfriction.papers.afem.classes import ClassOptions
 from nfriction.papers.afem.fit_adaptive import fit_adaptive
-from nfriction.papers.afem.labelled import Labelled, LabelledProblem
+from nfriction.papers.afem.fit_by_search import SearchOptions, fit_by_search
+from nfriction.papers.afem.given_classes import GivenClasses, GivenClassesProblem
+from nfriction.papers.afem.models import ALFM
 from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import F64, pendulum, swing
 from tests.fitting.test_trajectory import ABSOLUTE, point, windows
@@ -46,21 +48,17 @@ def case():
 
 def fitted(case, model=None, **settings):
     plant, train, _, motions, constant = case
+    options = FitOptions(fit_plant=False, windows=(1.0,), max_steps=settings.pop("max_steps", 30))
     return fit_adaptive(
-        model or ALFM(2, v_smooth=V_SMOOTH), plant, train, fit_plant=False, windows=(1.0,),
-        start=constant, motions=motions, **settings,
+        model or ALFM(2, v_smooth=V_SMOOTH), plant, train, options=options, start=constant,
+        motions=motions, **settings,
     )  # fmt: skip
-
-
-def classes_of(model, case):
-    plant, train, _, motions, _ = case
-    return find_classes(model.schedule, train, motions, plant.joint_names, thresholds=THRESHOLDS)
 
 
 def test_coefficients_by_class_are_recovered(case):
     plant, _, held, _, constant = case
     model = ALFM(2, v_smooth=V_SMOOTH)
-    found = fitted(case, model, classes=classes_of(model, case), prior_sd=3.0)
+    found = fitted(case, model, classes=ClassOptions(THRESHOLDS, prior_sd=3.0))
     # What matters of a class is its friction at the speeds that it has.
     true, speeds = torch.tensor(TRUTH, dtype=F64), torch.tensor([[2.0, 4.0, 8.0]] * 2, dtype=F64)
     for factor in (0.7, 1.4):
@@ -90,10 +88,11 @@ def test_an_ordinary_fit_finds_the_classes_itself(case):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["pattern", "sqp"])
 def test_searches_improve_on_the_constant_law_too(case, method):
-    plant, _, held, _, constant = case
+    plant, train, held, motions, constant = case
     model = ALFM(2, v_smooth=V_SMOOTH)
-    found = fitted(case, model, method=method, max_evaluations=600, threads=1, seed=1,
-                   classes=classes_of(model, case))  # fmt: skip
+    options = SearchOptions(method, horizon=1.0, max_evaluations=600, threads=1, seed=1)
+    found = fit_by_search(model, plant, train, options=options, classes=ClassOptions(THRESHOLDS),
+                          start=constant, motions=motions)  # fmt: skip
     assert "constant law is kept" not in found.status
     assert score(plant, model, held).free_run.all < score(plant, constant.model, held).free_run.all
 
@@ -102,7 +101,7 @@ def test_without_a_difference_between_classes_the_constant_law_stays(case):
     """A tight prior holds every class at the constant law; nothing may get worse."""
     constant = case[-1]
     model = ALFM(2, v_smooth=V_SMOOTH)
-    found = fitted(case, model, prior_sd=1e-6, max_steps=3)
+    found = fitted(case, model, classes=ClassOptions(prior_sd=1e-6), max_steps=3)
     flat = constant.model.schedule.values[:, None].expand(2, 3, 2)
     torch.testing.assert_close(model.schedule.values, flat, rtol=1e-3, atol=1e-8)
     assert found.residual <= constant.residual * (1 + 1e-9)
@@ -110,7 +109,7 @@ def test_without_a_difference_between_classes_the_constant_law_stays(case):
 
 def test_coefficients_that_serve_worse_are_not_taken(case, monkeypatch):
     constant = case[-1]
-    monkeypatch.setattr("nfriction.papers.afem.settling.PositionError.residuals",
+    monkeypatch.setattr("nfriction.papers.afem.given_classes.PositionError.residuals",
                         lambda self, vector: torch.full((1, 1, 2), 1e9, dtype=F64))  # fmt: skip
     model = ALFM(2, v_smooth=V_SMOOTH)
     found = fitted(case, model, max_steps=1)
@@ -124,12 +123,12 @@ def test_coefficients_that_serve_worse_are_not_taken(case, monkeypatch):
 def test_gradient_by_class_against_finite_differences(substeps):
     plant, model = pendulum(), ALFM(2, v_smooth=0.1)
     one = torch.ones(2, 2, dtype=F64)
-    given = FrictionModel(model.law, Labelled(model, 4e-3 * one, 1e-3 * one), 0.1)
+    given = FrictionModel(model.law, GivenClasses(model, 4e-3 * one, 1e-3 * one), 0.1)
     terms = plant_parameters(plant, driven=(0, 1), largest_torque=0.1)
     of = windows()
     classes = (torch.arange(of.tau.numel()).reshape(of.tau.shape) // 7 % 3).to(F64)
     jacobian = StepJacobian(plant, given, terms)
-    p = LabelledProblem(jacobian, given, of, 1e-3, ABSOLUTE, substeps=substeps, classes=classes)
+    p = GivenClassesProblem(jacobian, given, of, 1e-3, ABSOLUTE, substeps=substeps, classes=classes)
     x = point(p)
     gradient = p.linearise(x).gradient
     for i in range(p.variables.shared_count):
@@ -142,18 +141,12 @@ def test_gradient_by_class_against_finite_differences(substeps):
 
 
 def test_what_does_not_fit_is_refused(case):
-    plant, train, _, motions, constant = case
+    plant, train, _, _, _ = case
     with pytest.raises(ValueError, match="no adaptive model"):
         fit_adaptive(NFLFM(2), plant, train)
     with pytest.raises(ValueError, match="output_error"):
         fit(ALFM(2), plant, train, method="equation_error")
+    with pytest.raises(ValueError, match="prior_sd"):
+        ClassOptions(prior_sd=0.0)
     with pytest.raises(ValueError, match="method"):
-        fitted(case, method="simplex")
-    with pytest.raises(ValueError, match="seed"):
-        fitted(case, seed=1)
-    model = ALFM(2, v_smooth=V_SMOOTH)
-    classes = classes_of(model, case)
-    with pytest.raises(ValueError, match="other recordings"):
-        fit_adaptive(model, plant, train[:1], classes=classes, start=constant, motions=motions[:1])
-    with pytest.raises(ValueError, match="another model"):
-        fitted(case, classes=classes)
+        SearchOptions("simplex")

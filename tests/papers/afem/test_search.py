@@ -7,9 +7,14 @@ import torch
 
 from nfriction import LFM, NCFM, NFLFM
 from nfriction.fitting.data.windows import cut_windows
-from nfriction.papers.afem.fit_by_search import fit_by_search
-from nfriction.papers.afem.position_error import PositionError
-from nfriction.papers.afem.search import Box, SearchState, search
+from nfriction.papers.afem.fit_by_search import (
+    Box,
+    SearchOptions,
+    SearchState,
+    fit_by_search,
+    search,
+)
+from nfriction.papers.afem.given_classes import PositionError
 from nfriction.signals import kalman_smoother
 from nfriction.simulation.rollout import integrate
 from tests.fitting.recordings import F64, pendulum, swing
@@ -29,8 +34,10 @@ def recorded():
 
 def fitted(recorded, model, **settings):
     recording, motions = recorded
+    callback = settings.pop("callback", None)
+    options = SearchOptions(**{"horizon": 1.0, "threads": 1} | settings)
     return fit_by_search(
-        model, pendulum(), recording, motions=motions, **{"horizon": 1.0, "threads": 1} | settings
+        model, pendulum(), recording, options=options, motions=motions, callback=callback
     )
 
 
@@ -99,7 +106,7 @@ def test_minima_on_bounds_fixed_and_logarithmic_variables(method):
         value = (x[:, 0] + 1).square() + (x[:, 1] / 0.02).log().square() + x[:, 2]
         return torch.where(x[:, 0] > 3, torch.nan, value)
 
-    result = search(cost, box(lower=[0.0, 1e-4, 1.0]), method, tolerance=1e-6)
+    result = search(cost, box(lower=[0.0, 1e-4, 1.0]), SearchOptions(method, tolerance=1e-6))
     assert result.converged
     torch.testing.assert_close(
         result.vector, torch.tensor([0.0, 0.02, 1.0], dtype=F64), rtol=1e-3, atol=1e-6
@@ -114,4 +121,4 @@ def test_what_a_search_cannot_do_is_refused(recorded):
         fitted(recorded, LFM(2), method="simplex")
     state = SearchState("sqp", [1.0], 0.0, 1)
     with pytest.raises(ValueError, match="state"):
-        search(lambda x: x.sum(1), box(lower=[0.0, 1e-4, 1.0]), "pattern", state=state)
+        search(lambda x: x.sum(1), box(lower=[0.0, 1e-4, 1.0]), SearchOptions(state=state))

@@ -7,7 +7,7 @@ import torch
 
 from nfriction.papers.controller.fis import load_fis, parse_fis
 from nfriction.papers.controller.mamdani import MamdaniController
-from nfriction.papers.controller.rulefile import format_rules, parse_rules
+from nfriction.papers.controller.rules import format_rules, parse_rules
 
 FLOAT64 = torch.float64
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from nfriction.fuzzy import FuzzySet
 from nfriction.papers.controller.fis import parse_fis
 from nfriction.papers.controller.mamdani import MamdaniController, paper_controller
-from nfriction.papers.controller.rulebase import Rule, RuleBase, Variable
+from nfriction.papers.controller.rules import Rule, RuleBase, Variable
 
 FLOAT64 = torch.float64
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")

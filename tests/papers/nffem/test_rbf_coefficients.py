@@ -9,7 +9,7 @@ from torch import Tensor
 from nfriction import export, load, rigs, rollout, save
 from nfriction.friction.models import NFLFM, NFNLFM
 from nfriction.fuzzy import RBFNetwork
-from nfriction.papers.nffem.rbf_coefficients import RadialBasis
+from nfriction.papers.nffem.rbf_coefficients import RBFCoefficients
 
 JOINTS = 3
 
@@ -33,8 +33,8 @@ def model(acceleration: str = "signed") -> NFLFM:
     return made
 
 
-def schedule(of: NFLFM) -> RadialBasis:
-    assert isinstance(of.schedule, RadialBasis)
+def schedule(of: NFLFM) -> RBFCoefficients:
+    assert isinstance(of.schedule, RBFCoefficients)
     return of.schedule
 
 

@@ -8,9 +8,8 @@ from nfriction.evaluation.score import score
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.friction.laws import LINEAR
-from nfriction.friction.model import FrictionModel
+from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
-from nfriction.papers.afem.fit_adaptive import fit_adaptive
 from nfriction.papers.nffem.refine_adaptive import refine_adaptive
 from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import F64, pendulum, swing
@@ -47,7 +46,7 @@ def case():
     motions = [kalman_smoother(r.time, r.q) for r in train]
     settings = {"fit_plant": False, "windows": (1.0,), "motions": motions}
     constant = fit(LFM(2, v_smooth=V_SMOOTH), plant, train, **settings)
-    by_class = fit_adaptive(ALFM(2, v_smooth=V_SMOOTH), plant, train, start=constant, **settings)
+    by_class = fit(ALFM(2, v_smooth=V_SMOOTH), plant, train, start=constant, **settings)
     return plant, train, held, by_class
 
 

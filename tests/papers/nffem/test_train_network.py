@@ -2,18 +2,19 @@
 
 import math
 from copy import deepcopy
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor, nn
 
 from nfriction.fuzzy import Anfis, AnfisRBF, RBFNetwork
-from nfriction.optim.evidence_result import EvidenceState
+from nfriction.optim.evidence import EvidenceState
 from nfriction.optim.jacobian import flatten, trainable
 from nfriction.papers.controller.mamdani import paper_controller
-from nfriction.papers.nffem.network_group import one_group
-from nfriction.papers.nffem.scaling import Scaling, to_own_units
+from nfriction.papers.nffem.scaling import Scaling, one_group, to_own_units
 from nfriction.papers.nffem.train_network import (
+    TrainingOptions,
     controller_targets,
     train_network,
     train_on_controller,
@@ -91,8 +92,12 @@ def test_training_beats_the_least_squares_start(kind: str) -> None:
     network = NETWORKS[kind](1)
     x, y = controller_targets(controller, 1500)
     start = NETWORKS[kind](1)
-    train_on_controller(start, controller, samples=1500, search_steps=0, max_steps=0)
-    fits = train_on_controller(network, controller, samples=1500, search_steps=20, max_steps=10)
+    train_on_controller(
+        start, controller, samples=1500, options=TrainingOptions(search_steps=0, max_steps=0)
+    )
+    fits = train_on_controller(
+        network, controller, samples=1500, options=TrainingOptions(search_steps=20, max_steps=10)
+    )
     assert len(fits) == 1
     assert rmse(network, x[:, None], y[:, None]) < 0.95 * rmse(start, x[:, None], y[:, None])
     # It learns the function, not the samples.
@@ -102,7 +107,7 @@ def test_training_beats_the_least_squares_start(kind: str) -> None:
 
 def test_it_starts_from_the_controllers_own_sets_or_from_an_even_grid() -> None:
     controllers = [paper_controller(joint) for joint in (2, 4)]
-    frozen = {"samples": 300, "search_steps": 0, "max_steps": 0}
+    frozen = {"samples": 300, "options": TrainingOptions(search_steps=0, max_steps=0)}
     network = Anfis(2, 2, [len(v.sets) for v in controllers[0].rule_base.inputs], 2)
     train_on_controller(network, controllers, **frozen)
     centres, widths = network.sets()
@@ -133,7 +138,7 @@ def test_identities_hold_at_convergence() -> None:
         400, 1, 2, generator=torch.Generator().manual_seed(2), dtype=FLOAT64
     )
     network = Anfis(1, 2, [2, 2], 2)
-    fit = train_network(network, x, y, max_steps=500, tolerance=1e-6)[0].evidence
+    fit = train_network(network, x, y, TrainingOptions(max_steps=500, tolerance=1e-6))[0].evidence
     assert fit.converged
     for group, gamma in fit.gamma.items():
         shrinkage = 2 * fit.alpha[group] * fit.parameter_squares[group]
@@ -147,7 +152,7 @@ def test_error_bars_are_in_the_units_of_the_samples() -> None:
     x = samples(500, 1, 2)
     noise = torch.randn(500, 1, 2, generator=torch.Generator().manual_seed(2), dtype=FLOAT64)
     y = 100.0 * surface(x) + torch.tensor([3.0, 5.0], dtype=FLOAT64) * noise
-    fit = train_network(Anfis(1, 2, [3, 3], 2), 7.0 + 20 * x, y, max_steps=100)[0]
+    fit = train_network(Anfis(1, 2, [3, 3], 2), 7.0 + 20 * x, y, TrainingOptions(max_steps=100))[0]
     deviation = fit.predictive_std(7.0 + 20 * x[:, 0])
     assert deviation.shape == (500, 2)
     # One noise level for outputs scaled by their ranges: its share of each range is the same.
@@ -158,22 +163,27 @@ def test_error_bars_are_in_the_units_of_the_samples() -> None:
 
 def test_same_seed_same_network_and_more_starts_no_less_evidence() -> None:
     controller = paper_controller(2)
-    options = {"samples": 1000, "search_steps": 15, "max_steps": 10}
+    options = TrainingOptions(search_steps=15, max_steps=10)
+    three = replace(options, starts=3)
     twins = [RBFNetwork(1, units=5) for _ in range(2)]
-    fits = [train_on_controller(net, controller, starts=3, **options)[0] for net in twins]
+    fits = [train_on_controller(n, controller, samples=1000, options=three)[0] for n in twins]
     assert torch.equal(flatten(trainable(twins[0])), flatten(trainable(twins[1])))
     assert fits[0].evidence.log_evidence == fits[1].evidence.log_evidence
-    alone = train_on_controller(RBFNetwork(1, units=5), controller, **options)[0]
+    alone = train_on_controller(RBFNetwork(1, units=5), controller, samples=1000, options=options)[
+        0
+    ]
     assert fits[0].evidence.log_evidence >= alone.evidence.log_evidence - 1e-6
 
 
 def test_groups_train_as_if_alone() -> None:
     controllers = [paper_controller(joint) for joint in (2, 4)]
     both, alone = Anfis(2, 2, [3, 3], 2), Anfis(1, 2, [3, 3], 2)
-    options = {"samples": 800, "search_steps": 10, "max_steps": 5}
-    pair = train_on_controller(both, controllers, seed=5, **options)
+    options = TrainingOptions(search_steps=10, max_steps=5, seed=5)
+    pair = train_on_controller(both, controllers, samples=800, options=options)
     # Group g draws its samples with seed + g.
-    single = train_on_controller(alone, controllers[1], seed=6, **options)
+    single = train_on_controller(
+        alone, controllers[1], samples=800, options=replace(options, seed=6)
+    )
     assert pair[1].evidence.log_evidence == pytest.approx(single[0].evidence.log_evidence, rel=1e-9)
     x = controller_targets(controllers[1], 100)[0].unsqueeze(1)
     with torch.no_grad():
@@ -188,7 +198,9 @@ def test_interrupt_leaves_a_usable_network() -> None:
         if state.step == 2:
             raise KeyboardInterrupt
 
-    fits = train_on_controller(network, controllers, samples=1000, callback=interrupt)
+    fits = train_on_controller(
+        network, controllers, samples=1000, options=TrainingOptions(callback=interrupt)
+    )
     assert [fit.evidence.status for fit in fits] == ["stopped"]
     # The first group keeps what it reached, the second its least-squares start.
     for g, (controller, worst) in enumerate(zip(controllers, (0.05, 0.1), strict=True)):
@@ -202,7 +214,7 @@ def test_frozen_parameters_stay() -> None:
     network.init_grid(2.0, 4.0)
     network.partition.requires_grad_(False)
     before = flatten(dict(network.partition.named_parameters())).clone()
-    fit = train_network(network, x, surface(x), max_steps=20)[0].evidence
+    fit = train_network(network, x, surface(x), TrainingOptions(max_steps=20))[0].evidence
     assert set(fit.alpha) == {"consequents"}
     after = flatten(dict(network.partition.named_parameters()))
     torch.testing.assert_close(after, before, rtol=1e-12, atol=1e-13)
@@ -217,7 +229,7 @@ def test_misfits_are_refused_at_the_border() -> None:
     with pytest.raises(ValueError, match="vary"):
         train_network(network, x * torch.tensor([1.0, 0.0]), surface(x))
     with pytest.raises(ValueError, match="starts"):
-        train_network(network, x, surface(x), starts=0)
+        TrainingOptions(starts=0)
     with pytest.raises(TypeError, match="Linear"):
         train_network(nn.Linear(2, 2), x, surface(x))
     with pytest.raises(ValueError, match="controllers"):

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction.friction.models import LFM, model_by_name
+from nfriction.friction.models import LFM
+from nfriction.friction.registry import model_by_name
 from nfriction.papers.controller.mamdani import paper_controller
-from nfriction.papers.nffem.rbf_coefficients import RadialBasis
+from nfriction.papers.nffem.rbf_coefficients import RBFCoefficients
 from nfriction.papers.reproduction.procedure import controllers_from_classes, papers_neuro_fuzzy
 from nfriction.signals import Motion
 
@@ -68,7 +69,7 @@ def test_the_network_says_what_the_controller_says() -> None:
     adaptive = model_by_name("ALFM")(3, RISING)
     motion = swing()
     model = papers_neuro_fuzzy(adaptive, [motion], samples=4000)
-    assert isinstance(model.schedule, RadialBasis)
+    assert isinstance(model.schedule, RBFCoefficients)
     assert type(model).__name__ == "NFLFM"
     controllers = controllers_from_classes(model.law, RISING, motion.qd, motion.qdd)
     schedule = model.schedule

@@ -9,10 +9,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from nfriction.papers.reproduction import printed, report, tables
-from nfriction.papers.reproduction.settings import QUICK
+from nfriction.papers.reproduction import tables
 from nfriction.papers.reproduction.stages import LAWS, SECOND_PAPER, stages
-from nfriction.papers.reproduction.workspace import Workspace
+from nfriction.papers.reproduction.workspace import QUICK, Workspace
 
 EVERY = [name for name in stages() if not name.startswith("twin")]
 
@@ -29,7 +28,7 @@ def workspace(folder: Path, errors: Mapping[str, float | None]) -> Workspace:
     """Every stage finished, with errors by model (1 by default) on one of two test runs."""
     made = Workspace(folder, QUICK)
     for name in stages():
-        names = printed.SECOND_COEFFICIENTS.get(name.removeprefix("rtip-"), {})
+        names = tables.SECOND_COEFFICIENTS.get(name.removeprefix("rtip-"), {})
         made.finish(
             name,
             {
@@ -61,7 +60,7 @@ def test_table_10_stands_beside_the_print(tmp_path: Path) -> None:
     made = workspace(tmp_path, {})
     table, measured = tables.table_10(made), tables.table_10(made, "measured_drive")
     assert len(table) == 13
-    for name, row in printed.TABLE_10.items():
+    for name, row in tables.TABLE_10.items():
         assert tuple(table["printed"].loc[name]) == row
     assert table["printed"].loc["LFM"].isna().all()
     pd.testing.assert_frame_equal(2 * measured["ours"], table["ours"])
@@ -71,7 +70,7 @@ def test_table_11_is_what_is_saved(tmp_path: Path) -> None:
     table = tables.table_11(workspace(tmp_path, {"NFLFM": 0.25}))
     np.testing.assert_allclose(table["ours"].loc["NFLFM against ALFM"], 75.0)
     np.testing.assert_allclose(table["ours"].loc["ANCFM against NCFM"], 0.0, atol=1e-12)
-    theirs = printed.TABLE_10
+    theirs = tables.TABLE_10
     expected = 100 * (1 - np.array(theirs["NFLFM"]) / np.array(theirs["ALFM"]))
     np.testing.assert_allclose(table["printed"].loc["NFLFM against ALFM"], expected)
 
@@ -80,7 +79,7 @@ def test_the_second_papers_tables(tmp_path: Path) -> None:
     made = workspace(tmp_path, dict.fromkeys(SECOND_PAPER, 3.0))
     for law in LAWS:
         table = tables.second_coefficients(made, law)
-        assert list(table.index) == list(printed.SECOND_COEFFICIENTS[law])
+        assert list(table.index) == list(tables.SECOND_COEFFICIENTS[law])
         assert tuple(table["ours"].iloc[0]) == (1.0, 2.0, 3.0)
     assert tuple(tables.second_table_4(made)["printed"].loc["LFM"]) == (0.0049, 0.0065, 0.0079)
 
@@ -102,13 +101,13 @@ def test_the_order_is_broken_only_where_it_is(tmp_path: Path, law: str) -> None:
 
 def test_everything_is_written_and_said(tmp_path: Path) -> None:
     made = workspace(tmp_path, {"NFNLFM": 0.5, "LFM": None})
-    written = report.write_tables(made, command="a command")
+    written = tables.write_tables(made, command="a command")
     assert all(path.stat().st_size for path in written)
     results = json.loads((tmp_path / "results.json").read_text())
     assert set(results["stages"]) == set(stages())
     long = pd.read_csv(tmp_path / "rmse.csv")
     # Models, recordings, kinds of error (two drives and one window), joints and all of them.
     assert len(long) == len(EVERY) * 3 * 3 * 4
-    said = report.text(made)
+    said = tables.text(made)
     for name in (*tables.NINE, "Table 11", "Table IV", "on every joint: "):
         assert name in said

@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nfriction.papers.reproduction.settings import FULL, QUICK
-from nfriction.papers.reproduction.workspace import Workspace
+from nfriction.papers.reproduction.workspace import FULL, QUICK, Workspace
 
 
 def test_a_finished_stage_is_found_again(tmp_path: Path) -> None:

@@ -8,8 +8,13 @@ from pathlib import Path
 import pytest
 
 from nfriction.papers.controller.mamdani import paper_controller
-from nfriction.papers.controller.rulebase import RuleBase
-from nfriction.papers.controller.rulefile import format_rules, load_rules, parse_rules, save_rules
+from nfriction.papers.controller.rules import (
+    RuleBase,
+    format_rules,
+    load_rules,
+    parse_rules,
+    save_rules,
+)
 
 SMALL = {
     "format": "nfriction-rules/1",

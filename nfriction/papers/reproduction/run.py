@@ -1,4 +1,4 @@
-"""Runs the stages of a reproduction, several at a time, and goes on where an earlier run ended."""
+"""Run the stages of a reproduction, several at a time, and resume what an earlier run left."""
 
 import os
 import signal
@@ -11,9 +11,8 @@ from typing import Any
 
 from tqdm import tqdm
 
-from nfriction.papers.reproduction.settings import FULL, Settings
 from nfriction.papers.reproduction.stages import Stage, run_stage, stages
-from nfriction.papers.reproduction.workspace import Workspace
+from nfriction.papers.reproduction.workspace import FULL, Settings, Workspace
 
 
 def reproduce(
@@ -25,8 +24,8 @@ def reproduce(
 ) -> Workspace:
     """Run every stage that is not finished.
 
-    Each stage runs in a process of its own kind and writes its result last, whole or not at all:
-    a run that was killed goes on with what is not finished, whether by Ctrl-C or by force.
+    Each stage runs in a worker process and writes its result last, whole or not at all, so a run
+    that was ended by Ctrl-C or by force resumes with what is not finished.
 
     Args:
         folder: where all files go; made where it is missing.
@@ -65,7 +64,7 @@ def _run_all(workspace: Workspace, waiting: dict[str, Stage], jobs: int, bar: "t
                 running[pool.submit(run_stage, workspace, name)] = name
                 del waiting[name]
             bar.set_postfix_str(", ".join(running.values()))
-            # Woken now and then, so that the bar's clock goes on.
+            # The timeout keeps the bar's clock running.
             done, _ = wait(running, timeout=1.0, return_when=FIRST_COMPLETED)
             for future in done:
                 del running[future]
@@ -75,8 +74,8 @@ def _run_all(workspace: Workspace, waiting: dict[str, Stage], jobs: int, bar: "t
         finished = True
     finally:
         if not finished:
-            # An error or an interrupt; that reaches workers only where the keyboard sent it, and
-            # may have come while one was started, before it is among those running.
+            # An error or an interrupt. Only an interrupt of the keyboard reaches the workers, and
+            # one of them may have been started just before, so it is not among `running` yet.
             for worker in list((pool._processes or {}).values()):
                 worker.terminate()
         pool.shutdown(cancel_futures=True)
@@ -91,12 +90,12 @@ def _ready(waiting: Mapping[str, Stage], running: Iterable[str]) -> list[str]:
 def _end_with_the_caller() -> None:
     # A solver keeps its best point on Ctrl-C; such a fit would pass for a finished one.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    # A caller that is killed cannot end its workers, which would wait for work for ever.
-    threading.Thread(target=_watch_the_caller, daemon=True).start()
-
-
-def _watch_the_caller() -> None:
     caller = parent_process()
     assert caller is not None
-    caller.join()
-    os._exit(1)
+
+    def watch() -> None:
+        caller.join()
+        os._exit(1)
+
+    # A caller that is killed cannot end its workers, which would wait for work for ever.
+    threading.Thread(target=watch, daemon=True).start()

@@ -1,0 +1,166 @@
+"""Layers of independent groups (joints): memory layout, input Jacobian, output layer.
+
+Layers take and give rows, (*batch, groups, size). Inside, samples run last, (groups, size,
+samples), so that every kernel is vectorised over them.
+"""
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor, nn
+
+_ROWS_AT_ONCE = 8192
+
+
+def to_columns(x: Tensor) -> Tensor:
+    """(*batch, groups, size) → (groups, size, samples); scripts and exports."""
+    return x.reshape(-1, x.shape[-2], x.shape[-1]).movedim(0, -1)
+
+
+def to_rows(columns: Tensor, like: Tensor) -> Tensor:
+    """(groups, size, samples) → (*batch, groups, size) with the batch of `like`."""
+    return columns.movedim(-1, 0).reshape(like.shape[:-1] + columns.shape[1:2])
+
+
+def input_range(
+    lower: float | Sequence[float] | Tensor,
+    upper: float | Sequence[float] | Tensor,
+    like: Tensor,
+    *,
+    allow_equal: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """Bounds of every input, broadcast to `like` (groups, inputs).
+
+    Raises:
+        ValueError: bounds that are not finite or do not ascend.
+    """
+    low, high = (
+        torch.as_tensor(end, dtype=like.dtype, device=like.device).expand_as(like)
+        for end in (lower, upper)
+    )
+    sound = (high >= low) if allow_equal else (high > low)
+    if not bool((sound & torch.isfinite(high - low)).all()):
+        raise ValueError(
+            f"every input needs a finite range with `lower` < `upper`, got {low.tolist()} and "
+            f"{high.tolist()}; an input that never varies should be left out."
+        )
+    return low, high
+
+
+class GroupedModule(nn.Module):
+    """Module from (*batch, groups, inputs) to (*batch, groups, outputs), sample by sample."""
+
+    groups: int
+    inputs: int
+    outputs: int
+
+    def input_jacobian(self, x: Tensor) -> Tensor:
+        """Derivative of every output by the inputs of its group.
+
+        Args:
+            x: inputs, shape (samples, groups, inputs).
+        Returns:
+            Shape (groups, outputs, inputs, samples).
+        """
+        x = x.detach().requires_grad_()
+        with torch.enable_grad():
+            sums = self(x).flatten(0, -2).sum(0)
+            rows = [torch.autograd.grad(y, x, retain_graph=True)[0] for y in sums]
+        return torch.stack(rows, 2).movedim(0, -1)
+
+
+class LinearOutputModule(GroupedModule):
+    """Layer that is linear in its regressors, with derivatives that its outputs share.
+
+    The outputs share hidden units, so their derivatives combine fewer columns than there are
+    parameters. With F = jacobian_columns(x)[g] and M = jacobian_maps()[name][g, k],
+
+        d y_k(sample) / d parameter = F[:, sample] . M[:, parameter],
+
+    and least squares needs one product F F^T for all outputs, five times faster than a product of
+    whole Jacobians (`nfriction.optim.jacobian`). The first columns are the regressors, of which
+    `readout` makes the outputs.
+    """
+
+    @abstractmethod
+    def regressor_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
+        """Regressors (groups, regressors, samples) of x (samples, groups, inputs), in `out`."""
+
+    @abstractmethod
+    def jacobian_columns(self, x: Tensor, out: Tensor | None = None) -> Tensor:
+        """Columns (groups, columns, samples) of x (samples, groups, inputs), in `out`."""
+
+    @abstractmethod
+    def jacobian_maps(self) -> dict[str, Tensor]:
+        """By name of each trained parameter (groups, outputs, columns, entries of a group)."""
+
+    @abstractmethod
+    def readout(self) -> Tensor:
+        """The output layer, (groups, outputs, regressors)."""
+
+    def regressors(self, x: Tensor) -> Tensor:
+        """Features in which the layer is linear, shape (*batch, groups, regressors)."""
+        return to_rows(self.regressor_columns(x.reshape(-1, *x.shape[-2:])), x)
+
+    def _placed(self, blocks: Mapping[str, tuple[int, Tensor]], columns: int) -> dict[str, Tensor]:
+        """Maps of the trained parameters from their first columns and entries from there on."""
+        maps = {}
+        for name, value in self.named_parameters():
+            # Under `torch.func.functional_call` a plain tensor replaces each trained parameter.
+            if value.requires_grad or not isinstance(value, nn.Parameter):
+                start, block = blocks[name]
+                shape = (self.groups, self.outputs, columns, block.shape[-1])
+                maps[name] = block.new_zeros(shape)
+                maps[name][:, :, start : start + block.shape[-2]] = block
+        return maps
+
+
+def ridge(
+    features: Tensor, targets: Tensor, prior_precision: float | Tensor, prior: Tensor
+) -> Tensor:
+    """Minimiser of `|targets - features w|^2 + prior_precision |w - prior|^2`.
+
+    The rows are reduced to a triangle by Householder QR, a block at a time, so that the condition
+    of the problem is not squared and memory does not grow with the samples. Directions that neither
+    data nor prior determine stay at the prior (least change).
+
+    Args:
+        features: shape (samples, groups, features).
+        targets: shape (samples, groups, outputs).
+        prior_precision: not negative, a number or broadcastable to (groups, features); over the
+            noise precision, so that 1 weighs like one sample with unit feature.
+        prior: broadcastable to (groups, features, outputs).
+    Returns:
+        Weights, shape (groups, features, outputs).
+    Raises:
+        ValueError: no samples, samples that are not finite, or a negative precision.
+    References:
+        Golub and Van Loan, Matrix Computations, 4th ed., sections 5.2 and 5.5.
+    """
+    samples, groups, count = features.shape
+    if targets.shape[:2] != features.shape[:2]:
+        raise ValueError(
+            f"`features` {tuple(features.shape)} and `targets` {tuple(targets.shape)} must agree "
+            "in samples and groups."
+        )
+    if samples == 0:
+        raise ValueError("least squares needs at least one sample.")
+    precision = torch.as_tensor(prior_precision, dtype=features.dtype, device=features.device)
+    if not bool((precision >= 0).all()):
+        raise ValueError(f"`prior_precision` must not be negative, got {prior_precision}.")
+    prior = prior.expand(groups, count, targets.shape[-1])
+    rows = torch.cat([features, targets], -1).transpose(0, 1)
+    triangle = rows[:, :0]
+    for block in rows.split(_ROWS_AT_ONCE, dim=1):
+        triangle = torch.linalg.qr(torch.cat([triangle, block], 1), mode="r").R
+    if not bool(torch.isfinite(triangle).all()):
+        raise ValueError("samples must be finite; drop the rows with NaN or infinity first.")
+    upper, rhs = triangle[..., :count], triangle[..., count:]
+    scale = precision.expand(groups, count).sqrt()
+    rows = torch.cat([upper, torch.diag_embed(scale)], 1)
+    residual = torch.cat([rhs - upper @ prior, torch.zeros_like(prior)], 1)
+    U, singular, Vh = torch.linalg.svd(rows, full_matrices=False)
+    floor = singular[:, :1] * count * torch.finfo(rows.dtype).eps
+    inverse = torch.where(singular > floor, 1.0 / singular, torch.zeros_like(singular))
+    return prior + Vh.mT @ (inverse.unsqueeze(-1) * (U.mT @ residual))

@@ -1,0 +1,411 @@
+"""Rule bases of fuzzy controllers: variables, their sets, rules; and the JSON files they come in.
+
+A file looks like this (see also `nfriction/fuzzy/data/`)::
+
+    {
+      "format": "nfriction-rules/1",
+      "name": "joint 2",
+      "inputs": {
+        "velocity": {"unit": "deg/s", "sets": {"slow": [0, 300], "fast": [200, 1000]}},
+        "acceleration": {"unit": "deg/s^2", "universe": [-6000, 8000],
+                         "sets": {"braking": [-6000, 500], "driving": [-500, 8000]}}
+      },
+      "outputs": {
+        "B": {"unit": "N m s/rad", "sets": {"low": [0, 6e-4], "high": [4e-4, 1e-3]}}
+      },
+      "table": {
+        "columns": "velocity",
+        "braking": [["low"], ["high"]],
+        "driving": [["low"], ["low"]]
+      }
+    }
+
+A set is the range [low, high] that it spans (`membership.sets_from_ranges`), or for full control
+`{"shape": "gaussian", "parameters": [centre, sigma]}` with a shape of `membership.SHAPES`; a
+variable uses one way or the other. Sets are written from the smallest values to the largest. The
+universe may be left out where ranges give it. The table has a row for each set of the other input
+and in it a cell for each set of the input that `columns` names, in their order; a cell gives a
+term for each output, in their order. Instead of `table`, `rules` may list rules one by one, with
+any number of inputs: `{"if": ["slow", "*"], "then": ["low"], "weight": 1}`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from nfriction.fuzzy.membership import FuzzySet, sets_from_ranges
+from nfriction.io import strict_json
+from nfriction.io.atomic import write_atomically
+
+FORMAT = "nfriction-rules/1"
+MAX_BYTES = 1_000_000
+MAX_SETS, MAX_VARIABLES, MAX_RULES = 64, 16, 10_000
+
+ANY = "*"
+"""Wildcard in place of a term: the rule does not depend on (or set) this variable."""
+
+SI_FACTOR = {
+    "rad/s": 1.0,
+    "rad/s^2": 1.0,
+    "deg/s": math.pi / 180.0,
+    "deg/s^2": math.pi / 180.0,
+    "1": 1.0,
+}
+"""Units an input may be written in, and how much one of it is in SI."""
+
+
+@dataclass(frozen=True)
+class Variable:
+    """An input or output: its name, unit, universe and sets in ascending order."""
+
+    name: str
+    unit: str
+    universe: tuple[float, float]
+    sets: tuple[FuzzySet, ...]
+
+    def __post_init__(self) -> None:
+        where = f"variable {self.name!r}"
+        low, high = self.universe
+        if not (math.isfinite(low) and math.isfinite(high) and low < high):
+            raise ValueError(f"{where}: universe must be finite with low < high, got {low, high}.")
+        if not 1 <= len(self.sets) <= MAX_SETS:
+            raise ValueError(f"{where}: needs 1 to {MAX_SETS} sets, got {len(self.sets)}.")
+        _refuse_duplicates(f"{where}: sets", self.terms)
+        if ANY in self.terms:
+            raise ValueError(f"{where}: {ANY!r} means any term and cannot name a set.")
+        for before, after in pairwise(self.sets):
+            if before.core > after.core:
+                raise ValueError(
+                    f"{where}: sets must ascend, but {after.name!r} at {after.core} comes "
+                    f"after {before.name!r} at {before.core}."
+                )
+
+    @property
+    def terms(self) -> list[str]:
+        """Names of the sets."""
+        return [term.name for term in self.sets]
+
+
+@dataclass(frozen=True)
+class Rule:
+    """If every input is its term, then every output is its term; `*` is any."""
+
+    given: tuple[str, ...]
+    then: tuple[str, ...]
+    weight: float = 1.0
+
+
+@dataclass(frozen=True)
+class RuleBase:
+    """Variables and rules of a Mamdani controller, validated.
+
+    Args:
+        name: what the controller is for.
+        inputs, outputs: variables in the order in which rules name their terms.
+        rules: in any order.
+    """
+
+    name: str
+    inputs: tuple[Variable, ...]
+    outputs: tuple[Variable, ...]
+    rules: tuple[Rule, ...]
+
+    def __post_init__(self) -> None:
+        for kind, variables in (("inputs", self.inputs), ("outputs", self.outputs)):
+            if not 1 <= len(variables) <= MAX_VARIABLES:
+                raise ValueError(f"{kind}: 1 to {MAX_VARIABLES} variables, got {len(variables)}.")
+            _refuse_duplicates(kind, [variable.name for variable in variables])
+        for variable in self.inputs:
+            if variable.unit not in SI_FACTOR:
+                raise ValueError(
+                    f"input {variable.name!r}: unknown unit {variable.unit!r}; use one of "
+                    f"{list(SI_FACTOR)}."
+                )
+        if not 1 <= len(self.rules) <= MAX_RULES:
+            raise ValueError(f"1 to {MAX_RULES} rules are allowed, got {len(self.rules)}.")
+        for number, rule in enumerate(self.rules, 1):
+            _check_terms(f"rule {number}: if", rule.given, self.inputs)
+            _check_terms(f"rule {number}: then", rule.then, self.outputs)
+            if not 0.0 < rule.weight <= 1.0:
+                raise ValueError(f"rule {number}: weight must be in (0, 1], got {rule.weight}.")
+
+
+def load_rules(path: str | Path) -> RuleBase:
+    """Rule base from a JSON file in the schema of this module.
+
+    Raises:
+        ValueError: no such rule base; the message names the place and the remedy.
+    """
+    path = Path(path)
+    return parse_rules(read_text(path), path.name)
+
+
+def read_text(path: Path) -> str:
+    """Text of a rule file.
+
+    Raises:
+        ValueError: too large, or not UTF-8; names the file.
+    """
+    if path.stat().st_size > MAX_BYTES:
+        raise ValueError(f"{path.name}: rule files are at most {MAX_BYTES} bytes.")
+    try:
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path.name}: a rule file is UTF-8 text ({error}).") from error
+
+
+def parse_rules(text: str, source: str = "rules") -> RuleBase:
+    """Rule base from JSON text; `source` names it in errors."""
+    try:
+        document = strict_json.parse(text, _unique)
+        return _rule_base(document)
+    except RecursionError:
+        raise ValueError(f"{source}: nested too deeply for a rule base.") from None
+    except ValueError as error:
+        raise ValueError(f"{source}: {shortened(error)}") from error
+
+
+def format_rules(rules: RuleBase) -> str:
+    """JSON text that `parse_rules` reads back to an equal rule base."""
+    listed = [
+        {"if": list(rule.given), "then": list(rule.then), "weight": rule.weight}
+        for rule in rules.rules
+    ]
+    table = _table(rules)
+    document = {
+        "format": FORMAT,
+        "name": rules.name,
+        "inputs": _described(rules.inputs),
+        "outputs": _described(rules.outputs),
+        **({"rules": listed} if table is None else {"table": table}),
+    }
+    return _dump(document, "") + "\n"
+
+
+def save_rules(rules: RuleBase, path: str | Path) -> None:
+    """Write a rule base as a JSON file, atomically."""
+    write_atomically(path, format_rules(rules).encode())
+
+
+def _rule_base(document: Any) -> RuleBase:
+    _check_keys("the file", document, {"format", "inputs", "outputs"}, {"name", "table", "rules"})
+    if document["format"] != FORMAT:
+        raise ValueError(f'"format" must be {FORMAT!r}, got {document["format"]!r}.')
+    if ("table" in document) == ("rules" in document):
+        raise ValueError('give either a "table" or a list of "rules".')
+    inputs, outputs = (_variables(document[kind], kind) for kind in ("inputs", "outputs"))
+    table = document.get("table")
+    rules = (
+        _listed_rules(document["rules"])
+        if "rules" in document
+        else _table_rules(table, inputs, outputs)
+    )
+    name = _expect(document.get("name", ""), str, "name", "text")
+    return RuleBase(name, inputs, outputs, rules)
+
+
+def _variables(entries: Any, kind: str) -> tuple[Variable, ...]:
+    entries = _expect(entries, dict, f'"{kind}"', "names of variables")
+    return tuple(_variable(name, entry) for name, entry in entries.items())
+
+
+def _variable(name: str, entry: Any) -> Variable:
+    where = f"variable {name!r}"
+    _check_keys(where, entry, {"unit", "sets"}, {"universe"})
+    sets, universe = entry["sets"], entry.get("universe")
+    if not isinstance(sets, dict) or not sets:
+        raise ValueError(f'{where}: "sets" must map names to ranges, got {_brief(sets)}.')
+    if all(isinstance(value, list) for value in sets.values()):
+        ranges = [_pair(value, f"{where}: set {term!r}") for term, value in sets.items()]
+        try:
+            members = sets_from_ranges(list(sets), ranges)
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}") from error
+        universe = [ranges[0][0], ranges[-1][1]] if universe is None else universe
+    elif all(isinstance(value, dict) for value in sets.values()):
+        members = tuple(_set(f"{where}: set {term!r}", term, v) for term, v in sets.items())
+        if universe is None:
+            raise ValueError(f'{where}: sets given by shape need a "universe": [low, high].')
+    else:
+        raise ValueError(f"{where}: give every set as a range or every set by its shape.")
+    unit = _expect(entry["unit"], str, f"{where}: unit", "text")
+    return Variable(name, unit, _pair(universe, f"{where}: universe"), members)
+
+
+def _set(where: str, term: str, value: dict[str, Any]) -> FuzzySet:
+    _check_keys(where, value, {"shape", "parameters"}, set())
+    numbers = _expect(value["parameters"], list, where, '"parameters": a list of numbers')
+    shape = _expect(value["shape"], str, f"{where}: shape", "text")
+    return FuzzySet(term, shape, tuple(_number(number, where) for number in numbers))
+
+
+def _table_rules(
+    table: Any, inputs: tuple[Variable, ...], outputs: tuple[Variable, ...]
+) -> tuple[Rule, ...]:
+    if len(inputs) != 2:
+        raise ValueError(f'a "table" needs two inputs, got {len(inputs)}; list "rules" instead.')
+    names = [variable.name for variable in inputs]
+    if not isinstance(table, dict) or table.get("columns") not in names:
+        raise ValueError(f'"table": "columns" must name one of the inputs {names}.')
+    across = names.index(table["columns"])
+    columns, rows = inputs[across], inputs[1 - across]
+    unknown = [row for row in table if row != "columns" and row not in rows.terms]
+    if unknown:
+        raise ValueError(
+            f'"table": unknown row {unknown[0]!r}; {rows.name!r} has the terms {rows.terms}.'
+        )
+    rules = []
+    for row in rows.terms:
+        if row not in table:
+            raise ValueError(f'"table": row {row!r} of {rows.name!r} is missing.')
+        cells = _one_for_each(table[row], columns.terms, f'"table": row {row!r}', "cell")
+        for column, cell in zip(columns.terms, cells, strict=True):
+            where = f'"table": cell {row!r} x {column!r}'
+            then = _one_for_each(cell, [out.name for out in outputs], where, "term")
+            for term, output in zip(then, outputs, strict=True):
+                if term not in output.terms:
+                    raise ValueError(
+                        f"{where}: unknown term {_brief(term)}; {output.name!r} has {output.terms}."
+                    )
+            rules.append(Rule((column, row) if across == 0 else (row, column), tuple(then)))
+    return tuple(rules)
+
+
+def _listed_rules(entries: Any) -> tuple[Rule, ...]:
+    rules = []
+    for number, entry in enumerate(_expect(entries, list, '"rules"', "a list"), 1):
+        where = f"rule {number}"
+        _check_keys(where, entry, {"if", "then"}, {"weight"})
+        given, then = (
+            tuple(
+                _expect(term, str, f"{where}: {part}", "text")
+                for term in _expect(entry[part], list, f"{where}: {part}", "a list of terms")
+            )
+            for part in ("if", "then")
+        )
+        rules.append(Rule(given, then, _number(entry.get("weight", 1.0), f"{where}: weight")))
+    return tuple(rules)
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    entries: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in entries:
+            raise ValueError(f"{name!r} comes twice in the same place; every name once.")
+        entries[name] = value
+    return entries
+
+
+def _expect(value: Any, kind: type, where: str, form: str) -> Any:
+    if not isinstance(value, kind):
+        raise ValueError(f"{where}: expected {form}, got {_brief(value)}.")
+    return value
+
+
+def _one_for_each(value: Any, names: list[str], where: str, part: str) -> list[Any]:
+    if not isinstance(value, list) or len(value) != len(names):
+        raise ValueError(f"{where} needs a {part} for each of {names}, got {_brief(value)}.")
+    return value
+
+
+def _check_keys(where: str, entry: Any, needed: set[str], allowed: set[str]) -> None:
+    _expect(entry, dict, where, "an object in braces")
+    missing, unknown = needed - set(entry), set(entry) - needed - allowed
+    if missing:
+        raise ValueError(f"{where}: {sorted(missing)} missing.")
+    if unknown:
+        raise ValueError(
+            f"{where}: unknown {sorted(unknown)}; known are {sorted(needed | allowed)}."
+        )
+
+
+def _number(value: Any, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{where}: expected a number, got {_brief(value)}.")
+    try:
+        return float(value)
+    except OverflowError as error:
+        raise ValueError(f"{where}: the number is too large.") from error
+
+
+def _pair(value: Any, where: str) -> tuple[float, float]:
+    if not isinstance(value, list) or len(value) != 2:
+        raise ValueError(f"{where}: expected [low, high], got {_brief(value)}.")
+    return _number(value[0], where), _number(value[1], where)
+
+
+def shortened(error: ValueError) -> str:
+    """An error's message, which may quote a name of any length."""
+    text = str(error)
+    return text if len(text) <= 500 else text[:497] + "..."
+
+
+def _brief(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _described(variables: tuple[Variable, ...]) -> dict[str, Any]:
+    return {
+        variable.name: {
+            "unit": variable.unit,
+            "universe": list(variable.universe),
+            "sets": {
+                term.name: {"shape": term.shape, "parameters": list(term.parameters)}
+                for term in variable.sets
+            },
+        }
+        for variable in variables
+    }
+
+
+def _table(rules: RuleBase) -> dict[str, Any] | None:
+    """The table of a full grid of two inputs with rules in its order, else None."""
+    if len(rules.inputs) != 2 or "columns" in rules.inputs[1].terms:
+        return None
+    columns, rows = rules.inputs
+    in_order = [(column, row) for row in rows.terms for column in columns.terms]
+    if [rule.given for rule in rules.rules] != in_order:
+        return None
+    if any(rule.weight != 1.0 or ANY in rule.then for rule in rules.rules):
+        return None
+    cells = {rule.given: list(rule.then) for rule in rules.rules}
+    lines = {row: [cells[column, row] for column in columns.terms] for row in rows.terms}
+    return {"columns": columns.name, **lines}
+
+
+def _dump(value: Any, indent: str) -> str:
+    """JSON with a line for every entry, but sets, rules and rows of the table in one line."""
+    deeper = f"{indent}  "
+    if isinstance(value, dict) and not {"shape", "if"} & value.keys():
+        lines = [f"{deeper}{json.dumps(key)}: {_dump(v, deeper)}" for key, v in value.items()]
+        return "{\n" + ",\n".join(lines) + f"\n{indent}}}"
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        return "[\n" + ",\n".join(deeper + _dump(v, deeper) for v in value) + f"\n{indent}]"
+    return json.dumps(value)
+
+
+def _check_terms(where: str, terms: tuple[str, ...], variables: tuple[Variable, ...]) -> None:
+    if len(terms) != len(variables):
+        raise ValueError(
+            f"{where} names {len(terms)} terms for {len(variables)} variables "
+            f"{[variable.name for variable in variables]}; write {ANY!r} for any."
+        )
+    for term, variable in zip(terms, variables, strict=True):
+        if term != ANY and term not in variable.terms:
+            raise ValueError(
+                f"{where}: unknown term {term!r} of {variable.name!r}; it has {variable.terms}."
+            )
+    if all(term == ANY for term in terms):
+        raise ValueError(f"{where}: at least one variable must have a term.")
+
+
+def _refuse_duplicates(where: str, names: list[str]) -> None:
+    for index, name in enumerate(names):
+        if name in names[:index]:
+            raise ValueError(f"{where}: {name!r} comes twice; names must be unique.")
