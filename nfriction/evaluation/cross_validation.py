@@ -268,6 +268,8 @@ def choose(candidates: Sequence[Candidate], unit: str = "rad") -> tuple[str, str
     others = sorted((c for c in candidates if c is not best), key=lambda c: c.error)
     if not others:
         return best.name, "it is the only model."
+    if math.isinf(others[0].error):
+        return best.name, "every other model diverged on a block left out."
     return best.name, (
         f"its error on blocks left out, {error(best)}, is the least; {others[0].name} follows "
         f"with {error(others[0])}."
