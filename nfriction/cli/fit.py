@@ -18,8 +18,7 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
         description="Fit one friction model to recordings and write it as a model file.",
     )  # fmt: skip
     parser.add_argument("recordings", nargs="+", type=names.file, metavar="RECORDING",
-                        help="with columns time, q1, ... (.csv, .parquet, .npz, .mat, .h5, .mf4)"
-                        )  # fmt: skip
+                        help=f"with columns time, q1, ... ({names.FORMATS})")  # fmt: skip
     parser.add_argument("--model", type=names.model, default="NFLFM",
                         help=f"one of {', '.join(names.MODELS)}")  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path("model.json"), help="model file to write")

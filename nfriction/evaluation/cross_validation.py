@@ -126,11 +126,11 @@ def select(
 
     Every recording is cut into as many blocks of time as there are folds. Each fold leaves one
     block of every recording out, fits all models to the rest and simulates the blocks left out;
-    where encoders were zeroed anew for each recording, with the offsets estimated from the rest. A
-    model with fewer parameters is preferred where its error is statistically tied with the least
-    one: within 2 %, or within the standard error of the difference over blocks, both of their mean
-    squares and of the logarithms: one block of violent motion must not hide that it is worse on
-    all others.
+    where encoders were zeroed at the start of each recording, with the offsets estimated from the
+    rest. A model with fewer parameters is preferred where its error is statistically tied with the
+    least one: within 2 %, or within the standard error of the difference over blocks, both of their
+    mean squares and of the logarithms: one block of violent motion must not hide that it is worse
+    on all others.
 
     Args:
         plant, models, progress, jobs, fit_settings: as in `compare`.
@@ -209,8 +209,8 @@ def with_fitted_offsets(found: FitResult, blocks: Sequence[TimeBlock]) -> list[T
     recordings, motions = apply_encoder_offsets(
         found.encoder_offsets,
         found.plant,
-        [b.recording for b in blocks],
-        [b.motion for b in blocks],
+        [block.recording for block in blocks],
+        [block.motion for block in blocks],
     )
     return [TimeBlock(*pair) for pair in zip(recordings, motions, strict=True)]
 
@@ -268,6 +268,8 @@ def choose(candidates: Sequence[Candidate], unit: str = "rad") -> tuple[str, str
     others = sorted((c for c in candidates if c is not best), key=lambda c: c.error)
     if not others:
         return best.name, "it is the only model."
+    if math.isinf(others[0].error):
+        return best.name, "every other model diverged on a block left out."
     return best.name, (
         f"its error on blocks left out, {error(best)}, is the least; {others[0].name} follows "
         f"with {error(others[0])}."

@@ -87,9 +87,8 @@ def _figures(
     last = list(comparison.fits.values())[-1]
     moved = last.motions
     if last.encoder_offsets:
-        moved = tuple(
-            replace(m, q=m.q + z) for m, z in zip(moved, last.encoder_offsets, strict=True)
-        )
+        pairs = zip(moved, last.encoder_offsets, strict=True)
+        moved = tuple(replace(m, q=m.q + offset) for m, offset in pairs)
     order = [s.recording for s in next(iter(comparison.train.values()))]
     trained = dict(zip(order, moved, strict=True))
     given = [r for r in recordings if r.name in trained]

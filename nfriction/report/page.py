@@ -7,6 +7,7 @@ values that it shows.
 import base64
 import hashlib
 import math
+import re
 import shlex
 from collections.abc import Iterator, Sequence
 from importlib import resources
@@ -100,7 +101,7 @@ def _fit(run: Run, name: str) -> dict[str, Any]:
     """The record of a fit, its warnings and its tables."""
     fit, joints = run.fits[name], run.comparison.joint_names
     warnings = [*fit.warnings]
-    for what, names in (("At a bound", fit.at_bounds), ("Not identifiable", fit.lost)):
+    for what, names in (("At a bound", fit.at_bounds), ("Not identifiable", fit.unidentifiable)):
         # Most fits warn of them, and say more.
         silent = [name for name in names if not any(name in warning for warning in fit.warnings)]
         if silent:
@@ -124,7 +125,7 @@ def _fit(run: Run, name: str) -> dict[str, Any]:
     return {
         "name": name,
         "record": fit,
-        "status": fit.status.split(": ", 1)[-1].rstrip(".") + ".",
+        "reason": re.sub(r"^(not )?converged\W*", "", fit.status, flags=re.IGNORECASE),
         "warnings": list(dict.fromkeys(warnings)),
         "tables": tables,
     }

@@ -51,7 +51,7 @@ class FitRecord:
     residual_unit: str = ""
     at_bounds: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-    lost: tuple[str, ...] = ()
+    unidentifiable: tuple[str, ...] = ()
     plant: dict[str, float] = field(default_factory=dict)
     intervals: dict[str, tuple[float, float]] = field(default_factory=dict)
 
@@ -139,7 +139,7 @@ def _run(folder: Path, content: dict[str, Any]) -> Run:
         raise _EntryError("its best model is none of its models")
     tied = best.get("indistinguishable" if schema > 1 else "alike", [])
     recordings = _read(dict[str, dict[str, str]], content.get("recordings", {}), "`recordings`")
-    fits = {n: _read(FitRecord, e["fit"], f"fit of {n}") for n, e in entries.items() if "fit" in e}
+    fits = {n: _fit(e["fit"], f"fit of {n}") for n, e in entries.items() if "fit" in e}
     models, notes = _models(folder, fits, len(joints))
     figures, unread = read_figures(folder / "figures")
     failed = _read(dict[str, str], content.get("failed", {}), "`failed`")
@@ -193,6 +193,14 @@ def _scores(
     if len({tuple((s.recording, *s.windows) for s in many) for many in found.values()}) > 1:
         raise _EntryError(f"its models were scored on different recordings ({key})")
     return {name: many for name, many in found.items() if many}
+
+
+def _fit(value: Any, where: str) -> FitRecord:
+    entry = _read(dict[str, Any], value, where)
+    # The first schema's name of it.
+    known = {"unidentifiable": entry.get("lost", [])} | entry
+    fit: FitRecord = _read(FitRecord, known, where)
+    return fit
 
 
 def _selection(value: Any, unit: str) -> Selection | None:

@@ -41,7 +41,7 @@ def compare(bench: Path, out: Path, *more: str, models: str = "NCFM") -> int:
 
 
 def results(out: Path) -> dict:
-    """What a comparison wrote to `results.json`, which must be strict JSON."""
+    """Content of the `results.json` of a comparison, which must be strict JSON."""
 
     def refuse(word: str) -> None:
         raise AssertionError(f"{word} is no JSON")

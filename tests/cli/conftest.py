@@ -21,7 +21,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def compared(bench: Path) -> Path:
-    """What a comparison of two models left."""
+    """Folder of a comparison of two models."""
     out = bench / "out"
     assert compare(bench, out, models="NCFM,LFM") == 0
     return out

@@ -1,4 +1,4 @@
-"""What a comparison leaves in its folder, where models diverge or cannot be exported."""
+"""A comparison writes its folder, also where models diverge or cannot be exported."""
 
 import dataclasses
 import json

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nfriction import LFM, NLFM, PendulumChain, Recording, fit, rollout
-from nfriction.evaluation.cross_validation import block_errors, leave_blocks_out
+from nfriction.evaluation.cross_validation import block_errors, blocked_k_fold
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.models import CFM, CVFM, NFCVFM, FrictionModel
 from nfriction.papers.afem.models import ACVFM
@@ -119,13 +119,13 @@ def test_a_block_left_out_has_the_zero_of_its_recording():
     truth, off = CVFM(2, DRY, v_smooth=V_SMOOTH), ([0.06, -0.08], [-0.03, 0.05])
     recordings = [driven(plant, truth, seed) for seed in (0, 1)]
     moved = [replace(r, q=r.q - o) for r, o in zip(recordings, off, strict=True)]
-    splits = [leave_blocks_out(plant, r, 3)[1] for r in moved]
-    seen = [split.seen.recording for split in splits]
+    splits = [blocked_k_fold(plant, r, 3)[1] for r in moved]
+    seen = [split.train.recording for split in splits]
     found = fit(
         CVFM(2, v_smooth=V_SMOOTH), plant, seen, windows=(1.0,), encoder_reference="per_recording"
     )
     np.testing.assert_allclose(found.encoder_offsets, off, atol=3e-3)
-    blocks = [split.unseen for split in splits]
+    blocks = [split.test for split in splits]
     for error, block in zip(block_errors(found, blocks, 1.0), blocks, strict=True):
         assert error < 2e-3
         assert block_errors(replace(found, encoder_offsets=()), [block], 1.0)[0] > 5 * error

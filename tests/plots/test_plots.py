@@ -328,7 +328,7 @@ def rc_params() -> dict:
 def test_save_all_writes_every_figure_and_leaves_matplotlib_alone(tmp_path):
     plant, recording, motion = axis_data(NCFM(1, [3.0]))
     unseen = swing(1, "m", name="unseen")
-    found = fit(NCFM(1), plant, recording, method="torque", motions=[motion])
+    found = fit(NCFM(1), plant, recording, method="equation_error", motions=[motion])
     fits = {"NCFM": found, "NFNCFM": replace(found, model=NFNCFM(1))}
     train, test = (
         {n: [score_of(r, 0.01)] for n in (NO_FRICTION, *fits)} for r in (recording, unseen)

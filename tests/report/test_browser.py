@@ -78,7 +78,7 @@ addEventListener("load", async () => {
 
 @pytest.fixture(scope="module")
 def looks(tmp_path_factory: pytest.TempPathFactory) -> list[dict]:
-    """What the probe saw on a phone and on a desktop."""
+    """Findings of the probe on a phone and on a desktop."""
     folder = tmp_path_factory.mktemp("browser")
     page = escape(to_html(read_run(write(folder / "run"))))
     frames = "".join(

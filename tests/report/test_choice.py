@@ -1,4 +1,4 @@
-"""What the training data alone would choose, and what could not be fitted, on the page."""
+"""The choice on training data alone, and failed models, on the page."""
 
 import json
 import math

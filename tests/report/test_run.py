@@ -107,14 +107,17 @@ def paths(value: object, at: tuple = ()) -> list[tuple]:
 
 
 def test_results_of_the_first_schema_are_read(tmp_path):
-    """They had `held_out` for `test` and `alike` for `indistinguishable`, and no number."""
+    """They had `held_out` for `test` and `alike` for `indistinguishable`."""
     content = results()
     del content["schema"]
     for of in (*content["models"].values(), content["recordings"]):
         of["held_out"] = of.pop("test")
+    for fit in (of["fit"] for of in content["models"].values() if "fit" in of):
+        fit["lost"] = fit.pop("unidentifiable")
     content["best"]["alike"] = content["best"].pop("indistinguishable")
     today, then = read_run(write(tmp_path / "2")), read_run(write(tmp_path / "1", content))
     assert then.comparison.to_dict() == today.comparison.to_dict()
+    assert then.fits == today.fits
     assert (then.recordings, then.indistinguishable) == (today.recordings, today.indistinguishable)
     figures = tmp_path / "1" / "figures"
     (figures / "rmse_test.png").rename(figures / "rmse_held_out.png")

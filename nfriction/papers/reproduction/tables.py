@@ -197,11 +197,7 @@ def _beside(ours: pd.DataFrame, theirs: pd.DataFrame) -> pd.DataFrame:
 
 def order(workspace: Workspace) -> Order:
     """Verdict on the papers' order of models on test releases, joint by joint."""
-    return order_of(rmse(workspace, NINE))
-
-
-def order_of(table: pd.DataFrame) -> Order:
-    """The same for a table of errors with a row for each of the nine models."""
+    table = rmse(workspace, NINE)
     error = {str(model): np.asarray(table.loc[model], dtype=float) for model in table.index}
     broken = [
         f"{better} {1e3 * e:.4g} > {worse} {1e3 * limit:.4g} mrad on {joint}"

@@ -1,4 +1,4 @@
-"""Many fits: an order that lets most go at once, results that do not depend on how many did."""
+"""Many fits: an order that lets most run at once, results that do not depend on the processes."""
 
 import logging
 from itertools import permutations
@@ -50,7 +50,7 @@ def test_networks_and_classes_start_from_the_constant_fit_of_their_law() -> None
 
 
 def same(one: FitResult, other: FitResult) -> bool:
-    """Whether two fits are the same to the last bit."""
+    """True where two fits are the same to the last bit."""
     pairs = zip(one.model.state_dict().values(), other.model.state_dict().values(), strict=True)
     return one.to_dict() == other.to_dict() and all(torch.equal(a, b) for a, b in pairs)
 
