@@ -75,9 +75,8 @@ def papers_neuro_fuzzy(
         network="rbf",
     )
     assert isinstance(model.schedule, RBFCoefficients)
-    inputs = torch.stack(
-        [torch.stack([end(c) for c in controllers]) for end in (_lower_inputs, _upper_inputs)]
-    )
+    ends = [torch.stack([c.lower, c.upper]) * c.si_factor for c in controllers]
+    inputs = torch.stack(ends, 1)
     outputs = torch.tensor([[v.universe for v in c.rule_base.outputs] for c in controllers])
     model.schedule.set_network(network, inputs, outputs.to(inputs).permute(2, 0, 1))
     return model.requires_grad_(False)
@@ -177,14 +176,6 @@ def _spanned(
         shares = [(1.0 - b, 1.0 - a) for a, b in reversed(shares)]
         terms = terms[::-1]
     return terms, [(start + width * a, start + width * b) for a, b in shares]
-
-
-def _lower_inputs(controller: MamdaniController) -> Tensor:
-    return controller.lower * controller.si_factor
-
-
-def _upper_inputs(controller: MamdaniController) -> Tensor:
-    return controller.upper * controller.si_factor
 
 
 def _neuro_fuzzy_class(law: Law) -> type[NeuroFuzzyModel]:
