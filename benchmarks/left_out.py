@@ -15,7 +15,8 @@ from single_shooting import single_shooting
 from nfriction import Recording, rigs
 from nfriction.evaluation.cross_validation import TimeBlock, blocked_k_fold, with_fitted_offsets
 from nfriction.evaluation.score import score
-from nfriction.fitting.fit import Zeroed, fit
+from nfriction.fitting.fit import fit
+from nfriction.fitting.options import EncoderReference
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.models import FrictionModel
@@ -29,8 +30,8 @@ class Set(NamedTuple):
     """Recordings of one mechanism: folder, files, plant, what is aimed at, unit in the table.
 
     `target` is the free run's error and that of 5 s windows; of recordings kept apart, which the
-    folder does not hold. `zeroed` is when the encoders were: recordings that all begin at rest at 0
-    were zeroed anew.
+    folder does not hold. `encoder_reference` is that of the fit: encoders of recordings that all
+    begin at rest at 0 were zeroed at the start of each.
     """
 
     folder: str
@@ -38,7 +39,7 @@ class Set(NamedTuple):
     plant: Callable[[], Plant]
     target: tuple[float, float] = (math.nan, math.nan)
     unit: str = "mrad"
-    zeroed: Zeroed = "once"
+    encoder_reference: EncoderReference = "shared"
 
 
 SETS = {
@@ -49,11 +50,11 @@ SETS = {
     "triple": Set("multiarm_pendulum", ("triple_b0", "triple_b2"), rigs.multiarm_triple,
                   (2.0, 1.2)),
     "C1": Set("dfki_double_pendulum", ("C1_143339", "C1_143601", "C1_143747", "C1_144003"),
-              lambda: rigs.dfki("C1"), (54.0, math.nan), zeroed="each"),
+              lambda: rigs.dfki("C1"), (54.0, math.nan), encoder_reference="per_recording"),
     "C0": Set("dfki_double_pendulum", ("C0_00", "C0_02", "C0_04", "C0_06"),
-              lambda: rigs.dfki("C0"), (40.0, math.nan), zeroed="each"),
+              lambda: rigs.dfki("C0"), (40.0, math.nan), encoder_reference="per_recording"),
     "A0": Set("dfki_double_pendulum", ("A0_00", "A0_02", "A0_12"), lambda: rigs.dfki("A0"),
-              (85.0, math.nan), zeroed="each"),
+              (85.0, math.nan), encoder_reference="per_recording"),
     "emps": Set("emps", ("emps_first",), rigs.emps, (4.0, math.nan), "mm"),
     "xl330": Set("xl330_servo_pendulum", ("drop_kp100", "drop_kp400"), rigs.xl330,
                  (18.0, math.nan)),
@@ -146,8 +147,13 @@ def real(
                 start = time.process_time()
                 model = model_by_name(m)(plant.joints)
                 before = nearest_fit(fits, model)
-                fits.append(fit(model, plant, fold.fitted, start=before, zeroed=of.zeroed,
-                                motions=before.motions if before else None))  # fmt: skip
+                known = before.motions if before else None
+                fits.append(
+                    fit(
+                        model, plant, fold.fitted, start=before, motions=known,
+                        encoder_reference=of.encoder_reference,
+                    )
+                )  # fmt: skip
                 left = fold.left if blocks == 1 else with_fitted_offsets(fits[-1], fold.left)
                 rows[m].add(start, fits[-1].plant, model, left)
             # The peer knows no gaps and one zero for all.

@@ -14,7 +14,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("runs/fit_a_recording"))
     arguments = parser.parse_args(argv)
 
-    # A simulated rig stands in for yours; its files are as an encoder log would be.
+    # A simulated rig in place of yours; its files look like an encoder log.
     simulated = twin.make("tlrip", duration=2.0 if arguments.quick else 10.0)
     files = {}
     for part in ("train", "test"):

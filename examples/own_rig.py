@@ -9,7 +9,7 @@ import torch
 
 from nfriction import LFM, PendulumChain, Recording, fit, rigs, rollout
 
-# As a data sheet tells it; angles are absolute, counted from hanging.
+# Data-sheet values; angles are absolute, measured from hanging.
 BENCH = PendulumChain(
     mass=[0.15, 0.10], length=[0.30, 0.20], com=[0.15, 0.10], inertia=[1.1e-3, 3.3e-4],
     name="bench", convention=("absolute", "hanging"), position_quantum=np.pi / 4096,
@@ -43,7 +43,7 @@ TRUTH = np.array([[6e-4, 2e-3], [2e-4, 5e-4]])
 
 
 def write_log(path: Path, seconds: float) -> None:
-    """What a logger with German settings writes of a release from rest."""
+    """Write a release from rest as a logger with German settings does."""
     q0 = torch.tensor([np.pi + 1.2, 0.4], dtype=torch.float64)  # joints: relative, from upright
     friction = LFM(2, TRUTH.tolist()).requires_grad_(False)
     run = rollout(BENCH, friction, q0, 0 * q0, sample_time=2e-3, steps=round(seconds / 2e-3))

@@ -7,7 +7,6 @@ from nfriction import LFM, LinearAxis
 from nfriction.codegen import NoBackend
 from nfriction.fitting.plant_parameters import adjusted_buffers, plant_parameters
 from nfriction.fitting.shooting.sensitivity import CHUNK, StepJacobian, Trajectory, propagate
-from nfriction.friction.models import MODELS
 from nfriction.friction.registry import model_by_name
 from nfriction.simulation.rk4 import rk4_step
 from nfriction.simulation.rollout import integrate
@@ -55,7 +54,7 @@ CASES = {
 def test_compiled_and_eager_and_autograd_agree(case, law, monkeypatch):
     plant, settings = CASES[case]
     terms = plant_parameters(plant, **settings)
-    model = MODELS[law](plant.joints, v_smooth=0.5)
+    model = model_by_name(law)(plant.joints, v_smooth=0.5)
     k = len(model.law.coefficients)
     given = samples(plant.joints, k, len(terms))
     compiled = StepJacobian(plant, model, terms)
@@ -80,7 +79,7 @@ def test_compiled_and_eager_and_autograd_agree(case, law, monkeypatch):
 
 def test_eager_pieces_do_not_show(monkeypatch):
     """More samples than are linearised together give the same derivatives."""
-    plant, model = LinearAxis(2.0), MODELS["NCFM"](1)
+    plant, model = LinearAxis(2.0), model_by_name("NCFM")(1)
     terms = plant_parameters(plant, driven=(0,), largest_torque=1.0)
     given = samples(1, 1, len(terms), count=CHUNK + 3)
     found = without_compiler(monkeypatch, plant, model, terms)(*given)

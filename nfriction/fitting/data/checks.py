@@ -28,7 +28,7 @@ ROUNDING = 1e-9
 def looks_zeroed_per_recording(
     plant: Plant, recordings: Sequence[Recording], options: FitOptions = DEFAULTS
 ) -> bool:
-    """Whether encoders seem to have been set to zero at the start of each recording.
+    """True if encoders seem to have been set to zero at the start of each recording.
 
     Dry friction holds links wherever they stop. Where a driven chain begins several recordings at
     rest, and all its encoders read zero each time, they were set to it.

@@ -122,7 +122,7 @@ def largest_torques(joint: Sequence[Recording]) -> NDArray[np.float64]:
 
 
 def is_undriven_pendulum(plant: Plant, joint: Sequence[Recording]) -> bool:
-    """Whether nothing drives a chain on a fixed pivot."""
+    """True for a chain on a fixed pivot without any torque."""
     fixed = isinstance(plant, PendulumChain) and not plant.first_link
     return fixed and not largest_torques(joint).any()
 

@@ -118,6 +118,6 @@ def _cut(recording: Recording, length: float) -> Iterator[tuple[int, int]]:
 
 
 def begins_at_rest(recording: Recording, rest_speed: float) -> bool:
-    """Whether the first sample is slower than `rest_speed` [rad/s]."""
+    """True if the first sample is slower than `rest_speed` [rad/s]."""
     moved = np.abs(recording.q[1] - recording.q[0]).max()
     return bool(moved <= rest_speed * (recording.time[1] - recording.time[0]))

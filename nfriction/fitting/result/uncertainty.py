@@ -1,4 +1,4 @@
-"""How far the data leave a schedule's coefficients open, wherever the motion may be."""
+"""Uncertainty of a schedule's coefficients at any motion."""
 
 from dataclasses import dataclass
 
@@ -20,8 +20,8 @@ class CoefficientUncertainty:
 
     Attributes:
         schedule: whose parameters these are.
-        root: R of their covariance R R^T, (parameter, any); rows are infinite where the data tell
-            nothing, zero where nothing was fitted.
+        root: R of their covariance R R^T, (parameter, any); rows are infinite for
+            unidentifiable parameters, zero for parameters that were not fitted.
     """
 
     schedule: Schedule

@@ -69,7 +69,7 @@ class DecisionVariables:
 
     @property
     def state_count(self) -> int:
-        """Of one window."""
+        """Number of initial-state variables of one window."""
         return 2 * self.windows.q0.shape[-1]
 
     @property

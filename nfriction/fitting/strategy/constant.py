@@ -109,7 +109,7 @@ def known_terms(start: FitResult | None, terms: Sequence[PlantParameter]) -> Ten
 
 
 def fits_eccentricity(options: FitOptions, start: FitResult | None) -> bool:
-    """Whether a search has encoder terms: as asked, or `"auto"` if an earlier fit has them."""
+    """True if a search has encoder terms: `"on"`, or `"auto"` after a fit that has them."""
     terms = start.plant_terms if start else ()
     found = any(name.startswith("encoder ") for name, _, _ in terms)
     return options.eccentricity == "on" or (options.eccentricity == "auto" and found)
@@ -118,7 +118,7 @@ def fits_eccentricity(options: FitOptions, start: FitResult | None) -> bool:
 def is_constant_fit(
     start: FitResult | None, model: FrictionModel, continuity: Continuity = "none"
 ) -> TypeGuard[FitResult]:
-    """Whether a fit is an output-error fit of the model's law with constant coefficients."""
+    """True for an output-error fit of the model's law with constant coefficients."""
     return (
         start is not None
         and start.model.law == model.law
@@ -138,7 +138,7 @@ def constant_start(task: FitTask) -> FitResult:
 
 
 def _offsets_match(start: FitResult, task: FitTask) -> bool:
-    """Whether a fit has encoder offsets of just these recordings, or none where none are sought."""
+    """True if a fit has encoder offsets of just these recordings, or rightly none."""
     if not task.per_recording:
         return not start.encoder_offsets
     pairs = zip(start.motions, task.motions, strict=False)

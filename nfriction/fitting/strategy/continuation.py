@@ -45,7 +45,7 @@ class HorizonResult:
 
     @property
     def stopped(self) -> bool:
-        """Whether the caller stopped the search."""
+        """True if the caller stopped the search."""
         return self.result.status == "stopped"
 
     @cached_property
@@ -54,7 +54,7 @@ class HorizonResult:
         return effective_noise(self.residuals)
 
     def lost_motion(self, before: "HorizonResult", options: FitOptions) -> bool:
-        """Whether the motion forgets its start within the longer windows."""
+        """True if the longer windows only show that the motion forgets its start within them."""
         rms = [float(found.residuals.square().mean().sqrt()) for found in (before, self)]
         return not rms[1] <= options.max_growth * rms[0] and not self.result.converged
 

@@ -38,7 +38,7 @@ SearchMethod = Literal["pattern", "sqp"]
 DIFFERENCE = 1e-6
 # Cost of a diverged candidate in a gradient, relative to the start: finite, but beyond all others.
 DIVERGED = 1e6
-# Stands in for zero as the lower bound of a logarithmic variable.
+# Lower bound of a logarithmic variable, in place of zero.
 TINY = 1e-300
 
 
@@ -147,7 +147,7 @@ class Box:
         return vectors
 
     def scaling(self) -> VariableScaling:
-        """Of the free variables."""
+        """Scaling of the free variables."""
         free, log = self.free, self.logarithmic
         lower = torch.where(log, self.lower.clamp_min(TINY), self.lower)
         return VariableScaling.build(

@@ -157,7 +157,7 @@ class AdaptiveNeuroFuzzy(Schedule):
         return self.deviation.bounds()
 
     def prior(self) -> tuple[Tensor, Tensor]:
-        """Of the network: zero, where the adaptive schedule is all there is."""
+        """Parameters of the network: zero for the adaptive schedule alone."""
         return self.deviation.prior()
 
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
