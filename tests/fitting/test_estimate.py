@@ -30,7 +30,6 @@ from nfriction.fitting.strategy.continuation import HorizonResult
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import STRIBECK
 from nfriction.friction.models import FrictionModel
-from nfriction.papers.afem.fit_adaptive import fit_adaptive
 from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import F64, driven_axis, pendulum, swing
 
@@ -327,10 +326,10 @@ def test_what_does_not_match_is_refused():
     ):
         with pytest.raises(ValueError, match=message):
             fit(*arguments)
-    for model, fitting in ((LFM, fit), (NFLFM, fit), (ALFM, fit), (ALFM, fit_adaptive)):
+    for model in (LFM, NFLFM, ALFM):
         for windows in ((), 2.0, np.array(0.5), (-1.0,), (np.inf,), ("1",), "12"):
             with pytest.raises(ValueError, match=r"`windows` must be positive lengths \[s\]"):
-                fitting(model(2), pendulum(), recording, windows=windows)
+                fit(model(2), pendulum(), recording, windows=windows)
 
 
 def test_a_constant_fit_that_others_ask_for_has_the_defaults_of_fit():
@@ -468,7 +467,7 @@ def test_stribeck_friction_is_found_again_on_a_plant_that_is_a_tenth_off():
 
 def mine(joints, **settings):
     """A law of one's own that does not say what it contains."""
-    law = replace(STRIBECK, name="mine", simpler=None, shared=())
+    law = replace(STRIBECK, name="mine", nested_law=None, nested_coefficients=())
     return FrictionModel(law, Constant(law, joints), **settings)
 
 
@@ -501,7 +500,7 @@ def test_a_search_in_vain_from_the_simpler_law_leaves_the_model_as_it_was(monkey
     def by_torque(law, plant, *rest):
         found = fit_torque(law, plant, *rest)
         if not simpler:
-            simpler.extend([1] if law.simpler is None else [])
+            simpler.extend([1] if law.nested_law is None else [])
             return found
         return replace(found, coefficients=torch.tensor(POOR, dtype=F64))
 
@@ -523,7 +522,7 @@ def test_a_law_leaves_no_more_over_than_the_simpler_one_in_it(law, monkeypatch):
 
     def by_torque(law, plant, *rest):
         found = fit_torque(law, plant, *rest)
-        if law.simpler is None:
+        if law.nested_law is None:
             return found
         return replace(found, coefficients=0 * found.coefficients + 10.0)
 

@@ -8,6 +8,7 @@ from nfriction.codegen import NoBackend
 from nfriction.fitting.plant_parameters import adjusted_buffers, plant_parameters
 from nfriction.fitting.shooting.sensitivity import CHUNK, StepJacobian, Trajectory, propagate
 from nfriction.friction.registry import model_by_name
+from nfriction.simulation.protocols import RolloutInputs
 from nfriction.simulation.rk4 import rk4_step
 from nfriction.simulation.rollout import integrate
 from tests.fitting.recordings import F64, pendulum
@@ -124,7 +125,7 @@ def rows_of(name, steps, substeps, stride):
     plant, model = pendulum(), model_by_name(name)(2, v_smooth=0.5)
     q0, qd0 = torch.ones(2, 2, dtype=F64), torch.zeros(2, 2, dtype=F64)
     tau, step = torch.zeros(2, steps, 2, dtype=F64), torch.full((2, steps), 1e-3, dtype=F64)
-    motion = integrate(plant, model, q0, qd0, tau, step)
+    motion = integrate(plant, model, RolloutInputs(q0, qd0, tau, step))
     run = Trajectory(model, torch.zeros(0, dtype=F64), motion, tau, step)
     pieces = list(propagate(StepJacobian(plant, model, []), run, substeps, stride))
     samples = [k for part, _ in pieces for k in range(steps // substeps + 1)[part]]
