@@ -53,8 +53,8 @@ from nfriction.papers import twin as twins
 
 PROGRAM = (sys.executable, "-m", "nfriction")
 TEST_RECORDINGS, INITIAL_STATES = "--test", "--initial-states"
-TEST_KIND, FREE_RUN = "held out", "free run"  # as `table.csv` says
-EQUATION_ERROR = {"method": "torque"}
+TEST_PART, FREE_RUN = "test", "free run"  # as `table.csv` says
+EQUATION_ERROR = {"method": "equation_error"}
 
 
 def coverage_command(data: Path) -> list[str]:
@@ -294,7 +294,7 @@ def compared(*arguments: str, digits: int = 3) -> Iterator[Row]:
     with tempfile.TemporaryDirectory() as folder:
         command(*PROGRAM, *arguments, "--no-figures", "--out", folder)
         table = pd.read_csv(Path(folder) / "table.csv")
-    table = table[(table.kind == TEST_KIND) & (table.joint == "all")]
+    table = table[(table.part == TEST_PART) & (table.joint == "all")]
     for (model, horizon), part in table.groupby(["model", "horizon"], sort=False):
         over_recordings = 1e3 * math.sqrt(np.mean(np.square(part.iloc[:, -1])))
         label = FREE_RUN if horizon == FREE_RUN else f"{float(horizon):g} s"
