@@ -154,17 +154,6 @@ def even_centres(terms: list[int], lower: Tensor, upper: Tensor) -> list[Tensor]
     return centres
 
 
-def quantile_centres(terms: list[int], samples: Tensor) -> list[Tensor]:
-    """Evenly spaced quantiles of samples (samples, groups, inputs), extremes included."""
-    centres = []
-    for i, count in enumerate(terms):
-        # By sorting, since `torch.quantile` refuses large inputs.
-        ascending = samples[:, :, i].sort(0).values
-        ranks = (_fractions(count) * (len(ascending) - 1)).round().long()
-        centres.append(ascending[ranks.to(samples.device)].T)
-    return centres
-
-
 def crossing_half_widths(centres: list[Tensor], span: Tensor) -> list[Tensor]:
     """Half-widths by which neighbours overlap at 0.5 or more: half of the wider adjacent gap.
 

@@ -175,19 +175,18 @@ class RBFNetwork(LinearOutputModule):
         self.log_widths.copy_((0.5 * span).log().expand_as(self.centres))
 
     @torch.no_grad()
-    def init_kmeans(self, x: Tensor, seed: int = 0, overlap: float = 2.0) -> None:
-        """Centres by k-means; widths from the distance to the nearest other centres.
+    def init_kmeans(self, x: Tensor, seed: int = 0) -> None:
+        """Centres by k-means; widths twice the mean distance to the two nearest centres.
 
         Args:
             x: samples, shape (*batch, groups, inputs).
             seed: of the k-means++ start.
-            overlap: width over the mean distance to the two nearest centres.
         """
         samples = self._samples(x)
         for group in range(self.groups):
             centres = _kmeans(samples[:, group], self.units, seed)
             self.centres[group] = centres
-            self.log_widths[group] = _nearest_spread(centres, samples[:, group], overlap).log()
+            self.log_widths[group] = _nearest_spread(centres, samples[:, group]).log()
 
     @torch.no_grad()
     def init_ols(self, x: Tensor, y: Tensor, width: float = 1.5) -> None:
@@ -207,13 +206,7 @@ class RBFNetwork(LinearOutputModule):
             self.log_widths[group] = scale.log().expand_as(centres)
 
     @torch.no_grad()
-    def solve_output(
-        self,
-        x: Tensor,
-        y: Tensor,
-        prior_precision: float | Tensor = 1e-6,
-        prior: Tensor | None = None,
-    ) -> None:
+    def solve_output(self, x: Tensor, y: Tensor, prior_precision: float | Tensor = 1e-6) -> None:
         """Set weights and bias to the least-squares optimum for the present units, in place.
 
         Args:
@@ -221,12 +214,10 @@ class RBFNetwork(LinearOutputModule):
             y: wanted outputs, shape (*batch, groups, outputs).
             prior_precision: over the noise precision; a number or broadcastable to (groups,
                 units + 1).
-            prior: (groups, outputs, units + 1), weight then bias, to shrink toward; default zero.
         """
         features = self.regressors(x).reshape(-1, self.groups, self.units + 1)
         targets = y.reshape(-1, self.groups, self.outputs)
-        start = features.new_zeros(1, 1, 1) if prior is None else prior.mT
-        layer = ridge(features, targets, prior_precision, start).mT
+        layer = ridge(features, targets, prior_precision).mT
         self.output_weight.copy_(layer[..., :-1])
         self.output_bias.copy_(layer[..., -1])
 
@@ -251,18 +242,18 @@ def _kmeans(samples: Tensor, units: int, seed: int) -> Tensor:
     return torch.as_tensor(centres).to(samples) * scale
 
 
-def _nearest_spread(centres: Tensor, samples: Tensor, overlap: float, nearest: int = 2) -> Tensor:
-    """Widths proportional to the mean distance to the nearest other centres, (units, inputs).
+def _nearest_spread(centres: Tensor, samples: Tensor) -> Tensor:
+    """Widths twice the mean distance to the two nearest other centres, (units, inputs).
 
     Distances are in units of each input's standard deviation.
     """
     scale = samples.std(0)
     if len(centres) == 1:
-        return overlap * scale.expand_as(centres)
+        return 2 * scale.expand_as(centres)
     distance = torch.cdist(centres / scale, centres / scale)
     # The smallest distance is that of a centre to itself.
-    spread = distance.sort(1).values[:, 1 : nearest + 1].mean(1, keepdim=True)
-    return overlap * spread.clamp(min=1e-3) * scale
+    spread = distance.sort(1).values[:, 1:3].mean(1, keepdim=True)
+    return 2 * spread.clamp(min=1e-3) * scale
 
 
 def _selected(samples: Tensor, targets: Tensor, units: int, widths: Tensor) -> Tensor:

@@ -149,18 +149,6 @@ class Recording:
         first, last = np.searchsorted(self.time, [start - slack, stop + slack])
         return self[int(first) : int(last)]
 
-    def windows(self, length: float, stride: float | None = None) -> list[Recording]:
-        """Windows of `length` seconds, every `stride` seconds (`length` by default).
-
-        Windows in a row share the sample between them; what is left at the end is dropped.
-        """
-        stride = length if stride is None else stride
-        if not (length > 0 and stride > 0):
-            raise ValueError(f"`length` and `stride` must be positive, got {length} and {stride}.")
-        fitting = (self.duration - length + 1e-6 * self.sample_time) / stride
-        starts = self.time[0] + stride * np.arange(int(np.floor(fitting)) + 1)
-        return [self.window(start, start + length) for start in starts]
-
     def resolve_convention(self, plant: Mechanism) -> AngleConvention:
         """The recording's own convention, else the plant's; for sliding joints the default one.
 

@@ -236,7 +236,7 @@ def paper_controller(
     """
     if joint not in (2, 3, 4):
         raise ValueError(f"the paper has controllers for joints 2, 3 and 4, got {joint}.")
-    file = resources.files("nfriction.fuzzy") / "data" / f"joint{joint}.json"
+    file = resources.files("nfriction.papers.controller") / "data" / f"joint{joint}.json"
     rules = parse_rules(file.read_text(encoding="utf-8"), file.name)
     return MamdaniController(rules, points=points, centroid=centroid)
 

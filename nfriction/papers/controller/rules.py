@@ -1,6 +1,6 @@
 """Rule bases of fuzzy controllers: variables, their sets, rules; and the JSON files they come in.
 
-A file looks like this (see also `nfriction/fuzzy/data/`)::
+A file looks like this (see also `nfriction/papers/controller/data/`)::
 
     {
       "format": "nfriction-rules/1",
