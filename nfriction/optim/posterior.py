@@ -39,7 +39,6 @@ class EvidenceProblem:
         groups: group of each parameter, 0 ... groups - 1, int64, shape (p,).
         names: of the groups.
         squares: E_D alone, where that is cheaper; tries the steps.
-        log_weights: sum of the logarithms of the errors' weights.
     Raises:
         ValueError: no samples.
     """
@@ -50,7 +49,6 @@ class EvidenceProblem:
     groups: Tensor
     names: Sequence[str]
     squares: Callable[[Tensor], Tensor] | None = None
-    log_weights: float = 0.0
 
     def __post_init__(self) -> None:
         if self.samples < 1:
@@ -101,7 +99,7 @@ def posterior(
     log_evidence = (
         -beta * local.squares
         - alpha @ squares
-        + 0.5 * (problem.samples * math.log(beta / math.pi) + problem.log_weights)
+        + 0.5 * problem.samples * math.log(beta / math.pi)
         + 0.5 * sizes @ alpha.log()
         - 0.5 * log_determinant
     )
