@@ -15,6 +15,7 @@ from nfriction.fuzzy.partition import (
     even_centres,
 )
 
+# Rules are the product of the terms: a mistyped count would fill the memory.
 MAX_RULES = 100_000
 
 Range = float | Sequence[float] | Tensor
@@ -78,6 +79,7 @@ class Anfis(LinearOutputModule):
             if kind == "bell"
             else None
         )
+        # A linear function and its constant, or the constant alone.
         columns = inputs + 1 if order == 1 else 1
         self.consequents = nn.Parameter(
             torch.zeros(groups, outputs, self.rules, columns, dtype=dtype)
@@ -133,6 +135,7 @@ class Anfis(LinearOutputModule):
             width = widths[:, start : start + count]
             log_slopes = self.log_slopes
             if log_slopes is not None:
+                # As logarithms the trained numbers keep slopes and widths positive.
                 slope = torch.exp(log_slopes[:, start : start + count]).unsqueeze(-1)
                 logs.append(log_bell(u, c, width, slope))
             else:
@@ -212,6 +215,7 @@ class Anfis(LinearOutputModule):
         if self.log_slopes is not None:
             sets["log_slopes"] = torch.cat([torch.zeros_like(slopes).repeat(1, 2, 1), slopes], 1)
         for name, rows in sets.items():
+            # Gaussians have no columns for slopes, bells have.
             padded = torch.nn.functional.pad(rows, (0, 0, 0, own - rows.shape[1]))
             block = torch.einsum("ab,gce->gabce", output, padded).flatten(2, 3)
             blocks[name] = shared, block
@@ -281,12 +285,14 @@ class Anfis(LinearOutputModule):
         """
         packed_centres = self._pack("centres", centres)
         packed_widths = self._pack("widths", widths)
+        # Their logarithms are stored.
         if not bool((packed_widths > 0).all()):
             raise ValueError("`widths` must be positive.")
         pieces = packed_centres.split(self.terms, 1)
         low, high = self._range(
             torch.stack([c.amin(1) for c in pieces], 1) if lower is None else lower,
             torch.stack([c.amax(1) for c in pieces], 1) if upper is None else upper,
+            # Free sets ignore their range; one set alone has none.
             allow_equal=not self.interpretable,
         )
         self.partition.assign(packed_centres, packed_widths, low, high)

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor, nn
 
+# A block and its triangle then fit the cache.
 _ROWS_AT_ONCE = 8192
 
 
@@ -65,6 +66,7 @@ class GroupedModule(nn.Module):
         """
         x = x.detach().requires_grad_()
         with torch.enable_grad():
+            # Samples do not mix, so the gradient of a sum holds the derivative of each.
             sums = self(x).flatten(0, -2).sum(0)
             rows = [torch.autograd.grad(y, x, retain_graph=True)[0] for y in sums]
         return torch.stack(rows, 2).movedim(0, -1)
@@ -158,6 +160,7 @@ def ridge(features: Tensor, targets: Tensor, prior_precision: float | Tensor) ->
     # The prior adds rows whose targets are zero.
     rhs = torch.cat([rhs, rhs.new_zeros(groups, count, targets.shape[-1])], 1)
     U, singular, Vh = torch.linalg.svd(rows, full_matrices=False)
+    # Smaller singular values are rounding, and their inverse would be noise.
     floor = singular[:, :1] * count * torch.finfo(rows.dtype).eps
     inverse = torch.where(singular > floor, 1.0 / singular, torch.zeros_like(singular))
     return Vh.mT @ (inverse.unsqueeze(-1) * (U.mT @ rhs))

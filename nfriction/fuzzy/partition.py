@@ -68,6 +68,7 @@ class OrderedPartition(nn.Module):
         super().__init__()
         self.terms = terms
         self.half_width = half_width  # of a set of width 1
+        # As attributes, for TorchScript sees no globals.
         self.least, self.span = MIN_SPACING, MAX_SPACING - MIN_SPACING
         sets, inputs = sum(terms), len(terms)
         self.log_widths = nn.Parameter(torch.zeros(groups, sets, dtype=dtype))

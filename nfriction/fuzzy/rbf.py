@@ -1,11 +1,20 @@
-"""Radial basis functions, such as the paper's 2-10-2 network."""
+"""Radial basis functions: the paper's 2-10-2 network, and a head that refines an ANFIS."""
 
-from typing import Final
+from collections.abc import Sequence
+from typing import Any, Final
 
 import torch
 from torch import Tensor, nn
 
-from nfriction.fuzzy.grouped import LinearOutputModule, input_range, ridge, to_columns, to_rows
+from nfriction.fuzzy.anfis import Anfis
+from nfriction.fuzzy.grouped import (
+    GroupedModule,
+    LinearOutputModule,
+    input_range,
+    ridge,
+    to_columns,
+    to_rows,
+)
 
 # Orthogonal least squares takes so many evenly thinned candidates and samples.
 _CANDIDATES, _SAMPLES = 500, 5000
@@ -56,6 +65,7 @@ class RBFNetwork(LinearOutputModule):
         weight = torch.randn(groups, outputs, units, generator=random, dtype=dtype)
         self.centres = nn.Parameter(torch.empty(groups, units, inputs, dtype=dtype))
         self.log_widths = nn.Parameter(torch.empty(groups, units, inputs, dtype=dtype))
+        # Small, so that a fresh network is nearly flat; not zero, where centres have no gradient.
         self.output_weight = nn.Parameter(0.1 * weight)
         self.output_bias = nn.Parameter(torch.zeros(groups, outputs, dtype=dtype))
         self.init_range(-1.0, 1.0, seed)
@@ -81,6 +91,7 @@ class RBFNetwork(LinearOutputModule):
         constant, quadratic, powers = self._expanded(x)
         if out is None:
             out = powers.new_empty(len(powers), self.units + 1, powers.shape[2])
+        # In place all through: these arrays are the largest of a fit.
         phi = torch.baddbmm(constant, quadratic, powers, out=out[:, :-1])
         phi.clamp_(min=self.least_exponent).exp_()
         out[:, -1] = 1.0
@@ -232,6 +243,68 @@ class RBFNetwork(LinearOutputModule):
         return samples
 
 
+class AnfisRBF(GroupedModule):
+    """ANFIS layer plus an RBF head on [inputs, ANFIS outputs] that adds a correction.
+
+    The ANFIS carries the fit, the head refines it; the output of a fresh head is zero.
+
+    Args:
+        groups, inputs, terms, outputs: of the layer, see `Anfis`.
+        units: of the head.
+        seed: of the head's fresh centres.
+        options: of the layer: order, kind, interpretable, dtype.
+    """
+
+    def __init__(
+        self,
+        groups: int,
+        inputs: int,
+        terms: Sequence[int],
+        outputs: int,
+        *,
+        units: int = 10,
+        seed: int = 0,
+        **options: Any,
+    ) -> None:
+        super().__init__()
+        self.groups, self.inputs, self.outputs = groups, inputs, outputs
+        self.anfis = Anfis(groups, inputs, terms, outputs, **options)
+        dtype = self.anfis.consequents.dtype
+        self.head = RBFNetwork(groups, inputs + outputs, units, outputs, seed=seed, dtype=dtype)
+        # A fresh head changes nothing.
+        nn.init.zeros_(self.head.output_weight)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Outputs, shape (*batch, groups, outputs), of inputs (*batch, groups, inputs)."""
+        y = self.anfis(x)
+        return y + self.head(torch.cat([x, y], -1))
+
+    def init_grid(self, lower: float | Tensor, upper: float | Tensor, seed: int = 0) -> None:
+        """Even sets over the inputs' range, the head's centres drawn from it (outputs: ±1).
+
+        Args:
+            lower, upper: range of each input, broadcastable to (groups, inputs).
+            seed: of the head's centres.
+        """
+        self.anfis.init_grid(lower, upper)
+        centres = self.head.centres[:, 0].detach()
+        low, high = input_range(lower, upper, centres[:, : self.inputs])
+        ones = torch.ones_like(centres[:, self.inputs :])
+        self.head.init_range(torch.cat([low, -ones], 1), torch.cat([high, ones], 1), seed)
+
+    @torch.no_grad()
+    def init_head(self, x: Tensor, seed: int = 0) -> None:
+        """Place the head's units by the samples `x`; its output layer stays unchanged."""
+        self.head.init_kmeans(torch.cat([x, self.anfis(x)], -1), seed)
+
+    @torch.no_grad()
+    def solve_head(self, x: Tensor, y: Tensor, prior_precision: float | Tensor = 1e-6) -> None:
+        """Least squares of the head's output layer on the ANFIS's residual of `y`."""
+        carried = self.anfis(x)
+        # On the residual, so that the rules keep their meaning.
+        self.head.solve_output(torch.cat([x, carried], -1), y - carried, prior_precision)
+
+
 def _kmeans(samples: Tensor, units: int, seed: int) -> Tensor:
     """Centres of `units` clusters, shape (units, inputs), inputs weighed by their deviation."""
     from scipy.cluster.vq import kmeans2  # slow to import, and seldom needed
@@ -253,6 +326,7 @@ def _nearest_spread(centres: Tensor, samples: Tensor) -> Tensor:
     distance = torch.cdist(centres / scale, centres / scale)
     # The smallest distance is that of a centre to itself.
     spread = distance.sort(1).values[:, 1:3].mean(1, keepdim=True)
+    # Two centres may coincide, where k-means had too few different samples.
     return 2 * spread.clamp(min=1e-3) * scale
 
 
@@ -288,5 +362,6 @@ def _selected(samples: Tensor, targets: Tensor, units: int, widths: Tensor) -> T
 def _thin(rows: Tensor, most: int) -> Tensor:
     if len(rows) <= most:
         return rows
+    # Evenly over the recording, whose first seconds may be rest.
     picks = torch.linspace(0, len(rows) - 1, most, dtype=torch.float64, device=rows.device)
     return rows[picks.round().long()]

@@ -344,7 +344,7 @@ def _check_entry(key: str, value: Any) -> None:
 
 
 def _are_numbers(value: Any, depth: int = 0) -> bool:
-    """Whether a value is a finite number, or a list or matrix of such."""
+    """True for a finite number, or a list or matrix of such."""
     if isinstance(value, (list, tuple)):
         alike = len({isinstance(v, (list, tuple)) for v in value}) < 2
         small = len(value) <= MOST_LINKS and depth < 2

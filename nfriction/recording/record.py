@@ -142,13 +142,6 @@ class Recording:
             warnings.simplefilter("ignore", RecordingWarning)
             return replace(self, **changes)
 
-    def window(self, start: float, stop: float) -> Recording:
-        """The samples from `start` to `stop` [s of the recording's own time], both included."""
-        # A stamp that is a rounding error away counts as being there.
-        slack = 1e-6 * self.sample_time
-        first, last = np.searchsorted(self.time, [start - slack, stop + slack])
-        return self[int(first) : int(last)]
-
     def resolve_convention(self, plant: Mechanism) -> AngleConvention:
         """The recording's own convention, else the plant's; for sliding joints the default one.
 

@@ -91,7 +91,7 @@ def choose_signals(
 
 
 def asked_names(names: set[str], sources: Sequence[str]) -> set[str]:
-    """Those of a file's names that sources ask for."""
+    """The names in a file that sources ask for."""
     return {s.column for spec in sources if (s := parse_source(spec, names))}
 
 
