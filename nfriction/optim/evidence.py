@@ -41,6 +41,7 @@ MESSAGES: dict[str, str] = {
     "not_finite": "The errors or their Jacobian are not finite, at the start or at every step.",
     "stopped": "Stopped by the callback or by an interrupt; the parameters are the best reached.",
 }
+# Beyond it a step is too short to matter.
 LARGEST_DAMPING = 1e10
 
 
@@ -163,6 +164,7 @@ class EvidenceResult:
         floor = 0.5 / self.beta if noise else 0.0
         deviations = []
         for _, output, jacobians in jacobian_pieces(self.model, self.parameters, x):
+            # Only the diagonal of J C J^T.
             variance = torch.stack([((J @ self.covariance) * J).sum(-1) for J in jacobians], -1)
             deviations.append((variance.clamp(min=0) + floor).sqrt().view_as(output))
         return torch.cat(deviations)
@@ -198,6 +200,7 @@ class _Fit:
 
     def __init__(self, problem: EvidenceProblem, options: EvidenceOptions, w: Tensor) -> None:
         self.problem, self.options = problem, options
+        # Exact fits would otherwise drive beta to infinity.
         self.noise_floor = max(options.noise_floor, 1e-15)
         # An interrupt of the first evaluation must still find something to report.
         nan = torch.full_like(w, math.nan)
@@ -223,10 +226,12 @@ class _Fit:
                 if self._settled(known):
                     return "converged"
                 unexplained = self.problem.samples - float(known.gamma.sum())
+                # Below the known noise the fit only learns that noise.
                 if float(self.local.squares) <= unexplained * self.noise_floor**2:
                     return "noise_floor"
                 if self.state.step >= options.max_steps:
                     return "max_steps"
+                # At the start the residuals say nothing yet about noise and priors.
                 if self.state.step > 0:
                     self._reestimate(known)
                 failed = self._advance()
@@ -314,6 +319,7 @@ class _Fit:
         if problem.squares is not None:
             cheap = float(beta * problem.squares(w)) + shrinkage
             self.not_finite = not math.isfinite(cheap)
+            # Most rejected trials end here, at a fraction of the cost of a Jacobian.
             if not cheap < objective:
                 return None
         there = problem.equations(w)

@@ -178,6 +178,7 @@ def sum_of_squares(
 
 def check_samples(inputs: Tensor, targets: Tensor) -> None:
     """Raise ValueError where samples and targets do not belong together."""
+    # Slicing would silently shorten the longer of the two.
     if len(inputs) == 0 or len(inputs) != len(targets):
         raise ValueError(
             "`inputs` and `targets` must hold the same number of samples, at least one, got "
@@ -217,6 +218,7 @@ def _from_columns(
     # Groups share no parameter: J^T J is block diagonal.
     for group, gram in enumerate(grams.unbind(0)):
         where = _entries(parameters, len(grams), group).to(inputs.device)
+        # From columns to parameters once per group, after the sum over all samples.
         map_ = torch.cat([maps[name][group] for name in parameters], -1)
         columns = map_.shape[1]
         JtJ[where[:, None], where] = (map_.mT @ gram[:columns, :columns] @ map_).sum(0)

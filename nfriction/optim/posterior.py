@@ -87,6 +87,7 @@ def posterior(
     """
     groups, offset, count = problem.groups, w - problem.prior, len(alpha)
     precision = alpha[groups]
+    # Scaled to a unit diagonal, so that the units of the parameters cost no digits.
     scale, factor = factorise(beta * local.JtJ + precision.diag())
     inverse = scale[:, None] * torch.cholesky_inverse(factor) * scale
     slope = beta * local.Jte + precision * offset
@@ -138,6 +139,7 @@ def reestimate(
     # A group without curvature has no scale for a limit.
     limit = torch.where(limit > 0, limit, alpha)
     estimate = torch.minimum(known.gamma / (2 * known.parameter_squares), limit)
+    # At the centre of its prior the estimate divides zero by zero.
     usable = (known.parameter_squares > 0) & (estimate > 0)
     return torch.where(usable, estimate, alpha), beta
 

@@ -121,6 +121,7 @@ def group_index(
             )
         index.append(torch.full((value.numel(),), found[0], device=value.device))
     joined = torch.cat(index)
+    # A mistyped pattern would otherwise be a group without effect.
     empty = [group for number, group in enumerate(patterns) if not (joined == number).any()]
     if empty:
         raise ValueError(f"Groups {empty} match no parameter of {list(parameters)}.")

@@ -174,6 +174,7 @@ class Recording:
                 "the recording has no angle convention; give the plant, or read "
                 "it with convention='absolute,hanging' or the like."
             )
+        # Without a plant the first column is taken as a link, not as an arm.
         first_link = 0 if plant is None else plant.first_link
         qd = None if self.qd is None else convention.rate_to_joint(self.qd, first_link)
         q = convention.position_to_joint(self.q, first_link)
@@ -253,6 +254,7 @@ class Recording:
             )
         if degrees and unit == "m":
             raise ValueError("`degrees=True` needs angles, but `unit` is 'm'; drop one of the two.")
+        # One text, for CSV comments and Parquet metadata hold no lists.
         names = [part.strip() for part in str(attributes.get("names", "")).split(",")]
         recording = cls(
             time=arrays["time"],
@@ -323,5 +325,6 @@ class Recording:
         formats.write_table(self.to_pandas(), path)
 
     def _warn(self, finding: str, remedy: str, *, stacklevel: int) -> None:
+        # Of many recordings the reader must know which one.
         label = f"recording '{self.name}': " if self.name else ""
         warnings.warn(f"{label}{finding}; {remedy}.", RecordingWarning, stacklevel=stacklevel)

@@ -128,6 +128,7 @@ def _controldesk(content: dict[str, Any]) -> Columns:
         if not (isinstance(record, dict) and {"X", "Y"} <= record.keys()):
             continue
         axes, signals = _named_data(record["X"]), _named_data(record["Y"])
+        # With several time axes none of them is the common one.
         if len(axes) == 1:
             signals.append(("time", axes[0][1]))
         for label, values in signals:
