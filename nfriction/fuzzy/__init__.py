@@ -1,10 +1,9 @@
 """Fuzzy sets, ANFIS layers and radial basis functions."""
 
 from nfriction.fuzzy.anfis import Anfis
-from nfriction.fuzzy.anfis_rbf import AnfisRBF
 from nfriction.fuzzy.hybrid import HybridResult, hybrid_step, train_hybrid
 from nfriction.fuzzy.membership import FuzzySet, coverage, sets_from_ranges
-from nfriction.fuzzy.rbf import RBFNetwork
+from nfriction.fuzzy.rbf import AnfisRBF, RBFNetwork
 
 __all__ = [
     "Anfis", "AnfisRBF", "FuzzySet", "HybridResult", "RBFNetwork", "coverage",

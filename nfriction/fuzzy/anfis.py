@@ -13,9 +13,9 @@ from nfriction.fuzzy.partition import (
     OrderedPartition,
     crossing_half_widths,
     even_centres,
-    quantile_centres,
 )
 
+# Rules are the product of the terms: a mistyped count would fill the memory.
 MAX_RULES = 100_000
 
 Range = float | Sequence[float] | Tensor
@@ -79,6 +79,7 @@ class Anfis(LinearOutputModule):
             if kind == "bell"
             else None
         )
+        # A linear function and its constant, or the constant alone.
         columns = inputs + 1 if order == 1 else 1
         self.consequents = nn.Parameter(
             torch.zeros(groups, outputs, self.rules, columns, dtype=dtype)
@@ -112,22 +113,6 @@ class Anfis(LinearOutputModule):
             blended = (slopes * columns.unsqueeze(1)).sum(2) + constants
         return to_rows(blended, x)
 
-    def firing_strength(self, x: Tensor) -> Tensor:
-        """Normalised firing strengths, shape (*batch, groups, rules).
-
-        They sum to 1 even where every rule underflows.
-        """
-        return to_rows(self.strength_columns(to_columns(x)), x)
-
-    def rule_outputs(self, x: Tensor) -> Tensor:
-        """Output of each rule alone, shape (*batch, groups, outputs, rules)."""
-        batch = x.shape[:-2]
-        constants = self.consequents[..., -1].expand(batch + self.consequents.shape[:-1])
-        if self.order == 0:
-            return constants
-        slopes = self.consequents[..., :-1]
-        return (slopes * x.unsqueeze(-2).unsqueeze(-2)).sum(-1) + constants
-
     def sets(self) -> tuple[Tensor, Tensor]:
         """Centres and widths (sigma, or `a` of a bell), each (groups, sets), input by input."""
         centres, widths = self.partition()
@@ -150,6 +135,7 @@ class Anfis(LinearOutputModule):
             width = widths[:, start : start + count]
             log_slopes = self.log_slopes
             if log_slopes is not None:
+                # As logarithms the trained numbers keep slopes and widths positive.
                 slope = torch.exp(log_slopes[:, start : start + count]).unsqueeze(-1)
                 logs.append(log_bell(u, c, width, slope))
             else:
@@ -160,6 +146,7 @@ class Anfis(LinearOutputModule):
     def strength_columns(self, columns: Tensor) -> Tensor:
         """Normalised firing strengths, shape (groups, rules, samples).
 
+        They sum to 1 even where every rule underflows.
         On a full grid the softmax of the summed log memberships is the product of one softmax for
         each input: the same numbers with sum(terms) exponentials instead of prod(terms).
         """
@@ -228,6 +215,7 @@ class Anfis(LinearOutputModule):
         if self.log_slopes is not None:
             sets["log_slopes"] = torch.cat([torch.zeros_like(slopes).repeat(1, 2, 1), slopes], 1)
         for name, rows in sets.items():
+            # Gaussians have no columns for slopes, bells have.
             padded = torch.nn.functional.pad(rows, (0, 0, 0, own - rows.shape[1]))
             block = torch.einsum("ab,gce->gabce", output, padded).flatten(2, 3)
             blocks[name] = shared, block
@@ -278,22 +266,6 @@ class Anfis(LinearOutputModule):
         low, high = self._range(lower, upper)
         self._take_crossing(even_centres(self.terms, low, high), low, high)
 
-    def init_from_data(self, x: Tensor) -> None:
-        """Place sets by the samples: centres half way between quantiles and an even grid.
-
-        Quantiles alone would pile the sets up where a recording rests. Neighbours cross at 0.5 or
-        a little more.
-
-        Args:
-            x: samples, shape (*batch, groups, inputs).
-        """
-        samples = x.detach().reshape(-1, self.groups, self.inputs)
-        low, high = self._range(samples.amin(0), samples.amax(0))
-        grid = even_centres(self.terms, low, high)
-        quantiles = quantile_centres(self.terms, samples)
-        centres = [0.5 * (a + b) for a, b in zip(grid, quantiles, strict=True)]
-        self._take_crossing(centres, low, high)
-
     def init_from_sets(
         self,
         centres: Sequence[Tensor],
@@ -313,12 +285,14 @@ class Anfis(LinearOutputModule):
         """
         packed_centres = self._pack("centres", centres)
         packed_widths = self._pack("widths", widths)
+        # Their logarithms are stored.
         if not bool((packed_widths > 0).all()):
             raise ValueError("`widths` must be positive.")
         pieces = packed_centres.split(self.terms, 1)
         low, high = self._range(
             torch.stack([c.amin(1) for c in pieces], 1) if lower is None else lower,
             torch.stack([c.amax(1) for c in pieces], 1) if upper is None else upper,
+            # Free sets ignore their range; one set alone has none.
             allow_equal=not self.interpretable,
         )
         self.partition.assign(packed_centres, packed_widths, low, high)
@@ -329,18 +303,8 @@ class Anfis(LinearOutputModule):
                 self.log_slopes.copy_(self._pack("slopes", slopes).log())
 
     @torch.no_grad()
-    def init_constant(self, values: Tensor) -> None:
-        """Give every rule the output `values`, broadcastable to (groups, outputs)."""
-        self.consequents.zero_()
-        self.consequents[..., -1] = values.unsqueeze(-1)
-
-    @torch.no_grad()
     def solve_consequents(
-        self,
-        x: Tensor,
-        y: Tensor,
-        prior_precision: float | Tensor = 1e-6,
-        prior: Tensor | None = None,
+        self, x: Tensor, y: Tensor, prior_precision: float | Tensor = 1e-6
     ) -> None:
         """Set the consequents to the least-squares optimum for the present sets, in place.
 
@@ -349,17 +313,14 @@ class Anfis(LinearOutputModule):
             y: wanted outputs, shape (*batch, groups, outputs).
             prior_precision: over the noise precision, a number or broadcastable to (groups,
                 rules * columns). The default is that of the recursive least squares of Jang's
-                paper, which starts from a covariance of 1e6. With 0, undetermined directions stay
-                at the prior.
-            prior: consequents to shrink toward, broadcastable to theirs; default zero.
+                paper, which starts from a covariance of 1e6. With 0, undetermined directions are
+                zero.
         Raises:
             ValueError: no samples, or samples that are not finite.
         """
         features = self.regressors(x).reshape(-1, self.groups, self.consequents[0, 0].numel())
         targets = y.reshape(-1, self.groups, self.outputs)
-        start = torch.zeros_like(self.consequents) if prior is None else prior
-        start = start.expand_as(self.consequents).flatten(2).mT
-        weights = ridge(features, targets, prior_precision, start)
+        weights = ridge(features, targets, prior_precision)
         self.consequents.copy_(weights.mT.reshape(self.consequents.shape))
 
     def _range(

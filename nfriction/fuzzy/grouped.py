@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor, nn
 
+# A block and its triangle then fit the cache.
 _ROWS_AT_ONCE = 8192
 
 
@@ -65,6 +66,7 @@ class GroupedModule(nn.Module):
         """
         x = x.detach().requires_grad_()
         with torch.enable_grad():
+            # Samples do not mix, so the gradient of a sum holds the derivative of each.
             sums = self(x).flatten(0, -2).sum(0)
             rows = [torch.autograd.grad(y, x, retain_graph=True)[0] for y in sums]
         return torch.stack(rows, 2).movedim(0, -1)
@@ -116,21 +118,18 @@ class LinearOutputModule(GroupedModule):
         return maps
 
 
-def ridge(
-    features: Tensor, targets: Tensor, prior_precision: float | Tensor, prior: Tensor
-) -> Tensor:
-    """Minimiser of `|targets - features w|^2 + prior_precision |w - prior|^2`.
+def ridge(features: Tensor, targets: Tensor, prior_precision: float | Tensor) -> Tensor:
+    """Minimiser of `|targets - features w|^2 + prior_precision |w|^2`.
 
     The rows are reduced to a triangle by Householder QR, a block at a time, so that the condition
     of the problem is not squared and memory does not grow with the samples. Directions that neither
-    data nor prior determine stay at the prior (least change).
+    data nor prior determine are zero (shortest solution).
 
     Args:
         features: shape (samples, groups, features).
         targets: shape (samples, groups, outputs).
         prior_precision: not negative, a number or broadcastable to (groups, features); over the
             noise precision, so that 1 weighs like one sample with unit feature.
-        prior: broadcastable to (groups, features, outputs).
     Returns:
         Weights, shape (groups, features, outputs).
     Raises:
@@ -149,7 +148,6 @@ def ridge(
     precision = torch.as_tensor(prior_precision, dtype=features.dtype, device=features.device)
     if not bool((precision >= 0).all()):
         raise ValueError(f"`prior_precision` must not be negative, got {prior_precision}.")
-    prior = prior.expand(groups, count, targets.shape[-1])
     rows = torch.cat([features, targets], -1).transpose(0, 1)
     triangle = rows[:, :0]
     for block in rows.split(_ROWS_AT_ONCE, dim=1):
@@ -159,8 +157,10 @@ def ridge(
     upper, rhs = triangle[..., :count], triangle[..., count:]
     scale = precision.expand(groups, count).sqrt()
     rows = torch.cat([upper, torch.diag_embed(scale)], 1)
-    residual = torch.cat([rhs - upper @ prior, torch.zeros_like(prior)], 1)
+    # The prior adds rows whose targets are zero.
+    rhs = torch.cat([rhs, rhs.new_zeros(groups, count, targets.shape[-1])], 1)
     U, singular, Vh = torch.linalg.svd(rows, full_matrices=False)
+    # Smaller singular values are rounding, and their inverse would be noise.
     floor = singular[:, :1] * count * torch.finfo(rows.dtype).eps
     inverse = torch.where(singular > floor, 1.0 / singular, torch.zeros_like(singular))
-    return prior + Vh.mT @ (inverse.unsqueeze(-1) * (U.mT @ residual))
+    return Vh.mT @ (inverse.unsqueeze(-1) * (U.mT @ rhs))

@@ -66,6 +66,7 @@ def hybrid_step(
             gradient / value for gradient, value in zip(gradients[1:], values[1:], strict=True)
         ]
         length = torch.cat(natural, 1).norm(dim=1)
+        # The length is of the step, not a rate: it does not depend on the units of the error.
         wanted = torch.as_tensor(step, dtype=length.dtype, device=length.device)
         rate = wanted / length.clamp(min=torch.finfo(length.dtype).tiny)
         anfis.partition.centres.sub_(rate.unsqueeze(1) * natural[0])
@@ -112,6 +113,7 @@ def train_hybrid(
         before["consequents"] = anfis.consequents.detach().clone()
         better = error < best
         best = torch.where(better, error, best)
+        # Groups are independent: each keeps its own best epoch.
         kept = {
             name: torch.where(
                 better.view(-1, *[1] * (value.dim() - 1)), value, kept.get(name, value)
@@ -131,6 +133,7 @@ def train_hybrid(
 
 def _adapt(length: Tensor, errors: list[Tensor], changed: Tensor, epoch: int) -> Tensor:
     """Next step length of each group; `changed` keeps the epochs of the last fall and growth."""
+    # Four changes take five errors.
     if len(errors) <= _INTERVAL:
         return length
     change = torch.stack(errors[-_INTERVAL - 1 :]).diff(dim=0)

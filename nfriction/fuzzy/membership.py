@@ -136,6 +136,7 @@ class FuzzySet:
         if not all(math.isfinite(value) for value in self.parameters):
             raise ValueError(f"{where}: numbers must be finite, got {self.parameters}.")
         for name, value in zip(names, self.parameters, strict=True):
+            # Functions divide by these.
             if ("sigma" in name or name in ("width", "slope")) and value <= 0:
                 raise ValueError(f"{where}: `{name}` must be positive, got {value}.")
         if self.shape in ("triangle", "trapezoid") and list(self.parameters) != sorted(
@@ -192,6 +193,7 @@ def sets_from_ranges(
         for name, (low, high) in spans
     ]
     (first, (low, high)), (last, (last_low, last_high)) = spans[0], spans[-1]
+    # The outermost sets hold fully beyond the universe, as "very fast" does.
     sets[0] = FuzzySet(first, "left_shoulder", (low, (high - low) / 2))
     sets[-1] = FuzzySet(last, "right_shoulder", (last_high, (last_high - last_low) / 2))
     return tuple(sets)

@@ -68,6 +68,7 @@ class OrderedPartition(nn.Module):
         super().__init__()
         self.terms = terms
         self.half_width = half_width  # of a set of width 1
+        # As attributes, for TorchScript sees no globals.
         self.least, self.span = MIN_SPACING, MAX_SPACING - MIN_SPACING
         sets, inputs = sum(terms), len(terms)
         self.log_widths = nn.Parameter(torch.zeros(groups, sets, dtype=dtype))
@@ -151,17 +152,6 @@ def even_centres(terms: list[int], lower: Tensor, upper: Tensor) -> list[Tensor]
     for i, count in enumerate(terms):
         low, span = lower[:, i, None], (upper - lower)[:, i, None]
         centres.append(low + span * _fractions(count).to(lower))
-    return centres
-
-
-def quantile_centres(terms: list[int], samples: Tensor) -> list[Tensor]:
-    """Evenly spaced quantiles of samples (samples, groups, inputs), extremes included."""
-    centres = []
-    for i, count in enumerate(terms):
-        # By sorting, since `torch.quantile` refuses large inputs.
-        ascending = samples[:, :, i].sort(0).values
-        ranks = (_fractions(count) * (len(ascending) - 1)).round().long()
-        centres.append(ascending[ranks.to(samples.device)].T)
     return centres
 
 

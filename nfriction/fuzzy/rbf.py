@@ -1,11 +1,20 @@
-"""Radial basis functions, such as the paper's 2-10-2 network."""
+"""Radial basis functions: the paper's 2-10-2 network, and a head that refines an ANFIS."""
 
-from typing import Final
+from collections.abc import Sequence
+from typing import Any, Final
 
 import torch
 from torch import Tensor, nn
 
-from nfriction.fuzzy.grouped import LinearOutputModule, input_range, ridge, to_columns, to_rows
+from nfriction.fuzzy.anfis import Anfis
+from nfriction.fuzzy.grouped import (
+    GroupedModule,
+    LinearOutputModule,
+    input_range,
+    ridge,
+    to_columns,
+    to_rows,
+)
 
 # Orthogonal least squares takes so many evenly thinned candidates and samples.
 _CANDIDATES, _SAMPLES = 500, 5000
@@ -56,6 +65,7 @@ class RBFNetwork(LinearOutputModule):
         weight = torch.randn(groups, outputs, units, generator=random, dtype=dtype)
         self.centres = nn.Parameter(torch.empty(groups, units, inputs, dtype=dtype))
         self.log_widths = nn.Parameter(torch.empty(groups, units, inputs, dtype=dtype))
+        # Small, so that a fresh network is nearly flat; not zero, where centres have no gradient.
         self.output_weight = nn.Parameter(0.1 * weight)
         self.output_bias = nn.Parameter(torch.zeros(groups, outputs, dtype=dtype))
         self.init_range(-1.0, 1.0, seed)
@@ -81,6 +91,7 @@ class RBFNetwork(LinearOutputModule):
         constant, quadratic, powers = self._expanded(x)
         if out is None:
             out = powers.new_empty(len(powers), self.units + 1, powers.shape[2])
+        # In place all through: these arrays are the largest of a fit.
         phi = torch.baddbmm(constant, quadratic, powers, out=out[:, :-1])
         phi.clamp_(min=self.least_exponent).exp_()
         out[:, -1] = 1.0
@@ -175,19 +186,18 @@ class RBFNetwork(LinearOutputModule):
         self.log_widths.copy_((0.5 * span).log().expand_as(self.centres))
 
     @torch.no_grad()
-    def init_kmeans(self, x: Tensor, seed: int = 0, overlap: float = 2.0) -> None:
-        """Centres by k-means; widths from the distance to the nearest other centres.
+    def init_kmeans(self, x: Tensor, seed: int = 0) -> None:
+        """Centres by k-means; widths twice the mean distance to the two nearest centres.
 
         Args:
             x: samples, shape (*batch, groups, inputs).
             seed: of the k-means++ start.
-            overlap: width over the mean distance to the two nearest centres.
         """
         samples = self._samples(x)
         for group in range(self.groups):
             centres = _kmeans(samples[:, group], self.units, seed)
             self.centres[group] = centres
-            self.log_widths[group] = _nearest_spread(centres, samples[:, group], overlap).log()
+            self.log_widths[group] = _nearest_spread(centres, samples[:, group]).log()
 
     @torch.no_grad()
     def init_ols(self, x: Tensor, y: Tensor, width: float = 1.5) -> None:
@@ -207,13 +217,7 @@ class RBFNetwork(LinearOutputModule):
             self.log_widths[group] = scale.log().expand_as(centres)
 
     @torch.no_grad()
-    def solve_output(
-        self,
-        x: Tensor,
-        y: Tensor,
-        prior_precision: float | Tensor = 1e-6,
-        prior: Tensor | None = None,
-    ) -> None:
+    def solve_output(self, x: Tensor, y: Tensor, prior_precision: float | Tensor = 1e-6) -> None:
         """Set weights and bias to the least-squares optimum for the present units, in place.
 
         Args:
@@ -221,12 +225,10 @@ class RBFNetwork(LinearOutputModule):
             y: wanted outputs, shape (*batch, groups, outputs).
             prior_precision: over the noise precision; a number or broadcastable to (groups,
                 units + 1).
-            prior: (groups, outputs, units + 1), weight then bias, to shrink toward; default zero.
         """
         features = self.regressors(x).reshape(-1, self.groups, self.units + 1)
         targets = y.reshape(-1, self.groups, self.outputs)
-        start = features.new_zeros(1, 1, 1) if prior is None else prior.mT
-        layer = ridge(features, targets, prior_precision, start).mT
+        layer = ridge(features, targets, prior_precision).mT
         self.output_weight.copy_(layer[..., :-1])
         self.output_bias.copy_(layer[..., -1])
 
@@ -241,6 +243,68 @@ class RBFNetwork(LinearOutputModule):
         return samples
 
 
+class AnfisRBF(GroupedModule):
+    """ANFIS layer plus an RBF head on [inputs, ANFIS outputs] that adds a correction.
+
+    The ANFIS carries the fit, the head refines it; the output of a fresh head is zero.
+
+    Args:
+        groups, inputs, terms, outputs: of the layer, see `Anfis`.
+        units: of the head.
+        seed: of the head's fresh centres.
+        options: of the layer: order, kind, interpretable, dtype.
+    """
+
+    def __init__(
+        self,
+        groups: int,
+        inputs: int,
+        terms: Sequence[int],
+        outputs: int,
+        *,
+        units: int = 10,
+        seed: int = 0,
+        **options: Any,
+    ) -> None:
+        super().__init__()
+        self.groups, self.inputs, self.outputs = groups, inputs, outputs
+        self.anfis = Anfis(groups, inputs, terms, outputs, **options)
+        dtype = self.anfis.consequents.dtype
+        self.head = RBFNetwork(groups, inputs + outputs, units, outputs, seed=seed, dtype=dtype)
+        # A fresh head changes nothing.
+        nn.init.zeros_(self.head.output_weight)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Outputs, shape (*batch, groups, outputs), of inputs (*batch, groups, inputs)."""
+        y = self.anfis(x)
+        return y + self.head(torch.cat([x, y], -1))
+
+    def init_grid(self, lower: float | Tensor, upper: float | Tensor, seed: int = 0) -> None:
+        """Even sets over the inputs' range, the head's centres drawn from it (outputs: ±1).
+
+        Args:
+            lower, upper: range of each input, broadcastable to (groups, inputs).
+            seed: of the head's centres.
+        """
+        self.anfis.init_grid(lower, upper)
+        centres = self.head.centres[:, 0].detach()
+        low, high = input_range(lower, upper, centres[:, : self.inputs])
+        ones = torch.ones_like(centres[:, self.inputs :])
+        self.head.init_range(torch.cat([low, -ones], 1), torch.cat([high, ones], 1), seed)
+
+    @torch.no_grad()
+    def init_head(self, x: Tensor, seed: int = 0) -> None:
+        """Place the head's units by the samples `x`; its output layer stays unchanged."""
+        self.head.init_kmeans(torch.cat([x, self.anfis(x)], -1), seed)
+
+    @torch.no_grad()
+    def solve_head(self, x: Tensor, y: Tensor, prior_precision: float | Tensor = 1e-6) -> None:
+        """Least squares of the head's output layer on the ANFIS's residual of `y`."""
+        carried = self.anfis(x)
+        # On the residual, so that the rules keep their meaning.
+        self.head.solve_output(torch.cat([x, carried], -1), y - carried, prior_precision)
+
+
 def _kmeans(samples: Tensor, units: int, seed: int) -> Tensor:
     """Centres of `units` clusters, shape (units, inputs), inputs weighed by their deviation."""
     from scipy.cluster.vq import kmeans2  # slow to import, and seldom needed
@@ -251,18 +315,19 @@ def _kmeans(samples: Tensor, units: int, seed: int) -> Tensor:
     return torch.as_tensor(centres).to(samples) * scale
 
 
-def _nearest_spread(centres: Tensor, samples: Tensor, overlap: float, nearest: int = 2) -> Tensor:
-    """Widths proportional to the mean distance to the nearest other centres, (units, inputs).
+def _nearest_spread(centres: Tensor, samples: Tensor) -> Tensor:
+    """Widths twice the mean distance to the two nearest other centres, (units, inputs).
 
     Distances are in units of each input's standard deviation.
     """
     scale = samples.std(0)
     if len(centres) == 1:
-        return overlap * scale.expand_as(centres)
+        return 2 * scale.expand_as(centres)
     distance = torch.cdist(centres / scale, centres / scale)
     # The smallest distance is that of a centre to itself.
-    spread = distance.sort(1).values[:, 1 : nearest + 1].mean(1, keepdim=True)
-    return overlap * spread.clamp(min=1e-3) * scale
+    spread = distance.sort(1).values[:, 1:3].mean(1, keepdim=True)
+    # Two centres may coincide, where k-means had too few different samples.
+    return 2 * spread.clamp(min=1e-3) * scale
 
 
 def _selected(samples: Tensor, targets: Tensor, units: int, widths: Tensor) -> Tensor:
@@ -297,5 +362,6 @@ def _selected(samples: Tensor, targets: Tensor, units: int, widths: Tensor) -> T
 def _thin(rows: Tensor, most: int) -> Tensor:
     if len(rows) <= most:
         return rows
+    # Evenly over the recording, whose first seconds may be rest.
     picks = torch.linspace(0, len(rows) - 1, most, dtype=torch.float64, device=rows.device)
     return rows[picks.round().long()]

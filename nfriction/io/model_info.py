@@ -48,7 +48,9 @@ class ModelInfo:
 def parameter_hash(state: Mapping[str, Tensor]) -> str:
     """SHA-256 over names, shapes and values of a model's parameters and buffers."""
     digest = hashlib.sha256()
+    # The order in which a module registers its buffers is no property of the model.
     for name in sorted(state):
+        # In one type on the CPU, so that the device does not change the hash.
         value = state[name].detach().to("cpu", torch.float64).contiguous()
         digest.update(f"{name}{tuple(value.shape)}".encode())
         digest.update(value.numpy().tobytes())

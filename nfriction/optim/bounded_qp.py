@@ -93,6 +93,7 @@ def _active_set(
     system: Tensor, slope: Tensor, low: Tensor, high: Tensor, free: Tensor, solve: Solve
 ) -> Tensor:
     x, free = torch.zeros_like(slope), free.clone()
+    # A multiplier within rounding would release and activate the same bound for ever.
     rounding = 10 * len(slope) * torch.finfo(slope.dtype).eps
     for _ in range(ROUNDS * len(x)):
         if free.any():
@@ -108,6 +109,7 @@ def _active_set(
         inward &= pull.abs() > rounding * (slope.abs() + system.abs() @ x.abs())
         if not inward.any():
             break
+        # One at a time: after it the others may no longer pull inward.
         free[torch.where(inward, pull.abs(), -1.0).argmax()] = True
     return x
 
@@ -122,4 +124,5 @@ def _towards(x: Tensor, target: Tensor, low: Tensor, high: Tensor) -> tuple[Tens
         return target, torch.zeros_like(move, dtype=torch.bool)
     hit = share <= least
     reached = torch.where(hit, torch.where(move > 0, high, low), x + least * move)
+    # Rounding may pass a bound that was not the nearest.
     return reached.clamp(low, high), hit

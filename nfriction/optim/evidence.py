@@ -13,9 +13,9 @@ References:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal, TypeAlias
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Literal, TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -41,35 +41,27 @@ MESSAGES: dict[str, str] = {
     "not_finite": "The errors or their Jacobian are not finite, at the start or at every step.",
     "stopped": "Stopped by the callback or by an interrupt; the parameters are the best reached.",
 }
+# Beyond it a step is too short to matter.
 LARGEST_DAMPING = 1e10
 
 
 @dataclass(frozen=True, eq=False)
 class EvidenceState:
-    """State of a run, from which it can be resumed bit for bit.
+    """State of a run, as given to a callback.
 
     Args:
         w: parameters, shape (p,).
-        alpha: prior precisions, shape (groups,); None before the first step.
+        alpha: prior precisions, shape (groups,).
         beta: noise precision.
         damping: mu of the next step.
         step: accepted steps so far.
     """
 
     w: Tensor
-    alpha: Tensor | None = None
+    alpha: Tensor
     beta: float = 1.0
     damping: float = 0.005
     step: int = 0
-
-    def state_dict(self) -> dict[str, Any]:
-        """Plain dictionary for `torch.save`; loads with `weights_only=True`."""
-        return asdict(self)
-
-    @classmethod
-    def from_state_dict(cls, state: Mapping[str, Any]) -> EvidenceState:
-        """Inverse of `state_dict`."""
-        return cls(**state)
 
 
 Callback: TypeAlias = Callable[[EvidenceState], "bool | None"]
@@ -80,7 +72,7 @@ class EvidenceOptions:
     """Settings of a run.
 
     Args:
-        max_steps: limit of accepted steps, those of a resumed state included.
+        max_steps: limit of accepted steps.
         tolerance: of convergence: relative error of alpha = gamma / 2E_g and beta =
             (n - gamma) / 2E_D, and gain of a full Gauss-Newton step in nats.
         noise_floor: standard deviation of the errors at which fitting ends.
@@ -115,14 +107,13 @@ class EvidenceResult:
         w: parameters in one vector, shape (p,).
         alpha, gamma: prior precision and effective parameters, by group.
         beta: noise precision; the noise has the standard deviation `noise_std`.
-        error_squares: E_D, weighted.
+        error_squares: E_D.
         parameter_squares: E_g = sum (w - w0)^2, by group.
         samples: n, number of errors that E_D sums.
         log_evidence: in nats with all constants: models of the same data can be compared by it.
         covariance: posterior covariance of the parameters, shape (p, p).
         steps: accepted steps.
         history: log evidence before each step.
-        state: for resuming.
         model, parameters: differentiated by `predictive_std`, if known.
     """
 
@@ -138,7 +129,6 @@ class EvidenceResult:
     covariance: Tensor
     steps: int
     history: list[float]
-    state: EvidenceState
     model: nn.Module | Function | None = None
     parameters: dict[str, Tensor] = field(default_factory=dict)
 
@@ -154,20 +144,15 @@ class EvidenceResult:
 
     @property
     def noise_std(self) -> float:
-        """Standard deviation of the noise on an error of weight 1, in the targets' unit."""
+        """Standard deviation of the noise of an error, in the targets' unit."""
         return math.sqrt(0.5 / self.beta)
-
-    @property
-    def effective_parameters(self) -> float:
-        """Sum of gamma over the groups."""
-        return sum(self.gamma.values())
 
     def predictive_std(self, x: Tensor, noise: bool = True) -> Tensor:
         """Standard deviation of the outputs at `x` by the uncertainty of parameters and noise.
 
         Args:
             x: inputs, shape (m, ...).
-            noise: include that of a new measurement (of weight 1), or only that of the function.
+            noise: include that of a new measurement, or only that of the function.
         Returns:
             Shape of the outputs, (m, *outputs).
         """
@@ -179,16 +164,14 @@ class EvidenceResult:
         floor = 0.5 / self.beta if noise else 0.0
         deviations = []
         for _, output, jacobians in jacobian_pieces(self.model, self.parameters, x):
+            # Only the diagonal of J C J^T.
             variance = torch.stack([((J @ self.covariance) * J).sum(-1) for J in jacobians], -1)
             deviations.append((variance.clamp(min=0) + floor).sqrt().view_as(output))
         return torch.cat(deviations)
 
 
 def maximise_evidence(
-    problem: EvidenceProblem,
-    w: Tensor,
-    options: EvidenceOptions | None = None,
-    state: EvidenceState | None = None,
+    problem: EvidenceProblem, w: Tensor, options: EvidenceOptions | None = None
 ) -> EvidenceResult:
     """Fit parameters, noise precision and one prior precision per group to normal equations.
 
@@ -202,20 +185,9 @@ def maximise_evidence(
         problem: errors and priors.
         w: start, shape (p,).
         options: settings.
-        state: to be resumed; replaces `w`.
-    Raises:
-        ValueError: a state of another problem.
     """
     options = EvidenceOptions() if options is None else options
-    start = EvidenceState(w.detach().clone(), damping=options.initial_damping)
-    state = start if state is None else state
-    groups = len(problem.names)
-    if state.w.shape != w.shape or (state.alpha is not None and len(state.alpha) != groups):
-        raise ValueError(
-            f"`state` has {len(state.w)} parameters and alpha {state.alpha}; this fit has "
-            f"{len(w)} parameters in the groups {list(problem.names)}."
-        )
-    fit = _Fit(problem, options, state)
+    fit = _Fit(problem, options, w.detach().clone())
     try:
         status = fit.run()
     except KeyboardInterrupt:
@@ -226,14 +198,14 @@ def maximise_evidence(
 class _Fit:
     """A run of `maximise_evidence`."""
 
-    def __init__(
-        self, problem: EvidenceProblem, options: EvidenceOptions, state: EvidenceState
-    ) -> None:
-        self.problem, self.options, self.state = problem, options, state
+    def __init__(self, problem: EvidenceProblem, options: EvidenceOptions, w: Tensor) -> None:
+        self.problem, self.options = problem, options
+        # Exact fits would otherwise drive beta to infinity.
         self.noise_floor = max(options.noise_floor, 1e-15)
-        p = len(state.w)
         # An interrupt of the first evaluation must still find something to report.
-        nan = state.w.new_full((p,), math.nan)
+        nan = torch.full_like(w, math.nan)
+        unknown = nan.new_full((len(problem.names),), math.nan)
+        self.state = EvidenceState(w, unknown, damping=options.initial_damping)
         self.local = NormalEquations(nan.diag(), nan, nan.sum())
         self.history: list[float] = []
         self.not_finite = False
@@ -243,10 +215,9 @@ class _Fit:
         self.local = self.problem.equations(self.state.w)
         if not self.local.finite:
             return "not_finite"
-        if self.state.alpha is None:
-            self._start()
+        self._start()
         with tqdm(
-            total=options.max_steps, initial=self.state.step, disable=not options.progress,
+            total=options.max_steps, disable=not options.progress,
             unit="step",
         ) as bar:  # fmt: skip
             while True:
@@ -255,10 +226,12 @@ class _Fit:
                 if self._settled(known):
                     return "converged"
                 unexplained = self.problem.samples - float(known.gamma.sum())
+                # Below the known noise the fit only learns that noise.
                 if float(self.local.squares) <= unexplained * self.noise_floor**2:
                     return "noise_floor"
                 if self.state.step >= options.max_steps:
                     return "max_steps"
+                # At the start the residuals say nothing yet about noise and priors.
                 if self.state.step > 0:
                     self._reestimate(known)
                 failed = self._advance()
@@ -270,7 +243,6 @@ class _Fit:
                     return "stopped"
 
     def posterior(self) -> Posterior:
-        assert self.state.alpha is not None
         return posterior(self.problem, self.local, self.state.w, self.state.alpha, self.state.beta)
 
     def _start(self) -> None:
@@ -290,7 +262,6 @@ class _Fit:
     def _settled(self, known: Posterior) -> bool:
         """True where the log evidence is stationary in w, log alpha and log beta."""
         alpha, gamma, tolerance = self.state.alpha, known.gamma, self.options.tolerance
-        assert alpha is not None
         # Derivatives of the log evidence by log alpha are (gamma - 2 alpha E_g) / 2.
         off = (gamma - 2 * alpha * known.parameter_squares).abs() / gamma.clamp(min=1)
         unexplained = self.problem.samples - float(gamma.sum())
@@ -302,7 +273,6 @@ class _Fit:
         )
 
     def _reestimate(self, known: Posterior) -> None:
-        assert self.state.alpha is not None
         largest = 0.5 / self.noise_floor**2
         alpha, beta = reestimate(self.problem, known, self.local, self.state.alpha, largest)
         self.state = replace(self.state, alpha=alpha, beta=beta)
@@ -310,7 +280,6 @@ class _Fit:
     def _advance(self) -> Status | None:
         """Take one step that lowers the objective, with as much damping as that needs."""
         state, problem, local = self.state, self.problem, self.local
-        assert state.alpha is not None
         precision = state.alpha[problem.groups]
         offset = state.w - problem.prior
         system = state.beta * local.JtJ + precision.diag()
@@ -350,6 +319,7 @@ class _Fit:
         if problem.squares is not None:
             cheap = float(beta * problem.squares(w)) + shrinkage
             self.not_finite = not math.isfinite(cheap)
+            # Most rejected trials end here, at a fraction of the cost of a Jacobian.
             if not cheap < objective:
                 return None
         there = problem.equations(w)
@@ -360,11 +330,10 @@ class _Fit:
 
     def result(self, status: Status) -> EvidenceResult:
         state, names = self.state, self.problem.names
-        alpha = self.problem.prior.new_full((len(names),), math.nan)
-        known = Posterior(self.local.JtJ * math.nan, alpha, math.nan, math.nan, alpha)
-        if state.alpha is not None:
-            alpha = state.alpha
-            known = self.posterior() if self.local.finite else known
+        unknown = torch.full_like(state.alpha, math.nan)
+        known = Posterior(self.local.JtJ * math.nan, unknown, math.nan, math.nan, unknown)
+        if self.local.finite:
+            known = self.posterior()
 
         def named(values: Tensor) -> dict[str, float]:
             return dict(zip(names, values.tolist(), strict=True))
@@ -372,7 +341,7 @@ class _Fit:
         return EvidenceResult(
             status=status,
             w=state.w,
-            alpha=named(alpha),
+            alpha=named(state.alpha),
             beta=state.beta,
             gamma=named(known.gamma),
             error_squares=float(self.local.squares),
@@ -382,5 +351,4 @@ class _Fit:
             covariance=known.covariance,
             steps=state.step,
             history=self.history,
-            state=state,
         )

@@ -34,7 +34,7 @@ CHUNK_SAMPLES = 2**14
 
 
 class NormalEquations(NamedTuple):
-    """J^T J (p, p), J^T e (p,) and sum e^2 of the errors e = f - target, all weighted."""
+    """J^T J (p, p), J^T e (p,) and sum e^2 of the errors e = f - target."""
 
     JtJ: Tensor
     Jte: Tensor
@@ -133,7 +133,6 @@ def normal_equations(
     parameters: Mapping[str, Tensor],
     inputs: Tensor,
     targets: Tensor,
-    weights: Tensor | None = None,
     chunk: int | None = None,
 ) -> NormalEquations:
     """Normal equations of the least-squares problem f(parameters, inputs) = targets.
@@ -141,28 +140,21 @@ def normal_equations(
     Args:
         model, parameters, inputs, chunk: as for `jacobian_pieces`.
         targets: shape (n, *outputs).
-        weights: factors of the squared errors, shape (n,) or that of `targets`; 1 by default.
     Raises:
-        ValueError: targets or weights do not fit.
+        ValueError: targets do not fit.
     """
-    check_samples(inputs, targets, weights)
+    check_samples(inputs, targets)
     # A module's maps are those of all that it trains, in its order.
     offered = trainable(model) if isinstance(model, nn.Module) and shares_columns(model) else {}
     if isinstance(model, nn.Module) and list(parameters) == list(offered):
         _errors(_function(model)(parameters, inputs[:1]), targets[:1])
-        return _from_columns(model, parameters, inputs, targets, weights, chunk)
+        return _from_columns(model, parameters, inputs, targets, chunk)
     p = sum(value.numel() for value in parameters.values())
     JtJ, Jte, squares = inputs.new_zeros(p, p), inputs.new_zeros(p), inputs.new_zeros(())
     for rows, output, jacobians in jacobian_pieces(model, parameters, inputs, chunk):
         error = _errors(output, targets[rows])
-        # Weighted least squares: rows and errors scale by the weight's root.
-        root = None
-        if weights is not None:
-            root = weights[rows].reshape(len(error), -1).sqrt().expand_as(error)
-            error = error * root
         # Output by output the matrix product takes any memory layout without a copy.
-        for k, jacobian in enumerate(jacobians):
-            J = jacobian if root is None else jacobian * root[:, k, None]
+        for k, J in enumerate(jacobians):
             JtJ.addmm_(J.T, J)
             Jte.addmv_(J.T, error[:, k])
         squares += error.square().sum()
@@ -174,35 +166,24 @@ def sum_of_squares(
     parameters: Mapping[str, Tensor],
     inputs: Tensor,
     targets: Tensor,
-    weights: Tensor | None = None,
 ) -> Tensor:
-    """Weighted sum of squared errors alone: the cheap trial of a step."""
+    """Sum of squared errors alone: the cheap trial of a step."""
     function, total = _function(model), inputs.new_zeros(())
     with torch.no_grad():
         for start in range(0, len(inputs), CHUNK_SAMPLES):
             rows = slice(start, start + CHUNK_SAMPLES)
-            errors = _errors(function(parameters, inputs[rows]), targets[rows]).square()
-            if weights is not None:
-                errors = errors * weights[rows].reshape(len(errors), -1)
-            total += errors.sum()
+            total += _errors(function(parameters, inputs[rows]), targets[rows]).square().sum()
     return total
 
 
-def check_samples(inputs: Tensor, targets: Tensor, weights: Tensor | None) -> None:
-    """Raise ValueError where samples, targets and weights do not belong together."""
+def check_samples(inputs: Tensor, targets: Tensor) -> None:
+    """Raise ValueError where samples and targets do not belong together."""
+    # Slicing would silently shorten the longer of the two.
     if len(inputs) == 0 or len(inputs) != len(targets):
         raise ValueError(
             "`inputs` and `targets` must hold the same number of samples, at least one, got "
             f"{len(inputs)} and {len(targets)}."
         )
-    if weights is not None:
-        if weights.shape not in (targets.shape, targets.shape[:1]):
-            raise ValueError(
-                f"`weights` must be one per sample, shape {tuple(targets.shape[:1])}, or one per "
-                f"target, shape {tuple(targets.shape)}, got {tuple(weights.shape)}."
-            )
-        if not (weights >= 0).all():
-            raise ValueError("`weights` must not be negative or NaN.")
 
 
 def _function(model: nn.Module | Function) -> Function:
@@ -227,26 +208,22 @@ def _from_columns(
     parameters: Mapping[str, Tensor],
     inputs: Tensor,
     targets: Tensor,
-    weights: Tensor | None,
     chunk: int | None,
 ) -> NormalEquations:
     prefixed = {f"model.{name}": value for name, value in parameters.items()}
-    arguments = (inputs, targets, None if weights is None else weights.sqrt(), chunk)
-    grams, maps = functional_call(_Grams(model), prefixed, arguments)
+    grams, maps = functional_call(_Grams(model), prefixed, (inputs, targets, chunk))
     count = sum(value.numel() for value in parameters.values())
     JtJ, Jte = inputs.new_zeros(count, count), inputs.new_zeros(count)
     squares = inputs.new_zeros(())
     # Groups share no parameter: J^T J is block diagonal.
     for group, gram in enumerate(grams.unbind(0)):
         where = _entries(parameters, len(grams), group).to(inputs.device)
+        # From columns to parameters once per group, after the sum over all samples.
         map_ = torch.cat([maps[name][group] for name in parameters], -1)
-        outputs, columns = map_.shape[:2]
-        # With weights that differ between the outputs each has a Gram matrix of its own.
-        own = gram.expand(outputs, *gram.shape[1:])
-        JtJ[where[:, None], where] = (map_.mT @ own[:, :columns, :columns] @ map_).sum(0)
-        errors = own[:, columns:].diagonal(dim1=0, dim2=1)
-        Jte[where] = torch.einsum("kcp,ck->p", map_, errors[:columns])
-        squares += errors[columns:].diagonal().sum()
+        columns = map_.shape[1]
+        JtJ[where[:, None], where] = (map_.mT @ gram[:columns, :columns] @ map_).sum(0)
+        Jte[where] = torch.einsum("kcp,kc->p", map_, gram[columns:, :columns])
+        squares += gram[columns:, columns:].diagonal().sum()
     return NormalEquations(JtJ, Jte, squares)
 
 
@@ -258,9 +235,9 @@ class _Grams(nn.Module):
         self.model = model
 
     def forward(
-        self, inputs: Tensor, targets: Tensor, roots: Tensor | None, chunk: int | None
+        self, inputs: Tensor, targets: Tensor, chunk: int | None
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Gram matrices (groups, 1 or outputs, rows, rows) of [columns, errors], and the maps."""
+        """Gram matrices (groups, rows, rows) of [columns, errors], and the maps."""
         model = cast(SharedColumns, self.model)
         readout, maps = model.readout(), model.jacobian_maps()
         groups, outputs, used = readout.shape
@@ -270,8 +247,7 @@ class _Grams(nn.Module):
         chunk = min(len(inputs), max(1, chunk))
         # Reused: the first touch of fresh memory costs more than the arithmetic.
         buffer = inputs.new_empty(groups, rows, chunk)
-        own = outputs if roots is not None and roots.ndim > 1 else 1
-        grams = inputs.new_zeros(groups, own, rows, rows)
+        grams = inputs.new_zeros(groups, rows, rows)
         for start in range(0, len(inputs), chunk):
             part = slice(start, start + chunk)
             wanted = targets[part].permute(1, 2, 0)
@@ -279,13 +255,7 @@ class _Grams(nn.Module):
             model.jacobian_columns(inputs[part], F[:, :columns])
             torch.bmm(readout, F[:, :used], out=F[:, columns:])
             F[:, columns:].sub_(wanted)
-            if roots is None:
-                grams[:, 0].baddbmm_(F, F.mT)
-                continue
-            root = roots[part].reshape(wanted.shape[-1], -1, own if own > 1 else 1)
-            for k, factor in enumerate(root.permute(2, 1, 0)):
-                G = F * factor.unsqueeze(1)
-                grams[:, k].baddbmm_(G, G.mT)
+            grams.baddbmm_(F, F.mT)
         return grams, maps
 
 

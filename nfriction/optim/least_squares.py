@@ -51,10 +51,25 @@ class Quadratic:
 
     @property
     def finite(self) -> bool:
-        """Whether every entry is a finite number."""
+        """True if every entry is a finite number."""
         return math.isfinite(float(self.cost)) and bool(
             torch.isfinite(self.gradient).all() and torch.isfinite(self.hessian).all()
         )
+
+    def checked(self, p: int) -> Quadratic:
+        """The same without gradients of its own.
+
+        Raises:
+            ValueError: if it is not of `p` parameters.
+        """
+        if self.gradient.shape != (p,) or self.hessian.shape != (p, p):
+            raise ValueError(
+                f"The model of {p} parameters must give a gradient of shape ({p},) and a Hessian "
+                f"of shape ({p}, {p}), got {tuple(self.gradient.shape)} and "
+                f"{tuple(self.hessian.shape)}."
+            )
+        gradient, hessian = self.gradient.detach(), self.hessian.detach()
+        return Quadratic(float(self.cost), gradient, hessian, self.blocks)
 
 
 class Step(NamedTuple):
@@ -98,7 +113,7 @@ class LeastSquaresResult:
 
     @property
     def converged(self) -> bool:
-        """Whether the search ended at a (possibly constrained) stationary point."""
+        """True if the search ended at a (possibly constrained) stationary point."""
         return self.status.startswith("converged")
 
     @property

@@ -1,7 +1,14 @@
 """Levenberg-Marquardt on a local quadratic model, with bounds and an honest status.
 
-The solver asks for cost, gradient and Gauss-Newton Hessian instead of a residual Jacobian, so that
-callers may accumulate 40,000 samples in pieces and never hold one.
+Near a point x, a sum of squares 1/2 |r|^2 is almost the quadratic of its gradient J^T r and its
+Gauss-Newton Hessian J^T J. One iteration
+
+1. minimises that quadratic within the bounds, plus a damping that keeps the step short;
+2. evaluates the cost there, and takes the step only if the cost falls;
+3. lowers the damping where the quadratic predicted the fall well, else raises it.
+
+The solver asks for cost, gradient and Hessian instead of a residual Jacobian, so that callers may
+accumulate 40,000 samples in pieces and never hold one.
 """
 
 from __future__ import annotations
@@ -9,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -21,22 +29,21 @@ from nfriction.optim.least_squares import (
     Step,
     positive_diagonal,
 )
-from nfriction.optim.linear_algebra import solve_arrowhead, solve_semidefinite
+from nfriction.optim.linear_algebra import solve_free
 
 Model = Callable[[Tensor], Quadratic]
 Cost = Callable[[Tensor], Tensor]
 # (x, its quadratic, the step that led there) -> a status that ends the search, or None.
 Callback = Callable[[Tensor, Quadratic, Step], Status | None]
 
-# Fewer blocks than this are solved as fast in one piece.
-MANY = 100
-# Damping is relative to the (unit) scaled diagonal. Beyond LARGEST a step is lost in round-off; a
-# rejection raises it at least to SMALLEST, where it begins to matter; below FLOOR it no longer
-# keeps round-off from drifting along a singular direction. Only up to FULL is a short step evidence
-# of a minimum rather than of the damping.
-FLOOR, SMALLEST, FULL, LARGEST = 1e-16, 1e-8, 1.0, 1e16
+# Damping is relative to the (unit) scaled diagonal. Below the least, it no longer keeps round-off
+# from drifting along a singular direction; a rejected step raises it at least to where it begins to
+# matter; beyond the largest, a step is lost in round-off.
+LEAST_DAMPING, FELT_DAMPING, LARGEST_DAMPING = 1e-16, 1e-8, 1e16
+# Up to this damping a short step is evidence of a minimum, beyond it only of the damping.
+WEAK_DAMPING = 1.0
 # Factor after a rejected or poor step, divisor after a good one.
-UP, DOWN = 4.0, 6.0
+RAISE, LOWER = 4.0, 6.0
 
 
 @dataclass(frozen=True)
@@ -103,7 +110,7 @@ class LevenbergMarquardt:
         low, high = bounded_qp.as_bounds(x0, lower, upper)
         state = _State(x0.detach().clamp(low, high), low, high, self.initial_damping)
         try:
-            state.local = _checked(model(state.x), state.x)
+            state.local = model(state.x).checked(len(state.x))
             status = self._iterate(state, model, cost, callback)
         except KeyboardInterrupt:
             status = "stopped"
@@ -115,10 +122,16 @@ class LevenbergMarquardt:
         if not state.local.finite:
             return "not_finite"
         if cost is not None:
-            _compare(float(cost(state.x)), state.cost)
+            cheap, own = float(cost(state.x)), state.cost
+            if abs(cheap - own) > 1e-6 * max(abs(cheap), abs(own)):
+                raise ValueError(
+                    f"`cost(x0)` is {cheap:.9g} but `model(x0).cost` is {own:.9g}; "
+                    "both must be half the sum of squared residuals."
+                )
+        # The square of the relative rounding of the residuals.
         vanished = state.cost * torch.finfo(state.x.dtype).eps ** 2
-        state.scale = state.local.hessian.diagonal()
         while True:
+            # The running maximum keeps a parameter's scale where its influence vanishes on the way.
             state.scale = torch.maximum(state.scale, state.local.hessian.diagonal())
             if state.cost <= vanished or state.gradient_cosine() <= self.gradient_tolerance:
                 return "converged_gradient"
@@ -136,25 +149,26 @@ class LevenbergMarquardt:
         while True:
             step = state.damped_step(root)
             predicted = state.predicted_decrease(step)
-            norm, tolerated = float((root * step).norm()), self.cost_tolerance * state.cost
-            # With the damping out of the way, a step too short to matter means a minimum.
-            undamped = state.damping <= FULL
-            settled = undamped and norm <= self.step_tolerance * float((root * state.x).norm())
-            decrease = state.attempt(step, norm, model, cost)
+            length, negligible = float((root * step).norm()), self.cost_tolerance * state.cost
+            weak = state.damping <= WEAK_DAMPING
+            short = weak and length <= self.step_tolerance * float((root * state.x).norm())
+            decrease = state.attempt(step, length, model, cost)
+            # The prediction counts, too: at a kink the cost may change little far from a minimum.
+            flat = weak and max(abs(decrease), predicted) <= negligible
             if decrease > 0:
-                flat = undamped and max(decrease, predicted) <= tolerated
                 gain = decrease / max(predicted, 1e-300)
-                if gain > 0.75 and state.damping > FLOOR:
-                    state.damping /= DOWN
+                if gain > 0.75 and state.damping > LEAST_DAMPING:
+                    state.damping /= LOWER
                 elif gain < 0.25:
-                    state.damping = max(state.damping * UP, SMALLEST)
-                return "converged_cost" if flat else "converged_step" if settled else None
-            if settled and math.isfinite(decrease):
+                    state.raise_damping()
+                return "converged_cost" if flat else "converged_step" if short else None
+            # A step into a region without finite cost is no evidence, however short.
+            if short and math.isfinite(decrease):
                 return "converged_step"
-            if undamped and max(-decrease, predicted) <= tolerated:
+            if flat:
                 return "converged_cost"
-            state.damping = max(state.damping * UP, SMALLEST)
-            if state.damping > LARGEST:
+            state.raise_damping()
+            if state.damping > LARGEST_DAMPING:
                 return "stalled" if math.isfinite(decrease) else "not_finite"
 
 
@@ -173,11 +187,14 @@ class _State:
         # Until the first evaluation nothing is known; an interrupt in it must still find a result.
         unknown = self.x.new_full((len(self.x), len(self.x)), torch.nan)
         self.local = Quadratic(math.inf, self.x.new_full(self.x.shape, torch.nan), unknown)
-        self.scale = torch.ones_like(self.x)
+        self.scale = torch.zeros_like(self.x)
 
     @property
     def cost(self) -> float:
         return float(self.local.cost)
+
+    def raise_damping(self) -> None:
+        self.damping = max(self.damping * RAISE, FELT_DAMPING)
 
     def frozen(self) -> Tensor:
         """Parameters that the gradient pushes against their bound, bool (p,)."""
@@ -192,33 +209,27 @@ class _State:
         return float(cosines.max()) if len(cosines) else 0.0
 
     def damped_step(self, root: Tensor) -> Tensor:
-        """Minimiser of the damped quadratic within the bounds."""
+        """Minimiser of the damped quadratic within the bounds, of parameters scaled by `root`."""
         system = self.local.hessian / (root[:, None] * root)
         system.diagonal().add_(self.damping)
         low, high = (self.lower - self.x) * root, (self.upper - self.x) * root
         slope = self.local.gradient / root
-        return bounded_qp.minimise(system, slope, low, high, ~self.frozen(), self._solve) / root
-
-    def _solve(self, matrix: Tensor, right: Tensor, free: Tensor) -> Tensor:
-        """Solution for the free parameters, block by block if the model has blocks."""
-        if self.local.blocks is not None:
-            first, size = self.local.blocks
-            if len(free) - first >= MANY * size and free[first:].all():
-                return solve_arrowhead(matrix, right, int(free[:first].sum()), size)
-        return solve_semidefinite(matrix, right)
+        solve = partial(solve_free, blocks=self.local.blocks)
+        return bounded_qp.minimise(system, slope, low, high, ~self.frozen(), solve) / root
 
     def predicted_decrease(self, step: Tensor) -> float:
         return -float(self.local.gradient @ step + 0.5 * step @ (self.local.hessian @ step))
 
-    def attempt(self, step: Tensor, norm: float, model: Model, cost: Cost | None) -> float:
+    def attempt(self, step: Tensor, length: float, model: Model, cost: Cost | None) -> float:
         """Move if the cost decreases and all is finite; the decrease (-inf where not finite)."""
+        # A parameter left a rounding error from its bound would never count as frozen.
         trial = bounded_qp.snap_to_bounds(self.x + step, self.lower, self.upper, self.x)
         self.evaluations += 1
         if cost is not None:
             value = float(cost(trial))
             if not value < self.cost:
                 return self.cost - value if math.isfinite(value) else -math.inf
-        there = _checked(model(trial), trial)
+        there = model(trial).checked(len(trial))
         if cost is None:
             value = float(there.cost)
         if not (math.isfinite(value) and there.finite):
@@ -226,7 +237,7 @@ class _State:
         decrease = self.cost - value
         if decrease > 0:
             self.x, self.local = trial, there
-            self.history.append(Step(value, self.damping, norm))
+            self.history.append(Step(value, self.damping, length))
         return decrease
 
     def result(self, status: Status) -> LeastSquaresResult:
@@ -242,23 +253,3 @@ class _State:
             at_upper=self.x >= self.upper,
             history=self.history,
         )
-
-
-def _compare(cheap: float, cost: float) -> None:
-    if abs(cheap - cost) > 1e-6 * max(abs(cheap), abs(cost)):
-        raise ValueError(
-            f"`cost(x0)` is {cheap:.9g} but `model(x0).cost` is {cost:.9g}; "
-            "both must be half the sum of squared residuals."
-        )
-
-
-def _checked(local: Quadratic, x: Tensor) -> Quadratic:
-    p = len(x)
-    if local.gradient.shape != (p,) or local.hessian.shape != (p, p):
-        raise ValueError(
-            f"The model of {p} parameters must give a gradient of shape ({p},) and a Hessian "
-            f"of shape ({p}, {p}), got {tuple(local.gradient.shape)} and "
-            f"{tuple(local.hessian.shape)}."
-        )
-    cost, gradient, hessian = local.cost, local.gradient.detach(), local.hessian.detach()
-    return Quadratic(float(cost), gradient, hessian, local.blocks)

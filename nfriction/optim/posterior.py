@@ -39,7 +39,6 @@ class EvidenceProblem:
         groups: group of each parameter, 0 ... groups - 1, int64, shape (p,).
         names: of the groups.
         squares: E_D alone, where that is cheaper; tries the steps.
-        log_weights: sum of the logarithms of the errors' weights.
     Raises:
         ValueError: no samples.
     """
@@ -50,7 +49,6 @@ class EvidenceProblem:
     groups: Tensor
     names: Sequence[str]
     squares: Callable[[Tensor], Tensor] | None = None
-    log_weights: float = 0.0
 
     def __post_init__(self) -> None:
         if self.samples < 1:
@@ -89,6 +87,7 @@ def posterior(
     """
     groups, offset, count = problem.groups, w - problem.prior, len(alpha)
     precision = alpha[groups]
+    # Scaled to a unit diagonal, so that the units of the parameters cost no digits.
     scale, factor = factorise(beta * local.JtJ + precision.diag())
     inverse = scale[:, None] * torch.cholesky_inverse(factor) * scale
     slope = beta * local.Jte + precision * offset
@@ -101,7 +100,7 @@ def posterior(
     log_evidence = (
         -beta * local.squares
         - alpha @ squares
-        + 0.5 * (problem.samples * math.log(beta / math.pi) + problem.log_weights)
+        + 0.5 * problem.samples * math.log(beta / math.pi)
         + 0.5 * sizes @ alpha.log()
         - 0.5 * log_determinant
     )
@@ -140,6 +139,7 @@ def reestimate(
     # A group without curvature has no scale for a limit.
     limit = torch.where(limit > 0, limit, alpha)
     estimate = torch.minimum(known.gamma / (2 * known.parameter_squares), limit)
+    # At the centre of its prior the estimate divides zero by zero.
     usable = (known.parameter_squares > 0) & (estimate > 0)
     return torch.where(usable, estimate, alpha), beta
 

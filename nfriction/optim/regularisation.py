@@ -14,7 +14,6 @@ from nfriction.optim.evidence import (
     EvidenceOptions,
     EvidenceProblem,
     EvidenceResult,
-    EvidenceState,
     maximise_evidence,
 )
 from nfriction.optim.jacobian import (
@@ -35,9 +34,7 @@ def bayesian_regularisation(
     *,
     groups: Mapping[str, str | Sequence[str]] | None = None,
     prior: Mapping[str, Tensor | float] | Literal["initial"] | None = None,
-    weights: Tensor | None = None,
     options: EvidenceOptions | None = None,
-    state: EvidenceState | None = None,
 ) -> EvidenceResult:
     """Train a module in place on samples, with Bayesian regularisation and no validation set.
 
@@ -53,9 +50,7 @@ def bayesian_regularisation(
         groups: group name -> pattern(s) of parameter names ("rules.*"); by default each named
             parameter is a group of its own.
         prior: values w0 by parameter name, 0 where missing; "initial" for the present weights.
-        weights: factors of the squared errors, shape (n,) or that of `y`; 0 leaves one out.
         options: settings; the noise floor is in the unit of `y`.
-        state: of an earlier result or callback, to be resumed bit for bit.
     Returns:
         Weights, alpha, beta, gamma, log evidence, error bars and status.
     Raises:
@@ -65,38 +60,32 @@ def bayesian_regularisation(
     parameters = trainable(model)
     if not parameters:
         raise ValueError("`model` has no parameter that requires a gradient.")
-    check_samples(x, y, weights)
+    check_samples(x, y)
     if not (torch.isfinite(x).all() and torch.isfinite(y).all()):
         raise ValueError("`x` and `y` must be finite; drop the samples that are not.")
     names, index = group_index(parameters, groups)
-    used = torch.ones_like(y)
-    if weights is not None:
-        used = weights.reshape(weights.shape + (1,) * (y.ndim - weights.ndim)).expand_as(y)
-    used = used[used > 0]
     # Errors within the rounding of the targets carry no information.
     rounding = torch.finfo(y.dtype).eps * float(y.square().mean().sqrt())
     # Samples last in memory, as layers take them: kernels are vectorised over samples.
     x, y = (part.movedim(0, -1).contiguous().movedim(-1, 0) for part in (x, y))
 
     def equations(w: Tensor) -> NormalEquations:
-        return normal_equations(model, unflatten(w, parameters), x, y, weights)
+        return normal_equations(model, unflatten(w, parameters), x, y)
 
     def squares(w: Tensor) -> Tensor:
-        return sum_of_squares(model, unflatten(w, parameters), x, y, weights)
+        return sum_of_squares(model, unflatten(w, parameters), x, y)
 
     result = maximise_evidence(
         EvidenceProblem(
             equations=equations,
-            samples=used.numel(),
+            samples=y.numel(),
             prior=_prior_vector(parameters, prior),
             groups=index,
             names=names,
             squares=squares,
-            log_weights=float(used.log().sum()),
         ),
         flatten(parameters),
         replace(options, noise_floor=max(options.noise_floor, rounding)),
-        state,
     )
     best = unflatten(result.w.clone(), parameters)
     with torch.no_grad():
@@ -132,6 +121,7 @@ def group_index(
             )
         index.append(torch.full((value.numel(),), found[0], device=value.device))
     joined = torch.cat(index)
+    # A mistyped pattern would otherwise be a group without effect.
     empty = [group for number, group in enumerate(patterns) if not (joined == number).any()]
     if empty:
         raise ValueError(f"Groups {empty} match no parameter of {list(parameters)}.")

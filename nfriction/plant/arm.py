@@ -35,6 +35,7 @@ class Arm:
     length: float
 
     def __post_init__(self) -> None:
+        # Without length the chain swings unmoved by the arm, and the mass matrix may be singular.
         if not (self.inertia > 0 and self.length > 0):
             raise ValueError(
                 f"an arm's inertia [kg m^2] and length [m] must be positive, got {self}; "
@@ -64,6 +65,7 @@ def arm_terms(
     """
     sin, cos = pose.sin, [angle.cos() for angle in pose.angle]
     size = len(sin)
+    # Only the upper triangle is fitted, so only it is read.
     upper = [[coupling[min(i, j)][max(i, j)] for j in range(size)] for i in range(size)]
     swept = [dot(row, sin) for row in upper]
     cross = [-(reach * c) for reach, c in zip(lever, cos, strict=True)]

@@ -120,6 +120,7 @@ class Plant(nn.Module):
             if not isinstance(value, Tensor) or not value.is_floating_point():
                 raise TypeError(f"`{name}` must be a floating-point tensor, got {value!r}.")
             trailing = tuple(own[name].shape)
+            # Leading dimensions are batches of plants; the trailing ones belong to the buffer.
             if tuple(value.shape[value.ndim - len(trailing) :]) != trailing:
                 raise ValueError(
                     f"`{name}` must have shape (*batch, {', '.join(map(str, trailing))}), "
@@ -162,6 +163,7 @@ class Plant(nn.Module):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # shown when this plant was built
             fresh = dict(self.from_dict(data).named_buffers())
+        # Only these: a file of untouched arguments stays readable, and follows a new derivation.
         changed = {
             name: value.tolist()
             for name, value in self.named_buffers()

@@ -42,6 +42,7 @@ from nfriction.plant.gears import (
 )
 from nfriction.plant.inertia import fastest_mode, inertia_tensors, require_positive_definite
 
+# Zero in a new chain, and set by `replace`: a fit finds them, no user knows them.
 _PER_JOINT = ("angle_offset", "encoder_cosine", "encoder_sine", "gear_loss", "torque_offset")
 # Least gravity [m/s^2], as loads are in units of a link's weight.
 WEIGHTLESS = 1e-6
@@ -175,6 +176,7 @@ class PendulumChain(Plant):
             buffers["inertia_tensor"] = tensors
         for key, value in buffers.items():
             self.register_buffer(key, value)
+        # Joint coordinates are zero upright for the first link, in line for the others.
         hanging = torch.ones_like(rotor)
         hanging[first] = -1.0
         self.register_buffer("encoder_zero", hanging, persistent=False)
@@ -307,6 +309,7 @@ class PendulumChain(Plant):
         self._check(q=q, qd=qd)
         q, qd = self._true(q, qd)
         angle = (q + self.angle_offset)[..., self.first_link :].cumsum(-1)
+        # The paper's normal force takes the joint's own rate, not the link's absolute one.
         rate = qd[..., self.first_link :]
         load = (self.load_lever * rate * rate - angle.cos()).abs()
         return torch.cat([torch.ones_like(load[..., :1]), load], -1) if self.first_link else load
@@ -325,9 +328,11 @@ class PendulumChain(Plant):
             Shape (*batch,), the largest over all values of a plant with batches of buffers.
         """
         effective = damping.clamp(min=0.0)
+        # Eigenvalues of infinity are errors of LAPACK; a caller handles infinite rates.
         if not effective.isfinite().all():
             return effective.amax(-1)
         rows = effective.reshape(-1, self.joints).to(self.armature)
+        # Friction acts at the motor: its slope reaches the joint by the gear, at most so much.
         gear = self.torque_gain * (1.0 + self.gear_loss)
         found = [fastest_mode(self, gear * row) for row in rows]
         return torch.stack(found).reshape(damping.shape[:-1])
@@ -352,6 +357,7 @@ class PendulumChain(Plant):
             self.has_eccentricity = True
         self.has_armature = self.has_armature or "armature" in names
         self.has_gear = self.has_gear or bool({"torque_gain", "gear_loss"} & set(names))
+        # A fit starts at zeros that are about to move.
         self._slender = self._slender and "inertia_tensor" not in names
 
     def _corrected(self, q: Tensor) -> EncoderCorrection:
@@ -402,6 +408,7 @@ class PendulumChain(Plant):
 
     @classmethod
     def _check_buffers(cls, values: Mapping[str, Tensor]) -> None:
+        # Values of a file have not gone through the constructor.
         super()._check_buffers(values)
         check_gear(values)
 

@@ -94,6 +94,7 @@ def absolute(joint: Sequence[Tensor], first: int) -> list[Tensor]:
 
 def relative(link: Sequence[Tensor], first: int) -> list[Tensor]:
     """Joint angles, rates or accelerations of absolute ones: q = S^-1 u, differences."""
+    # The first link hangs on no other: its joint angle is its absolute one.
     later = [link[i] - link[i - 1] for i in range(first + 1, len(link))]
     return [*link[: first + 1], *later]
 

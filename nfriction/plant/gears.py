@@ -27,6 +27,7 @@ def joint_torque(tau: Tensor, qd: Tensor, gain: Tensor, loss: Tensor) -> Tensor:
 
 def motor_torque(torque: Tensor, qd: Tensor, gain: Tensor, loss: Tensor) -> Tensor:
     """Torque of the motors that gives `torque` at the joints; inverse of `joint_torque`."""
+    # The efficiency is positive, so the joint torque has the sign of the motor torque.
     efficiency = 1.0 - loss * torque.sign() * torch.tanh(qd / SIGN_WIDTH)
     return torque / (gain * efficiency)
 

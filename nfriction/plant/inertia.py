@@ -40,6 +40,7 @@ def inertia_tensors(inertia: object, links: int) -> Tensor:
             f"`inertia` must be None, ({links},) for Izz per link or ({links}, 6) for "
             f"(Ixx, Iyy, Izz, Ixy, Ixz, Iyz), got shape {tuple(given.shape)}."
         )
+    # A warning only: identified values absorb what a model leaves out.
     _warn_impossible(rows)
     return rows
 
@@ -49,6 +50,7 @@ def _warn_impossible(rows: Tensor) -> None:
     xx, yy, zz, xy, xz, yz = rows.unbind(-1)
     matrix = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).reshape(-1, 3, 3)
     small, middle, large = torch.linalg.eigvalsh(matrix).unbind(-1)
+    # A slender rod lies on the border: rounding must not warn.
     slack = 1e-9 * rows.abs().amax(-1)
     wrong = (small < -slack) | (large > small + middle + slack)
     if wrong.any():
@@ -80,6 +82,7 @@ class _Poses:
 
     def fastest_mode(self, damping: Tensor) -> Tensor:
         """Largest eigenvalue of M^-1 D, with D diagonal, (batch, 1, joint), and not negative."""
+        # A search asks again and again for the same slopes.
         if self._damping is None or not torch.equal(damping, self._damping):
             self._damping, self._rate = damping, self._largest(damping.mT * damping)
         return self._rate
@@ -112,6 +115,7 @@ def fastest_mode(plant: Any, damping: Tensor) -> Tensor:
         damping: diagonal of D, not negative [N m s/rad], (joint,) or (*batch of the plant, joint).
     """
     values = torch.cat([buffer.reshape(-1) for buffer in plant.buffers()])
+    # Buffers may be changed in place, so the values decide and not the object.
     known = _poses.get(plant)
     if known is None or not torch.equal(known.values, values):
         known = _poses[plant] = _Poses(plant, values)
@@ -150,6 +154,7 @@ def require_positive_definite(coupling: Tensor, aligned: Tensor) -> None:
     Raises:
         ValueError: where `coupling` has a negative eigenvalue, or `aligned` one not positive.
     """
+    # Point masses may give a singular coupling, with eigenvalues of plus or minus rounding.
     rounding = 1e-12 * aligned.trace().item()
     smallest = torch.linalg.eigvalsh(aligned)[0].item()
     alone = torch.linalg.eigvalsh(coupling)[0].item()

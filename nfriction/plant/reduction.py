@@ -109,6 +109,7 @@ def pendulum_chain(links: Sequence[HingedLink], gravity: Array, name: str) -> Pe
     plane = np.stack([up, np.cross(z, up)])
     bodies = [link.whole() for link in hinged]
     flat = _in_plane(hinged, bodies, plane, z)
+    # The nearer zero keeps `angle_offset` small, and often exactly zero.
     hanging = math.cos(flat.angle[0] - hinged[0].reading) < 0
     turns = np.diff([math.pi * hanging, *flat.angle])
     offset = [_turned(turn - k.reading) for turn, k in zip(turns, hinged, strict=True)]
@@ -133,6 +134,7 @@ def pendulum_chain(links: Sequence[HingedLink], gravity: Array, name: str) -> Pe
             joint_names=[link.name for link in chain],
             name=name,
         )
+    # Sines of pi leave 1e-16: a chain that hangs at zero has no offset.
     offset = [0.0] * bool(arm) + [0.0 if abs(o) < 1e-12 else o for o in offset]
     if any(offset):
         plant = plant.replace(angle_offset=torch.tensor(offset, dtype=torch.float64))
@@ -173,9 +175,11 @@ def _common_axis(links: Sequence[HingedLink], up: Array) -> Array:
         if apart > TILT:
             _refuse(link.name, f"has an axis {math.degrees(apart):.3g} degrees off that of "
                     f"{first.name!r}; all links must turn in one plane")  # fmt: skip
+        # Not turned round here: the sign of its recordings would silently change.
         if link.axis @ first.axis < 0:
             _refuse(link.name, f"turns against {first.name!r}: turn its axis round, and the sign "
                     "of its recordings")  # fmt: skip
+    # A right angle written as 1.57 tilts the axis by less than anybody meant.
     level = first.axis - (first.axis @ up) * up
     return level / np.linalg.norm(level)
 
@@ -192,6 +196,7 @@ def _in_plane(
         reach = float(np.hypot(*ahead))
         if last:
             about_joint = float(z @ body.inertia @ z) + body.mass * reach**2
+            # An even rod of mass m and length L has m L^2 / 3 about its end.
             size = math.sqrt(3 * about_joint / body.mass) or 1.0
             along = ahead / reach if reach > 1e-9 * size else np.array([-1.0, 0.0])
         else:
@@ -200,6 +205,7 @@ def _in_plane(
                         "need a length")  # fmt: skip
             size, along = reach, ahead / reach
             aside = along[0] * centre[1] - along[1] * centre[0]
+            # The equations know no mass beside the line through the joints.
             if abs(aside) > ASIDE * size:
                 _refuse(link.name, f"carries a mass centre {1e3 * abs(aside):.4g} mm off the line "
                         f"to {links[k + 1].name!r}, {1e3 * size:.4g} mm away; it must lie on that "

@@ -176,6 +176,7 @@ def dfki(build: Literal["A0", "C0", "C1"]) -> PendulumChain:
     if build not in _DFKI:
         raise ValueError(f"`build` must be one of {sorted(_DFKI)}, got {build!r}.")
     p, gear = _DFKI[build], _DFKI_GEAR
+    # Published about the joint; ours are about the mass centre.
     inertia = [i - m * r**2 for i, m, r in zip(p["I"], p["m"], p["r"], strict=True)]
     inertia[1] -= gear * p["Ir"]
     with warnings.catch_warnings():
@@ -298,6 +299,7 @@ def read(path: str | Path) -> Plant:
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
     if path.is_file() and path.stat().st_size > LARGEST_FILE:
+        # Before it is read into memory.
         raise ValueError(f"{path}: rig files are at most {LARGEST_FILE} bytes.")
     content = path.read_bytes()
     try:
@@ -344,11 +346,12 @@ def _check_entry(key: str, value: Any) -> None:
 
 
 def _are_numbers(value: Any, depth: int = 0) -> bool:
-    """Whether a value is a finite number, or a list or matrix of such."""
+    """True for a finite number, or a list or matrix of such."""
     if isinstance(value, (list, tuple)):
         alike = len({isinstance(v, (list, tuple)) for v in value}) < 2
         small = len(value) <= MOST_LINKS and depth < 2
         return alike and small and all(_are_numbers(v, depth + 1) for v in value)
+    # In Python, True is an int.
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
     return abs(value) <= LARGEST_NUMBER  # false of NaN

@@ -45,6 +45,7 @@ def read_robot(path: str | Path) -> PendulumChain:
     """
     path = Path(path)
     root = parse_xml(path)
+    # Macros are a program; running one is not for a reader of data.
     if any("xacro" in element.tag for element in root.iter()):
         raise ValueError("holds macros; write it out first: xacro robot.xacro > robot.urdf")
     if root.tag == "robot":
@@ -92,6 +93,7 @@ def urdf_links(robot: Element) -> list[HingedLink]:
             raise ValueError(f"link {child!r} is the child of two joints; a chain has no loop.")
         carried.add(child)
         children[parent].append(joint)
+    # A tree has one root; more are several robots in one file.
     roots = [name for name in links if name not in carried]
     if len(roots) != 1:
         raise ValueError(f"there must be one link that no joint carries, got {roots}.")
@@ -111,6 +113,7 @@ def urdf_links(robot: Element) -> list[HingedLink]:
                 found.append(_hinge(joint, frame, origin, mover))
                 of = len(found) - 1
             waiting.append((_link(joint, "child", "", links), frame, origin, of))
+    # Links in a loop are carried by each other, and never reached from the root.
     if reached < len(links):
         raise ValueError(f"{len(links) - reached} links go round in a circle, off the ground.")
     return found
@@ -123,6 +126,7 @@ def _hinge(joint: Element, frame: Array, origin: Array, parent: int | None) -> H
             f"joint {name!r} is {joint.get('type', '')[:80]!r}; a pendulum's are revolute or "
             "continuous."
         )
+    # A coupled joint is one degree of freedom less than the chain has.
     if joint.find("mimic") is not None:
         raise ValueError(f"joint {name!r} mimics another; every joint must be free.")
     given = joint.find("axis")
@@ -137,6 +141,7 @@ def _body(inertial: Element, link: str, turn: Array, place: Array) -> RigidBody:
     what = f"link {link!r}"
     rotation, com = _origin(inertial, f"inertial of {what}")
     given, mass = inertial.find("inertia"), inertial.find("mass")
+    # URDF allows their absence, and simulators then differ in their defaults.
     if given is None or mass is None:
         raise ValueError(f"{what}: an inertial needs `mass` and `inertia`.")
     xx, yy, zz, xy, xz, yz = (
@@ -263,6 +268,7 @@ def _at_reference(path: Path, mujoco: Any) -> tuple[Any, Any]:
         model = mujoco.MjModel.from_xml_path(str(path))
         _refuse_more_than_hinges(model, mujoco)
         data = mujoco.MjData(model)
+        # Where MuJoCo's own coordinates are `ref`, as the file draws the bodies.
         data.qpos[:] = model.qpos0
         mujoco.mj_kinematics(model, data)
     finally:

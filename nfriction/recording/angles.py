@@ -80,6 +80,7 @@ class AngleConvention:
         Raises:
             ValueError: anything else.
         """
+        # By attribute: recordings must not import plants.
         found = getattr(given, "convention", given)
         if isinstance(found, cls):
             return found
@@ -116,6 +117,7 @@ class AngleConvention:
         """Joint rates of rates (velocities or accelerations) in this convention."""
         qd = _links(qd, first_link)
         if self.angles == "absolute":
+            # The first link has none before it: absolute and relative agree.
             qd[..., first_link + 1 :] = np.diff(qd[..., first_link:], axis=-1)
         return qd
 

@@ -142,25 +142,6 @@ class Recording:
             warnings.simplefilter("ignore", RecordingWarning)
             return replace(self, **changes)
 
-    def window(self, start: float, stop: float) -> Recording:
-        """The samples from `start` to `stop` [s of the recording's own time], both included."""
-        # A stamp that is a rounding error away counts as being there.
-        slack = 1e-6 * self.sample_time
-        first, last = np.searchsorted(self.time, [start - slack, stop + slack])
-        return self[int(first) : int(last)]
-
-    def windows(self, length: float, stride: float | None = None) -> list[Recording]:
-        """Windows of `length` seconds, every `stride` seconds (`length` by default).
-
-        Windows in a row share the sample between them; what is left at the end is dropped.
-        """
-        stride = length if stride is None else stride
-        if not (length > 0 and stride > 0):
-            raise ValueError(f"`length` and `stride` must be positive, got {length} and {stride}.")
-        fitting = (self.duration - length + 1e-6 * self.sample_time) / stride
-        starts = self.time[0] + stride * np.arange(int(np.floor(fitting)) + 1)
-        return [self.window(start, start + length) for start in starts]
-
     def resolve_convention(self, plant: Mechanism) -> AngleConvention:
         """The recording's own convention, else the plant's; for sliding joints the default one.
 
@@ -193,6 +174,7 @@ class Recording:
                 "the recording has no angle convention; give the plant, or read "
                 "it with convention='absolute,hanging' or the like."
             )
+        # Without a plant the first column is taken as a link, not as an arm.
         first_link = 0 if plant is None else plant.first_link
         qd = None if self.qd is None else convention.rate_to_joint(self.qd, first_link)
         q = convention.position_to_joint(self.q, first_link)
@@ -272,6 +254,7 @@ class Recording:
             )
         if degrees and unit == "m":
             raise ValueError("`degrees=True` needs angles, but `unit` is 'm'; drop one of the two.")
+        # One text, for CSV comments and Parquet metadata hold no lists.
         names = [part.strip() for part in str(attributes.get("names", "")).split(",")]
         recording = cls(
             time=arrays["time"],
@@ -342,5 +325,6 @@ class Recording:
         formats.write_table(self.to_pandas(), path)
 
     def _warn(self, finding: str, remedy: str, *, stacklevel: int) -> None:
+        # Of many recordings the reader must know which one.
         label = f"recording '{self.name}': " if self.name else ""
         warnings.warn(f"{label}{finding}; {remedy}.", RecordingWarning, stacklevel=stacklevel)

@@ -52,6 +52,7 @@ def read_initial_states(
         if lost or not label:
             raise ValueError(f"'{path}': row {row + 1} has no id.")
         state = np.stack([q0[row], qd0[row]])
+        # Mechanisms of one table may have fewer joints than it has columns.
         present = ~np.isnan(state[0])
         sound = np.array_equal(present, ~np.isnan(state[1])) and not np.isinf(state).any()
         if label in states or not present.any() or not sound:

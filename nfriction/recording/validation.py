@@ -75,6 +75,7 @@ def check(arrays: Mapping[str, Array | None], names: Sequence[str], unit: str) -
             )
     if len(names) != q.shape[1] or len(set(names)) < len(names):
         raise ValueError(f"`names` must name each of {q.shape[1]} joints once, got {names}.")
+    # Names are written in CSV headers and comments, and must come back from them.
     if any(not re.fullmatch(r"[^\s,#]([^,#\n]*[^\s,#])?", name) for name in names):
         raise ValueError(f"`names` must be free of commas, # and outer blanks, got {names}.")
     if unit not in ("rad", "m"):
@@ -171,6 +172,7 @@ def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> list[tuple
 def _turns_between_samples(q: Array, pauses: NDArray[np.intp]) -> NDArray[np.intp]:
     """Jumps of about a turn between short steps, (joint,): no joint starts and stops so fast."""
     step = np.abs(np.diff(q, axis=0))
+    # Across a gap any number of turns is possible.
     step[pauses] = 0.0
     short = np.pad(step < np.pi / 2, ((1, 1), (0, 0)), constant_values=True)
     jumps = (np.abs(step - 2 * np.pi) < np.pi / 2) & short[:-2] & short[2:]

@@ -104,6 +104,7 @@ def initial_state(
     first = int(np.searchsorted(time, begin - slack))
     stop = int(np.searchsorted(time, begin + duration + slack, side="right"))
     stop = min(max(stop, first + 4), len(time))
+    # A cubic needs four samples.
     first = max(min(first, stop - 4), 0)
     coefficients = local_polynomial(time[None, first:stop] - start, q[None, first:stop], 3)
     return coefficients[0, 0], coefficients[0, 1]

@@ -53,15 +53,13 @@ def test_chunks_change_nothing(chunk: int) -> None:
     J = per_sample_jacobian(model, parameters, x)
     close = {"rtol": 1e-12, "atol": 1e-13}
     torch.testing.assert_close(per_sample_jacobian(model, parameters, x, chunk), J, **close)
-    weights = noise(2, 10).square()
-    got = normal_equations(model, parameters, x, y, weights, chunk)
-    rows = weights.sqrt()[:, None, None] * J
-    error = weights.sqrt()[:, None] * (torch.func.functional_call(model, parameters, (x,)) - y)
-    rows, error = rows.reshape(20, 52), error.flatten()
+    got = normal_equations(model, parameters, x, y, chunk)
+    error = (torch.func.functional_call(model, parameters, (x,)) - y).flatten()
+    rows = J.reshape(20, 52)
     torch.testing.assert_close(got.JtJ, rows.T @ rows, **close)
     torch.testing.assert_close(got.Jte, rows.T @ error, **close)
     torch.testing.assert_close(got.squares, error @ error, **close)
-    cheap = sum_of_squares(model, parameters, x, y, weights)
+    cheap = sum_of_squares(model, parameters, x, y)
     torch.testing.assert_close(cheap, got.squares, **close)
 
 
@@ -86,15 +84,6 @@ def test_frozen_parameters_have_no_column() -> None:
     torch.testing.assert_close(part, whole[:, :, 20:], rtol=1e-14, atol=0)
 
 
-def test_weights_of_single_errors_scale_their_rows() -> None:
-    model, x, y = RadialBasis(), noise(0, 6, 2), noise(1, 6, 2)
-    weights = torch.zeros(6, 2).double()
-    weights[2, 1] = 4.0
-    row = 2 * per_sample_jacobian(model, trainable(model), x)[2, 1]
-    got = normal_equations(model, trainable(model), x, y, weights)
-    torch.testing.assert_close(got.JtJ, torch.outer(row, row), rtol=1e-13, atol=1e-15)
-
-
 def test_memory_stays_bounded_on_a_long_recording() -> None:
     model = RadialBasis()
     sizes = [len(y) for _, y, _ in jacobian_pieces(model, trainable(model), noise(0, 40_000, 2))]
@@ -110,9 +99,5 @@ def test_misfits_are_refused_at_the_border() -> None:
         normal_equations(model, parameters, x, noise(1, 5, 1))
     with pytest.raises(ValueError, match="number of samples"):
         normal_equations(model, parameters, x, noise(1, 4))
-    with pytest.raises(ValueError, match="weights"):
-        normal_equations(model, parameters, x, noise(1, 5), torch.ones(4))
-    with pytest.raises(ValueError, match="negative"):
-        normal_equations(model, parameters, x, noise(1, 5), -torch.ones(5).double())
     with pytest.raises(ValueError, match="number of samples"):
         normal_equations(model, parameters, x[:0], noise(1, 5)[:0])

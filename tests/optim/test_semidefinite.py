@@ -44,7 +44,7 @@ def test_what_nothing_tells_stays_at_zero(lost):
 @pytest.mark.parametrize("bound", [float("inf"), 0.05])
 def test_a_search_goes_the_same_way_with_blocks_and_without(bound, monkeypatch):
     """Also where a shared unknown ends at a bound."""
-    monkeypatch.setattr("nfriction.optim.levenberg_marquardt.MANY", COUNT)
+    monkeypatch.setattr("nfriction.optim.linear_algebra.MANY_BLOCKS", COUNT)
     jacobian, r = bordered()
     upper = torch.full((jacobian.shape[1],), torch.inf, dtype=F64)
     upper[0] = bound

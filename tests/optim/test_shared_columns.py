@@ -71,24 +71,18 @@ def test_columns_and_maps_make_the_jacobian_of_reverse_differentiation(
     torch.testing.assert_close(first.movedim(-1, 0), network(x), rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("weighted", ["not", "by sample", "by error"])
 @pytest.mark.parametrize("groups", [1, 3])
 @pytest.mark.parametrize("kind", LAYERS)
-def test_columns_give_the_normal_equations_of_the_whole_jacobian(
-    kind: str, groups: int, weighted: str
-) -> None:
+def test_columns_give_the_normal_equations_of_the_whole_jacobian(kind: str, groups: int) -> None:
     layer = shaken(LAYERS[kind](groups))
     assert shares_columns(layer)
     x, y = noise(0, 101, groups, 2), noise(1, 101, groups, 2)
-    weights = {"not": None, "by sample": noise(2, 101).square(), "by error": noise(3, *y.shape)}
-    weight = weights[weighted]
-    weight = None if weight is None else weight.abs()
     for module in (layer, frozen_first(layer)):
         offset = {name: value + 0.1 for name, value in trainable(module).items()}
-        wanted = normal_equations(automatic(module), offset, x, y, weight)
+        wanted = normal_equations(automatic(module), offset, x, y)
         # Chunks that do not divide the samples, and all at once.
         for chunk in (33, None):
-            assert_same(normal_equations(module, offset, x, y, weight, chunk), wanted)
+            assert_same(normal_equations(module, offset, x, y, chunk), wanted)
 
 
 def test_regularisation_takes_the_columns_where_they_are_offered() -> None:

@@ -6,7 +6,6 @@ import sys
 import warnings
 import zipfile
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -432,21 +431,6 @@ def test_what_jumps_by_a_turn_for_other_reasons_is_not_taken_for_wrapped() -> No
 
 
 # --- cutting ---------------------------------------------------------------------------------
-
-
-def test_windows_share_their_borders_and_cover_the_record() -> None:
-    time = np.arange(1001) * 1e-3 + 5.0
-    recording = Recording(time, np.sin(time)[:, None], name="sine")
-    windows = recording.windows(0.1)
-    assert [len(window) for window in windows] == [101] * 10
-    for before, after in pairwise(windows):
-        assert before.time[-1] == after.time[0]
-    assert windows[-1].time[-1] == time[-1]
-    assert len(recording.windows(0.3)) == 3
-    assert len(recording.windows(0.3, stride=0.1)) == 8
-    assert recording.windows(2.0) == []
-    with pytest.raises(ValueError, match="positive"):
-        recording.windows(0.0)
 
 
 def test_slices_keep_everything_else() -> None:

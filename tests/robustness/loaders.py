@@ -357,9 +357,9 @@ def _read_rig(path: Path) -> None:
 
 
 def _rule_samples(_: Path) -> list[bytes]:
-    import nfriction.fuzzy
+    import nfriction.papers.controller
 
-    folder = Path(nfriction.fuzzy.__file__).parent / "data"
+    folder = Path(nfriction.papers.controller.__file__).parent / "data"
     table = (folder / "joint2.json").read_bytes()
     listed = json.loads(table)
     names = [list(v["sets"]) for v in listed["inputs"].values()]

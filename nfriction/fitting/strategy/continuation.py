@@ -17,7 +17,7 @@ from nfriction.fitting.shooting.variables import Parts, model_at
 from nfriction.fitting.strategy.extrapolation_prior import ExtrapolationPrior
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import LeastSquaresResult, Quadratic, Status, Step
-from nfriction.optim.levenberg_marquardt import FULL, LevenbergMarquardt
+from nfriction.optim.levenberg_marquardt import WEAK_DAMPING, LevenbergMarquardt
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
@@ -172,7 +172,7 @@ class StallMonitor:
         count = self.problem.variables.shared_count
         before, self.before = self.before, x
         # A step that damping cut short shows no convergence.
-        if before is None or step.damping > FULL:
+        if before is None or step.damping > WEAK_DAMPING:
             return torch.inf
         sd = self.problem.posterior_sd(local.hessian)
         # Of chaotic windows the curvature is round-off, by which nothing would ever move.

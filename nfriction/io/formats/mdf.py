@@ -58,6 +58,7 @@ def choose_channels(file: Any, sources: Sequence[str]) -> Signals:
     # Each group has a channel of stamps, often called "time"; they come with every signal, too.
     ours = {name for name in places if OURS.fullmatch(name) and name != "time"}
     for name in sorted(ours | asked_names(set(places), sources)):
+        # Several groups may log one signal at different rates.
         if len(places[name]) > 1:
             raise ValueError(f"channel {name} is there more than once")
         signal = file.get(name)

@@ -91,7 +91,7 @@ def choose_signals(
 
 
 def asked_names(names: set[str], sources: Sequence[str]) -> set[str]:
-    """Those of a file's names that sources ask for."""
+    """The names in a file that sources ask for."""
     return {s.column for spec in sources if (s := parse_source(spec, names))}
 
 
@@ -128,6 +128,7 @@ def _controldesk(content: dict[str, Any]) -> Columns:
         if not (isinstance(record, dict) and {"X", "Y"} <= record.keys()):
             continue
         axes, signals = _named_data(record["X"]), _named_data(record["Y"])
+        # With several time axes none of them is the common one.
         if len(axes) == 1:
             signals.append(("time", axes[0][1]))
         for label, values in signals:

@@ -153,6 +153,7 @@ def _with_decimal_points(table: pd.DataFrame) -> pd.DataFrame:
     commas = {c for c in table.columns if _all_numbers_with(table[c], _COMMA, ",")}
     if not commas:
         return table
+    # Else a thousands separator in one column would pass for a decimal one.
     points = [c for c in table.columns if _all_numbers_with(table[c], _POINT, ".")]
     if points:
         raise ValueError(

@@ -47,7 +47,7 @@ def read_in_worker(
 
 
 def read_main(read: Callable[[Path, Sequence[str]], Signals]) -> None:
-    """Serve `read_in_worker`; a ValueError of `read` refuses the file."""
+    """Read for `read_in_worker`, in the worker; a ValueError of `read` refuses the file."""
 
     def work(task: Mapping[str, Any], folder: Path) -> None:
         save_signals(read(Path(task["path"]), task["sources"]), folder)

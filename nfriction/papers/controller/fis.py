@@ -41,6 +41,7 @@ class _FileVariable:
     sets: tuple[FuzzySet, ...]
 
     def ordered(self, unit: str) -> Variable:
+        # Only here: rules of the file count the sets in its own order.
         ascending = sorted(self.sets, key=lambda term: term.core)
         return Variable(self.name, unit, self.universe, tuple(ascending))
 
@@ -106,10 +107,12 @@ def _sections(text: str) -> dict[str, dict[str, _Line]]:
     for number, raw in enumerate(text.splitlines(), 1):
         stripped = raw.strip()
         line = _Line(number, stripped)
+        # MATLAB's comments.
         if not stripped or stripped.startswith("%"):
             continue
         if stripped.startswith("[") and stripped.endswith("]"):
             heading = stripped[1:-1].strip()
+            # Reading on would mix two systems into one.
             if heading in sections:
                 raise line.error("this section comes twice.")
             section = sections[heading] = {}
@@ -135,6 +138,7 @@ def _check_system(system: dict[str, _Line]) -> None:
     if _quoted(system["Type"]).lower() != "mamdani":
         raise system["Type"].error("only systems of type 'mamdani' are read.")
     for key, method in _METHODS.items():
+        # A missing method is the default, which is ours.
         if key in system and _quoted(system[key]) != method:
             raise system[key].error(f"{key} must be {method!r}.")
 
@@ -190,6 +194,7 @@ def _rules(
     weight = _numbers(line, match[3])
     if len(weight) != 1:
         raise line.error("expected one weight in parentheses.")
+    # OR over one condition, or none, is that condition.
     asked = [i for i, term in enumerate(given) if term != ANY]
     if match[4] == "1" or len(asked) < 2:
         return [Rule(given, then, weight[0])]
@@ -203,6 +208,7 @@ def _rules(
 
 def _named(line: _Line, text: str, variables: list[_FileVariable]) -> tuple[str, ...]:
     parts = text.split()
+    # The limit of digits keeps int() from very long numbers.
     if not all(re.fullmatch(r"-?\d{1,6}", part) for part in parts):
         raise line.error("terms are whole numbers.")
     numbers = [int(part) for part in parts]
@@ -212,6 +218,7 @@ def _named(line: _Line, text: str, variables: list[_FileVariable]) -> tuple[str,
         )
     names = []
     for number, variable in zip(numbers, variables, strict=True):
+        # MATLAB's sign for NOT.
         if number < 0:
             raise line.error("negated terms are not supported; write the opposite set.")
         if number > len(variable.sets):

@@ -77,6 +77,7 @@ class LinguisticTerms(nn.Module):
 
     def __init__(self, sets: Sequence[FuzzySet]) -> None:
         super().__init__()
+        # Every set as four numbers of one family: scripts allow no objects of different classes.
         families, numbers = zip(*(_canonical(term) for term in sets), strict=True)
         self.families = list(families)
         self.register_buffer("numbers", torch.tensor(numbers, dtype=torch.float64))
@@ -165,6 +166,7 @@ class MamdaniController(nn.Module):
         if torch.jit.is_scripting() or torch.compiler.is_compiling():
             y = self._defuzzify(strengths)
         else:
+            # Exported graphs know no lists of a length that depends on the input.
             blocks = strengths.split(_SAMPLES_AT_ONCE, -1)
             y = torch.cat([self._defuzzify(block) for block in blocks], 0)
         return y.reshape(x.shape[:-1] + self.middle.shape)
@@ -185,6 +187,7 @@ class MamdaniController(nn.Module):
             qd, qdd: velocity (either sign) [rad/s] and acceleration [rad/s^2] of one joint.
             fired: strength from which a rule counts as fired.
         """
+        # Rules are written over the speed: friction opposes motion in both directions alike.
         x = torch.stack([qd.abs(), qdd], -1).reshape(-1, 2) / self.si_factor
         return _rule_report(
             self.rule_base, x, self.memberships(x), self.rule_strengths(x), fired=fired
@@ -236,7 +239,7 @@ def paper_controller(
     """
     if joint not in (2, 3, 4):
         raise ValueError(f"the paper has controllers for joints 2, 3 and 4, got {joint}.")
-    file = resources.files("nfriction.fuzzy") / "data" / f"joint{joint}.json"
+    file = resources.files("nfriction.papers.controller") / "data" / f"joint{joint}.json"
     rules = parse_rules(file.read_text(encoding="utf-8"), file.name)
     return MamdaniController(rules, points=points, centroid=centroid)
 
@@ -245,6 +248,7 @@ def _rule_indices(rules: RuleBase) -> tuple[Tensor, Tensor]:
     """Term of each input by rule (inputs, rules), and rules by output term, padded."""
     antecedents = [
         [
+            # "Any" points behind the terms, to a row of ones.
             len(variable.terms) if rule.given[i] == ANY else variable.terms.index(rule.given[i])
             for rule in rules.rules
         ]
@@ -259,6 +263,7 @@ def _rule_indices(rules: RuleBase) -> tuple[Tensor, Tensor]:
     ]
     terms = max(len(output) for output in speaking)
     most = max(len(numbers) for output in speaking for numbers in output)
+    # Padding points behind the rules, to a row of zeros, which no maximum notices.
     padded = torch.full((len(speaking), terms, most), len(rules.rules))
     for o, output in enumerate(speaking):
         for t, numbers in enumerate(output):
@@ -278,6 +283,7 @@ def _output_sets(
         shapes[o, : len(variable.sets)] = torch.stack([term(universe) for term in variable.sets])
         weights = torch.ones_like(universe)
         if centroid == "trapezoid":
+            # The spacing cancels in the centroid.
             weights[0] = weights[-1] = 0.5
         # About the middle: no digits are lost where the universe lies far from zero.
         offset = universe - 0.5 * (universe[0] + universe[-1])
@@ -338,6 +344,7 @@ def _input_coverage(variable: Variable, x: Tensor, memberships: Tensor) -> Input
 
 def _intervals(universe: Tensor, inside: Tensor) -> tuple[tuple[float, float], ...]:
     """First and last point of every run of True."""
+    # Padded, so that runs at either end have both edges.
     edges = torch.nn.functional.pad(inside.long(), (1, 1)).diff()
     starts, ends = (edges == 1).nonzero()[:, 0], (edges == -1).nonzero()[:, 0] - 1
     return tuple(zip(universe[starts].tolist(), universe[ends].tolist(), strict=True))

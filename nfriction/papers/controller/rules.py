@@ -1,6 +1,6 @@
 """Rule bases of fuzzy controllers: variables, their sets, rules; and the JSON files they come in.
 
-A file looks like this (see also `nfriction/fuzzy/data/`)::
+A file looks like this (see also `nfriction/papers/controller/data/`)::
 
     {
       "format": "nfriction-rules/1",
@@ -43,6 +43,7 @@ from nfriction.io import strict_json
 from nfriction.io.atomic import write_atomically
 
 FORMAT = "nfriction-rules/1"
+# Bounds of foreign files: inference costs rules times points of the output universe.
 MAX_BYTES = 1_000_000
 MAX_SETS, MAX_VARIABLES, MAX_RULES = 64, 16, 10_000
 
@@ -76,6 +77,7 @@ class Variable:
         if not 1 <= len(self.sets) <= MAX_SETS:
             raise ValueError(f"{where}: needs 1 to {MAX_SETS} sets, got {len(self.sets)}.")
         _refuse_duplicates(f"{where}: sets", self.terms)
+        # A set of that name could never be asked for.
         if ANY in self.terms:
             raise ValueError(f"{where}: {ANY!r} means any term and cannot name a set.")
         # Ascending sets have a linguistic order, which plots and reports use.
@@ -117,6 +119,7 @@ class RuleBase:
     rules: tuple[Rule, ...]
 
     def __post_init__(self) -> None:
+        # Here and not in the readers: rules built in Python are checked as those of files are.
         for kind, variables in (("inputs", self.inputs), ("outputs", self.outputs)):
             if not 1 <= len(variables) <= MAX_VARIABLES:
                 raise ValueError(f"{kind}: 1 to {MAX_VARIABLES} variables, got {len(variables)}.")
@@ -132,6 +135,7 @@ class RuleBase:
         for number, rule in enumerate(self.rules, 1):
             _check_terms(f"rule {number}: if", rule.given, self.inputs)
             _check_terms(f"rule {number}: then", rule.then, self.outputs)
+            # A weight of zero is a rule that never fires; above 1, a strength is no membership.
             if not 0.0 < rule.weight <= 1.0:
                 raise ValueError(f"rule {number}: weight must be in (0, 1], got {rule.weight}.")
 
@@ -152,6 +156,7 @@ def read_text(path: Path) -> str:
     Raises:
         ValueError: too large, or not UTF-8; names the file.
     """
+    # Before it is read into memory.
     if path.stat().st_size > MAX_BYTES:
         raise ValueError(f"{path.name}: rule files are at most {MAX_BYTES} bytes.")
     try:
@@ -165,6 +170,7 @@ def parse_rules(text: str, source: str = "rules") -> RuleBase:
     try:
         document = strict_json.parse(text, _unique)
         return _rule_base(document)
+    # Python's parser recurses into brackets, of which a hostile file may open thousands.
     except RecursionError:
         raise ValueError(f"{source}: nested too deeply for a rule base.") from None
     except ValueError as error:
@@ -177,6 +183,7 @@ def format_rules(rules: RuleBase) -> str:
         {"if": list(rule.given), "then": list(rule.then), "weight": rule.weight}
         for rule in rules.rules
     ]
+    # A table reads like the one that is printed in a paper; a list holds every rule base.
     table = _table(rules)
     document = {
         "format": FORMAT,
@@ -197,6 +204,7 @@ def _rule_base(document: Any) -> RuleBase:
     _check_keys("the file", document, {"format", "inputs", "outputs"}, {"name", "table", "rules"})
     if document["format"] != FORMAT:
         raise ValueError(f'"format" must be {FORMAT!r}, got {document["format"]!r}.')
+    # With both, they could contradict each other.
     if ("table" in document) == ("rules" in document):
         raise ValueError('give either a "table" or a list of "rules".')
     inputs, outputs = (_variables(document[kind], kind) for kind in ("inputs", "outputs"))
@@ -227,10 +235,12 @@ def _variable(name: str, entry: Any) -> Variable:
             members = sets_from_ranges(list(sets), ranges)
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from error
+        # The shoulders are full at these ends, so nothing is to be gained beyond.
         universe = [ranges[0][0], ranges[-1][1]] if universe is None else universe
     elif all(isinstance(value, dict) for value in sets.values()):
         members = tuple(_set(f"{where}: set {term!r}", term, v) for term, v in sets.items())
         if universe is None:
+            # Gaussians have no ends to take it from.
             raise ValueError(f'{where}: sets given by shape need a "universe": [low, high].')
     else:
         raise ValueError(f"{where}: give every set as a range or every set by its shape.")
@@ -255,6 +265,7 @@ def _table_rules(
         raise ValueError(f'"table": "columns" must name one of the inputs {names}.')
     across = names.index(table["columns"])
     columns, rows = inputs[across], inputs[1 - across]
+    # A misspelt row would otherwise be reported as a missing one only.
     unknown = [row for row in table if row != "columns" and row not in rows.terms]
     if unknown:
         raise ValueError(
@@ -296,6 +307,7 @@ def _listed_rules(entries: Any) -> tuple[Rule, ...]:
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     entries: dict[str, Any] = {}
     for name, value in pairs:
+        # Python's parser keeps the last of two equal keys, and the first would be lost silently.
         if name in entries:
             raise ValueError(f"{name!r} comes twice in the same place; every name once.")
         entries[name] = value
@@ -326,10 +338,12 @@ def _check_keys(where: str, entry: Any, needed: set[str], allowed: set[str]) -> 
 
 
 def _number(value: Any, where: str) -> float:
+    # In Python, True is an int.
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ValueError(f"{where}: expected a number, got {_brief(value)}.")
     try:
         return float(value)
+    # Integers in JSON have no bound, floats do.
     except OverflowError as error:
         raise ValueError(f"{where}: the number is too large.") from error
 
@@ -367,12 +381,14 @@ def _described(variables: tuple[Variable, ...]) -> dict[str, Any]:
 
 def _table(rules: RuleBase) -> dict[str, Any] | None:
     """The table of a full grid of two inputs with rules in its order, else None."""
+    # The key that names the columns shares its place with the rows.
     if len(rules.inputs) != 2 or "columns" in rules.inputs[1].terms:
         return None
     columns, rows = rules.inputs
     in_order = [(column, row) for row in rows.terms for column in columns.terms]
     if [rule.given for rule in rules.rules] != in_order:
         return None
+    # A cell of a table has no place for a weight, and names a term for every output.
     if any(rule.weight != 1.0 or ANY in rule.then for rule in rules.rules):
         return None
     cells = {rule.given: list(rule.then) for rule in rules.rules}
@@ -402,6 +418,7 @@ def _check_terms(where: str, terms: tuple[str, ...], variables: tuple[Variable, 
             raise ValueError(
                 f"{where}: unknown term {term!r} of {variable.name!r}; it has {variable.terms}."
             )
+    # Such a rule would always fire, or do nothing.
     if all(term == ANY for term in terms):
         raise ValueError(f"{where}: at least one variable must have a term.")
 

@@ -143,7 +143,7 @@ def test_identities_hold_at_convergence() -> None:
     for group, gamma in fit.gamma.items():
         shrinkage = 2 * fit.alpha[group] * fit.parameter_squares[group]
         assert abs(gamma - shrinkage) <= 1e-5 * max(1, gamma)
-    unexplained = fit.samples - fit.effective_parameters
+    unexplained = fit.samples - sum(fit.gamma.values())
     assert math.isclose(fit.beta, unexplained / (2 * fit.error_squares), rel_tol=1e-5)
     assert set(fit.alpha) == {"centres", "widths", "consequents"}
 

@@ -1,4 +1,4 @@
-"""Joint and absolute coordinates: inverse to each other, and power stays the same."""
+"""The unrolled solve against LAPACK; joint and absolute coordinates are inverse to each other."""
 
 import pytest
 import torch
@@ -10,9 +10,31 @@ from nfriction.plant.dynamics import (
     joint_forces,
     joint_matrix,
     link_forces,
+    multiply,
     relative,
+    solve,
+    stack,
     stack_matrix,
 )
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 4, 6])
+def test_solve_and_multiply(size: int) -> None:
+    generator = torch.Generator().manual_seed(size)
+    root = torch.randn(8, size, size, dtype=torch.float64, generator=generator)
+    matrix = root @ root.mT + 0.1 * torch.eye(size)
+    rhs = torch.randn(8, size, dtype=torch.float64, generator=generator)
+    x = solve(entries(matrix), rhs.unbind(-1))
+    torch.testing.assert_close(stack(x), torch.linalg.solve(matrix, rhs), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(stack(multiply(entries(matrix), x)), rhs, rtol=1e-9, atol=1e-9)
+    assert torch.equal(stack_matrix(entries(matrix)), matrix)
+
+
+def test_entries_of_different_shapes_broadcast() -> None:
+    matrix = [[torch.tensor(2.0), torch.zeros(3, 1)], [torch.zeros(3, 1), torch.ones(4)]]
+    x = stack(solve(matrix, [torch.ones(4), torch.tensor(5.0)]))
+    assert x.shape == (3, 4, 2)
+    torch.testing.assert_close(x, torch.tensor([0.5, 5.0]).expand(3, 4, 2))
 
 
 @pytest.mark.parametrize(("size", "first"), [(1, 0), (3, 0), (2, 1), (4, 1)])
