@@ -62,8 +62,6 @@ def fit_adaptive(
     References:
         TLRIP paper, AFEM.
     """
-    if not isinstance(model.schedule, Adaptive):
-        raise ValueError(f"{type(model).__name__} is no adaptive model; use `fit`.")
     task = prepare_task(
         model, plant, recordings, like_start(options, start), start, motions, callback
     )
@@ -80,12 +78,15 @@ def like_start(options: FitOptions, start: FitResult | None) -> FitOptions:
 
 def fit_by_class(task: FitTask, classes: ClassOptions = DEFAULTS) -> FitResult:
     """Fit coefficients by class by output error, from the fit of the constant law."""
+    schedule = task.model.schedule
+    if not isinstance(schedule, Adaptive):
+        raise ValueError(f"{type(task.model).__name__} is no adaptive model; use `fit`.")
     # The classes have no encoder eccentricity, and windows are free.
     options = replace(task.options, eccentricity="off", continuity="none")
     task = replace(task, options=options)
     constant = constant_start(task)
     length = constant.longest_usable_horizon(options.windows)
-    by_class = ClassFit.of(task, constant, length, classes)
+    by_class = ClassFit.of(task, schedule, constant, length, classes)
     task, given, windows = by_class.task, by_class.given, by_class.windows
     terms = adjustable_terms(
         task.plant, task.recordings, options, per_recording=bool(constant.encoder_offsets)

@@ -295,15 +295,17 @@ def fit_by_search(
         raise ValueError(
             f"a search fits constant or adaptive coefficients, not {type(schedule).__name__}."
         )
-    method: Method = "output_error" if isinstance(schedule, Adaptive) else "equation_error"
+    method: Method = "output_error" if schedule.follows_motion else "equation_error"
     asked = like_start(FitOptions(method), start)
     task = prepare_task(model, plant, recordings, asked, start, motions)
     longest = max(float(r.time[-1] - r.time[0]) for r in task.recordings)
     length, by_class, varied = options.horizon or longest, None, model
+    table: Tabulated = schedule
     if isinstance(schedule, Adaptive):
         constant = constant_start(task)
-        by_class = ClassFit.of(task, constant, length, classes)
+        by_class = ClassFit.of(task, schedule, constant, length, classes)
         task, varied, windows = by_class.task, by_class.given, by_class.windows
+        table = by_class.table
     else:
         constant = start or fit_constant(task)
         schedule.set_coefficients(constant.model.schedule.coefficient_sets()["always"])
@@ -314,18 +316,18 @@ def fit_by_search(
         integration_substeps(plant, varied, step), threads=options.threads or available_threads(),
         drive=None if by_class is None else by_class.drive(),
     )  # fmt: skip
-    box = _box(varied, constant, task)
-    first = error.residuals(varied.schedule.parameter_vector())
+    box = _box(table, varied, constant, task)
+    first = error.residuals(table.parameter_vector())
     noise = effective_noise(first.nan_to_num(1.0, 1.0, -1.0))
-    mean, sd = varied.schedule.prior()
+    mean, sd = table.prior()
 
     def cost(vectors: Tensor) -> Tensor:
         data = error.mean_square(vectors) * (error.values / noise**2)
         return 0.5 * (data + ((vectors - mean) / sd).square().sum(-1))
 
     result = search(cost, box, options, callback)
-    varied.schedule.set_parameter_vector(result.vector)
-    names = varied.schedule.parameter_names(plant.joint_names)
+    table.set_parameter_vector(result.vector)
+    names = table.parameter_names(plant.joint_names)
     hit = box.free & ((result.vector <= box.lower) | (result.vector >= box.upper))
     found = FitResult(
         model=model.requires_grad_(False),
@@ -344,19 +346,17 @@ def fit_by_search(
     return by_class.backtracked(found, windows, float(error.mean_square(mean[None])[0].sqrt()))
 
 
-def _box(model: FrictionModel, constant: FitResult, task: FitTask) -> Box:
+def _box(table: Tabulated, model: FrictionModel, constant: FitResult, task: FitTask) -> Box:
     """Variables of a search, scaled by the natural size of each coefficient."""
-    schedule = model.schedule
-    assert isinstance(schedule, Tabulated)
-    values = schedule.values
+    values = table.values
     natural = coefficient_scale(model, constant.plant, task.recordings, task.motions)
     natural = natural.reshape(len(natural), *(1,) * (values.ndim - 2), -1)
     log = torch.tensor([not c.linear for c in model.law.coefficients]).expand_as(values)
     scale = torch.maximum(values.abs(), natural)
     # A coefficient that is searched over decades moves by one of them.
     scale = torch.where(log | (scale == 0), 1.0, scale)
-    lower, upper = schedule.bounds()
-    return Box(schedule.parameter_vector(), lower, upper, scale.reshape(-1), log.reshape(-1))
+    lower, upper = table.bounds()
+    return Box(table.parameter_vector(), lower, upper, scale.reshape(-1), log.reshape(-1))
 
 
 def available_threads() -> int:

@@ -167,7 +167,9 @@ class ClassFit:
         motions: of the recordings, as recorded.
         constant: fit of the constant law, from which every class starts.
         classes: of the recordings.
-        given: the model whose classes are given.
+        schedule: of the model to be fitted, set to these classes.
+        table: the coefficients that a fit with given classes varies.
+        given: the model of that table.
         windows: of the recordings.
     """
 
@@ -175,16 +177,22 @@ class ClassFit:
     motions: tuple[Motion, ...]
     constant: FitResult
     classes: AccelerationClasses
+    schedule: Adaptive
+    table: GivenClasses
     given: FrictionModel
     windows: Windows
 
     @classmethod
     def of(
-        cls, task: FitTask, constant: FitResult, length: float, options: ClassOptions
+        cls,
+        task: FitTask,
+        schedule: Adaptive,
+        constant: FitResult,
+        length: float,
+        options: ClassOptions,
     ) -> "ClassFit":
-        """Find the classes, set the model's schedule to them, and cut windows [s]."""
-        model, schedule = task.model, task.model.schedule
-        assert isinstance(schedule, Adaptive)
+        """Find the classes, set the schedule of the task's model to them, and cut windows [s]."""
+        model = task.model
         joint, motions = apply_encoder_offsets(
             constant.encoder_offsets, task.plant, task.recordings, task.motions
         )
@@ -195,11 +203,11 @@ class ClassFit:
         natural = coefficient_scale(model, constant.plant, joint, motions)
         sd = options.prior_sd * torch.maximum(values.abs(), natural)
         # Where neither gives a size, the coefficient is free.
-        given = GivenClasses(model, values, torch.where(sd > 0, sd, torch.inf))
-        friction = FrictionModel(model.law, given, model.v_smooth).requires_grad_(False)
+        table = GivenClasses(model, values, torch.where(sd > 0, sd, torch.inf))
+        given = FrictionModel(model.law, table, model.v_smooth).requires_grad_(False)
         corrected = replace(task, recordings=joint, motions=motions)
         windows = cut_windows(joint, motions, length)
-        return cls(corrected, task.motions, constant, classes, friction, windows)
+        return cls(corrected, task.motions, constant, classes, schedule, table, given, windows)
 
     @property
     def substeps(self) -> int:
@@ -225,12 +233,9 @@ class ClassFit:
             windows: with the initial states that it found.
             baseline: root mean square error of the constant law [rad].
         """
-        task, constant, model = self.task, self.constant, self.task.model
-        schedule, given = model.schedule, self.given.schedule
-        assert isinstance(schedule, Adaptive)
-        assert isinstance(given, GivenClasses)
+        task, constant, model, schedule = self.task, self.constant, self.task.model, self.schedule
         flat = constant.model.schedule.coefficient_sets()["always"][:, None]
-        table = torch.take_along_dim(given.values, self.classes.stands_for[..., None], 1)
+        table = torch.take_along_dim(self.table.values, self.classes.stands_for[..., None], 1)
         model.requires_grad_(False)
         along = [
             schedule.states(torch.as_tensor(m.qd), torch.as_tensor(m.qdd)) for m in task.motions

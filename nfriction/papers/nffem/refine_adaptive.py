@@ -67,10 +67,13 @@ def refine_adaptive(
         TLRIP paper, neuro-fuzzy friction estimation (NFFEM), which starts from AFEM's models.
         L. Breiman, Machine Learning 24 (1996) 49, on shares from hold-out data (stacking).
     """
-    schedule = _schedule_of(model, adaptive)
+    schedule, reference = _schedules_of(model, adaptive)
     plant, motions = adaptive.plant, adaptive.motions
     joint = in_joint_coordinates(plant, model, list(recordings))
-    _start_at(model, adaptive, joint)
+    scale = coefficient_scale(model, plant, joint, motions)
+    schedule.set_adaptive(reference, scale)
+    schedule.set_range(*input_range(motions, schedule.deviation.along_motion))
+    model.requires_grad_(False)
     known = [schedule.states(torch.as_tensor(m.qd), torch.as_tensor(m.qdd)) for m in motions]
     substeps = integration_substeps(plant, model, max(r.longest_step for r in joint))
     cut = cut_for_folds(joint, motions, length, FOLDS)
@@ -88,7 +91,7 @@ def refine_adaptive(
         FitOptions(max_steps=max_steps, patience=0), callback,
     )  # fmt: skip
     name = f"{length:g} s windows, correction by class"
-    begun, shares = _cross_fitted(whole, fitter, name)
+    begun, shares = _cross_fitted(schedule, whole, fitter, name)
     part = shares[schedule.joint_of_parameters()]
     if part.any():
         start = whole.variables.start(friction=begun)
@@ -106,35 +109,27 @@ def refine_adaptive(
     return replace(found, status=status, plant_terms=adaptive.plant_terms)
 
 
-def _schedule_of(model: FrictionModel, adaptive: FitResult) -> AdaptiveNeuroFuzzy:
-    """The model's schedule, which must be able to start from the fit."""
-    fits = isinstance(adaptive.model.schedule, Adaptive) and adaptive.model.law == model.law
-    if not (isinstance(model.schedule, AdaptiveNeuroFuzzy) and fits):
+def _schedules_of(model: FrictionModel, adaptive: FitResult) -> tuple[AdaptiveNeuroFuzzy, Adaptive]:
+    """The model's schedule, and that of the fit from which it must be able to start."""
+    schedule, reference = model.schedule, adaptive.model.schedule
+    if (
+        adaptive.model.law != model.law
+        or not isinstance(schedule, AdaptiveNeuroFuzzy)
+        or not isinstance(reference, Adaptive)
+    ):
         raise ValueError(
             f"an adaptive fit of the model's law, {model.law.name!r}, and a model made with "
             f'network="by_class" are needed, got {type(adaptive.model).__name__} and '
             f"{type(model).__name__}."
         )
-    return model.schedule
-
-
-def _start_at(model: FrictionModel, adaptive: FitResult, joint: Sequence[Recording]) -> None:
-    """Set the model to the adaptive one, and its network's inputs to the range of the motion."""
-    schedule, reference = model.schedule, adaptive.model.schedule
-    assert isinstance(schedule, AdaptiveNeuroFuzzy)
-    assert isinstance(reference, Adaptive)
-    scale = coefficient_scale(model, adaptive.plant, joint, adaptive.motions)
-    schedule.set_adaptive(reference, scale)
-    schedule.set_range(*input_range(adaptive.motions, schedule.deviation.along_motion))
-    model.requires_grad_(False)
+    return schedule, reference
 
 
 def _cross_fitted(
-    whole: ShootingProblem, fitter: ShootingFitter, name: str
+    schedule: AdaptiveNeuroFuzzy, whole: ShootingProblem, fitter: ShootingFitter, name: str
 ) -> tuple[Tensor, Tensor]:
     """The mean of corrections learned from parts, and the share of them for each joint."""
-    schedule, windows, memory = whole.friction.schedule, whole.windows, whole.memory
-    assert isinstance(schedule, AdaptiveNeuroFuzzy)
+    windows, memory = whole.windows, whole.memory
     assert memory is not None
     zero = torch.zeros_like(schedule.parameter_vector())
     fold = torch.arange(len(windows)) % FOLDS

@@ -51,11 +51,11 @@ class Encoder:
         return math.tau / (4 * self.lines)
 
     @classmethod
-    def drawn(cls, random: np.random.Generator, lines: int = 2048) -> Encoder:
+    def drawn(cls, random: np.random.Generator) -> Encoder:
         """An encoder of usual quality: eccentric by 0.3 counts, edges off by 0.05 counts (rms)."""
         phase = float(random.uniform(0.0, math.tau))
         first, second, third, fourth = (0.05 * random.standard_normal(4)).tolist()
-        return cls(lines, 0.3, phase, (first, second, third, fourth))
+        return cls(eccentricity=0.3, phase=phase, edges=(first, second, third, fourth))
 
     def read(self, q: Array) -> Array:
         """Positions [rad] that the counter reads at true positions, any shape."""
@@ -111,6 +111,7 @@ def make(
         duration: of each recording [s]; by default the experiment's own. A shorter twin is the
             beginning of a longer one.
         progress: show a progress bar.
+
     Raises:
         ValueError: for an unknown name or a duration of fewer than 8 samples.
     """

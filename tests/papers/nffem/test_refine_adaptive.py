@@ -60,9 +60,9 @@ def test_what_classes_cannot_say_is_learned(case):
     assert ours.free_run.all < 0.7 * before.free_run.all
 
 
-def test_a_correction_that_does_not_serve_is_left(case, monkeypatch):
+def test_a_correction_that_does_not_help_is_left(case, monkeypatch):
     plant, train, held, by_class = case
-    # However little is taken, the windows held back come out worse.
+    # However little is taken, the hold-out windows come out worse.
     monkeypatch.setattr(
         "nfriction.papers.nffem.refine_adaptive._errors",
         lambda p, vector: (1.0 + vector.any()) * torch.ones(len(p.windows), 2, dtype=F64),
@@ -74,11 +74,11 @@ def test_a_correction_that_does_not_serve_is_left(case, monkeypatch):
 
 
 def test_a_correction_worse_where_it_was_learned_is_left(case, monkeypatch):
-    """Though its parts fared well on windows held back."""
+    """Though its parts did well on hold-out windows."""
     _, train, _, by_class = case
     monkeypatch.setattr(
         "nfriction.papers.nffem.refine_adaptive._cross_fitted",
-        lambda whole, *_: (whole.friction.schedule.parameter_vector(), torch.ones(2, dtype=F64)),
+        lambda schedule, *_: (schedule.parameter_vector(), torch.ones(2, dtype=F64)),
     )
     monkeypatch.setattr(
         "nfriction.papers.nffem.refine_adaptive._errors",
@@ -89,7 +89,7 @@ def test_a_correction_worse_where_it_was_learned_is_left(case, monkeypatch):
     assert not found.model.schedule.parameter_vector().any()
 
 
-def test_a_joint_s_part_that_does_not_serve_is_left(case, monkeypatch):
+def test_a_joint_s_part_that_does_not_help_is_left(case, monkeypatch):
     plant, train, _, by_class = case
     model = network()
     of_joint = model.schedule.joint_of_parameters()
