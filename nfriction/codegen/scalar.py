@@ -77,11 +77,10 @@ EVALUATE: dict[str, Callable[..., Any]] = {
     "or": np.logical_or,
     "not": np.logical_not,
     "where": np.where,
-    "finite": np.isfinite,  # made by `finite.py` alone, for C that looks at the bits
 }
 """Every scalar operation with its meaning; the emitters know the same ones."""
 
-PREDICATES = frozenset({"lt", "le", "eq", "ne", "and", "or", "not", "finite"})
+PREDICATES = frozenset({"lt", "le", "eq", "ne", "and", "or", "not"})
 _COMMUTATIVE = frozenset({"add", "mul", "max", "min", "eq", "ne", "and", "or"})
 
 

@@ -16,14 +16,14 @@ from nfriction.codegen import UnsupportedOperation
 from nfriction.export.c_code.dialect import comment
 from nfriction.export.c_code.export import c
 from nfriction.export.c_code.run import c_contract, c_runner
-from nfriction.export.contract import verify
+from nfriction.export.contract import compare, verify
 from nfriction.export.controller import NOT_FINITE, OUTSIDE, SATURATED, controller_of
 from nfriction.export.errors import ExportError
-from nfriction.export.parity import compare
 from nfriction.export.test_vectors import draw
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
-from nfriction.friction.models import MODELS, FrictionModel
+from nfriction.friction.models import FrictionModel
+from nfriction.friction.registry import model_by_name, model_names
 from nfriction.io.model_info import ModelInfo
 from tests.export.artefacts import Rising
 from tests.friction.samples import randomise
@@ -56,7 +56,7 @@ INFO = ModelInfo(
 def random_model(name: str, joints: int = 3, seed: int = 0) -> FrictionModel:
     """A named model, every parameter off its start."""
     random = torch.Generator().manual_seed(seed)
-    kind = MODELS[name]
+    kind = model_by_name(name)
     initial = INITIAL[kind(1).law.name]
     factors = 1.0 + 0.3 * torch.rand(joints, len(initial), generator=random, dtype=torch.float64)
     model = kind(joints, factors * torch.tensor(initial, dtype=torch.float64))
@@ -99,7 +99,7 @@ def points(controller, dtype: str, count: int):
 
 
 cases = pytest.mark.parametrize("dtype", ["float64", "float32"])
-names = pytest.mark.parametrize("name", list(MODELS))
+names = pytest.mark.parametrize("name", model_names())
 few = pytest.mark.parametrize("name", ["Stribeck", "ALFM", "NFLFM"])  # one of each kind
 
 
@@ -410,7 +410,7 @@ def test_a_schedule_that_has_no_range_is_clamped_in_c_too(tmp_path, schedule, dt
 
 @pytest.mark.parametrize("terms", [(3, 5), (6, 2)])
 def test_one_input_may_have_fewer_sets_than_the_other(tmp_path, terms):
-    model = MODELS["NFLFM"](2, INITIAL["linear"], terms=terms)
+    model = model_by_name("NFLFM")(2, INITIAL["linear"], terms=terms)
     randomise(model, 0.2)
     c(model, tmp_path)
     inputs = points(controller_of(model), "float64", 1000)
