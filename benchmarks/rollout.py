@@ -88,7 +88,7 @@ def single(friction: FrictionModel, label: str, rounds: int, folder: str) -> dic
     ]
     if n.network is None:
         makers += [
-            # A constraint solver stands for tanh, so its motion is close but another one.
+            # A constraint solver replaces tanh, so its motion is close but another one.
             lambda: peers.mujoco(plant, *start, steps=STEPS, tolerance=0.2),
             lambda: peers.torchdiffeq(plant, friction, q0, qd0, early),
             lambda: peers.scipy(n, *start),

@@ -15,10 +15,10 @@ from nfriction.codegen.llvm.driver import AXES, Driver, Layout
 
 Array = np.ndarray
 
+# Rows computed together where all share their parameters.
 WIDTH = 8
-"""Rows computed together where all share their parameters."""
+# From that many rows on they are; it costs another compilation.
 FEW = 3
-"""From that many rows on they are; it costs another compilation."""
 
 
 @dataclass(frozen=True)

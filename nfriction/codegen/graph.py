@@ -24,8 +24,8 @@ from nfriction.codegen.errors import UnsupportedOperation
 from nfriction.codegen.operations import OPERATIONS, constants
 from nfriction.codegen.scalar import Graph, Node, UpdateRate
 
+# Most elements a traced tensor, and most scalar operations a traced function, may have.
 LIMIT = 50_000
-"""Most elements a traced tensor, and most scalar operations a traced function, may have."""
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,6 @@ from nfriction.codegen.graph import FunctionalModule, Program
 from nfriction.codegen.llvm import jit
 from nfriction.codegen.rollout_program import LAYOUT, ForcedSystem, RolloutDriver, arrange
 
-SPEED_LIMIT = 1e6
-"""Above this velocity [rad/s or m/s] a candidate counts as diverged."""
-
 # Of accelerations over steps of 0.1 ms: velocities of 10 rad/s round to 2e-15, rates to 2e-11.
 _CHECK_TOLERANCE = 1e-9
 
@@ -138,7 +135,6 @@ class CompiledRollout:
         threads: int = 1,
         substeps: int = 1,
         memory: Any = None,
-        speed_limit: float = SPEED_LIMIT,
     ) -> Trajectories:
         """Integrate all candidates from their initial states.
 
@@ -157,7 +153,6 @@ class CompiledRollout:
                 others are held anew at each of these steps.
             memory: what the coefficients remember after the first sample, (candidate, joint,
                 state_size), one row is for all; by default that of this sample alone.
-            speed_limit: a candidate faster than this [rad/s] has diverged and is stopped.
 
         Returns:
             Trajectories, in NumPy or (where `q0` is one) torch.
@@ -179,7 +174,6 @@ class CompiledRollout:
             "qd0": rows_of("qd0", qd0, (n,)),
             "tau": series("tau", np.zeros(n) if tau is None else tau, steps, (n,)),
             "step": series("time_step", step, steps, ()),
-            "limit": rows_of("speed_limit", [[speed_limit]], (1,)),
         }
         if drive is not None:
             for name, value in zip(("drive_qd", "drive_qdd"), drive, strict=True):

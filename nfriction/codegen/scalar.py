@@ -40,6 +40,7 @@ class Node:
         return f"%{self.number} = {self.op}({shown})"
 
 
+# Every scalar operation with its meaning; the emitters know the same ones.
 EVALUATE: dict[str, Callable[..., Any]] = {
     "add": np.add,
     "sub": np.subtract,
@@ -78,7 +79,6 @@ EVALUATE: dict[str, Callable[..., Any]] = {
     "not": np.logical_not,
     "where": np.where,
 }
-"""Every scalar operation with its meaning; the emitters know the same ones."""
 
 PREDICATES = frozenset({"lt", "le", "eq", "ne", "and", "or", "not"})
 _COMMUTATIVE = frozenset({"add", "mul", "max", "min", "eq", "ne", "and", "or"})

@@ -213,8 +213,8 @@ def work(asked: Mapping[str, Any], folder: Path) -> None:
     np.savez(folder / _OUTPUTS, **found)
 
 
+# Runs several batches of samples, each a sequence of inputs, through an artefact.
 Batches = Callable[..., Sequence[Sequence[Any]]]
-"""Runs several batches of samples, each a sequence of inputs, through an artefact."""
 
 
 def _here(opener: Callable[[str | Path], tuple[Contract, Runner]]) -> Callable[..., Any]:

@@ -27,6 +27,7 @@ from nfriction.friction.models import FrictionModel
 
 # An exponential that compilers vectorise: that of `math.h` is a call for every number, this one a
 # loop over an array without branches or tables.
+# Of (exp(r) - 1) / r for |r| <= ln(2) / 2, minimax: exp(r) to 4e-18 and 2e-9, beside roundings.
 _POLYNOMIAL: dict[Real, tuple[float, ...]] = {
     "double": (1.0, 0.5000000000000012, 0.16666666666666222, 0.0416666666665181,
                0.008333333333548278, 0.0013888888946297076, 0.0001984126943904723,
@@ -34,7 +35,6 @@ _POLYNOMIAL: dict[Real, tuple[float, ...]] = {
                2.4991890031105645e-08),
     "float": (1.0, 0.49999994, 0.16666432, 0.041667998, 0.008374143, 0.0013843952),
 }  # fmt: skip
-"""Of (exp(r) - 1) / r for |r| <= ln(2) / 2, minimax: exp(r) to 4e-18 and 2e-9, beside roundings."""
 
 # ln 2 as a number of few bits, whose products with whole numbers are exact, and the rest.
 _LN2: dict[Real, tuple[float, float]] = {
