@@ -171,6 +171,7 @@ class Kernel:
 
         def part(first: int, last: int) -> None:
             space = np.empty(room + 8)
+            # Vectors of eight doubles are read by instructions that need 64-byte alignment.
             aligned = space.ctypes.data + -space.ctypes.data % 64
             function(first, last, where.ctypes.data, sizes.ctypes.data, aligned)
 

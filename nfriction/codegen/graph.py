@@ -235,6 +235,7 @@ def trace(
         array = np.empty(len(nodes), dtype=object)
         array[:] = nodes
         arguments[name] = ScalarTensor(array.reshape(tuple(example.shape)), example, graph)
+    # Without gradients: autograd would wrap every traced tensor for nothing.
     with torch.no_grad(), _Watch(graph):
         outputs = function(**arguments)
     outputs = outputs if isinstance(outputs, (tuple, list)) else (outputs,)

@@ -124,6 +124,7 @@ def arrange(program: Program, jacobian: Port | None) -> RolloutProgram:
 def _within(graph: Graph, q: Sequence[Node], qd: Sequence[Node]) -> Node:
     """A test for finite and slow enough states; numbers that are not finite compare false."""
     zero, limit = graph.constant(0.0), graph.constant(SPEED_LIMIT)
+    # A number minus itself is zero unless it is NaN or infinite.
     tests = [graph.apply("eq", graph.apply("sub", x, x), zero) for x in q]
     tests += [graph.apply("le", graph.apply("abs", x), limit) for x in qd]
     return graph.total(tests, "and")

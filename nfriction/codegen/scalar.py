@@ -120,6 +120,7 @@ class Graph:
         simpler = rule(self, *args) if rule else None
         if simpler is not None:
             return simpler
+        # In one order, so that a + b and b + a are one node.
         if op in _COMMUTATIVE and args[0].number > args[1].number:
             args = args[::-1]
         return self._intern(op, args, None, max(a.rate for a in args))

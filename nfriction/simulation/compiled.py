@@ -94,14 +94,16 @@ def integrate_compiled(
     found = compiled(
         q.detach().reshape(-1, joints),
         qd.detach().reshape(-1, joints),
-        steps=inputs.step.shape[-1],
-        time_step=rows(inputs.step, 1),
-        tau=rows(inputs.tau, 2),
-        parameters=values,
-        drive=drive,
-        threads=threads,
-        substeps=inputs.substeps,
-        memory=None if memory is None else rows(memory, 2).reshape(-1, *memory.shape[-2:]),
+        codegen.RolloutSignals(
+            steps=inputs.step.shape[-1],
+            time_step=rows(inputs.step, 1),
+            tau=rows(inputs.tau, 2),
+            drive=drive,
+            substeps=inputs.substeps,
+            memory=None if memory is None else rows(memory, 2).reshape(-1, *memory.shape[-2:]),
+        ),
+        values,
+        threads,
     )
     states = tuple(x.reshape(*batch, -1, joints) for x in (found.q, found.qd, found.qdd))
     return (*states, found.jacobian.unflatten(0, batch)) if jacobian else states
