@@ -1,4 +1,4 @@
-"""What the benchmarks simulate: a swing of the three-link rig that friction ends, two frictions."""
+"""Cases of the benchmarks: a swing of the three-link rig that friction ends, two frictions."""
 
 import math
 from typing import NamedTuple

@@ -220,7 +220,7 @@ def tour(_: Path) -> Iterator[Row]:
 
 
 def intervals(data: Path) -> Iterator[Row]:
-    """How often pieces of real recordings agree within their 95 % intervals [%]."""
+    """Share of pieces of real recordings that agree within their 95 % intervals [%]."""
     told = command(sys.executable, *coverage_command(data)).stdout
     rows = {line.split()[0]: line.split() for line in told.splitlines()[1:]}
     for name in INTERVAL_SETS:

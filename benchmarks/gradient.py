@@ -42,7 +42,7 @@ def median_time(work: Callable[[], object], repeats: int) -> tuple[float, float]
 
 
 def operations(work: Callable[[], object]) -> int:
-    """How many operations eager torch is asked for, those of the backward pass included."""
+    """Number of operations that eager torch runs, those of the backward pass included."""
     from torch.utils._python_dispatch import TorchDispatchMode
 
     class Counter(TorchDispatchMode):

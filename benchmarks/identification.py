@@ -20,7 +20,7 @@ from smoothed states.
 first state; with `--blocks N` each recording is cut in N, and one block of every recording is left
 out at a time, and simulated with the zeros that the others of its recording showed where encoders
 were zeroed anew. With `--peer scipy` every constant law is also fitted by single shooting, as the
-baselines on the recordings' cards were, which tells how hard these recordings are beside those that
+baselines on the recordings' cards were, which shows how hard these recordings are beside those that
 are kept apart. DATA holds a folder to each set, with a `recordings.csv` of initial states.
 
 `intervals` fits pieces of recordings, each alone, and prints how often the difference of what two

@@ -5,8 +5,8 @@
 The controller is an NFLFM (5 x 5 rules and 10 radial units a joint) with random parameters, in all
 targets the same. Every call is timed on its own. For C what two readings of the clock cost (their
 median, measured beside it) is taken off; the last column is the mean of many calls in a row, which
-needs no such correction. The yardstick tells what TorchScript's 35 operations on four joints cost
-here if they were the cheapest there are. Rows of C tell the compiler's options. TorchScript in C++
+needs no such correction. The yardstick is what TorchScript's 35 operations on four joints cost
+here if they were the cheapest there are. Rows of C name the compiler's options. TorchScript in C++
 needs cmake, ONNX Runtime its package; what is not here is left out.
 """
 
@@ -37,7 +37,7 @@ ROWS = 1000  # different samples, taken in turn
 
 @dataclass(frozen=True)
 class Case:
-    """What every target is given.
+    """Inputs of every target.
 
     Attributes:
         model: the friction model.

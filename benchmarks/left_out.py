@@ -82,7 +82,7 @@ class Left(NamedTuple):
 
 
 class Fold(NamedTuple):
-    """What is fitted, and what is left out; with blocks, one of every recording that is fitted."""
+    """Recordings to fit, and those left out; with blocks, one of every recording that is fitted."""
 
     fitted: list[Recording]
     left: list[Left] | list[TimeBlock]

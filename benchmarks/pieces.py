@@ -12,7 +12,7 @@ from nfriction.fitting.fit import fit
 from nfriction.friction.registry import model_by_name
 
 WINDOWS = (0.5, 2.0)
-# Pieces that move by less tell nothing [rad or m]; more of them than so many take too long.
+# Pieces that move by less show nothing [rad or m]; more of them than so many take too long.
 LEAST_TRAVEL, MOST = 0.3, 10
 
 

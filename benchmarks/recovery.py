@@ -34,7 +34,7 @@ PEER_WINDOWS = (None, 0.5)
 
 @dataclass
 class Row:
-    """What one method found in recordings of one release and length."""
+    """Result of one method in recordings of one release and length."""
 
     errors: list[float] = field(default_factory=list)
     held: list[bool] = field(default_factory=list)
@@ -60,7 +60,7 @@ class Row:
 
 
 def simulated(seconds: float, release: Sequence[float], seed: int) -> Recording:
-    """What the encoders see of a release from about `release` [rad]."""
+    """Encoder readings of a release from about `release` [rad]."""
     random = torch.Generator().manual_seed(seed)
     q0 = torch.tensor(release, dtype=torch.float64)
     q0 = q0 + 0.01 * torch.randn(3, generator=random, dtype=torch.float64)

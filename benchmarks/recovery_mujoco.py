@@ -28,7 +28,7 @@ FRICTION_SOLREF = (2 * peers.DT, 1.0)
 
 @dataclass(frozen=True)
 class Found:
-    """What the toolbox says of viscous and Coulomb coefficients, each (joint, 2)."""
+    """Estimates of the toolbox of viscous and Coulomb coefficients, each (joint, 2)."""
 
     values: Array
     half_widths: Array

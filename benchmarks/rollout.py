@@ -23,7 +23,7 @@ from limit import hand_written
 from timing import Contestant, verdict
 
 from nfriction import FrictionModel, PendulumChain, rollout
-from nfriction.codegen import compile_rollout
+from nfriction.codegen import RolloutSignals, compile_rollout
 from nfriction.simulation.rk4 import rk4_step
 
 BATCH_STEPS = 2_000
@@ -58,7 +58,7 @@ def bare(plant: PendulumChain, friction: FrictionModel, q0: Any, qd0: Any) -> Ca
     q, qd = q0[None].numpy(), qd0[None].numpy()
 
     def run() -> np.ndarray:
-        motion = compiled(q, qd, steps=STEPS, time_step=DT)
+        motion = compiled(q, qd, RolloutSignals(STEPS, DT))
         return np.concatenate([motion.q[0, -1], motion.qd[0, -1]])
 
     return run
@@ -88,7 +88,7 @@ def single(friction: FrictionModel, label: str, rounds: int, folder: str) -> dic
     ]
     if n.network is None:
         makers += [
-            # A constraint solver stands for tanh, so its motion is close but another one.
+            # A constraint solver replaces tanh, so its motion is close but another one.
             lambda: peers.mujoco(plant, *start, steps=STEPS, tolerance=0.2),
             lambda: peers.torchdiffeq(plant, friction, q0, qd0, early),
             lambda: peers.scipy(n, *start),

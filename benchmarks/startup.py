@@ -49,7 +49,7 @@ def first_calls(repeats: int) -> None:
 
 
 def imports(repeats: int) -> None:
-    """The package loads its parts when they are asked for, so both are told."""
+    """The package loads its parts when they are asked for, so both are timed."""
     used = "import nfriction; nfriction.rollout, nfriction.fit, nfriction.NFLFM"
     for code in ("import nfriction", used):
         times = sorted(float(_python(IMPORTS.format(more=code)).stdout) for _ in range(repeats))

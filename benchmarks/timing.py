@@ -59,7 +59,7 @@ def pin() -> str:
 
 
 def yardstick() -> str:
-    """How fast this machine is now: absolute times mean nothing without it."""
+    """Speed of this machine now: absolute times mean nothing without it."""
     import torch
 
     x = torch.ones((), dtype=torch.float64)

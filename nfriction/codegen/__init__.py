@@ -12,13 +12,14 @@ from nfriction.codegen.errors import (
 from nfriction.codegen.function import CompiledFunction, compile_function
 from nfriction.codegen.llvm.jit import cache_folder
 from nfriction.codegen.operations import supported_operations
-from nfriction.codegen.rollout import CompiledRollout, Trajectories, compile_rollout
+from nfriction.codegen.rollout import CompiledRollout, RolloutSignals, Trajectories, compile_rollout
 
 __all__ = [
     "CodegenError",
     "CompiledFunction",
     "CompiledRollout",
     "NoBackend",
+    "RolloutSignals",
     "SelfCheckFailed",
     "Trajectories",
     "UnsupportedOperation",

@@ -15,10 +15,10 @@ from nfriction.codegen.llvm.driver import AXES, Driver, Layout
 
 Array = np.ndarray
 
+# Rows computed together where all share their parameters.
 WIDTH = 8
-"""Rows computed together where all share their parameters."""
+# From that many rows on they are; it costs another compilation.
 FEW = 3
-"""From that many rows on they are; it costs another compilation."""
 
 
 @dataclass(frozen=True)
@@ -171,6 +171,7 @@ class Kernel:
 
         def part(first: int, last: int) -> None:
             space = np.empty(room + 8)
+            # Vectors of eight doubles are read by instructions that need 64-byte alignment.
             aligned = space.ctypes.data + -space.ctypes.data % 64
             function(first, last, where.ctypes.data, sizes.ctypes.data, aligned)
 

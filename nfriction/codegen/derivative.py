@@ -54,6 +54,7 @@ def tangents(graph: Graph, outputs: Iterable[Node], seed: Tangents) -> dict[int,
     """
     found = dict(seed)
     for node in reachable(outputs):
+        # Comparisons jump: their derivative is zero wherever they have one.
         if not any(a.number in found for a in node.args) or is_predicate(node):
             continue
         moving = [found.get(a.number) for a in node.args]
@@ -86,12 +87,14 @@ def _div(g: Graph, node: Node, da: Node | None, db: Node | None) -> Node:
     b = node.args[1]
     if db is None:
         return g.apply("div", _one(da), b)
+    # By the quotient itself, which is known: (da - (a / b) db) / b.
     fall = g.apply("mul", node, db)
     over = g.apply("neg", fall) if da is None else g.apply("sub", da, fall)
     return g.apply("div", over, b)
 
 
 def _where(g: Graph, node: Node, _: Node | None, da: Node | None, db: Node | None) -> Node:
+    # Only the branch taken counts; a NaN of the other one is not passed on.
     zero = g.constant(0.0)
     return g.apply("where", node.args[0], da or zero, db or zero)
 

@@ -24,8 +24,8 @@ from nfriction.codegen.errors import UnsupportedOperation
 from nfriction.codegen.operations import OPERATIONS, constants
 from nfriction.codegen.scalar import Graph, Node, UpdateRate
 
+# Most elements a traced tensor, and most scalar operations a traced function, may have.
 LIMIT = 50_000
-"""Most elements a traced tensor, and most scalar operations a traced function, may have."""
 
 
 @dataclass(frozen=True)
@@ -235,6 +235,7 @@ def trace(
         array = np.empty(len(nodes), dtype=object)
         array[:] = nodes
         arguments[name] = ScalarTensor(array.reshape(tuple(example.shape)), example, graph)
+    # Without gradients: autograd would wrap every traced tensor for nothing.
     with torch.no_grad(), _Watch(graph):
         outputs = function(**arguments)
     outputs = outputs if isinstance(outputs, (tuple, list)) else (outputs,)

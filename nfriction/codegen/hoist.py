@@ -54,6 +54,7 @@ def _regrouped(graph: Graph, outputs: Sequence[Node]) -> list[Node]:
     done: dict[int, Node] = {}
     factors: dict[int, list[Node]] = {}
     one = graph.constant(1.0)
+    # Arguments come before their users, so that each is rewritten when it is asked for.
     for node in nodes:
         args = [done[a.number] for a in node.args]
         if node.op == "mul":

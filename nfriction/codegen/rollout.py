@@ -1,6 +1,7 @@
 """Compile the rollout of a plant with friction, and run many at once."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,11 +22,33 @@ from nfriction.codegen.graph import FunctionalModule, Program
 from nfriction.codegen.llvm import jit
 from nfriction.codegen.rollout_program import LAYOUT, ForcedSystem, RolloutDriver, arrange
 
-SPEED_LIMIT = 1e6
-"""Above this velocity [rad/s or m/s] a candidate counts as diverged."""
-
 # Of accelerations over steps of 0.1 ms: velocities of 10 rad/s round to 2e-15, rates to 2e-11.
 _CHECK_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True)
+class RolloutSignals:
+    """Sample times of rollouts, and all that drives the motion.
+
+    Attributes:
+        steps: number of samples.
+        time_step: sample time [s]: a number, (steps,) or (candidate, steps).
+        tau: joint torque held over each sample [N m], (steps, joint) or (candidate, steps, joint);
+            zero by default.
+        drive: measured velocity and acceleration that drive the coefficients instead of the
+            simulated ones, each (steps, joint) or (candidate, steps, joint).
+        substeps: steps to each sample. Coefficients with a memory are held over the sample; others
+            are held anew at each of these steps.
+        memory: memory of the coefficients after the first sample, (candidate, joint, state_size),
+            one row is for all; by default that of this sample alone.
+    """
+
+    steps: int
+    time_step: Any
+    tau: Any = None
+    drive: tuple[Any, Any] | None = None
+    substeps: int = 1
+    memory: Any = None
 
 
 class Trajectories(NamedTuple):
@@ -129,35 +152,18 @@ class CompiledRollout:
         self,
         q0: Any,
         qd0: Any,
-        *,
-        steps: int,
-        time_step: Any,
-        tau: Any = None,
+        inputs: RolloutSignals,
         parameters: Mapping[str, Any] | None = None,
-        drive: tuple[Any, Any] | None = None,
         threads: int = 1,
-        substeps: int = 1,
-        memory: Any = None,
-        speed_limit: float = SPEED_LIMIT,
     ) -> Trajectories:
         """Integrate all candidates from their initial states.
 
         Args:
             q0, qd0: initial state [rad, rad/s], shape (candidate, joint); one row is for all.
-            steps: number of samples.
-            time_step: sample time [s]: a number, (steps,) or (candidate, steps).
-            tau: joint torque held over each sample [N m], (steps, joint) or (candidate, steps,
-                joint); zero by default.
+            inputs: sample times, and all that drives the motion.
             parameters: values that differ from the modules', by name ("plant.…", "friction.…"),
                 shape (candidate, *the parameter's own) or just the parameter's own.
-            drive: measured velocity and acceleration that drive the coefficients instead of the
-                simulated ones, each (steps, joint) or (candidate, steps, joint).
             threads: candidates are shared out among this many.
-            substeps: steps to each sample. Coefficients with a memory are held over the sample;
-                others are held anew at each of these steps.
-            memory: what the coefficients remember after the first sample, (candidate, joint,
-                state_size), one row is for all; by default that of this sample alone.
-            speed_limit: a candidate faster than this [rad/s] has diverged and is stopped.
 
         Returns:
             Trajectories, in NumPy or (where `q0` is one) torch.
@@ -165,6 +171,7 @@ class CompiledRollout:
         Raises:
             ValueError: for shapes that do not fit, or a name that is not there.
         """
+        steps, substeps, drive, memory = inputs.steps, inputs.substeps, inputs.drive, inputs.memory
         if steps < 0 or substeps < 1 or threads < 1:
             raise ValueError(
                 "`steps` must be 0 or more, `substeps` and `threads` 1 or more, got "
@@ -173,13 +180,12 @@ class CompiledRollout:
         if self._jacobian and substeps > 1:
             raise ValueError("a rollout with derivatives of each step has one step a sample.")
         n = self.joints
-        step = time_step if substeps == 1 else to_array(time_step) / substeps
+        step = inputs.time_step if substeps == 1 else to_array(inputs.time_step) / substeps
         given = {
             "q0": rows_of("q0", q0, (n,)),
             "qd0": rows_of("qd0", qd0, (n,)),
-            "tau": series("tau", np.zeros(n) if tau is None else tau, steps, (n,)),
+            "tau": series("tau", np.zeros(n) if inputs.tau is None else inputs.tau, steps, (n,)),
             "step": series("time_step", step, steps, ()),
-            "limit": rows_of("speed_limit", [[speed_limit]], (1,)),
         }
         if drive is not None:
             for name, value in zip(("drive_qd", "drive_qdd"), drive, strict=True):
@@ -209,6 +215,7 @@ class CompiledRollout:
         Raises:
             SelfCheckFailed: if they differ by more than rounding explains.
         """
+        # Two steps, so that a memory advances once; short ones, so that errors show in the rate.
         steps, dt = 2, 1e-4
         generator = torch.Generator().manual_seed(1)
         scales = (1.0, 1.0, 3.0)  # of torque, position and velocity, as mechanisms move
@@ -218,7 +225,7 @@ class CompiledRollout:
                 for s in scales
             )
             expected = to_array(self._eager(q, qd, tau, steps, dt)) - qd.numpy()
-            ours = self(q[None], qd[None], steps=steps, time_step=dt, tau=tau.expand(steps, -1))
+            ours = self(q[None], qd[None], RolloutSignals(steps, dt, tau.expand(steps, -1)))
             rate, eager = (ours.qd[0, -1].numpy() - qd.numpy()) / dt, expected / dt
             scale = _CHECK_TOLERANCE * (1.0 + np.abs(eager).max())
             if not np.allclose(rate, eager, rtol=0.0, atol=scale, equal_nan=True):

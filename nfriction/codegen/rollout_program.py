@@ -14,12 +14,14 @@ from nfriction.codegen.llvm.emit import write_function
 from nfriction.codegen.scalar import Graph, Node
 
 LAYOUT = Layout(
-    series=("q0", "qd0", "tau", "step", "drive_qd", "drive_qdd", "memory", "limit"),
+    series=("q0", "qd0", "tau", "step", "drive_qd", "drive_qdd", "memory"),
     outputs=("q_out", "qd_out", "qdd_out", "diverged", "jacobian_out"),
     settings=("samples", "substeps", "driven", "remembered"),
 )
+# A joint faster than this [rad/s or m/s] has left any mechanism's range: it has diverged.
+SPEED_LIMIT = 1e6
+# Of `ForcedSystem`; all other inputs of its trace are parameters.
 INPUTS = ("q", "qd", "tau", "step", "held", "seen_qd", "seen_qdd", "memory")
-"""Of `ForcedSystem`; all other inputs of its trace are parameters."""
 
 
 class ForcedSystem(nn.Module):
@@ -98,8 +100,7 @@ def arrange(program: Program, jacobian: Port | None) -> RolloutProgram:
     q, qd, qdd, start, held, *remembered = outputs
     begin, advance = remembered or ((), ())
     joints = len(q)
-    limit = graph.input("limit", 0)
-    within = _within(graph, q, qd, limit)
+    within = _within(graph, q, qd)
     slopes = jacobian.nodes if jacobian else ()
     groups = [start, held, (*q, *qd, *qdd), (within,), begin, advance, slopes]
     found = hoist(graph, [node for group in groups for node in group])
@@ -109,7 +110,7 @@ def arrange(program: Program, jacobian: Port | None) -> RolloutProgram:
     )
     at = {"q": ("state", 0), "qd": ("state", joints), "seen_qdd": ("seen", joints),
           "seen_qd": ("seen", 0)}  # fmt: skip
-    places = {limit.number: ("limit", 0)}
+    places: dict[int, tuple[str, int]] = {}
     parameters = 0
     for port in program.inputs:
         own = port.name in INPUTS
@@ -120,9 +121,10 @@ def arrange(program: Program, jacobian: Port | None) -> RolloutProgram:
     return RolloutProgram(joints, once, start, held, step, within, begin, advance, slopes, places)
 
 
-def _within(graph: Graph, q: Sequence[Node], qd: Sequence[Node], limit: Node) -> Node:
+def _within(graph: Graph, q: Sequence[Node], qd: Sequence[Node]) -> Node:
     """A test for finite and slow enough states; numbers that are not finite compare false."""
-    zero = graph.constant(0.0)
+    zero, limit = graph.constant(0.0), graph.constant(SPEED_LIMIT)
+    # A number minus itself is zero unless it is NaN or infinite.
     tests = [graph.apply("eq", graph.apply("sub", x, x), zero) for x in q]
     tests += [graph.apply("le", graph.apply("abs", x), limit) for x in qd]
     return graph.total(tests, "and")
@@ -139,7 +141,7 @@ class RolloutDriver(Driver):
     def __init__(self, program: RolloutProgram, width: int) -> None:
         n = program.joints
         sizes = {"state": 3 * n, "seen": 2 * n, "tau": n, "step": 1, "held": len(program.held),
-                 "memory": len(program.advance), "limit": 1, "within": 1,
+                 "memory": len(program.advance), "within": 1,
                  "jacobian": len(program.jacobian), "alive": 1}  # fmt: skip
         super().__init__(LAYOUT, width, sizes, len(program.once))
         self.program = program
@@ -164,7 +166,7 @@ class RolloutDriver(Driver):
         function("nf_begin", ["seen"], {"memory": parts.begin}, seldom=True)
         function("nf_advance", ["seen", "memory"], {"memory": parts.advance})
         after = {"state": parts.step, "within": (parts.within,), "jacobian": parts.jacobian}
-        function("nf_step", ["state", "tau", "step", "held", "limit"], after)
+        function("nf_step", ["state", "tau", "step", "held"], after)
 
     def _candidates(self) -> None:
         """The candidates that are computed together."""
@@ -173,7 +175,6 @@ class RolloutDriver(Driver):
         self.gather("q0", n, value["room.state"])
         self.gather("qd0", n, self.element("state", n))
         self.gather("tau", n, value["room.tau"])
-        self.gather("limit", 1, value["room.limit"])
         value["rate"] = self.element("state", 2 * n)
         self.call("nf_start", "own_p", "room.once", "room.state", "room.tau", "rate")
         with self.each() as (candidate, _):
@@ -206,7 +207,7 @@ class RolloutDriver(Driver):
         with body.loop("0", value["substeps"]):
             if not self.program.advance:
                 self.call("nf_held", "own_p", "room.once", "sees", "room.memory", "room.held")
-            rooms = ("state", "tau", "step", "held", "limit", "within", "jacobian")
+            rooms = ("state", "tau", "step", "held", "within", "jacobian")
             self.call("nf_step", "own_p", "room.once", *(f"room.{name}" for name in rooms))
             fine = body.load(value["room.within"], 0, real(self.width))
             one = body.constant(1.0, self.width)

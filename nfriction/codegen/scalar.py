@@ -40,6 +40,7 @@ class Node:
         return f"%{self.number} = {self.op}({shown})"
 
 
+# Every scalar operation with its meaning; the emitters know the same ones.
 EVALUATE: dict[str, Callable[..., Any]] = {
     "add": np.add,
     "sub": np.subtract,
@@ -77,11 +78,9 @@ EVALUATE: dict[str, Callable[..., Any]] = {
     "or": np.logical_or,
     "not": np.logical_not,
     "where": np.where,
-    "finite": np.isfinite,  # made by `finite.py` alone, for C that looks at the bits
 }
-"""Every scalar operation with its meaning; the emitters know the same ones."""
 
-PREDICATES = frozenset({"lt", "le", "eq", "ne", "and", "or", "not", "finite"})
+PREDICATES = frozenset({"lt", "le", "eq", "ne", "and", "or", "not"})
 _COMMUTATIVE = frozenset({"add", "mul", "max", "min", "eq", "ne", "and", "or"})
 
 
@@ -121,6 +120,7 @@ class Graph:
         simpler = rule(self, *args) if rule else None
         if simpler is not None:
             return simpler
+        # In one order, so that a + b and b + a are one node.
         if op in _COMMUTATIVE and args[0].number > args[1].number:
             args = args[::-1]
         return self._intern(op, args, None, max(a.rate for a in args))

@@ -11,11 +11,10 @@ import torch
 from torch import Tensor
 
 from nfriction.export.c_code.run import open_c
-from nfriction.export.contract import Contract, Runner
+from nfriction.export.contract import Contract, Parity, Runner, compare
 from nfriction.export.controller import Controller, controller_of
 from nfriction.export.errors import ContractError, ExportError
 from nfriction.export.onnx_file import open_onnx
-from nfriction.export.parity import Parity, compare
 from nfriction.export.test_vectors import draw
 from nfriction.export.torch_code.archive import contract_of_archive
 from nfriction.export.torch_code.pt2 import open_pt2
@@ -214,8 +213,8 @@ def work(asked: Mapping[str, Any], folder: Path) -> None:
     np.savez(folder / _OUTPUTS, **found)
 
 
+# Runs several batches of samples, each a sequence of inputs, through an artefact.
 Batches = Callable[..., Sequence[Sequence[Any]]]
-"""Runs several batches of samples, each a sequence of inputs, through an artefact."""
 
 
 def _here(opener: Callable[[str | Path], tuple[Contract, Runner]]) -> Callable[..., Any]:

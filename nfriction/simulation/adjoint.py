@@ -18,7 +18,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from nfriction.simulation.compiled import NoFriction
 from nfriction.simulation.protocols import Friction, Plant, RolloutInputs, as_stateful
 from nfriction.simulation.rk4 import acceleration, runge_kutta
 
@@ -30,7 +29,7 @@ States = tuple[Tensor, ...]
 
 
 def adjoint_rollout(
-    simulate: Callable[[], States], plant: Plant, friction: Friction | None, inputs: RolloutInputs
+    simulate: Callable[[], States], plant: Plant, friction: Friction, inputs: RolloutInputs
 ) -> States | None:
     """States of a rollout, differentiable once by the initial state, the torque and the modules.
 
@@ -42,8 +41,7 @@ def adjoint_rollout(
         None where a gradient would be incomplete: with a hidden state, a sample time or measured
         motion that requires one, or modules that read tensors of others.
     """
-    model: Any = NoFriction(plant.joints) if friction is None else friction
-    system = _System(plant, model, inputs, own_tensors(plant, friction))
+    system = _System(plant, friction, inputs, own_tensors(plant, friction))
     fixed = (inputs.step, *(inputs.measured or ()))
     if as_stateful(friction) or any(x.requires_grad for x in fixed):
         return None
@@ -63,7 +61,7 @@ def own_tensors(*modules: Any) -> list[Tensor]:
 
 
 def _is_closed(system: "_System") -> bool:
-    """Whether gradients of a step reach no other tensors, found by walking the graph of one."""
+    """True where gradients of a step reach no other tensors, found by walking its graph."""
     q, qd = system.inputs.q0.detach(), system.inputs.qd0.detach()
     tau = system.inputs.tau[..., 0, :].detach().expand_as(q)
     with torch.enable_grad():
@@ -214,7 +212,7 @@ class _Sweep:
     def _stage_jacobians(
         self, stages: Sequence[tuple[Tensor, Tensor]], tau: Tensor, held: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Of the stages' accelerations by (q, qd) and all coefficients, (stage, ..., joint, _)."""
+        """Jacobians of the stages' accelerations by (q, qd) and by all coefficients."""
         q, qd = (torch.stack(x).requires_grad_() for x in zip(*stages, strict=True))
         c = held.expand(4, *held.shape).contiguous().requires_grad_()
         rates = acceleration(self.plant, self.friction, q, qd, tau, c)
@@ -223,9 +221,9 @@ class _Sweep:
         return by_state, torch.stack([row[2].flatten(-2) for row in rows], -2)
 
     def _drive_jacobian(self, held: Tensor, driven: Sequence[Tensor]) -> Tensor:
-        """Of the coefficients by qd and qdd, (step, *batch, joint coefficient, 2 joint)."""
+        """Jacobian of the coefficients by motion, (step, *batch, joint coefficient, 2 joint)."""
         if getattr(self.friction, "joint_wise", False):
-            # Each joint's coefficients follow its own motion: one pass serves all joints.
+            # Each joint's coefficients follow its own motion: one pass is enough for all.
             rows = [_pulled(c, driven, retain=True) for c in held.unbind(-1)]
             own = [torch.cat([torch.diag_embed(x) for x in row], -1) for row in rows]
             return torch.stack(own, -2).flatten(-3, -2)

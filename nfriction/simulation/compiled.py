@@ -14,8 +14,8 @@ import torch
 from torch import Tensor, nn
 
 from nfriction import codegen
-from nfriction.simulation.protocols import RolloutInputs
-from nfriction.simulation.rk4 import StepFunction, rk4_step
+from nfriction.simulation.protocols import RolloutInputs, StepFunction
+from nfriction.simulation.rk4 import rk4_step
 
 logger = logging.getLogger(__name__)
 
@@ -24,20 +24,6 @@ Backend = Literal["auto", "compiled", "torch"]
 KEPT = 32
 
 _cache: OrderedDict[Hashable, "codegen.CompiledRollout | codegen.CodegenError"] = OrderedDict()
-
-
-class NoFriction(nn.Module):
-    """A friction model without torque, where a compiled rollout needs one."""
-
-    def __init__(self, joints: int) -> None:
-        super().__init__()
-        self.joints = joints
-
-    def coefficients(self, qd: Tensor, qdd: Tensor) -> Tensor:
-        return torch.zeros_like(qd)[..., None]
-
-    def torque(self, qd: Tensor, load: Tensor, coefficients: Tensor) -> Tensor:
-        return torch.zeros_like(qd)
 
 
 def wants_compiled(backend: Backend, q: Tensor, gradients: bool) -> bool:
@@ -86,7 +72,6 @@ def integrate_compiled(
     Raises:
         CodegenError: if compiled code is asked for and cannot be made.
     """
-    friction = NoFriction(plant.joints) if friction is None else friction
     compiled = _compiled(plant, friction, backend, step_function, jacobian)
     if compiled is None:
         return None
@@ -109,14 +94,16 @@ def integrate_compiled(
     found = compiled(
         q.detach().reshape(-1, joints),
         qd.detach().reshape(-1, joints),
-        steps=inputs.step.shape[-1],
-        time_step=rows(inputs.step, 1),
-        tau=rows(inputs.tau, 2),
-        parameters=values,
-        drive=drive,
-        threads=threads,
-        substeps=inputs.substeps,
-        memory=None if memory is None else rows(memory, 2).reshape(-1, *memory.shape[-2:]),
+        codegen.RolloutSignals(
+            steps=inputs.step.shape[-1],
+            time_step=rows(inputs.step, 1),
+            tau=rows(inputs.tau, 2),
+            drive=drive,
+            substeps=inputs.substeps,
+            memory=None if memory is None else rows(memory, 2).reshape(-1, *memory.shape[-2:]),
+        ),
+        values,
+        threads,
     )
     states = tuple(x.reshape(*batch, -1, joints) for x in (found.q, found.qd, found.qdd))
     return (*states, found.jacobian.unflatten(0, batch)) if jacobian else states

@@ -1,9 +1,11 @@
 """Interfaces and inputs of a rollout: mechanism, friction, initial state and what drives it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, cast
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
 
 class Plant(Protocol):
@@ -36,7 +38,28 @@ class StatefulFriction(Friction, Protocol):
     def coefficients_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor: ...
 
 
-def as_stateful(friction: Friction | None) -> StatefulFriction | None:
+class NoFriction(nn.Module):
+    """A friction model without torque, so that a rollout without friction is no special case."""
+
+    def __init__(self, joints: int) -> None:
+        super().__init__()
+        self.joints = joints
+
+    def coefficients(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        return torch.zeros_like(qd)[..., None]
+
+    def torque(self, qd: Tensor, load: Tensor, coefficients: Tensor) -> Tensor:
+        return torch.zeros_like(qd)
+
+    def zero_velocity_damping(self) -> Tensor:
+        return torch.zeros(self.joints)
+
+
+# One integration step, with the arguments and values of `nfriction.simulation.rk4.rk4_step`.
+StepFunction = Callable[..., tuple[Tensor, Tensor, Tensor]]
+
+
+def as_stateful(friction: Friction) -> StatefulFriction | None:
     """The friction model if its coefficients have a hidden state, else None."""
     if getattr(friction, "state_size", 0) > 0:
         return cast(StatefulFriction, friction)

@@ -6,7 +6,13 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from nfriction.simulation.protocols import Friction, Plant, RolloutInputs, as_stateful
+from nfriction.simulation.protocols import (
+    Friction,
+    Plant,
+    RolloutInputs,
+    StepFunction,
+    as_stateful,
+)
 
 # RK4 is stable on the negative real axis down to h * lambda = -2.785.
 RK4_STABILITY = 2.785
@@ -23,17 +29,11 @@ def required_substeps(plant: Plant, friction: Friction, sample_time: float) -> i
 
 
 def acceleration(
-    plant: Plant,
-    friction: Friction | None,
-    q: Tensor,
-    qd: Tensor,
-    tau: Tensor,
-    coefficients: Tensor | None,
+    plant: Plant, friction: Friction, q: Tensor, qd: Tensor, tau: Tensor, coefficients: Tensor
 ) -> Tensor:
     """Joint acceleration with friction whose coefficients are given [rad/s^2], (*batch, joint)."""
-    if friction is not None and coefficients is not None:
-        tau = tau - friction.torque(qd, plant.load(q, qd), coefficients)
-    return plant.forward_dynamics(q, qd, tau)
+    tau_f = friction.torque(qd, plant.load(q, qd), coefficients)
+    return plant.forward_dynamics(q, qd, tau - tau_f)
 
 
 def runge_kutta(
@@ -49,78 +49,70 @@ def runge_kutta(
     v4 = qd + step * a3
     a4 = rate(q + step * v3, v4)
     sixth = step / 6.0
-    return (
-        q + sixth * (qd + 2.0 * (v2 + v3) + v4),
-        qd + sixth * (a1 + 2.0 * (a2 + a3) + a4),
-        a1,
-    )
+    after = q + sixth * (qd + 2.0 * (v2 + v3) + v4)
+    return after, qd + sixth * (a1 + 2.0 * (a2 + a3) + a4), a1
 
 
 def rk4_step(
     plant: Plant,
-    friction: Friction | None,
+    friction: Friction,
     q: Tensor,
     qd: Tensor,
     tau: Tensor,
-    coefficients: Tensor | None,
+    coefficients: Tensor,
     step: Tensor | float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """One Runge-Kutta step of fourth order with coefficients and torque held.
 
     Args:
-        plant: the mechanism.
-        friction: friction model, or None.
+        plant, friction: the mechanism and its friction model.
         q, qd: state at the start of the step, (*batch, joint).
         tau: torque over the step, (*batch, joint).
-        coefficients: held over the step, (*batch, joint, coefficient); None without friction.
+        coefficients: held over the step, (*batch, joint, coefficient).
         step: step length [s], a number or (*batch, 1).
 
     Returns:
         q and qd at the end of the step, qdd at its start.
     """
-    return runge_kutta(
-        lambda q, qd: acceleration(plant, friction, q, qd, tau, coefficients), q, qd, step
-    )
 
+    def rate(q: Tensor, qd: Tensor) -> Tensor:
+        return acceleration(plant, friction, q, qd, tau, coefficients)
 
-StepFunction = Callable[..., tuple[Tensor, Tensor, Tensor]]
-"""Of the arguments of `rk4_step`, in that order."""
+    return runge_kutta(rate, q, qd, step)
 
 
 def simulate_eager(
     plant: Plant,
-    friction: Friction | None,
+    friction: Friction,
     inputs: RolloutInputs,
     progress: bool = False,
     step_function: StepFunction = rk4_step,
 ) -> tuple[Tensor, ...]:
     """States at every sample in eager torch: q, qd, qdd, each (*batch, steps + 1, joint)."""
     q, qd, tau = inputs.q0, inputs.qd0, inputs.tau
-    inner = inputs.step / inputs.substeps
+    step = inputs.step / inputs.substeps
     # Nothing is known of friction before the first step, so that acceleration leaves it out.
     qdd = plant.forward_dynamics(q, qd, tau[..., 0, :])
     states = [(q, qd, qdd)]
-    stateful = as_stateful(friction)
-    hidden: Tensor | None = None
-    held: Tensor | None = None
-    for k in tqdm(range(inner.shape[-1]), disable=not progress, unit="step", leave=False):
+    stateful, hidden = as_stateful(friction), inputs.hidden_state
+    for k in tqdm(range(step.shape[-1]), disable=not progress, unit="step", leave=False):
         measured = None
         if inputs.measured is not None:
             measured = inputs.measured[0][..., k, :], inputs.measured[1][..., k, :]
         if stateful is not None:
-            driven = measured or (qd, qdd)
-            if hidden is not None:
-                hidden = stateful.advance(*driven, hidden)
-            elif inputs.hidden_state is not None:
-                hidden = inputs.hidden_state
-            else:
-                hidden = stateful.initial_state(*driven)
-            held = stateful.coefficients_from(*driven, hidden)
+            # A hidden state advances with the samples, as in a controller, not with the substeps.
+            drive = measured or (qd, qdd)
+            if hidden is None:
+                hidden = stateful.initial_state(*drive)
+            elif k:
+                hidden = stateful.advance(*drive, hidden)
+            held = stateful.coefficients_from(*drive, hidden)
         for _ in range(inputs.substeps):
-            if friction is not None and stateful is None:
+            if stateful is None:
                 held = friction.coefficients(*(measured or (qd, qdd)))
-            given = (q, qd, tau[..., k, :], held, inner[..., k, None])
-            q, qd, qdd = step_function(plant, friction, *given)
+            q, qd, qdd = step_function(
+                plant, friction, q, qd, tau[..., k, :], held, step[..., k, None]
+            )
         states.append((q, qd, qdd))
     shape = states[-1][0].shape
     return tuple(

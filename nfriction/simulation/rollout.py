@@ -12,9 +12,10 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
+from nfriction.codegen.rollout_program import SPEED_LIMIT
 from nfriction.simulation.adjoint import adjoint_rollout, own_tensors
 from nfriction.simulation.compiled import Backend, integrate_compiled, wants_compiled
-from nfriction.simulation.protocols import Friction, Plant, RolloutInputs
+from nfriction.simulation.protocols import Friction, NoFriction, Plant, RolloutInputs
 from nfriction.simulation.rk4 import simulate_eager
 from nfriction.simulation.stiction import simulate_stiction
 from nfriction.simulation.validate import (
@@ -30,8 +31,6 @@ logger = logging.getLogger(__name__)
 Scheme = Literal["rk4", "time_stepping"]
 # Beyond this many steps gradients are rarely meant and may take gigabytes: they must be asked for.
 GRADIENT_STEPS = 10_000
-# A joint faster than this [rad/s] has left any mechanism's range: the rollout has diverged.
-SPEED_LIMIT = 1e6
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ class Rollout:
 
     @property
     def diverged(self) -> Tensor:
-        """Which candidates diverged, shape (*batch,)."""
+        """True for candidates that diverged, shape (*batch,)."""
         return torch.isfinite(self.diverged_at)
 
 
@@ -123,9 +122,10 @@ def rollout(
             a stable integration, or the scheme does not support an option.
         CodegenError: if `backend="compiled"` and the model cannot be compiled.
     """
-    inputs = validate_inputs(plant, friction, q0, qd0, tau, sample_time, steps, substeps)
+    model = NoFriction(plant.joints) if friction is None else friction
+    inputs = validate_inputs(plant, model, q0, qd0, tau, sample_time, steps, substeps)
     inputs = replace(inputs, measured=validate_measured(drive, measured, inputs))
-    inputs = with_hidden_state(inputs, friction, hidden_state)
+    inputs = with_hidden_state(inputs, model, hidden_state)
     if scheme not in get_args(Scheme):
         raise ValueError(f"`scheme` must be one of {get_args(Scheme)}, got {scheme!r}.")
     if scheme == "time_stepping":
@@ -134,36 +134,27 @@ def rollout(
                 '`scheme="time_stepping"` needs a friction model, and has no gradients, measured '
                 'drive or hidden state; use scheme="rk4" for these.'
             )
-        return _as_rollout(inputs, simulate_stiction(plant, friction, inputs, progress))
-    require_stability(plant, friction, inputs)
-    warn_of_sample_time(friction, inputs)
+        return _as_rollout(inputs, simulate_stiction(plant, model, inputs, progress))
+    require_stability(plant, model, inputs)
+    warn_of_sample_time(model, inputs)
     if gradients is None:
-        gradients = (
-            backend in ("auto", "torch")
-            and torch.is_grad_enabled()
-            and inputs.tau.shape[-2] <= GRADIENT_STEPS
-            and (
-                any(x.requires_grad for x in (inputs.q0, inputs.qd0, inputs.tau))
-                or bool(own_tensors(plant, friction))
-            )
-        )
-    states = simulate(
-        plant, friction, inputs,
-        gradients=gradients, backend=backend, threads=threads, progress=progress,
-    )  # fmt: skip
+        able = backend in ("auto", "torch") and inputs.tau.shape[-2] <= GRADIENT_STEPS
+        given = (inputs.q0, inputs.qd0, inputs.tau, *own_tensors(plant, model))
+        gradients = able and torch.is_grad_enabled() and any(x.requires_grad for x in given)
+    states = _simulate(plant, model, inputs, gradients, backend, threads, progress)
     return _as_rollout(inputs, states)
 
 
 def integrate(plant: Plant, friction: Friction | None, inputs: RolloutInputs) -> Rollout:
     """`rollout` without checks and gradients, for searches whose trials may well be unstable."""
-    return _as_rollout(inputs, simulate(plant, friction, inputs))
+    model = NoFriction(plant.joints) if friction is None else friction
+    return _as_rollout(inputs, _simulate(plant, model, inputs))
 
 
-def simulate(
+def _simulate(
     plant: Plant,
-    friction: Friction | None,
+    friction: Friction,
     inputs: RolloutInputs,
-    *,
     gradients: bool = False,
     backend: Backend = "auto",
     threads: int = 1,
@@ -171,19 +162,19 @@ def simulate(
 ) -> tuple[Tensor, ...]:
     """States q, qd, qdd, each (*batch, steps + 1, joint), by the backend that can compute them."""
     compiled = wants_compiled(backend, inputs.q0, gradients)
-    if gradients:
-        states = None
-        if backend == "auto":
-            states = adjoint_rollout(
-                lambda: simulate(plant, friction, inputs, threads=threads, progress=progress),
-                plant, friction, inputs,
-            )  # fmt: skip
-        return states or simulate_eager(plant, friction, inputs, progress)
-    with torch.no_grad():
-        states = None
-        if compiled:
-            states = integrate_compiled(plant, friction, inputs, backend, threads)
-        return states or simulate_eager(plant, friction, inputs, progress)
+    states = None
+    # With gradients the motion itself may still be compiled: the adjoint sweep adds them.
+    if gradients and backend == "auto":
+        states = adjoint_rollout(
+            lambda: _simulate(plant, friction, inputs, threads=threads, progress=progress),
+            plant, friction, inputs,
+        )  # fmt: skip
+    elif compiled:
+        states = integrate_compiled(plant, friction, inputs, backend, threads)
+    if states is None:
+        with torch.set_grad_enabled(gradients and torch.is_grad_enabled()):
+            states = simulate_eager(plant, friction, inputs, progress)
+    return states
 
 
 def _as_rollout(inputs: RolloutInputs, states: tuple[Tensor, ...]) -> Rollout:
@@ -197,18 +188,18 @@ def _as_rollout(inputs: RolloutInputs, states: tuple[Tensor, ...]) -> Rollout:
     return Rollout(time, q, qd, qdd, diverged_at)
 
 
+@torch.no_grad()
 def _divergence(time: Tensor, q: Tensor, qd: Tensor) -> Tensor:
     """Time of the first sample that is not finite or beyond any speed, infinity where none."""
-    with torch.no_grad():
-        # Positions are finite while velocities are; a NaN fails every comparison.
-        low, high = qd.aminmax()
-        if float(low) > -SPEED_LIMIT and float(high) < SPEED_LIMIT:
-            return time.new_full(q.shape[:-2], torch.inf)
-        lost = ~(torch.isfinite(q) & (qd.abs() < SPEED_LIMIT)).all(-1)
-        first = lost.to(torch.int64).argmax(-1, keepdim=True)
-        at = torch.gather(time.expand(lost.shape), -1, first).squeeze(-1)
-        diverged_at = torch.where(lost.any(-1), at, torch.inf)
-        count = int(lost.any(-1).sum())
-        if count:
-            logger.warning("%d rollout(s) diverged, first at %.4g s", count, diverged_at.min())
+    # Positions are finite while velocities are; a NaN fails every comparison.
+    low, high = qd.aminmax()
+    if float(low) > -SPEED_LIMIT and float(high) < SPEED_LIMIT:
+        return time.new_full(q.shape[:-2], torch.inf)
+    lost = ~(torch.isfinite(q) & (qd.abs() < SPEED_LIMIT)).all(-1)
+    first = lost.to(torch.int64).argmax(-1, keepdim=True)
+    at = torch.gather(time.expand(lost.shape), -1, first).squeeze(-1)
+    diverged_at = torch.where(lost.any(-1), at, torch.inf)
+    count = int(lost.any(-1).sum())
+    if count:
+        logger.warning("%d rollout(s) diverged, first at %.4g s", count, diverged_at.min())
     return diverged_at

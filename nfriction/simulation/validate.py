@@ -8,14 +8,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.simulation.protocols import Friction, Plant, RolloutInputs
+from nfriction.simulation.protocols import Friction, NoFriction, Plant, RolloutInputs
 from nfriction.simulation.rk4 import RK4_STABILITY, required_substeps
 
 logger = logging.getLogger(__name__)
 
 
 def all_finite(x: Tensor) -> bool:
-    """Whether no element is NaN or infinite, in one pass over them."""
+    """True where no element is NaN or infinite, in one pass over them."""
     if not x.numel():
         return True
     low, high = x.detach().aminmax()  # NaN if there is one
@@ -24,7 +24,7 @@ def all_finite(x: Tensor) -> bool:
 
 def validate_inputs(
     plant: Plant,
-    friction: Friction | None,
+    friction: Friction,
     q0: Tensor,
     qd0: Tensor,
     tau: Tensor | None,
@@ -40,7 +40,7 @@ def validate_inputs(
         q0 = q0.to(torch.float64)
     qd0 = qd0.to(q0)
     joints = plant.joints
-    if friction is not None and friction.joints != joints:
+    if friction.joints != joints:
         raise ValueError(f"the plant has {joints} joints, the friction model {friction.joints}.")
     for name, value in (("q0", q0), ("qd0", qd0)):
         if value.ndim == 0 or value.shape[-1] != joints:
@@ -97,7 +97,7 @@ def validate_measured(
 
 
 def with_hidden_state(
-    inputs: RolloutInputs, friction: Friction | None, hidden_state: Tensor | None
+    inputs: RolloutInputs, friction: Friction, hidden_state: Tensor | None
 ) -> RolloutInputs:
     """The inputs with a hidden state from which coefficients continue."""
     if hidden_state is None:
@@ -117,9 +117,9 @@ def with_hidden_state(
     return replace(inputs, q0=q0, qd0=qd0, hidden_state=given)
 
 
-def require_stability(plant: Plant, friction: Friction | None, inputs: RolloutInputs) -> None:
+def require_stability(plant: Plant, friction: Friction, inputs: RolloutInputs) -> None:
     """Refuse friction too steep at rest for stable Runge-Kutta steps."""
-    if friction is None:
+    if isinstance(friction, NoFriction):
         return
     sample_time = float(inputs.step.max())
     longest_step = sample_time / inputs.substeps
@@ -142,7 +142,7 @@ def require_stability(plant: Plant, friction: Friction | None, inputs: RolloutIn
     )
 
 
-def warn_of_sample_time(friction: Friction | None, inputs: RolloutInputs) -> None:
+def warn_of_sample_time(friction: Friction, inputs: RolloutInputs) -> None:
     """Warn of a hidden state that decays at another rate than the model was made for."""
     meant = getattr(getattr(friction, "schedule", None), "sample_time", None)
     step = float(inputs.step.mean()) if meant is not None else 0.0

@@ -180,9 +180,9 @@ def test_importing_codegen_and_tracing_stay_light():
     """Neither torch._dynamo, torch.distributed nor LLVM is loaded before it is needed."""
     script = (
         "import sys, torch; before = set(sys.modules)\n"
-        "from nfriction.codegen.function import specialise\n"
+        "from nfriction.codegen.graph import FunctionalModule, Method\n"
         "m = torch.nn.Linear(2, 2).double()\n"
-        "specialise(m, {'x': torch.ones(2, dtype=torch.float64)})\n"
+        "FunctionalModule(Method(m)).trace({'x': torch.ones(2, dtype=torch.float64)})\n"
         "new = {n for n in set(sys.modules) - before}\n"
         "heavy = ('torch._dynamo', 'torch.distributed.tensor', 'llvmlite')\n"
         "print([n for n in heavy if n in new])"

@@ -16,10 +16,9 @@ from nfriction.codegen import UnsupportedOperation
 from nfriction.export.c_code.dialect import comment
 from nfriction.export.c_code.export import c
 from nfriction.export.c_code.run import c_contract, c_runner
-from nfriction.export.contract import verify
+from nfriction.export.contract import compare, verify
 from nfriction.export.controller import NOT_FINITE, OUTSIDE, SATURATED, controller_of
 from nfriction.export.errors import ExportError
-from nfriction.export.parity import compare
 from nfriction.export.test_vectors import draw
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
@@ -100,7 +99,7 @@ def points(controller, dtype: str, count: int):
 
 
 cases = pytest.mark.parametrize("dtype", ["float64", "float32"])
-names = pytest.mark.parametrize("name", list(model_names()))
+names = pytest.mark.parametrize("name", model_names())
 few = pytest.mark.parametrize("name", ["Stribeck", "ALFM", "NFLFM"])  # one of each kind
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nfriction.export.c_code.dialect import ControllerC
-from nfriction.export.c_code.exponential import exponential
+from nfriction.export.c_code.model import exponential
 
 GCC = shutil.which("gcc")
 # Arguments that it takes. Below -87.3 the result is 0; further down k would not fit its integer,

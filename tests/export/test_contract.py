@@ -10,12 +10,12 @@ from torch import Tensor
 
 from nfriction.export.contract import (
     Contract,
+    compare,
     contract_of,
     verify,
 )
 from nfriction.export.controller import NOT_FINITE, controller_of
 from nfriction.export.errors import ContractError
-from nfriction.export.parity import compare
 from nfriction.friction.models import LFM
 from nfriction.io.model_info import ModelInfo
 from tests.export.artefacts import INFO

@@ -12,11 +12,10 @@ import torch
 from torch import Tensor
 
 from nfriction.export import ExportError, onnx
-from nfriction.export.contract import verify
+from nfriction.export.contract import compare, verify
 from nfriction.export.controller import controller_of
 from nfriction.export.errors import ContractError
 from nfriction.export.onnx_file import open_onnx
-from nfriction.export.parity import compare
 from nfriction.export.test_vectors import draw
 from nfriction.export.torch_code.archive import METADATA
 from nfriction.friction.coefficients import Constant

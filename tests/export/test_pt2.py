@@ -8,10 +8,9 @@ import pytest
 import torch
 
 from nfriction.export import ExportError, pt2
-from nfriction.export.contract import verify
+from nfriction.export.contract import compare, verify
 from nfriction.export.controller import controller_of
 from nfriction.export.errors import ContractError
-from nfriction.export.parity import compare
 from nfriction.export.test_vectors import draw
 from nfriction.export.torch_code.archive import METADATA
 from nfriction.export.torch_code.pt2 import open_pt2

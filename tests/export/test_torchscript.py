@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 
 from nfriction.export import ExportError, torchscript
-from nfriction.export.contract import verify
+from nfriction.export.contract import compare, verify
 from nfriction.export.controller import controller_of
-from nfriction.export.parity import compare
 from nfriction.export.test_vectors import draw
 from nfriction.export.torch_code.archive import METADATA
 from nfriction.export.torch_code.torchscript import open_torchscript, sample_inputs

@@ -21,11 +21,11 @@ from nfriction.codegen.errors import NoBackend
 logger = logging.getLogger(__name__)
 
 _KEPT = ".object"
+# Functions of the C library that emitted code calls.
 LIBRARY = (
     *("exp", "expm1", "log", "log1p", "pow", "fmod", "sin", "cos", "tan", "asin", "acos", "atan"),
     *("atan2", "sinh", "cosh", "tanh"),
 )
-"""Functions of the C library that emitted code calls."""
 
 
 def cache_folder() -> Path:

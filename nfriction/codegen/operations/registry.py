@@ -15,8 +15,8 @@ from nfriction.codegen.scalar import Graph, Node, is_predicate
 Nodes = np.ndarray
 Operation = Callable[..., Any]
 
+# By the ATen name without `aten::` and overload; in-place forms map to their base name.
 OPERATIONS: dict[str, Operation] = {}
-"""By the ATen name without `aten::` and overload; in-place forms map to their base name."""
 
 
 def supported_operations() -> list[str]:

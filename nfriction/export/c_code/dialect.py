@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
-from typing import Any
+from typing import Any, Literal
 
 import jinja2
 import numpy as np
 
-from nfriction.export.c_code.emit import C
+Real = Literal["double", "float"]
 
 # Functions of C89's math.h; others, and all in single precision, came with C99.
 _C89 = frozenset(
@@ -33,24 +33,30 @@ _HELPERS = {
 
 
 @dataclass(frozen=True)
-class ControllerC(C):
+class ControllerC:
     """The dialect of exported C.
 
     Attributes:
+        real: type of all numbers.
         prefix: of every name in the file, for which templates write `nf`.
     """
 
+    real: Real = "double"
     prefix: str = "nf"
 
     def literal(self, value: float | bool) -> str:
-        if not isinstance(value, bool):
-            if math.isnan(value):
-                raise ValueError("NaN among the numbers of a model; check its parameters.")
-            # C89 has no infinity. Emitted code sees finite numbers only, on which comparisons
-            # with the largest one come out the same.
-            largest = _LARGEST[self.real]
-            value = min(max(float(value), -largest), largest)
-        return super().literal(value)
+        """A number as C spells it, in brackets where it is negative."""
+        if isinstance(value, bool):
+            return "1" if value else "0"
+        if math.isnan(value):
+            raise ValueError("NaN among the numbers of a model; check its parameters.")
+        # C89 has no infinity. Emitted code sees finite numbers only, on which comparisons with
+        # the largest one come out the same.
+        largest = _LARGEST[self.real]
+        value = min(max(float(value), -largest), largest)
+        single = self.real == "float"
+        text = f"{np.float32(value)!s}f" if single else repr(value)
+        return f"({text})" if text.startswith("-") else text
 
     def call(self, op: str, args: Sequence[str]) -> str:
         own = op in ("max", "min") or (op == "abs" and self.real == "float")

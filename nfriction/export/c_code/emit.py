@@ -1,18 +1,13 @@
-"""Scalar nodes as C, double or float.
+"""Scalar nodes as expressions and statements of C.
 
 Values used once are written where they are used, the others become constants of the function.
 The text depends on the graph alone, so the same model gives the same bytes.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Literal
-
-import numpy as np
 
 from nfriction.codegen.scalar import Node, is_predicate, reachable
-
-Real = Literal["double", "float"]
+from nfriction.export.c_code.dialect import ControllerC
 
 _INLINE = 64  # characters; longer single-use values get a line of their own
 
@@ -28,55 +23,10 @@ _INFIX = {
     "eq": ("==", _COMPARE),
     "ne": ("!=", _COMPARE),
 }
-_C_NAMES = {"abs": "fabs"}
-
-# The two functions that the emitted C relies on both propagate NaN.
-C_PRELUDE = """\
-#include <math.h>
-#include <stddef.h>
-
-static double nf_max(double a, double b) { return a > b || a != a ? a : b; }
-static double nf_min(double a, double b) { return a < b || a != a ? a : b; }
-"""
-
-
-@dataclass(frozen=True)
-class C:
-    """C with C89 syntax and the functions of the C99 `math.h`."""
-
-    real: Real = "double"
-
-    def literal(self, value: float | bool) -> str:
-        if isinstance(value, bool):
-            return "1" if value else "0"
-        single = self.real == "float"
-        if single:
-            with np.errstate(over="ignore"):
-                value = float(np.float32(value))
-        if np.isnan(value):
-            return "(HUGE_VAL - HUGE_VAL)"
-        if np.isinf(value):
-            return "HUGE_VAL" if value > 0 else "(-HUGE_VAL)"
-        text = f"{np.float32(value)!s}f" if single else repr(value)
-        return f"({text})" if text.startswith("-") else text
-
-    def call(self, op: str, args: Sequence[str]) -> str:
-        suffix = "f" if self.real == "float" else ""
-        name = f"nf_{op}" if op in ("max", "min") else _C_NAMES.get(op, op) + suffix
-        return f"{name}({', '.join(args)})"
-
-    def logical(self, op: str) -> str:
-        return {"and": "&&", "or": "||", "not": "!"}[op]
-
-    def where(self, condition: str, a: str, b: str) -> str:
-        return f"({condition} ? {a} : {b})"
-
-    def define(self, name: str, text: str, predicate: bool) -> str:
-        return f"const {'int' if predicate else self.real} {name} = {text};"
 
 
 def statements(
-    outputs: Sequence[Node], bound: Mapping[int, str], dialect: C
+    outputs: Sequence[Node], bound: Mapping[int, str], dialect: ControllerC
 ) -> tuple[list[str], list[str]]:
     """Definitions of local values, and one expression per output.
 
@@ -107,7 +57,8 @@ def statements(
             text, binding = expression(node.op, [texts[a.number] for a in node.args], dialect)
             if uses[node.number] > 1 or len(text) > _INLINE:
                 name = f"t{len(lines)}"
-                lines.append(dialect.define(name, text, is_predicate(node)))
+                kind = "int" if is_predicate(node) else dialect.real
+                lines.append(f"const {kind} {name} = {text};")
                 text, binding = name, ATOM
             texts[node.number] = text, binding
 
@@ -116,7 +67,9 @@ def statements(
     return lines, [texts[node.number][0] for node in outputs]
 
 
-def expression(op: str, operands: Sequence[tuple[str, int]], dialect: C) -> tuple[str, int]:
+def expression(
+    op: str, operands: Sequence[tuple[str, int]], dialect: ControllerC
+) -> tuple[str, int]:
     """Text of an operation, and how tightly it binds, of operands given likewise."""
 
     def operand(i: int, binding: int) -> str:
@@ -131,36 +84,11 @@ def expression(op: str, operands: Sequence[tuple[str, int]], dialect: C) -> tupl
     if op == "neg":
         return f"-{operand(0, ATOM)}", _UNARY
     if op == "not":
-        return f"{dialect.logical('not')}{operand(0, ATOM)}", _NOT
+        return f"!{operand(0, ATOM)}", _NOT
     if op in ("and", "or"):
         sides = [operand(i, ATOM) for i in range(len(operands))]
-        return f" {dialect.logical(op)} ".join(sides), _AND if op == "and" else _OR
+        return (" && ".join(sides), _AND) if op == "and" else (" || ".join(sides), _OR)
     if op == "where":
-        return dialect.where(*(operand(i, _SUM) for i in range(3))), ATOM
+        condition, a, b = (operand(i, _SUM) for i in range(3))
+        return f"({condition} ? {a} : {b})", ATOM
     return dialect.call(op, [text for text, _ in operands]), ATOM
-
-
-def c_function(
-    name: str,
-    arguments: Sequence[str],
-    outputs: Mapping[str, Sequence[Node]],
-    bound: Mapping[int, str],
-    qualifier: str = "static ",
-) -> str:
-    """A C function of doubles that writes each of `outputs` to the array of that name.
-
-    Args:
-        name: of the function.
-        arguments: names of its input arrays.
-        outputs: nodes by output array.
-        bound: text of the input nodes.
-        qualifier: what stands before `void`.
-    """
-    nodes = [node for group in outputs.values() for node in group]
-    lines, texts = statements(nodes, bound, C())
-    targets = [f"{array}[{i}]" for array, group in outputs.items() for i in range(len(group))]
-    lines += [f"{target} = {text};" for target, text in zip(targets, texts, strict=True)]
-    signature = [f"const double *{a}" for a in arguments] + [f"double *{a}" for a in outputs]
-    unused = [f"(void){a};" for a in (*arguments, *outputs)]
-    body = "\n    ".join(lines + unused)
-    return f"{qualifier}void {name}({', '.join(signature)})\n{{\n    {body}\n}}\n"

@@ -6,12 +6,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from nfriction.export.c_code.dialect import ControllerC, is_identifier
-from nfriction.export.c_code.emit import Real
+from nfriction.export.c_code.dialect import ControllerC, Real, is_identifier
 from nfriction.export.c_code.model import source_of
-from nfriction.export.contract import Contract, contract_of
+from nfriction.export.contract import COEFFICIENT_SLACK, Contract, contract_of
 from nfriction.export.controller import controller_of
-from nfriction.export.parity import COEFFICIENT_SLACK
 from nfriction.friction.models import FrictionModel
 from nfriction.io.atomic import write_atomically
 from nfriction.io.model_info import ModelInfo
