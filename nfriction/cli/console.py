@@ -25,6 +25,7 @@ class _Help(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpF
     """Shows defaults where there is one; leaves examples as they are written."""
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
+        # "(default: None)" would say nothing.
         if action.default in (None, False, []):
             return action.help
         return super()._get_help_string(action)
@@ -64,6 +65,7 @@ def check_writable(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
         raise UsageError(f"cannot make the folder {folder}: there is a file in its way.") from None
+    # Permissions alone do not show it: the disk may be full or read-only.
     with tempfile.TemporaryFile(dir=folder):
         pass
 
@@ -149,6 +151,7 @@ class Progress:
     """One bar for a whole run: stages, which are also logged, and steps taken."""
 
     def __init__(self, logger: logging.Logger | None = None) -> None:
+        # Slow to import, and not needed for `--help`.
         from tqdm import tqdm
 
         self._what, self._logger = "start", logger
@@ -159,6 +162,7 @@ class Progress:
 
     def __exit__(self, _type: object, error: BaseException | None, _trace: object) -> None:
         self._bar.close()
+        # The message that the user sees; only here the stage is known.
         if isinstance(error, KeyboardInterrupt):
             error.args = (f"({self._what}); no file was left half-written",)
 

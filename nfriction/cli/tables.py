@@ -21,6 +21,7 @@ def error_tables(comparison: Comparison) -> str:
     for part in comparison.parts:
         lines = [str(tables.error_table(comparison, part))]
         names = (s.recording for s in next(iter(comparison.scores(part).values())))
+        # The names of the recordings belong to the caption, the first line.
         lines[0] = lines[0].replace("\n", f": {', '.join(names)}\n", 1)
         floor = comparison.floor(part=part)
         if floor is not None:
@@ -43,6 +44,7 @@ def fit_lines(name: str, fit: FitResult) -> str:
 def interval_table(fit: FitResult) -> str:
     """Values and 95 % intervals of constant coefficients and of the plant's terms; may be empty."""
     rows = [(i.name, i.value, i.low, i.high) for i in fit.intervals]
+    # Only constant coefficients have intervals.
     if not rows:
         return ""
     return str(tables.interval_table(type(fit.model).__name__, rows, bool(fit.plant_terms)))
@@ -70,6 +72,7 @@ def verdict(comparison: Comparison) -> str:
         f"m{comparison.unit}){end}"
     )
     tied, floor = comparison.indistinguishable(), comparison.floor()
+    # Without a floor no difference can be called insignificant.
     if len(tied) < 2 or floor is None:
         return found
     others = ", ".join(name for name in tied if name != best)

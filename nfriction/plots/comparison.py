@@ -52,6 +52,7 @@ def positions(
     whole = whole - {NO_FRICTION} or whole
     for joint, name in enumerate(recording.names):
         measured = recording.q[:, joint]
+        # A joint at rest has no range.
         span = float(np.ptp(measured)) or 1.0
         position, below = axes[2 * joint, 0], axes[2 * joint + 1, 0]
         position.plot(recording.time, measured, **style.MEASURED)
@@ -93,6 +94,7 @@ def rmse_bars(table: pd.DataFrame, unit: str, *, width: float | None = None) -> 
         raise ValueError("`table` is empty; it needs a row a model and a column a joint.")
     factor, unit = style.scaled(unit, values)
     models, joints = [str(name) for name in table.index], [str(name) for name in table.columns]
+    # Numbers above bars must not overlap.
     room = _BAR * (len(models) + 1) * len(joints) + 0.6
     width = width or (style.COLUMN if room <= style.COLUMN else style.PAGE)
     figure, axes = style.panels(1, 1, width, 2.2)
@@ -100,6 +102,7 @@ def rmse_bars(table: pd.DataFrame, unit: str, *, width: float | None = None) -> 
     finite = factor * values[np.isfinite(values) & (values > 0)]
     largest, smallest = (finite.max(), finite.min()) if finite.size else (1.0, 1.0)
     if style.spread(values) > style.LOG_FROM:
+        # A number above a bar takes a share of the axis, not of the value.
         bottom, top = smallest / 2.5, largest * (largest / smallest) ** 0.3
         style.log_axis(ax, bottom, top)
     else:
@@ -171,6 +174,7 @@ def horizon_curve(
         )  # fmt: skip
     if floor is not None:
         ends = [x[-1] - 0.3, x[-1] + 0.3]
+        # Only at the free run: shorter windows restart from other states.
         band = ax.fill_between(ends, bottom, factor * floor, color=style.BAND, alpha=0.6, lw=0)
         handles.append(band)
         models = [*models, "one encoder count"]

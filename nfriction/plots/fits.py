@@ -117,6 +117,7 @@ def coefficient_intervals(fits: Mapping[str, FitResult], *, width: float | None 
         factor = style.coefficient_axis(ax, coefficient, first.plant.unit, [low, high])
         for m, (name, of) in enumerate(ends.items()):
             x = np.arange(len(joints)) + 0.6 * ((m + 0.5) / len(fits) - 0.5)
+            # Open intervals end at the edges of the panel.
             value, bottom, top = (factor * np.clip(e, low, high) for e in of)
             ax.errorbar(
                 x, value, [value - bottom, top - value], capsize=2, elinewidth=1.0, **looks[name]
@@ -163,6 +164,7 @@ def convergence(
     if finite.min() > 0 and style.spread(finite) > style.LOG_FROM:
         ax.set_yscale("log")
     else:
+        # Offsets hide the size of a cost that changes little.
         ax.ticklabel_format(axis="y", useOffset=False)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlabel("step")
@@ -175,6 +177,7 @@ def convergence(
 def _velocities(qd: Array) -> Array:
     """The range of the data, dense about zero, where laws turn over a few thousandths."""
     low, high = float(qd.min()), float(qd.max())
+    # Evenly spaced velocities would draw the step at zero as a slope.
     near = np.geomspace(1e-5, 1.0, 100) * max(abs(low), abs(high))
     grid = np.unique(np.concatenate([np.linspace(low, high, 300), -near, [0.0], near]))
     return grid[(grid >= low) & (grid <= high)]

@@ -75,6 +75,7 @@ def memberships(
         for i, ax in enumerate(row):
             low, high = rules.lower[j, i], rules.upper[j, i]
             x = torch.as_tensor(np.linspace(float(low), float(high), _POINTS))
+            # Before and after share colours, so that each set can be followed.
             ax.set_prop_cycle(color=style.COLOURS[: rules.centres[i].shape[1]])
             for of, look in drawn:
                 ax.plot(x, of.memberships(i, j, x), **look)
@@ -161,12 +162,14 @@ def draw_map(
     """
     shown = values if seen is None else np.ma.masked_where(~seen, values)
     low, high = (float(shown.min()), float(shown.max())) if np.ma.count(shown) else (0.0, 1.0)
+    # A constant map would show rounding errors in full colour.
     if high - low < 1e-6 * max(abs(low), abs(high)):
         low, high = style.padded(low, low)
     factor, unit = style.scaled(label[1], [low, high])
     ax.grid(False)
     ax.spines[:].set_visible(True)
     ax.patch.set(facecolor=style.UNSEEN, hatch="////", edgecolor=style.HATCH)
+    # Rasterised: as vectors, thousands of cells would make a PDF slow to open.
     mesh = ax.pcolormesh(
         *axes, factor * shown, cmap=style.MAP, vmin=factor * low, vmax=factor * high,
         shading="flat" if len(axes[0]) > values.shape[1] else "gouraud", rasterized=True,

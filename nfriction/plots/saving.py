@@ -56,8 +56,10 @@ def save_all(
     folder.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
     for name, figure in _figures(comparison, recordings):
+        # Names come from recordings, which may hold any character.
         stem = re.sub(r"[^\w-]+", "_", name)
         path = folder / f"{stem}.png"
+        # Two names may differ only in characters that were replaced.
         for count in range(2, 2 + len(written)):
             if path not in written:
                 break
@@ -82,11 +84,13 @@ def _figures(
             of = {m: s for m, many in scores.items() for s in many if s.recording == recording.name}
             if of:
                 yield f"positions_{part}_{recording.name}", positions(recording, of)
+    # A comparison that was read from a file has scores only.
     if not comparison.fits:
         return
     last = list(comparison.fits.values())[-1]
     moved = last.motions
     if last.encoder_offsets:
+        # Motions are kept as recorded; the plant expects corrected angles.
         pairs = zip(moved, last.encoder_offsets, strict=True)
         moved = tuple(replace(m, q=m.q + offset) for m, offset in pairs)
     order = [s.recording for s in next(iter(comparison.train.values()))]

@@ -97,6 +97,7 @@ def legend(figure: Figure, handles: Iterable[Artist], labels: Sequence[str]) -> 
     longest = max(len(label) for label in labels)
     columns = min(len(labels), max(1, int(figure.get_figwidth() / (0.5 + 0.05 * longest))))
     rows = -(-len(labels) // columns)
+    # Balanced: no row is left with a single entry.
     columns = -(-len(labels) // rows)
     # Filled column by column, read row by row.
     order = [k for column in range(columns) for k in range(column, len(labels), columns)]
@@ -134,6 +135,7 @@ def log_axis(ax: Axes, bottom: float, top: float) -> None:
     ax.set_yscale("log")
     ax.set_ylim(bottom, top)
     ratio = top / bottom
+    # Over a short range, decades alone would leave an axis with a single number.
     subs = (1,) if ratio > 200 else (1, 2, 5) if ratio > 8 else range(1, 10)
     ax.yaxis.set_major_locator(LogLocator(subs=[float(s) for s in subs]))
     ax.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
@@ -163,6 +165,7 @@ class Look:
 def looks(names: Iterable[str]) -> dict[str, Look]:
     """A look for each model; no friction is grey whichever others there are."""
     models = [name for name in names if name != NO_FRICTION]
+    # Fixed, so that colours of models do not depend on whether it was simulated.
     found = {NO_FRICTION: _look(FAINT, (0, (2.5, 2.5)), "x", "xxxx")}
     for k, name in enumerate(models):
         cycles: tuple[Sequence[Any], ...] = (COLOURS, _DASHES, _MARKERS, _HATCHES)
@@ -226,6 +229,7 @@ def spread(values: Any) -> float:
 
 def padded(low: float, high: float, share: float = 0.05) -> tuple[float, float]:
     """Limits a little wider than the values, and never empty."""
+    # Equal limits have no range to take a share of.
     margin = share * (high - low) or 0.05 * abs(high) or 1.0
     return low - margin, high + margin
 

@@ -88,6 +88,7 @@ def to_html(run: Run) -> str:
 
 def _policy(style: str, script: str) -> str:
     """Only this style and this script, and pictures that are in the page."""
+    # Hashes, as "unsafe-inline" would let injected code run.
     of_style, of_script = (
         base64.b64encode(hashlib.sha256(t.encode()).digest()).decode() for t in (style, script)
     )
@@ -125,7 +126,9 @@ def _fit(run: Run, name: str) -> dict[str, Any]:
     return {
         "name": name,
         "record": fit,
+        # The page shows convergence by a badge; the status would repeat it.
         "reason": re.sub(r"^(not )?converged\W*", "", fit.status, flags=re.IGNORECASE),
+        # Several fits of a chain may pass on the same warning.
         "warnings": list(dict.fromkeys(warnings)),
         "tables": tables,
     }
@@ -222,6 +225,7 @@ def _are_pairs(value: Any, joints: int) -> bool:
 
 def _commands(run: Run) -> list[str]:
     lines = [shlex.join(["nfriction", "report", str(run.folder)])]
+    # Without a readable model file there is nothing to export.
     if run.best in run.models:
         file = str(run.folder / "models" / f"{run.best}.json")
         lines.append(shlex.join(["nfriction", "info", file]))

@@ -94,6 +94,7 @@ def rules_in_words(model: FrictionModel, joint_names: Sequence[str] = ()) -> lis
         v = tuple(map(Term, _speed_names(speeds), speeds, speed_widths))
         named = _acceleration_names(accelerations, fuzzy.along_motion)
         a = tuple(map(Term, named, accelerations, widths))
+        # The order of the rule table: the acceleration varies faster.
         pairs = [(x.name, y.name) for x in v for y in a]
         values = fuzzy.coefficients[j].tolist()
         rules = [Rule(*pair, tuple(of)) for pair, of in zip(pairs, values, strict=True)]
@@ -102,6 +103,7 @@ def rules_in_words(model: FrictionModel, joint_names: Sequence[str] = ()) -> lis
 
 
 def _speed_names(centres: Sequence[float]) -> list[str]:
+    # Language has no words for more than five.
     names = _SPEEDS.get(len(centres)) or [f"speed {k + 1}" for k in range(len(centres))]
     return _in_order(centres, names)
 
@@ -109,6 +111,7 @@ def _speed_names(centres: Sequence[float]) -> list[str]:
 def _acceleration_names(centres: Sequence[float], along_motion: bool) -> list[str]:
     below, above = ("braking", "speeding up") if along_motion else ("negative", "positive")
     ordered = sorted(centres)
+    # The set nearest to zero: after training none need lie exactly there.
     zero = min(range(len(ordered)), key=lambda k: abs(ordered[k]))
     names = [_size(zero - k) + below for k in range(zero)]
     names += ["about zero"]
@@ -122,6 +125,7 @@ def _size(rank: int) -> str:
 
 def _in_order(centres: Sequence[float], names: Sequence[str]) -> list[str]:
     """Names from the lowest centre to the highest, in the order of the centres."""
+    # Training may move sets past each other.
     order = sorted(range(len(centres)), key=lambda k: centres[k])
     named = dict(zip(order, names, strict=True))
     return [named[k] for k in range(len(centres))]

@@ -107,6 +107,7 @@ def read_run(folder: str | Path) -> Run:
             f"{folder}: has no results.json; give a folder that `nfriction compare` or "
             "`nfriction demo` wrote."
         )
+    # Before reading, so that a huge file cannot exhaust the memory.
     if path.stat().st_size > LARGEST_RESULTS:
         raise RunError(f"{path}: is too large for results of a comparison.")
     try:
@@ -123,6 +124,7 @@ def _run(folder: Path, content: dict[str, Any]) -> Run:
     schema = _read(float, content.get("schema", 1), "`schema`")
     if schema > SCHEMA:
         raise _EntryError(f"its schema {schema:g} is newer than {SCHEMA}; update nfriction")
+    # The first schema named test recordings differently.
     keys: dict[Part, str] = {"train": "train", "test": "test" if schema > 1 else "held_out"}
     joints = _read(tuple[str, ...], content.get("joints"), "`joints`")
     unit = content.get("units")
@@ -135,8 +137,10 @@ def _run(folder: Path, content: dict[str, Any]) -> Run:
     if not any(scores.values()):
         raise _EntryError("it has no scores")
     best = _read(dict[str, Any], content.get("best") or {}, "`best`")
+    # Names select files and table rows further on.
     if best and _read(str, best.get("model"), "`best`") not in entries:
         raise _EntryError("its best model is none of its models")
+    # Also renamed since the first schema.
     tied = best.get("indistinguishable" if schema > 1 else "alike", [])
     recordings = _read(dict[str, dict[str, str]], content.get("recordings", {}), "`recordings`")
     fits = {n: _fit(e["fit"], f"fit of {n}") for n, e in entries.items() if "fit" in e}
@@ -246,6 +250,7 @@ def _models(
         except ModelFileError as error:
             notes.append(f"{name}: its model file could not be read ({error})")
             continue
+        # A copied file would show the coefficients of one model under the name of another.
         if type(model).__name__ != name or model.joints != joints:
             notes.append(f"{name}: {path} holds another model")
             continue

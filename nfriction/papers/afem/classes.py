@@ -145,7 +145,9 @@ def find_classes(
     schedule.set_sample_time(step)
     qdd = [torch.as_tensor(m.qdd, dtype=torch.float64) for m in motions]
     qd = [torch.as_tensor(m.qd, dtype=torch.float64) for m in motions]
+    # A swing's amplitude ratio of acceleration to velocity, its angular frequency on average.
     rate = torch.cat(qdd).square().mean(0).sqrt() / torch.cat(qd).square().mean(0).sqrt()
+    # In the words of the status of the fit, which repeats them.
     notes: list[str] = []
     labels, thresholds = None, options.thresholds
     if options.intervals is not None:
@@ -178,6 +180,7 @@ def otsu(values: Array, bins: int = 128) -> tuple[float, float]:
     """
     count, edges = np.histogram(values, bins)
     centre = 0.5 * (edges[:-1] + edges[1:])
+    # Cumulative sums, so that every pair of thresholds costs the same few operations.
     weight = np.concatenate([[0], np.cumsum(count)]).astype(np.float64)
     moment = np.concatenate([[0], np.cumsum(count * centre)])
     i, j = np.triu_indices(bins, 1)
@@ -211,6 +214,7 @@ def _by_otsu(
     """Thresholds of each joint for the peak of |qdd| within a moving window [s]."""
     from scipy.ndimage import maximum_filter1d  # slow to import
 
+    # Longer than half a swing, or every reversal would fall into the lowest class.
     width = max(1, round(window / step))
     peaks = np.concatenate([maximum_filter1d(np.abs(a.numpy()), width, axis=0) for a in qdd])
     highest = np.maximum(peaks.max(0), STILL)
@@ -227,6 +231,7 @@ def _by_otsu(
     for j, name in enumerate(joints):
         if varies[j] < LEAST_VARIATION:
             notes.append(f"acceleration of {name} hardly varies: it has one class")
+            # Thresholds that the motion never reaches.
             found.append((2.0 * float(highest[j]), 4.0 * float(highest[j])))
         else:
             low, high = otsu(np.log(peaks[:, j]))
@@ -252,6 +257,7 @@ def _labels(intervals: Intervals, recording: Recording, joints: Sequence[str]) -
                 )
         time = recording.time
         starts, ends = (np.array([row[i] for row in own[joint]])[:, None] for i in (1, 2))
+        # Distance to each interval, so that samples between two belong to the nearer one.
         gap = np.maximum(np.maximum(starts - time, time - ends), 0.0)
         gap[(time >= starts) & (time < ends)] = -1.0
         order = np.array([CLASSES.index(known) for known, _, _ in own[joint]])
@@ -266,6 +272,7 @@ def _separating(labels: Sequence[Tensor], envelopes: Sequence[Tensor]) -> Tensor
     for of_joint, size in zip(known.T, envelope.T, strict=True):
         ends = size.aminmax()
         low, high = (float(e.log10()) for e in ends)
+        # Accelerations span decades; a linear grid would not resolve the lower threshold.
         grid = torch.logspace(low, high, 200, dtype=size.dtype)
         above = size[:, None] > grid
         row = []

@@ -188,6 +188,7 @@ def _pattern(cost: Cost, box: Box, options: SearchOptions, callback: Callback) -
 
     def step(at: PatternState) -> bool | None:
         best = box.whole(scaling.from_unit(scaling.tensor(at.x)))
+        # A copy: the live state changes with the next iteration.
         kept = PatternState.from_dict(at.to_dict())
         return callback(SearchState("pattern", best.tolist(), at.value, at.evaluations, kept))
 
@@ -203,6 +204,7 @@ def _pattern(cost: Cost, box: Box, options: SearchOptions, callback: Callback) -
     return SearchResult(box.whole(result.x), value, result.converged, result.message, iterations)
 
 
+# SLSQP ignores the result of its callback; only an exception ends it.
 class _StoppedError(Exception):
     """Leaves SciPy's loop."""
 
@@ -214,6 +216,7 @@ def _sqp(cost: Cost, box: Box, options: SearchOptions, callback: Callback) -> Se
     scaling, state = box.scaling(), options.state
     lower, upper = scaling.to_unit(scaling.lower), scaling.to_unit(scaling.upper)
     start = box.start if state is None else torch.tensor(state.vector, dtype=box.start.dtype)
+    # SLSQP returns its last iterate, which need not be the best point that it evaluated.
     least, best, iterations = np.inf, start, 0
     evaluations = 0 if state is None else state.evaluations
     reference = float(cost(start[None])[0])
@@ -237,9 +240,11 @@ def _sqp(cost: Cost, box: Box, options: SearchOptions, callback: Callback) -> Se
         nonlocal iterations
         iterations += 1
         at = SearchState("sqp", best.tolist(), least, evaluations)
+        # SciPy limits iterations, but simulations are what takes time.
         if evaluations >= options.max_evaluations or callback(at):
             raise _StoppedError
 
+    # SLSQP tests the change of one step, which is smaller than the distance to the minimum.
     settings: Any = {"ftol": 1e-2 * options.tolerance, "maxiter": 1000}
     try:
         end = minimize(
@@ -295,6 +300,7 @@ def fit_by_search(
         raise ValueError(
             f"a search fits constant or adaptive coefficients, not {type(schedule).__name__}."
         )
+    # Constants start from the torques, which cost no simulation; classes need a motion to follow.
     method: Method = "output_error" if schedule.follows_motion else "equation_error"
     asked = like_start(FitOptions(method), start)
     task = prepare_task(model, plant, recordings, asked, start, motions)
@@ -317,6 +323,7 @@ def fit_by_search(
         drive=None if by_class is None else by_class.drive(),
     )  # fmt: skip
     box = _box(table, varied, constant, task)
+    # Errors of the start set the weight of the prior; those of the end are not known yet.
     first = error.residuals(table.parameter_vector())
     noise = effective_noise(first.nan_to_num(1.0, 1.0, -1.0))
     mean, sd = table.prior()

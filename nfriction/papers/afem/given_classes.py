@@ -71,6 +71,7 @@ class GivenClassesProblem(ShootingProblem):
     ) -> Rollout:
         assert self.classes is not None
         classes = self.classes.repeat_interleave(self.substeps, 1)
+        # The schedule reads the class in place of the acceleration; velocity does not enter.
         measured = torch.zeros_like(classes), classes
         inputs = RolloutInputs(q0, qd0, tau, step, measured=measured)
         motion = integrate(plant, model, inputs)
@@ -133,6 +134,7 @@ class PositionError:
         memory = None if self.memory is None else self.memory[w]
         q0, qd0 = of.q0[w].expand(m, -1), of.qd0[w].expand(m, -1)
         inputs = RolloutInputs(q0, qd0, of.tau[w], of.step[w], self.substeps, measured, memory)
+        # All candidates of a window in one call; without a compiler one after the other.
         states = integrate_compiled(self.plant, self.friction, inputs, "auto", self.threads, own)
         if states is not None:
             return states[0]
@@ -205,6 +207,7 @@ class ClassFit:
         # Where neither gives a size, the coefficient is free.
         table = GivenClasses(model, values, torch.where(sd > 0, sd, torch.inf))
         given = FrictionModel(model.law, table, model.v_smooth).requires_grad_(False)
+        # Windows are compared in joint coordinates, without what the encoders are off by.
         corrected = replace(task, recordings=joint, motions=motions)
         windows = cut_windows(joint, motions, length)
         return cls(corrected, task.motions, constant, classes, schedule, table, given, windows)
@@ -235,6 +238,7 @@ class ClassFit:
         """
         task, constant, model, schedule = self.task, self.constant, self.task.model, self.schedule
         flat = constant.model.schedule.coefficient_sets()["always"][:, None]
+        # A class without data was never varied: its own entry is still the start.
         table = torch.take_along_dim(self.table.values, self.classes.stands_for[..., None], 1)
         model.requires_grad_(False)
         along = [
@@ -249,6 +253,7 @@ class ClassFit:
             found, model=model, motions=self.motions, encoder_offsets=constant.encoder_offsets,
             skipped_horizons=constant.skipped_horizons,
         )  # fmt: skip
+        # Given classes hide that a wrong class feeds back on the motion that chooses it.
         for share in SHARES:
             schedule.set_coefficients(flat + share * (table - flat))
             residuals = error.residuals(schedule.parameter_vector())
@@ -258,6 +263,7 @@ class ClassFit:
                 status = found.status + part + "".join(f" {note}." for note in self.classes.notes)
                 taken = replace(found, residual=rms, residuals=residuals, status=status)
                 return taken.with_warnings(constant.data_warnings)
+        # All classes equal: the adaptive model then is the constant one.
         schedule.set_coefficients(flat.expand(-1, len(CLASSES), -1))
         status = f"{constant.status} The classes simulate no better: the constant law is kept."
         return replace(constant, model=model, motions=self.motions, status=status)

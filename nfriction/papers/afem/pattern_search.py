@@ -73,6 +73,7 @@ class VariableScaling:
         # A lower bound of zero is no bound to a logarithm.
         unbounded = log & (low <= 0)
         low = torch.where(unbounded, -math.inf, low)
+        # The width of an unbounded variable must come out as NaN, so that the default applies.
         unit = cls(low, high, torch.ones_like(start), log)
         width = unit.to_unit(high) - unit.to_unit(torch.where(unbounded, torch.nan, low))
         default = torch.where(log | (start == 0), 1.0, start.abs())
@@ -89,7 +90,7 @@ class VariableScaling:
     def from_unit(self, u: Tensor) -> Tensor:
         """The caller's variables from the search's, within the bounds."""
         x = u * self.scale
-        return torch.where(self.logarithmic, 10.0**x, x).clamp(self.lower, self.upper)
+        x = torch.where(self.logarithmic, 10.0**x, x).clamp(self.lower, self.upper)
         # A variable at its bound is there to the last bit, however the logarithm is rounded.
         x = torch.where(u <= self.to_unit(self.lower), self.lower, x)
         return torch.where(u >= self.to_unit(self.upper), self.upper, x)
@@ -248,6 +249,7 @@ class PatternSearch:
             start = scaling.to_unit(x0.clamp(scaling.lower, scaling.upper))
             state = PatternState(start.tolist(), math.inf, self.initial_mesh, [0.0] * len(x0))
         else:
+            # The caller's state stays as it was, so that a search can be resumed from it twice.
             state = PatternState.from_dict(state.to_dict())
         if len(state.x) != len(x0):
             raise ValueError(f"`state` has {len(state.x)} variables, `x0` has {len(x0)}.")
@@ -273,6 +275,8 @@ class PatternSearch:
             total=self.max_evaluations, initial=state.evaluations, disable=not self.progress
         ) as bar:
             while state.mesh >= self.mesh_tolerance:
+                # A partial poll would depend on the limit, and a resumed search would differ from a
+                # whole one.
                 if state.evaluations + self.poll_size(len(state.x)) > self.max_evaluations:
                     return "max_evaluations"
                 self._iterate(objective, scaling, state)
@@ -290,14 +294,17 @@ class PatternSearch:
         steps = steps[(steps @ last).argsort(descending=True, stable=True)]
         if self.speculate:
             steps = torch.cat([last[None], steps])
+        # Projected, not rejected: a minimum at a bound is approached along it.
         candidates = scaling.project(x + steps)
         values = _evaluate(objective, scaling, candidates)
         best = int(values.argmin())
         if values[best] < state.value:
             state.last_step = (candidates[best] - x).tolist()
             state.x, state.value = candidates[best].tolist(), float(values[best])
+            # A mesh beyond the range of the variables would only poll the bounds.
             state.mesh = min(2.0 * state.mesh, max(1.0, self.initial_mesh))
         else:
+            # A direction that failed once must not be preferred.
             state.last_step = [0.0] * len(x)
             state.mesh *= self.contraction
         state.evaluations += len(candidates)
@@ -312,10 +319,12 @@ class PatternSearch:
         generator = torch.Generator().manual_seed(self.seed * 1_000_003 + iteration)
         drawn = torch.randn(d, d, generator=generator, dtype=torch.float64)
         axes, triangle = torch.linalg.qr(drawn)
+        # The sign makes the factorisation unique, and so the rotations uniform.
         return axes * triangle.diagonal().sign()
 
 
 def _evaluate(objective: Objective, scaling: VariableScaling, candidates: Tensor) -> Tensor:
+    # Candidates are compared, never differentiated.
     values = torch.as_tensor(objective(scaling.from_unit(candidates))).detach()
     if values.shape != candidates.shape[:1]:
         raise ValueError(

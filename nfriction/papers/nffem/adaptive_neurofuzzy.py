@@ -59,6 +59,7 @@ class AdaptiveNeuroFuzzy(Schedule):
         super().__init__(law, joints)
         self._law = law
         self.adaptive = Adaptive(law, joints, initial, **(memory or {}))
+        # The mean over the classes: the network corrects all of them alike.
         self.deviation = NeuroFuzzy(law, joints, self.adaptive.values.mean(1), **network)
 
     @torch.no_grad()
@@ -71,6 +72,7 @@ class AdaptiveNeuroFuzzy(Schedule):
         """
         self.adaptive = Adaptive(self._law, self.joints, adaptive.values, **adaptive.options())
         self.adaptive.set_classes(adaptive.thresholds, adaptive.swing_rate)
+        # A coefficient that is small in one class may be large in another.
         largest = adaptive.values.abs().amax(1)
         self.deviation.set_reference(
             adaptive.values.mean(1), largest if scale is None else torch.maximum(largest, scale)
@@ -96,6 +98,7 @@ class AdaptiveNeuroFuzzy(Schedule):
         # In the network's inputs, where zero acceleration lies wherever its range leaves it.
         accelerations = (torch.where(share < 0, -share * low, share * high) - low) / (high - low)
         centres = [(fast**VELOCITY_POWER).expand(self.joints, -1), accelerations]
+        # Neighbouring sets cross at one half, however unevenly they are spaced.
         half_widths = crossing_half_widths(centres, torch.ones(self.joints, 2).to(velocity))
         widths = [half / HALF_WIDTH_OF_GAUSSIAN for half in half_widths]
         network.network.anfis.init_from_sets(centres, widths, lower=0.0, upper=1.0)
@@ -131,6 +134,7 @@ class AdaptiveNeuroFuzzy(Schedule):
         return dict(zip(CLASSES, self.rest_coefficients().detach(), strict=True))
 
     def rest_coefficients(self) -> Tensor:
+        # At rest the class is a matter of the past: each class has a set of its own.
         rest = torch.zeros_like(self.adaptive.swing_rate)
         rows = []
         for known in range(self.adaptive.raw.shape[1]):

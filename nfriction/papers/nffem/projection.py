@@ -34,8 +34,10 @@ def project(layer: Anfis | RBFNetwork, x: Tensor, y: Tensor, steps: int) -> None
     problem = Projection(layer, x, y)
     if not problem.separable:
         return
+    # Only a start for the regularised fit: a tighter tolerance would be wasted.
     solver = LevenbergMarquardt(max_steps=steps, cost_tolerance=1e-6)
     result = solver.minimise(problem.quadratic, problem.theta, cost=problem.cost)
+    # The solver's last trial may not be its best; evaluating it writes the layer.
     problem.cost(result.x)
     if result.status == "stopped":
         raise KeyboardInterrupt
@@ -65,6 +67,7 @@ class Projection:
         self.linear, self.moving = linear.to(x.device), ~linear.to(x.device)
         self.shared = layer.readout().shape[2]
         self.total = layer.jacobian_columns(x[:1]).shape[1]
+        # Of a fixed size, so that memory does not grow with the samples.
         rows = min(len(x), max(1, CHUNK_ENTRIES // self.total))
         # Written again and again: the first touch of fresh memory costs more than the arithmetic.
         self.buffer = x.new_empty(1, self.total, rows)
@@ -101,6 +104,7 @@ class Projection:
             R = self.layer.regressor_columns(self.x[rows], out)[0]
             G.addmm_(R, R.T)
             b.addmm_(R, self.y[rows, 0])
+        # The ridge keeps the Gram matrix definite where sets coincide or no sample fires a rule.
         factor = torch.linalg.cholesky_ex(G + self.ridge * torch.eye(self.shared).to(G)).L
         weights = torch.cholesky_solve(b, factor)
         # In a regressor's coordinates an output layer's maps pick, so that their transpose places.
@@ -119,6 +123,7 @@ class Projection:
             Golub and Pereyra (1973); L. Kaufman, BIT 15 (1975) 49-57.
         """
         known = self._eliminated
+        # The solver has just evaluated the cost there, except at its start.
         if known is None or not torch.equal(known.theta, theta):
             self.cost(theta)
             known = self._eliminated
@@ -131,6 +136,7 @@ class Projection:
             F = self.layer.jacobian_columns(self.x[rows], out)[0]
             A.addmm_(F[shared:], F.T)
             b.addmm_(F[shared:], F[:shared].T @ known.weights - self.y[rows, 0])
+        # Schur complement: curvature that the re-optimised output layer removes.
         explained = A[:, :shared] @ torch.cholesky_solve(A[:, :shared].T, known.factor)
         maps = self._maps()[:, shared:, self.moving]
         hessian = (maps.mT @ (A[:, shared:] - explained) @ maps).sum(0)

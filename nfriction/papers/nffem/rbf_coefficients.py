@@ -66,6 +66,7 @@ class RBFCoefficients(Schedule):
             ("output_upper", values.clone()),
         ):
             self.register_buffer(name, start)
+        # Bias alone: an untrained network is the constant law.
         nn.init.zeros_(self.network.output_weight)
         with torch.no_grad():
             self.network.output_bias.copy_(values)
@@ -94,6 +95,7 @@ class RBFCoefficients(Schedule):
             ValueError: if the network has another shape, a universe is no range, or one of a
                 coefficient that is positive by physics begins below zero.
         """
+        # The description has all sizes.
         ours, theirs = self.network.extra_repr(), network.extra_repr()
         if ours != theirs:
             raise ValueError(f"`network` must have {ours}, got {theirs}.")
@@ -107,6 +109,7 @@ class RBFCoefficients(Schedule):
                     f"`{name}` must be lower and upper ends {shape} with lower <= upper, got shape "
                     f"{tuple(given.shape)}."
                 )
+        # The clamp to the universe is all that keeps such a coefficient positive.
         if bool((self.positive & (outputs[0] < 0)).any()):
             raise ValueError("a coefficient that is positive by physics has a universe from >= 0.")
         self.network.load_state_dict(network.state_dict())
@@ -147,6 +150,7 @@ class RBFCoefficients(Schedule):
         own = torch.eye(y.shape[-1], dtype=y.dtype, device=y.device)
         by_input = self.network.input_jacobian(x).permute(3, 0, 1, 2)
         by_speed, by_qdd = (by_input * free[..., None] * moving[:, :, None]).unbind(-1)
+        # The network reads |qd|.
         by_qd = by_speed * qd.sign()[..., None]
         if self.along_motion:
             turn = self.turn * self.input_upper.select(-1, 0)

@@ -92,6 +92,7 @@ def refine_adaptive(
     )  # fmt: skip
     name = f"{length:g} s windows, correction by class"
     begun, shares = _cross_fitted(schedule, whole, fitter, name)
+    # Parameters of a joint whose share is zero stay at the adaptive model.
     part = shares[schedule.joint_of_parameters()]
     if part.any():
         start = whole.variables.start(friction=begun)
@@ -106,6 +107,7 @@ def refine_adaptive(
     parts = zip(shares.tolist(), plant.joint_names, strict=True)
     taken = ", ".join(f"{share:g} of {name}'s" for share, name in parts)
     status = f"{found.status} Taken of the correction: {taken}."
+    # The plant is that of the adaptive fit, and so are the terms reported.
     return replace(found, status=status, plant_terms=adaptive.plant_terms)
 
 
@@ -187,6 +189,7 @@ def stacking_weights(errors: Callable[[Tensor], Tensor], joints: int) -> Tensor:
     """
 
     def log_errors(shares: tuple[float, ...]) -> Tensor:
+        # Errors below rounding would make their logarithms decide.
         found = errors(torch.tensor(shares, dtype=torch.float64))
         return found.clamp_min(DEFAULTS.min_noise).log().nan_to_num(torch.inf, torch.inf)
 
@@ -199,6 +202,7 @@ def stacking_weights(errors: Callable[[Tensor], Tensor], joints: int) -> Tensor:
         found = own.mean() + SIGNIFICANCE * own.std() / len(own) ** 0.5
         return float(found) if bool((ratio.mean(0) <= 0).all()) else math.inf
 
+    # Joints are coupled: shares searched one by one from zero could stay there.
     best = min(((share,) * joints for share in SHARES), key=change)
     before = None
     while best != before:

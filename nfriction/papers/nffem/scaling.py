@@ -56,6 +56,7 @@ class Scaling:
                 "not out of the network."
             )
         y_middle, y_half = _range(y)
+        # A constant output has no range to be scaled by.
         return cls(x_middle, x_half, y_middle, torch.where(y_half > 0, y_half, 1.0))
 
     def inverse(self) -> Scaling:
@@ -102,6 +103,7 @@ def to_own_units(network: nn.Module, scaling: Scaling) -> None:
 
 
 def _rescale_rbf(network: RBFNetwork, scaling: Scaling) -> None:
+    # Widths scale with the inputs, so that every unit responds exactly as before.
     half = scaling.x_half.unsqueeze(1)
     network.centres.mul_(half).add_(scaling.x_middle.unsqueeze(1))
     network.log_widths.add_(half.log())
@@ -110,6 +112,7 @@ def _rescale_rbf(network: RBFNetwork, scaling: Scaling) -> None:
 
 
 def _rescale_anfis(anfis: Anfis, scaling: Scaling) -> None:
+    # Free sets lie one after the other in a row, input by input.
     counts = torch.tensor(anfis.terms, device=scaling.x_half.device)
     if isinstance(anfis.partition, FreePartition):
         half = scaling.x_half.repeat_interleave(counts, 1)
@@ -120,6 +123,7 @@ def _rescale_anfis(anfis: Anfis, scaling: Scaling) -> None:
             bound.mul_(scaling.x_half).add_(scaling.x_middle)
     consequents = anfis.consequents
     if anfis.order == 1:
+        # A plane of scaled inputs: slopes absorb the ranges, the offset absorbs the middles.
         consequents[..., :-1].div_(scaling.x_half[:, None, None])
         moved = consequents[..., :-1] * scaling.x_middle[:, None, None]
         consequents[..., -1].sub_(moved.sum(-1))
@@ -129,5 +133,6 @@ def _rescale_anfis(anfis: Anfis, scaling: Scaling) -> None:
 
 def _range(values: Tensor) -> tuple[Tensor, Tensor]:
     """Middle and half-range over the samples, each (groups, size)."""
+    # Extremes, not deviations: sets then lie on [-1, 1] whatever the distribution.
     low, high = values.amin(0), values.amax(0)
     return 0.5 * (low + high), 0.5 * (high - low)

@@ -152,6 +152,7 @@ def train_on_controller(
     drawn = [controller_targets(c, samples, options.seed + g) for g, c in enumerate(given)]
     x, y = (torch.stack(parts, 1) for parts in zip(*drawn, strict=True))
     if isinstance(network, RBFNetwork):
+        # Units at samples, each where it explains most of what the others leave.
         network.init_ols(x, y, width=0.5)
     else:
         _take_sets(network.anfis if isinstance(network, AnfisRBF) else network, given)
@@ -272,6 +273,7 @@ class NetworkGroup:
         else:
             self.carrier.solve_output(x, y)
         if isinstance(self.layer, AnfisRBF):
+            # The layer alone is usable; a head from its random start would spoil it.
             nn.init.zeros_(self.layer.head.output_weight)
             nn.init.zeros_(self.layer.head.output_bias)
         self.write_back()
@@ -281,6 +283,7 @@ class NetworkGroup:
         few = self._thinned(options.search_samples)
         refining = REFINING_STEPS if options.starts == 1 else PROJECTED_STEPS
         ranking = max(3, min(options.max_steps, RANKING_EFFORT // len(self.x)))
+        # The prior is centred on where the sets started, not on where the search moved them.
         best, prior = -float("inf"), _moving(self.carrier)
         found = deepcopy(self.carrier.state_dict())
         for number in range(options.starts):
@@ -290,6 +293,7 @@ class NetworkGroup:
             start = _moving(trial)
             project(trial, *few, options.search_steps)
             if len(few[0]) < len(self.x):
+                # The thinned samples placed the sets; the rest only refines them.
                 project(trial, self.x, self.y, refining)
             evidence = 0.0
             if options.starts > 1:
@@ -312,14 +316,17 @@ class NetworkGroup:
 
     def _thinned(self, most: int) -> tuple[Tensor, Tensor]:
         """At most `most` samples, evenly spaced."""
+        # Rounded up, so that the limit holds.
         every = -(-len(self.x) // most)
         return self.x[::every].contiguous(), self.y[::every].contiguous()
 
     @torch.no_grad()
     def write_back(self) -> None:
         """Copy the layer into its group of the network, in the samples' own units."""
+        # Training goes on in scaled units.
         own = deepcopy(self.layer)
         to_own_units(own, self.scaling)
+        # The variables themselves, as copies would leave the network unchanged.
         ours = self.network.state_dict(keep_vars=True)
         for name, value in own.state_dict().items():
             ours[name][self.group : self.group + 1] = value
@@ -332,7 +339,9 @@ def _regularised(
     parameters = trainable(layer)
     groups: dict[str, list[str]] = {}
     for name in parameters:
+        # Each kind has a scale of its own, so the evidence weights each prior separately.
         groups.setdefault(_kind(name), []).append(name)
+    # Frozen parameters have no prior.
     wanted = {name: value for name, value in prior.items() if name in parameters}
     return bayesian_regularisation(layer, x, y, groups=groups, prior=wanted, options=options)
 
@@ -364,5 +373,6 @@ def _restart(layer: Anfis | RBFNetwork, x: Tensor, seed: int) -> None:
     for name, value in layer.named_parameters():
         if value.requires_grad and not name.endswith(LINEAR):
             drawn = torch.randn(value.shape, generator=random, dtype=torch.float64)
+            # Centres lie on [-1, 1]; other parameters are logarithms, which may vary more.
             size = 0.5 * SHAKE if name.endswith("centres") else SHAKE
             value.add_(size * drawn.to(value))

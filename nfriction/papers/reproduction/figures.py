@@ -49,6 +49,7 @@ def draw_all(workspace: Workspace, *, progress: bool = False) -> list[Path]:
     for name, draw in tqdm(drawers.items(), unit="figure", disable=not progress, leave=False):
         figure = draw()
         path = workspace.folder / "figures" / f"{name}.png"
+        # An interrupt must not leave half a picture under the final name.
         with atomic_write(path) as temporary:
             figure.savefig(temporary, dpi=DPI, format="png")
         figure.clear()
@@ -91,6 +92,7 @@ def inertia_cases() -> Figure:
         TLRIP paper, Fig. 2.
     """
     izz = (0.04, 0.05, 0.05)
+    # Elements other than Izz are arbitrary: the figure shows that they do not matter.
     full = [[0.1 * i, i, i, 0.0, 0.0, 0.0] for i in izz]
     cases = {
         "inertia neglected": rigs.tlrip(inertia="none"),
@@ -191,6 +193,7 @@ def model_groups(workspace: Workspace, joint: int) -> Figure:
     looks = [look for name, look in style.looks(LAWS).items() if name in LAWS]
     errors = np.concatenate(list(q.values())) - np.tile(measured, len(q))
     largest = float(np.abs(errors[np.isfinite(errors)]).max(initial=0.0))
+    # A model that diverges must not flatten all others.
     shown = min(largest, 0.5 * span) or span
     factor, unit = style.scaled(recording.unit, shown)
     for (group, models), (above, below) in zip(groups.items(), axes.T, strict=True):
@@ -277,6 +280,7 @@ def _joint_axes(axes: Sequence[Axes], names: Sequence[str], unit: str) -> None:
 def _sets(ax: Axes, variable: Variable) -> None:
     low, high = variable.universe
     x = torch.linspace(low, high, _POINTS, dtype=torch.float64)
+    # The papers give inputs in degrees, which take no prefix.
     is_input = "deg" in variable.unit
     factor, unit = (1.0, variable.unit) if is_input else style.scaled(variable.unit, [low, high])
     colours = style.COLOURS
@@ -300,6 +304,7 @@ def _sets(ax: Axes, variable: Variable) -> None:
 def _runs(values: NDArray[np.int64]) -> list[tuple[int, int, int]]:
     """First and last sample of every run of equal values, with the value."""
     edges = np.flatnonzero(np.diff(values)) + 1
+    # Ends at the next start, so that the shading has no gaps.
     firsts, lasts = [0, *edges.tolist()], [*edges.tolist(), len(values) - 1]
     return [(a, b, int(values[a])) for a, b in zip(firsts, lasts, strict=True)]
 
@@ -308,6 +313,7 @@ def _strip(ax: Axes, intervals: Sequence[tuple[str, float, float]]) -> None:
     """Intervals as a strip along the upper edge of a panel."""
     right = ax.get_xlim()[1]
     for known, start, stop in intervals:
+        # A short run ends before the printed intervals do.
         if start >= right:
             continue
         ax.axvspan(

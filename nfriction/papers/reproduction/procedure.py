@@ -103,6 +103,7 @@ def controllers_from_classes(
     """
     controllers = []
     for joint in range(len(coefficients)):
+        # The papers number these joints 2 to 4.
         paper = paper_controller(joint + 2 if joint < 3 else 2).rule_base
         velocity, acceleration = paper.inputs
         fastest = float(np.abs(qd[:, joint]).max())
@@ -114,6 +115,7 @@ def controllers_from_classes(
                 _stretched(acceleration, lowest, highest),
             ),
         )  # fmt: skip
+        # Viscous coefficients follow the rules of B, all others those of C.
         kinds = [0 if c.unit.startswith("N m s") else 1 for c in law.coefficients]
         outputs = []
         for k, (kind, coefficient) in enumerate(zip(kinds, law.coefficients, strict=True)):
@@ -147,6 +149,7 @@ def _range(term: FuzzySet) -> tuple[float, float]:
 def _stretched(variable: Variable, low: float, high: float) -> Ranges:
     """Ranges of a variable's sets with its universe taken to [low, high] and zero left there."""
     below, above = variable.universe
+    # Velocity enters as a magnitude, so its universe begins at zero.
     down = low / below if below < 0 else 1.0
     up = high / above
     if not (down > 0 and up > 0):
@@ -165,6 +168,7 @@ def _spanned(
 ) -> tuple[list[str], Ranges]:
     """Terms and ranges of an output whose universe is spanned by the coefficients by class."""
     low, high = min(classes), max(classes)
+    # Equal classes would leave a universe without extent.
     width = max(high - low, NARROWEST * max(abs(low), abs(high)), 1e-9)
     middle = 0.5 * (low + high)
     start = max(0.0, middle - 0.5 * width) if positive else middle - 0.5 * width
@@ -172,6 +176,7 @@ def _spanned(
     shares = [((a - below) / (above - below), (b - below) / (above - below))
               for a, b in map(_range, variable.sets)]  # fmt: skip
     terms = variable.terms
+    # Terms keep their meaning: "high" names the larger coefficient.
     if classes[-1] < classes[0]:
         shares = [(1.0 - b, 1.0 - a) for a, b in reversed(shares)]
         terms = terms[::-1]

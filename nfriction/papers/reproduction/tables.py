@@ -159,6 +159,7 @@ def table_11(workspace: Workspace) -> pd.DataFrame:
         rows = {
             f"{better} against {worse}": 100.0 * (1.0 - table.loc[better] / table.loc[worse])
             for better, worse in pairs
+            # The paper's table lacks constant models.
             if {better, worse} <= set(table.index)
         }
         return pd.DataFrame(rows).T
@@ -182,6 +183,7 @@ def second_table_4(workspace: Workspace, split: str = "test") -> pd.DataFrame:
     References:
         RTIP paper, Table IV.
     """
+    # Stages of this rig have a prefix that the table does not need.
     ours = rmse(workspace, SECOND_PAPER, split=split).set_axis(list(LAWS))
     return _beside(ours, _table(SECOND_TABLE_4))
 
@@ -192,6 +194,7 @@ def _table(rows: Mapping[str, Any]) -> pd.DataFrame:
 
 def _beside(ours: pd.DataFrame, theirs: pd.DataFrame) -> pd.DataFrame:
     """Two tables side by side; rows that the paper lacks are empty there."""
+    # Rows follow ours: the print has fewer.
     return pd.concat({"ours": ours, "printed": theirs.reindex(ours.index)}, axis=1)
 
 
@@ -230,6 +233,7 @@ def long_table(workspace: Workspace) -> pd.DataFrame:
                 for kind, error in errors.items():
                     joints = zip(JOINTS, error["joints"], strict=True)
                     for joint, value in (*joints, ("all", error["all"])):
+                        # JSON has no infinity; null means diverged.
                         value = np.inf if value is None else value
                         rows.append(about | {"kind": kind, "joint": joint, "rmse [rad]": value})
     return pd.DataFrame(rows)
@@ -278,6 +282,7 @@ def write_tables(workspace: Workspace, *, command: str = "") -> list[Path]:
         "results.json": json.dumps(results, indent=1, allow_nan=False),
     }
     for name, (_, table) in all_tables(workspace).items():
+        # One header row, so that any reader of CSV can read it.
         flat = table.set_axis([f"{column[1]}, {column[0]}" for column in table.columns], axis=1)
         content[f"tables/{name}.csv"] = flat.to_csv(index_label="row")
     return [write_atomically(workspace.folder / n, t.encode()) for n, t in content.items()]
@@ -287,6 +292,7 @@ def text(workspace: Workspace) -> str:
     """All tables beside the printed ones, and whether the papers' order of models holds."""
     parts = []
     for title, table in all_tables(workspace).values():
+        # Coefficients stay in SI; errors are read in thousandths.
         shown = 1e3 * table if "[mrad]" in title else table
         written = shown.to_string(float_format=lambda x: f"{x:.4g}", na_rep="")
         parts.append(f"{title}\n{written}")

@@ -69,6 +69,7 @@ class Settings:
 
     def digest(self) -> str:
         """Marks a result as made with these settings by this version."""
+        # Another version may compute other numbers, so its results are not reused.
         content = json.dumps(self.to_dict() | {"version": __version__}, sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
@@ -147,6 +148,7 @@ class Workspace:
         """Result of a finished stage; None where it is not finished with these settings."""
         try:
             content = json.loads(self._file(stage, "json").read_text(encoding="utf-8"))
+        # A damaged file is made again like a missing one.
         except (FileNotFoundError, json.JSONDecodeError, UnicodeDecodeError):
             return None
         if not isinstance(content, dict) or content.get("settings") != self.settings.digest():
@@ -171,6 +173,7 @@ class Workspace:
     def finish(self, stage: str, result: Mapping[str, Any]) -> None:
         """Mark a stage as finished with its result, plain JSON."""
         content = {"stage": stage, "settings": self.settings.digest(), "result": result}
+        # Refuse NaN: strict JSON readers would not read the file back.
         text = json.dumps(content, indent=1, allow_nan=False)
         write_atomically(self._file(stage, "json"), text.encode())
 
@@ -204,11 +207,13 @@ class Workspace:
         with tqdm(desc=stage, unit=" steps", disable=not self.progress) as bar:
 
             def step(*about: object) -> None:
+                # Fits report the name of their stage, searches their state.
                 if about and isinstance(about[0], str):
                     bar.set_description(f"{stage}, {about[0]}")
                 bar.update()
 
             found = make(step)
+        # The JSON file comes last: it marks the stage as finished.
         self.write_arrays(name, _tables(found))
         save(found.model, path, model_info(found, bench.train))
         plain = {f.name: getattr(found, f.name) for f in fields(found) if f.name not in _APART}
@@ -225,6 +230,7 @@ class Workspace:
 
         def keep(state: SearchState) -> None:
             step()
+            # SQP has no state that would continue it exactly.
             if state.pattern is not None:
                 self.finish(f"{stage}-search", state.to_dict())
 
@@ -243,6 +249,7 @@ class Workspace:
             Motion(r.time, kept[f"{r.name}_q"], kept[f"{r.name}_qd"], kept[f"{r.name}_qdd"])
             for r in (*parts["train"], *parts["test"])
         ]
+        # Exact only for twins; other recordings have none.
         states = read_initial_states(folder / "recordings.csv")
         return Bench(plant, parts["train"], parts["test"], motions, states)
 
@@ -271,6 +278,7 @@ def _restored(
     return FitResult(
         model=load(path),
         plant=load_plant(path),
+        # Smoothed once for all stages, so not kept with every fit.
         motions=tuple(bench.train_motions),
         residuals=torch.as_tensor(arrays["residuals"]),
         plant_terms=tuple(arrays["plant_terms"].tolist()),

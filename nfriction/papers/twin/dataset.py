@@ -60,6 +60,7 @@ class Encoder:
     def read(self, q: Array) -> Array:
         """Positions [rad] that the counter reads at true positions, any shape."""
         place = q / self.quantum + self.eccentricity * np.sin(q - self.phase)
+        # The nearest count; displaced edges then move a position near one to its neighbour.
         count = np.floor(place + 0.5)
         # The edge below a count lies half a count down, displaced.
         edges = np.array(self.edges)
@@ -71,6 +72,7 @@ class Encoder:
 def jitter(random: np.random.Generator, samples: int, deviation: float) -> Array:
     """Delay of each sample [s], (samples,): normal, cut at three deviations, zero at the first."""
     late = deviation * np.clip(random.standard_normal(samples), -3.0, 3.0)
+    # The release is the origin of time, and its state is given as exact.
     late[0] = 0.0
     return late
 
@@ -124,9 +126,11 @@ def make(
             f"{QUICK_DURATION:g} s is enough for a quick look."
         )
     plant = specified.rig()
+    # The twin's own mechanics take only the rig's numbers.
     links = Links.of(plant)
     convention = AngleConvention.of(plant)
     random = np.random.default_rng([seed, 0])
+    # The same encoders in all recordings, as on a real rig.
     encoders = [Encoder.drawn(random) for _ in plant.joint_names]
     truth, recordings = {}, {}
     total = samples // RATE * len(specified.releases)
@@ -142,6 +146,7 @@ def make(
                 advance=bar.update,
             )
             truth[release.label] = motion
+            # A stream for each release: a shorter twin is the beginning of a longer one.
             random = np.random.default_rng([seed, index + 1])
             recordings[release.label] = _record(
                 motion, encoders, jitter(random, samples, JITTER), plant, release.label
@@ -218,6 +223,7 @@ def _record(
     """A motion as the rig's computer logs it; its stamps are those of an even clock."""
     convention = AngleConvention.of(plant)
     late = late[:, None]
+    # Jitter is far below a sample: two terms of the series err far less than a count.
     moved = motion.q + late * (motion.qd + 0.5 * late * motion.qdd)
     position = convention.position_from_joint(moved)
     return Recording(

@@ -55,6 +55,7 @@ class Links:
     def of(cls, plant: PendulumChain) -> Links:
         """The constants of a rig with three links and a fixed arm."""
         rig = plant.to_dict()
+        # Refused rather than ignored: the recordings would not be of the rig that is written.
         if plant.joints != 3 or rig.get("arm") or rig.get("buffers") or rig.get("armature"):
             raise ValueError("a twin has three links on a fixed pivot, without drag or rotors.")
         (m2, m3, m4), (l2, l3, l4), (length2, length3, _) = rig["mass"], rig["com"], rig["length"]
@@ -120,6 +121,7 @@ class HiddenFriction:
         rise, v_s = self.stribeck_rise[index], self.stribeck_velocity[index]
         asymmetry, v_smooth = self.asymmetry[index], self.v_smooth
         viscous, v_t = self.viscous[index], self.shear_velocity[index]
+        # The root of Carreau's law, merged with its exponent.
         power = 0.5 * (self.shear_exponent - 1.0)
         tanh, exp = math.tanh, math.exp
 
@@ -128,6 +130,7 @@ class HiddenFriction:
             slow, fast = v / v_s, v / v_t
             dry = (1.0 + rise * exp(-slow * slow)) * (seal + arm * reaction)
             grease = viscosity * viscous * v * (1.0 + fast * fast) ** power
+            # Asymmetry multiplies the smooth sign, so that friction vanishes at rest.
             return dry * (1.0 + asymmetry * sign) * sign + grease
 
         return torque
@@ -184,6 +187,7 @@ def rates_of(links: Links, friction: HiddenFriction | None) -> _Rates:
 
         torque = drag(time, (s2, s3, s4), (c2, c3, c4), (w2, w3, w4), (x2, x3, x4))
         t2, t3, t4 = torque
+        # A joint torque acts on its link and, reversed, on the link before it.
         f2 = t3 - t2
         f3 = t4 - t3 - l32 * f2
         f4 = -t4 - l42 * f2 - l43 * f3
@@ -220,6 +224,7 @@ def _drag(links: Links, friction: HiddenFriction) -> Callable[..., Vector]:
         r4x, r4y = m4 * (hinge4x + l4 * x4), m4 * (hinge4y + l4 * y4)
         r3x, r3y = r4x + m3 * (hinge3x + l3 * x3), r4y + m3 * (hinge3y + l3 * y3)
         r2x, r2y = r3x + m2 * l2 * x2, r3y + m2 * (l2 * y2 + gravity)
+        # One temperature for all joints.
         viscosity = viscosity_at(time)
         return (
             joint2(w2, sqrt(r2x * r2x + r2y * r2y), viscosity),
@@ -254,12 +259,14 @@ def simulate(
     """
     rates = rates_of(links, friction)
     step = 1.0 / (rate * substeps)
+    # Absolute angles make the mass matrix a product of constants and cosines of differences.
     state: _State = (*np.cumsum(q0).tolist(), *np.cumsum(qd0).tolist())
     rows = []
     for sample in range(samples):
         for substep in range(substeps):
             time = (sample * substeps + substep) * step
             acceleration, torque = rates(time, state)
+            # The first stage of a step is at the sample itself, so its acceleration is exact there.
             if substep == 0:
                 rows.append((*state, *acceleration, *torque))
             state = _runge_kutta(rates, time, state, acceleration, step)
@@ -271,6 +278,7 @@ def simulate(
 
 def _runge_kutta(rates: _Rates, time: float, state: _State, a: Vector, h: float) -> _State:
     """One classical step, the accelerations `a` at its start already known."""
+    # Written out: calls on arrays of three cost more than the arithmetic.
     p, q, r, u, v, w = state
     half, sixth = 0.5 * h, h / 6.0
     a1, b1, c1 = a

@@ -63,6 +63,7 @@ _TLRIP = Specification(
         viscous=(4e-2, 3e-2, 2e-2),
         shear_velocity=(4.0, 5.0, 6.0),
     ),
+    # As in the TLRIP paper.
     duration=40.0,
     releases=(
         Release("train_upright", "train", (20.0, 30.0, 40.0)),
@@ -84,6 +85,7 @@ _RTIP = Specification(
         viscous=(1e-2, 1.5e-2, 3e-2),
         shear_velocity=(4.0, 5.0, 6.0),
     ),
+    # As in the RTIP paper.
     duration=80.0,
     releases=(
         Release("train_bent", "train", (45.0, 45.0, 45.0)),
