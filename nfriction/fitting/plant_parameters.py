@@ -25,7 +25,7 @@ class PlantParameter:
         lower, upper: bounds.
         prior_sd: standard deviation of the prior around 0.
         ratio: whether it scales its entries, rather than adding to them.
-        to_none: whether its lower bound stands for the absence of the effect.
+        to_none: true if the lower bound means that the effect is absent.
     """
 
     name: str
