@@ -19,6 +19,8 @@ from nfriction.fitting.strategy.holdout import (
 )
 from nfriction.fitting.strategy.neurofuzzy import initialise_from_constant, revert_to_constant
 from nfriction.friction.neurofuzzy import NeuroFuzzy
+from nfriction.recording import Recording
+from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import F64, pendulum, swing
 
 V_SMOOTH = 0.05
@@ -61,6 +63,18 @@ def test_windows_are_shared_out_once(constant):
         spans = sorted((*seen.spans, *held_back.spans))
         samples = [np.arange(first, last) for _, first, last in spans]
         np.testing.assert_array_equal(np.concatenate(samples), np.arange(len(constant[0]) - 1))
+
+
+def test_a_short_recording_with_a_gap_still_has_windows_to_hold_out(constant):
+    """As cross-validation leaves it, which takes blocks out of a recording."""
+    joint, _ = constant
+    samples = np.r_[0:60, len(joint) - 60 : len(joint)]
+    gapped = Recording(time=joint.time[samples], q=joint.q[samples])
+    assert len(gapped.segments) == 2
+    motion = kalman_smoother(gapped.time, gapped.q)
+    seen, held_back = holdout_split([gapped], [motion], 100.0, FOLDS)
+    assert len(seen) >= 2
+    assert len(held_back) >= 1
 
 
 def test_a_network_errs_as_its_law_and_by_more_where_it_talks_nonsense(constant):

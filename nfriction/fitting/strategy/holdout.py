@@ -19,11 +19,16 @@ from nfriction.signals import Motion
 def cut_for_folds(
     joint: Sequence[Recording], motions: Sequence[Motion], length: float, folds: int
 ) -> Windows:
-    """Windows of which some can be held out: shorter ones where the recordings are short."""
+    """At least `folds` windows, so that some can be held out; shorter ones of short recordings.
+
+    Raises:
+        ValueError: if the recordings have too few samples.
+    """
     cut = cut_windows(joint, motions, length)
     if len(cut) >= folds:
         return cut
-    longest = max(float(r.time[-1] - r.time[0]) for r in joint)
+    # No window spans a gap, so the longest stretch between gaps has to give the windows.
+    longest = max(float(r.time[last] - r.time[first]) for r in joint for first, last in r.segments)
     return cut_windows(joint, motions, longest / folds)
 
 
