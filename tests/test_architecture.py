@@ -241,7 +241,7 @@ STORY = (
     *("fitting/fit.py", "fitting/shooting/problem.py", "optim/levenberg_marquardt.py"),
     "evaluation/score.py",
 )
-MOST_LINES_OF_THE_STORY = 2_020
+MOST_LINES_OF_THE_STORY = 2_030
 MOST_FLOORS_OF_FITTING = 8
 # Entry points whose options are keywords of their own; everything else takes eight arguments.
 MOST_ARGUMENTS = 8

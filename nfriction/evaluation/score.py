@@ -3,7 +3,8 @@
 A model that was fitted to some recordings is judged by others, simulated from nothing but their
 initial state and torques. One simulation over the whole recording is the *free run*; *windows* are
 simulations of 1, 2 and 5 s restarted from the measured motion, because in a chaotic mechanism the
-free run amplifies the error of its initial state more than that of the model.
+free run amplifies the error of its initial state more than that of the model. The next step is
+`nfriction.evaluation.compare`: the scores of several models on the same recordings.
 """
 
 import logging
@@ -159,8 +160,7 @@ class _Simulator:
         scheme: Scheme,
     ) -> None:
         self.plant, self.friction, self.recording = plant, friction, recording
-        self.motion = motion
-        self.scheme: Scheme = scheme
+        self.motion, self.scheme = motion, scheme
         # From zero, so that the rounding of large stamps costs no window its last sample.
         self.time = recording.time - recording.time[0]
         self.substeps: int | None = math.ceil(recording.longest_step / STOP_STEP)
@@ -228,7 +228,7 @@ class _Simulator:
 
 
 def _substeps(plant: Plant, friction: FrictionModel | None, recording: Recording) -> int | None:
-    """Integration steps to a sample; None where friction is too steep to be simulated."""
+    # None where friction is too steep to be simulated.
     if friction is None:
         return 1
     longest = recording.longest_step

@@ -1,4 +1,7 @@
-"""Fit a friction model to recordings: check them, then run the strategy of its coefficients."""
+"""Fit a friction model to recordings: check them, then run the strategy of its coefficients.
+
+The next step is `nfriction.fitting.shooting.problem`, the cost that the strategies minimise.
+"""
 
 import pkgutil
 from collections.abc import Callable, Iterable, Sequence

@@ -3,6 +3,7 @@
 A schedule is a module that maps joint velocity and acceleration to the coefficients of a law,
 shape (*batch, joint) -> (*batch, joint, coefficient). A fit sees it through `parameter_vector`,
 `bounds` and `sensitivities`, so every schedule can be estimated from torques and trajectories.
+The next step is `nfriction.friction.models`, which joins a law and a schedule.
 """
 
 import math

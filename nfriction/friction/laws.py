@@ -13,7 +13,8 @@ Every law here is a function `(qd, load, coefficients, v_smooth) -> tau_f` of
     tau_f         friction torque [N m], shape (*batch, joint)
 
 and scripts, exports and broadcasts. For a sliding axis read m for rad and N for N m. A law of your
-own is one such function with a description of its coefficients, a `Law`.
+own is one such function with a description of its coefficients, a `Law`. The next step is
+`nfriction.friction.coefficients`: the coefficients as a function of the motion.
 """
 
 import math

@@ -1,4 +1,7 @@
-"""Friction models: a law with coefficients, `tau_f = model(qd, qdd, load)`."""
+"""Friction models: a law with coefficients, `tau_f = model(qd, qdd, load)`.
+
+The next step is `nfriction.simulation.rk4`, the motion of a mechanism with friction.
+"""
 
 import math
 from collections.abc import Callable, Sequence
