@@ -87,7 +87,7 @@ QUICK = Settings(
     controller_samples=2000,
     search_evaluations=200,
 )
-"""A look at everything within two minutes; the figures are then not the papers'."""
+"""A look at everything within a minute or two; the figures are then not the papers'."""
 
 
 @dataclass(frozen=True, eq=False)
