@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nfriction.papers.afem.pattern_search import PatternSearch, PatternState
+from nfriction.papers.afem.pattern_search import PatternSearch, PatternState, VariableScaling
 
 F64 = torch.float64
 
@@ -229,3 +229,12 @@ def test_bad_input_is_refused_at_the_border() -> None:
         search.minimise(rosenbrock, start[None])
     with pytest.raises(ValueError, match="contraction"):
         PatternSearch(contraction=2.0)
+
+
+def test_a_logarithmic_variable_at_its_bound_is_exactly_there():
+    """exp(log(x)) may miss x in its last digits, and a fit reports which bounds were reached."""
+    g = torch.Generator().manual_seed(0)
+    upper = 10 ** (6 * torch.rand(100, generator=g, dtype=torch.float64) - 3)
+    scaling = VariableScaling.build(0.5 * upper, 1e-3 * upper, upper, logarithmic=True)
+    assert torch.equal(scaling.from_unit(scaling.to_unit(scaling.upper)), scaling.upper)
+    assert torch.equal(scaling.from_unit(scaling.to_unit(scaling.lower)), scaling.lower)
