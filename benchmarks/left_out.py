@@ -18,9 +18,9 @@ from nfriction.evaluation.score import score
 from nfriction.fitting.fit import fit
 from nfriction.fitting.options import EncoderReference
 from nfriction.fitting.result.fit_result import FitResult
+from nfriction.friction import model_by_name
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.models import FrictionModel
-from nfriction.friction.registry import model_by_name
 from nfriction.plant import Plant
 
 State = tuple[NDArray[np.float64], NDArray[np.float64]]

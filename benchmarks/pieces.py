@@ -9,7 +9,7 @@ from left_out import SETS, read
 
 from nfriction import Recording
 from nfriction.fitting.fit import fit
-from nfriction.friction.registry import model_by_name
+from nfriction.friction import model_by_name
 
 WINDOWS = (0.5, 2.0)
 # Pieces that move by less show nothing [rad or m]; more of them than so many take too long.

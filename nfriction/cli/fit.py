@@ -31,7 +31,7 @@ def run(arguments: argparse.Namespace) -> int:
     from nfriction.cli.tables import coefficient_table, fit_lines, interval_table
     from nfriction.evaluation.results import model_info
     from nfriction.fitting.fit import fit
-    from nfriction.friction.registry import model_by_name
+    from nfriction.friction import model_by_name
     from nfriction.io.model_file import save
 
     plant = estimation.read_rig(arguments.rig)

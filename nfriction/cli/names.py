@@ -6,7 +6,7 @@ A test holds `RIGS` equal to `rigs.names()`.
 import argparse
 from pathlib import Path
 
-from nfriction.friction.registry import model_names
+from nfriction.friction import model_names
 
 MODELS = model_names()
 RIGS = (

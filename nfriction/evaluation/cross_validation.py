@@ -16,7 +16,7 @@ from nfriction.fitting.data.checks import looks_zeroed_per_recording
 from nfriction.fitting.data.inputs import apply_encoder_offsets
 from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction.registry import model_by_name
+from nfriction.friction import model_by_name
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion, kalman_smoother

@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from nfriction.evaluation.score import score
 from nfriction.fitting.fit import fit
 from nfriction.fitting.result.fit_result import FitResult
+from nfriction.friction import model_by_name
 from nfriction.friction.models import FrictionModel
-from nfriction.friction.registry import model_by_name
 from nfriction.plant import Plant
 from nfriction.recording import Recording, Unit
 from nfriction.signals import kalman_smoother

@@ -24,8 +24,8 @@ import torch
 
 from nfriction.fitting.fit import fit
 from nfriction.fitting.result.fit_result import FitResult
+from nfriction.friction import model_by_name
 from nfriction.friction.models import ConstantModel
-from nfriction.friction.registry import model_by_name
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion

@@ -1,9 +1,11 @@
-"""Schedules: the coefficients of a law as a function of the motion.
+"""Schedules: the coefficients c of a law as a function of the motion.
 
-A schedule is a module that maps joint velocity and acceleration to the coefficients of a law,
-shape (*batch, joint) -> (*batch, joint, coefficient). A fit sees it through `parameter_vector`,
-`bounds` and `sensitivities`, so every schedule can be estimated from torques and trajectories.
-The next step is `nfriction.friction.models`, which joins a law and a schedule.
+A schedule is a module c = c(qd, qdd; theta) from joint velocity and acceleration, each
+(*batch, joint), to the coefficients of a law, (*batch, joint, coefficient). Its parameters theta
+are what a fit estimates; a fit sees them as one flat vector with bounds, a prior and the
+derivatives dc/dtheta. The simplest schedule, `Constant`, ignores the motion and has the
+coefficients themselves for parameters. The next step is `nfriction.friction.models`, which joins a
+law and a schedule.
 """
 
 import math
@@ -15,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from nfriction.friction.laws import Law
-from nfriction.friction.sensitivity import Sensitivity
+from nfriction.friction.parameters import Sensitivity, checked_coefficients
 from nfriction.fuzzy.rules import FuzzyRules
 
 # Smallest value of a positive coefficient: far below the resolution of any torque sensor.
@@ -25,8 +27,12 @@ SMALLEST = 1e-12
 class Schedule(nn.Module, ABC):
     """Coefficients as a function of the motion.
 
+    A schedule may have a hidden state, such as a filtered acceleration. At every sample a
+    simulation or controller calls `advance` (at the first `initial_state`), then
+    `coefficients_from`, and holds these coefficients until the next sample.
+
     Args:
-        law: the law whose coefficients are scheduled.
+        law: the law whose coefficients these are.
         joints: number of joints.
 
     Attributes:
@@ -34,16 +40,12 @@ class Schedule(nn.Module, ABC):
         fitted_mask: which coefficients are estimated by default.
         limits: lower and upper bound of each coefficient in a fit.
         positive: which coefficients are positive by physics, a buffer (coefficient,).
-        state_size: size of each joint's hidden state. At every sample a simulation or controller
-            calls `advance` (`initial_state` at the first), then `coefficients_from`, and holds
-            these coefficients until the next.
+        state_size: size of each joint's hidden state.
         follows_motion: False where the coefficients are constants.
-        handles_range: True where the schedule itself handles inputs outside its trained range;
-            exports clamp the inputs of any other.
+        handles_range: False where exports must clamp the inputs to the trained range.
         fit_strategy: function that fits such coefficients, as `"module:function"`; it takes a
-            `nfriction.fitting.fit.FitTask`.
-        form: formula that exports have code of their own for, named by the very class that
-            computes it; a subclass is traced unless it names it again.
+            `nfriction.fitting.fit.FitTask`. Empty where there is none.
+        form: formula that exports have code of their own for; others are traced.
     """
 
     follows_motion: ClassVar[bool] = True
@@ -51,10 +53,6 @@ class Schedule(nn.Module, ABC):
     form: ClassVar[str] = "traced"
     fit_strategy: ClassVar[str] = ""
 
-    joints: int
-    coefficient_names: list[str]
-    fitted_mask: list[bool]
-    limits: list[tuple[float, float]]
     positive: Tensor
     state_size: int = 0
 
@@ -91,10 +89,7 @@ class Schedule(nn.Module, ABC):
         return state
 
     def coefficients_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
-        """Coefficients at a sample, given the hidden state after it, (*batch, joint, coefficient).
-
-        `forward` is this with the state of a first sample.
-        """
+        """Coefficients at a sample, given the hidden state after it; `forward` is a first one's."""
         coefficients: Tensor = self(qd, qdd)
         return coefficients
 
@@ -113,11 +108,7 @@ class Schedule(nn.Module, ABC):
         return coefficients
 
     def coefficient_sets(self) -> dict[str, Tensor]:
-        """Coefficients that describe the model, (joint, coefficient) each, by where they apply.
-
-        `"always"` of constants, one set per class of an adaptive model, `"at_rest"` and the
-        constant `"reference"` of a neuro-fuzzy one.
-        """
+        """Coefficients that describe the model, (joint, coefficient) each, by where they apply."""
         return {"at_rest": self.rest_coefficients().detach()}
 
     def fuzzy_rules(self) -> FuzzyRules | None:
@@ -126,7 +117,7 @@ class Schedule(nn.Module, ABC):
 
     @abstractmethod
     def parameter_vector(self) -> Tensor:
-        """The parameters that a fit varies, flat; a copy."""
+        """The parameters that a fit varies, (parameter,); a copy."""
 
     @abstractmethod
     def set_parameter_vector(self, vector: Tensor) -> None:
@@ -169,21 +160,17 @@ class Tabulated(Schedule):
     bounded below by zero, because the logarithm's gradient vanishes where a coefficient is zero.
 
     Args:
-        law: the law whose coefficients these are.
-        joints: number of joints.
+        law, joints: see `Schedule`.
         initial: start values in SI, the table's whole shape, (joint, coefficient) or
             (coefficient,); default 1e-3 (the middle of the initial grid of a nonlinear one, zero of
             a signed one).
-        cells: shape of the table of one joint.
+        cells: shape of the table of one joint, before its coefficients.
     """
 
     def __init__(
-        self,
-        law: Law,
-        joints: int,
-        initial: Tensor | Sequence | None = None,
+        self, law: Law, joints: int, initial: Tensor | Sequence | None = None,
         cells: tuple[int, ...] = (),
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__(law, joints)
         shape = (joints, *cells, len(law.names))
         self.raw = nn.Parameter(torch.zeros(shape, dtype=torch.float64))
@@ -208,41 +195,12 @@ class Tabulated(Schedule):
         """Set the coefficients in SI, the table's shape, (joint, coefficient) or (coefficient,).
 
         Raises:
-            ValueError: if the shape does not fit, a coefficient is not finite, or one that is
-                positive by physics is negative.
+            ValueError: for another shape, and a value that is not finite or has the wrong sign.
         """
-        given = self._broadcast(values)
-        bad = ~torch.isfinite(given) | (self.positive & (given < 0))
-        if bad.any():
-            where = tuple(int(i) for i in bad.nonzero()[0])
-            joint, k = where[0], where[-1]
-            raise ValueError(
-                f"`{self.coefficient_names[k]}` of joint {joint + 1} must be finite"
-                f"{' and not negative' if self.positive[k] else ''}, got {given[where]:g}."
-            )
+        given = checked_coefficients(values, self.raw, self.coefficient_names, self.positive)
         raw = torch.where(self.positive, torch.log(given.clamp_min(SMALLEST)), given)
         # exp(log(x)) may differ from x in its last digits; unchanged coefficients keep their bits.
         self.raw.copy_(torch.where(given == self.values, self.raw, raw))
-
-    def _broadcast(self, values: Tensor | Sequence) -> Tensor:
-        """Given coefficients as a tensor (joint, *cells, coefficient)."""
-        try:
-            given = torch.as_tensor(values, dtype=self.raw.dtype, device=self.raw.device)
-        except (TypeError, ValueError) as error:
-            raise ValueError(
-                f"coefficients must be an array of numbers, got {values!r}."
-            ) from error
-        flat = torch.Size([self.joints, self.raw.shape[-1]])
-        if given.shape not in (self.raw.shape, flat, flat[1:]):
-            whole = "" if self.raw.shape == flat else f"the whole table {tuple(self.raw.shape)}, "
-            raise ValueError(
-                f"coefficients must be {whole}(joint, coefficient) = {tuple(flat)} or one row "
-                f"for all joints ({', '.join(self.coefficient_names)}), got shape "
-                f"{tuple(given.shape)}."
-            )
-        if given.shape == flat:
-            given = given.reshape(self.joints, *(1,) * (self.raw.ndim - 2), -1)
-        return given.expand(self.raw.shape)
 
     def parameter_vector(self) -> Tensor:
         return self.values.reshape(-1)
@@ -256,22 +214,15 @@ class Tabulated(Schedule):
     def bounds(self) -> tuple[Tensor, Tensor]:
         values = self.values
         fitted = torch.tensor(self.fitted_mask, device=values.device)
-        lower, upper = values.new_tensor(self.limits).unbind(-1)
-        return (
-            torch.where(fitted, lower, values).reshape(-1),
-            torch.where(fitted, upper, values).reshape(-1),
+        lower, upper = (
+            torch.where(fitted, limit, values).reshape(-1)
+            for limit in values.new_tensor(self.limits).unbind(-1)
         )
+        return lower, upper
 
 
 class Constant(Tabulated):
-    """Coefficients that do not depend on the motion.
-
-    Args:
-        law: the law whose coefficients these are.
-        joints: number of joints.
-        initial: start values in SI, shape (joint, coefficient) or (coefficient,); default as in
-            `Tabulated`.
-    """
+    """Coefficients that do not depend on the motion; arguments as of `Tabulated`."""
 
     follows_motion = False
     handles_range = True
@@ -285,11 +236,7 @@ class Constant(Tabulated):
         return {"always": self.values}
 
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
-        k = self.raw.shape[-1]
-        identity = torch.eye(k, dtype=self.raw.dtype, device=self.raw.device)
-        zero = self.raw.new_zeros(()).expand(*qd.shape, k)
-        one = self.raw.new_ones(()).expand(*qd.shape, 1)
-        return Sensitivity(((identity.expand(*qd.shape, k, k), one),), zero, zero)
+        return Sensitivity.of_constants(torch.eye(self.raw.shape[-1]).to(self.raw), qd)
 
     def extra_repr(self) -> str:
         columns = [f"{v:.4g}" for v in self.values.mean(0)]

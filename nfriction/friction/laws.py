@@ -7,14 +7,19 @@ A law gives the friction torque tau_f on the left-hand side of
 Every law here is a function `(qd, load, coefficients, v_smooth) -> tau_f` of
 
     qd            joint velocity [rad/s], shape (*batch, joint)
-    load          normal load over its value at rest, |N| / (m g) [-], shaped like `qd`
-    coefficients  shape (*batch, joint, coefficient), in the order that the function documents
+    load          normal force |N| on the joint's bearing over the weight m g of its link [-],
+                  shaped like `qd`; only load-dependent laws read it
+    coefficients  shape (*batch, joint, coefficient), in the order of the law's description
     v_smooth      velocity over which the sign of the velocity changes [rad/s]
     tau_f         friction torque [N m], shape (*batch, joint)
 
 and scripts, exports and broadcasts. For a sliding axis read m for rad and N for N m. A law of your
 own is one such function with a description of its coefficients, a `Law`. The next step is
 `nfriction.friction.coefficients`: the coefficients as a function of the motion.
+
+References:
+    Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30 (1994), for Coulomb, viscous and
+    Stribeck friction; the two papers (see docs/from_the_papers.md) for the others.
 """
 
 import math
@@ -43,7 +48,8 @@ class Coefficient:
             of an effect that short recordings seem to show.
 
     Raises:
-        ValueError: if a nonlinear coefficient has no initial grid, or has a prior.
+        ValueError: if a nonlinear coefficient has no initial grid, or has a prior, or a start value
+            that its sign or size forbids.
     """
 
     name: str
@@ -58,6 +64,11 @@ class Coefficient:
         if not self.linear and not self.initial_grid:
             raise ValueError(
                 f"coefficient {self.name!r} is not linear, so `initial_grid` needs values to try."
+            )
+        if not all((0 if self.positive else -math.inf) < x < math.inf for x in self.initial_grid):
+            rule = "positive and finite" if self.positive else "finite"
+            raise ValueError(
+                f"`initial_grid` of {self.name!r} must be {rule}, got {self.initial_grid}."
             )
         if not self.prior_scale > 0 or (self.prior_scale < math.inf and not self.linear):
             raise ValueError(
@@ -80,6 +91,7 @@ class Law:
         nested_coefficients: names, here, of the nested law's coefficients, in its order.
 
     Raises:
+        TypeError: if a coefficient or the nested law is something else.
         ValueError: if there is no coefficient, two have the same name, or the nested coefficients
             do not match the nested law.
 
@@ -96,6 +108,11 @@ class Law:
     nested_coefficients: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        given = self.coefficients
+        if not isinstance(given, tuple) or not all(isinstance(c, Coefficient) for c in given):
+            raise TypeError(
+                f"`coefficients` of law {self.name!r} must be a tuple of Coefficient, got {given}."
+            )
         if not self.names or len(set(self.names)) < len(self.names):
             raise ValueError(
                 f"law {self.name!r} needs coefficients with names of their own, got {self.names}."
@@ -123,40 +140,25 @@ class Law:
 
 
 def smooth_sign(qd: Tensor, v_smooth: float) -> Tensor:
-    """Sign of the velocity with a linear passage through zero: `tanh(qd / v_smooth)`."""
+    """Sign of the velocity with a smooth passage through zero: `tanh(qd / v_smooth)`.
+
+    Written sgn below. A true sign would jump, which an explicit integrator cannot follow.
+    """
     return torch.tanh(qd / v_smooth)
 
 
 def viscous(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
-    """Viscous friction `C_p qd` (NCFM).
-
-    Coefficients: C_p [N m s/rad].
-
-    References:
-        TLRIP paper, viscous model; second paper's NCFM (Table I).
-    """
+    """Viscous friction `C_p qd` (NCFM; TLRIP paper, viscous model; second paper, Table I)."""
     return coefficients.select(-1, 0) * qd
 
 
 def coulomb(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
-    """Coulomb friction `F_c sgn(qd)` (CFM).
-
-    Coefficients: F_c [N m].
-
-    References:
-        Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30 (1994), section 2.
-    """
+    """Coulomb friction `F_c sgn(qd)` (CFM)."""
     return coefficients.select(-1, 0) * smooth_sign(qd, v_smooth)
 
 
 def coulomb_viscous(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
-    """Coulomb plus viscous friction `F_c sgn(qd) + F_v qd` (CVFM).
-
-    Coefficients: F_c [N m], F_v [N m s/rad].
-
-    References:
-        Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30 (1994), section 2.
-    """
+    """Coulomb plus viscous friction `F_c sgn(qd) + F_v qd` (CVFM)."""
     f_c, f_v = coefficients.unbind(-1)
     return f_c * smooth_sign(qd, v_smooth) + f_v * qd
 
@@ -164,24 +166,16 @@ def coulomb_viscous(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: fl
 def linear(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
     """Viscous plus load-dependent Coulomb friction `B qd + C load sgn(qd)` (LFM).
 
-    Coefficients: B [N m s/rad], C [N m].
-
-    References:
-        TLRIP paper, eqs. (26)-(29), with the load taken as |N|/(m g) so that C is a torque.
+    TLRIP paper, eqs. (26)-(29), with the load taken as |N|/(m g) so that C is a torque.
     """
     b, c = coefficients.unbind(-1)
     return b * qd + c * load * smooth_sign(qd, v_smooth)
 
 
 def nonlinear(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
-    """Offset, Coulomb, viscous and arctangent friction (NLFM).
+    """Offset, Coulomb, viscous and arctangent friction (NLFM; second paper, Table III).
 
     `f_o + f_c sgn(qd) + f_v qd + f_a arctan(f_b qd)`; passive where `f_o = 0`.
-
-    Coefficients: f_o [N m], f_c [N m], f_v [N m s/rad], f_a [N m], f_b [s/rad].
-
-    References:
-        Second paper's NLFM (Table III); TLRIP paper's NLFM.
     """
     f_o, f_c, f_v, f_a, f_b = coefficients.unbind(-1)
     return f_o + f_c * smooth_sign(qd, v_smooth) + f_v * qd + f_a * torch.atan(f_b * qd)
@@ -191,12 +185,7 @@ def stribeck(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) ->
     """Generalised Stribeck friction: `(F_c + F_d exp(-|qd/v_s|^delta)) sgn(qd) + F_v qd`.
 
     `F_d = F_s - F_c` is the excess of breakaway over Coulomb friction, so positive coefficients
-    make the law passive.
-
-    Coefficients: F_c [N m], F_d [N m], F_v [N m s/rad], v_s [rad/s], delta [-].
-
-    References:
-        Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30 (1994), eq. (8).
+    make the law passive (eq. (8) of Armstrong-Helouvry et al.).
     """
     f_c, f_d, f_v, v_s, delta = coefficients.unbind(-1)
     # A millionth of v_s is added in quadrature, so that the power's slope is finite at qd = 0 for
@@ -227,6 +216,8 @@ NONLINEAR = Law(
         Coefficient("f_c", "N m"),
         Coefficient("f_v", "N m s/rad"),
         Coefficient("f_a", "N m"),
+        # The reciprocal of the velocity at which the arctangent has risen by half: from 0.1 to 10
+        # rad/s, the range in which joints move.
         Coefficient("f_b", "s/rad", linear=False, initial_grid=(0.1, 0.3, 1.0, 3.0, 10.0)),
     ),
     nonlinear,

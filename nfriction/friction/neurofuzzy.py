@@ -1,14 +1,17 @@
-"""Coefficients as a neuro-fuzzy function of velocity and acceleration."""
+"""Neuro-fuzzy models: coefficients as a network's function of velocity and acceleration."""
 
 from collections.abc import Sequence
+from pkgutil import resolve_name
 from typing import Any, Final, Literal
 
 import torch
 from torch import Tensor, nn
 
+from nfriction.friction import laws
 from nfriction.friction.coefficients import Constant, Schedule
 from nfriction.friction.laws import Law
-from nfriction.friction.sensitivity import Sensitivity
+from nfriction.friction.models import NamedModel
+from nfriction.friction.parameters import Sensitivity, positive_number
 from nfriction.fuzzy import AnfisRBF
 from nfriction.fuzzy.rules import FuzzyRules
 
@@ -32,9 +35,7 @@ def smooth_relu_inverse(y: Tensor, roundness: float) -> Tensor:
 def taper(beyond: Tensor, reach: float) -> Tensor:
     """1 within a range and 0 from `reach` outside it on, `(1 - |e|^2 / reach^2)^2` between.
 
-    Args:
-        beyond: e, the distance of each input from its range, (..., input).
-        reach: positive.
+    `beyond` is e, the distance of each input from its range, (..., input).
     """
     beyond = beyond / reach
     rest = (1.0 - (beyond * beyond).sum(-1)).clamp_min(0.0)
@@ -105,23 +106,17 @@ class NeuroFuzzy(Schedule):
             raise ValueError(
                 f'`acceleration` must be "along_motion" or "signed", got {acceleration!r}.'
             )
-        if not prior_sd > 0:
-            raise ValueError(f"`prior_sd` must be positive, got {prior_sd}.")
         k = len(law.names)
         self.terms, self.head_units = tuple(terms), head_units
         self.interpretable = bool(interpretable)
         self.along_motion = acceleration == "along_motion"
-        self.prior_sd = float(prior_sd)
+        self.prior_sd = positive_number("prior_sd", prior_sd)
         self.network = AnfisRBF(joints, 2, terms, k, units=head_units, interpretable=interpretable)
         self.network.init_grid(0.0, 1.0)
-        for name, shape in (
-            ("reference", (joints, k)),
-            ("scale", (joints, k)),
-            ("velocity_range", (joints,)),
-            ("acceleration_lower", (joints,)),
-            ("acceleration_upper", (joints,)),
-        ):
-            self.register_buffer(name, torch.ones(shape, dtype=torch.float64))
+        for name in ("reference", "scale"):
+            self.register_buffer(name, torch.ones(joints, k, dtype=torch.float64))
+        for name in ("velocity_range", "acceleration_lower", "acceleration_upper"):
+            self.register_buffer(name, torch.ones(joints, dtype=torch.float64))
         self.set_reference(Constant(law, joints, initial).values)
         self.set_range(20.0, [-200.0, 200.0])
 
@@ -163,7 +158,7 @@ class NeuroFuzzy(Schedule):
         lower = torch.stack([torch.zeros_like(self.velocity_range), self.acceleration_lower], -1)
         upper = torch.stack([self.velocity_range, self.acceleration_upper], -1)
         centres, widths = (x.split(self.terms, -1) for x in self.network.anfis.sets())
-        # Every pair of centres is a sample, velocity's slower, all joints at once.
+        # Every pair of centres is a sample, all joints at once; the acceleration varies faster.
         v, a = (c.clamp(0.0, 1.0).T for c in centres)
         pairs = [v.repeat_interleave(self.terms[1], 0), a.repeat(self.terms[0], 1)]
         found = self.to_coefficients(self.reference + self.network(torch.stack(pairs, -1)))
@@ -200,9 +195,7 @@ class NeuroFuzzy(Schedule):
 
     @torch.no_grad()
     def set_range(
-        self,
-        velocity: Tensor | Sequence[float] | float,
-        acceleration: Tensor | Sequence[float],
+        self, velocity: Tensor | Sequence[float] | float, acceleration: Tensor | Sequence[float]
     ) -> None:
         """Set the trained range, beyond which the network's output tapers off.
 
@@ -296,17 +289,9 @@ class NeuroFuzzy(Schedule):
             du/dx   = w dn/dx within the range, n dw/dx beyond it,
             dc/dqd  = dc/du (du/dx_1 sgn(v) / v_max + du/dx_2 qdd dt/dqd / span),
             dc/dqdd = dc/du du/dx_2 t / span.
-
-        The slope of s = smooth_relu(u) with roundness r is s^2 / (s^2 + r^2).
-
-        Args:
-            qd, qdd: shape (*batch, joint).
-            coefficients: at this motion, (*batch, joint, coefficient).
-
-        Returns:
-            Each (*batch, joint, coefficient).
         """
         by_x = self._slopes_over_range(self.scaled(qd, qdd))
+        # The slope of s = smooth_relu(u) with roundness r is s^2 / (s^2 + r^2).
         s = coefficients / self.scale
         rounded = s * s / (s * s + self.roundness**2)
         by_u = self.scale * torch.where(self.positive, rounded, 1.0)
@@ -366,3 +351,66 @@ class NeuroFuzzy(Schedule):
 
     def extra_repr(self) -> str:
         return ", ".join(f"{name}={value!r}" for name, value in self.options().items())
+
+
+# Coefficients by networks, as model files name them. The papers' own are resolved by name, because
+# the core does not import them.
+NETWORKS = {
+    "anfis": "nfriction.friction.neurofuzzy:NeuroFuzzy",
+    "by_class": "nfriction.papers.nffem.adaptive_neurofuzzy:AdaptiveNeuroFuzzy",
+    "rbf": "nfriction.papers.nffem.rbf_coefficients:RBFCoefficients",
+}
+
+
+class NeuroFuzzyModel(NamedModel):
+    """A law with coefficients from an ANFIS layer with a radial basis head, `NeuroFuzzy`.
+
+    Args:
+        joints, initial, v_smooth: see `NamedModel`; training starts from constants `initial`.
+        network: `"anfis"`; `"rbf"`: the papers' network alone, see `RBFCoefficients`; `"by_class"`:
+            a network that corrects coefficients by class, see `AdaptiveNeuroFuzzy`.
+        options: of the coefficients, e.g. `terms=(7, 5)`.
+    """
+
+    @staticmethod
+    def make_schedule(*args: Any, network: str = "anfis", **options: Any) -> Schedule:
+        if network not in NETWORKS:
+            raise ValueError(f"`network` must be one of {sorted(NETWORKS)}, got {network!r}.")
+        schedule: Schedule = resolve_name(NETWORKS[network])(*args, **options)
+        return schedule
+
+
+class NFNCFM(NeuroFuzzyModel):
+    """Viscous friction with a neuro-fuzzy coefficient (TLRIP paper)."""
+
+    definition = laws.VISCOUS
+
+
+class NFCFM(NeuroFuzzyModel):
+    """Coulomb friction with a neuro-fuzzy F_c: any curve over velocity that is odd."""
+
+    definition = laws.COULOMB
+
+
+class NFCVFM(NeuroFuzzyModel):
+    """Coulomb plus viscous friction with neuro-fuzzy F_c and F_v."""
+
+    definition = laws.COULOMB_VISCOUS
+
+
+class NFLFM(NeuroFuzzyModel):
+    """Viscous plus load-dependent Coulomb friction with neuro-fuzzy B and C (TLRIP paper)."""
+
+    definition = laws.LINEAR
+
+
+class NFNLFM(NeuroFuzzyModel):
+    """Offset, Coulomb, viscous and arctangent friction, neuro-fuzzy coefficients (TLRIP paper)."""
+
+    definition = laws.NONLINEAR
+
+
+class NFStribeck(NeuroFuzzyModel):
+    """Generalised Stribeck friction with neuro-fuzzy F_c, F_d, F_v, v_s and delta."""
+
+    definition = laws.STRIBECK

@@ -15,8 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from nfriction.friction import model_by_name, model_names
 from nfriction.friction.models import FrictionModel
-from nfriction.friction.registry import model_by_name, model_names
 from nfriction.io import strict_json
 from nfriction.io.atomic import write_atomically
 from nfriction.io.model_info import FORMAT, SCHEMA, ModelInfo, describe
@@ -221,7 +221,7 @@ def _check_same_model(content: Mapping[str, Any], model: FrictionModel) -> None:
         "coefficients": (names, list(model.law.names)),
         "joints": (content["joints"], model.joints),
         "v_smooth": (content["v_smooth"], model.v_smooth),
-        "options": (content["options"], model.options()),
+        "options": (content["options"], model.schedule.options()),
     }
     # By key, so that the message names the first difference.
     for key, (ours, theirs) in pairs.items():

@@ -13,8 +13,8 @@ import numpy as np
 from nfriction.evaluation.compare import SCHEMA, Comparison, Part
 from nfriction.evaluation.cross_validation import Candidate, Selection
 from nfriction.evaluation.score import Score
+from nfriction.friction import model_names
 from nfriction.friction.models import FrictionModel
-from nfriction.friction.registry import model_names
 from nfriction.io import strict_json
 from nfriction.io.model_file import ModelFileError, load, load_info
 from nfriction.io.model_info import ModelInfo

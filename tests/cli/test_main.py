@@ -11,8 +11,8 @@ import pytest
 
 from nfriction import cli, rigs
 from nfriction.cli import demo, names
+from nfriction.friction import model_names
 from nfriction.friction.models import NCFM
-from nfriction.friction.registry import model_names
 from nfriction.io.model_file import save
 from nfriction.papers import twin
 from nfriction.plant import robot_file

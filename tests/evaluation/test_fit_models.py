@@ -11,7 +11,7 @@ from nfriction import Recording, fit
 from nfriction.evaluation import parallel
 from nfriction.evaluation.parallel import Data, dependency_levels, fit_models, warm_starts
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction.registry import model_by_name, model_names
+from nfriction.friction import model_by_name, model_names
 from nfriction.signals import kalman_smoother
 from tests.cli.benches import pendulum, swing
 

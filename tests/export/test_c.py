@@ -20,10 +20,10 @@ from nfriction.export.contract import compare, verify
 from nfriction.export.controller import NOT_FINITE, OUTSIDE, SATURATED, controller_of
 from nfriction.export.errors import ExportError
 from nfriction.export.test_vectors import draw
+from nfriction.friction import model_by_name, model_names
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.models import FrictionModel
-from nfriction.friction.registry import model_by_name, model_names
 from nfriction.io.model_info import ModelInfo
 from tests.export.artefacts import Rising
 from tests.friction.samples import randomise

@@ -8,7 +8,8 @@ import torch
 
 from nfriction.export.controller import NOT_FINITE, OUTSIDE, SATURATED, controller_of
 from nfriction.export.test_vectors import draw
-from nfriction.friction.models import LFM, NFLFM
+from nfriction.friction.models import LFM
+from nfriction.friction.neurofuzzy import NFLFM
 from nfriction.io.model_info import ModelInfo
 from nfriction.signals import SecondOrderLowPass
 from tests.export.artefacts import INFO, rising

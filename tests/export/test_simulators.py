@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from nfriction.export import fit_damping_frictionloss, mjcf, urdf
-from nfriction.friction.models import LFM, NCFM, NFLFM, NLFM
+from nfriction.friction.models import LFM, NCFM, NLFM
+from nfriction.friction.neurofuzzy import NFLFM
 from nfriction.io.model_info import ModelInfo
 from nfriction.papers.afem.models import ALFM
 from nfriction.signals import Motion

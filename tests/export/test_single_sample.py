@@ -6,8 +6,8 @@ import torch
 from nfriction.export.controller import controller_of
 from nfriction.export.torch_code.single_sample import SingleSample, with_single_sample
 from nfriction.friction.laws import NONLINEAR
-from nfriction.friction.models import LFM, NFLFM, NFNCFM, NFNLFM, FrictionModel
-from nfriction.friction.neurofuzzy import NeuroFuzzy
+from nfriction.friction.models import LFM, FrictionModel
+from nfriction.friction.neurofuzzy import NFLFM, NFNCFM, NFNLFM, NeuroFuzzy
 from tests.friction.samples import randomise
 
 JOINTS = 3

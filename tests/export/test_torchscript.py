@@ -18,8 +18,8 @@ from nfriction.export.torch_code.archive import METADATA
 from nfriction.export.torch_code.torchscript import open_torchscript, sample_inputs
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law, TorqueFunction
-from nfriction.friction.models import LFM, NFLFM, FrictionModel
-from nfriction.friction.neurofuzzy import NeuroFuzzy
+from nfriction.friction.models import LFM, FrictionModel
+from nfriction.friction.neurofuzzy import NFLFM, NeuroFuzzy
 from nfriction.io.model_info import ModelInfo, parameter_hash
 from tests.export.artefacts import INFO, rising
 from tests.friction.samples import QUADRATIC, named_models, randomise

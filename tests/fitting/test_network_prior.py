@@ -48,7 +48,7 @@ def test_the_prior_is_the_one_whose_network_predicts_best(constant, monkeypatch,
     fit(model, pendulum(), recording, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
     assert seen == pytest.approx([0.6 * share for share in PRIOR_SHARES])
     # It travels with the model as what it was fitted with.
-    assert model.options()["prior_sd"] == pytest.approx(0.6 * PRIOR_SHARES[best])
+    assert model.schedule.options()["prior_sd"] == pytest.approx(0.6 * PRIOR_SHARES[best])
 
 
 def test_a_law_that_is_not_linear_has_a_network_too(constant):
@@ -164,4 +164,4 @@ def test_a_network_stopped_before_it_is_judged_gives_way_to_its_law(with_plant, 
     assert "its constant law is kept" in kept.status
     at = (torch.ones(1, 2, dtype=torch.float64),) * 3
     torch.testing.assert_close(model(*at), law.model(*at), rtol=1e-5, atol=1e-9)
-    assert model.options()["prior_sd"] == 0.6
+    assert model.schedule.options()["prior_sd"] == 0.6

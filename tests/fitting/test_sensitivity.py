@@ -7,7 +7,7 @@ from nfriction import LFM, LinearAxis
 from nfriction.codegen import NoBackend
 from nfriction.fitting.plant_parameters import adjusted_buffers, plant_parameters
 from nfriction.fitting.shooting.sensitivity import CHUNK, StepJacobian, Trajectory, propagate
-from nfriction.friction.registry import model_by_name
+from nfriction.friction import model_by_name
 from nfriction.simulation.protocols import RolloutInputs
 from nfriction.simulation.rk4 import rk4_step
 from nfriction.simulation.rollout import integrate

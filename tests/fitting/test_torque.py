@@ -7,8 +7,8 @@ import torch
 from nfriction import Recording
 from nfriction.fitting.equation_error import TorqueFit, fit_torque, friction_torque, prior_sd
 from nfriction.fitting.options import DEFAULTS
+from nfriction.friction import model_by_name
 from nfriction.friction.laws import LINEAR, NONLINEAR, Coefficient, Law
-from nfriction.friction.registry import model_by_name
 from nfriction.signals import Motion
 from tests.fitting.recordings import pendulum
 

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from nfriction.friction import model_by_name, model_names
 from nfriction.friction.laws import (
     COULOMB,
     COULOMB_VISCOUS,
@@ -14,7 +15,6 @@ from nfriction.friction.laws import (
     Law,
 )
 from nfriction.friction.models import FrictionModel
-from nfriction.friction.registry import model_by_name, model_names
 
 LAWS = (VISCOUS, COULOMB, COULOMB_VISCOUS, LINEAR, NONLINEAR, STRIBECK)
 

@@ -190,3 +190,15 @@ def test_a_law_is_the_simpler_one_where_nothing_else_is_left(law):
         law.torque(qd, load, lifted.expand(7, -1), 0.1),
         simpler.torque(qd, load, values.expand(7, -1), 0.1),
     )
+
+
+def test_a_description_of_another_type_is_refused() -> None:
+    for wrong in (Coefficient("B", "N m"), ["B"], [Coefficient("B", "N m")]):
+        with pytest.raises(TypeError, match="`coefficients` of law 'odd' must be a tuple of"):
+            Law("odd", wrong, coulomb)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("start", [-1.0, 0.0, float("nan"), float("inf")])
+def test_start_values_are_possible_ones(start: float) -> None:
+    with pytest.raises(ValueError, match="`initial_grid` of 'v_s' must be positive and finite"):
+        Coefficient("v_s", "rad/s", linear=False, initial_grid=(1.0, start))

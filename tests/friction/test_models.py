@@ -3,12 +3,12 @@
 import pytest
 import torch
 
+from nfriction.friction import model_by_name, model_names
 from nfriction.friction.coefficients import Constant, Schedule
 from nfriction.friction.laws import LINEAR, VISCOUS
-from nfriction.friction.models import LFM, NFLFM, NLFM, FrictionModel
-from nfriction.friction.neurofuzzy import NeuroFuzzy
-from nfriction.friction.registry import model_by_name, model_names
-from nfriction.friction.sensitivity import Sensitivity
+from nfriction.friction.models import LFM, NLFM, FrictionModel
+from nfriction.friction.neurofuzzy import NFLFM, NeuroFuzzy
+from nfriction.friction.parameters import Sensitivity
 from tests.friction.samples import QUADRATIC, motion, named_models, normal, quadratic
 
 every_model = pytest.mark.parametrize("name", named_models())
@@ -154,10 +154,10 @@ def test_options_are_those_given() -> None:
         "interpretable": True,
         "prior_sd": 0.1,
     }
-    assert NFLFM(2, **options).options() == options
-    assert LFM(2).options() == {}
+    assert NFLFM(2, **options).schedule.options() == options
+    assert LFM(2).schedule.options() == {}
     # Made by hand, a model still tells them.
-    assert FrictionModel(LINEAR, NeuroFuzzy(LINEAR, 2, **options)).options() == options
+    assert FrictionModel(LINEAR, NeuroFuzzy(LINEAR, 2, **options)).schedule.options() == options
 
 
 def test_the_number_of_joints_must_fit() -> None:
@@ -180,3 +180,28 @@ def test_models_are_found_by_name() -> None:
     assert all(model_by_name(name).__name__ == name for name in model_names())
     with pytest.raises(ValueError, match=r"'LFN'; there are NCFM, LFM, .*NFNLFM"):
         model_by_name("LFN")
+
+
+def test_a_mistyped_name_gets_the_nearest_one() -> None:
+    with pytest.raises(ValueError, match=r"did you mean Stribeck\?"):
+        model_by_name("stribek")
+
+
+def test_arrays_and_lists_are_inputs_too() -> None:
+    for name, model in named_models(2).items():
+        motion = [[0.5, -1.0]], [[3.0, 20.0]], [[1.0, 0.5]]
+        tensors = [torch.tensor(x, dtype=torch.float64) for x in motion]
+        expected = model(*tensors)
+        assert torch.equal(model(*motion), expected), name
+        assert torch.equal(model(*(x.numpy() for x in tensors)), expected), name
+
+
+@pytest.mark.parametrize("value", [10**400, "fast", None, [1e-3, 1e-3]])
+def test_numbers_beyond_every_float_are_refused_by_name(value: object) -> None:
+    with pytest.raises(ValueError, match="`v_smooth` must be positive and finite"):
+        LFM(1, v_smooth=value)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="`prior_sd` must be positive and finite"):
+        NFLFM(1, prior_sd=value)
+    if isinstance(value, int):
+        with pytest.raises(ValueError, match="coefficients must be an array of numbers"):
+            LFM(1, [value, 1.0])

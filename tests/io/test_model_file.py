@@ -14,8 +14,8 @@ import torch
 from nfriction import PendulumChain, __version__, rollout, score
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
-from nfriction.friction.models import LFM, NCFM, NFLFM, NFNLFM, NLFM, FrictionModel
-from nfriction.friction.neurofuzzy import NeuroFuzzy
+from nfriction.friction.models import LFM, NCFM, NLFM, FrictionModel
+from nfriction.friction.neurofuzzy import NFLFM, NFNLFM, NeuroFuzzy
 from nfriction.io.model_file import (
     ModelFileError,
     load,
@@ -59,7 +59,7 @@ def test_a_model_comes_back_bit_for_bit(name: str, tmp_path: Path) -> None:
     loaded = load(save(model, tmp_path / "model.json"))
     assert type(loaded) is type(model)
     assert loaded.v_smooth == model.v_smooth
-    assert loaded.options() == model.options()
+    assert loaded.schedule.options() == model.schedule.options()
     expected, found = model.state_dict(), loaded.state_dict()
     assert expected.keys() == found.keys()
     assert all(torch.equal(found[key], value) for key, value in expected.items())
@@ -380,7 +380,7 @@ def test_a_forged_file_is_refused(name: str, tmp_path: Path) -> None:
         ({"interpretable": "yes"}, "`options` is"),
         ({"acceleration": "papers"}, "`acceleration` must be"),
         ({"acceleration": ["signed"]}, "`acceleration` must be"),
-        ({"prior_sd": "wide"}, "'>' not supported"),
+        ({"prior_sd": "wide"}, "`prior_sd` must be positive"),
         ({"prior_sd": 0.5, "initial": [1.0, 1.0]}, "`options` is"),
     ],
 )

@@ -19,8 +19,9 @@ from nfriction import plots
 from nfriction.evaluation.compare import NO_FRICTION, Comparison
 from nfriction.evaluation.score import RMSE, Score
 from nfriction.fitting.fit import fit
-from nfriction.friction.models import LFM, NCFM, NFLFM, NFNCFM, NFNLFM, NLFM
-from nfriction.friction.registry import model_names
+from nfriction.friction import model_names
+from nfriction.friction.models import LFM, NCFM, NLFM
+from nfriction.friction.neurofuzzy import NFLFM, NFNCFM, NFNLFM
 from nfriction.optim.least_squares import Step
 from nfriction.papers.controller.mamdani import paper_controller
 from nfriction.plant import LinearAxis, rigs

@@ -6,7 +6,7 @@ from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from nfriction import NFLFM, PendulumChain, rollout
-from nfriction.friction.registry import model_by_name, model_names
+from nfriction.friction import model_by_name, model_names
 from nfriction.simulation import adjoint
 
 F64 = torch.float64

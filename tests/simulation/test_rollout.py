@@ -10,10 +10,10 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from nfriction import LFM, NFLFM, LinearAxis, PendulumChain, rigs, rollout
+from nfriction.friction import model_by_name, model_names
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.models import FrictionModel
-from nfriction.friction.registry import model_by_name, model_names
 from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.simulation.rk4 import RK4_STABILITY, required_substeps
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from nfriction import codegen
 from nfriction.fitting.plant_parameters import PlantParameter, adjusted_plant
 from nfriction.friction.models import FrictionModel
-from nfriction.friction.sensitivity import Sensitivity
+from nfriction.friction.parameters import Sensitivity
 from nfriction.plant import Plant
 from nfriction.simulation.rk4 import rk4_step
 from nfriction.simulation.rollout import Rollout

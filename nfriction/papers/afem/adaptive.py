@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nfriction.friction.coefficients import Tabulated
 from nfriction.friction.laws import Law
-from nfriction.friction.sensitivity import Sensitivity
+from nfriction.friction.parameters import Sensitivity
 
 CLASSES = ("low", "medium", "high")
 
@@ -229,9 +229,7 @@ class Adaptive(Tabulated):
         chosen = (known[..., None] == options).to(self.raw.dtype)  # (sample, joint, class)
         identity = torch.eye(k, dtype=self.raw.dtype, device=self.raw.device)
         by_cell = torch.einsum("sjc,kl->sjkcl", chosen, identity).flatten(3)
-        zero = self.raw.new_zeros(()).expand(*qd.shape, k)
-        one = self.raw.new_ones(()).expand(*qd.shape, 1)
-        return Sensitivity(((by_cell, one),), zero, zero)
+        return Sensitivity.of_constants(by_cell, qd)
 
     def options(self) -> dict[str, Any]:
         return {

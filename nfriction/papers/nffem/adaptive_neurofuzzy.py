@@ -9,7 +9,7 @@ from torch import Tensor
 from nfriction.friction.coefficients import Schedule
 from nfriction.friction.laws import Law
 from nfriction.friction.neurofuzzy import LEAST_RATIO, NeuroFuzzy, smooth_relu_inverse
-from nfriction.friction.sensitivity import Sensitivity
+from nfriction.friction.parameters import Sensitivity
 from nfriction.fuzzy.membership import HALF_WIDTH_OF_GAUSSIAN
 from nfriction.fuzzy.partition import crossing_half_widths
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive

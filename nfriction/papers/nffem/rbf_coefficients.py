@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from nfriction.friction.coefficients import Constant, Schedule
 from nfriction.friction.laws import Law
-from nfriction.friction.sensitivity import Sensitivity
+from nfriction.friction.parameters import Sensitivity
 from nfriction.fuzzy import RBFNetwork
 
 

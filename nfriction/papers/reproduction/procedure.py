@@ -6,9 +6,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nfriction.friction import model_by_name, model_names
 from nfriction.friction.laws import Law
-from nfriction.friction.models import FrictionModel, NeuroFuzzyModel
-from nfriction.friction.registry import model_by_name, model_names
+from nfriction.friction.models import FrictionModel
+from nfriction.friction.neurofuzzy import NeuroFuzzyModel
 from nfriction.fuzzy import FuzzySet, RBFNetwork, sets_from_ranges
 from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.controller.mamdani import MamdaniController, paper_controller

@@ -17,8 +17,8 @@ from nfriction.export import ExportError, torchscript
 from nfriction.fitting.fit import fit
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.fit_result import FitResult
+from nfriction.friction import model_by_name
 from nfriction.friction.models import FrictionModel
-from nfriction.friction.registry import model_by_name
 from nfriction.io.model_file import load, load_info, save
 from nfriction.io.model_info import ModelInfo
 from nfriction.papers import twin

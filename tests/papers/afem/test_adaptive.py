@@ -154,7 +154,7 @@ def test_every_class_counts_for_the_slope_at_rest() -> None:
 
 def test_options_rebuild_the_memory() -> None:
     made = ALFM(2, hysteresis=0.1, time_constant=3.0, sample_time=2e-3)
-    again = ALFM(2, **json.loads(json.dumps(made.options())))
+    again = ALFM(2, **json.loads(json.dumps(made.schedule.options())))
     assert torch.equal(made.schedule.fading, again.schedule.fading)
     assert torch.equal(made.schedule.band, again.schedule.band)
     assert "medium B=" in repr(made)

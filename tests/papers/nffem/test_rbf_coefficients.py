@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from nfriction import export, load, rigs, rollout, save
-from nfriction.friction.models import NFLFM, NFNLFM
+from nfriction.friction.neurofuzzy import NFLFM, NFNLFM
 from nfriction.fuzzy import RBFNetwork
 from nfriction.papers.nffem.rbf_coefficients import RBFCoefficients
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from nfriction.friction import model_by_name
 from nfriction.friction.models import LFM
-from nfriction.friction.registry import model_by_name
 from nfriction.papers.controller.mamdani import paper_controller
 from nfriction.papers.nffem.rbf_coefficients import RBFCoefficients
 from nfriction.papers.reproduction.procedure import controllers_from_classes, papers_neuro_fuzzy

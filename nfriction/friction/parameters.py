@@ -1,0 +1,134 @@
+"""Parameters of a schedule: given values checked, and derivatives of the coefficients by them."""
+
+from __future__ import annotations
+
+import math
+import reprlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+def positive_number(name: str, value: object, unit: str = "") -> float:
+    """A positive finite number, or an error that names it."""
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not 0 < number < math.inf:
+        unit = f" [{unit}]" if unit else ""
+        raise ValueError(f"`{name}` must be positive and finite{unit}, got {reprlib.repr(value)}.")
+    return number
+
+
+def checked_coefficients(
+    values: Tensor | Sequence, like: Tensor, names: Sequence[str], positive: Tensor
+) -> Tensor:
+    """Given coefficients as a tensor of the shape of `like`, (joint, *cells, coefficient).
+
+    Args:
+        values: of that shape, (joint, coefficient) or (coefficient,).
+        like: a tensor of the wanted shape and type.
+        names, positive: of the coefficients, and which must not be negative.
+    """
+    try:
+        given = torch.as_tensor(values, dtype=like.dtype, device=like.device)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise ValueError(
+            f"coefficients must be an array of numbers, got {reprlib.repr(values)}."
+        ) from error
+    joints, count = like.shape[0], like.shape[-1]
+    if given.shape not in (like.shape, (joints, count), (count,)):
+        whole = "" if like.ndim == 2 else f"the whole table {tuple(like.shape)}, "
+        raise ValueError(
+            f"coefficients must be {whole}(joint, coefficient) = {(joints, count)} or one row "
+            f"for all joints ({', '.join(names)}), got shape {tuple(given.shape)}."
+        )
+    if given.shape == (joints, count):
+        given = given.reshape(joints, *(1,) * (like.ndim - 2), count)
+    given = given.expand(like.shape)
+    bad = ~torch.isfinite(given) | (positive & (given < 0))
+    if bad.any():
+        where = tuple(int(i) for i in bad.nonzero()[0])
+        rule = "finite and not negative" if positive[where[-1]] else "finite"
+        raise ValueError(
+            f"`{names[where[-1]]}` of joint {where[0] + 1} must be {rule}, got {given[where]:g}."
+        )
+    return given
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """Derivatives of the coefficients at given motions.
+
+    A parameter acts on one joint's coefficients only. The parameters come in groups, each laid out
+    as (joint, output, feature): an output is a sum of features with the parameters as weights, so
+    the derivative is an outer product, which is kept as its two factors.
+
+    Attributes:
+        factors: of each group, the coefficients' derivatives by the outputs, (sample, joint,
+            coefficient, output), and the features, (sample, joint, feature).
+        qd: by the joint's own velocity, (sample, joint, coefficient).
+        qdd: by the joint's own acceleration, (sample, joint, coefficient).
+    """
+
+    factors: tuple[tuple[Tensor, Tensor], ...]
+    qd: Tensor
+    qdd: Tensor
+
+    @classmethod
+    def of_constants(cls, by_parameter: Tensor, motion: Tensor) -> Sensitivity:
+        """Derivatives of coefficients that do not follow the motion.
+
+        Args:
+            by_parameter: (coefficient, parameter of a joint), or (sample, joint, ...) of these.
+            motion: joint velocities, (sample, joint), for the shape.
+        """
+        count = by_parameter.shape[-2]
+        zero = by_parameter.new_zeros(()).expand(*motion.shape, count)
+        # Nothing is shared among the parameters, so their one feature is 1.
+        one = by_parameter.new_ones(()).expand(*motion.shape, 1)
+        return cls(((by_parameter.expand(*motion.shape, count, -1), one),), zero, zero)
+
+    @property
+    def parameters(self) -> Tensor:
+        """By the parameter vector, multiplied out, (sample, coefficient, parameter)."""
+        whole = [torch.einsum("sjko,sjf->skjof", *factor).flatten(2) for factor in self.factors]
+        return torch.cat(whole, -1)
+
+    @property
+    def joint(self) -> Tensor:
+        """The joint that each parameter acts on, (parameter,)."""
+        rows = []
+        for mix, features in self.factors:
+            joints = torch.arange(mix.shape[1], device=mix.device)
+            rows.append(joints.repeat_interleave(mix.shape[-1] * features.shape[-1]))
+        return torch.cat(rows)
+
+    def contract(self, cotangent: Tensor) -> Tensor:
+        """Derivatives by the parameters of quantities that depend on the coefficients.
+
+        Args:
+            cotangent: derivatives by the coefficients at many samples, (block, row, sample, joint,
+                coefficient); the blocks' samples are those of this sensitivity, in order.
+
+        Returns:
+            Shape (block, row, parameter).
+        """
+        blocks, rows, samples = cotangent.shape[:3]
+        found = []
+        for mix, features in self.factors:
+            mix, features = (x.unflatten(0, (blocks, samples)) for x in (mix, features))
+            if features.shape[-1] == 1:
+                # Nothing is shared: one product over samples and coefficients is faster.
+                by_parameter = (mix * features[..., None]).transpose(1, 2).flatten(2, 3)
+                both = cotangent.permute(0, 3, 1, 2, 4).flatten(3) @ by_parameter
+            else:
+                # (block, joint, row and output, sample) by (block, joint, sample, feature).
+                mixed = cotangent.permute(0, 2, 3, 1, 4) @ mix
+                left = mixed.permute(0, 2, 3, 4, 1).flatten(2, 3)
+                both = (left @ features.transpose(1, 2)).unflatten(2, (rows, -1))
+            found.append(both.transpose(1, 2).flatten(2))
+        return torch.cat(found, -1)
