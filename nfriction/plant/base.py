@@ -1,16 +1,21 @@
-"""Base class of plants: names and conventions, replaced buffers, conversion to plain numbers.
+"""Plants: their common base, and the simplest one, a driven mass on a straight guide.
 
 A plant is a module whose buffers are the constants of M(q) qdd + bias(q, qd) = tau +
-torque_offset, with tau the torque at the joints, behind gears if there are any.
+torque_offset, with tau the torque at the joints, behind gears if there are any. Friction is no
+part of it: a rollout subtracts friction from tau.
 """
 
 from __future__ import annotations
 
 import copy
+import difflib
+import reprlib
 import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -21,7 +26,7 @@ ANGLES = ("relative", "absolute")
 ZEROS = ("upright", "hanging")
 
 
-class Plant(nn.Module):
+class Plant(nn.Module, ABC):
     """Base of the mechanisms; all methods take joint coordinates of shape (*batch, joint).
 
     A type for hints: fits know which terms of `PendulumChain` and `LinearAxis` they may adjust.
@@ -56,15 +61,17 @@ class Plant(nn.Module):
         position_quantum: float | None = None,
     ) -> None:
         super().__init__()
-        names = tuple(joint_names or (f"joint{i + 1}" for i in range(joints)))
+        names = _texts("joint_names", joint_names or [f"joint{i + 1}" for i in range(joints)])
         if len(names) != joints or len(set(names)) != joints:
             raise ValueError(f"`joint_names` must be {joints} different names, got {names}.")
-        angles, zero = (*convention, "", "")[:2]
+        angles, zero = (*_texts("convention", convention), "", "")[:2]
         if len(convention) != 2 or angles not in ANGLES or zero not in ZEROS:
             raise ValueError(
                 f"`convention` must be one of {ANGLES} followed by one of {ZEROS}, "
                 f"got {tuple(convention)}."
             )
+        if not isinstance(name, str):
+            raise ValueError(f"`name` must be text, got {reprlib.repr(name)}.")
         if position_quantum is not None:
             position_quantum = number("position_quantum", position_quantum, positive=True)
         self.joints = joints
@@ -80,35 +87,34 @@ class Plant(nn.Module):
 
     # Equations of motion, defined by each mechanism.
 
+    @abstractmethod
     def gravity(self, q: Tensor) -> Tensor:
         """The gravity part of the bias."""
-        raise NotImplementedError(f"{type(self).__name__} has no gravity term.")
 
+    @abstractmethod
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
         """Acceleration at a state under joint torques."""
-        raise NotImplementedError(f"{type(self).__name__} has no equations of motion.")
 
+    @abstractmethod
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
         """Joint torques that give the accelerations."""
-        raise NotImplementedError(f"{type(self).__name__} has no inverse dynamics.")
 
+    @abstractmethod
     def load(self, q: Tensor, qd: Tensor) -> Tensor:
         """Normal load of each joint over its load at rest [-]."""
-        raise NotImplementedError(f"{type(self).__name__} has no joint loads.")
 
+    @abstractmethod
     def decay_rate(self, damping: Tensor) -> Tensor:
         """Fastest decay of velocities [1/s] that slopes (*batch, joint) of friction can cause."""
-        raise NotImplementedError(f"{type(self).__name__} has no bound on decay rates.")
 
     def replace(self, **buffers: Tensor) -> Self:
-        """A shallow copy with some buffers swapped; this plant stays as it is.
+        """A shallow copy with some buffers swapped, the others shared; this plant stays as it is.
 
         Args:
             **buffers: tensors by buffer name. They may carry gradients and extra leading
                 dimensions that broadcast against the batch: `gravity_moment` of shape (P, 1, n)
                 goes with `q` of shape (P, W, n).
-        Returns:
-            The copy; buffers not named are shared.
+
         Raises:
             ValueError: for a name that is no buffer, or trailing dimensions that differ.
             TypeError: for a value that is no floating-point tensor.
@@ -144,10 +150,12 @@ class Plant(nn.Module):
 
     def _check(self, **states: Tensor) -> None:
         for name, value in states.items():
-            if not value.ndim or value.shape[-1] != self.joints:
+            tensor = isinstance(value, Tensor)
+            if not tensor or value.shape[-1:] != (self.joints,):
+                got = f"shape {tuple(value.shape)}" if tensor else reprlib.repr(value)
                 raise ValueError(
-                    f"`{name}` must be (*batch, {self.joints}), the joints {self.joint_names} "
-                    f"last, got shape {tuple(value.shape)}."
+                    f"`{name}` must be (*batch, {self.joints}), a tensor with the joints "
+                    f"{self.joint_names} last, got {got}."
                 )
 
     def to_dict(self) -> dict[str, Any]:
@@ -173,45 +181,134 @@ class Plant(nn.Module):
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """The plant of `to_dict`.
+        """The plant of `to_dict`, whose `buffers` take the place of derived ones.
 
-        Args:
-            data: constructor arguments by name (an arm as its `inertia` and `length`); optionally
-                `buffers`, values that take the place of derived ones, and `kind`.
         Raises:
             ValueError: for missing or unknown keys, or values the constructor refuses.
         """
         check_keys("rig", data, cls.required, (*cls.optional, "buffers", "kind"))
         given = {key: data[key] for key in (*cls.required, *cls.optional) if key in data}
         buffers = data.get("buffers", {})
-        values = {name: torch.tensor(v, dtype=torch.float64) for name, v in buffers.items()}
-        cls._check_buffers(values)
-        return cls(**cls._parse(given)).replace(**values)
-
-    @classmethod
-    def _check_buffers(cls, values: Mapping[str, Tensor]) -> None:
-        """Refuse buffers of a file that no mechanism has."""
+        check_keys("buffers", buffers, (), buffers)
+        values = {name: numbers(name, value) for name, value in buffers.items()}
         for name, value in values.items():
             if not value.isfinite().all():
                 raise ValueError(f"`{name}` must be finite, got {value.tolist()}.")
+        return cls(**given).replace(**values)
 
-    @classmethod
-    def _parse(cls, given: dict[str, Any]) -> dict[str, Any]:
-        """Hook of `from_dict` for arguments that are no plain numbers."""
-        return given
+
+class LinearAxis(Plant):
+    """Equation of motion mass * qdd = tau + torque_offset - asymmetry |qd|, in m and N.
+
+    Args:
+        mass: moved mass, the drive's inertia included [kg].
+        torque_offset: constant force added to tau [N].
+        name, joint_names, position_quantum: see `Plant`.
+
+    Attributes:
+        mass: (1,) [kg].
+        torque_offset: (1,) [N].
+        asymmetry: difference in viscous resistance between the two directions, (1,) [N s/m]; zero
+            unless `replace` sets it. With viscous friction B it is passive up to B.
+    """
+
+    kind = "axis"
+    required = ("mass",)
+    optional = ("torque_offset", "name", "joint_names", "position_quantum")
+
+    mass: Tensor
+    asymmetry: Tensor
+
+    def __init__(
+        self,
+        mass: float,
+        *,
+        torque_offset: float = 0.0,
+        name: str = "",
+        joint_names: Sequence[str] | None = None,
+        position_quantum: float | None = None,
+    ) -> None:
+        super().__init__(
+            1, joint_names=joint_names, name=name, unit="m", position_quantum=position_quantum
+        )
+        self.links = 1
+        self.register_buffer("mass", vector("mass", [mass], 1, positive=True))
+        self.register_buffer("torque_offset", vector("torque_offset", [torque_offset], 1))
+        self.register_buffer("asymmetry", torch.zeros(1, dtype=torch.float64))
+        self._given = {"mass": float(mass), "torque_offset": float(torque_offset)}
+
+    def mass_matrix(self, q: Tensor) -> Tensor:
+        """The mass [kg], (*batch, 1, 1)."""
+        self._check(q=q)
+        return torch.broadcast_tensors(self.mass, q)[0].unsqueeze(-1)
+
+    def bias(self, q: Tensor, qd: Tensor) -> Tensor:
+        """Force that depends on the direction of motion [N], (*batch, 1)."""
+        self._check(q=q, qd=qd)
+        return self.asymmetry * qd.abs() + torch.zeros_like(q)
+
+    def gravity(self, q: Tensor) -> Tensor:
+        """Zero force [N], (*batch, 1)."""
+        self._check(q=q)
+        return torch.zeros_like(q)
+
+    def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
+        """Acceleration [m/s^2], (*batch, 1), under a force with friction subtracted [N]."""
+        self._check(q=q, qd=qd, tau=tau)
+        qdd = (tau + self.torque_offset - self.asymmetry * qd.abs()) / self.mass
+        return qdd.expand(np.broadcast_shapes(qdd.shape, q.shape, qd.shape))
+
+    def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+        """Force tau (friction subtracted) that gives the acceleration `qdd` [N], (*batch, 1)."""
+        self._check(q=q, qd=qd, qdd=qdd)
+        return self.mass * qdd + self.asymmetry * qd.abs() - self.torque_offset
+
+    def energy(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
+        """Kinetic and (zero) potential energy [J], each (*batch)."""
+        self._check(q=q, qd=qd)
+        kinetic = (self.mass * qd * qd / 2).squeeze(-1)
+        return kinetic, torch.zeros_like(kinetic)
+
+    def load(self, q: Tensor, qd: Tensor) -> Tensor:
+        """Normal load over the load at rest [-]: 1, the guide carries the weight at all times."""
+        self._check(q=q, qd=qd)
+        return torch.ones_like(q)
+
+    @torch.no_grad()
+    def decay_rate(self, damping: Tensor) -> Tensor:
+        """Decay of the velocity under a friction slope [N s/m] of shape (*batch, 1), [1/s]."""
+        return (damping.clamp(min=0.0).to(self.mass) / self.mass).amax(-1)
+
+    def extra_repr(self) -> str:
+        offset = self.torque_offset.tolist()
+        return f"{self.name or 'unnamed'}, mass={self.mass.tolist()} kg, offset={offset} N"
 
 
 def check_keys(
     what: str, data: Mapping[str, Any], required: Collection[str], optional: Collection[str] = ()
 ) -> None:
     """Refuse a table with missing or unknown keys."""
+    if not isinstance(data, Mapping):
+        raise ValueError(f"{what} must be a table of keys and values, got {reprlib.repr(data)}.")
+    known = [*required, *optional]
     missing = [key for key in required if key not in data]
-    unknown = [key for key in data if key not in {*required, *optional}]
+    unknown = [str(key) for key in data if key not in known]
+    near = [m for key in unknown[:9] for m in difflib.get_close_matches(key, known, 1)]
+    faults = [f"missing keys {missing}"] * bool(missing)
+    faults += [f"unknown keys {reprlib.repr(unknown)}"] * bool(unknown)
+    faults += [f"did you mean {', '.join(near)}?"] * bool(near)
     if missing or unknown:
         raise ValueError(
-            f"{what}: missing keys {missing}, unknown keys {unknown}; "
-            f"required {sorted(required)}, optional {sorted(optional)}."
+            f"{what}: {', '.join(faults)}; required {sorted(required)}, "
+            f"optional {sorted(optional)}."
         )
+
+
+def _texts(name: str, values: object) -> tuple[str, ...]:
+    """A list of texts; a single text would silently be taken for its letters."""
+    if not isinstance(values, list | tuple) or not all(isinstance(v, str) for v in values):
+        raise ValueError(f"`{name}` must be a list of texts, got {reprlib.repr(values)}.")
+    return tuple(values)
 
 
 def number(name: str, value: object, *, positive: bool = False) -> float:
@@ -222,13 +319,19 @@ def number(name: str, value: object, *, positive: bool = False) -> float:
 def vector(name: str, values: object, count: int | None, *, positive: bool = False) -> Tensor:
     """`count` (None: one or more) finite numbers as a float64 tensor on the CPU, or an error."""
     wanted = "one or more numbers" if count is None else f"a list of {count}"
-    try:
-        result = torch.as_tensor(values, dtype=torch.float64).detach().cpu()
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"`{name}` must be {wanted}, got {values!r}.") from error
+    result = numbers(name, values, wanted)
     if result.ndim != 1 or not len(result) or count not in (None, len(result)):
         raise ValueError(f"`{name}` must be {wanted}, got {result.tolist()}.")
     if not result.isfinite().all() or (positive and not (result > 0).all()):
         rule = "positive and finite" if positive else "finite"
         raise ValueError(f"`{name}` must be {rule}, got {result.tolist()}.")
     return result
+
+
+def numbers(name: str, values: object, wanted: str = "numbers") -> Tensor:
+    """Numbers as a float64 tensor on the CPU, or an error that names them."""
+    try:
+        return torch.as_tensor(values, dtype=torch.float64).detach().cpu()
+    # Ragged lists, texts, and whole numbers that exceed every float.
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise ValueError(f"`{name}` must be {wanted}, got {reprlib.repr(values)}.") from error

@@ -1,46 +1,21 @@
 """A chain of pendulum links in one plane, on a fixed pivot or on a rotating arm."""
 
+from __future__ import annotations
+
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict
-from typing import Any, NamedTuple
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.plant.arm import Arm, ArmTerms, arm_terms, with_arm_bias, with_arm_mass
-from nfriction.plant.base import Plant, check_keys, number, vector
-from nfriction.plant.drag import drag_forces
-from nfriction.plant.dynamics import (
-    Matrix,
-    Pose,
-    absolute,
-    add_centrifugal,
-    add_rotors,
-    coupling_constants,
-    dot,
-    entries,
-    gravity_forces,
-    joint_forces,
-    joint_matrix,
-    link_forces,
-    multiply,
-    planar_mass,
-    pose_of,
-    relative,
-    solve,
-    stack,
-    stack_matrix,
-    static_moment,
-)
-from nfriction.plant.gears import (
-    EncoderCorrection,
-    check_gear,
-    correct_encoder,
-    joint_torque,
-    motor_torque,
-)
+from nfriction.plant import dynamics
+from nfriction.plant.base import Plant, check_keys, number, numbers, vector
 from nfriction.plant.inertia import fastest_mode, inertia_tensors, require_positive_definite
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 # Zero in a new chain, and set by `replace`: a fit finds them, no user knows them.
 _PER_JOINT = ("angle_offset", "encoder_cosine", "encoder_sine", "gear_loss", "torque_offset")
@@ -48,10 +23,29 @@ _PER_JOINT = ("angle_offset", "encoder_cosine", "encoder_sine", "gear_loss", "to
 WEIGHTLESS = 1e-6
 
 
+@dataclass(frozen=True)
+class Arm:
+    """A rotating arm at whose end the chain hangs.
+
+    Args:
+        inertia: of the arm alone about the vertical axis [kg m^2] (m1 L1^2/4 + Izz1 for a link of
+            mass m1 with its mass centre half way).
+        length: from the vertical axis to the chain's first joint [m].
+    """
+
+    inertia: float
+    length: float
+
+    def __post_init__(self) -> None:
+        # Without length the chain swings unmoved by the arm, and the mass matrix may be singular.
+        for name in ("inertia", "length"):
+            number(f"arm's {name}", getattr(self, name), positive=True)
+
+
 class _Geometry(NamedTuple):
-    pose: Pose
-    arm: ArmTerms | None
-    coupling: Matrix
+    pose: dynamics.Pose
+    arm: dynamics.ArmTerms | None
+    coupling: dynamics.Matrix
 
 
 class PendulumChain(Plant):
@@ -82,9 +76,9 @@ class PendulumChain(Plant):
         gravity_moment: g b_i, (links,) [N m].
         armature: (joints,) [kg m^2].
         angle_offset: added to q before the geometry is evaluated, (joints,) [rad].
-        encoder_cosine, encoder_sine: eccentricity of the encoders, see `gears`, (joints,) [rad].
-        torque_gain, gear_loss: from the motor's torque to the joint's, see `gears`, (joints,) [-].
-            Friction is expressed at the motor side, as a controller commands it.
+        encoder_cosine, encoder_sine: eccentricity, see `correct_encoder`, (joints,) [rad].
+        torque_gain, gear_loss: of gears, see `joint_torque`, (joints,) [-]. Friction is then that
+            at the motor side, as a controller commands it.
         torque_offset: added to tau at the joints, (joints,) [N m].
         drag_linear, drag_quadratic: k1 [N s/m^2], k2 [N s^2/m^3] per link.
         length: (links,) [m].
@@ -155,13 +149,14 @@ class PendulumChain(Plant):
         size = vector("length", length, links, positive=True)
         centre = size / 2 if com is None else vector("com", com, links)
         tensors = inertia_tensors(inertia, links)
-        rotor = vector("armature", [0.0] * self.joints if armature is None else armature,
-                       self.joints)  # fmt: skip
+        rotor = m.new_zeros(self.joints)
+        if armature is not None:
+            rotor = vector("armature", armature, self.joints)
         if (rotor < 0).any():
             raise ValueError(f"`armature` must not be negative, got {rotor.tolist()}.")
         buffers = {
-            "inertia_coupling": coupling_constants(m, size, centre, tensors[:, 2]),
-            "gravity_moment": gravity * static_moment(m, size, centre),
+            "inertia_coupling": dynamics.coupling_constants(m, size, centre, tensors[:, 2]),
+            "gravity_moment": gravity * dynamics.static_moment(m, size, centre),
             "armature": rotor,
             **{name: torch.zeros_like(rotor) for name in _PER_JOINT},
             "torque_gain": torch.ones_like(rotor),
@@ -183,9 +178,7 @@ class PendulumChain(Plant):
         # Absent terms cost nothing: they are Python flags, set here and by `replace`, never
         # tested by value within a step.
         self.has_armature = bool(rotor.any())
-        self.has_gear = False
-        self.has_drag = False
-        self.has_eccentricity = False
+        self.has_gear = self.has_drag = self.has_eccentricity = False
         self._slender = bool(torch.equal(tensors[:, 1], tensors[:, 2])) and not bool(
             tensors[:, [0, 3, 4, 5]].any()
         )
@@ -194,9 +187,7 @@ class PendulumChain(Plant):
             "mass": m.tolist(),
             "length": size.tolist(),
             "com": centre.tolist(),
-            "inertia": None
-            if inertia is None
-            else torch.as_tensor(inertia, dtype=m.dtype).tolist(),
+            "inertia": inertia if inertia is None else numbers("inertia", inertia).tolist(),
             "gravity": gravity,
             "arm": asdict(arm) if arm else None,
             "armature": rotor.tolist() if self.has_armature else None,
@@ -205,16 +196,12 @@ class PendulumChain(Plant):
         require_positive_definite(self.inertia_coupling, aligned[first:, first:])
 
     def mass_matrix(self, q: Tensor) -> Tensor:
-        """Mass matrix M(q) [kg m^2].
-
-        Args:
-            q: joint angles [rad], (*batch, joint).
-        Returns:
-            Symmetric positive definite, (*batch, joint, joint).
-        """
+        """Mass matrix M(q), symmetric positive definite, (*batch, joint, joint) [kg m^2]."""
         self._check(q=q)
         q = self._true(q, q)[0]
-        mass = stack_matrix(joint_matrix(self._mass(self._geometry(q)), self.first_link))
+        mass = dynamics.stack_matrix(
+            dynamics.joint_matrix(self._mass(self._geometry(q)), self.first_link)
+        )
         # A single link's does not depend on q, yet has its batch.
         return mass.expand(np.broadcast_shapes(mass.shape, (*q.shape, self.joints)))
 
@@ -223,24 +210,20 @@ class PendulumChain(Plant):
         self._check(q=q, qd=qd)
         q, qd = self._true(q, qd)
         force = self._bias(self._geometry(q), qd)
-        return stack(joint_forces(force, self.first_link))
+        return dynamics.stack(dynamics.joint_forces(force, self.first_link))
 
     def gravity(self, q: Tensor) -> Tensor:
         """The gravity part of the bias [N m], (*batch, joint): the potential's gradient."""
         self._check(q=q)
         pose = self._geometry(self._true(q, q)[0]).pose
-        force = gravity_forces(pose, self.gravity_moment.unbind(-1))
+        force = dynamics.gravity_forces(pose, self.gravity_moment.unbind(-1))
         own = [torch.zeros_like(force[0])] * self.first_link
-        return stack(joint_forces([*own, *force], self.first_link))
+        return dynamics.stack(dynamics.joint_forces([*own, *force], self.first_link))
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
-        """Joint accelerations under joint torques.
+        """Joint accelerations [rad/s^2] under torques with friction subtracted [N m].
 
-        Args:
-            q, qd: joint angles [rad] and rates [rad/s], (*batch, joint).
-            tau: joint torques with friction already subtracted [N m], (*batch, joint).
-        Returns:
-            qdd [rad/s^2], (*batch, joint).
+        All (*batch, joint), with joint angles [rad] and rates [rad/s].
         """
         self._check(q=q, qd=qd, tau=tau)
         if self.has_eccentricity:
@@ -253,21 +236,19 @@ class PendulumChain(Plant):
         """True accelerations at true angles and rates."""
         geometry = self._geometry(q)
         if self.has_gear:
-            tau = joint_torque(tau, qd, self.torque_gain, self.gear_loss)
-        force = link_forces((tau + self.torque_offset).unbind(-1), self.first_link)
+            tau = dynamics.joint_torque(tau, qd, self.torque_gain, self.gear_loss)
+        force = dynamics.link_forces((tau + self.torque_offset).unbind(-1), self.first_link)
         bias = self._bias(geometry, qd)
         rhs = [f - h for f, h in zip(force, bias, strict=True)]
         # Every acceleration depends on every input, so all share one shape without broadcasting.
-        return torch.stack(relative(solve(self._mass(geometry), rhs), self.first_link), -1)
+        return torch.stack(
+            dynamics.relative(dynamics.solve(self._mass(geometry), rhs), self.first_link), -1
+        )
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
         """Joint torques tau (friction subtracted) that give the accelerations `qdd` [N m].
 
-        Args:
-            q, qd, qdd: joint angles [rad], rates [rad/s], accelerations [rad/s^2],
-                (*batch, joint).
-        Returns:
-            tau [N m], (*batch, joint).
+        All (*batch, joint), with joint angles [rad], rates [rad/s], accelerations [rad/s^2].
         """
         self._check(q=q, qd=qd, qdd=qdd)
         if self.has_eccentricity:
@@ -275,11 +256,13 @@ class PendulumChain(Plant):
             true_qdd = corrected.true_acceleration(qd, qdd)
             q, qd, qdd = corrected.angle, corrected.slope * qd, true_qdd
         geometry = self._geometry(q)
-        inertial = multiply(self._mass(geometry), absolute(qdd.unbind(-1), self.first_link))
+        inertial = dynamics.multiply(
+            self._mass(geometry), dynamics.absolute(qdd.unbind(-1), self.first_link)
+        )
         force = [f + h for f, h in zip(inertial, self._bias(geometry, qd), strict=True)]
-        torque = stack(joint_forces(force, self.first_link)) - self.torque_offset
+        torque = dynamics.stack(dynamics.joint_forces(force, self.first_link)) - self.torque_offset
         if self.has_gear:
-            torque = motor_torque(torque, qd, self.torque_gain, self.gear_loss)
+            torque = dynamics.motor_torque(torque, qd, self.torque_gain, self.gear_loss)
         return torque
 
     def energy(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
@@ -287,10 +270,10 @@ class PendulumChain(Plant):
         self._check(q=q, qd=qd)
         q, qd = self._true(q, qd)
         geometry = self._geometry(q)
-        rate = absolute(qd.unbind(-1), self.first_link)
-        kinetic = dot(rate, multiply(self._mass(geometry), rate)) / 2
+        rate = dynamics.absolute(qd.unbind(-1), self.first_link)
+        kinetic = dynamics.dot(rate, dynamics.multiply(self._mass(geometry), rate)) / 2
         height = [angle.cos() for angle in geometry.pose.angle]
-        return kinetic, dot(self.gravity_moment.unbind(-1), height)
+        return kinetic, dynamics.dot(self.gravity_moment.unbind(-1), height)
 
     def load(self, q: Tensor, qd: Tensor) -> Tensor:
         """Normal load of each joint over its link's weight, |N_i| / (m_i g) [-].
@@ -298,10 +281,6 @@ class PendulumChain(Plant):
         N_i = m_i l_i qd_i^2 - m_i g cos phi_i with the joint's own rate qd_i and the link's
         absolute angle phi_i from upright; 1 for the arm, whose axis is vertical.
 
-        Args:
-            q, qd: joint angles [rad] and rates [rad/s], (*batch, joint).
-        Returns:
-            Loads >= 0, (*batch, joint).
         References:
             TLRIP paper, eqs. (26)-(29), with - m g cos phi for + m g cos theta: the printed sign
             belongs to angles from hanging, and taken literally feeds energy in.
@@ -324,6 +303,7 @@ class PendulumChain(Plant):
 
         Args:
             damping: slope of each joint's friction torque [N m s/rad], (*batch, joint).
+
         Returns:
             Shape (*batch,), the largest over all values of a plant with batches of buffers.
         """
@@ -338,12 +318,12 @@ class PendulumChain(Plant):
         return torch.stack(found).reshape(damping.shape[:-1])
 
     def extra_repr(self) -> str:
-        """Name, links, arm and optional terms."""
-        parts = [self.name or "unnamed", f"links={self.links}"]
-        parts.append(f"arm={'free' if self.first_link else 'fixed'}")
-        parts.append(f"mass={self._given['mass']}, length={self._given['length']}")
-        parts.append(f"convention={self.convention}, armature={self.has_armature}")
-        return ", ".join([*parts, f"drag={self.has_drag}, gears={self.has_gear}"])
+        arm, given = "free" if self.first_link else "fixed", self._given
+        return (
+            f"{self.name or 'unnamed'}, links={self.links}, arm={arm}, mass={given['mass']}, "
+            f"length={given['length']}, convention={self.convention}, "
+            f"armature={self.has_armature}, drag={self.has_drag}, gears={self.has_gear}"
+        )
 
     def _note_replaced(self, names: Collection[str]) -> None:
         if {"drag_linear", "drag_quadratic"} & set(names):
@@ -360,8 +340,10 @@ class PendulumChain(Plant):
         # A fit starts at zeros that are about to move.
         self._slender = self._slender and "inertia_tensor" not in names
 
-    def _corrected(self, q: Tensor) -> EncoderCorrection:
-        return correct_encoder(q, self.encoder_zero, self.encoder_cosine, self.encoder_sine)
+    def _corrected(self, q: Tensor) -> dynamics.EncoderCorrection:
+        return dynamics.correct_encoder(
+            q, self.encoder_zero, self.encoder_cosine, self.encoder_sine
+        )
 
     def _true(self, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
         """True angles and rates of readings."""
@@ -371,50 +353,48 @@ class PendulumChain(Plant):
         return corrected.angle, corrected.slope * qd
 
     def _geometry(self, q: Tensor) -> _Geometry:
-        pose = pose_of((q + self.angle_offset).unbind(-1)[self.first_link :])
-        coupling = entries(self.inertia_coupling)
+        pose = dynamics.pose_of((q + self.angle_offset).unbind(-1)[self.first_link :])
+        coupling = dynamics.entries(self.inertia_coupling)
         if not self.first_link:
             return _Geometry(pose, None, coupling)
         lever = (self.gravity_moment * self.arm_lever.unsqueeze(-1)).unbind(-1)
         tensor = None
         if not self._slender:
             tensor = [list(row.unbind(-1)) for row in self.inertia_tensor.unbind(-2)]
-        arm = arm_terms(pose, coupling, self.arm_inertia, lever, tensor)
+        arm = dynamics.arm_terms(pose, coupling, self.arm_inertia, lever, tensor)
         return _Geometry(pose, arm, coupling)
 
-    def _mass(self, geometry: _Geometry) -> Matrix:
+    def _mass(self, geometry: _Geometry) -> dynamics.Matrix:
         """Mass matrix over (arm angle, absolute link angles), rotors included."""
-        mass = planar_mass(geometry.pose, geometry.coupling)
+        mass = dynamics.planar_mass(geometry.pose, geometry.coupling)
         if geometry.arm is not None:
-            mass = with_arm_mass(mass, geometry.arm)
+            mass = dynamics.with_arm_mass(mass, geometry.arm)
         if self.has_armature:
-            add_rotors(mass, self.armature.unbind(-1), self.first_link)
+            dynamics.add_rotors(mass, self.armature.unbind(-1), self.first_link)
         return mass
 
     def _bias(self, geometry: _Geometry, qd: Tensor) -> list[Tensor]:
         """Bias over (arm angle, absolute link angles)."""
         joint = qd.unbind(-1)
-        rate = absolute(joint[self.first_link :], 0)
+        rate = dynamics.absolute(joint[self.first_link :], 0)
         squared = [x * x for x in rate]
-        bias = gravity_forces(geometry.pose, self.gravity_moment.unbind(-1))
-        add_centrifugal(bias, geometry.pose, geometry.coupling, squared)
+        bias = dynamics.gravity_forces(geometry.pose, self.gravity_moment.unbind(-1))
+        dynamics.add_centrifugal(bias, geometry.pose, geometry.coupling, squared)
         if self.has_drag:
             coefficients = (self.length, self.drag_linear, self.drag_quadratic)
-            drag = drag_forces(geometry.pose, rate, *(x.unbind(-1) for x in coefficients))
+            drag = dynamics.drag_forces(geometry.pose, rate, *(x.unbind(-1) for x in coefficients))
             bias = [h + d for h, d in zip(bias, drag, strict=True)]
         if geometry.arm is not None:
-            bias = with_arm_bias(bias, geometry.arm, joint[0], rate, squared)
+            bias = dynamics.with_arm_bias(bias, geometry.arm, joint[0], rate, squared)
         return bias
 
     @classmethod
-    def _check_buffers(cls, values: Mapping[str, Tensor]) -> None:
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        arm = data.get("arm")
+        if arm is not None:
+            check_keys("arm", arm, ("inertia", "length"))
+            data = {**data, "arm": Arm(**arm)}
+        plant = super().from_dict(data)
         # Values of a file have not gone through the constructor.
-        super()._check_buffers(values)
-        check_gear(values)
-
-    @classmethod
-    def _parse(cls, given: dict[str, Any]) -> dict[str, Any]:
-        if given.get("arm") is None:
-            return given
-        check_keys("arm", given["arm"], ("inertia", "length"))
-        return given | {"arm": Arm(**{k: number(k, v) for k, v in given["arm"].items()})}
+        dynamics.check_gear(plant.torque_gain, plant.gear_loss)
+        return plant

@@ -1,15 +1,28 @@
-"""Equations of motion of links hinged in one plane, in absolute angles from upright.
+"""Equations of motion of hinged links, as pure functions: planar links, arm, drag, gears, encoders.
+
+Links hinged in one plane have, in absolute angles phi_i from upright,
 
     sum_j a_ij cos(phi_i - phi_j) phi_j'' + sum_j a_ij sin(phi_i - phi_j) phi_j'^2
-        - g b_i sin phi_i = Q_i
+        - g b_i sin phi_i = Q_i.
 
-Pure functions on lists of scalars, one tensor of shape (*batch) per link or joint. Unrolled this
+The functions take lists of scalars, one tensor of shape (*batch) per link or joint. Unrolled this
 way a batch of 3x3 systems needs no small-matrix kernels, traces to plain arithmetic and
 differentiates in both modes. Only the upper triangle of `coupling` (a_ij) is read.
 
 Joint coordinates q (relative angles) and absolute angles u are related by u = S q; generalised
 forces go back as S^T Q and matrices as S^T M S. The first `first` entries (the arm's angle, if
 there is a free arm) are the same in both.
+
+A free arm at the angle th1 about the vertical adds its own row and the links' share of its motion:
+
+    M11 = J0 + sum_i Ixx_i + sum_ij k_ij s_i s_j - 2 sum_i Ixy_i s_i c_i
+    M1i = -L1 b_i c_i + Ixz_i c_i - Iyz_i s_i
+    e_i = 1/2 dM11/dphi_i = c_i sum_j k_ij s_j - Ixy_i (c_i^2 - s_i^2)
+    h1 = 2 th1' sum_i e_i phi_i' + sum_i (L1 b_i s_i - Ixz_i s_i - Iyz_i c_i) phi_i'^2
+    h_i gains -e_i th1'^2
+
+where J0 is the arm with the links' masses at its end, and k_ij = a_ij except k_ii = a_ii -
+(Izz_i + Ixx_i - Iyy_i), a difference that vanishes for slender rods.
 """
 
 from collections.abc import Sequence
@@ -22,6 +35,12 @@ from torch import Tensor
 
 Matrix = list[list[Tensor]]
 Pairs = dict[tuple[int, int], Tensor]
+
+# Keeps 0/0 away where a whole link is at rest: the drag's numerators are cubic in the velocity.
+_TINY = 1e-30
+# Velocity over which a gear's loss changes sign [rad/s]: at lower ones dry friction dominates, and
+# a sharper change would require shorter integration steps.
+SIGN_WIDTH = 0.1
 
 
 def entries(matrix: Tensor) -> Matrix:
@@ -56,9 +75,7 @@ def dot(left: Sequence[Tensor], right: Sequence[Tensor]) -> Tensor:
 def solve(matrix: Matrix, rhs: Sequence[Tensor]) -> list[Tensor]:
     """Solve `matrix @ x = rhs` by an LDL^T factorisation without square roots or pivoting.
 
-    Args:
-        matrix: symmetric positive definite; only the lower triangle is read.
-        rhs: right-hand side, as long as the matrix.
+    `matrix` is symmetric positive definite; only its lower triangle is read.
     """
     lower: list[list[Tensor]] = []
     pivots: list[Tensor] = []
@@ -120,17 +137,11 @@ def joint_matrix(link: Matrix, first: int) -> Matrix:
 
 
 class Pose(NamedTuple):
-    """Trigonometry of a pose, shared by the mass matrix and the bias.
+    """Trigonometry of a pose, shared by the mass matrix and the bias."""
 
-    Attributes:
-        angle: absolute link angles phi_i from upright [rad].
-        sin: sin phi_i.
-        cos_between, sin_between: of phi_j - phi_i for i < j.
-    """
-
-    angle: list[Tensor]
+    angle: list[Tensor]  # absolute link angles phi_i from upright [rad]
     sin: list[Tensor]
-    cos_between: Pairs
+    cos_between: Pairs  # of phi_j - phi_i for i < j
     sin_between: Pairs
 
 
@@ -202,3 +213,166 @@ def static_moment(mass: Tensor, length: Tensor, com: Tensor) -> Tensor:
 def _mass_beyond(mass: Tensor) -> Tensor:
     """Mass of all links after each link, shape (links,) [kg]."""
     return mass.sum() - mass.cumsum(0)
+
+
+class ArmTerms(NamedTuple):
+    """Mass entries M11, M1i, gradient e_i and factors of phi_i'^2 in h1 of an arm [kg m^2]."""
+
+    own: Tensor
+    cross: list[Tensor]
+    slope: list[Tensor]
+    lever: list[Tensor]
+
+
+def arm_terms(
+    pose: Pose, coupling: Matrix, own_inertia: Tensor, lever: Sequence[Tensor],
+    tensor: Matrix | None,
+) -> ArmTerms:  # fmt: skip
+    """Evaluate the arm's terms; `own_inertia` is J0 and `lever` L1 b_i [kg m^2].
+
+    `tensor` has rows (Ixx, Iyy, Izz, Ixy, Ixz, Iyz) per link [kg m^2]; None for slender rods.
+    """
+    sin, cos = pose.sin, [angle.cos() for angle in pose.angle]
+    size = len(sin)
+    # Only the upper triangle is fitted, so only it is read.
+    upper = [[coupling[min(i, j)][max(i, j)] for j in range(size)] for i in range(size)]
+    swept = [dot(row, sin) for row in upper]
+    cross = [-(reach * c) for reach, c in zip(lever, cos, strict=True)]
+    factor = [reach * s for reach, s in zip(lever, sin, strict=True)]
+    own = own_inertia
+    if tensor is not None:
+        for i, (ixx, iyy, izz, _, ixz, iyz) in enumerate(tensor):
+            swept[i] = swept[i] - (izz + ixx - iyy) * sin[i]
+            cross[i] = cross[i] + ixz * cos[i] - iyz * sin[i]
+            factor[i] = factor[i] - ixz * sin[i] - iyz * cos[i]
+            own = own + ixx
+    own = own + dot(swept, sin)
+    slope = [c * k for c, k in zip(cos, swept, strict=True)]
+    if tensor is not None:
+        for i, (_, _, _, ixy, _, _) in enumerate(tensor):
+            own = own - 2 * ixy * sin[i] * cos[i]
+            slope[i] = slope[i] - ixy * (cos[i] * cos[i] - sin[i] * sin[i])
+    return ArmTerms(own, cross, slope, factor)
+
+
+def with_arm_mass(links: Matrix, terms: ArmTerms) -> Matrix:
+    """The links' mass matrix preceded by the arm's row and column."""
+    rows = [[side, *row] for side, row in zip(terms.cross, links, strict=True)]
+    return [[terms.own, *terms.cross], *rows]
+
+
+def with_arm_bias(
+    links: Sequence[Tensor], terms: ArmTerms, arm_rate: Tensor, rate: Sequence[Tensor],
+    rate_squared: Sequence[Tensor],
+) -> list[Tensor]:  # fmt: skip
+    """The links' bias with the arm's rotation in it, preceded by the arm's own bias."""
+    own = 2 * arm_rate * dot(terms.slope, rate) + dot(terms.lever, rate_squared)
+    spin = arm_rate * arm_rate
+    return [own, *(h - e * spin for h, e in zip(links, terms.slope, strict=True))]
+
+
+def drag_forces(
+    pose: Pose, rate: Sequence[Tensor], length: Sequence[Tensor], linear: Sequence[Tensor],
+    quadratic: Sequence[Tensor],
+) -> list[Tensor]:  # fmt: skip
+    """Torques of air drag on the absolute angles, int f(v) dv/dphi_j' ds along the links [N m].
+
+    A point at distance s from the joint of link i moves at v = s phi_i' + sum_{j<i} L_j phi_j'
+    cos(phi_i - phi_j) across the link and meets the force f = k1 v + k2 v |v| per length. As v is
+    linear in s, f and its moment have closed forms even where v changes sign: no quadrature, no
+    branch. The product with the absolute rates phi_i' is the power lost, never negative for
+    k1, k2 >= 0 (`linear`, `quadratic`).
+    """
+    torque: list[Tensor] = []
+    for i, (size, k1, k2) in enumerate(zip(length, linear, quadratic, strict=True)):
+        reach = [length[j] * pose.cos_between[j, i] for j in range(i)]
+        sweep = size * rate[i]
+        if i == 0:  # its joint is fixed, so that v grows from 0
+            torque.append(size * size * sweep * (k1 / 3 + k2 / 4 * sweep.abs()))
+            continue
+        start = dot(reach, rate[:i])
+        end = start + sweep
+        mean, first = square_moments(start, end)
+        push = size * (k1 / 2 * (start + end) + k2 * mean)
+        torque = [t + lever * push for t, lever in zip(torque, reach, strict=True)]
+        torque.append(size * size * (k1 / 6 * (start + 2 * end) + k2 * first))
+    return torque
+
+
+def square_moments(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
+    """Integrals over t in [0, 1] of v |v| and of t v |v| for v = start + t (end - start).
+
+    Exact for either sign of both ends: with w = start * end, the second is half the first plus
+    the moment about the middle; |w| - w is zero unless v changes sign on the way.
+    """
+    w = start * end
+    both = w.abs()
+    total = start.abs() + end.abs() + _TINY
+    squares = start * start + end * end + both
+    mean = (start + end) / total * squares / 3
+    crossing = both / total * ((both - w) / total)
+    about_middle = (end - start) / total * (squares + w - crossing) / 12
+    return mean, mean / 2 + about_middle
+
+
+def joint_torque(tau: Tensor, qd: Tensor, gain: Tensor, loss: Tensor) -> Tensor:
+    """Torque at the joints behind gears, gain (tau - loss |tau| sgn(qd)) [N m], (*batch, joint).
+
+    `tau` is the motors' torque with friction subtracted: less of it arrives where the motor drives
+    the joint, more where the joint drives the motor.
+    """
+    return gain * (tau - loss * tau.abs() * torch.tanh(qd / SIGN_WIDTH))
+
+
+def motor_torque(torque: Tensor, qd: Tensor, gain: Tensor, loss: Tensor) -> Tensor:
+    """Torque of the motors that gives `torque` at the joints; inverse of `joint_torque`."""
+    # The efficiency is positive, so the joint torque has the sign of the motor torque.
+    efficiency = 1.0 - loss * torque.sign() * torch.tanh(qd / SIGN_WIDTH)
+    return torque / (gain * efficiency)
+
+
+def check_gear(gain: Tensor, loss: Tensor) -> None:
+    """Refuse gears that would generate power or reverse a torque."""
+    if not (gain > 0).all():
+        raise ValueError(f"`torque_gain` must be positive, got {gain.tolist()}.")
+    if not ((loss >= 0) & (loss < 1)).all():
+        raise ValueError(
+            "`gear_loss`, the share of a torque that is lost, must be from 0 to less than 1, "
+            f"got {loss.tolist()}."
+        )
+
+
+class EncoderCorrection(NamedTuple):
+    """True angle of an encoder's readings, and its first two derivatives by them."""
+
+    angle: Tensor
+    slope: Tensor
+    curvature: Tensor
+
+    def true_acceleration(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        """True acceleration of a reading's rate and acceleration."""
+        return self.slope * qdd + self.curvature * qd * qd
+
+    def read_acceleration(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        """The reading's acceleration, of its rate and the true acceleration."""
+        return (qdd - self.curvature * qd * qd) / self.slope
+
+
+def correct_encoder(q: Tensor, zero: Tensor, cosine: Tensor, sine: Tensor) -> EncoderCorrection:
+    """True angles of readings of eccentric encoders.
+
+    A disc off-centre by e in the direction delta reads q + e sin(q + delta). With u the reading
+    from hanging, that is q + c (cos u - 1) + s sin u, zero at hanging, so that it does not mix with
+    the encoder's zero. Taking u of the reading and not of q matters to second order in e only, and
+    gives q in closed form.
+
+    Args:
+        q: readings [rad], (*batch, joint).
+        zero: cosine of each joint's coordinate where the mechanism hangs: -1 for a first link
+            measured from upright, 1 for the others, (joint,).
+        cosine, sine: c and s [rad], (joint,); the eccentricity is e = sqrt(c^2 + s^2).
+    """
+    cos, sin = zero * q.cos(), zero * q.sin()
+    angle = q - cosine * (cos - 1) - sine * sin
+    slope = 1 + cosine * sin - sine * cos
+    return EncoderCorrection(angle, slope, cosine * cos + sine * sin)

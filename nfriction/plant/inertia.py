@@ -8,7 +8,7 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
-from nfriction.plant.base import vector
+from nfriction.plant.base import numbers, vector
 
 
 def inertia_tensors(inertia: object, links: int) -> Tensor:
@@ -17,20 +17,13 @@ def inertia_tensors(inertia: object, links: int) -> Tensor:
     The link frame has x along the link, z along the joint axis and y = z cross x; products are
     the matrix entries.
 
-    Args:
-        inertia: None (point masses), one Izz per link (slender rods: Iyy = Izz, Ixx = 0), or
-            (links, 6) numbers in the order above.
-        links: number of rows.
-    Warns:
-        UserWarning: where no rigid body has such an inertia.
+    `inertia` is None (point masses), one Izz per link (slender rods: Iyy = Izz, Ixx = 0), or
+    (links, 6) numbers in the order above. Warns where no rigid body has such an inertia.
     """
     rows = torch.zeros(links, 6, dtype=torch.float64)
     if inertia is None:
         return rows
-    try:
-        given = torch.as_tensor(inertia, dtype=torch.float64).detach().cpu()
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"`inertia` must be numbers, got {inertia!r}.") from error
+    given = numbers("inertia", inertia)
     if tuple(given.shape) == (links, 6):
         rows = vector("inertia", given.flatten(), 6 * links).reshape(links, 6)
     elif tuple(given.shape) == (links,):
@@ -64,13 +57,7 @@ def _warn_impossible(rows: Tensor) -> None:
 
 
 class _Poses:
-    """M^-1 of a chain over a grid of poses.
-
-    Attributes:
-        values: of the chain's buffers, which it belongs to.
-        inverse: M^-1, (batch, pose, joint, joint).
-        squares: its squared entries, flat.
-    """
+    """M^-1 of a chain with certain values of its buffers over a grid of poses."""
 
     def __init__(self, plant: Any, values: Tensor) -> None:
         mass = plant.mass_matrix(configuration_grid(plant.joints).to(values))
@@ -108,11 +95,9 @@ _poses: WeakKeyDictionary[Any, _Poses] = WeakKeyDictionary()
 
 
 def fastest_mode(plant: Any, damping: Tensor) -> Tensor:
-    """Largest eigenvalue of M^-1 D over a grid of poses [1/s].
+    """Largest eigenvalue of M^-1 D over a grid of poses of a chain [1/s].
 
-    Args:
-        plant: the chain.
-        damping: diagonal of D, not negative [N m s/rad], (joint,) or (*batch of the plant, joint).
+    `damping` is the diagonal of D, not negative, (joint,) or (*batch of the plant, joint).
     """
     values = torch.cat([buffer.reshape(-1) for buffer in plant.buffers()])
     # Buffers may be changed in place, so the values decide and not the object.
@@ -146,13 +131,7 @@ def require_positive_definite(coupling: Tensor, aligned: Tensor) -> None:
 
     M over absolute angles is a_ij cos(phi_i - phi_j) plus the rotors. The cosines are a Gram
     matrix, so by Schur's product theorem a positive semidefinite `coupling` (a_ij) keeps M so in
-    every pose.
-
-    Args:
-        coupling: a_ij, (links, links) [kg m^2].
-        aligned: the links' mass matrix, rotors included, with all links in line.
-    Raises:
-        ValueError: where `coupling` has a negative eigenvalue, or `aligned` one not positive.
+    every pose. `aligned` is the links' mass matrix, rotors included, with all links in line.
     """
     # Point masses may give a singular coupling, with eigenvalues of plus or minus rounding.
     rounding = 1e-12 * aligned.trace().item()

@@ -14,8 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from nfriction.plant.arm import Arm
-from nfriction.plant.chain import PendulumChain
+from nfriction.plant.chain import Arm, PendulumChain
 from nfriction.plant.inertia import inertia_tensors
 
 Array = NDArray[np.float64]
@@ -75,26 +74,22 @@ class HingedLink:
 
 @dataclass(frozen=True)
 class _Planar:
-    """Lengths and angles of the links in their plane; `reach` is along the axis."""
+    """Lengths and angles of the links in their plane."""
 
     length: list[float]
     com: list[float]
     angle: list[float]
-    reach: Array
+    reach: Array  # of the mass centres along the joints' axis
 
 
 def pendulum_chain(links: Sequence[HingedLink], gravity: Array, name: str) -> PendulumChain:
-    """The planar chain that these links form.
+    """The planar chain that these links form, given in any order, under a gravity (3,) [m/s^2].
 
     Joint coordinates are those of the file: where the first link is nearer to upright than to
     hanging at zero, its convention is measured from upright, else from hanging, and the rest goes
     into `angle_offset`. A first joint about the vertical becomes the arm. The length of the last
     link, which only drag needs, is that of a rod with its mass and inertia.
 
-    Args:
-        links: in any order.
-        gravity: acceleration in the world, (3,) [m/s^2].
-        name: of the mechanism.
     Raises:
         ValueError: if they form no such chain, naming the joint and the rule.
     """
@@ -170,7 +165,8 @@ def _common_axis(links: Sequence[HingedLink], up: Array) -> Array:
         if lean > TILT:
             _refuse(link.name, f"has an axis {math.degrees(lean):.3g} degrees off the horizontal; "
                     "gravity must act in the plane of the links (only the first of several joints "
-                    "may turn about the vertical, as an arm)")  # fmt: skip
+                    "may turn about the vertical, as an arm). Of a robot in space, make the "
+                    "joints with other axes \"fixed\" and record with these at rest")  # fmt: skip
         apart = _tilt(link.axis, first.axis)
         if apart > TILT:
             _refuse(link.name, f"has an axis {math.degrees(apart):.3g} degrees off that of "

@@ -13,8 +13,10 @@ relative, from upright. `buffers` may hold values in place of derived constants,
 are read, too.
 """
 
+import difflib
 import json
 import math
+import reprlib
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -27,14 +29,11 @@ from torch import Tensor
 from nfriction.io import strict_json
 from nfriction.io.atomic import write_atomically
 from nfriction.plant import robot_file
-from nfriction.plant.arm import Arm
-from nfriction.plant.axis import LinearAxis
-from nfriction.plant.base import Plant
-from nfriction.plant.chain import PendulumChain
+from nfriction.plant.base import LinearAxis, Plant
+from nfriction.plant.chain import Arm, PendulumChain
 
 _HANGING = ("relative", "hanging")
 _PAPER_QUANTUM = math.tau / 8192  # 2048 pulses per revolution, counted on all four edges
-_MULTIARM_QUANTUM = math.tau / 40_000
 
 InertiaCase = Literal["none", "izz"] | Sequence[Sequence[float]] | Tensor
 
@@ -98,50 +97,47 @@ def rtip(arm: Literal["fixed", "free"] = "fixed", inertia: InertiaCase = "izz") 
     return tlrip(arm, inertia, name="rtip", convention=_HANGING)
 
 
-def multiarm_single() -> PendulumChain:
-    """Single pendulum of the MultiArm-Pendulum bench (Kaheman et al., arXiv 2205.06231).
+def _multiarm(
+    name: str, mass: list[float], com: list[float], inertia: list[float],
+    inner_lengths: list[float], gravity: float = 9.81,
+) -> PendulumChain:  # fmt: skip
+    """A pendulum of the MultiArm-Pendulum bench (Kaheman et al., arXiv 2205.06231).
 
-    The last link's length is published for none of the three; it is taken as twice the distance to
-    its mass centre, as for an even rod, and matters to air drag only. The authors' values were
-    fitted with viscous friction; in free swing only ratios are identifiable.
+    The last link's length is published for none of them; it is taken as twice the distance to its
+    mass centre, as for an even rod, and matters to air drag only. The authors' values were fitted
+    with viscous friction; in free swing only ratios are identifiable.
     """
     return PendulumChain(
-        mass=[0.14758],
-        com=[0.14775],
-        length=[2 * 0.14775],
-        inertia=[1.0912e-4],
-        name="multiarm-single",
+        mass=mass,
+        com=com,
+        length=[*inner_lengths, 2 * com[-1]],
+        inertia=inertia,
+        gravity=gravity,
+        name=f"multiarm-{name}",
         convention=("absolute", "hanging"),
-        position_quantum=_MULTIARM_QUANTUM,
+        position_quantum=math.tau / 40_000,
     )
+
+
+def multiarm_single() -> PendulumChain:
+    """Single pendulum of the MultiArm-Pendulum bench (Kaheman et al., arXiv 2205.06231)."""
+    return _multiarm("single", [0.14758], [0.14775], [1.0912e-4], [])
 
 
 def multiarm_double() -> PendulumChain:
-    """Double pendulum of the MultiArm-Pendulum bench; see `multiarm_single`."""
-    return PendulumChain(
-        mass=[0.093844, 0.137596],
-        com=[0.108565, 0.116779],
-        length=[0.172719, 2 * 0.116779],
-        inertia=[4.3753e-4, 1.26883e-3],
-        gravity=9.80858,
-        name="multiarm-double",
-        convention=("absolute", "hanging"),
-        position_quantum=_MULTIARM_QUANTUM,
-    )
+    """Double pendulum of the MultiArm-Pendulum bench (Kaheman et al., arXiv 2205.06231)."""
+    return _multiarm(
+        "double", [0.093844, 0.137596], [0.108565, 0.116779], [4.3753e-4, 1.26883e-3],
+        [0.172719], 9.80858,
+    )  # fmt: skip
 
 
 def multiarm_triple() -> PendulumChain:
-    """Triple pendulum of the MultiArm-Pendulum bench; see `multiarm_single`."""
-    return PendulumChain(
-        mass=[0.258172, 0.279428, 0.118624],
-        com=[0.160000, 0.202939, 0.183709],
-        length=[0.172800, 0.228700, 2 * 0.183709],
-        inertia=[1.00043e-4, 3.14160e-4, 1.68739e-4],
-        gravity=9.80834,
-        name="multiarm-triple",
-        convention=("absolute", "hanging"),
-        position_quantum=_MULTIARM_QUANTUM,
-    )
+    """Triple pendulum of the MultiArm-Pendulum bench (Kaheman et al., arXiv 2205.06231)."""
+    return _multiarm(
+        "triple", [0.258172, 0.279428, 0.118624], [0.160000, 0.202939, 0.183709],
+        [1.00043e-4, 3.14160e-4, 1.68739e-4], [0.172800, 0.228700], 9.80834,
+    )  # fmt: skip
 
 
 # m [kg], r = joint to mass centre [m], l = lengths [m], I about the joint [kg m^2], Ir = rotor
@@ -249,7 +245,11 @@ def by_name(name: str) -> Plant:
         ValueError: for a name that is none of `names()`.
     """
     if name not in _RIGS:
-        raise ValueError(f"no rig {name!r}; there are {', '.join(_RIGS)}, or give a rig file.")
+        near = difflib.get_close_matches(str(name), _RIGS, 1)
+        hint = f" Did you mean {near[0]}?" if near else ""
+        raise ValueError(
+            f"no rig {name!r}; there are {', '.join(_RIGS)}, or give a rig file.{hint}"
+        )
     return _RIGS[name]()
 
 
@@ -258,12 +258,7 @@ _KINDS: dict[str, type[PendulumChain] | type[LinearAxis]] = {
 }
 # Far beyond any rig; the memory of a chain's matrices grows with the square of its links.
 LARGEST_FILE, MOST_LINKS, LARGEST_NUMBER = 2**20, 100, 1e30
-_TEXTS, _LISTS_OF_TEXT, _TABLES = (
-    ("kind", "name"),
-    ("convention", "joint_names"),
-    ("arm", "buffers"),
-)
-_MAY_BE_NULL = ("com", "inertia", "arm", "armature", "joint_names", "position_quantum")
+_TEXTS = ("kind", "name", "convention", "joint_names")
 
 
 def from_dict(data: Mapping[str, Any]) -> Plant:
@@ -272,15 +267,16 @@ def from_dict(data: Mapping[str, Any]) -> Plant:
     Raises:
         ValueError: for an unknown kind, missing or unknown keys, or impossible values.
     """
-    for key, value in data.items():
-        _check_entry(key, value)
     kind = data.get("kind", "chain")
-    if kind not in _KINDS:
-        raise ValueError(f"rig: no kind {_short(kind)}; there are {sorted(_KINDS)}.")
+    if not isinstance(kind, str) or kind not in _KINDS:
+        raise ValueError(f"rig: no kind {reprlib.repr(kind)}; there are {sorted(_KINDS)}.")
+    for key, value in data.items():
+        if key not in _TEXTS:
+            _check_numbers(key, value)
     try:
         return _KINDS[kind].from_dict(data)
     except RuntimeError as error:  # torch, of shapes that do not fit
-        raise ValueError(f"its values do not fit together ({_short(error)}).") from error
+        raise ValueError(f"its values do not fit together ({str(error)[:300]}).") from error
 
 
 def read(path: str | Path) -> Plant:
@@ -293,24 +289,20 @@ def read(path: str | Path) -> Plant:
         ImportError: for an MJCF where MuJoCo is not installed.
     """
     path = Path(path)
-    if path.suffix.lower() in robot_file.ENDINGS:
-        try:
-            return robot_file.read_robot(path)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
-    if path.is_file() and path.stat().st_size > LARGEST_FILE:
-        # Before it is read into memory.
-        raise ValueError(f"{path}: rig files are at most {LARGEST_FILE} bytes.")
-    content = path.read_bytes()
     try:
-        data = _parse(content.decode(), path.suffix.lower())
+        if path.suffix.lower() in robot_file.ENDINGS:
+            return robot_file.read_robot(path)
+        if path.is_file() and path.stat().st_size > LARGEST_FILE:
+            # Before it is read into memory.
+            raise ValueError(f"rig files are at most {LARGEST_FILE} bytes.")
+        data = _parse(path.read_bytes().decode(), path.suffix.lower())
         if not isinstance(data, dict):
             raise ValueError("a rig file holds one table of keys and values.")
         return from_dict(data)
     except RecursionError:
         raise ValueError(f"{path}: nested too deeply for a rig.") from None
     except ValueError as error:  # those of JSON, TOML and Unicode too
-        raise ValueError(f"{path}: {_short(error)}") from error
+        raise ValueError(f"{path}: {str(error)[:600]}") from error
 
 
 def write(plant: Plant, path: str | Path) -> None:
@@ -326,23 +318,16 @@ def write(plant: Plant, path: str | Path) -> None:
     write_atomically(path, (json.dumps(plant.to_dict(), indent=2) + "\n").encode())
 
 
-def _check_entry(key: str, value: Any) -> None:
-    """Refuse an entry of the wrong type, before it is taken for numbers or names."""
-    if value is None and key in _MAY_BE_NULL:
-        return
-    if key in _TEXTS:
-        sound, wanted = isinstance(value, str), "text"
-    elif key in _LISTS_OF_TEXT:
-        sound = isinstance(value, (list, tuple)) and all(isinstance(v, str) for v in value)
-        wanted = "a list of texts"
-    elif key in _TABLES:
-        sound, wanted = isinstance(value, Mapping), "a table"
-        for name, numbers in value.items() if sound else ():
-            _check_entry(f"{key}.{name}", numbers)
-    else:
-        sound, wanted = _are_numbers(value), f"finite numbers, at most {MOST_LINKS} in a row"
-    if not sound:
-        raise ValueError(f"`{key[:100]}` must be {wanted}, got {_short(value)}.")
+def _check_numbers(key: str, value: Any) -> None:
+    """Refuse numbers that torch would take and no rig has: booleans, and lists without end."""
+    if isinstance(value, Mapping):
+        for name, entry in value.items():
+            _check_numbers(f"{key}.{name}", entry)
+    elif value is not None and not _are_numbers(value):
+        raise ValueError(
+            f"`{key[:100]}` must be finite numbers, at most {MOST_LINKS} in a row, "
+            f"got {reprlib.repr(value)}."
+        )
 
 
 def _are_numbers(value: Any, depth: int = 0) -> bool:
@@ -355,11 +340,6 @@ def _are_numbers(value: Any, depth: int = 0) -> bool:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
     return abs(value) <= LARGEST_NUMBER  # false of NaN
-
-
-def _short(value: object) -> str:
-    text = str(value) if isinstance(value, Exception) else repr(value)
-    return text if len(text) <= 300 else f"{text[:297]}..."
 
 
 def _parse(text: str, suffix: str) -> Any:

@@ -23,8 +23,7 @@ Array = NDArray[np.float64]
 
 ENDINGS = (".urdf", ".xml", ".mjcf")
 LARGEST_FILE = 64 * 2**20
-GRAVITY = np.array([0.0, 0.0, -9.81])
-"""URDF has none; its world has z up (REP 103) [m/s^2]."""
+GRAVITY = np.array([0.0, 0.0, -9.81])  # of URDF, which gives none but has z up (REP 103) [m/s^2]
 
 _HINGES = ("revolute", "continuous")
 # Elements that generate many bodies, or read other files as descriptions.
@@ -79,11 +78,7 @@ def parse_xml(path: Path, *, comments: bool = False) -> Element:
 
 
 def urdf_links(robot: Element) -> list[HingedLink]:
-    """The hinged links of a robot, with the bodies fixed to them.
-
-    Its root link is the ground. Limits, friction and transmissions are not read: friction is no
-    part of a plant.
-    """
+    """The hinged links of a robot, with the bodies fixed to them; its root link is the ground."""
     links = _named(robot, "link")
     children: dict[str, list[Element]] = {name: [] for name in links}
     carried: set[str] = set()
@@ -100,7 +95,8 @@ def urdf_links(robot: Element) -> list[HingedLink]:
     found: list[HingedLink] = []
     reached = 0
     # Link, its frame in the world, and the hinge that moves it.
-    waiting: list[tuple[str, Array, Array, int | None]] = [(roots[0], np.eye(3), np.zeros(3), None)]
+    waiting: list[tuple[str, Array, Array, int | None]]
+    waiting = [(roots[0], np.eye(3), np.zeros(3), None)]
     while waiting:
         name, turn, place, mover = waiting.pop()
         reached += 1
@@ -163,14 +159,10 @@ def _origin(element: Element, what: str) -> tuple[Array, Array]:
     roll, pitch, yaw = _numbers(given, "rpy", what, "0 0 0").tolist()
     sr, cr, sp, cp = math.sin(roll), math.cos(roll), math.sin(pitch), math.cos(pitch)
     sy, cy = math.sin(yaw), math.cos(yaw)
-    rotation = np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
-    )
-    return rotation, _numbers(given, "xyz", what, "0 0 0")
+    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    return about_z @ about_y @ about_x, _numbers(given, "xyz", what, "0 0 0")
 
 
 def _numbers(
@@ -215,8 +207,7 @@ def _link(joint: Element, end: str, name: str, links: dict[str, Element]) -> str
 def mjcf_links(path: Path, root: Element) -> tuple[list[HingedLink], Array, str]:
     """The hinged links of an MJCF at its reference pose, its gravity [m/s^2], and its name.
 
-    Read by MuJoCo's own compiler, which knows default classes, geoms and meshes. Damping, friction
-    loss, limits, contacts and actuators are not read: friction is no part of a plant.
+    Read by MuJoCo's own compiler, which knows default classes, geoms and meshes.
     """
     for element in root.iter():
         name = element.get("name", "")

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from nfriction.plant import Arm, PendulumChain, gears, rigs
+from nfriction.plant import Arm, PendulumChain, dynamics, rigs
 
 FULL_TENSOR = [
     [0.002, 0.0388, 0.04, 0.0004, 0.00032, -0.00024],
@@ -83,7 +83,7 @@ def test_inverse_dynamics_undoes_forward_dynamics(rig: PendulumChain, seed: int)
 def test_forward_dynamics_is_mass_matrix_and_bias(arm: Any) -> None:
     rig = every_kind(arm)
     q, qd, tau = states(rig.joints)
-    loss = rig.gear_loss * tau.abs() * torch.tanh(qd / gears.SIGN_WIDTH)
+    loss = rig.gear_loss * tau.abs() * torch.tanh(qd / dynamics.SIGN_WIDTH)
     rhs = rig.torque_gain * (tau - loss) + rig.torque_offset - rig.bias(q, qd)
     expected = torch.linalg.solve(rig.mass_matrix(q), rhs)
     torch.testing.assert_close(rig(q, qd, tau), expected, rtol=1e-10, atol=1e-10)

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nfriction.plant import PendulumChain, rigs
-from nfriction.plant.drag import square_moments
+from nfriction.plant.dynamics import square_moments
 
 SPEEDS = st.floats(-20, 20).filter(lambda v: v == 0 or abs(v) > 1e-9)
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from nfriction import PendulumChain, rigs, rollout
-from nfriction.plant.gears import correct_encoder
+from nfriction.plant.dynamics import correct_encoder
 
 F64 = torch.float64
 COSINE, SINE = torch.tensor([2e-3, -1e-3, 3e-3], dtype=F64), torch.tensor([1e-3] * 3, dtype=F64)

@@ -2,7 +2,7 @@
 
 import torch
 
-from nfriction.plant.gears import SIGN_WIDTH, joint_torque, motor_torque
+from nfriction.plant.dynamics import SIGN_WIDTH, joint_torque, motor_torque
 
 F64 = torch.float64
 GAIN, LOSS = torch.tensor([1.1, 0.9], dtype=F64), torch.tensor([0.1, 0.4], dtype=F64)

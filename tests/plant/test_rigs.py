@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction.plant import LinearAxis, PendulumChain, rigs
+from nfriction.plant import Arm, LinearAxis, PendulumChain, rigs
 
 
 @pytest.mark.filterwarnings("error")
@@ -146,3 +146,63 @@ def test_a_rig_file_may_hold_drag(tmp_path: Path) -> None:
     data = {"mass": [1.0], "length": [1.0], "buffers": {"drag_quadratic": [0.1]}}
     rig = rigs.read(write(tmp_path / "rig.json", json.dumps(data)))
     assert rig.has_drag
+
+
+def test_a_mistyped_rig_or_key_gets_the_nearest_one(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="Did you mean multiarm-double"):
+        rigs.by_name("multiarm_double")
+    text = '{"mass": [1], "lenght": [1]}'
+    with pytest.raises(ValueError, match=r"unknown keys \['lenght'\], did you mean length\?"):
+        rigs.read(write(tmp_path / "rig.json", text))
+    with pytest.raises(ValueError, match=r"rig: missing keys \['mass'\]; required"):
+        rigs.read(write(tmp_path / "rig.json", '{"length": [1]}'))
+
+
+HUGE = "1" + "0" * 400  # a whole number in JSON, beyond every float
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f'{{"mass": [{HUGE}], "length": [1]}}',
+        f'{{"mass": [1], "length": [1], "gravity": {HUGE}}}',
+        f'{{"mass": [1], "length": [1], "inertia": [[{HUGE}, 0, 0, 0, 0, 0]]}}',
+        f'{{"mass": [1], "length": [1], "arm": {{"inertia": {HUGE}, "length": 1}}}}',
+        f'{{"mass": [1], "length": [1], "buffers": {{"armature": [{HUGE}]}}}}',
+        f'{{"kind": "axis", "mass": {HUGE}}}',
+    ],
+)
+def test_numbers_beyond_every_float_are_refused_in_short(text: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"rig\.json: .* must be") as refusal:
+        rigs.read(write(tmp_path / "rig.json", text))
+    assert len(str(refusal.value)) < 400
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"mass": [10**400]}, "`mass` must be one or more numbers"),
+        ({"inertia": [10**400]}, "`inertia` must be numbers"),
+        ({"gravity": math.nan}, "`gravity` must be positive and finite"),
+        ({"joint_names": "a"}, "`joint_names` must be a list of texts"),
+        ({"joint_names": [1]}, "`joint_names` must be a list of texts"),
+        ({"convention": "ab"}, "`convention` must be a list of texts"),
+        ({"convention": None}, "`convention` must be a list of texts"),
+        ({"name": 3}, "`name` must be text"),
+        ({"position_quantum": [1e-4, 1e-4]}, "`position_quantum` must be"),
+    ],
+)
+def test_python_arguments_are_checked_like_those_of_files(changed: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        PendulumChain(**({"mass": [1.0], "length": [1.0]} | changed))
+
+
+def test_an_arm_of_no_number_is_refused() -> None:
+    for value in (math.inf, math.nan, -1.0, 10**400, "1"):
+        with pytest.raises(ValueError, match="`arm's length` must be"):
+            Arm(1.0, value)  # type: ignore[arg-type]
+
+
+def test_states_that_are_no_tensors_are_refused_by_name() -> None:
+    with pytest.raises(ValueError, match=r"`q` must be \(\*batch, 1\), a tensor .*got \[0\.1\]"):
+        rigs.xl330().load([0.1], [0.0])  # type: ignore[arg-type]
