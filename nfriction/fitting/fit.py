@@ -1,6 +1,14 @@
 """Fit a friction model to recordings: check them, then run the strategy of its coefficients.
 
-The next step is `nfriction.fitting.shooting.problem`, the cost that the strategies minimise.
+A fit has two stages. *Equation error*: the smoothed motion implies the friction torque
+
+    tau_f = tau - M(q) qdd - bias(q, qd),
+
+in which constant coefficients are linear, so regression finds them from any start, but biased by
+the noise of qdd. *Output error*: simulations from the start of short windows must follow the
+measured positions; this refines coefficients and plant without any derivative of the data. A
+strategy, one for each kind of coefficients (constant, neuro-fuzzy), says what is fitted in which
+order. The next step is `nfriction.fitting.shooting.problem`, the cost of the second stage.
 """
 
 import pkgutil
@@ -85,9 +93,9 @@ def fit(
 ) -> FitResult:
     """Estimate a friction model from recordings.
 
-    Regression on the friction torque that the smoothed motion implies gives constant coefficients;
-    simulated windows of growing length then refine them and the plant. Nonlinear laws are also
-    started from their nested law; the lowest residual wins. A neuro-fuzzy model starts at the
+    Equation error gives constant coefficients; output error over windows of growing length then
+    refines them and the plant. Laws with several minima are also started from the simpler law that
+    they contain (`Law.nested_law`); the lowest residual wins. A neuro-fuzzy model starts at the
     constant fit of its law and is kept only if its hold-out RMSE is 20 % below the law's; its
     plant prior is relaxed only for a further 20 %. An adaptive model starts at the constant fit,
     too; `fit_adaptive` has its further settings.

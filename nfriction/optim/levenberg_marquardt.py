@@ -1,14 +1,16 @@
 """Levenberg-Marquardt on a local quadratic model, with bounds and an honest status.
 
-Near a point x, a sum of squares 1/2 |r|^2 is almost the quadratic of its gradient J^T r and its
-Gauss-Newton Hessian J^T J. One iteration
+Near a point x, a sum of squares 1/2 |r|^2 is almost the quadratic of its gradient g = J^T r and its
+Gauss-Newton Hessian H = J^T J. One iteration
 
-1. minimises that quadratic within the bounds, plus a damping that keeps the step short;
-2. evaluates the cost there, and takes the step only if the cost falls;
+1. minimises g^T p + 1/2 p^T (H + damping D) p within the bounds, with D the largest diagonal of H
+   so far: a strong damping keeps the step p short;
+2. evaluates the cost at x + p, and takes the step only if the cost falls;
 3. lowers the damping where the quadratic predicted the fall well, else raises it.
 
 The solver asks for cost, gradient and Hessian instead of a residual Jacobian, so that callers may
-accumulate 40,000 samples in pieces and never hold one.
+accumulate 40,000 samples in pieces and never hold one. The next step is
+`nfriction.evaluation.score`, which tests the fitted model on other recordings.
 """
 
 from __future__ import annotations

@@ -1,4 +1,14 @@
-"""Runge-Kutta steps in torch, and the largest friction slope over velocity that they integrate."""
+"""One Runge-Kutta step of a mechanism with friction, and the steps over a whole motion in torch.
+
+A step integrates
+
+    qdd = M(q)^-1 (tau - tau_f - bias(q, qd)),    tau_f = f(qd, load(q, qd), c),
+
+which the plant solves for qdd (`forward_dynamics`), with the coefficients c of the friction law f
+and the torque tau held over the step. Near rest friction is steep, of a slope F_c / v_smooth; that
+limits the length of a step. The next step is `nfriction.simulation.rollout`, which checks the
+inputs and chooses between these steps and compiled ones.
+"""
 
 from collections.abc import Callable
 
@@ -22,7 +32,7 @@ def required_substeps(plant: Plant, friction: Friction, sample_time: float) -> i
     """Integration steps per sample that keep friction stable where it is steepest, at rest.
 
     Linearised there, friction damps each joint: M(q) d(qd)/dt = -D qd. Its fastest mode decays at
-    the largest eigenvalue of M^-1 D, over all poses, which a step must resolve.
+    the largest eigenvalue lambda of M^-1 D, over all poses, so h lambda must stay below 2.785.
     """
     rate = plant.decay_rate(friction.zero_velocity_damping())
     return max(1, int(torch.ceil(rate.max() * (sample_time / RK4_STABILITY * (1 - 1e-9)))))
@@ -31,7 +41,7 @@ def required_substeps(plant: Plant, friction: Friction, sample_time: float) -> i
 def acceleration(
     plant: Plant, friction: Friction, q: Tensor, qd: Tensor, tau: Tensor, coefficients: Tensor
 ) -> Tensor:
-    """Joint acceleration with friction whose coefficients are given [rad/s^2], (*batch, joint)."""
+    """Joint acceleration under given coefficients of friction [rad/s^2], (*batch, joint)."""
     tau_f = friction.torque(qd, plant.load(q, qd), coefficients)
     return plant.forward_dynamics(q, qd, tau - tau_f)
 
@@ -101,6 +111,7 @@ def simulate_eager(
             measured = inputs.measured[0][..., k, :], inputs.measured[1][..., k, :]
         if stateful is not None:
             # A hidden state advances with the samples, as in a controller, not with the substeps.
+            # It follows the simulated motion or, as in the papers, the measured one.
             drive = measured or (qd, qdd)
             if hidden is None:
                 hidden = stateful.initial_state(*drive)

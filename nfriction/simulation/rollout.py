@@ -2,7 +2,8 @@
 
 Coefficients that depend on the motion are held over a step, as a controller at the sample rate
 would hold them; that also breaks the loop in which friction needs the acceleration and the
-acceleration needs friction.
+acceleration needs friction. The next step is `nfriction.fitting.fit`: the coefficients with which
+such a simulation follows a recording.
 """
 
 import logging
@@ -43,8 +44,8 @@ class Rollout:
         qd: joint velocity [rad/s], same shape.
         qdd: joint acceleration known at each sample, that of the step before (at the start: without
             friction) [rad/s^2], same shape; with `qd` it drives the coefficients.
-        diverged_at: time [s] at which a candidate stopped being finite, infinity where it never
-            did, shape (*batch,).
+        diverged_at: time [s] at which a motion of the batch stopped being finite, infinity where
+            it never did, shape (*batch,).
     """
 
     time: Tensor
@@ -55,7 +56,7 @@ class Rollout:
 
     @property
     def diverged(self) -> Tensor:
-        """True for candidates that diverged, shape (*batch,)."""
+        """True for motions that diverged, shape (*batch,)."""
         return torch.isfinite(self.diverged_at)
 
 
@@ -114,7 +115,7 @@ def rollout(
         progress: show a progress bar (eager torch only; compiled rollouts take milliseconds).
 
     Returns:
-        Rollout with `q` and `qd` of shape (*batch, steps + 1, joint). A diverging candidate is no
+        Rollout with `q` and `qd` of shape (*batch, steps + 1, joint). A motion that diverges is no
         error: it is NaN from `diverged_at` on.
 
     Raises:

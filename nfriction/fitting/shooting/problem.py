@@ -1,8 +1,16 @@
-"""Output error by multiple shooting: a cost and its Gauss-Newton model, without hidden state.
+"""Output error by multiple shooting: a cost and its Gauss-Newton model.
 
-Each window starts from a state of its own, because the motion of a light mechanism forgets its
-start within seconds. Where one window begins as another ends, their defect may be penalised.
-Every method takes the vector of decision variables; neither plant nor friction model changes.
+A recording is cut into windows. Each is simulated from a state of its own, because the motion of a
+light mechanism forgets its start within seconds. The decision variables x are the friction
+parameters, the plant terms, each window's initial state and the encoders' offsets, and the cost is
+
+    J(x) = 1/2 sum |C (q_sim(t; x) - q(t))|^2 / noise_sd^2      over windows and samples
+         + 1/2 sum |defect|^2 / defect_sd^2                     where windows meet, if asked for
+         + 1/2 sum (x - mean)^2 / sd^2                          priors
+
+with C the matrix from joint to recorded coordinates, and a defect the jump of the state from the
+end of a window to the start of the next. Every method takes x; plant and friction model stay as
+they are. The next step is `nfriction.optim.levenberg_marquardt`, which minimises J.
 
 References:
     H. G. Bock, in: Modelling of Chemical Reaction Systems, Springer (1981), 102-125.
@@ -49,14 +57,14 @@ class ShootingProblem:
         measurement: matrix (joint, joint) from joint coordinates to the recorded ones, in which
             errors count.
         substeps: integration steps per sample.
-        stride: samples per counted one, which weighs as many: model errors last far longer than a
-            sample, and the sums over many parameters dominate the cost of a step.
+        stride: every so many samples one counts, with that weight: model errors last far longer
+            than a sample, and sums over many parameters dominate the time of a step.
         friction_prior, plant_prior, offset_sd: see `DecisionVariables`.
         defect_sd: of position and velocity from the end of a window to the start of the next
             [rad, rad/s; m, m/s]; None leaves windows apart.
         extrapolation: prior of a neuro-fuzzy schedule where there are no data.
-        memory: of the coefficients at the start of each window, (window, joint, state_size), of a
-            schedule with one. It advances with every integration step.
+        memory: hidden state of the coefficients (see `Schedule`) at the start of each window,
+            (window, joint, state_size); None of a schedule without. It advances with every step.
         options: priors of the initial states.
     """
 
