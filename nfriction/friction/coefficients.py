@@ -70,6 +70,7 @@ class Schedule(nn.Module, ABC):
             else (SMALLEST if c.positive else -math.inf, math.inf)
             for c in law.coefficients
         ]
+        # Not in model files: it follows from the law.
         positive = torch.tensor([c.positive for c in law.coefficients])
         self.register_buffer("positive", positive, persistent=False)
 
@@ -95,6 +96,7 @@ class Schedule(nn.Module, ABC):
 
     def states(self, qd: Tensor, qdd: Tensor) -> Tensor:
         """Hidden state after every sample of a motion (sample, joint): (sample, joint, state)."""
+        # One by one, as each state needs the one before; a subclass may know a closed form.
         rows = [self.initial_state(qd[0], qdd[0])]
         for v, a in zip(qd[1:], qdd[1:], strict=True):
             rows.append(self.advance(v, a, rows[-1]))
@@ -102,6 +104,7 @@ class Schedule(nn.Module, ABC):
 
     def rest_coefficients(self) -> Tensor:
         """Every set of coefficients that is possible at rest, (*set, joint, coefficient)."""
+        # Without parameters a schedule has no dtype of its own.
         like = next(self.parameters(), torch.zeros((), dtype=torch.float64))
         rest = torch.zeros(self.joints, dtype=like.dtype, device=like.device)
         coefficients: Tensor = self(rest, torch.zeros_like(rest))
@@ -175,6 +178,7 @@ class Tabulated(Schedule):
         shape = (joints, *cells, len(law.names))
         self.raw = nn.Parameter(torch.zeros(shape, dtype=torch.float64))
         if initial is None:
+            # Small, yet felt: a gradient step on the logarithm of zero would not leave it.
             initial = [
                 c.initial_grid[len(c.initial_grid) // 2] if c.initial_grid else 1e-3 * c.positive
                 for c in law.coefficients
@@ -213,6 +217,7 @@ class Tabulated(Schedule):
 
     def bounds(self) -> tuple[Tensor, Tensor]:
         values = self.values
+        # Bounds that meet keep a coefficient; solvers need no other way to leave one out.
         fitted = torch.tensor(self.fitted_mask, device=values.device)
         lower, upper = (
             torch.where(fitted, limit, values).reshape(-1)

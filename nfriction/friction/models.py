@@ -69,6 +69,7 @@ class FrictionModel(nn.Module):
         """
         if not torch.jit.is_scripting():
             qd, qdd, load = (_as_tensor(x) for x in (qd, qdd, load))
+        # A single velocity would broadcast to all joints' coefficients without a word.
         width = qd.shape[-1] if qd.ndim else 0
         if width != self.joints:
             raise ValueError(
@@ -105,11 +106,12 @@ class FrictionModel(nn.Module):
         It decides whether an explicit integrator is stable near standstill. The largest, where
         several sets of coefficients are possible at rest.
         """
-        held = self.schedule.rest_coefficients().detach()
-        rest = held.new_zeros(held.shape[:-1])
-        load = torch.ones_like(rest)
-        with torch.enable_grad():
-            qd = rest.requires_grad_()
+        # A caller may have switched gradients off, even for good (`torch.inference_mode`).
+        with torch.inference_mode(False), torch.enable_grad():
+            held = self.schedule.rest_coefficients().detach().clone()
+            qd = held.new_zeros(held.shape[:-1]).requires_grad_()
+            # At rest no load exceeds 1, the link's own weight.
+            load = torch.ones_like(qd)
             # A law is elementwise, so the sum's gradient is each joint's slope.
             slope = torch.autograd.grad(self.torque(qd, load, held).sum(), qd)[0]
         return slope.reshape(-1, self.joints).amax(0)

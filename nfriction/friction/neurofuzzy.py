@@ -118,10 +118,12 @@ class NeuroFuzzy(Schedule):
         for name in ("velocity_range", "acceleration_lower", "acceleration_upper"):
             self.register_buffer(name, torch.ones(joints, dtype=torch.float64))
         self.set_reference(Constant(law, joints, initial).values)
+        # As wide as the papers' motion; a fit sets the range of its recordings.
         self.set_range(20.0, [-200.0, 200.0])
 
     def scaled(self, qd: Tensor, qdd: Tensor) -> Tensor:
         """Inputs over their trained range, within it in [0, 1], shape (*batch, joint, 2)."""
+        # Of |velocity|, so that friction is odd in the velocity without any training.
         velocity = qd / self.velocity_range
         if self.along_motion:
             qdd = qdd * torch.tanh(velocity / self.turn)
@@ -188,6 +190,7 @@ class NeuroFuzzy(Schedule):
         size = values.abs()
         if scale is not None:
             size = torch.maximum(size, scale.to(size))
+        # A coefficient of zero has no size to be a unit.
         self.scale.copy_(torch.where(size > 0, size, torch.ones_like(size)))
         ratio = values / self.scale
         lifted = smooth_relu_inverse(ratio.clamp_min(least), self.roundness)
@@ -265,6 +268,7 @@ class NeuroFuzzy(Schedule):
 
     def bounds(self) -> tuple[Tensor, Tensor]:
         vector = self.parameter_vector()
+        # The network of a coefficient that is not fitted stays where it started.
         mask = torch.tensor(self.fitted_mask, device=vector.device)[:, None]
         fitted = torch.cat(
             [mask.expand(self.joints, -1, p[0, 0].numel()).reshape(-1) for p in self.trained()]
@@ -310,6 +314,7 @@ class NeuroFuzzy(Schedule):
         x = scaled.clamp(0.0, 1.0)
         beyond = scaled - x
         by_x = self.network.input_jacobian(x.reshape(-1, self.joints, 2)).permute(3, 0, 1, 2)
+        # A clamped input no longer moves the network, only the weight of its output.
         weight = taper(beyond, self.reach)[..., None] * (beyond == 0.0)
         slope = taper_slope(beyond, self.reach)
         by_x = by_x.reshape(*x.shape[:-1], -1, 2) * weight[..., None, :]
@@ -323,6 +328,7 @@ class NeuroFuzzy(Schedule):
         y = anfis(x)
         both = torch.cat([x, y], -1)
         with torch.enable_grad():
+            # The map to coefficients is elementwise, so the sum's gradient is its slope.
             u = (reference + weight * (y + head(both))).detach().requires_grad_()
             coefficients = self.to_coefficients(u)
             (by_u,) = torch.autograd.grad(coefficients.sum(), u)

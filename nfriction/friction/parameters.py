@@ -16,6 +16,7 @@ def positive_number(name: str, value: object, unit: str = "") -> float:
     try:
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
+        # NaN fails every comparison, so one message covers all.
         number = math.nan
     if not 0 < number < math.inf:
         unit = f" [{unit}]" if unit else ""
@@ -40,6 +41,7 @@ def checked_coefficients(
             f"coefficients must be an array of numbers, got {reprlib.repr(values)}."
         ) from error
     joints, count = like.shape[0], like.shape[-1]
+    # Before any broadcast: one column would silently be taken for all coefficients.
     if given.shape not in (like.shape, (joints, count), (count,)):
         whole = "" if like.ndim == 2 else f"the whole table {tuple(like.shape)}, "
         raise ValueError(
@@ -95,6 +97,7 @@ class Sensitivity:
     @property
     def parameters(self) -> Tensor:
         """By the parameter vector, multiplied out, (sample, coefficient, parameter)."""
+        # Large, but only short stretches are asked for whole; sums over a motion use `contract`.
         whole = [torch.einsum("sjko,sjf->skjof", *factor).flatten(2) for factor in self.factors]
         return torch.cat(whole, -1)
 

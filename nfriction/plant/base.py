@@ -204,19 +204,15 @@ class LinearAxis(Plant):
         mass: moved mass, the drive's inertia included [kg].
         torque_offset: constant force added to tau [N].
         name, joint_names, position_quantum: see `Plant`.
-
-    Attributes:
-        mass: (1,) [kg].
-        torque_offset: (1,) [N].
-        asymmetry: difference in viscous resistance between the two directions, (1,) [N s/m]; zero
-            unless `replace` sets it. With viscous friction B it is passive up to B.
     """
 
     kind = "axis"
     required = ("mass",)
     optional = ("torque_offset", "name", "joint_names", "position_quantum")
 
-    mass: Tensor
+    mass: Tensor  # (1,) [kg]
+    # Difference in viscous resistance between the two directions, (1,) [N s/m]; zero unless
+    # `replace` sets it. With viscous friction B it is passive up to B.
     asymmetry: Tensor
 
     def __init__(

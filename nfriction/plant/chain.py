@@ -17,7 +17,7 @@ from nfriction.plant.inertia import fastest_mode, inertia_tensors, require_posit
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-# Zero in a new chain, and set by `replace`: a fit finds them, no user knows them.
+# Zero in a new chain.
 _PER_JOINT = ("angle_offset", "encoder_cosine", "encoder_sine", "gear_loss", "torque_offset")
 # Least gravity [m/s^2], as loads are in units of a link's weight.
 WEIGHTLESS = 1e-6
@@ -52,11 +52,12 @@ class PendulumChain(Plant):
     """Frictionless equations of motion M(q) qdd + bias(q, qd) = tau + torque_offset.
 
     Joint coordinates: with a free arm, column 0 is its angle about the vertical; the first link
-    is measured from upright, each further one relative to the link before. Friction is not part
-    of a plant (a rollout subtracts it from tau). Air drag, gears and eccentric encoders are, once
-    `replace` sets them: with gears, tau is the torque at the joint; with eccentric encoders, inputs
-    and outputs are encoder angles, except that `mass_matrix`, `bias` and `gravity` are those over
-    the true angles at that reading.
+    is measured from upright, each further one relative to the link before. Air drag, gears and
+    eccentric encoders are part of a plant once `replace` sets them. With gears, methods take and
+    give the motors' torques, from which friction is subtracted at the motor side, as a controller
+    commands it; tau above is their torque at the joints. With eccentric encoders, inputs and
+    outputs are encoder angles, except that `mass_matrix`, `bias` and `gravity` are those over the
+    true angles at that reading.
 
     Args:
         mass: of each link [kg].
@@ -71,21 +72,7 @@ class PendulumChain(Plant):
         convention: of the recordings' columns, see `Plant`.
         joint_names, name, position_quantum: see `Plant`.
 
-    Attributes:
-        inertia_coupling: a_ij, (links, links) [kg m^2]; only the upper triangle is read.
-        gravity_moment: g b_i, (links,) [N m].
-        armature: (joints,) [kg m^2].
-        angle_offset: added to q before the geometry is evaluated, (joints,) [rad].
-        encoder_cosine, encoder_sine: eccentricity, see `correct_encoder`, (joints,) [rad].
-        torque_gain, gear_loss: of gears, see `joint_torque`, (joints,) [-]. Friction is then that
-            at the motor side, as a controller commands it.
-        torque_offset: added to tau at the joints, (joints,) [N m].
-        drag_linear, drag_quadratic: k1 [N s/m^2], k2 [N s^2/m^3] per link.
-        length: (links,) [m].
-        load_lever: l_i / g, (links,) [s^2].
-        arm_inertia: J0, the arm with the links' masses at its end, () [kg m^2]; with an arm only.
-        arm_lever: L1 / g, () [s^2], so that L1 b_i follows `gravity_moment`; with an arm only.
-        inertia_tensor: (links, 6) [kg m^2]; with an arm only.
+    The constants of the equations are buffers, listed below with their units.
 
     Raises:
         ValueError: for values that are not positive, of another shape, or whose mass matrix is
@@ -100,22 +87,27 @@ class PendulumChain(Plant):
     optional = ("com", "inertia", "gravity", "arm", "armature", "convention", "joint_names",
                 "name", "position_quantum")  # fmt: skip
 
-    inertia_coupling: Tensor
-    gravity_moment: Tensor
-    armature: Tensor
-    angle_offset: Tensor
-    encoder_cosine: Tensor
-    encoder_sine: Tensor
-    encoder_zero: Tensor
-    torque_gain: Tensor
-    gear_loss: Tensor
-    drag_linear: Tensor
-    drag_quadratic: Tensor
-    length: Tensor
-    load_lever: Tensor
+    # Constants of the equations; those of a mechanism as given follow from its arguments.
+    inertia_coupling: Tensor  # a_ij, (links, links) [kg m^2]; only the upper triangle is read
+    gravity_moment: Tensor  # g b_i, (links,) [N m]
+    armature: Tensor  # (joints,) [kg m^2]
+    length: Tensor  # (links,) [m]
+    load_lever: Tensor  # l_i / g, (links,) [s^2]
+    # With an arm only: J0, the arm with the links' masses at its end, () [kg m^2], and L1 / g,
+    # () [s^2], so that L1 b_i follows `gravity_moment`.
     arm_inertia: Tensor
     arm_lever: Tensor
-    inertia_tensor: Tensor
+    inertia_tensor: Tensor  # (links, 6) [kg m^2]
+    # Set by `replace` alone: a fit finds them, no user knows them.
+    angle_offset: Tensor  # added to q before the geometry is evaluated, (joints,) [rad]
+    encoder_cosine: Tensor  # eccentricity, see `dynamics.correct_encoder`, (joints,) [rad]
+    encoder_sine: Tensor
+    encoder_zero: Tensor  # cosine of the coordinate at hanging, (joints,)
+    torque_gain: Tensor  # of gears, see `dynamics.joint_torque`, (joints,) [-]
+    gear_loss: Tensor
+    torque_offset: Tensor  # added to tau at the joints, (joints,) [N m]
+    drag_linear: Tensor  # k1, (links,) [N s/m^2]
+    drag_quadratic: Tensor  # k2, (links,) [N s^2/m^3]
 
     def __init__(
         self,

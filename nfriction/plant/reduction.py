@@ -39,25 +39,15 @@ class RigidBody:
 
 @dataclass
 class HingedLink:
-    """A hinge and all bodies that turn with it, at the pose in which the file describes it.
+    """A hinge and all bodies that turn with it, at the pose in which the file describes it."""
 
-    Attributes:
-        name: of the joint.
-        parent: index of the link that carries the hinge; None for the ground.
-        axis: unit vector in the world, (3,).
-        anchor: a point of the axis in the world, (3,) [m].
-        armature: rotor inertia seen at the joint [kg m^2].
-        reading: the joint's coordinate at this pose [rad].
-        bodies: those that turn with it and with no later hinge.
-    """
-
-    name: str
-    parent: int | None
-    axis: Array
-    anchor: Array
-    armature: float = 0.0
-    reading: float = 0.0
-    bodies: list[RigidBody] = field(default_factory=list)
+    name: str  # of the joint
+    parent: int | None  # index of the link that carries the hinge; None for the ground
+    axis: Array  # unit vector in the world, (3,)
+    anchor: Array  # a point of the axis in the world, (3,) [m]
+    armature: float = 0.0  # rotor inertia seen at the joint [kg m^2]
+    reading: float = 0.0  # the joint's coordinate at this pose [rad]
+    bodies: list[RigidBody] = field(default_factory=list)  # those that no later hinge turns
 
     def whole(self) -> RigidBody:
         """All bodies as one."""

@@ -8,9 +8,10 @@ default) or `LinearAxis` (kind "axis"), in SI units:
      "position_quantum": 1.571e-4}
 
 Only `mass` and, for a chain, `length` are required; angles of a chain without a `convention` are
-relative, from upright. `buffers` may hold values in place of derived constants, such as
-`{"drag_quadratic": [0.01, 0.01]}`; a fitted plant is written so. Robot descriptions (URDF, MJCF)
-are read, too.
+relative, from upright. A geared motor adds `armature`, its rotor's inertia times the gear ratio
+squared, per joint [kg m^2]. A balanced rotor is a chain of one link with `"com": [0]`. `buffers`
+may hold values in place of derived constants, such as `{"drag_quadratic": [0.01, 0.01]}`; a fitted
+plant is written so. Robot descriptions (URDF, MJCF) are read, too.
 """
 
 import difflib
@@ -55,8 +56,7 @@ def tlrip(
         inertia: "none" (point masses), "izz" (slender links with the printed Izz) or a full
             tensor per link, (3, 6) as in `PendulumChain` [kg m^2].
         name, convention: for a rig of the same numbers.
-    Raises:
-        ValueError: for another `arm` or `inertia`.
+
     References:
         Comparative study of joint neuro-fuzzy friction models for a triple link rotary inverted
         pendulum, Table 2.
@@ -89,8 +89,6 @@ def rtip(arm: Literal["fixed", "free"] = "fixed", inertia: InertiaCase = "izz") 
     Assumed: that paper prints no masses or lengths and describes the same pendulum, so the numbers
     are Table 2 of the first. Known to differ: angles are measured from hanging.
 
-    Args:
-        arm, inertia: as in `tlrip`.
     References:
         Comparison of friction estimation models for a rotary triple inverted pendulum.
     """
@@ -162,10 +160,6 @@ def dfki(build: Literal["A0", "C0", "C1"]) -> PendulumChain:
     published inertia about its joint is below m r^2, which no body has; the mass matrix is
     positive definite all the same.
 
-    Args:
-        build: A0 (lengths 0.3, 0.2 m), C0 or C1 (0.2, 0.3 m).
-    Raises:
-        ValueError: for another build.
     References:
         github.com/dfki-ric-underactuated-lab/double_pendulum.
     """

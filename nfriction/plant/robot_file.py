@@ -229,16 +229,11 @@ def mjcf_links(path: Path, root: Element) -> tuple[list[HingedLink], Array, str]
         of = mover[model.body_parentid[body]]
         for k in range(model.body_jntnum[body]):
             joint = model.body_jntadr[body] + k
-            links.append(
-                HingedLink(
-                    model.joint(joint).name or f"joint{joint + 1}",
-                    of,
-                    data.xaxis[joint].copy(),
-                    data.xanchor[joint].copy(),
-                    float(model.dof_armature[model.jnt_dofadr[joint]]),
-                    float(model.qpos0[model.jnt_qposadr[joint]]),
-                )
-            )
+            name = model.joint(joint).name or f"joint{joint + 1}"
+            hinge = HingedLink(name, of, data.xaxis[joint].copy(), data.xanchor[joint].copy())
+            hinge.armature = float(model.dof_armature[model.jnt_dofadr[joint]])
+            hinge.reading = float(model.qpos0[model.jnt_qposadr[joint]])
+            links.append(hinge)
             of = len(links) - 1
         mover.append(of)
         if of is not None:
@@ -284,15 +279,17 @@ def _refuse_more_than_hinges(model: Any, mujoco: Any) -> None:
             raise ValueError(f"joint {name!r} is {word!r}; a pendulum's joints are hinges.")
         if np.any(model.jnt_stiffness[joint]):
             raise ValueError(f"joint {name!r} has a spring; a plant has none.")
-    for count, what in ((model.neq, "equality constraints"), (model.ntendon, "tendons")):
-        if count:
-            raise ValueError(f"it has {what}; a plant is a chain of free hinges.")
-    if model.opt.density or model.opt.viscosity:
-        raise ValueError(
-            "its medium brakes (density, viscosity); set both to 0: air drag is fitted with the "
-            "friction."
-        )
-    if model.body_gravcomp.any():
-        raise ValueError("it compensates gravity (gravcomp); leave that to the torques.")
-    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
-        raise ValueError("its gravity is switched off, and a pendulum needs some.")
+    no_gravity = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
+    for found, why in (
+        (model.neq, "it has equality constraints; a plant is a chain of free hinges"),
+        (model.ntendon, "it has tendons; a plant is a chain of free hinges"),
+        # Air drag is fitted together with the friction.
+        (
+            model.opt.density or model.opt.viscosity,
+            "its medium brakes; set density, viscosity to 0",
+        ),
+        (model.body_gravcomp.any(), "it compensates gravity (gravcomp); leave that to the torques"),
+        (no_gravity, "its gravity is switched off, and a pendulum needs some"),
+    ):
+        if found:
+            raise ValueError(f"{why}.")

@@ -205,3 +205,13 @@ def test_numbers_beyond_every_float_are_refused_by_name(value: object) -> None:
     if isinstance(value, int):
         with pytest.raises(ValueError, match="coefficients must be an array of numbers"):
             LFM(1, [value, 1.0])
+
+
+@every_model
+def test_the_slope_at_rest_is_known_without_gradients_too(name: str) -> None:
+    expected = named_models()[name].zero_velocity_damping()
+    with torch.no_grad():
+        assert torch.equal(named_models()[name].zero_velocity_damping(), expected)
+    model = named_models()[name]
+    with torch.inference_mode():
+        assert torch.equal(model.zero_velocity_damping(), expected)
