@@ -58,6 +58,8 @@ class Schedule(nn.Module, ABC):
 
     def __init__(self, law: Law, joints: int) -> None:
         super().__init__()
+        if not isinstance(law, Law):
+            raise TypeError(f"`law` must be a Law, such as laws.VISCOUS, got {law!r}.")
         if not isinstance(joints, int) or joints < 1:
             raise ValueError(f"`joints` must be a whole number of at least 1, got {joints!r}.")
         self.joints = joints

@@ -91,7 +91,7 @@ class Law:
         nested_coefficients: names, here, of the nested law's coefficients, in its order.
 
     Raises:
-        TypeError: if a coefficient or the nested law is something else.
+        TypeError: if a coefficient, the torque or the nested law is something else.
         ValueError: if there is no coefficient, two have the same name, or the nested coefficients
             do not match the nested law.
 
@@ -112,6 +112,10 @@ class Law:
         if not isinstance(given, tuple) or not all(isinstance(c, Coefficient) for c in given):
             raise TypeError(
                 f"`coefficients` of law {self.name!r} must be a tuple of Coefficient, got {given}."
+            )
+        if not callable(self.torque):
+            raise TypeError(
+                f"`torque` of law {self.name!r} must be a function, got {self.torque!r}."
             )
         if not self.names or len(set(self.names)) < len(self.names):
             raise ValueError(

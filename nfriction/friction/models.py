@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from nfriction.friction import laws
 from nfriction.friction.coefficients import Constant, Schedule
 from nfriction.friction.laws import Law
-from nfriction.friction.parameters import positive_number
+from nfriction.friction.parameters import as_tensor, positive_number
 
 # Velocity over which the sign changes [rad/s]; larger values creep, smaller ones make RK4 unstable.
 V_SMOOTH = 3e-3
@@ -68,7 +68,7 @@ class FrictionModel(nn.Module):
         Arrays and lists are taken, too.
         """
         if not torch.jit.is_scripting():
-            qd, qdd, load = (_as_tensor(x) for x in (qd, qdd, load))
+            qd, qdd, load = as_tensor("qd", qd), as_tensor("qdd", qdd), as_tensor("load", load)
         # A single velocity would broadcast to all joints' coefficients without a word.
         width = qd.shape[-1] if qd.ndim else 0
         if width != self.joints:
@@ -118,10 +118,6 @@ class FrictionModel(nn.Module):
 
     def extra_repr(self) -> str:
         return f"law={self.law.name}, joints={self.joints}, v_smooth={self.v_smooth:g}"
-
-
-def _as_tensor(values: Any) -> Tensor:
-    return values if isinstance(values, Tensor) else torch.as_tensor(values, dtype=torch.float64)
 
 
 class NamedModel(FrictionModel):

@@ -1,5 +1,6 @@
 """Neuro-fuzzy models: coefficients as a network's function of velocity and acceleration."""
 
+import reprlib
 from collections.abc import Sequence
 from pkgutil import resolve_name
 from typing import Any, Final, Literal
@@ -105,6 +106,11 @@ class NeuroFuzzy(Schedule):
         if acceleration not in ("along_motion", "signed"):
             raise ValueError(
                 f'`acceleration` must be "along_motion" or "signed", got {acceleration!r}.'
+            )
+        if not isinstance(terms, list | tuple):
+            raise ValueError(
+                "`terms` must be two whole numbers, the fuzzy sets of velocity and of "
+                f"acceleration, got {reprlib.repr(terms)}."
             )
         k = len(law.names)
         self.terms, self.head_units = tuple(terms), head_units

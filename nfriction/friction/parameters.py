@@ -6,6 +6,7 @@ import math
 import reprlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,6 +25,20 @@ def positive_number(name: str, value: object, unit: str = "") -> float:
     return number
 
 
+def as_tensor(name: str, values: Any, like: Tensor | None = None) -> Tensor:
+    """Tensors as they are, arrays and lists in double precision or as `like`."""
+    if isinstance(values, Tensor) and like is None:
+        return values
+    dtype, device = (torch.float64, None) if like is None else (like.dtype, like.device)
+    try:
+        return torch.as_tensor(values, dtype=dtype, device=device)
+    # Ragged lists, texts, and whole numbers that exceed every float.
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise ValueError(
+            f"{name} must be an array of numbers, got {reprlib.repr(values)}."
+        ) from error
+
+
 def checked_coefficients(
     values: Tensor | Sequence, like: Tensor, names: Sequence[str], positive: Tensor
 ) -> Tensor:
@@ -34,12 +49,7 @@ def checked_coefficients(
         like: a tensor of the wanted shape and type.
         names, positive: of the coefficients, and which must not be negative.
     """
-    try:
-        given = torch.as_tensor(values, dtype=like.dtype, device=like.device)
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise ValueError(
-            f"coefficients must be an array of numbers, got {reprlib.repr(values)}."
-        ) from error
+    given = as_tensor("coefficients", values, like)
     joints, count = like.shape[0], like.shape[-1]
     # Before any broadcast: one column would silently be taken for all coefficients.
     if given.shape not in (like.shape, (joints, count), (count,)):

@@ -39,7 +39,8 @@ class Arm:
     def __post_init__(self) -> None:
         # Without length the chain swings unmoved by the arm, and the mass matrix may be singular.
         for name in ("inertia", "length"):
-            number(f"arm's {name}", getattr(self, name), positive=True)
+            value = number(f"arm's {name}", getattr(self, name), positive=True)
+            object.__setattr__(self, name, value)
 
 
 class _Geometry(NamedTuple):
@@ -128,6 +129,8 @@ class PendulumChain(Plant):
         gravity = number("gravity", gravity, positive=True)
         if gravity < WEIGHTLESS:
             raise ValueError(f"`gravity` must be at least {WEIGHTLESS:g} m/s^2, got {gravity:g}.")
+        if not isinstance(arm, Arm | None):
+            raise TypeError(f"`arm` must be an Arm(inertia, length) or None, got {arm!r}.")
         links, first = len(m), int(arm is not None)
         super().__init__(
             first + links,

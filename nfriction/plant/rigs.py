@@ -261,6 +261,8 @@ def from_dict(data: Mapping[str, Any]) -> Plant:
     Raises:
         ValueError: for an unknown kind, missing or unknown keys, or impossible values.
     """
+    if not isinstance(data, Mapping):
+        raise ValueError(f"a rig is one table of keys and values, got {reprlib.repr(data)}.")
     kind = data.get("kind", "chain")
     if not isinstance(kind, str) or kind not in _KINDS:
         raise ValueError(f"rig: no kind {reprlib.repr(kind)}; there are {sorted(_KINDS)}.")
@@ -289,10 +291,7 @@ def read(path: str | Path) -> Plant:
         if path.is_file() and path.stat().st_size > LARGEST_FILE:
             # Before it is read into memory.
             raise ValueError(f"rig files are at most {LARGEST_FILE} bytes.")
-        data = _parse(path.read_bytes().decode(), path.suffix.lower())
-        if not isinstance(data, dict):
-            raise ValueError("a rig file holds one table of keys and values.")
-        return from_dict(data)
+        return from_dict(_parse(path.read_bytes().decode(), path.suffix.lower()))
     except RecursionError:
         raise ValueError(f"{path}: nested too deeply for a rig.") from None
     except ValueError as error:  # those of JSON, TOML and Unicode too

@@ -202,3 +202,8 @@ def test_a_description_of_another_type_is_refused() -> None:
 def test_start_values_are_possible_ones(start: float) -> None:
     with pytest.raises(ValueError, match="`initial_grid` of 'v_s' must be positive and finite"):
         Coefficient("v_s", "rad/s", linear=False, initial_grid=(1.0, start))
+
+
+def test_a_law_needs_a_function() -> None:
+    with pytest.raises(TypeError, match="`torque` of law 'odd' must be a function, got None"):
+        Law("odd", (Coefficient("B", "N m"),), None)  # type: ignore[arg-type]

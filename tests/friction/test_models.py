@@ -215,3 +215,19 @@ def test_the_slope_at_rest_is_known_without_gradients_too(name: str) -> None:
     model = named_models()[name]
     with torch.inference_mode():
         assert torch.equal(model.zero_velocity_damping(), expected)
+
+
+def test_what_is_no_number_is_refused_by_name() -> None:
+    for wrong in ("fast", None, [[1.0], [1.0, 2.0]], [10**400, 1.0]):
+        with pytest.raises(ValueError, match=r"^load must be an array of numbers, got"):
+            LFM(2)([1.0, 2.0], [0.0, 0.0], wrong)
+    with pytest.raises(
+        TypeError, match=r"`law` must be a Law, such as laws\.VISCOUS, got 'viscous'"
+    ):
+        Constant("viscous", 1)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("terms", [5, None, "55"])
+def test_the_network_has_two_inputs(terms: object) -> None:
+    with pytest.raises(ValueError, match="`terms` must be two whole numbers"):
+        NFLFM(1, terms=terms)

@@ -206,3 +206,14 @@ def test_an_arm_of_no_number_is_refused() -> None:
 def test_states_that_are_no_tensors_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match=r"`q` must be \(\*batch, 1\), a tensor .*got \[0\.1\]"):
         rigs.xl330().load([0.1], [0.0])  # type: ignore[arg-type]
+
+
+def test_an_arm_is_one_and_keeps_plain_numbers() -> None:
+    with pytest.raises(TypeError, match="`arm` must be an Arm"):
+        PendulumChain([1.0], [1.0], arm={"inertia": 1.0, "length": 1.0})  # type: ignore[arg-type]
+    arm = Arm(torch.tensor(1.0), np.float64(0.5))  # type: ignore[arg-type]
+    data = PendulumChain([1.0], [1.0], arm=arm).to_dict()
+    assert json.loads(json.dumps(data)) == data
+    for wrong in (None, [1.0], "rig"):
+        with pytest.raises(ValueError, match="a rig is one table"):
+            rigs.from_dict(wrong)  # type: ignore[arg-type]
