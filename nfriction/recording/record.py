@@ -287,15 +287,19 @@ class Recording:
         or .mf4.
 
         A CSV file may begin with comment lines `# convention: absolute,hanging` and `# unit: rad`;
-        arguments override the file. Cells may be separated by commas, semicolons, tabs
-        or blanks, as the header is; numbers may have a decimal comma where no comma separates. A
-        row of units under the header, or units in it as in `time [ms]`, are followed. Arrays of
-        .mat and .h5 files are named by their path, `data.Y.q1`, `enc[0]`; signals of dSPACE
-        ControlDesk by their names. The name is the file's without its ending.
+        arguments override the file. Cells may be separated by commas, semicolons, tabs or blanks,
+        as the header is; numbers may have decimal commas, and thousands separated by the other
+        sign. If all are like `35,000`, a unit in counts or a line `# decimal: .` decides; without,
+        it is guessed with a warning. A row of units under the header, or units in it as in
+        `time [ms]`, are followed. Arrays of .mat and .h5 files are named by their path,
+        `data.Y.q1`, `enc[0]`; signals of dSPACE ControlDesk by their names. The name is the file's
+        without its ending.
 
         Args:
             path: of the file.
             columns, degrees, convention, unit, name: as for `from_pandas`.
+        Warns:
+            RecordingWarning: a decimal sign that is guessed; and as `from_pandas`.
         Raises:
             FileNotFoundError: there is no such file.
             ImportError: a format whose library is not installed.

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from nfriction.io.formats.numbers import THOUSANDS, column_numbers
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -92,6 +94,7 @@ def table_arrays(
             f"positions of those joints, too, or drop them."
         )
     sources = {key: source for key, source in sources.items() if _number(key) <= joints}
+    undecided = _settle_decimal_sign(table, sources)
     arrays = {"time": _column(table, "time", sources["time"])}
     for key in ("q", "qd", "tau"):
         group = [sources.get(f"{key}{k + 1}") for k in range(joints)]
@@ -103,7 +106,8 @@ def table_arrays(
     kinds = {slides(unit) for unit in units}
     if len(kinds) > 1:
         raise ValueError(f"positions must all be angles or all be lengths, got {', '.join(units)}.")
-    return Arrays(arrays, kinds.pop() if kinds else None, _remarks(table, sources, joints))
+    remarks = (*undecided, *_remarks(table, sources, joints))
+    return Arrays(arrays, kinds.pop() if kinds else None, remarks)
 
 
 def parse_source(spec: str, names: set[str]) -> Source | None:
@@ -112,33 +116,6 @@ def parse_source(spec: str, names: set[str]) -> Source | None:
     if spec in names:
         return Source(spec, None)
     return Source(stem, unit) if stem in names and is_unit(unit) else None
-
-
-def column_numbers(table: pd.DataFrame, column: str) -> Array:
-    """A column as float64; empty cells are NaN.
-
-    Raises:
-        ValueError: a cell is no number; names it.
-    """
-    cells = table[column].to_numpy(dtype=object, na_value=np.nan)
-    try:
-        return cells.astype(np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        row = next(row for row, cell in enumerate(cells) if not is_number(cell))
-        shown = repr(cells[row])
-        raise ValueError(
-            f"column {column}, row {row} (counted from 0 below the header) must be a number, "
-            f"got {shown if len(shown) < 80 else shown[:77] + '...'}."
-        ) from error
-
-
-def is_number(cell: object) -> bool:
-    """True if Python reads the cell as a float."""
-    try:
-        float(cell)  # type: ignore[arg-type]
-    except (TypeError, ValueError, OverflowError):
-        return False
-    return True
 
 
 def canonical_unit(text: str) -> str:
@@ -241,9 +218,28 @@ def _number(name: str) -> int:
     return int(digits[1]) if digits else 0
 
 
-def _remarks(
-    table: pd.DataFrame, sources: dict[str, Source], joints: int
-) -> tuple[tuple[str, str], ...]:
+def _settle_decimal_sign(table: pd.DataFrame, sources: dict[str, Source]) -> list[tuple[str, str]]:
+    """Settle the decimal sign that the text leaves open; a remark if it remains a guess."""
+    columns = set(table.attrs.get("undecided", ()))
+    used = [source for source in sources.values() if source.column in columns]
+    for column, unit in used:
+        cell = next(str(cell) for cell in table[column] if set(str(cell)) & set(THOUSANDS))
+        sign = "," if "," in cell else "."
+        # Counts are whole, so it cannot be a decimal sign.
+        if unit and canonical_unit(unit).startswith("count"):
+            table.attrs["decimal"] = THOUSANDS[sign]
+            return []
+    if not used:
+        return []
+    role = "is a decimal sign" if table.attrs["decimal"] == sign else "separates thousands"
+    finding = (
+        f"column {column} leaves open what {sign!r} in {cell!r} means; assumed is that it {role}"
+    )
+    remedy = "state the decimal sign by a line `# decimal: ,` or `# decimal: .` above the header"
+    return [(finding, remedy)]
+
+
+def _remarks(table: pd.DataFrame, sources: dict[str, Source], joints: int) -> list[tuple[str, str]]:
     lacking = {
         key: [f"{key}{k + 1}" for k in range(joints) if f"{key}{k + 1}" not in sources]
         for key in ("qd", "tau")
@@ -262,7 +258,7 @@ def _remarks(
         remedy = f'columns={{"{own if own in free else free[0]}": "{unread[0]}"}}'
         finding = f"column {', '.join(unread[:3])} looks like torque and is not read"
         remarks.append((finding, f"if it is, name it with {remedy}"))
-    return tuple(remarks)
+    return remarks
 
 
 def _unread_torques(table: pd.DataFrame, sources: dict[str, Source]) -> list[str]:
