@@ -19,11 +19,13 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 OURS = re.compile(r"time|(q|qd|tau)[1-9]\d{0,3}", re.ASCII)
-# Usual names of a torque, with a number and a unit behind; "torque_on" and "taut" are none.
+# Usual names of a torque, or of the current that makes it, with a number and a unit behind;
+# "torque_on" and "taut" are none.
 _LIKE_TORQUE = re.compile(
-    r"(torque|drehmoment|(?<![a-z])(tau|force))(_(cmd|command|meas|measured))?[\W_]*\d*\s*([\[(].*)?$",
+    r"(torque|drehmoment|strom|(?<![a-z])(tau|force|current))(_(cmd|command|meas|measured))?[\W_]*\d*\s*([\[(].*)?$",
     re.IGNORECASE,
 )
+_LIKE_CURRENT = re.compile("strom|current", re.IGNORECASE)
 
 _TURN = 2 * math.pi
 _ROTATION = {"rad": 1.0, "mrad": 1e3, "deg": 180 / math.pi, "rev": 1 / _TURN}
@@ -174,10 +176,18 @@ def _sources(table: pd.DataFrame, columns: dict[str, str]) -> dict[str, Source]:
         for key, spec in columns.items()
     }
     found = {key: source for key, source in mapped.items() if source is not None}
+    keys: dict[str, list[str]] = {}
+    for key, source in found.items():
+        keys.setdefault(aliases.get(source.column, source.column), []).append(key)
+    for column, of in keys.items():
+        if len(of) > 1:
+            raise ValueError(
+                f"`columns` names column {column} for {' and '.join(of)}; each has a column of its "
+                "own, so correct one of them."
+            )
     # A column that is mapped to one key must not also be found by its own name.
-    claimed = {aliases.get(s.column, s.column) for s in found.values()}
     for name in (*names, *aliases):
-        if OURS.fullmatch(name) and name not in columns and aliases.get(name, name) not in claimed:
+        if OURS.fullmatch(name) and name not in columns and aliases.get(name, name) not in keys:
             found[name] = Source(name, None)
     return {key: _known(table, aliases, source) for key, source in found.items()}
 
@@ -255,9 +265,14 @@ def _remarks(table: pd.DataFrame, sources: dict[str, Source], joints: int) -> li
     unread = _unread_torques(table, sources) if free else []
     if unread:
         own = f"tau{_number(unread[0])}"
-        remedy = f'columns={{"{own if own in free else free[0]}": "{unread[0]}"}}'
-        finding = f"column {', '.join(unread[:3])} looks like torque and is not read"
-        remarks.append((finding, f"if it is, name it with {remedy}"))
+        option = f'columns={{"{own if own in free else free[0]}": "{unread[0]}"}}'
+        kind, remedy = "torque", f"if it is, name it with {option}"
+        if _LIKE_CURRENT.search(unread[0]):
+            kind = "motor current"
+            remedy = "if it drives a joint, multiply it by the torque constant "
+            remedy += f"and name it with {option}"
+        finding = f"column {', '.join(unread[:3])} looks like {kind} and is not read"
+        remarks.append((finding, remedy))
     return remarks
 
 
@@ -290,10 +305,11 @@ def _missing(table: pd.DataFrame, columns: dict[str, str], missing: list[str]) -
     first = columns.get(missing[0], missing[0])
     stem, _, unit = first.rpartition(":")
     note = f" {unit!r} is no unit known." if stem in found and not is_unit(unit) else ""
+    lost = [columns.get(key, key) for key in missing[:10]]
+    label = f"column {lost[0]} is" if len(lost) == 1 else f"columns {', '.join(lost)} are"
     return (
-        f"column {', '.join(columns.get(c, c) for c in missing[:10])} is missing; found "
-        f'{shown}.{note} Name the columns with columns={{"{missing[0]}": "..."}}, a unit after '
-        f'a colon where it is not SI, as in "enc_1:deg".'
+        f'{label} missing; found {shown}.{note} Name the columns with columns={{"{missing[0]}": '
+        f'"..."}}, a unit after a colon where it is not SI, as in "enc_1:deg".'
     )
 
 
