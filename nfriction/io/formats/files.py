@@ -31,8 +31,8 @@ _READERS = {
     ".parquet": "columnar:read_parquet",
     ".npz": "columnar:read_npz",
     ".mat": "matlab:read_mat",
-    ".h5": "hdf5:read_hdf5",
-    ".hdf5": "hdf5:read_hdf5",
+    ".h5": "matlab:read_hdf5",
+    ".hdf5": "matlab:read_hdf5",
     ".mf4": "mdf:read_mdf",
 }
 _WRITERS = {
