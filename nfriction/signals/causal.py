@@ -158,29 +158,15 @@ class SecondOrderLowPass:
         a2 = (1 - 2 * self.damping * warped + warped**2) / a0
         return np.array([b0, 2 * b0, b0]), np.array([1.0, a1, a2])
 
-    def init(self, value: ArrayLike) -> Array:
-        """State (2, *value) of a filter at rest at `value`."""
-        b, a = self.coefficients
-        value = np.asarray(value, dtype=np.float64)
-        return np.stack([(1 - b[0]) * value, (b[2] - a[2]) * value])
-
-    def step(self, state: Array, value: ArrayLike) -> tuple[Array, Array]:
-        """Next state and output for one sample."""
-        b, a = self.coefficients
-        value = np.asarray(value, dtype=np.float64)
-        output = b[0] * value + state[0]
-        following = np.stack(
-            [b[1] * value - a[1] * output + state[1], b[2] * value - a[2] * output]
-        )
-        return following, output
-
     def __call__(self, values: ArrayLike, state: Array | None = None) -> Array:
-        """Filter a whole array (time, ...), at rest at its first sample unless `state` is given."""
-        values = np.asarray(values, dtype=np.float64)
-        state = self.init(values[0]) if state is None else state
+        """Filter an array (time, ...), at rest at its first sample unless a state is given."""
         from scipy.signal import lfilter  # slow to import
 
-        filtered, _ = lfilter(*self.coefficients, values, axis=0, zi=state)
+        values = np.asarray(values, dtype=np.float64)
+        b, a = self.coefficients
+        if state is None:
+            state = np.stack([(1 - b[0]) * values[0], (b[2] - a[2]) * values[0]])
+        filtered, _ = lfilter(b, a, values, axis=0, zi=state)
         return np.asarray(filtered)
 
 

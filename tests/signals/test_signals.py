@@ -228,17 +228,6 @@ def test_low_pass_falls_with_the_second_power() -> None:
     assert response(low_pass, 0.05) == pytest.approx(1, rel=1e-4)
 
 
-def test_sample_by_sample_equals_the_array() -> None:
-    values = np.random.default_rng(3).normal(size=(500, 3))
-    low_pass = SecondOrderLowPass(15.0, 1e-3)
-    state = low_pass.init(values[0])
-    outputs = []
-    for value in values:
-        state, output = low_pass.step(state, value)
-        outputs.append(output)
-    np.testing.assert_allclose(outputs, low_pass(values), atol=1e-13)
-
-
 def test_low_pass_at_rest_stays() -> None:
     low_pass = SecondOrderLowPass(15.0, 1e-3)
     # Rounding, kept by poles close to 1.
