@@ -331,6 +331,19 @@ def test_a_gap_parts_a_record_and_spoils_neither_side(gap: float, cut: int) -> N
         assert rmse(found.qdd, truth.qdd) < 1.2 * rmse(apart, truth.qdd)
 
 
+@pytest.mark.parametrize("counter", [1e-6, 1e-7])
+@pytest.mark.filterwarnings("error")
+def test_stamps_rounded_to_a_slow_clock_spoil_no_number(counter: float) -> None:
+    """Ten stamps of a clock of 10 ms, told apart by a counter: tiny steps, then a huge one."""
+    group, place = np.divmod(np.arange(500), 10)
+    time = group / 100 + counter * place
+    for q in (1e-3 * np.random.default_rng(0).normal(size=500), np.sin(group / 20)):
+        found = kalman_smoother(time, q[:, None])
+        assert found.std is not None
+        for values in (found.q, found.qd, found.qdd, found.std.q, found.std.qd, found.std.qdd):
+            assert np.isfinite(values).all()
+
+
 def test_joint_at_rest_has_no_motion() -> None:
     q = np.full((300, 2), 0.7)
     q[:, 1] = quantise(np.sin(np.arange(300) / 50), COUNTS)
