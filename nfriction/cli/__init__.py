@@ -51,7 +51,9 @@ def _answer(words: list[str]) -> int:
         if "run" not in arguments:
             parser.print_help(sys.stderr)
             return 2
-        arguments.command_line = shlex.join(["nfriction", *words])
+        # File names that are not UTF-8 cannot be written as they are.
+        line = shlex.join(["nfriction", *words]).encode(errors="backslashreplace")
+        arguments.command_line = line.decode()
         return _run(arguments)
     except KeyboardInterrupt as interrupt:
         print(f"nfriction: interrupted {interrupt}".rstrip(), file=sys.stderr)

@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
     if out.is_dir():
         raise UsageError(f"--out is a file, and {out} is a folder.")
     found = read_run(arguments.folder)
-    write_atomically(out, to_html(found).encode())
+    write_atomically(out, to_html(found).encode(errors="backslashreplace"))
     for note in found.notes:
         warn(note)
     print(f"wrote {out}")

@@ -1,7 +1,6 @@
 """Recordings of a mechanism: validated arrays in SI units, from files and tables and back."""
 
-from nfriction.recording.record import Recording, RecordingWarning, Unit
-from nfriction.recording.states import read_initial_states
+from nfriction.recording.record import Recording, RecordingWarning, Unit, read_initial_states
 from nfriction.recording.validation import MINIMUM_SAMPLES, is_uniform
 
 __all__ = [

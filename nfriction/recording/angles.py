@@ -11,7 +11,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Literal, Protocol, TypeAlias, get_args
+from typing import Any, Literal, Protocol, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 Angles = Literal["relative", "absolute"]
 MeasuredFrom = Literal["upright", "hanging"]
+_WORDS = {*get_args(Angles), *get_args(MeasuredFrom)}
 
 
 class Mechanism(Protocol):
@@ -56,40 +57,30 @@ class AngleConvention:
                 raise ValueError(f"`{field.name}` must be {valid}, got {value!r}.")
 
     @classmethod
-    def parse(cls, text: str) -> AngleConvention:
-        """Convention from words such as "absolute,hanging" or "relative-upright", in any order.
-
-        A word that is left out takes its default; an unknown or doubled one raises ValueError.
-        """
-        settings: dict[str, str] = {}
-        for word in re.split(r"[\s,;/_+-]+", text.strip().lower()):
-            # The two vocabularies share no word, so that the order does not matter.
-            key = "angles" if word in get_args(Angles) else "measured_from"
-            if word not in get_args(Angles) + get_args(MeasuredFrom) or key in settings:
-                raise ValueError(
-                    f"an angle convention is one of relative, absolute and one of upright, "
-                    f"hanging, such as 'absolute,hanging'; got {text!r}."
-                )
-            settings[key] = word
-        return cls(**settings)  # type: ignore[arg-type]
-
-    @classmethod
     def of(cls, given: ConventionLike) -> AngleConvention:
-        """Convention of a plant, or from words as `parse` takes them, in one string or several.
+        """Convention of a plant, or from words such as "absolute,hanging" or "relative-upright".
+
+        Words come in one string or several, in any order; one that is left out takes its default.
 
         Raises:
-            ValueError: anything else.
+            ValueError: an unknown or doubled word, or anything else.
         """
         # By attribute: recordings must not import plants.
         found = getattr(given, "convention", given)
         if isinstance(found, cls):
             return found
-        words = [found] if isinstance(found, str) else found
-        if isinstance(words, Sequence) and all(isinstance(word, str) for word in words):
-            return cls.parse(",".join(words))
+        parts = [found] if isinstance(found, str) else found
+        if isinstance(parts, Sequence) and all(isinstance(part, str) for part in parts):
+            words = re.split(r"[\s,;/_+-]+", ",".join(parts).strip().lower())
+            # The two vocabularies share no word, so that the order does not matter.
+            settings: dict[str, Any] = {
+                "angles" if word in get_args(Angles) else "measured_from": word for word in words
+            }
+            if len(settings) == len(words) and set(words) <= _WORDS:
+                return cls(**settings)
         raise ValueError(
-            f"an angle convention is words such as 'absolute,hanging', an AngleConvention, or a "
-            f"plant that has one; got {given!r}."
+            "an angle convention is one of relative, absolute and one of upright, hanging, such as "
+            f"'absolute,hanging', an AngleConvention, or a plant that has one; got {given!r}."
         )
 
     def __str__(self) -> str:

@@ -1,11 +1,12 @@
-"""Recording: an encoder log, validated, in SI units, one column per joint."""
+"""Recordings: encoder logs, validated, in SI units, one column per joint; their initial states."""
 
 from __future__ import annotations
 
 import hashlib
 import os
+import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -287,15 +288,19 @@ class Recording:
         or .mf4.
 
         A CSV file may begin with comment lines `# convention: absolute,hanging` and `# unit: rad`;
-        arguments override the file. Cells may be separated by commas, semicolons, tabs
-        or blanks, as the header is; numbers may have a decimal comma where no comma separates. A
-        row of units under the header, or units in it as in `time [ms]`, are followed. Arrays of
-        .mat and .h5 files are named by their path, `data.Y.q1`, `enc[0]`; signals of dSPACE
-        ControlDesk by their names. The name is the file's without its ending.
+        arguments override the file. Cells may be separated by commas, semicolons, tabs or blanks,
+        as the header is; numbers may have decimal commas, and thousands separated by the other
+        sign. If all are like `35,000`, a unit in counts or a line `# decimal: .` decides; without,
+        it is guessed with a warning. A row of units under the header, or units in it as in
+        `time [ms]`, are followed. Arrays of .mat and .h5 files are named by their path,
+        `data.Y.q1`, `enc[0]`; signals of dSPACE ControlDesk by their names. The name is the file's
+        without its ending.
 
         Args:
             path: of the file.
             columns, degrees, convention, unit, name: as for `from_pandas`.
+        Warns:
+            RecordingWarning: a decimal sign that is guessed; and as `from_pandas`.
         Raises:
             FileNotFoundError: there is no such file.
             ImportError: a format whose library is not installed.
@@ -328,3 +333,58 @@ class Recording:
         # Of many recordings the reader must know which one.
         label = f"recording '{self.name}': " if self.name else ""
         warnings.warn(f"{label}{finding}; {remedy}.", RecordingWarning, stacklevel=stacklevel)
+
+
+def read_initial_states(
+    path: str | os.PathLike[str], *, degrees: bool = False
+) -> dict[str, tuple[Array, Array]]:
+    """Initial position and velocity per recording from a table with columns id, q0_1, qd0_1, ….
+
+    Cells of joints that a mechanism lacks are empty. Angles are in the recordings' convention.
+
+    Args:
+        path: of the table, such as a data set's `recordings.csv`.
+        degrees: positions and velocities are in degrees.
+    Returns:
+        {id: (q0, qd0)} in SI, each (joint,).
+    Raises:
+        ValueError: missing columns, or a state that is incomplete or comes twice.
+    """
+    table = formats.read_table(path)
+    joints = sorted((c[3:] for c in table.columns if re.fullmatch(r"q0_[0-9]{1,4}", c)), key=int)
+    wanted = ["id", *(f"{key}_{k}" for key in ("q0", "qd0") for k in joints or ["1"])]
+    missing = [c for c in wanted if c not in table.columns]
+    if missing:
+        raise ValueError(
+            f"'{path}' lacks columns {_listed(missing)}; found {_listed(table.columns)}."
+        )
+    try:
+        q0, qd0 = (
+            np.stack([formats.column_numbers(table, f"{key}_{k}") for k in joints], axis=1)
+            for key in ("q0", "qd0")
+        )
+    except ValueError as error:
+        raise ValueError(f"'{path}': {error}") from error
+    if degrees:
+        q0, qd0 = np.deg2rad(q0), np.deg2rad(qd0)
+    states: dict[str, tuple[Array, Array]] = {}
+    ids = table["id"]
+    for row, (label, lost) in enumerate(zip(ids.astype(str), ids.isna(), strict=True)):
+        if lost or not label:
+            raise ValueError(f"'{path}': row {row + 1} has no id.")
+        state = np.stack([q0[row], qd0[row]])
+        # Mechanisms of one table may have fewer joints than it has columns.
+        present = ~np.isnan(state[0])
+        sound = np.array_equal(present, ~np.isnan(state[1])) and not np.isinf(state).any()
+        if label in states or not present.any() or not sound:
+            raise ValueError(
+                f"'{path}': {label[:60]!r} must come once, with finite q0 and qd0 of the same "
+                f"joints."
+            )
+        states[label] = (state[0, present], state[1, present])
+    return states
+
+
+def _listed(names: Iterable[str]) -> str:
+    """Names from a file, which may be many and long."""
+    return ", ".join(str(name)[:60] for name in list(names)[:30])

@@ -131,7 +131,8 @@ def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> list[tuple
     # A joint's motion cannot be seen at two samples a second.
     slow = bool(np.median(step) >= 0.5)
     if slow:
-        found.append(("`time` looks like milliseconds", "if so, divide it by 1000"))
+        remedy = 'if so, divide it by 1000, or read it with columns={"time": "time:ms"}'
+        found.append(("`time` looks like milliseconds", remedy))
     if len(pauses):
         k = int(pauses[np.argmax(step[pauses])])
         found.append(
@@ -150,11 +151,15 @@ def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> list[tuple
     with np.errstate(over="ignore"):  # stamps may be as close as numbers get
         speed = np.abs(np.diff(q, axis=0) / step[:, None]).max()
     if turns > 1 and speed > 30.0 and not slow:
+        unit, remedy = "degrees", "if so, read it with `degrees=True`"
+        if np.array_equal(q, np.rint(q)):
+            unit = "encoder counts"
+            remedy = 'if so, state how many make a turn, as in columns={"q1": "q1:counts/8192"}'
         found.append(
             (
-                f"`q` looks like degrees (every joint turns at least {turns:.1f} times, at up to "
+                f"`q` looks like {unit} (every joint turns at least {turns:.1f} times, at up to "
                 f"{speed:.0f} rad/s)",
-                "if so, read it with `degrees=True`",
+                remedy,
             )
         )
     jumps = _turns_between_samples(q, pauses)

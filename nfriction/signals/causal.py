@@ -1,4 +1,4 @@
-"""Causal motion, as in a controller: frequency counting and a second-order low-pass filter."""
+"""Encoders and causal motion, as in a controller: counts, edges, and a low-pass filter."""
 
 from __future__ import annotations
 
@@ -8,10 +8,115 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nfriction.signals.encoder import frequency_counting, quantise
 from nfriction.signals.motion import Motion, check_motion
 
 Array = NDArray[np.float64]
+
+# Least share of one-count changes among all changes of a moving joint.
+REPEATED = 0.01
+# Positions written with few digits make one count now larger, now smaller, by this share.
+ALIKE = 0.05
+# Share of a joint's range: no encoder has so many counts, smaller changes are rounding.
+ROUNDING = 1e-9
+
+
+def quantise(q: ArrayLike, counts_per_revolution: float, *, offset: float = 0.0) -> Array:
+    """Position of an incremental encoder: the nearest of its evenly spaced counts.
+
+    Args:
+        q: position [rad], any shape.
+        counts_per_revolution: counts after quadrature; an encoder of 2048 lines has 8192.
+        offset: position of one count's centre [rad].
+    Returns:
+        Quantised position [rad], shape like `q`.
+    """
+    quantum = _quantum(counts_per_revolution)
+    return offset + quantum * np.rint((np.asarray(q, dtype=np.float64) - offset) / quantum)
+
+
+def count_seen(q: ArrayLike) -> Array:
+    """Estimate one count of each joint's encoder, (joint,), NaN where positions do not show it.
+
+    It is the smallest change from a sample to the next if a hundredth of the changes equal it:
+    the smallest change of noise, or of numbers with many digits, hardly repeats.
+
+    Args:
+        q: positions as they were read [rad or m], shape (..., time, joint).
+    """
+    q = np.asarray(q, dtype=np.float64)
+    changes = np.abs(np.diff(q, axis=-2)).reshape(-1, q.shape[-1])
+    spans = np.ptp(q.reshape(-1, q.shape[-1]), axis=0)
+    found = np.full(q.shape[-1], np.nan)
+    for joint, (change, span) in enumerate(zip(changes.T, spans, strict=True)):
+        moved = change[change > ROUNDING * span]
+        if len(moved) and np.mean(moved <= (1 + ALIKE) * moved.min()) >= REPEATED:
+            found[joint] = moved.min()
+    return found
+
+
+def frequency_counting(
+    time: ArrayLike,
+    q: ArrayLike,
+    counts_per_revolution: float,
+    *,
+    offset: float = 0.0,
+    edge_time: ArrayLike | None = None,
+) -> Array:
+    """Causal velocity from the time between encoder edges.
+
+    The velocity is the distance between the last two edges over the time between them. Without a
+    further edge the joint cannot have moved by more than a count, so the speed falls as one count
+    over the time since the last edge. An edge crossed back and forth is no distance. Before the
+    second edge the velocity is zero.
+
+    Args:
+        time: sample times [s], shape (time,).
+        q: position [rad], shape (time, joint); quantised here, which leaves counts as they are.
+        counts_per_revolution: counts after quadrature.
+        offset: position of one count's centre [rad].
+        edge_time: time of the last edge at or before each sample [s], shape like `q`, where the
+            hardware latches it; without it edges are known to the sample clock.
+    Returns:
+        Velocity [rad/s], shape (time, joint).
+    """
+    time, q = check_motion(time, q)
+    quantum = _quantum(counts_per_revolution)
+    counts = np.rint((q - offset) / quantum)
+    latched = np.broadcast_to(time[:, None], q.shape) if edge_time is None else edge_time
+    latched = np.asarray(latched, dtype=np.float64)
+    if latched.shape != q.shape:
+        raise ValueError(f"`edge_time` must be shaped like `q` {q.shape}, got {latched.shape}.")
+    velocity = np.zeros_like(q)
+    for joint in range(q.shape[1]):
+        step = np.diff(counts[:, joint])
+        edges = np.flatnonzero(step) + 1
+        # One edge gives a place but no time to travel.
+        if len(edges) < 2:
+            continue
+        # An edge lies half a count before the new count, on the side it came from.
+        place = counts[edges, joint] - 0.5 * np.sign(step[edges - 1])
+        moment = latched[edges, joint]
+        if np.any(np.diff(moment) <= 0):
+            raise ValueError("`edge_time` must increase from edge to edge.")
+        at_edge = quantum * np.diff(place) / np.diff(moment)
+        # For every sample the number of the last edge, counted from the second one on.
+        last = np.searchsorted(edges, np.arange(len(q)), side="right") - 2
+        known = last >= 0
+        v = at_edge[last[known]]
+        # |v| · waited is the distance since the edge at that speed; beyond one count it is less.
+        waited = time[known] - moment[last[known] + 1]
+        way = np.abs(v) * waited
+        velocity[known, joint] = v * quantum / np.maximum(way, quantum)
+    return velocity
+
+
+def _quantum(counts_per_revolution: float) -> float:
+    if not 0 < counts_per_revolution < math.inf:
+        raise ValueError(
+            f"`counts_per_revolution` must be positive and finite, got {counts_per_revolution}; "
+            f"an encoder of 2048 lines has 8192 counts after quadrature."
+        )
+    return 2 * math.pi / counts_per_revolution
 
 
 @dataclass(frozen=True)
@@ -53,29 +158,15 @@ class SecondOrderLowPass:
         a2 = (1 - 2 * self.damping * warped + warped**2) / a0
         return np.array([b0, 2 * b0, b0]), np.array([1.0, a1, a2])
 
-    def init(self, value: ArrayLike) -> Array:
-        """State (2, *value) of a filter at rest at `value`."""
-        b, a = self.coefficients
-        value = np.asarray(value, dtype=np.float64)
-        return np.stack([(1 - b[0]) * value, (b[2] - a[2]) * value])
-
-    def step(self, state: Array, value: ArrayLike) -> tuple[Array, Array]:
-        """Next state and output for one sample."""
-        b, a = self.coefficients
-        value = np.asarray(value, dtype=np.float64)
-        output = b[0] * value + state[0]
-        following = np.stack(
-            [b[1] * value - a[1] * output + state[1], b[2] * value - a[2] * output]
-        )
-        return following, output
-
     def __call__(self, values: ArrayLike, state: Array | None = None) -> Array:
-        """Filter a whole array (time, ...), at rest at its first sample unless `state` is given."""
-        values = np.asarray(values, dtype=np.float64)
-        state = self.init(values[0]) if state is None else state
+        """Filter an array (time, ...), at rest at its first sample unless a state is given."""
         from scipy.signal import lfilter  # slow to import
 
-        filtered, _ = lfilter(*self.coefficients, values, axis=0, zi=state)
+        values = np.asarray(values, dtype=np.float64)
+        b, a = self.coefficients
+        if state is None:
+            state = np.stack([(1 - b[0]) * values[0], (b[2] - a[2]) * values[0]])
+        filtered, _ = lfilter(b, a, values, axis=0, zi=state)
         return np.asarray(filtered)
 
 

@@ -87,7 +87,10 @@ def _smooth(delta: Array, process: Array, y: Array) -> tuple[Array, Array]:
     means[:-1] -= gain @ (transition @ means[:-1])
     for k in range(len(y) - 2, -1, -1):
         means[k] += gain[k] @ means[k + 1]
-    filtered[:-1] -= gain @ predicted[1:] @ gain.swapaxes(-1, -2)
+    # A sum of squares, for a difference of covariances would lose its sign behind a long gap.
+    keep = np.eye(ORDER) - gain @ transition
+    filtered[:-1] = keep @ filtered[:-1] @ keep.swapaxes(-1, -2)
+    filtered[:-1] += gain @ diffusion @ gain.swapaxes(-1, -2)
     k = len(y) - 2
     while k >= 0:
         filtered[k] += gain[k] @ filtered[k + 1] @ gain[k].swapaxes(-1, -2)
@@ -96,7 +99,8 @@ def _smooth(delta: Array, process: Array, y: Array) -> tuple[Array, Array]:
             filtered[settled:k] = filtered[k]
             k = settled
         k -= 1
-    return means[..., 0], np.diagonal(filtered, axis1=-2, axis2=-1)
+    # Behind a gap rounding may exceed a variance.
+    return means[..., 0], np.maximum(np.diagonal(filtered, axis1=-2, axis2=-1), 0.0)
 
 
 def _most_likely(
@@ -153,7 +157,8 @@ def _innovations(delta: Array, y: Array) -> tuple[Array, Array]:
     predicted, _, _ = _covariances(transition, diffusion, covariance)
     means = _filter(transition, predicted, mean, series)
     ahead = (transition[..., :1, :] @ means[:-1])[..., 0, :]
-    variance = predicted[1:, ..., 0, 0] + 1
+    # At least the noise's own, whatever rounding leaves of the prediction's behind a gap.
+    variance = np.maximum(predicted[1:, ..., 0, 0], 0.0) + 1
     misfit = ((series[1:] - ahead) ** 2 / variance[..., None]).sum(axis=(0, 1))
     return misfit, np.log(variance).sum(axis=(0, 1))
 

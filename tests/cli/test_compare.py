@@ -1,6 +1,7 @@
 """`compare` and `demo` as a user meets them: what they write and print, how they stop."""
 
 import logging
+import os
 import re
 import signal
 import subprocess
@@ -13,9 +14,10 @@ import pandas as pd
 import pytest
 import torch
 
-from nfriction import cli, load
+from nfriction import Recording, cli, load
 from nfriction.cli.console import Progress
-from tests.cli.benches import compare, results
+from nfriction.io.model_file import load_info
+from tests.cli.benches import QUICK, compare, results
 
 
 def test_compare_writes_the_promised_schema(compared: Path) -> None:
@@ -264,3 +266,21 @@ def test_triple_pendulum_test(data_dir: Path, tmp_path: Path) -> None:
     # The card's ratios are free of each other, ours keep to the chain's geometry.
     assert 0.8 < found["NCFM"]["free_run"]["all"] / 11.6e-3 < 1.15
     assert 0.8 < found["NCFM"]["windows"]["5"]["all"] / 6.1e-3 < 1.15
+
+
+def test_file_names_of_older_systems_lose_nothing(bench: Path, tmp_path: Path) -> None:
+    files = [tmp_path / os.fsdecode(f"Gelenk_{x}_ä.csv".encode("latin-1")) for x in "ab"]
+    for path, name in zip(files, ("a.csv.gz", "b.csv"), strict=True):
+        Recording.read(bench / name).write(path)
+    rig = ["--rig", str(bench / "bench.json")]
+    train, test, out = str(files[0]), str(files[1]), tmp_path / "out"
+    words = ["compare", train, "--test", test, *rig, "--models", "NCFM", *QUICK]
+    assert cli.main([*words, "--out", str(out)]) == 0
+    found = results(out)
+    assert list(found["models"]["NCFM"]["test"]) == ["Gelenk_b_ä"]
+    assert "Gelenk_b_ä" in set(pd.read_csv(out / "table.csv").recording)
+    assert cli.main(["report", str(out)]) == 0
+    assert "Gelenk_b_ä" in (out / "report.html").read_text(encoding="utf-8")
+    model = tmp_path / "model.json"
+    assert cli.main(["fit", train, *rig, "--model", "NCFM", *QUICK, "--out", str(model)]) == 0
+    assert "Gelenk_a_ä" in str(load_info(model))

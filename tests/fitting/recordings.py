@@ -37,7 +37,7 @@ def swing(
         sample_time=sample_time if steps is None else torch.as_tensor(steps),
         steps=count, substeps=4, gradients=False,
     )  # fmt: skip
-    written = AngleConvention.parse(convention)
+    written = AngleConvention.of(convention)
     q = quantise(written.position_from_joint(out.q.numpy()), COUNTS)
     return Recording(out.time.numpy(), q, convention=written, name=name)
 

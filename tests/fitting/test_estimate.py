@@ -420,6 +420,7 @@ def test_a_method_that_is_none_is_named():
         (lambda m, p, r: (m, r, p), "`plant` must be"),
         (lambda m, p, r: (m, p, "run.csv"), "`recordings` must be one Recording .*'run.csv'"),
         (lambda m, p, r: (m, p, r.q), "`recordings` must be"),
+        (lambda m, p, r: (m, p, r.to_pandas()), "`recordings` .*from_pandas.* got DataFrame"),
     ],
 )
 def test_what_is_something_else_is_told(arguments, told):

@@ -85,12 +85,12 @@ def test_controldesk_records_are_read_by_name(tmp_path: Path, prefix: str) -> No
 
 def test_a_name_that_two_signals_bear_leads_nowhere(tmp_path: Path) -> None:
     content = controldesk() | {"run_002": controldesk()["run_001"]}
-    with pytest.raises(ValueError, match="Model Root/enc 1/Out1 is missing; found run_001"):
+    with pytest.raises(ValueError, match="Model Root/enc 1/Out1 are missing; found run_001"):
         read(tmp_path, content, columns={"q1": "Model Root/enc 1/Out1"})
 
 
 def test_what_cannot_be_a_recording_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="column time, q1 is missing; found a, b"):
+    with pytest.raises(ValueError, match="columns time, q1 are missing; found a, b"):
         read(tmp_path, {"a": TIME, "b": TIME})
     with pytest.raises(ValueError, match="different numbers of samples: q1 20, time 40"):
         read(tmp_path, {"time": TIME, "q1": Q[:20, 0]})

@@ -50,7 +50,7 @@ def test_channels_are_read_by_name_with_their_units(asammdf: Any, tmp_path: Path
         Recording.read(path, columns={"q1": "enc_1:rad"})
     with pytest.raises(ValueError, match="'bar' is no unit of q"):
         Recording.read(path, columns={"q1": "gas"})
-    with pytest.raises(ValueError, match="column time, q1 is missing; found enc_1, enc_2, gas"):
+    with pytest.raises(ValueError, match="columns time, q1 are missing; found enc_1, enc_2, gas"):
         Recording.read(path)
 
 

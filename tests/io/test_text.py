@@ -3,6 +3,7 @@
 import gzip
 import itertools
 import math
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from nfriction.recording import Recording
+from nfriction.recording import Recording, RecordingWarning
 
 TIME = np.arange(20) / 1000
 Q = np.random.default_rng(0).normal(size=(20, 2)) / 7
@@ -124,7 +125,7 @@ def test_an_ending_separator_is_no_column(tmp_path: Path) -> None:
         ("time,q1\n0\t1\n1\t2\n", "header is separated by commas, its rows by tabs"),
         ("time;q1;q2\n0,1;1,5;1.5\n0,2;1,6;1.6\n", "decimal commas and column q2 decimal points"),
         ("time;q1\n0,1;1,5\n0,2;1.6\n", "must be a number, got '1,5'|decimal commas"),
-        ("time;q1\n0;1.234,5\n1;1.235,5\n", r"column q1, row 0 .* got '1\.234,5'"),
+        ("time;q1\n0;1.23,5\n1;1.235,5\n", r"column q1, row 0 .* got '1\.23,5'"),
         ("time;q1;q1\n0;1;2\n1;2;3\n", "q1 is there more than once"),
         ("time;q1;q1 \n0;1;2\n1;2;3\n", "q1 is there more than once"),
         ("time;q1\n[s];[bar]\n0;1\n1;2\n", r"column q1: '\[bar\]' is no unit of q"),
@@ -139,6 +140,111 @@ def test_what_can_be_read_in_two_ways_is_refused(tmp_path: Path, text: str, mess
     with pytest.raises(ValueError, match=message) as caught:
         read(tmp_path, text)
     assert "run.csv" in str(caught.value)
+
+
+def thousands(value: float, separator: str) -> str:
+    return f"{value:,}".replace(",", separator)
+
+
+def log(q1: list[str], time: list[str] | None = None, separator: str = ";") -> str:
+    time = [str(k) for k in range(len(q1))] if time is None else time
+    rows = [separator.join(pair) for pair in zip(time, q1, strict=True)]
+    return "\n".join([separator.join(("time", "q1")), *rows]) + "\n"
+
+
+COUNTS = np.rint(35_000 + 1200 * np.cos(np.arange(40) / 7)).astype(int)
+IN_COUNTS = {"time": "time:ms", "q1": "q1:counts/40000"}
+# All that says which sign is which is a number elsewhere, or the unit.
+BY_COLUMN = {
+    "more than a million": ([0, 999, 12_345, 1_234_567, 1_234_000, 8, 9, 10], None),
+    "a point elsewhere": (COUNTS.tolist(), [f"{k / 1000:.3f}" for k in range(40)]),
+}
+
+
+@pytest.mark.parametrize("separator", [",", "."])
+@pytest.mark.parametrize("case", BY_COLUMN)
+def test_thousands_are_recognised_by_the_whole_file(
+    tmp_path: Path, separator: str, case: str, recwarn: pytest.WarningsRecorder
+) -> None:
+    values, time = BY_COLUMN[case]
+    if time and separator == ".":
+        time = [stamp.replace(".", ",") for stamp in time]
+    back = read(tmp_path, log([thousands(x, separator) for x in values], time))
+    assert np.array_equal(back.q[:, 0], values)
+    assert not [w for w in recwarn if "thousands" in str(w.message)]
+
+
+@pytest.mark.parametrize("separator", [",", "."])
+def test_counts_are_whole(tmp_path: Path, separator: str, recwarn: pytest.WarningsRecorder) -> None:
+    text = log([thousands(int(x), separator) for x in COUNTS])
+    back = read(tmp_path, text, columns=IN_COUNTS)
+    np.testing.assert_allclose(back.q[:, 0], COUNTS * 2 * np.pi / 40_000, rtol=1e-15)
+    assert np.array_equal(read(tmp_path, text.replace("q1", "q1 [counts/40000]"),
+                               columns={"time": "time:ms", "q1": "q1"}).q, back.q)  # fmt: skip
+    assert not recwarn
+
+
+@pytest.mark.parametrize("separator", [",", "."])
+def test_thousands_that_nothing_gives_away_are_asked_about(tmp_path: Path, separator: str) -> None:
+    text = log([thousands(int(x), separator) for x in COUNTS])
+    with pytest.warns(
+        RecordingWarning, match=r"q1 .*3[56].*assumed is that it is a decimal sign; .*# decimal"
+    ):
+        assert np.array_equal(read(tmp_path, text).q[:, 0], COUNTS / 1000)
+    for decimal, scale in ((separator, 1000), ({",": ".", ".": ","}[separator], 1)):
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", "column", RecordingWarning)
+            back = read(tmp_path, f"# decimal: {decimal}\n{text}")
+        assert np.array_equal(back.q[:, 0], COUNTS / scale)
+
+
+@pytest.mark.parametrize("separator", [",", "."])
+def test_a_motion_through_a_thousand_is_followed_and_said(tmp_path: Path, separator: str) -> None:
+    counts = COUNTS - 34_900
+    text = log([thousands(int(x), separator) for x in counts])
+    with pytest.warns(RecordingWarning, match="assumed is that it separates thousands"):
+        assert np.array_equal(read(tmp_path, text).q[:, 0], counts)
+
+
+def test_thousands_and_decimals_in_one_number(tmp_path: Path) -> None:
+    values = [999.5, 1000.25, 1234.5, 0, 1, 2, 3, -12345.75]
+    english = log([f"{x:,}" for x in values])
+    german = english.translate({ord(","): ".", ord("."): ","})
+    for text in (english, german):
+        assert np.array_equal(read(tmp_path, text).q[:, 0], values)
+
+
+def test_numbers_in_quotation_marks_may_hold_commas(tmp_path: Path) -> None:
+    text = log([f'"{x:,}"' for x in [0, *COUNTS.tolist(), 1_234_567]], separator=",")
+    assert np.array_equal(read(tmp_path, text).q[:, 0], [0, *COUNTS, 1_234_567])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [log([f"{x / 1000:.3f}" for x in range(990, 1030)]),
+     log([f"{x}.125" for x in range(10, 20)], [f"{k / 10}" for k in range(10)]),
+     log([f"{x}.125" for x in range(1020, 1030)]),
+     log([f"{x}.125" for x in range(20)])],
+)  # fmt: skip
+def test_decimal_points_before_three_digits_are_taken_silently(
+    tmp_path: Path, text: str, recwarn: pytest.WarningsRecorder
+) -> None:
+    for written_so in (text, text.replace(".", ",")):
+        back = read(tmp_path, written_so)
+        cells = [line.split(";")[1] for line in text.splitlines()[1:]]
+        assert np.array_equal(back.q[:, 0], np.array(cells, dtype=float))
+    assert not [w for w in recwarn if "thousands" in str(w.message)]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("# decimal: .\ntime;q1\n0;0,5\n", "column q1 has ',' as its decimal sign, .* states '.'"),
+     ("# decimal: comma\ntime;q1\n0;0,5\n", "must state , or . as the sign, got 'comma'"),
+     ("time;q1;q2\n0;1,234,567;1.234.567\n", "column q2 has decimal commas and column q1")],
+)  # fmt: skip
+def test_signs_that_contradict_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        read(tmp_path, text)
 
 
 @pytest.mark.parametrize(

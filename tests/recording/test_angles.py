@@ -77,20 +77,20 @@ def test_the_argument_is_not_changed() -> None:
 
 @pytest.mark.parametrize("convention", CONVENTIONS, ids=str)
 def test_text_round_trip(convention: AngleConvention) -> None:
-    assert AngleConvention.parse(str(convention)) == convention
+    assert AngleConvention.of(str(convention)) == convention
     swapped = f" {convention.measured_from}-{convention.angles.upper()} "
-    assert AngleConvention.parse(swapped) == convention
+    assert AngleConvention.of(swapped) == convention
 
 
 def test_words_left_out_take_the_default() -> None:
-    assert AngleConvention.parse("hanging") == AngleConvention("relative", "hanging")
-    assert AngleConvention.parse("absolute") == AngleConvention("absolute", "upright")
+    assert AngleConvention.of("hanging") == AngleConvention("relative", "hanging")
+    assert AngleConvention.of("absolute") == AngleConvention("absolute", "upright")
 
 
 @pytest.mark.parametrize("text", ["", "sideways", "absolute,relative", "hanging hanging"])
 def test_bad_text_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"one of upright, hanging.*got"):
-        AngleConvention.parse(text)
+        AngleConvention.of(text)
 
 
 def test_bad_fields_are_refused() -> None:

@@ -154,8 +154,32 @@ def test_a_column_that_looks_like_torque_is_not_left_out_without_a_word(
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         # Who has named all torques knows what else there is.
-        Recording.from_pandas(table, columns={f"tau{k + 1}": name for k in range(joints)})
+        named = {f"tau{k + 1}": f"motor {k}" if k else name for k in range(joints)}
+        Recording.from_pandas(table.assign(**{"motor 1": 2.0}), columns=named)
         Recording.from_pandas(table.rename(columns={name: "torque_on"}))
+
+
+@pytest.mark.parametrize("name", ["current", "current1 [A]", "Motorstrom_1"])
+def test_a_current_is_no_torque_and_not_left_out_without_a_word(name: str) -> None:
+    table = swing(joints=1).to_pandas().filter(regex="time|q")
+    table[name] = 1.0
+    said = "looks like motor current and is not read; .* multiply it by the torque constant"
+    with pytest.warns(RecordingWarning, match=said):
+        assert Recording.from_pandas(table).tau is None
+
+
+@pytest.mark.parametrize("columns", [{"q1": "q2"}, {"q1": "q1", "tau2": "q1"}, {"time": "q1:ms"}])
+def test_a_column_is_named_once(columns: dict[str, str]) -> None:
+    table = swing().to_pandas().drop(columns="tau2", errors="ignore")
+    columns = {"q1": "q1", "q2": "q2"} | columns
+    with pytest.raises(ValueError, match=r"names column q\d for q\d and .*; each has a column"):
+        Recording.from_pandas(table, columns=columns)
+
+
+def test_whole_numbers_that_whirl_look_like_counts() -> None:
+    counts = np.rint(8192 * np.arange(200) / 20)[:, None]
+    with pytest.warns(RecordingWarning, match="looks like encoder counts .*q1:counts/8192"):
+        Recording(np.arange(200) / 1000, counts)
 
 
 def test_named_columns_must_be_there_and_of_joints_that_are() -> None:

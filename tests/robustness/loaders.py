@@ -32,7 +32,7 @@ from nfriction.export.onnx_file import open_onnx
 from nfriction.export.torch_code.pt2 import open_pt2
 from nfriction.export.torch_code.torchscript import open_torchscript
 from nfriction.io.formats import matlab, mdf
-from nfriction.io.formats.worker import load_signals, save_signals
+from nfriction.io.formats.signals import load_signals, save_signals
 from nfriction.io.model_file import ModelFileError, load, load_info, load_plant
 from nfriction.io.model_info import parameter_hash
 from nfriction.papers.controller.fis import load_fis

@@ -5,6 +5,7 @@ import textwrap
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -34,16 +35,21 @@ def as_recording_list(
     Warns:
         UserWarning: if only some recordings have torques.
     """
-    many = [recordings] if isinstance(recordings, Recording) else recordings
-    given = list(many) if isinstance(many, Iterable) and not isinstance(many, str) else [many]
+    given: list[Any] = [recordings]
+    # A table iterates over its columns, a text over its letters.
+    single = isinstance(recordings, str) or hasattr(recordings, "columns")
+    if isinstance(recordings, Iterable) and not single:
+        given = list(recordings)
     wanted: list[tuple[str, object, tuple[type, ...], str]] = [
         ("model", model, (FrictionModel,), "a friction model such as LFM(joints=3)"),
         ("plant", plant, (PendulumChain, LinearAxis), "a PendulumChain or LinearAxis"),
-        *(("recordings", r, (Recording,), "one Recording or a list of them") for r in given),
-    ]
+        *(("recordings", r, (Recording,), "one Recording or a list of them, made by "
+           "`Recording.read(path)` or `Recording.from_pandas(table)`") for r in given),
+    ]  # fmt: skip
     for name, value, kinds, what in wanted:
         if not isinstance(value, kinds):
-            raise TypeError(f"`{name}` must be {what}, got {textwrap.shorten(repr(value), 60)}.")
+            shown = textwrap.shorten(repr(value), 60)
+            raise TypeError(f"`{name}` must be {what}, got {type(value).__name__} {shown}.")
     _refuse_repeated(given)
     warn_of_undriven(given)
     return given

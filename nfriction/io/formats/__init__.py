@@ -8,6 +8,7 @@ pandas is slow to import, so only functions that make tables import it.
 """
 
 from nfriction.io.formats.files import read_table, stem, write_table
-from nfriction.io.formats.selection import Arrays, column_numbers, table_arrays
+from nfriction.io.formats.numbers import column_numbers
+from nfriction.io.formats.selection import Arrays, table_arrays
 
 __all__ = ["Arrays", "column_numbers", "read_table", "stem", "table_arrays", "write_table"]

@@ -31,8 +31,8 @@ _READERS = {
     ".parquet": "columnar:read_parquet",
     ".npz": "columnar:read_npz",
     ".mat": "matlab:read_mat",
-    ".h5": "hdf5:read_hdf5",
-    ".hdf5": "hdf5:read_hdf5",
+    ".h5": "matlab:read_hdf5",
+    ".hdf5": "matlab:read_hdf5",
     ".mf4": "mdf:read_mdf",
 }
 _WRITERS = {
@@ -91,9 +91,13 @@ def write_table(table: pd.DataFrame, path: str | os.PathLike[str]) -> None:
 
 
 def stem(path: str | os.PathLike[str]) -> str:
-    """A file's name without the ending of its format."""
-    name = Path(path).name
-    return name[: -len(_ending(Path(path), _READERS, "read"))]
+    """A file's name without the ending of its format, as text that any file can hold."""
+    name = os.fsencode(Path(path).name)[: -len(_ending(Path(path), _READERS, "read"))]
+    try:
+        return name.decode()
+    except UnicodeDecodeError:
+        # Of an older system, like the file's content; Python's stand-ins cannot be written.
+        return name.decode("latin-1")
 
 
 def most_unpacked(packed: int) -> int:

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nfriction.io.formats.nested import Signals, asked_names
 from nfriction.io.formats.selection import OURS
-from nfriction.io.formats.worker import read_in_worker, read_main
+from nfriction.io.formats.signals import Signals, asked_names, read_in_worker, read_main
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -11,17 +11,21 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from nfriction.io.formats.numbers import THOUSANDS, column_numbers
+
 if TYPE_CHECKING:
     import pandas as pd
 
 Array = NDArray[np.float64]
 
 OURS = re.compile(r"time|(q|qd|tau)[1-9]\d{0,3}", re.ASCII)
-# Usual names of a torque, with a number and a unit behind; "torque_on" and "taut" are none.
+# Usual names of a torque, or of the current that makes it, with a number and a unit behind;
+# "torque_on" and "taut" are none.
 _LIKE_TORQUE = re.compile(
-    r"(torque|drehmoment|(?<![a-z])(tau|force))(_(cmd|command|meas|measured))?[\W_]*\d*\s*([\[(].*)?$",
+    r"(torque|drehmoment|strom|(?<![a-z])(tau|force|current))(_(cmd|command|meas|measured))?[\W_]*\d*\s*([\[(].*)?$",
     re.IGNORECASE,
 )
+_LIKE_CURRENT = re.compile("strom|current", re.IGNORECASE)
 
 _TURN = 2 * math.pi
 _ROTATION = {"rad": 1.0, "mrad": 1e3, "deg": 180 / math.pi, "rev": 1 / _TURN}
@@ -92,6 +96,7 @@ def table_arrays(
             f"positions of those joints, too, or drop them."
         )
     sources = {key: source for key, source in sources.items() if _number(key) <= joints}
+    undecided = _settle_decimal_sign(table, sources)
     arrays = {"time": _column(table, "time", sources["time"])}
     for key in ("q", "qd", "tau"):
         group = [sources.get(f"{key}{k + 1}") for k in range(joints)]
@@ -103,7 +108,8 @@ def table_arrays(
     kinds = {slides(unit) for unit in units}
     if len(kinds) > 1:
         raise ValueError(f"positions must all be angles or all be lengths, got {', '.join(units)}.")
-    return Arrays(arrays, kinds.pop() if kinds else None, _remarks(table, sources, joints))
+    remarks = (*undecided, *_remarks(table, sources, joints))
+    return Arrays(arrays, kinds.pop() if kinds else None, remarks)
 
 
 def parse_source(spec: str, names: set[str]) -> Source | None:
@@ -112,33 +118,6 @@ def parse_source(spec: str, names: set[str]) -> Source | None:
     if spec in names:
         return Source(spec, None)
     return Source(stem, unit) if stem in names and is_unit(unit) else None
-
-
-def column_numbers(table: pd.DataFrame, column: str) -> Array:
-    """A column as float64; empty cells are NaN.
-
-    Raises:
-        ValueError: a cell is no number; names it.
-    """
-    cells = table[column].to_numpy(dtype=object, na_value=np.nan)
-    try:
-        return cells.astype(np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        row = next(row for row, cell in enumerate(cells) if not is_number(cell))
-        shown = repr(cells[row])
-        raise ValueError(
-            f"column {column}, row {row} (counted from 0 below the header) must be a number, "
-            f"got {shown if len(shown) < 80 else shown[:77] + '...'}."
-        ) from error
-
-
-def is_number(cell: object) -> bool:
-    """True if Python reads the cell as a float."""
-    try:
-        float(cell)  # type: ignore[arg-type]
-    except (TypeError, ValueError, OverflowError):
-        return False
-    return True
 
 
 def canonical_unit(text: str) -> str:
@@ -197,10 +176,18 @@ def _sources(table: pd.DataFrame, columns: dict[str, str]) -> dict[str, Source]:
         for key, spec in columns.items()
     }
     found = {key: source for key, source in mapped.items() if source is not None}
+    keys: dict[str, list[str]] = {}
+    for key, source in found.items():
+        keys.setdefault(aliases.get(source.column, source.column), []).append(key)
+    for column, of in keys.items():
+        if len(of) > 1:
+            raise ValueError(
+                f"`columns` names column {column} for {' and '.join(of)}; each has a column of its "
+                "own, so correct one of them."
+            )
     # A column that is mapped to one key must not also be found by its own name.
-    claimed = {aliases.get(s.column, s.column) for s in found.values()}
     for name in (*names, *aliases):
-        if OURS.fullmatch(name) and name not in columns and aliases.get(name, name) not in claimed:
+        if OURS.fullmatch(name) and name not in columns and aliases.get(name, name) not in keys:
             found[name] = Source(name, None)
     return {key: _known(table, aliases, source) for key, source in found.items()}
 
@@ -241,9 +228,28 @@ def _number(name: str) -> int:
     return int(digits[1]) if digits else 0
 
 
-def _remarks(
-    table: pd.DataFrame, sources: dict[str, Source], joints: int
-) -> tuple[tuple[str, str], ...]:
+def _settle_decimal_sign(table: pd.DataFrame, sources: dict[str, Source]) -> list[tuple[str, str]]:
+    """Settle the decimal sign that the text leaves open; a remark if it remains a guess."""
+    columns = set(table.attrs.get("undecided", ()))
+    used = [source for source in sources.values() if source.column in columns]
+    for column, unit in used:
+        cell = next(str(cell) for cell in table[column] if set(str(cell)) & set(THOUSANDS))
+        sign = "," if "," in cell else "."
+        # Counts are whole, so it cannot be a decimal sign.
+        if unit and canonical_unit(unit).startswith("count"):
+            table.attrs["decimal"] = THOUSANDS[sign]
+            return []
+    if not used:
+        return []
+    role = "is a decimal sign" if table.attrs["decimal"] == sign else "separates thousands"
+    finding = (
+        f"column {column} leaves open what {sign!r} in {cell!r} means; assumed is that it {role}"
+    )
+    remedy = "state the decimal sign by a line `# decimal: ,` or `# decimal: .` above the header"
+    return [(finding, remedy)]
+
+
+def _remarks(table: pd.DataFrame, sources: dict[str, Source], joints: int) -> list[tuple[str, str]]:
     lacking = {
         key: [f"{key}{k + 1}" for k in range(joints) if f"{key}{k + 1}" not in sources]
         for key in ("qd", "tau")
@@ -259,10 +265,15 @@ def _remarks(
     unread = _unread_torques(table, sources) if free else []
     if unread:
         own = f"tau{_number(unread[0])}"
-        remedy = f'columns={{"{own if own in free else free[0]}": "{unread[0]}"}}'
-        finding = f"column {', '.join(unread[:3])} looks like torque and is not read"
-        remarks.append((finding, f"if it is, name it with {remedy}"))
-    return tuple(remarks)
+        option = f'columns={{"{own if own in free else free[0]}": "{unread[0]}"}}'
+        kind, remedy = "torque", f"if it is, name it with {option}"
+        if _LIKE_CURRENT.search(unread[0]):
+            kind = "motor current"
+            remedy = "if it drives a joint, multiply it by the torque constant "
+            remedy += f"and name it with {option}"
+        finding = f"column {', '.join(unread[:3])} looks like {kind} and is not read"
+        remarks.append((finding, remedy))
+    return remarks
 
 
 def _unread_torques(table: pd.DataFrame, sources: dict[str, Source]) -> list[str]:
@@ -294,10 +305,11 @@ def _missing(table: pd.DataFrame, columns: dict[str, str], missing: list[str]) -
     first = columns.get(missing[0], missing[0])
     stem, _, unit = first.rpartition(":")
     note = f" {unit!r} is no unit known." if stem in found and not is_unit(unit) else ""
+    lost = [columns.get(key, key) for key in missing[:10]]
+    label = f"column {lost[0]} is" if len(lost) == 1 else f"columns {', '.join(lost)} are"
     return (
-        f"column {', '.join(columns.get(c, c) for c in missing[:10])} is missing; found "
-        f'{shown}.{note} Name the columns with columns={{"{missing[0]}": "..."}}, a unit after '
-        f'a colon where it is not SI, as in "enc_1:deg".'
+        f'{label} missing; found {shown}.{note} Name the columns with columns={{"{missing[0]}": '
+        f'"..."}}, a unit after a colon where it is not SI, as in "enc_1:deg".'
     )
 
 

@@ -1,8 +1,8 @@
 """CSV as loggers write it: any separator, decimal commas, a row of units, odd encodings.
 
 The header decides the separator: a tab if it has one, else a semicolon, else a comma, else blanks.
-Between commas numbers have a decimal point; between other separators a comma in a number is a
-decimal comma, never one of thousands. All else is refused.
+The decimal sign is that with which all columns are numbers, the other sign separates thousands: a
+single `0,5` or `1.234.567` decides for the whole file. A line `# decimal: ,` states it.
 """
 
 from __future__ import annotations
@@ -18,18 +18,17 @@ from pathlib import Path
 import pandas as pd
 
 from nfriction.io.formats.files import MOST_COLUMNS, most_unpacked, refuse_bomb, refuse_size
-from nfriction.io.formats.selection import is_number, is_unit
+from nfriction.io.formats.numbers import decimal_sign, is_number
+from nfriction.io.formats.selection import is_unit
 
 ATTRIBUTES = ("convention", "unit", "names")
 
 _SEPARATORS = ("\t", ";", ",")
 _NAMES = {"\t": "tabs", ";": "semicolons", ",": "commas", " ": "blanks"}
-_COMMA = re.compile(r"\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*", re.ASCII)
-_POINT = re.compile(r"\s*[+-]?\d*\.\d+([eE][+-]?\d+)?\s*", re.ASCII)
 
 
 def read_csv(path: Path, _: object = ()) -> pd.DataFrame:
-    """Table of text cells with decimal points; `attrs` hold comments, units and aliases."""
+    """Table of text cells; `attrs` hold comments, units, aliases and the decimal sign."""
     return parse_csv(_decoded(path.read_bytes()))
 
 
@@ -85,9 +84,6 @@ def parse_csv(text: str) -> pd.DataFrame:
     unnamed = [c for c in table.columns if c.startswith("Unnamed: ") and table[c].isna().all()]
     table = table.drop(columns=unnamed)
     table, units = _without_units_row(table)
-    # Between commas a decimal comma is indistinguishable from a separator.
-    if separator != ",":
-        table = _with_decimal_points(table)
     aliases: dict[str, str] = {}
     for column in table.columns:
         # "time [s]" may also be called "time".
@@ -97,7 +93,12 @@ def parse_csv(text: str) -> pd.DataFrame:
             if named[1] not in table.columns:
                 aliases.setdefault(named[1], column)
     repeated = sorted(n for n, count in Counter(names).items() if n and count > 1)
-    table.attrs.update(_comments(text), units=units, aliases=aliases, repeated=repeated)
+    settings = _comments(text)
+    # Who separates cells by commas hardly writes them in numbers, too.
+    usual = "." if separator == "," else ","
+    decimal, undecided = decimal_sign(table, settings.pop("decimal", None), usual)
+    table.attrs.update(settings, units=units, aliases=aliases, repeated=repeated)
+    table.attrs.update(decimal=decimal, undecided=undecided)
     return table
 
 
@@ -121,7 +122,7 @@ def _comments(text: str) -> dict[str, str]:
         if not _is_comment(line):
             break
         key, _, value = line.lstrip()[1:].partition(":")
-        if key.strip() in ATTRIBUTES:
+        if key.strip() in (*ATTRIBUTES, "decimal"):
             found[key.strip()] = value.strip()
     return found
 
@@ -148,22 +149,6 @@ def _separator(header: str, rows: list[str]) -> str:
     return found
 
 
-def _with_decimal_points(table: pd.DataFrame) -> pd.DataFrame:
-    """Numbers with a decimal comma rewritten; refused where the file also has decimal points."""
-    commas = {c for c in table.columns if _all_numbers_with(table[c], _COMMA, ",")}
-    if not commas:
-        return table
-    # Else a thousands separator in one column would pass for a decimal one.
-    points = [c for c in table.columns if _all_numbers_with(table[c], _POINT, ".")]
-    if points:
-        raise ValueError(
-            f"column {min(commas)} has decimal commas and column {points[0]} decimal points; "
-            "write all numbers alike"
-        )
-    changed = {c: table[c].str.replace(",", ".", regex=False) for c in commas}
-    return table.assign(**changed)
-
-
 def _unique(names: Iterable[str]) -> list[str]:
     """Names made unique as pandas does, but after blanks are stripped."""
     found: dict[str, None] = {}
@@ -173,12 +158,6 @@ def _unique(names: Iterable[str]) -> list[str]:
             own, k = f"{name}.{k + 1}", k + 1
         found[own] = None
     return list(found)
-
-
-def _all_numbers_with(cells: pd.Series, form: re.Pattern[str], sign: str) -> bool:
-    """True if cells with this decimal sign exist and all of them are numbers."""
-    holding = cells[cells.str.contains(sign, regex=False, na=False)]
-    return len(holding) > 0 and bool(holding.str.fullmatch(form).all())
 
 
 def _without_units_row(table: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, str]]:

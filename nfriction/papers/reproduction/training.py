@@ -100,7 +100,7 @@ def _bench(given: argparse.Namespace) -> Bench:
     if given.rig is None:
         raise ValueError("recordings need --rig, a rig file or the name of one.")
     plant = rigs.by_name(given.rig) if given.rig in rigs.names() else rigs.read(given.rig)
-    convention = AngleConvention.parse(given.angles or ",".join(plant.convention))
+    convention = AngleConvention.of(given.angles or plant)
     unit: Literal["rad", "m"] = "m" if plant.unit == "m" else "rad"
     train = [
         Recording.read(path, degrees=given.degrees, convention=convention, unit=unit)
