@@ -1,5 +1,6 @@
 """Batches of arguments as compiled code reads them, and kernels that work through them."""
 
+import math
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -73,7 +74,7 @@ def rows_of(name: str, value: Any, shape: tuple[int, ...]) -> Series:
         raise ValueError(
             f"`{name}` must be (batch, {shown}), got {array.shape}; a single one is `{name}[None]`."
         )
-    flat = array.reshape(len(array), -1)
+    flat = array.reshape(len(array), math.prod(shape))
     return _strided(np.broadcast_to(flat[:, None], (len(flat), 1, flat.shape[1])))
 
 
@@ -119,7 +120,7 @@ def parameter_rows(
             raise ValueError(
                 f"parameter `{name}` must be {shape} or (candidate, *{shape}), got {array.shape}."
             )
-        given[name] = array.reshape(len(array), -1)
+        given[name] = array.reshape(len(array), math.prod(shape))
     counts = {f"parameters[{name!r}]": len(given[name]) for name in overrides}
     rows = common_rows(counts)
     columns = [a if len(a) == rows else np.repeat(a, rows, axis=0) for a in given.values()]

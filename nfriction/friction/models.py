@@ -96,7 +96,8 @@ class FrictionModel(nn.Module):
         It decides whether an explicit integrator is stable near standstill. The largest, where
         several sets of coefficients are possible at rest.
         """
-        held = self.schedule.rest_coefficients().detach()
+        # A copy, because tensors made in inference mode cannot be differentiated through.
+        held = self.schedule.rest_coefficients().detach().clone()
         rest = held.new_zeros(held.shape[:-1])
         load = torch.ones_like(rest)
         with torch.enable_grad():

@@ -109,7 +109,7 @@ def integrate_compiled(
         values,
         threads,
     )
-    states = tuple(x.reshape(*batch, -1, joints) for x in (found.q, found.qd, found.qdd))
+    states = tuple(x.reshape(*batch, *x.shape[1:]) for x in (found.q, found.qd, found.qdd))
     return (*states, found.jacobian.unflatten(0, batch)) if jacobian else states
 
 

@@ -6,8 +6,10 @@ acceleration needs friction.
 """
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from functools import wraps
+from typing import Literal, ParamSpec, TypeVar, get_args
 
 import torch
 from torch import Tensor
@@ -28,6 +30,8 @@ from nfriction.simulation.validate import (
 
 logger = logging.getLogger(__name__)
 
+P = ParamSpec("P")
+R = TypeVar("R")
 Scheme = Literal["rk4", "time_stepping"]
 # Beyond this many steps gradients are rarely meant and may take gigabytes: they must be asked for.
 GRADIENT_STEPS = 10_000
@@ -59,6 +63,23 @@ class Rollout:
         return torch.isfinite(self.diverged_at)
 
 
+def _outside_inference_mode(function: Callable[P, R]) -> Callable[P, R]:
+    """The function without gradients in `torch.inference_mode()`, which is left meanwhile.
+
+    Its tensors can be neither traced nor differentiated, and the slope at rest is a derivative.
+    """
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        if not torch.is_inference_mode_enabled():
+            return function(*args, **kwargs)
+        with torch.inference_mode(False), torch.no_grad():
+            return function(*args, **kwargs)
+
+    return call
+
+
+@_outside_inference_mode
 def rollout(
     plant: Plant,
     friction: Friction | None,
@@ -87,7 +108,8 @@ def rollout(
     Args:
         plant: the mechanism, e.g. `rigs.tlrip()`.
         friction: friction model, or None for no friction.
-        q0, qd0: initial state [rad, rad/s] in joint coordinates, shape (*batch, joint).
+        q0, qd0: initial state [rad, rad/s] in joint coordinates, shape (*batch, joint); like all
+            tensors here also NumPy arrays or lists, which are float64 unless an array says else.
         tau: joint torque [N m], held over each step, shape (steps, joint) or
             (*batch, steps, joint); None for none.
         sample_time: sample time [s], a number, (steps,) or (*batch, steps).
@@ -191,6 +213,8 @@ def _as_rollout(inputs: RolloutInputs, states: tuple[Tensor, ...]) -> Rollout:
 @torch.no_grad()
 def _divergence(time: Tensor, q: Tensor, qd: Tensor) -> Tensor:
     """Time of the first sample that is not finite or beyond any speed, infinity where none."""
+    if not q.numel():
+        return time.new_full(q.shape[:-2], torch.inf)
     # Positions are finite while velocities are; a NaN fails every comparison.
     low, high = qd.aminmax()
     if float(low) > -SPEED_LIMIT and float(high) < SPEED_LIMIT:
