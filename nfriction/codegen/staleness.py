@@ -197,8 +197,8 @@ class _Walk:
     def _tensor(self, value: Tensor) -> None:
         if value.layout is not torch.strided:
             raise Incomparable(f"a tensor with layout {value.layout}")
-        flat = value.detach().cpu().contiguous().reshape(-1)
-        self.parts += (value.shape, value.dtype, flat.view(torch.uint8).numpy().tobytes())
+        exact = value.float() if value.dtype is torch.bfloat16 else value  # NumPy has none
+        self.parts += (value.shape, value.dtype, exact.numpy(force=True).tobytes())
 
     def _array(self, value: Any) -> None:
         if value.dtype.hasobject:
@@ -293,13 +293,8 @@ class _Walk:
 
     def _object(self, kind: type, value: Any) -> None:
         """An object of a class in Python: its class and all of its attributes."""
-        slots = [
-            name
-            for base in kind.__mro__
-            for name, slot in vars(base).items()
-            if isinstance(slot, types.MemberDescriptorType)
-        ]
-        if not _is_transparent(kind, len(slots)):
+        slots = _slots(kind)
+        if slots is None:
             raise Incomparable(f"an object of {kind.__module__}.{kind.__qualname__}")
         self._class(kind)
         for name in slots:
@@ -311,12 +306,17 @@ class _Walk:
 
 
 @functools.lru_cache(1024)
-def _is_transparent(kind: type, slots: int) -> bool:
-    """True where attributes are all that objects of a class hold."""
+def _slots(kind: type) -> tuple[str, ...] | None:
+    """Slots of a class whose objects hold these and attributes alone, else None."""
+    slots = tuple(
+        name
+        for base in kind.__mro__
+        for name, slot in vars(base).items()
+        if isinstance(slot, types.MemberDescriptorType)
+    )
     if kind is types.SimpleNamespace:
-        return True
-    word = tuple.__itemsize__
+        return slots
     # Beside its slots, an object in Python has its attributes and a place for weak references.
-    within = kind.__basicsize__ <= object.__basicsize__ + word * (slots + 2)
+    most = object.__basicsize__ + tuple.__itemsize__ * (len(slots) + 2)
     python = all(k.__flags__ & _HEAP_TYPE for k in kind.__mro__ if k is not object)
-    return within and python and not kind.__itemsize__
+    return slots if python and kind.__basicsize__ <= most and not kind.__itemsize__ else None

@@ -6,10 +6,8 @@ acceleration needs friction.
 """
 
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import wraps
-from typing import Literal, ParamSpec, TypeVar, get_args
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -21,6 +19,7 @@ from nfriction.simulation.protocols import Friction, NoFriction, Plant, RolloutI
 from nfriction.simulation.rk4 import simulate_eager
 from nfriction.simulation.stiction import simulate_stiction
 from nfriction.simulation.validate import (
+    outside_inference_mode,
     require_stability,
     validate_inputs,
     validate_measured,
@@ -30,8 +29,6 @@ from nfriction.simulation.validate import (
 
 logger = logging.getLogger(__name__)
 
-P = ParamSpec("P")
-R = TypeVar("R")
 Scheme = Literal["rk4", "time_stepping"]
 # Beyond this many steps gradients are rarely meant and may take gigabytes: they must be asked for.
 GRADIENT_STEPS = 10_000
@@ -63,23 +60,7 @@ class Rollout:
         return torch.isfinite(self.diverged_at)
 
 
-def _outside_inference_mode(function: Callable[P, R]) -> Callable[P, R]:
-    """The function without gradients in `torch.inference_mode()`, which is left meanwhile.
-
-    Its tensors can be neither traced nor differentiated, and the slope at rest is a derivative.
-    """
-
-    @wraps(function)
-    def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        if not torch.is_inference_mode_enabled():
-            return function(*args, **kwargs)
-        with torch.inference_mode(False), torch.no_grad():
-            return function(*args, **kwargs)
-
-    return call
-
-
-@_outside_inference_mode
+@outside_inference_mode
 def rollout(
     plant: Plant,
     friction: Friction | None,
@@ -201,7 +182,7 @@ def _simulate(
 
 def _as_rollout(inputs: RolloutInputs, states: tuple[Tensor, ...]) -> Rollout:
     """The motion with its time, NaN from where it diverged."""
-    time = torch.nn.functional.pad(inputs.step.cumsum(-1), (1, 0))
+    time = torch.nn.functional.pad(inputs.step, (1, 0)).cumsum_(-1)
     q, qd, qdd = states
     diverged_at = _divergence(time, q, qd)
     if torch.isfinite(diverged_at).any():

@@ -2,10 +2,11 @@
 
 import logging
 import math
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from dataclasses import replace
+from functools import wraps
 from numbers import Integral
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 import torch
@@ -17,9 +18,28 @@ from nfriction.simulation.rk4 import RK4_STABILITY, required_substeps
 
 logger = logging.getLogger(__name__)
 
+P = ParamSpec("P")
+R = TypeVar("R")
+
 # Some tens of kilobytes each.
 KEPT_RATES = 64
 _decay_rates: dict[Hashable, float] = {}
+
+
+def outside_inference_mode(function: Callable[P, R]) -> Callable[P, R]:
+    """The function without gradients in `torch.inference_mode()`, which is left meanwhile.
+
+    Its tensors can be neither traced nor differentiated, and the slope at rest is a derivative.
+    """
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        if not torch.is_inference_mode_enabled():
+            return function(*args, **kwargs)
+        with torch.inference_mode(False), torch.no_grad():
+            return function(*args, **kwargs)
+
+    return call
 
 
 def all_finite(x: Tensor) -> bool:
