@@ -5,6 +5,7 @@ Knows nothing of plants or friction beyond the methods it calls.
 
 from nfriction.codegen.errors import (
     CodegenError,
+    Incomparable,
     NoBackend,
     SelfCheckFailed,
     UnsupportedOperation,
@@ -12,12 +13,20 @@ from nfriction.codegen.errors import (
 from nfriction.codegen.function import CompiledFunction, compile_function
 from nfriction.codegen.llvm.jit import cache_folder
 from nfriction.codegen.operations import supported_operations
-from nfriction.codegen.rollout import CompiledRollout, RolloutSignals, Trajectories, compile_rollout
+from nfriction.codegen.rollout import (
+    CompiledRollout,
+    RolloutSignals,
+    Trajectories,
+    compile_rollout,
+    trace_rollout,
+)
+from nfriction.codegen.staleness import fingerprint
 
 __all__ = [
     "CodegenError",
     "CompiledFunction",
     "CompiledRollout",
+    "Incomparable",
     "NoBackend",
     "RolloutSignals",
     "SelfCheckFailed",
@@ -26,5 +35,7 @@ __all__ = [
     "cache_folder",
     "compile_function",
     "compile_rollout",
+    "fingerprint",
     "supported_operations",
+    "trace_rollout",
 ]

@@ -26,3 +26,7 @@ class NoBackend(CodegenError):  # noqa: N818
 
 class SelfCheckFailed(CodegenError):  # noqa: N818
     """A compiled model disagrees with eager torch and must not be used."""
+
+
+class Incomparable(CodegenError):  # noqa: N818
+    """Something that a trace may read cannot be compared with what it was before."""

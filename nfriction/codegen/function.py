@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 from nfriction.codegen.batch import (
+    Driver,
     Kernel,
+    Layout,
     common_rows,
     parameter_rows,
     rows_of,
@@ -19,7 +21,6 @@ from nfriction.codegen.errors import SelfCheckFailed
 from nfriction.codegen.graph import FunctionalModule, Method, Program
 from nfriction.codegen.hoist import hoist
 from nfriction.codegen.llvm import jit
-from nfriction.codegen.llvm.driver import Driver, Layout
 from nfriction.codegen.llvm.emit import write_function
 from nfriction.codegen.scalar import Node
 

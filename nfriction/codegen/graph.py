@@ -5,10 +5,10 @@ example value. Every ATen operation that reaches the dispatcher (composite ones 
 decomposed) acts on both, so views cost nothing, writing in place is seen through views, two equal
 tensors stay two inputs, and shapes and dtypes are torch's own. Where Python asks for a value (`if
 x > 0`, `.item()`) the trace stops with an error instead of baking one branch. Tracing takes
-milliseconds where `torch.export` takes seconds, so compiled code is looked up by the hash of its
-source rather than by guessing whether a module has changed.
+milliseconds where `torch.export` takes seconds.
 """
 
+import hashlib
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -22,7 +22,7 @@ from torch.utils._pytree import tree_leaves, tree_map
 
 from nfriction.codegen.errors import UnsupportedOperation
 from nfriction.codegen.operations import OPERATIONS, constants
-from nfriction.codegen.scalar import Graph, Node, UpdateRate
+from nfriction.codegen.scalar import Graph, Node, UpdateRate, reachable
 
 # Most elements a traced tensor, and most scalar operations a traced function, may have.
 LIMIT = 50_000
@@ -44,6 +44,15 @@ class Program:
     graph: Graph
     inputs: tuple[Port, ...]
     outputs: tuple[Port, ...]
+
+    def digest(self) -> str:
+        """A hash of all that is computed: inputs, operations, constants and outputs."""
+        nodes = reachable(node for port in self.outputs for node in port.nodes)
+        ports = [
+            (port.name, port.shape, [node.number for node in port.nodes])
+            for port in (*self.inputs, *self.outputs)
+        ]
+        return hashlib.sha256(repr((ports, nodes)).encode()).hexdigest()
 
 
 class ScalarTensor(Tensor):

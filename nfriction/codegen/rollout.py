@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -95,13 +96,24 @@ def compile_rollout(
         UnsupportedOperation: the modules use an operation that has no scalar form here.
         SelfCheckFailed: a compiled step is not the eager one.
     """
+    compiled = trace_rollout(plant, friction, step, jacobian=jacobian)
+    compiled.check()
+    return compiled
+
+
+def trace_rollout(
+    plant: Any, friction: Any, step: Callable[..., Any], *, jacobian: Sequence[str] = ()
+) -> "CompiledRollout":
+    """The same, neither compiled nor checked before its first call.
+
+    Raises:
+        NoBackend, UnsupportedOperation: see `compile_rollout`.
+    """
     jit.require_backend()
     for name, module in (("plant", plant), ("friction", friction)):
         if not isinstance(module, nn.Module):
             raise TypeError(f"`{name}` must be a torch module, got {type(module).__name__}.")
-    compiled = CompiledRollout(ForcedSystem(plant, friction, step), tuple(jacobian))
-    compiled.check()
-    return compiled
+    return CompiledRollout(ForcedSystem(plant, friction, step), tuple(jacobian))
 
 
 class CompiledRollout:
@@ -109,6 +121,8 @@ class CompiledRollout:
 
     Attributes:
         parameter_names: names under which `parameters` may be given.
+        digest: a hash of all that is computed; code of another plant and friction model with the
+            same digest computes the same, given the same parameters.
     """
 
     def __init__(self, system: ForcedSystem, jacobian: tuple[str, ...]) -> None:
@@ -125,8 +139,15 @@ class CompiledRollout:
             step = Program(traced.graph, traced.inputs, traced.outputs[:3])
             slopes = with_jacobian(step, wanted).outputs[-1]
         self._jacobian = slopes.shape if slopes else None
-        program = arrange(traced, slopes)
-        self._kernel = Kernel(lambda width: RolloutDriver(program, width), LAYOUT)
+        self._traced, self._slopes = traced, slopes
+        outputs = (*traced.outputs, slopes) if slopes else traced.outputs
+        whole = Program(traced.graph, traced.inputs, outputs)
+        self.digest = f"{self._module.shapes} {whole.digest()}"
+
+    @cached_property
+    def _kernel(self) -> Kernel:
+        program = arrange(self._traced, self._slopes)
+        return Kernel(lambda width: RolloutDriver(program, width), LAYOUT)
 
     def source(self, width: int = 0) -> str:
         """LLVM IR that computes so many candidates together, 0 for one at a time."""

@@ -6,11 +6,11 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from nfriction.codegen.batch import Driver, Layout
 from nfriction.codegen.graph import Port, Program
 from nfriction.codegen.hoist import hoist
-from nfriction.codegen.llvm.body import real
-from nfriction.codegen.llvm.driver import Driver, Layout
 from nfriction.codegen.llvm.emit import write_function
+from nfriction.codegen.llvm.ir import real
 from nfriction.codegen.scalar import Graph, Node
 
 LAYOUT = Layout(

@@ -4,13 +4,12 @@ Nodes are hash-consed: the same operation on the same arguments is the same node
 subexpressions never arise. Each node has an `UpdateRate`, that of its most volatile argument.
 """
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from enum import IntEnum
 from typing import Any
 
 import numpy as np
-
-from nfriction.codegen.simplify import SIMPLIFY
 
 
 class UpdateRate(IntEnum):
@@ -116,7 +115,7 @@ class Graph:
             with np.errstate(all="ignore"):
                 folded = EVALUATE[op](*(np.asarray(a.value) for a in args))
             return self.constant(folded.item())
-        rule = SIMPLIFY.get(op)
+        rule = _RULES.get(op)
         simpler = rule(self, *args) if rule else None
         if simpler is not None:
             return simpler
@@ -183,3 +182,142 @@ def evaluate(outputs: Sequence[Node], inputs: Mapping[str, np.ndarray]) -> list[
             else:
                 values[node.number] = EVALUATE[node.op](*(values[a.number] for a in node.args))
     return [np.asarray(values[node.number]) for node in outputs]
+
+
+# Rules that make an operation simpler without changing its value. Signs are moved outward (exactly:
+# rounding is symmetric) so that a - b and b - a share a node. A literal zero annihilates its
+# partner even though 0 * NaN is NaN: a zero written in the model says "no such coupling", and
+# whoever runs the code tests the state itself for NaN.
+Rule = Callable[..., Node | None]
+
+
+def _is(node: Node, value: float) -> bool:
+    return node.op == "constant" and node.value == value
+
+
+def _add(g: Graph, a: Node, b: Node) -> Node | None:
+    if _is(a, 0.0):
+        return b
+    if _is(b, 0.0):
+        return a
+    if a.op == b.op == "neg":
+        return g.apply("neg", g.apply("add", a.args[0], b.args[0]))
+    if b.op == "neg":
+        return g.apply("sub", a, b.args[0])
+    if a.op == "neg":
+        return g.apply("sub", b, a.args[0])
+    return None
+
+
+def _sub(g: Graph, a: Node, b: Node) -> Node | None:
+    if _is(b, 0.0):
+        return a
+    if _is(a, 0.0):
+        return g.apply("neg", b)
+    if b.op == "neg":
+        return g.apply("add", a, b.args[0])
+    if a.op == "neg":
+        return g.apply("neg", g.apply("add", a.args[0], b))
+    if a is not b and g.known("sub", b, a):
+        return g.apply("neg", g.apply("sub", b, a))
+    return None
+
+
+def _mul(g: Graph, a: Node, b: Node) -> Node | None:
+    for x, y in ((a, b), (b, a)):
+        if _is(x, 1.0):
+            return y
+        if _is(x, -1.0):
+            return g.apply("neg", y)
+        if _is(x, 0.0):
+            return g.constant(0.0)
+    return _unsigned(g, "mul", a, b)
+
+
+def _div(g: Graph, a: Node, b: Node) -> Node | None:
+    if _is(b, 1.0):
+        return a
+    if b.op == "constant" and b.value != 0.0 and abs(math.frexp(b.value)[0]) == 0.5:
+        return g.apply("mul", a, g.constant(1.0 / b.value))  # a power of two: exact
+    return _unsigned(g, "div", a, b)
+
+
+def _unsigned(g: Graph, op: str, a: Node, b: Node) -> Node | None:
+    """A product or quotient with the signs of its operands in front of it."""
+    signs = (a.op == "neg") + (b.op == "neg")
+    if not signs:
+        return None
+    bare = g.apply(op, *(x.args[0] if x.op == "neg" else x for x in (a, b)))
+    return bare if signs == 2 else g.apply("neg", bare)
+
+
+def _neg(g: Graph, a: Node) -> Node | None:
+    return a.args[0] if a.op == "neg" else None
+
+
+def _pow(g: Graph, a: Node, b: Node) -> Node | None:
+    if b.op != "constant":
+        return None
+    if b.value == 0.5:
+        return g.apply("sqrt", a)
+    if b.value == -0.5:
+        return g.apply("div", g.constant(1.0), g.apply("sqrt", a))
+    if not abs(b.value) <= 8 or b.value != int(b.value):
+        return None
+    power = g.total([a] * abs(int(b.value)), "mul") if b.value else g.constant(1.0)
+    return power if b.value >= 0 else g.apply("div", g.constant(1.0), power)
+
+
+def _where(g: Graph, condition: Node, a: Node, b: Node) -> Node | None:
+    if a is b:
+        return a
+    if condition.op == "constant":
+        return a if condition.value else b
+    if condition.op == "not":
+        return g.apply("where", condition.args[0], b, a)
+    return None
+
+
+def _logical(deciding: bool) -> Rule:
+    """The rule of a conjunction or disjunction, which one such operand decides."""
+
+    def rule(g: Graph, a: Node, b: Node) -> Node | None:
+        for x, y in ((a, b), (b, a)):
+            if x.op == "constant":
+                return g.constant(deciding) if bool(x.value) == deciding else y
+        return _same(g, a, b)
+
+    return rule
+
+
+def _same(g: Graph, a: Node, b: Node) -> Node | None:
+    return a if a is b else None
+
+
+def _mirrored(op: str, odd: bool) -> Rule:
+    """The rule of an odd or even function."""
+
+    def rule(g: Graph, a: Node) -> Node | None:
+        if a.op != "neg":
+            return None
+        value = g.apply(op, a.args[0])
+        return g.apply("neg", value) if odd else value
+
+    return rule
+
+
+_RULES: dict[str, Rule] = {
+    "add": _add,
+    "sub": _sub,
+    "mul": _mul,
+    "div": _div,
+    "neg": _neg,
+    "pow": _pow,
+    "where": _where,
+    "and": _logical(False),
+    "or": _logical(True),
+    "max": _same,
+    "min": _same,
+    **{op: _mirrored(op, odd=True) for op in ("sin", "tan", "tanh", "atan", "asin", "sinh")},
+    **{op: _mirrored(op, odd=False) for op in ("cos", "cosh", "abs")},
+}

@@ -1,7 +1,8 @@
-"""Compiled rollouts, found by the structure of plant and friction and kept for later calls.
+"""Compiled rollouts, found by all that plant and friction read and kept for later calls.
 
-Code is compiled once for all plants and friction models of the same structure: parameters and
-buffers are inputs of the compiled code, so a fit may change them between calls.
+Code is compiled once for all plants and friction models that compute the same: parameters and
+buffers are inputs of the compiled code, so a fit may change them between calls. Constants are part
+of the code, whether an attribute, a global or a closure holds them; a change of one is noticed.
 """
 
 import logging
@@ -9,7 +10,6 @@ from collections import OrderedDict
 from collections.abc import Hashable, Mapping
 from typing import Any, Literal, get_args
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -23,7 +23,11 @@ Backend = Literal["auto", "compiled", "torch"]
 # Compiled structures kept in memory; each is some hundred kilobytes.
 KEPT = 32
 
-_cache: OrderedDict[Hashable, "codegen.CompiledRollout | codegen.CodegenError"] = OrderedDict()
+# By the fingerprint of plant and friction, cheap enough for every call, and by what is computed: a
+# changed fingerprint takes a new trace, and only another graph another compilation.
+_known: OrderedDict[Hashable, "codegen.CompiledRollout | codegen.CodegenError"] = OrderedDict()
+_compiled_graphs: OrderedDict[Hashable, "codegen.CompiledRollout"] = OrderedDict()
+_warned: set[str] = set()
 
 
 def wants_compiled(backend: Backend, q: Tensor, gradients: bool) -> bool:
@@ -105,7 +109,7 @@ def integrate_compiled(
         values,
         threads,
     )
-    states = tuple(x.reshape(*batch, -1, joints) for x in (found.q, found.qd, found.qdd))
+    states = tuple(x.reshape(*batch, *x.shape[1:]) for x in (found.q, found.qd, found.qdd))
     return (*states, found.jacobian.unflatten(0, batch)) if jacobian else states
 
 
@@ -126,14 +130,18 @@ def _compiled(
             "only a plant and a friction model that are torch modules can be compiled; use "
             'backend="torch".'
         )
-    key = (step_function, jacobian, _structure(plant), _structure(friction))
-    if key in _cache:
-        _cache.move_to_end(key)
-    else:
-        _cache[key] = _attempt(plant, friction, step_function, jacobian)
-        if len(_cache) > KEPT:
-            _cache.popitem(last=False)
-    found = _cache[key]
+    try:
+        key = codegen.fingerprint((plant, friction), step_function, jacobian)
+    except codegen.Incomparable as reason:
+        key = None
+        _warn_once(
+            f"compiled rollouts are traced anew in every call, because they may read {reason}"
+        )
+    found = _known.get(key)
+    if found is None:
+        found = _attempt(plant, friction, step_function, jacobian)
+    if key is not None:
+        _keep(_known, key, found)
     if isinstance(found, codegen.CodegenError):
         if backend != "auto":
             raise found
@@ -147,12 +155,32 @@ def _attempt(
     """A compiled rollout, or the reason why there is none."""
     try:
         _check_compilable(plant, friction)
-        return codegen.compile_rollout(plant, friction, step_function, jacobian=jacobian)
+        traced = codegen.trace_rollout(plant, friction, step_function, jacobian=jacobian)
+        found = _compiled_graphs.get(traced.digest)
+        if found is None:
+            traced.check()
+            found = traced
     except codegen.SelfCheckFailed:
         raise
     except codegen.CodegenError as error:
-        logger.warning("rollouts run in eager torch, as they cannot be compiled: %s", error)
+        _warn_once(f"rollouts run in eager torch, as they cannot be compiled: {error}")
         return error.with_traceback(None)
+    _keep(_compiled_graphs, found.digest, found)
+    return found
+
+
+def _keep(cache: OrderedDict[Hashable, Any], key: Hashable, value: Any) -> None:
+    """Remember the most recent ones."""
+    cache[key] = value
+    cache.move_to_end(key)
+    if len(cache) > KEPT:
+        cache.popitem(last=False)
+
+
+def _warn_once(message: str) -> None:
+    if message not in _warned:
+        _warned.add(message)
+        logger.warning("%s", message)
 
 
 def _check_compilable(plant: Any, friction: Any) -> None:
@@ -172,33 +200,6 @@ def _check_compilable(plant: Any, friction: Any) -> None:
             raise codegen.CodegenError(
                 "a plant or friction model with a batch of its own cannot be compiled"
             )
-
-
-def _structure(module: nn.Module) -> Hashable:
-    """All that compiled code bakes in: classes, plain attributes, shapes, tables of indices."""
-    parts: list[Hashable] = []
-    for name, part in module.named_modules():
-        plain = tuple(
-            (key, _baked(value))
-            for key, value in sorted(vars(part).items())
-            if not (key.startswith("_") and isinstance(value, list | dict))
-        )
-        parts.append((name, type(part), plain))
-    for name, tensor in (*module.named_parameters(), *module.named_buffers()):
-        baked = None if tensor.is_floating_point() else tensor.cpu().numpy().tobytes()
-        parts.append((name, tuple(tensor.shape), tensor.dtype, baked))
-    return tuple(parts)
-
-
-def _baked(value: Any) -> Hashable:
-    """A plain attribute as part of a key; functions and objects count as themselves."""
-    if isinstance(value, Tensor):
-        value = value.detach().cpu().numpy()
-    if isinstance(value, np.ndarray):
-        return value.shape, value.tobytes()
-    if isinstance(value, list | tuple):
-        return (type(value), *map(_baked, value))
-    return value if isinstance(value, Hashable) else repr(value)
 
 
 def _values(plant: nn.Module, friction: Any, names: Any) -> dict[str, Tensor]:

@@ -20,6 +20,7 @@ from nfriction.simulation.protocols import Friction, NoFriction, Plant, RolloutI
 from nfriction.simulation.rk4 import simulate_eager
 from nfriction.simulation.stiction import simulate_stiction
 from nfriction.simulation.validate import (
+    outside_inference_mode,
     require_stability,
     validate_inputs,
     validate_measured,
@@ -60,6 +61,7 @@ class Rollout:
         return torch.isfinite(self.diverged_at)
 
 
+@outside_inference_mode
 def rollout(
     plant: Plant,
     friction: Friction | None,
@@ -88,7 +90,8 @@ def rollout(
     Args:
         plant: the mechanism, e.g. `rigs.tlrip()`.
         friction: friction model, or None for no friction.
-        q0, qd0: initial state [rad, rad/s] in joint coordinates, shape (*batch, joint).
+        q0, qd0: initial state [rad, rad/s] in joint coordinates, shape (*batch, joint); like all
+            tensors here also NumPy arrays or lists, which are float64 unless an array says else.
         tau: joint torque [N m], held over each step, shape (steps, joint) or
             (*batch, steps, joint); None for none.
         sample_time: sample time [s], a number, (steps,) or (*batch, steps).
@@ -180,7 +183,7 @@ def _simulate(
 
 def _as_rollout(inputs: RolloutInputs, states: tuple[Tensor, ...]) -> Rollout:
     """The motion with its time, NaN from where it diverged."""
-    time = torch.nn.functional.pad(inputs.step.cumsum(-1), (1, 0))
+    time = torch.nn.functional.pad(inputs.step, (1, 0)).cumsum_(-1)
     q, qd, qdd = states
     diverged_at = _divergence(time, q, qd)
     if torch.isfinite(diverged_at).any():
@@ -192,6 +195,8 @@ def _as_rollout(inputs: RolloutInputs, states: tuple[Tensor, ...]) -> Rollout:
 @torch.no_grad()
 def _divergence(time: Tensor, q: Tensor, qd: Tensor) -> Tensor:
     """Time of the first sample that is not finite or beyond any speed, infinity where none."""
+    if not q.numel():
+        return time.new_full(q.shape[:-2], torch.inf)
     # Positions are finite while velocities are; a NaN fails every comparison.
     low, high = qd.aminmax()
     if float(low) > -SPEED_LIMIT and float(high) < SPEED_LIMIT:

@@ -2,16 +2,44 @@
 
 import logging
 import math
+from collections.abc import Callable, Hashable
 from dataclasses import replace
+from functools import wraps
+from numbers import Integral
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from nfriction import codegen
 from nfriction.simulation.protocols import Friction, NoFriction, Plant, RolloutInputs
 from nfriction.simulation.rk4 import RK4_STABILITY, required_substeps
 
 logger = logging.getLogger(__name__)
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+# Some tens of kilobytes each.
+KEPT_RATES = 64
+_decay_rates: dict[Hashable, float] = {}
+
+
+def outside_inference_mode(function: Callable[P, R]) -> Callable[P, R]:
+    """The function without gradients in `torch.inference_mode()`, which is left meanwhile.
+
+    Its tensors can be neither traced nor differentiated, and the slope at rest is a derivative.
+    """
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        if not torch.is_inference_mode_enabled():
+            return function(*args, **kwargs)
+        with torch.inference_mode(False), torch.no_grad():
+            return function(*args, **kwargs)
+
+    return call
 
 
 def all_finite(x: Tensor) -> bool:
@@ -20,6 +48,28 @@ def all_finite(x: Tensor) -> bool:
         return True
     low, high = x.detach().aminmax()  # NaN if there is one
     return math.isfinite(low) and math.isfinite(high)
+
+
+def as_tensor(name: str, value: Any) -> Tensor:
+    """Tensors as they are; arrays keep their precision, whole numbers and lists become float64.
+
+    Raises:
+        ValueError: if it is no array of real numbers.
+    """
+    if isinstance(value, Tensor):
+        found = value
+    else:
+        try:
+            # A copy, because arrays may be read-only or reversed, which tensors cannot be.
+            found = torch.from_numpy(np.array(value, order="C"))
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"`{name}` must be a tensor, an array or a list of numbers with rows of one "
+                f"length, got {type(value).__name__}: {error}"
+            ) from None
+    if found.is_complex():
+        raise ValueError(f"`{name}` must be real, got {found.dtype}; take its real part.")
+    return found if found.is_floating_point() else found.to(torch.float64)
 
 
 def validate_inputs(
@@ -33,12 +83,11 @@ def validate_inputs(
     substeps: int,
 ) -> RolloutInputs:
     """Initial state, torque and sample times as tensors of matching shape."""
-    if substeps < 1:
-        raise ValueError(f"`substeps` must be at least 1, got {substeps}.")
-    q0, qd0 = torch.as_tensor(q0), torch.as_tensor(qd0)
-    if not q0.is_floating_point():
-        q0 = q0.to(torch.float64)
-    qd0 = qd0.to(q0)
+    for name, whole in (("steps", 1 if steps is None else steps), ("substeps", substeps)):
+        if not isinstance(whole, Integral) or whole < 1:
+            raise ValueError(f"`{name}` must be a whole number of at least 1, got {whole!r}.")
+    q0 = as_tensor("q0", q0)
+    qd0 = as_tensor("qd0", qd0).to(q0)
     joints = plant.joints
     if friction.joints != joints:
         raise ValueError(f"the plant has {joints} joints, the friction model {friction.joints}.")
@@ -49,29 +98,41 @@ def validate_inputs(
             )
         if not all_finite(value):
             raise ValueError(f"`{name}` must be finite, got NaN or infinity.")
-    step = torch.as_tensor(sample_time, dtype=q0.dtype, device=q0.device)
+    step = as_tensor("sample_time", sample_time).to(q0)
+    if not step.numel() or not all_finite(step) or float(step.min()) <= 0:
+        raise ValueError(
+            "`sample_time` must be finite and positive [s], got "
+            f"{float(step.min()) if step.numel() else 'none'}."
+        )
+    torque = None if tau is None else as_tensor("tau", tau).to(q0)
+    if torque is not None and (torque.ndim < 2 or torque.shape[-1] != joints):
+        raise ValueError(f"`tau` must be (*batch, steps, {joints}), got {tuple(torque.shape)}.")
     lengths = {
         "steps": steps,
         "sample_time": step.shape[-1] if step.ndim else None,
-        "tau": None if tau is None else tau.shape[-2],
+        "tau": None if torque is None else torque.shape[-2],
     }
-    known = {name: n for name, n in lengths.items() if n is not None}
+    known = {name: int(n) for name, n in lengths.items() if n is not None}
     if not known or len(set(known.values())) != 1:
         raise ValueError(f"the number of steps must be given and agree, got {known or 'nothing'}.")
-    steps = next(iter(known.values()))
-    if steps < 1 or not all_finite(step) or float(step.min()) < 0:
-        raise ValueError("`steps` must be at least 1 and `sample_time` finite and positive [s].")
+    count = next(iter(known.values()))
+    if count < 1:
+        raise ValueError("`tau` must have a row for at least one step, got none.")
     if step.ndim == 0:
-        step = step.expand(steps)
-    torque = q0.new_zeros(1, 1).expand(steps, joints) if tau is None else tau.to(q0)
-    if torque.shape[-1] != joints:
-        raise ValueError(f"`tau` must be (*batch, steps, {joints}), got {tuple(torque.shape)}.")
-    if tau is not None and not all_finite(torque):
+        step = step.expand(count)
+    if torque is None:
+        torque = q0.new_zeros(1, 1).expand(count, joints)
+    elif not all_finite(torque):
         raise ValueError("`tau` must be finite, got NaN or infinity.")
-    shape = np.broadcast_shapes(
-        q0.shape, qd0.shape, (*torque.shape[:-2], joints), (*step.shape[:-1], joints)
-    )
-    return RolloutInputs(q0.expand(shape), qd0.expand(shape), torque, step, substeps)
+    batches = {"q0": q0.shape[:-1], "qd0": qd0.shape[:-1], "tau": torque.shape[:-2],
+               "sample_time": step.shape[:-1]}  # fmt: skip
+    try:
+        batch = np.broadcast_shapes(*batches.values())
+    except ValueError:
+        shown = ", ".join(f"`{name}` {tuple(b)}" for name, b in batches.items() if b)
+        raise ValueError(f"batches must be the same, 1 or left out, got {shown}.") from None
+    shape = (*batch, joints)
+    return RolloutInputs(q0.expand(shape), qd0.expand(shape), torque, step, int(substeps))
 
 
 def validate_measured(
@@ -86,14 +147,16 @@ def validate_measured(
     if measured is None:
         return None
     shape = inputs.step.shape[-1], inputs.q0.shape[-1]
-    found = torch.as_tensor(measured[0]).to(inputs.q0), torch.as_tensor(measured[1]).to(inputs.q0)
+    found = tuple(as_tensor("measured", x).to(inputs.q0) for x in measured)
+    if len(found) != 2:
+        raise ValueError(f"`measured` must be two, velocity and acceleration, got {len(found)}.")
     for x in found:
         if x.shape[-2:] != shape or not all_finite(x):
             raise ValueError(
                 f"`measured` must be two finite (*batch, {shape[0]}, {shape[1]}), a value a step, "
                 f"got {tuple(found[0].shape)} and {tuple(found[1].shape)}."
             )
-    return found
+    return found[0], found[1]
 
 
 def with_hidden_state(
@@ -102,7 +165,8 @@ def with_hidden_state(
     """The inputs with a hidden state from which coefficients continue."""
     if hidden_state is None:
         return inputs
-    given, joints = torch.as_tensor(hidden_state).to(inputs.q0), inputs.q0.shape[-1]
+    given = as_tensor("hidden_state", hidden_state).to(inputs.q0)
+    joints = inputs.q0.shape[-1]
     size = getattr(friction, "state_size", 0)
     if size == 0:
         raise ValueError(
@@ -123,12 +187,11 @@ def require_stability(plant: Plant, friction: Friction, inputs: RolloutInputs) -
         return
     sample_time = float(inputs.step.max())
     longest_step = sample_time / inputs.substeps
-    slope = friction.zero_velocity_damping()
-    excess = float(plant.decay_rate(slope).max()) * longest_step / RK4_STABILITY
+    excess = _fastest_decay(plant, friction) * longest_step / RK4_STABILITY
     # As much slack as `required_substeps` takes, so that its number is never refused.
     if not excess * (1 - 1e-9) > 1:  # false of NaN
         return
-    rows = slope.reshape(-1, plant.joints)
+    rows = friction.zero_velocity_damping().reshape(-1, plant.joints)
     alone = torch.stack([plant.decay_rate(row.diag()) for row in rows]).amax(0)
     joint = int(alone.argmax())
     v_smooth = getattr(friction, "v_smooth", float("nan"))
@@ -140,6 +203,22 @@ def require_stability(plant: Plant, friction: Friction, inputs: RolloutInputs) -
         # A twentieth more outweighs the rounding to two digits.
         f"v_smooth >= {1.05 * v_smooth * excess:.2g} (now {v_smooth:g})."
     )
+
+
+def _fastest_decay(plant: Plant, friction: Friction) -> float:
+    """Decay rate of the fastest mode at rest [1/s], kept for the same models with the same values.
+
+    A derivative and eigenvalues take as long as simulating some thousand steps.
+    """
+    try:
+        key = codegen.fingerprint((), plant, friction)
+    except codegen.Incomparable:
+        return float(plant.decay_rate(friction.zero_velocity_damping()).max())
+    if key not in _decay_rates:
+        if len(_decay_rates) >= KEPT_RATES:
+            _decay_rates.clear()
+        _decay_rates[key] = float(plant.decay_rate(friction.zero_velocity_damping()).max())
+    return _decay_rates[key]
 
 
 def warn_of_sample_time(friction: Friction, inputs: RolloutInputs) -> None:

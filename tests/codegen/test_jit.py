@@ -1,5 +1,6 @@
 """Machine code is made without a compiler; the cache is safe, private and reused."""
 
+import errno
 import logging
 import multiprocessing
 import os
@@ -91,13 +92,20 @@ def test_a_cache_folder_of_somebody_else_is_refused(cache, monkeypatch):
         jit.cache_folder()
 
 
-@pytest.mark.parametrize("obstacle", ["open to others", "a file", "full"])
+@pytest.mark.parametrize("obstacle", ["open to others", "a file", "full", "read-only"])
 def test_without_a_usable_cache_code_is_made_in_memory(cache, monkeypatch, caplog, obstacle):
     if obstacle == "a file":
         cache.write_text("")
     elif obstacle == "open to others":
         cache.mkdir()
         cache.chmod(0o777)
+    elif obstacle == "read-only":
+        cache.mkdir(mode=0o700)
+
+        def refuse(*_, **__):
+            raise OSError(errno.EROFS, "Read-only file system", "building-0")
+
+        monkeypatch.setattr(jit.tempfile, "mkstemp", refuse)
     else:
         cache.mkdir(mode=0o700)
 
@@ -107,7 +115,10 @@ def test_without_a_usable_cache_code_is_made_in_memory(cache, monkeypatch, caplo
         monkeypatch.setattr(jit.os, "replace", full)
     with caplog.at_level(logging.WARNING, "nfriction"):
         assert answer() == 42
-    assert "not kept" in caplog.text
+        assert answer() == 42
+    assert caplog.text.count("not kept") == 1
+    assert "set NFRICTION_CACHE to a folder that you can write to" in caplog.text
+    assert str(cache) in caplog.text
     if cache.is_dir():
         assert not list(cache.iterdir())
 
@@ -120,6 +131,19 @@ def test_without_the_override_the_platforms_cache_is_used(tmp_path, monkeypatch)
     folder = jit.cache_folder()
     assert folder.name == "nfriction"
     assert tmp_path in folder.parents
+
+
+def test_without_a_home_code_is_made_in_memory(monkeypatch, caplog):
+    def homeless():
+        raise RuntimeError("Could not determine home directory.")
+
+    for name in ("NFRICTION_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(jit.sys, "platform", "linux")
+    monkeypatch.setattr(jit.Path, "home", homeless)
+    jit._warn_not_kept.cache_clear()
+    assert answer() == 42
+    assert "NFRICTION_CACHE" in caplog.text
 
 
 def _build(folder, barrier, queue):

@@ -7,7 +7,7 @@ from torch import nn
 
 from nfriction import codegen
 from nfriction.codegen import SelfCheckFailed, UnsupportedOperation
-from nfriction.codegen.llvm import body
+from nfriction.codegen.llvm import ir
 from nfriction.simulation.rk4 import rk4_step
 from tests.codegen.mechanisms import F64, Coulomb, NeuroFuzzy, Pendulum, reference
 
@@ -360,8 +360,8 @@ def test_a_memory_agrees_with_eager_steps():
 
 
 def test_wrong_code_fails_the_self_check(monkeypatch):
-    true = body.Body.text
-    monkeypatch.setattr(body.Body, "text", lambda b: true(b).replace("fsub double", "fadd double"))
+    true = ir.Body.text
+    monkeypatch.setattr(ir.Body, "text", lambda b: true(b).replace("fsub double", "fadd double"))
     with pytest.raises(SelfCheckFailed, match=r'backend="torch"'):
         compile_rollout(Pendulum(2), Coulomb(2))
 

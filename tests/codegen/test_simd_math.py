@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from nfriction.codegen.llvm import jit
-from nfriction.codegen.llvm.body import Body
 from nfriction.codegen.llvm.emit import write_function
+from nfriction.codegen.llvm.ir import Body
 from nfriction.codegen.scalar import Graph, evaluate
 
 OPERATIONS = ("sin", "cos", "exp", "tanh")

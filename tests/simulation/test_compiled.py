@@ -3,7 +3,9 @@
 import functools
 import logging
 import sys
+import types
 
+import numpy as np
 import pytest
 import torch
 
@@ -26,13 +28,14 @@ def compilations(monkeypatch):
     """An empty cache, and a list that grows with every compilation."""
     made = []
 
-    def compile_rollout(*args, **settings):
-        made.append(args)
-        return original(*args, **settings)
+    def check(rollout):
+        made.append(rollout)
+        original(rollout)
 
-    original = codegen.compile_rollout
-    monkeypatch.setattr(codegen, "compile_rollout", compile_rollout)
-    monkeypatch.setattr(compiled, "_cache", type(compiled._cache)())
+    original = codegen.CompiledRollout.check
+    monkeypatch.setattr(codegen.CompiledRollout, "check", check)
+    for name in ("_known", "_compiled_graphs", "_warned"):
+        monkeypatch.setattr(compiled, name, type(getattr(compiled, name))())
     return made
 
 
@@ -98,6 +101,99 @@ def test_what_is_baked_in_recompiles(compilations):
             assert not torch.allclose(a, b, rtol=0, atol=1e-8)
 
 
+EXPONENT = 2.0
+GAINS = types.ModuleType("gains")
+GAINS.damping = 1e-2
+
+
+class Grease:
+    """Attributes that a law reads."""
+
+    scale = 1.0
+
+    def __init__(self):
+        self.viscosity = {"cold": [2e-2]}
+        self.table = np.full(5_000, 1e-2)
+        self.memo = iter([1e-2])  # cannot be compared
+
+    def at(self, i):
+        return float(self.table[i])
+
+
+def shaped(qd):
+    return qd * qd.abs() ** (EXPONENT - 1.0)
+
+
+def by_global(qd, load, coefficients, v_smooth):
+    return coefficients[..., 0] * shaped(qd)
+
+
+def by_module(qd, load, coefficients, v_smooth):
+    return coefficients[..., 0] * GAINS.damping * qd
+
+
+def by_closure(grease):
+    settings = {"gain": 2e-2}
+
+    def torque(qd, load, coefficients, v_smooth):
+        return coefficients[..., 0] * settings["gain"] * qd
+
+    return torque, lambda: settings.update(gain=1.0)
+
+
+def by_attribute(grease):
+    def torque(qd, load, coefficients, v_smooth):
+        return coefficients[..., 0] * grease.viscosity["cold"][0] * qd
+
+    return torque, lambda: grease.viscosity["cold"].__setitem__(0, 1.0)
+
+
+def by_array(grease):
+    def torque(qd, load, coefficients, v_smooth):
+        return coefficients[..., 0] * grease.at(2_500) * qd
+
+    return torque, lambda: grease.table.__setitem__(2_500, 1.0)
+
+
+def by_class(grease):
+    def torque(qd, load, coefficients, v_smooth):
+        return coefficients[..., 0] * (grease.viscosity["cold"][0] * grease.scale) * qd
+
+    return torque, lambda: setattr(Grease, "scale", 30.0)
+
+
+@pytest.mark.parametrize("comparable", [True, False])
+@pytest.mark.parametrize("case", ["global", "module", "closure", "attribute", "array", "class"])
+def test_constants_of_a_users_law_are_followed(case, comparable, compilations, monkeypatch, caplog):
+    """Wherever Python holds a constant, a changed one is simulated, and one put back is known."""
+    monkeypatch.setattr(Grease, "scale", 1.0)
+    grease = Grease()
+    if comparable:
+        del grease.memo
+    if case in ("global", "module"):
+        torque = {"global": by_global, "module": by_module}[case]
+        name, owner = {"global": ("EXPONENT", sys.modules[__name__]),
+                       "module": ("damping", GAINS)}[case]  # fmt: skip
+        change = functools.partial(monkeypatch.setattr, owner, name, 1.0)
+    else:
+        torque, change = globals()[f"by_{case}"](grease)
+    law = Law("user", LINEAR.coefficients, torque)
+    model = FrictionModel(law, Constant(law, 2, [1e-2, 1e-2]))
+    model.grease = grease
+    before = both(model)
+    both(model)
+    assert len(compilations) == 1
+    change()
+    after = both(model)
+    assert not torch.allclose(before, after, rtol=0, atol=1e-5)
+    # A new model of the same law, too.
+    same = FrictionModel(law, Constant(law, 2, [1e-2, 1e-2]))
+    torch.testing.assert_close(both(same), after, rtol=0, atol=1e-15)
+    assert len(compilations) == 2
+    assert ("list_iterator" in caplog.text) != comparable
+    assert caplog.text.count("traced anew in every call") == (not comparable)
+
+
 def test_tables_that_are_no_buffers_are_told_apart(compilations):
     class Table(torch.nn.Module):
         joints = 2
@@ -137,7 +233,7 @@ def test_old_structures_are_forgotten(compilations, monkeypatch):
     both(LFM(2, v_smooth=0.2))
     both(LFM(2, v_smooth=0.1))
     assert len(compilations) == 3
-    assert len(compiled._cache) == 1
+    assert len(compiled._known) == len(compiled._compiled_graphs) == 1
 
 
 def test_without_llvm_eager_torch_steps_and_says_so_once(compilations, monkeypatch, caplog):

@@ -4,6 +4,7 @@ import logging
 import re
 from itertools import pairwise
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -478,6 +479,41 @@ def test_gradients_are_recorded_where_asked_for_and_affordable(monkeypatch):
 # Errors
 
 
+def test_arrays_and_lists_are_tensors_in_double_precision():
+    tau = 0.1 * torch.arange(10, dtype=F64).reshape(5, 2) + 1 / 3
+    expected = run(smooth_model(), tau=tau, sample_time=1e-3, gradients=False)
+    backwards = tau.numpy()[::-1].copy()[::-1]
+    backwards.flags.writeable = False
+    for given in (tau.numpy(), backwards, tau.tolist(), tuple(tau.tolist())):
+        for times in (1e-3, [1e-3] * 5, np.full(5, 1e-3)):
+            found = run(smooth_model(), Q0.tolist(), QD0.numpy(), tau=given,
+                        sample_time=times, gradients=False)  # fmt: skip
+            assert found.q.dtype == F64
+            torch.testing.assert_close(found.q, expected.q, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+def test_an_empty_batch_has_no_motion(backend):
+    nothing = torch.zeros(0, 2, dtype=F64)
+    for settings in ({"steps": 5}, {"tau": torch.zeros(0, 5, 2, dtype=F64)}):
+        out = run(smooth_model(), nothing, nothing, backend=backend, gradients=False, **settings)
+        assert out.q.shape == out.qd.shape == out.qdd.shape == (0, 6, 2)
+        assert out.diverged.shape == (0,)
+
+
+@pytest.mark.parametrize("scheme", ["rk4", "time_stepping"])
+@pytest.mark.parametrize("backend", ["auto", "torch"])
+def test_inference_mode_changes_nothing(backend, scheme):
+    def motion():
+        model = named_model("NFLFM") if scheme == "rk4" else smooth_model()
+        q0 = 1.0 * Q0  # a tensor of the mode itself
+        return run(model, q0, QD0, steps=20, backend=backend, scheme=scheme).q
+
+    expected = motion().detach()
+    with torch.inference_mode():
+        torch.testing.assert_close(motion(), expected, rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -485,6 +521,18 @@ def test_gradients_are_recorded_where_asked_for_and_affordable(monkeypatch):
         ({"steps": 5, "tau": torch.zeros(4, 2)}, "number of steps"),
         ({"steps": 5, "sample_time": torch.full((6,), 1e-3)}, "number of steps"),
         ({"steps": 0}, "at least 1"),
+        ({"steps": 2.5}, "`steps` must be a whole number"),
+        ({"steps": 5, "substeps": 1.5}, "`substeps` must be a whole number"),
+        ({"steps": 5, "sample_time": 0}, "`sample_time` must be finite and positive"),
+        ({"sample_time": [1e-3, 0.0, 1e-3]}, "`sample_time` must be finite and positive"),
+        ({"sample_time": []}, "`sample_time` must be finite and positive"),
+        ({"tau": torch.zeros(2)}, r"`tau` must be \(\*batch, steps, 2\), got \(2,\)"),
+        ({"tau": torch.zeros(0, 2)}, "at least one step"),
+        ({"tau": [[0.0, 0.0], [0.0]]}, "`tau` must be a tensor, an array or a list"),
+        ({"tau": "none"}, "`tau` must be a tensor, an array or a list"),
+        ({"steps": 5, "q0": torch.zeros(2) + 1j}, "`q0` must be real"),
+        ({"tau": torch.zeros(3, 5, 2), "q0": torch.zeros(2, 2)}, r"`q0` \(2,\), `tau` \(3,\)"),
+        ({"steps": 5, "drive": "measured", "measured": (torch.zeros(5, 2),) * 3}, "two"),
         ({"steps": 5, "sample_time": -1e-3}, "positive"),
         ({"steps": 5, "sample_time": float("nan")}, "finite"),
         ({"steps": 5, "substeps": 0}, "substeps"),

@@ -101,11 +101,11 @@ def test_gears_lose_what_they_lose_in_smooth_steps(torque):
 def test_eager_torch_serves_where_nothing_compiles(monkeypatch, caplog):
     fast = slide(2.5, v0=-0.1, steps=200)
 
-    def refuse(*_):
+    def refuse(*_, **__):
         raise codegen.CodegenError("no compiler")
 
-    monkeypatch.setattr(codegen, "compile_rollout", lambda *_, **__: refuse())
-    monkeypatch.setattr(compiled, "_cache", type(compiled._cache)())
+    monkeypatch.setattr(codegen, "trace_rollout", refuse)
+    monkeypatch.setattr(compiled, "_known", type(compiled._known)())
     eager = slide(2.5, v0=-0.1, steps=200)
     assert "eager torch, as they cannot be compiled: no compiler" in caplog.text
     torch.testing.assert_close(eager.q, fast.q, rtol=0, atol=1e-12)

@@ -42,7 +42,7 @@ def cache_folder() -> Path:
         if status.st_uid != os.getuid() or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
             raise PermissionError(
                 f"the cache folder {folder} must belong to you and be writable by you alone, "
-                "because code is loaded from it; `chmod 700` it or set NFRICTION_CACHE."
+                "because code is loaded from it; `chmod 700` it"
             )
     return folder
 
@@ -118,12 +118,17 @@ def _find_library(llvm: Any) -> None:
 def _usable_folder() -> Path | None:
     try:
         return cache_folder()
-    except PermissionError as error:
-        reason = str(error)
-    except OSError as error:
-        reason = f"the cache folder cannot be made ({error})"
-    logger.warning("compiled models are not kept: %s", reason)
+    except (OSError, RuntimeError) as error:  # a RuntimeError where there is no home folder
+        _warn_not_kept(str(error))
     return None
+
+
+@cache
+def _warn_not_kept(reason: str) -> None:
+    logger.warning(
+        "compiled models are not kept (%s), so every process compiles them anew; set "
+        "NFRICTION_CACHE to a folder that you can write to.", reason,
+    )  # fmt: skip
 
 
 def _kept(folder: Path, key: str) -> bytes | None:
@@ -147,7 +152,7 @@ def _keep(folder: Path, key: str, code: bytes) -> None:
             file.write(code)
         os.replace(draft, folder / f"{key}-{_digest(code)}{_KEPT}")
     except OSError as error:
-        logger.warning("the compiled model is not kept: %s", error)
+        _warn_not_kept(f"{folder}: {error.strerror or error}")
         if draft and os.path.exists(draft):
             os.unlink(draft)
 

@@ -1,0 +1,578 @@
+"""ATen operations on arrays of scalar nodes: pointwise ones, reductions, products and views.
+
+Every function takes the graph and then the operation's own arguments in their order, with tensors
+replaced by object arrays of nodes, and returns such an array (views really are views).
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from nfriction.codegen.errors import UnsupportedOperation
+from nfriction.codegen.scalar import Graph, Node, is_predicate
+
+Nodes = np.ndarray
+Operation = Callable[..., Any]
+
+# By the ATen name without `aten::` and overload; in-place forms map to their base name.
+OPERATIONS: dict[str, Operation] = {}
+
+
+def supported_operations() -> list[str]:
+    """Names of the ATen operations that can be compiled (others are decomposed where known)."""
+    return sorted(OPERATIONS)
+
+
+def handles(*names: str) -> Callable[[Operation], Operation]:
+    """Register the decorated function under ATen names."""
+
+    def register(operation: Operation) -> Operation:
+        for name in names:
+            OPERATIONS[name] = operation
+        return operation
+
+    return register
+
+
+def constants(graph: Graph, tensor: Tensor) -> Nodes:
+    """The values of an ordinary tensor as constant nodes."""
+    flat = np.empty(tensor.numel(), dtype=object)
+    flat[:] = [graph.constant(x) for x in tensor.detach().cpu().reshape(-1).tolist()]
+    return flat.reshape(tuple(tensor.shape))
+
+
+def as_nodes(g: Graph, x: Any) -> Nodes:
+    """An array, a node or a number as an array of nodes."""
+    if isinstance(x, np.ndarray):
+        return x
+    out = np.empty((), dtype=object)
+    out[()] = x if isinstance(x, Node) else g.constant(x)
+    return out
+
+
+def elementwise(g: Graph, function: Callable[..., Node], *operands: Any) -> Nodes:
+    """`function` of corresponding elements, operands broadcast."""
+    arrays = np.broadcast_arrays(*(as_nodes(g, x) for x in operands))
+    out = np.empty(arrays[0].size, dtype=object)
+    out[:] = [function(*xs) for xs in zip(*(a.flat for a in arrays), strict=True)]
+    return out.reshape(arrays[0].shape)
+
+
+def number(g: Graph, node: Node) -> Node:
+    """`node` as a number: true is 1."""
+    if is_predicate(node):
+        return g.apply("where", node, g.constant(1.0), g.constant(0.0))
+    return node
+
+
+def predicate(g: Graph, node: Node) -> Node:
+    """`node` as a truth value: everything but zero is true."""
+    return node if is_predicate(node) else g.apply("ne", node, g.constant(0.0))
+
+
+def numbers(g: Graph, op: str, *operands: Any) -> Nodes:
+    """The scalar operation `op` on corresponding elements, truth values taken as numbers."""
+    return elementwise(g, lambda *xs: g.apply(op, *(number(g, x) for x in xs)), *operands)
+
+
+def _register_pointwise(aten: str, op: str) -> None:
+    OPERATIONS[aten] = lambda g, *xs: numbers(g, op, *xs)
+
+
+for _aten, _op in {
+    **{
+        name: name
+        for name in (
+            *("neg", "abs", "sqrt", "exp", "expm1", "log", "log1p", "floor", "ceil", "trunc"),
+            *("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh"),
+            *("mul", "atan2", "fmod", "pow", "lt", "le", "eq", "ne"),
+        )
+    },
+    "maximum": "max",
+    "minimum": "min",
+}.items():
+    _register_pointwise(_aten, _op)
+
+
+@handles("add")
+def add(g: Graph, a: Any, b: Any, alpha: float = 1) -> Nodes:
+    return numbers(g, "add", a, numbers(g, "mul", b, alpha))
+
+
+@handles("sub")
+def sub(g: Graph, a: Any, b: Any, alpha: float = 1) -> Nodes:
+    return numbers(g, "sub", a, numbers(g, "mul", b, alpha))
+
+
+@handles("rsub")
+def _rsub(g: Graph, a: Any, b: Any, alpha: float = 1) -> Nodes:
+    return sub(g, b, a, alpha)
+
+
+@handles("div")
+def div(g: Graph, a: Any, b: Any, rounding_mode: str | None = None) -> Nodes:
+    quotient = numbers(g, "div", a, b)
+    return quotient if rounding_mode is None else numbers(g, rounding_mode, quotient)
+
+
+@handles("reciprocal")
+def reciprocal(g: Graph, a: Nodes) -> Nodes:
+    return div(g, 1.0, a)
+
+
+@handles("rsqrt")
+def _rsqrt(g: Graph, a: Nodes) -> Nodes:
+    return div(g, 1.0, numbers(g, "sqrt", a))
+
+
+@handles("sigmoid")
+def _sigmoid(g: Graph, a: Nodes) -> Nodes:
+    return div(g, 1.0, add(g, 1.0, numbers(g, "exp", numbers(g, "neg", a))))
+
+
+@handles("softplus")
+def _softplus(g: Graph, a: Nodes, beta: float = 1, threshold: float = 20) -> Nodes:
+    scaled = numbers(g, "mul", a, beta)
+    soft = div(g, numbers(g, "log1p", numbers(g, "exp", scaled)), beta)
+    return where(g, _gt(g, scaled, threshold), a, soft)
+
+
+@handles("hypot")
+def _hypot(g: Graph, a: Nodes, b: Nodes) -> Nodes:
+    return numbers(g, "sqrt", add(g, numbers(g, "mul", a, a), numbers(g, "mul", b, b)))
+
+
+@handles("sign", "sgn")
+def _sign(g: Graph, a: Nodes) -> Nodes:
+    return where(g, _gt(g, a, 0.0), 1.0, where(g, numbers(g, "lt", a, 0.0), -1.0, 0.0))
+
+
+@handles("silu")
+def _silu(g: Graph, a: Nodes) -> Nodes:
+    return numbers(g, "mul", a, _sigmoid(g, a))
+
+
+@handles("addcmul")
+def _addcmul(g: Graph, a: Nodes, b: Nodes, c: Nodes, value: float = 1) -> Nodes:
+    return add(g, a, numbers(g, "mul", b, c), value)
+
+
+@handles("addcdiv")
+def _addcdiv(g: Graph, a: Nodes, b: Nodes, c: Nodes, value: float = 1) -> Nodes:
+    return add(g, a, numbers(g, "div", b, c), value)
+
+
+@handles("lerp")
+def _lerp(g: Graph, a: Nodes, b: Nodes, weight: Any) -> Nodes:
+    return add(g, a, numbers(g, "mul", weight, sub(g, b, a)))
+
+
+@handles("relu")
+def _relu(g: Graph, a: Nodes) -> Nodes:
+    return numbers(g, "max", a, 0.0)
+
+
+@handles("remainder")
+def _remainder(g: Graph, a: Any, b: Any) -> Nodes:
+    def remainder(x: Node, y: Node) -> Node:
+        zero = g.constant(0.0)
+        rest = g.apply("fmod", x, y)
+        opposed = g.apply("ne", g.apply("lt", rest, zero), g.apply("lt", y, zero))
+        wrong = g.apply("and", g.apply("ne", rest, zero), opposed)
+        return g.apply("where", wrong, g.apply("add", rest, y), rest)
+
+    return elementwise(g, remainder, a, b)
+
+
+@handles("clamp")
+def _clamp(g: Graph, a: Nodes, min: Any = None, max: Any = None) -> Nodes:
+    raised = a if min is None else numbers(g, "max", a, min)
+    return raised if max is None else numbers(g, "min", raised, max)
+
+
+@handles("clamp_min")
+def _clamp_min(g: Graph, a: Nodes, min: Any) -> Nodes:
+    return _clamp(g, a, min=min)
+
+
+@handles("clamp_max")
+def _clamp_max(g: Graph, a: Nodes, max: Any) -> Nodes:
+    return _clamp(g, a, max=max)
+
+
+@handles("gt")
+def _gt(g: Graph, a: Any, b: Any) -> Nodes:
+    return numbers(g, "lt", b, a)
+
+
+@handles("ge")
+def _ge(g: Graph, a: Any, b: Any) -> Nodes:
+    return numbers(g, "le", b, a)
+
+
+@handles("isnan")
+def _isnan(g: Graph, a: Nodes) -> Nodes:
+    return numbers(g, "ne", a, a)
+
+
+@handles("where")
+def where(g: Graph, condition: Nodes, a: Any = None, b: Any = None) -> Nodes:
+    if a is None or b is None:
+        raise UnsupportedOperation("where(condition)", "has a shape known only at run time")
+
+    def choose(c: Node, x: Node, y: Node) -> Node:
+        if is_predicate(x) != is_predicate(y):
+            x, y = number(g, x), number(g, y)
+        return g.apply("where", c, x, y)
+
+    return elementwise(g, choose, condition, a, b)
+
+
+@handles("masked_fill")
+def _masked_fill(g: Graph, a: Nodes, mask: Nodes, value: Any) -> Nodes:
+    return where(g, mask, value, a)
+
+
+def _logical(op: str) -> Operation:
+    def apply(g: Graph, *operands: Any) -> Nodes:
+        return elementwise(g, lambda *xs: g.apply(op, *(predicate(g, x) for x in xs)), *operands)
+
+    return apply
+
+
+OPERATIONS["logical_and"] = _logical("and")
+OPERATIONS["logical_or"] = _logical("or")
+OPERATIONS["logical_xor"] = _logical("ne")
+OPERATIONS["logical_not"] = _logical("not")
+
+
+def _bitwise(name: str, op: str) -> None:
+    def apply(g: Graph, *operands: Any) -> Nodes:
+        if not all(is_predicate(x) for a in operands for x in as_nodes(g, a).flat):
+            raise UnsupportedOperation(name, "is known for booleans only")
+        return _logical(op)(g, *operands)
+
+    OPERATIONS[name] = apply
+
+
+for _aten, _op in {"and": "and", "or": "or", "xor": "ne", "not": "not"}.items():
+    _bitwise(f"bitwise_{_aten}", _op)
+
+
+def _reduce(
+    g: Graph, function: Callable[[list[Node]], Node], a: Nodes, dim: Any, keepdim: bool
+) -> Nodes:
+    dims = range(a.ndim) if dim is None or dim == [] else [dim] if isinstance(dim, int) else dim
+    axes = sorted({d % a.ndim for d in dims}) if a.ndim else []
+    kept = [i for i in range(a.ndim) if i not in axes]
+    rows = a.transpose(kept + axes).reshape(math.prod(a.shape[i] for i in kept), -1)
+    out = np.empty(len(rows), dtype=object)
+    out[:] = [function([number(g, x) for x in row]) for row in rows]
+    shape = [1 if i in axes else n for i, n in enumerate(a.shape)]
+    return out.reshape(shape if keepdim else [a.shape[i] for i in kept])
+
+
+@handles("sum")
+def _sum(g: Graph, a: Nodes, dim: Any = None, keepdim: bool = False, **_: Any) -> Nodes:
+    return _reduce(g, g.total, a, dim, keepdim)
+
+
+@handles("mean")
+def _mean(g: Graph, a: Nodes, dim: Any = None, keepdim: bool = False, **_: Any) -> Nodes:
+    return _reduce(g, lambda xs: g.apply("div", g.total(xs), g.constant(len(xs))), a, dim, keepdim)
+
+
+@handles("prod")
+def _prod(g: Graph, a: Nodes, dim: Any = None, keepdim: bool = False, **_: Any) -> Nodes:
+    return _reduce(g, lambda xs: g.total(xs, "mul"), a, dim, keepdim)
+
+
+@handles("amax", "max")
+def _amax(g: Graph, a: Nodes, dim: Any = None, keepdim: bool = False) -> Nodes:
+    if isinstance(dim, int):
+        raise UnsupportedOperation("max.dim", "returns indices; use `torch.amax`")
+    if isinstance(dim, np.ndarray):
+        return numbers(g, "max", a, dim)
+    return _reduce(g, lambda xs: g.total(xs, "max"), a, dim, keepdim)
+
+
+@handles("amin", "min")
+def _amin(g: Graph, a: Nodes, dim: Any = None, keepdim: bool = False) -> Nodes:
+    if isinstance(dim, int):
+        raise UnsupportedOperation("min.dim", "returns indices; use `torch.amin`")
+    if isinstance(dim, np.ndarray):
+        return numbers(g, "min", a, dim)
+    return _reduce(g, lambda xs: g.total(xs, "min"), a, dim, keepdim)
+
+
+@handles("logsumexp")
+def _logsumexp(g: Graph, a: Nodes, dim: Any, keepdim: bool = False) -> Nodes:
+    def logsumexp(xs: list[Node]) -> Node:
+        top = g.total(xs, "max")
+        infinite = g.apply("eq", g.apply("abs", top), g.constant(math.inf))
+        top = g.apply("where", infinite, g.constant(0.0), top)
+        exps = [g.apply("exp", g.apply("sub", x, top)) for x in xs]
+        return g.apply("add", g.apply("log", g.total(exps)), top)
+
+    return _reduce(g, logsumexp, a, dim, keepdim)
+
+
+@handles("_softmax")
+def _softmax(g: Graph, a: Nodes, dim: int, half_to_float: bool) -> Nodes:
+    exps = numbers(g, "exp", sub(g, a, _amax(g, a, [dim], True)))
+    return numbers(g, "mul", exps, reciprocal(g, _sum(g, exps, dim, True)))
+
+
+@handles("_log_softmax")
+def _log_softmax(g: Graph, a: Nodes, dim: int, half_to_float: bool) -> Nodes:
+    return sub(g, a, _logsumexp(g, a, dim, True))
+
+
+@handles("cumsum")
+def _cumsum(g: Graph, a: Nodes, dim: int, dtype: Any = None) -> Nodes:
+    out = elementwise(g, lambda x: number(g, x), a)
+    rows = np.moveaxis(out, dim, 0) if out.ndim else out[None]
+    for i in range(1, len(rows)):
+        rows[i : i + 1] = add(g, rows[i - 1 : i], rows[i : i + 1])
+    return out
+
+
+@handles("linalg_vector_norm")
+def _vector_norm(
+    g: Graph, a: Nodes, ord: float = 2, dim: Any = None, keepdim: bool = False, dtype: Any = None
+) -> Nodes:
+    if ord == 2:
+        return numbers(g, "sqrt", _sum(g, numbers(g, "mul", a, a), dim, keepdim))
+    if ord == 1:
+        return _sum(g, numbers(g, "abs", a), dim, keepdim)
+    if ord == math.inf:
+        return _amax(g, numbers(g, "abs", a), None if dim is None else [*dim], keepdim)
+    raise UnsupportedOperation("linalg_vector_norm", f"is not known for ord={ord}")
+
+
+@handles("mm", "mv", "dot", "bmm")
+def _matmul(g: Graph, a: Nodes, b: Nodes) -> Nodes:
+    """Contract the last axis of `a` with the first (after the batch) of `b`."""
+    if a.ndim == 3:
+        return np.stack([_matmul(g, x, y) for x, y in zip(a, b, strict=True)])
+    left, right = a.reshape(-1, a.shape[-1]), b.reshape(b.shape[0], -1).T
+    out = np.empty(len(left) * len(right), dtype=object)
+    out[:] = [g.total([g.apply("mul", *p) for p in zip(x, y)]) for x in left for y in right]  # noqa: B905
+    return out.reshape(a.shape[:-1] + b.shape[1:])
+
+
+@handles("addmm", "addmv", "baddbmm", "addbmm")
+def _addmm(g: Graph, c: Nodes, a: Nodes, b: Nodes, beta: float = 1, alpha: float = 1) -> Nodes:
+    return add(g, numbers(g, "mul", c, beta), _matmul(g, a, b), alpha)
+
+
+# Copies, creation, views, joining and indexing compute nothing.
+
+
+@handles("clone", "contiguous", "lift_fresh", "lift_fresh_copy")
+def _clone(g: Graph, a: Nodes, memory_format: Any = None) -> Nodes:
+    return a.copy()
+
+
+@handles("_to_copy")
+def _to_copy(g: Graph, a: Nodes, dtype: Any = None, **_: Any) -> Nodes:
+    if dtype is None:
+        return a.copy()
+    if dtype.is_floating_point:
+        return elementwise(g, lambda x: number(g, x), a)
+    if dtype.is_complex:
+        raise UnsupportedOperation("_to_copy", "makes a complex tensor")
+    if str(dtype) == "torch.bool":
+        return elementwise(g, lambda x: predicate(g, x), a)
+    return numbers(g, "trunc", a)
+
+
+@handles("copy")
+def _copy(g: Graph, a: Nodes, source: Any, non_blocking: bool = False) -> Nodes:
+    return np.broadcast_to(elementwise(g, lambda x: number(g, x), source), a.shape)
+
+
+@handles("fill")
+def _fill(g: Graph, a: Nodes, value: Any) -> Nodes:
+    return _copy(g, a, value)
+
+
+@handles("zero", "zeros_like", "new_zeros")
+def _zeros(g: Graph, a: Nodes, size: Sequence[int] | None = None, **_: Any) -> Nodes:
+    return _full(g, a, size, 0.0)
+
+
+@handles("ones_like", "new_ones")
+def _ones(g: Graph, a: Nodes, size: Sequence[int] | None = None, **_: Any) -> Nodes:
+    return _full(g, a, size, 1.0)
+
+
+@handles("empty_like", "new_empty")
+def _empty(g: Graph, a: Nodes, size: Sequence[int] | None = None, **_: Any) -> Nodes:
+    return _full(g, a, size, 0.0)
+
+
+@handles("new_full")
+def _full(g: Graph, a: Nodes, size: Sequence[int] | None, value: Any, **_: Any) -> Nodes:
+    return elementwise(
+        g, lambda x: x, np.broadcast_to(as_nodes(g, value), a.shape if size is None else size)
+    )
+
+
+@handles("full_like")
+def _full_like(g: Graph, a: Nodes, value: Any, **_: Any) -> Nodes:
+    return _full(g, a, None, value)
+
+
+@handles("view", "_unsafe_view", "reshape", "_reshape_alias")
+def _view(g: Graph, a: Nodes, size: Sequence[int], *_: Any) -> Nodes:
+    out = a.reshape(tuple(size))
+    if out.size and not np.shares_memory(out, a):
+        a.flags.writeable = out.flags.writeable = False  # torch may alias here, NumPy did not
+    return out
+
+
+@handles("permute")
+def _permute(g: Graph, a: Nodes, dims: Sequence[int]) -> Nodes:
+    return a.transpose([d % a.ndim for d in dims])
+
+
+@handles("transpose")
+def _transpose(g: Graph, a: Nodes, dim0: int, dim1: int) -> Nodes:
+    return a.swapaxes(dim0, dim1) if a.ndim else a
+
+
+@handles("t", "numpy_T")
+def _t(g: Graph, a: Nodes) -> Nodes:
+    return a.T
+
+
+@handles("expand")
+def _expand(g: Graph, a: Nodes, size: Sequence[int], implicit: bool = False) -> Nodes:
+    lead = len(size) - a.ndim
+    return np.broadcast_to(a, [a.shape[i - lead] if n == -1 else n for i, n in enumerate(size)])
+
+
+@handles("select")
+def _select(g: Graph, a: Nodes, dim: int, index: int) -> Nodes:
+    return np.moveaxis(a, dim, 0)[int(index), ...]
+
+
+@handles("slice")
+def _slice(
+    g: Graph, a: Nodes, dim: int = 0, start: Any = None, end: Any = None, step: int = 1
+) -> Nodes:
+    return np.moveaxis(np.moveaxis(a, dim, 0)[start:end:step], 0, dim)
+
+
+@handles("squeeze")
+def _squeeze(g: Graph, a: Nodes, dim: Any = None) -> Nodes:
+    dims = range(a.ndim) if dim is None else [dim] if isinstance(dim, int) else dim
+    axes = tuple(d % a.ndim for d in dims if a.ndim and a.shape[d] == 1)
+    return a.squeeze(axes)
+
+
+@handles("unsqueeze")
+def _unsqueeze(g: Graph, a: Nodes, dim: int) -> Nodes:
+    return np.expand_dims(a, dim)
+
+
+@handles("unbind")
+def _unbind(g: Graph, a: Nodes, dim: int = 0) -> list[Nodes]:
+    return [_select(g, a, dim, i) for i in range(a.shape[dim])]
+
+
+@handles("split")
+def _split(g: Graph, a: Nodes, size: int, dim: int = 0) -> list[Nodes]:
+    length = a.shape[dim]
+    return [_slice(g, a, dim, i, i + size) for i in range(0, max(length, 1), size)]
+
+
+@handles("split_with_sizes")
+def _split_with_sizes(g: Graph, a: Nodes, sizes: Sequence[int], dim: int = 0) -> list[Nodes]:
+    stops = np.cumsum(sizes)
+    return [_slice(g, a, dim, s - n, s) for s, n in zip(stops, sizes, strict=True)]
+
+
+@handles("alias", "detach")
+def _alias(g: Graph, a: Nodes) -> Nodes:
+    return a
+
+
+@handles("diagonal")
+def _diagonal(g: Graph, a: Nodes, offset: int = 0, dim1: int = 0, dim2: int = 1) -> Nodes:
+    return np.diagonal(a, offset, dim1, dim2)  # read-only: writing through it is refused
+
+
+@handles("flip")
+def _flip(g: Graph, a: Nodes, dims: Sequence[int]) -> Nodes:
+    return np.flip(a, tuple(dims)).copy()
+
+
+@handles("roll")
+def _roll(g: Graph, a: Nodes, shifts: Sequence[int], dims: Sequence[int] = ()) -> Nodes:
+    return np.roll(a, tuple(shifts), tuple(dims)) if dims else np.roll(a, shifts[0])
+
+
+@handles("constant_pad_nd")
+def _pad(g: Graph, a: Nodes, pad: Sequence[int], value: float = 0.0) -> Nodes:
+    widths = [(0, 0)] * (a.ndim - len(pad) // 2)
+    widths += [(pad[i], pad[i + 1]) for i in range(len(pad) - 2, -1, -2)]
+    return np.pad(a, widths, constant_values=g.constant(value))  # type: ignore[call-overload]
+
+
+@handles("cat")
+def _cat(g: Graph, tensors: Sequence[Nodes], dim: int = 0) -> Nodes:
+    # torch ignores the historic empty 1-D tensor.
+    return np.concatenate([t for t in tensors if t.shape != (0,)] or list(tensors), axis=dim)
+
+
+@handles("stack")
+def _stack(g: Graph, tensors: Sequence[Nodes], dim: int = 0) -> Nodes:
+    return np.stack(tensors, axis=dim)
+
+
+@handles("repeat")
+def _repeat(g: Graph, a: Nodes, repeats: Sequence[int]) -> Nodes:
+    return np.tile(a, tuple(repeats))
+
+
+def _static(name: str, index: Nodes) -> np.ndarray:
+    if any(node.op != "constant" for node in index.flat):
+        raise UnsupportedOperation(name, "has an index that is known only at run time")
+    boolean = index.size > 0 and isinstance(index.flat[0].value, bool)
+    values = np.array([node.value for node in index.flat], dtype=bool if boolean else np.int64)
+    return values.reshape(index.shape)
+
+
+def _subscript(name: str, indices: Sequence[Nodes | None]) -> tuple[Any, ...]:
+    return tuple(slice(None) if i is None else _static(name, i) for i in indices)
+
+
+@handles("index", "_unsafe_index")
+def _index(g: Graph, a: Nodes, indices: Sequence[Nodes | None]) -> Nodes:
+    return as_nodes(g, a[_subscript("index", indices)])
+
+
+@handles("index_put")
+def _index_put(
+    g: Graph, a: Nodes, indices: Sequence[Nodes | None], values: Nodes, accumulate: bool = False
+) -> Nodes:
+    if accumulate:
+        raise UnsupportedOperation("index_put", "accumulates, which is not known here")
+    out = a.copy()
+    out[_subscript("index_put", indices)] = values
+    return out
+
+
+@handles("index_select")
+def _index_select(g: Graph, a: Nodes, dim: int, index: Nodes) -> Nodes:
+    return np.take(a, _static("index_select", index), axis=dim)
+
+
+@handles("gather")
+def _gather(g: Graph, a: Nodes, dim: int, index: Nodes, sparse_grad: bool = False) -> Nodes:
+    return np.take_along_axis(a, _static("gather", index), axis=dim)

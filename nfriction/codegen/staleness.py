@@ -1,0 +1,322 @@
+"""Fingerprints of all that a trace may read: compiled code is stale once its fingerprint changes.
+
+Python code reads far more than its arguments: globals, closures, attributes of objects that it
+holds, elements of arrays. All of that is followed here from the traced objects on, by what their
+functions name, and compared by value. What cannot be compared (an open file, an object of a C
+library) is an error that names it; then only another trace says what the code computes now.
+"""
+
+import builtins
+import dis
+import enum
+import functools
+import types
+from collections import defaultdict, deque
+from collections.abc import Hashable, Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from nfriction.codegen.errors import Incomparable
+
+
+class _Read(NamedTuple):
+    """Names in a function's code: globals, attributes and imported modules."""
+
+    names: tuple[str, ...]
+    attributes: frozenset[str]
+    imports: tuple[str, ...]
+
+
+# Packages whose functions and classes never change, so that they need not be followed.
+_CONSTANT = frozenset({
+    *("nfriction", "torch", "numpy", "builtins", "math", "cmath", "operator", "_operator", "abc"),
+    *("functools", "_functools", "itertools", "collections", "types", "typing", "dataclasses"),
+    *("enum", "contextlib", "numbers"),
+})  # fmt: skip
+# Built-in functions that reach what no name shows.
+_REACHING = frozenset({"open", "input", "eval", "exec", "globals", "locals", "vars", "__import__"})
+_ATOMS = frozenset({
+    *(type(None), bool, int, str, bytes, type(Ellipsis), type(NotImplemented), range),
+    *(torch.dtype, torch.device, torch.Size, np.ufunc, types.CodeType),
+})  # fmt: skip
+_MAPPINGS = (dict, types.MappingProxyType)
+_SEQUENCES = (list, tuple, set, frozenset, deque)
+_TENSORS = frozenset({Tensor, nn.Parameter})
+_METHODS = (types.BuiltinFunctionType, types.MethodWrapperType)
+# Descriptors of what an object holds, which is followed in the object.
+_FIELDS = (types.MemberDescriptorType, types.GetSetDescriptorType, type(_Read.names))
+_DESCRIPTORS = (types.WrapperDescriptorType, types.MethodDescriptorType)
+# Fields of every module; those that decide what it computes are followed by themselves.
+_OF_MODULES = frozenset(vars(nn.Module())) - {"training"}
+_HOOKS = ("_forward_hooks", "_forward_pre_hooks")
+# Parts of a fingerprint; following more of them takes longer than another trace.
+_LIMIT = 20_000
+_HEAP_TYPE = 1 << 9  # of a class's flags: made by Python code
+
+
+def fingerprint(modules: Iterable[nn.Module], *others: Any) -> Hashable:
+    """A key that differs where a trace of these objects may differ.
+
+    Args:
+        modules: their floating-point parameters and buffers are inputs of the traced code, so that
+            shapes count and values do not.
+        others: further functions and values that the trace reads.
+
+    Raises:
+        Incomparable: if they reach something that cannot be compared, named.
+    """
+    walk = _Walk(modules)
+    try:
+        for value in (torch.get_default_dtype(), *modules, *others):
+            walk.add(value)
+    except RecursionError:
+        raise Incomparable("a chain of objects that is too long to follow") from None
+    return tuple(walk.parts)
+
+
+@functools.lru_cache(1024)
+def _read_by(code: types.CodeType) -> _Read:
+    found: dict[str, set[str]] = {"LOAD_GLOBAL": set(), "IMPORT_NAME": set()}
+    for instruction in dis.get_instructions(code):
+        if instruction.opname in found:
+            found[instruction.opname].add(instruction.argval)
+    names, imports, attributes = *found.values(), set(code.co_names)
+    for inner in code.co_consts:
+        if isinstance(inner, types.CodeType):
+            more = _read_by(inner)
+            names.update(more.names)
+            imports.update(more.imports)
+            attributes |= more.attributes
+    return _Read(tuple(sorted(names)), frozenset(attributes), tuple(sorted(imports)))
+
+
+def _is_constant(module: Any) -> bool:
+    return isinstance(module, str) and module.partition(".")[0] in _CONSTANT
+
+
+class _Walk:
+    """One walk over all that can be reached; `parts` is a text of it in hashable pieces."""
+
+    def __init__(self, modules: Iterable[nn.Module]) -> None:
+        self.parts: list[Any] = []
+        self.seen: dict[Any, int] = {}
+        self.inputs: set[int] = set()
+        found = list(modules)
+        while found:
+            module = found.pop()
+            self.inputs.add(id(module))
+            found += [m for m in module._modules.values() if m is not None]
+
+    def add(self, value: Any) -> None:
+        kind: type = type(value)
+        parts = self.parts
+        parts.append(kind)
+        if kind in _ATOMS:
+            parts.append(value)
+        elif kind is float or kind is complex:
+            parts.append(repr(value))  # tells signs of zero apart, and NaN equals itself
+        elif kind in _TENSORS:
+            self._tensor(value)
+        elif isinstance(value, np.ndarray | np.generic):
+            self._array(value)
+        elif self._is_new(id(value)):
+            self._compound(kind, value)
+
+    def _is_new(self, *key: Hashable) -> bool:
+        """False where the same was met before, so that circles end."""
+        before = self.seen.setdefault(key, len(self.seen))
+        self.parts.append(before)
+        return before == len(self.seen) - 1
+
+    def _compound(self, kind: type, value: Any) -> None:
+        if isinstance(value, nn.Module):
+            self._module(value)
+        elif isinstance(value, _SEQUENCES):
+            self._all(value)
+            self._subclass(kind, value, _SEQUENCES)
+        elif isinstance(value, _MAPPINGS):
+            self._mapping(value)
+            self._subclass(kind, value, _MAPPINGS)
+        elif kind is types.FunctionType:
+            self._function(value)
+        elif kind is types.MethodType:
+            self.add(value.__func__)
+            self.add(value.__self__)
+        elif kind is functools.partial:
+            self._all((value.func, value.args, value.keywords))
+        elif kind is slice:
+            self._all((value.start, value.stop, value.step))
+        elif isinstance(value, type):
+            self._class(value)
+        elif kind in (staticmethod, classmethod):
+            self.add(value.__func__)
+        elif kind is property:
+            self.add(value.fget)
+        elif kind is functools.cached_property:
+            self.add(value.func)
+        elif isinstance(value, enum.Enum):
+            self.parts.append(value.name)
+            self._class(kind)
+        elif isinstance(value, _METHODS):
+            self._built_in(value)
+        elif isinstance(value, _DESCRIPTORS) and _is_constant(value.__objclass__.__module__):
+            self.parts.append(value)
+        elif kind is types.ModuleType and _is_constant(value.__name__):
+            self.parts.append(value.__name__)
+        else:
+            self._object(kind, value)
+
+    def _length(self, length: int) -> None:
+        self.parts.append(length)
+        if len(self.parts) + length > _LIMIT:
+            raise Incomparable(f"more than {_LIMIT} values")
+
+    def _all(self, values: Any) -> None:
+        self._length(len(values))
+        for value in values:
+            self.add(value)
+
+    def _mapping(self, values: Any) -> None:
+        self._length(len(values))
+        for key, value in values.items():
+            self.add(key)
+            self.add(value)
+
+    def _subclass(self, kind: type, value: Any, plain: tuple[type, ...]) -> None:
+        """All that a container has beside its elements."""
+        if kind is defaultdict:
+            self.add(value.default_factory)
+        elif kind not in plain:
+            self._class(kind)
+            if hasattr(value, "__dict__"):
+                self._mapping(vars(value))
+
+    def _tensor(self, value: Tensor) -> None:
+        if value.layout is not torch.strided:
+            raise Incomparable(f"a tensor with layout {value.layout}")
+        exact = value.float() if value.dtype is torch.bfloat16 else value  # NumPy has none
+        self.parts += (value.shape, value.dtype, exact.numpy(force=True).tobytes())
+
+    def _array(self, value: Any) -> None:
+        if value.dtype.hasobject:
+            raise Incomparable("an array of objects")
+        self.parts += (value.shape, value.dtype.str, value.tobytes())
+
+    def _module(self, module: nn.Module) -> None:
+        own = id(module) in self.inputs
+        for tensors in (module._parameters, module._buffers):
+            for name, tensor in tensors.items():
+                self.parts.append(name)
+                if tensor is not None and own and tensor.is_floating_point():
+                    self.parts += (tensor.shape, tensor.dtype)
+                else:
+                    self.add(tensor)
+        for name, part in module._modules.items():
+            self.parts.append(name)
+            self.add(part)
+        for name in _HOOKS:
+            if vars(module).get(name):
+                self.add(vars(module)[name])
+        ours = _is_constant(type(module).__module__)
+        for name, value in vars(module).items():
+            # The library's modules keep descriptions, which no step reads, in private containers.
+            if name in _OF_MODULES or (ours and name[0] == "_" and isinstance(value, list | dict)):
+                continue
+            self.parts.append(name)
+            self.add(value)
+        if not ours:
+            self._class(type(module))
+
+    def _function(self, function: types.FunctionType) -> None:
+        code = function.__code__
+        self.parts.append(code)
+        if not _is_constant(function.__globals__.get("__name__")):
+            self._named(function, _read_by(code))
+        for cell in function.__closure__ or ():
+            try:
+                self.add(cell.cell_contents)
+            except ValueError:
+                self.parts.append("an empty cell")
+        for values in (function.__defaults__, function.__kwdefaults__, function.__dict__):
+            if values:
+                self.add(values)
+
+    def _named(self, function: types.FunctionType, read: _Read) -> None:
+        """All that a function names outside itself."""
+        for name in read.imports:
+            if not _is_constant(name):
+                raise Incomparable(f"`{function.__qualname__}`, which imports `{name or '.'}`")
+        for name in read.names:
+            if name in function.__globals__:
+                self.parts.append(name)
+                self._reached(function.__globals__[name], read.attributes)
+            elif name in _REACHING and hasattr(builtins, name):
+                raise Incomparable(f"`{function.__qualname__}`, which calls `{name}`")
+
+    def _reached(self, value: Any, attributes: frozenset[str]) -> None:
+        """A global; of a module, all names that the function also mentions."""
+        if not isinstance(value, types.ModuleType) or _is_constant(value.__name__):
+            self.add(value)
+            return
+        self.parts.append(value.__name__)
+        if self._is_new(id(value), attributes):
+            has = vars(value)
+            for name in sorted(has if "getattr" in attributes else attributes & has.keys()):
+                self.parts.append(name)
+                self._reached(has[name], attributes)
+
+    def _class(self, kind: type) -> None:
+        for base in kind.__mro__:
+            self.parts.append(base)
+            if not _is_constant(base.__module__):
+                for name, value in vars(base).items():
+                    # Of the names that Python gives, functions alone compute something.
+                    given = name.startswith("__") or name == "_abc_impl"
+                    wanted = not given or isinstance(value, types.FunctionType)
+                    if wanted and not isinstance(value, _FIELDS):
+                        self.parts.append(name)
+                        self.add(value)
+
+    def _built_in(self, value: Any) -> None:
+        owner = value.__self__
+        self.parts.append(value.__name__)
+        if isinstance(owner, types.ModuleType | type):
+            name = owner.__name__ if isinstance(owner, types.ModuleType) else owner.__module__
+            if not _is_constant(name):
+                raise Incomparable(f"`{name}.{value.__name__}`, which is not written in Python")
+            self.parts.append(owner)
+        else:
+            self.add(owner)
+
+    def _object(self, kind: type, value: Any) -> None:
+        """An object of a class in Python: its class and all of its attributes."""
+        slots = _slots(kind)
+        if slots is None:
+            raise Incomparable(f"an object of {kind.__module__}.{kind.__qualname__}")
+        self._class(kind)
+        for name in slots:
+            self.parts.append(name)
+            if hasattr(value, name):
+                self.add(getattr(value, name))
+        if hasattr(value, "__dict__"):
+            self._mapping(vars(value))
+
+
+@functools.lru_cache(1024)
+def _slots(kind: type) -> tuple[str, ...] | None:
+    """Slots of a class whose objects hold these and attributes alone, else None."""
+    slots = tuple(
+        name
+        for base in kind.__mro__
+        for name, slot in vars(base).items()
+        if isinstance(slot, types.MemberDescriptorType)
+    )
+    if kind is types.SimpleNamespace:
+        return slots
+    # Beside its slots, an object in Python has its attributes and a place for weak references.
+    most = object.__basicsize__ + tuple.__itemsize__ * (len(slots) + 2)
+    python = all(k.__flags__ & _HEAP_TYPE for k in kind.__mro__ if k is not object)
+    return slots if python and kind.__basicsize__ <= most and not kind.__itemsize__ else None
