@@ -172,7 +172,7 @@ class Controller(nn.Module):
 
         Without a memory, whatever is given for it is handed back.
         """
-        qd_seen, qdd_seen, outside = self._seen(qd, qdd)
+        qd_seen, qdd_seen, outside = self.seen(qd, qdd)
         motion = qd.abs() + qdd.abs()
         if self.remembers:
             following = self.model.schedule.advance(qd_seen, qdd_seen, memory)
@@ -213,7 +213,7 @@ class Controller(nn.Module):
     def initial_memory(self, qd: Tensor, qdd: Tensor) -> Tensor:
         """Memory before a first sample; a joint that is not finite counts as one at rest."""
         finite = qd.abs() + qdd.abs() < math.inf
-        qd_seen, qdd_seen, _ = self._seen(
+        qd_seen, qdd_seen, _ = self.seen(
             torch.where(finite, qd, 0.0), torch.where(finite, qdd, 0.0)
         )
         return self.model.schedule.initial_state(qd_seen, qdd_seen)
@@ -229,14 +229,14 @@ class Controller(nn.Module):
 
     def torque(self, qd: Tensor, qdd: Tensor, load: Tensor) -> Tensor:
         """The torque alone, by the same contract; a memory is that after a first sample."""
-        qd_seen, qdd_seen, _ = self._seen(qd, qdd)
+        qd_seen, qdd_seen, _ = self.seen(qd, qdd)
         tau_f = self.model.torque(qd, load, self.model.schedule(qd_seen, qdd_seen))
         held = torch.clamp(tau_f, -self.torque_limit, self.torque_limit) if self.limited else tau_f
         # Zero times what is not finite is NaN: a third of the operations of comparisons.
         held = torch.addcmul(held, qd, qdd, value=0.0)
         return torch.addcmul(held, load, tau_f, value=0.0)
 
-    def _seen(self, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def seen(self, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Velocity and acceleration that the schedule sees, and whether they leave the range."""
         if qd.size(-1) != self.joints:
             raise ValueError(

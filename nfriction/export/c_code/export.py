@@ -1,6 +1,7 @@
 """C for controllers: one source file and its header, a self-test, and skeletons around them."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -70,7 +71,7 @@ def c(
     )
     contract = contract_of(model, controller, info, dtype=dtype)
     described = {**contract.description, "prefix": prefix}
-    contract = Contract(described, contract.inputs, contract.outputs, contract.tolerance)
+    contract = replace(contract, description=described)
     dialect = ControllerC(REALS[dtype], prefix)
     source = source_of(controller, described, dialect, name)
     words = _words(contract, name)
@@ -115,13 +116,12 @@ def _vectors(contract: Contract, dialect: ControllerC) -> dict[str, str]:
     # What the filter gives is rounded to single precision on its way to the model.
     rounded = dialect.real == "float" and contract.description["filter"] is not None
     tolerance = (ROUNDED if rounded else 1.0) * contract.tolerance
-    scales = tau.abs().amax(0)[None], coefficients.abs().amax((0, 1))[None]
     tables += [
         _table("test_tau", tau, dialect),
         _table("test_coefficients", coefficients.flatten(1), dialect),
         _table("test_status", status, dialect, "unsigned char"),
-        _table("test_torque_scale", scales[0], dialect),
-        _table("test_coefficient_scale", scales[1], dialect),
+        _table("test_torque_scale", contract.scales["tau_f"][None], dialect),
+        _table("test_coefficient_scale", contract.scales["coefficients"][None], dialect),
     ]
     return {
         "count": str(len(tau)),
