@@ -69,7 +69,7 @@ def test_a_coefficient_near_zero_is_no_fault_of_the_artefact(
     dtype = {"dtype": "float32"} if single else {}
     path = tmp_path / f"m.{ending}"
     if ending == "c":
-        c(model, tmp_path, INFO, name="m", prefix="m", **dtype)
+        c(model, tmp_path, INFO, name="m", **dtype)
     else:
         {"pt": torchscript, "pt2": pt2, "onnx": onnx}[ending](model, path, INFO, **dtype)
     verdict = verify_artefact(path, model, INFO, points=500)
