@@ -133,7 +133,7 @@ class Contract:
             )
         try:
             vectors = content.pop("vectors")
-            tolerance = float(_tensor("tolerance", [content.pop("tolerance")]))
+            tolerance = strict_json.numbers("tolerance", content.pop("tolerance"))
             inputs, outputs, scales = (
                 {str(name): _tensor(name, x) for name, x in side.items()}
                 for side in (vectors["inputs"], vectors["outputs"], content.pop("scales"))
@@ -333,19 +333,10 @@ def _plain(x: Tensor) -> list[Any]:
 def _tensor(name: str, given: Any) -> Tensor:
     """A tensor of nested lists as `_plain` spells them."""
 
-    def number(value: Any) -> Any:
-        if isinstance(value, list):
-            return [number(v) for v in value]
-        if isinstance(value, bool) or (isinstance(value, str) and value not in _SPELLINGS):
-            raise ValueError(f"`{name}` holds {str(value)[:40]!r}")
-        return float(value)
-
     if not isinstance(given, list) or len(given) > MOST_VECTORS:
         raise ValueError(f"`{name}` is no list, or too long")
-    return torch.tensor(number(given), dtype=torch.float64)
-
-
-_SPELLINGS = ("nan", "inf", "-inf")
+    values = strict_json.numbers(name, given, words=("nan", "inf", "-inf"))
+    return torch.tensor(values, dtype=torch.float64)
 
 
 def _check_interface(content: Mapping[str, Any], names: list[str]) -> None:
@@ -370,7 +361,8 @@ def _check_vectors(
 ) -> None:
     """Raise `ContractError` where test vectors do not fit each other."""
     shapes = {tuple(x.shape) for x in inputs.values()}
-    sound = len(shapes) == 1 and tuple(outputs) == OUTPUTS and 0 < tolerance < 1
+    sound = len(shapes) == 1 and tuple(outputs) == OUTPUTS
+    sound = sound and isinstance(tolerance, float) and 0 < tolerance < 1
     if sound:
         shape = shapes.pop()
         given = [tuple(x.shape) for x in outputs.values()]

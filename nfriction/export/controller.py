@@ -15,11 +15,13 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Final
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_info import ModelInfo
+from nfriction.io.strict_json import numbers
 from nfriction.signals import SecondOrderLowPass
 
 # Bits of the status.
@@ -59,7 +61,10 @@ def controller_of(
             "was fitted to recordings of different ones."
         )
     return Controller(
-        model, info, torque_limit, SecondOrderLowPass(cutoff_hz, float(info.sample_time))
+        model,
+        info,
+        torque_limit,
+        SecondOrderLowPass(numbers("cutoff_hz", cutoff_hz), float(info.sample_time)),
     )
 
 
@@ -163,6 +168,8 @@ class Controller(nn.Module):
         """Torque, coefficients and status of samples in order, (sample, joint, ...)."""
         if not self.state_size:
             return self(*inputs)
+        if not len(inputs[0]):
+            return self(*inputs, self.start(*inputs))[:3]
         return run_in_order(self, inputs, self.start(*(x[0] for x in inputs)))
 
     def step(
@@ -291,11 +298,8 @@ def _range(name: str, given: object, joints: int) -> tuple[Tensor, Tensor]:
     if given is None:
         edge = torch.full((joints,), UNBOUNDED, dtype=torch.float64)
         return -edge, edge
-    try:
-        pairs = torch.tensor(given, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"`input_ranges` of {name} must be numbers, got {given!r}.") from error
-    if pairs.shape != (joints, 2) or not (pairs[:, 0] <= pairs[:, 1]).all():
+    pairs = torch.tensor(given, dtype=torch.float64)
+    if len(pairs) != joints:
         raise ValueError(
             f"`input_ranges` of {name} must be [lowest, highest] for each of {joints} joints, got "
             f"{given!r}."
@@ -306,7 +310,8 @@ def _range(name: str, given: object, joints: int) -> tuple[Tensor, Tensor]:
 
 def _limit(given: float | Sequence[float] | None, joints: int) -> Tensor:
     """Largest |torque| by joint."""
-    limit = torch.as_tensor(UNBOUNDED if given is None else given, dtype=torch.float64)
+    plain = UNBOUNDED if given is None else np.asarray(given, dtype=object).tolist()
+    limit = torch.tensor(numbers("torque_limit", plain), dtype=torch.float64)
     if limit.shape not in ((), (joints,)) or not ((limit > 0) & (limit < math.inf)).all():
         raise ValueError(
             f"`torque_limit` must be positive and finite [N m], one number or one for each of "

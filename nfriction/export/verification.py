@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from nfriction.export.c_code.run import open_c
-from nfriction.export.contract import Contract, Parity, Runner, compare, contract_of
+from nfriction.export.contract import Contract, Parity, compare, contract_of
 from nfriction.export.controller import Controller, controller_of
 from nfriction.export.errors import ContractError, ExportError
-from nfriction.export.onnx_file import open_onnx
+from nfriction.export.onnx_file import contract_of_onnx, open_onnx
 from nfriction.export.test_vectors import draw
 from nfriction.export.torch_code.archive import contract_of_archive
 from nfriction.export.torch_code.pt2 import open_pt2
@@ -57,9 +57,10 @@ def verify_artefact(
 ) -> Verdict:
     """Compare an artefact with the model that it should be.
 
-    An artefact is a program, and running it is how it is verified. Those of torch run in a process
-    of their own and only if they are arithmetic of tensors alone; C is compiled and run as it is,
-    so only verify files from sources that you trust.
+    An artefact is a program, and running it is how it is verified. Those of torch and ONNX run in a
+    process of their own with limits of time and memory, those of torch only if they are arithmetic
+    of tensors alone; C is compiled and run as it is, so only verify files from sources that you
+    trust.
 
     Args:
         path: `.pt`, `.pt2`, `.onnx`, or `.c` with its `.contract.json` beside it.
@@ -126,9 +127,9 @@ def _controller(
         raise ContractError(f"the metadata's filter or limit is damaged ({error}).") from error
 
 
-# Programs of torch are run in a process of their own, which may perish of them.
+# Programs of torch and ONNX are run in a process of their own, which may perish of them.
 
-TORCH_OPENERS = {".pt": open_torchscript, ".pt2": open_pt2}
+ISOLATED = {".pt": open_torchscript, ".pt2": open_pt2, ".onnx": open_onnx}
 # Processor time [s]: to begin with, and for a sample of a controller with a state.
 STARTING, BY_SAMPLE = 120.0, 0.01
 ROOM = 2**34
@@ -146,7 +147,8 @@ def open_apart(path: str | Path) -> tuple[Contract, Any]:
         ContractError: if its metadata are absent or damaged.
         OSError: if it cannot be read.
     """
-    contract = contract_of_archive(path)
+    onnx = Path(path).suffix == ".onnx"
+    contract = contract_of_onnx(path) if onnx else contract_of_archive(path)
 
     def run(*batches: Sequence[Tensor]) -> list[tuple[Tensor, ...]]:
         with tempfile.TemporaryDirectory() as folder:
@@ -190,7 +192,7 @@ def work(asked: Mapping[str, Any], folder: Path) -> None:
         ExportError, ContractError: as the openers do, or if its outputs are none of a controller.
     """
     path = Path(asked["path"])
-    _, run = TORCH_OPENERS[path.suffix](path)
+    _, run = ISOLATED[path.suffix](path)
     found: dict[str, Any] = {}
     with np.load(folder / _INPUTS, allow_pickle=False) as given:
         for k, count in enumerate(asked["batches"]):
@@ -209,19 +211,15 @@ def work(asked: Mapping[str, Any], folder: Path) -> None:
 Batches = Callable[..., Sequence[Sequence[Any]]]
 
 
-def _here(opener: Callable[[str | Path], tuple[Contract, Runner]]) -> Callable[..., Any]:
-    """An opener of artefacts that are run in this process."""
-
-    def opened(path: str | Path) -> tuple[Contract, Batches]:
-        contract, run = opener(path)
-        return contract, lambda *batches: [run(*batch) for batch in batches]
-
-    return opened
+def open_here(path: str | Path) -> tuple[Contract, Batches]:
+    """As `open_apart`, for C, which is run in this process."""
+    contract, run = open_c(path)
+    return contract, lambda *batches: [run(*batch) for batch in batches]
 
 
 OPENERS: dict[str, Callable[[str | Path], tuple[Contract, Batches]]] = {
-    ".c": _here(open_c),
+    ".c": open_here,
     ".pt": open_apart,
     ".pt2": open_apart,
-    ".onnx": _here(open_onnx),
+    ".onnx": open_apart,
 }
