@@ -2,7 +2,7 @@
 #define _POSIX_C_SOURCE 199309L
 #include <time.h>
 
-#include "nfriction.h"
+#include "nf.h"
 
 static double now(void)
 {

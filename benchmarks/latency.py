@@ -81,12 +81,12 @@ def case(joints: int, calls: int, folder: Path) -> Case:
 def c_timer(dtype: str, *options: str) -> Timer:
     def run(given: Case) -> Times:
         folder = given.folder / "_".join(["c", dtype, str(given.model.joints), *options])
-        c(given.model, folder, given.info, dtype=dtype)
+        c(given.model, folder, given.info, name="nf", dtype=dtype)
         compiler = find_compiler()
         if compiler is None:
             raise FileNotFoundError("no C compiler")
         library = folder / "latency.so"
-        sources = [str(Path(__file__).with_name("latency.c")), str(folder / "nfriction.c")]
+        sources = [str(Path(__file__).with_name("latency.c")), str(folder / "nf.c")]
         command = [*compiler, "-std=c99", *options, f"-I{folder}", "-shared", "-fPIC", *sources,
                    "-o", str(library), "-lm"]  # fmt: skip
         subprocess.run(command, check=True)

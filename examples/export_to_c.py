@@ -30,7 +30,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             print("no C compiler here; the self-test was not run")
             continue
         program = folder.resolve() / "selftest"
-        sources = ["nfriction.c", "nf_selftest.c"]
+        sources = ["nfriction.c", "nfriction_selftest.c"]
         subprocess.run(
             [compiler, "-O2", *sources, "-o", str(program), "-lm"], cwd=folder, check=True
         )

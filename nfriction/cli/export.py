@@ -86,6 +86,7 @@ def _write_controller(
 ) -> list[Path]:
     """Write an artefact; returns its files."""
     from nfriction import export
+    from nfriction.export.c_code.dialect import is_identifier
 
     options: dict[str, Any] = {
         "torque_limit": _limit(arguments.torque_limit),
@@ -97,7 +98,7 @@ def _write_controller(
     stem = arguments.model.stem
     if target == "c":
         name = "".join(x if x.isascii() and x.isalnum() else "_" for x in stem)[:24]
-        name = name if name[0].isalpha() else f"nf_{name}"
+        name = name if is_identifier(name) else f"nf_{name}"
         return export.c(model, arguments.out, info, name=name, **options)
     writer = getattr(export, target)
     return [writer(model, arguments.out / f"{stem}{CONTROLLERS[target]}", info, **options)]

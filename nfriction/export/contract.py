@@ -24,8 +24,7 @@ from nfriction.io.atomic import atomic_write
 from nfriction.io.model_info import ModelInfo, describe
 
 FORMAT, SCHEMA = "nfriction controller", 1
-# Largest torque error over full scale that a target in double, or in single precision, may show;
-# in single precision it is more where the model itself is steep.
+# Largest torque error over full scale that a target in double, or in single precision, may show.
 TOLERANCE = {"float64": 1e-12, "float32": 5e-7}
 # Coefficients come out of longer sums than the torque, some of them small differences.
 COEFFICIENT_SLACK = 20.0
@@ -41,8 +40,9 @@ class Parity:
 
     Attributes:
         points: samples compared.
-        torque_error: largest |difference| of the torque over the largest |torque| of the joint.
-        coefficient_error: the same of the coefficients, over the largest of each coefficient.
+        torque_error: largest |difference| of the torque over the joint's full scale, which is the
+            largest |torque| or that of `Contract.scales`.
+        coefficient_error: the same of the coefficients, over the full scale of each.
         edges: samples whose status, or whose NaN, are not those of the model.
         tolerance: largest torque error allowed; the coefficients have 20 times that.
     """
@@ -81,12 +81,16 @@ class Contract:
         inputs: test vectors by name of the input, each (vector, joint). Where the controller has a
             state they are successive samples, the first one on `initial_state`.
         outputs: `tau_f`, `coefficients` and `status` that the model gives.
+        scales: full scale of `tau_f`, (joint,), and of `coefficients`, (coefficient,): the largest
+            value in the outputs or, where it is a small difference of large numbers, as much as
+            its rounding errors call for.
         tolerance: largest torque error over full scale that an artefact may show [-].
     """
 
     description: Mapping[str, Any]
     inputs: Mapping[str, Tensor]
     outputs: Mapping[str, Tensor]
+    scales: Mapping[str, Tensor]
     tolerance: float = TOLERANCE["float64"]
 
     @property
@@ -100,7 +104,10 @@ class Contract:
             side: {name: _plain(x) for name, x in values.items()}
             for side, values in (("inputs", self.inputs), ("outputs", self.outputs))
         }
-        return {**self.description, "tolerance": self.tolerance, "vectors": vectors}
+        scales = {name: x.tolist() for name, x in self.scales.items()}
+        return {
+            **self.description, "tolerance": self.tolerance, "scales": scales, "vectors": vectors,
+        }  # fmt: skip
 
     def to_json(self) -> str:
         """As text; the same model gives the same bytes."""
@@ -126,20 +133,20 @@ class Contract:
             )
         try:
             vectors = content.pop("vectors")
-            tolerance = float(content.pop("tolerance"))
-            inputs, outputs = (
-                {str(name): _tensor(name, x) for name, x in vectors[side].items()}
-                for side in ("inputs", "outputs")
+            tolerance = strict_json.numbers("tolerance", content.pop("tolerance"))
+            inputs, outputs, scales = (
+                {str(name): _tensor(name, x) for name, x in side.items()}
+                for side in (vectors["inputs"], vectors["outputs"], content.pop("scales"))
             )
         except (
             KeyError, TypeError, AttributeError, ValueError, RuntimeError, OverflowError,
         ) as error:  # fmt: skip
             reason = first_line(error)
             raise ContractError(f"the test vectors are missing or damaged ({reason}).") from error
-        _check_vectors(inputs, outputs, tolerance)
+        _check_vectors(inputs, outputs, scales, tolerance)
         _check_interface(content, list(inputs))
         outputs["status"] = outputs["status"].to(torch.int32)
-        return cls(content, inputs, outputs, tolerance)
+        return cls(content, inputs, outputs, scales, tolerance)
 
 
 def contract_of(
@@ -190,24 +197,42 @@ def contract_of(
         description,
         dict(zip(controller.inputs, inputs, strict=True)),
         dict(zip(OUTPUTS, outputs, strict=True)),
-        TOLERANCE[dtype] if dtype == "float64" else _single_tolerance(controller),
+        _scales(controller, outputs),
+        TOLERANCE[dtype],
     )
 
 
-def _single_tolerance(controller: Controller) -> float:
-    """Largest torque error that a target in single precision may show.
+def _scales(controller: Controller, outputs: Sequence[Tensor]) -> dict[str, Tensor]:
+    """Full scales of torque and coefficients; see `Contract`.
 
-    A network that is steep in its inputs passes their roundings on: twice the error of torch in
-    single precision over 20,000 samples is allowed where that is more.
+    A coefficient that training has driven to zero is a small difference of numbers that are not
+    small, and a steep network passes the roundings of its inputs on. No artefact can then be exact
+    to the last digits of the value. How much is lost shows in the model itself: scales are such
+    that a target in single precision may err twice as much as torch does in single precision over
+    20,000 samples. Roundings of double precision are smaller by a constant factor, so the same
+    scale holds for them.
     """
+    scales = {
+        name: values.abs().nan_to_num(0.0).flatten(0, -2).amax(0)
+        for name, values in zip(OUTPUTS[:2], outputs, strict=False)
+    }
+    model = controller.model
+    single = copy.deepcopy(model).float()
     qd, qdd, load = (x.float().double() for x in draw_motion(controller, 20_000, seed=7))
-    # Any memory will do: that of a first sample.
-    exact = (qd, qdd, load, controller.initial_memory(qd, qdd))
-    expected = controller.step(*exact)[:3]
-    found = copy.deepcopy(controller).float().step(*(x.float() for x in exact))[:3]
-    parity = compare(expected, found, TOLERANCE["float32"])
-    worst = max(parity.torque_error, parity.coefficient_error / COEFFICIENT_SLACK)
-    return max(TOLERANCE["float32"], float(f"{2.0 * worst:.1e}"))
+    seen = controller.seen(qd, qdd)[:2]
+    # The same memory for both: a rounding must not put a sample into another class.
+    motion = (*seen, model.schedule.initial_state(*seen))
+    exact = model.schedule.coefficients_from(*motion)
+    try:
+        rounded = single.schedule.coefficients_from(*(x.float() for x in motion))
+        torque = single.torque(qd.float(), load.float(), rounded)
+    except RuntimeError:  # a schedule of one's own that computes in double alone
+        return scales
+    pairs = ((torque, model.torque(qd, load, exact), 1.0), (rounded, exact, COEFFICIENT_SLACK))
+    for (name, scale), (found, expected, slack) in zip(scales.items(), pairs, strict=True):
+        error = (found - expected).abs().nan_to_num(0.0, 0.0).flatten(0, -2).amax(0)
+        scales[name] = torch.maximum(scale, 2.0 * error / (slack * TOLERANCE["float32"]))
+    return scales
 
 
 def verify(run: Runner, contract: Contract) -> Parity:
@@ -220,16 +245,22 @@ def verify(run: Runner, contract: Contract) -> Parity:
         contract: of the artefact.
     """
     found = run(*contract.inputs.values())
-    return compare(tuple(contract.outputs.values()), found, contract.tolerance)
+    return compare(tuple(contract.outputs.values()), found, contract.tolerance, contract.scales)
 
 
-def compare(expected: Sequence[Any], found: Sequence[Any], tolerance: float) -> Parity:
+def compare(
+    expected: Sequence[Any],
+    found: Sequence[Any],
+    tolerance: float,
+    scales: Mapping[str, Tensor] | None = None,
+) -> Parity:
     """Compare torque, coefficients and status with those of the model.
 
     Args:
         expected, found: torque (sample, joint), coefficients (sample, joint, coefficient) and
             status (sample, joint).
         tolerance: see `Parity`.
+        scales: least full scales, see `Contract`; none where not given.
 
     Raises:
         ContractError: if the shapes differ.
@@ -238,24 +269,26 @@ def compare(expected: Sequence[Any], found: Sequence[Any], tolerance: float) -> 
     shapes = [[x.shape for x in side] for side in (model, artefact)]
     if shapes[0] != shapes[1]:
         raise ContractError(f"the artefact gives shapes {shapes[1]}, the model {shapes[0]}.")
+    least = scales or {name: torch.zeros(()) for name in OUTPUTS}
     wrong = model[2] != artefact[2]
     wrong |= np.isnan(model[0]) != np.isnan(artefact[0])
     wrong |= (np.isnan(model[1]) != np.isnan(artefact[1])).any(-1)
     return Parity(
         points=len(model[0]),
-        torque_error=_error(model[0], artefact[0], axis=(0,)),
-        coefficient_error=_error(model[1], artefact[1], axis=(0, 1)),
+        torque_error=_error(model[0], artefact[0], least["tau_f"]),
+        coefficient_error=_error(model[1], artefact[1], least["coefficients"]),
         edges=int(wrong.sum()),
         tolerance=tolerance,
     )
 
 
-def _error(expected: np.ndarray, found: np.ndarray, axis: tuple[int, ...]) -> float:
-    """Largest difference over the largest value along `axis`; where either is NaN is not seen."""
+def _error(expected: np.ndarray, found: np.ndarray, least: Tensor) -> float:
+    """Largest difference over full scale by last axis; where either is NaN is not seen."""
+    axes = tuple(range(expected.ndim - 1))
     difference = np.nan_to_num(np.abs(found - expected), nan=0.0, posinf=math.inf)
-    scale = np.nan_to_num(np.abs(expected), nan=0.0).max(axis, initial=0.0)
-    worst = difference.max(axis, initial=0.0)
-    return float(np.where(worst > 0, worst / np.maximum(scale, 1e-300), 0.0).max(initial=0.0))
+    scale = np.nan_to_num(np.abs(expected), nan=0.0).max(axes, initial=0.0)
+    scale = np.maximum(np.maximum(scale, least.numpy()), 1e-300)
+    return float((difference / scale).max(initial=0.0))
 
 
 def _array(x: Any) -> np.ndarray:
@@ -300,19 +333,10 @@ def _plain(x: Tensor) -> list[Any]:
 def _tensor(name: str, given: Any) -> Tensor:
     """A tensor of nested lists as `_plain` spells them."""
 
-    def number(value: Any) -> Any:
-        if isinstance(value, list):
-            return [number(v) for v in value]
-        if isinstance(value, bool) or (isinstance(value, str) and value not in _SPELLINGS):
-            raise ValueError(f"`{name}` holds {str(value)[:40]!r}")
-        return float(value)
-
     if not isinstance(given, list) or len(given) > MOST_VECTORS:
         raise ValueError(f"`{name}` is no list, or too long")
-    return torch.tensor(number(given), dtype=torch.float64)
-
-
-_SPELLINGS = ("nan", "inf", "-inf")
+    values = strict_json.numbers(name, given, words=("nan", "inf", "-inf"))
+    return torch.tensor(values, dtype=torch.float64)
 
 
 def _check_interface(content: Mapping[str, Any], names: list[str]) -> None:
@@ -330,16 +354,23 @@ def _check_interface(content: Mapping[str, Any], names: list[str]) -> None:
 
 
 def _check_vectors(
-    inputs: Mapping[str, Tensor], outputs: Mapping[str, Tensor], tolerance: float
+    inputs: Mapping[str, Tensor],
+    outputs: Mapping[str, Tensor],
+    scales: Mapping[str, Tensor],
+    tolerance: float,
 ) -> None:
     """Raise `ContractError` where test vectors do not fit each other."""
     shapes = {tuple(x.shape) for x in inputs.values()}
-    sound = len(shapes) == 1 and tuple(outputs) == OUTPUTS and 0 < tolerance < 1
+    sound = len(shapes) == 1 and tuple(outputs) == OUTPUTS
+    sound = sound and isinstance(tolerance, float) and 0 < tolerance < 1
     if sound:
         shape = shapes.pop()
         given = [tuple(x.shape) for x in outputs.values()]
         sound = len(shape) == 2 and given[0] == given[2] == given[1][:2] == shape
         sound = sound and len(given[1]) == 3 and min(*shape, given[1][2]) > 0
         sound = sound and bool(((outputs["status"] >= 0) & (outputs["status"] < 8)).all())
+        sizes = {"tau_f": shape[1:], "coefficients": given[1][2:]}
+        sound = sound and {name: tuple(x.shape) for name, x in scales.items()} == sizes
+        sound = sound and all(bool((x >= 0).all() and x.isfinite().all()) for x in scales.values())
     if not sound:
         raise ContractError("the test vectors do not fit each other.")

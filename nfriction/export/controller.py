@@ -15,11 +15,13 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Final
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_info import ModelInfo
+from nfriction.io.strict_json import numbers
 from nfriction.signals import SecondOrderLowPass
 
 # Bits of the status.
@@ -59,7 +61,10 @@ def controller_of(
             "was fitted to recordings of different ones."
         )
     return Controller(
-        model, info, torque_limit, SecondOrderLowPass(cutoff_hz, float(info.sample_time))
+        model,
+        info,
+        torque_limit,
+        SecondOrderLowPass(numbers("cutoff_hz", cutoff_hz), float(info.sample_time)),
     )
 
 
@@ -163,6 +168,8 @@ class Controller(nn.Module):
         """Torque, coefficients and status of samples in order, (sample, joint, ...)."""
         if not self.state_size:
             return self(*inputs)
+        if not len(inputs[0]):
+            return self(*inputs, self.start(*inputs))[:3]
         return run_in_order(self, inputs, self.start(*(x[0] for x in inputs)))
 
     def step(
@@ -172,7 +179,7 @@ class Controller(nn.Module):
 
         Without a memory, whatever is given for it is handed back.
         """
-        qd_seen, qdd_seen, outside = self._seen(qd, qdd)
+        qd_seen, qdd_seen, outside = self.seen(qd, qdd)
         motion = qd.abs() + qdd.abs()
         if self.remembers:
             following = self.model.schedule.advance(qd_seen, qdd_seen, memory)
@@ -213,7 +220,7 @@ class Controller(nn.Module):
     def initial_memory(self, qd: Tensor, qdd: Tensor) -> Tensor:
         """Memory before a first sample; a joint that is not finite counts as one at rest."""
         finite = qd.abs() + qdd.abs() < math.inf
-        qd_seen, qdd_seen, _ = self._seen(
+        qd_seen, qdd_seen, _ = self.seen(
             torch.where(finite, qd, 0.0), torch.where(finite, qdd, 0.0)
         )
         return self.model.schedule.initial_state(qd_seen, qdd_seen)
@@ -229,14 +236,14 @@ class Controller(nn.Module):
 
     def torque(self, qd: Tensor, qdd: Tensor, load: Tensor) -> Tensor:
         """The torque alone, by the same contract; a memory is that after a first sample."""
-        qd_seen, qdd_seen, _ = self._seen(qd, qdd)
+        qd_seen, qdd_seen, _ = self.seen(qd, qdd)
         tau_f = self.model.torque(qd, load, self.model.schedule(qd_seen, qdd_seen))
         held = torch.clamp(tau_f, -self.torque_limit, self.torque_limit) if self.limited else tau_f
         # Zero times what is not finite is NaN: a third of the operations of comparisons.
         held = torch.addcmul(held, qd, qdd, value=0.0)
         return torch.addcmul(held, load, tau_f, value=0.0)
 
-    def _seen(self, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def seen(self, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Velocity and acceleration that the schedule sees, and whether they leave the range."""
         if qd.size(-1) != self.joints:
             raise ValueError(
@@ -291,11 +298,8 @@ def _range(name: str, given: object, joints: int) -> tuple[Tensor, Tensor]:
     if given is None:
         edge = torch.full((joints,), UNBOUNDED, dtype=torch.float64)
         return -edge, edge
-    try:
-        pairs = torch.tensor(given, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"`input_ranges` of {name} must be numbers, got {given!r}.") from error
-    if pairs.shape != (joints, 2) or not (pairs[:, 0] <= pairs[:, 1]).all():
+    pairs = torch.tensor(given, dtype=torch.float64)
+    if len(pairs) != joints:
         raise ValueError(
             f"`input_ranges` of {name} must be [lowest, highest] for each of {joints} joints, got "
             f"{given!r}."
@@ -306,7 +310,8 @@ def _range(name: str, given: object, joints: int) -> tuple[Tensor, Tensor]:
 
 def _limit(given: float | Sequence[float] | None, joints: int) -> Tensor:
     """Largest |torque| by joint."""
-    limit = torch.as_tensor(UNBOUNDED if given is None else given, dtype=torch.float64)
+    plain = UNBOUNDED if given is None else np.asarray(given, dtype=object).tolist()
+    limit = torch.tensor(numbers("torque_limit", plain), dtype=torch.float64)
     if limit.shape not in ((), (joints,)) or not ((limit > 0) & (limit < math.inf)).all():
         raise ValueError(
             f"`torque_limit` must be positive and finite [N m], one number or one for each of "

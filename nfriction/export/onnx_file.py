@@ -87,16 +87,11 @@ def open_onnx(path: str | Path) -> tuple[Contract, Runner]:
         ContractError: if its metadata are absent or damaged.
     """
     package = _package()
-    if Path(path).stat().st_size > LARGEST_FILE:
-        raise ExportError(f"{path}: too large for a graph of nfriction.")
-    broken = importlib.import_module("google.protobuf.message").DecodeError
+    file, contract = _read(path)
     try:
-        file = package.load_model_from_string(Path(path).read_bytes())
         package.checker.check_model(file)
-    except (broken, ValueError, RuntimeError, package.checker.ValidationError) as error:
+    except (ValueError, RuntimeError, package.checker.ValidationError) as error:
         raise ExportError(f"{path}: no ONNX graph ({first_line(error)}).") from error
-    properties = {prop.key: prop.value for prop in file.metadata_props}
-    contract = Contract.from_json(properties.get(METADATA, ""))
     size, real = contract.state_size, REAL[contract.description["dtype"]]
     names = [value.name for value in file.graph.input]
     evaluate = _evaluator(package, file, path)
@@ -106,6 +101,28 @@ def open_onnx(path: str | Path) -> tuple[Contract, Runner]:
         return evaluate(given)
 
     return contract, lambda *x: run_from_nan(step, x, size)
+
+
+def contract_of_onnx(path: str | Path) -> Contract:
+    """Read the contract of an ONNX graph.
+
+    Raises: as `open_onnx`.
+    """
+    return _read(path)[1]
+
+
+def _read(path: str | Path) -> tuple[Any, Contract]:
+    """The file as a protocol buffer, and its contract."""
+    package = _package()
+    if Path(path).stat().st_size > LARGEST_FILE:
+        raise ExportError(f"{path}: too large for a graph of nfriction.")
+    broken = importlib.import_module("google.protobuf.message").DecodeError
+    try:
+        file = package.load_model_from_string(Path(path).read_bytes())
+    except (broken, ValueError, RuntimeError) as error:
+        raise ExportError(f"{path}: no ONNX graph ({first_line(error)}).") from error
+    properties = {prop.key: prop.value for prop in file.metadata_props}
+    return file, Contract.from_json(properties.get(METADATA, ""))
 
 
 def _package() -> Any:
@@ -167,12 +184,23 @@ def _evaluator(package: Any, file: Any, path: str | Path) -> Callable[[dict[str,
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     state = onnxruntime.capi.onnxruntime_pybind11_state
-    refusals = (state.Fail, state.InvalidGraph, state.InvalidProtobuf, state.NotImplemented,
-                state.RuntimeException)  # fmt: skip
+    refusals = (state.Fail, state.InvalidArgument, state.InvalidGraph, state.InvalidProtobuf,
+                state.NotImplemented, state.RuntimeException)  # fmt: skip
+
+    def refused(error: Exception) -> ExportError:
+        return ExportError(f"{path}: ONNX Runtime refuses it ({first_line(error)}).")
+
     try:
         session = onnxruntime.InferenceSession(
             file.SerializeToString(), options, providers=["CPUExecutionProvider"]
         )
     except refusals as error:
-        raise ExportError(f"{path}: ONNX Runtime refuses it ({first_line(error)}).") from error
-    return lambda given: session.run(None, given)
+        raise refused(error) from error
+
+    def evaluate(given: dict[str, Any]) -> Any:
+        try:
+            return session.run(None, given)
+        except refusals as error:
+            raise refused(error) from error
+
+    return evaluate

@@ -11,17 +11,17 @@ import torch
 from torch import Tensor
 
 from nfriction.export.c_code.run import open_c
-from nfriction.export.contract import Contract, Parity, Runner, compare
+from nfriction.export.contract import Contract, Parity, compare, contract_of
 from nfriction.export.controller import Controller, controller_of
 from nfriction.export.errors import ContractError, ExportError
-from nfriction.export.onnx_file import open_onnx
+from nfriction.export.onnx_file import contract_of_onnx, open_onnx
 from nfriction.export.test_vectors import draw
 from nfriction.export.torch_code.archive import contract_of_archive
 from nfriction.export.torch_code.pt2 import open_pt2
 from nfriction.export.torch_code.torchscript import open_torchscript
 from nfriction.friction.models import FrictionModel
 from nfriction.io import sandbox
-from nfriction.io.model_info import ModelInfo, parameter_hash
+from nfriction.io.model_info import ModelInfo
 
 # A controller with a state goes through its points one by one.
 MOST_SUCCESSIVE = 2000
@@ -57,9 +57,10 @@ def verify_artefact(
 ) -> Verdict:
     """Compare an artefact with the model that it should be.
 
-    An artefact is a program, and running it is how it is verified. Those of torch run in a process
-    of their own and only if they are arithmetic of tensors alone; C is compiled and run as it is,
-    so only verify files from sources that you trust.
+    An artefact is a program, and running it is how it is verified. Those of torch and ONNX run in a
+    process of their own with limits of time and memory, those of torch only if they are arithmetic
+    of tensors alone; C is compiled and run as it is, so only verify files from sources that you
+    trust.
 
     Args:
         path: `.pt`, `.pt2`, `.onnx`, or `.c` with its `.contract.json` beside it.
@@ -82,19 +83,27 @@ def verify_artefact(
         raise FileNotFoundError(2, "there is no such file", str(path))
     contract, run = opener(path)
     controller = _controller(model, info, contract.description)
+    # By the model's own contract: tolerance and scales of a doctored artefact might pass anything.
+    own = contract_of(model, controller, info, dtype=contract.description["dtype"])
     count = min(points, MOST_SUCCESSIVE) if controller.state_size else points
     inputs = draw(controller, count, seed)
     if contract.description["dtype"] == "float32":
         inputs = tuple(x.float().double() for x in inputs)
     try:
         vectors, drawn = run(tuple(contract.inputs.values()), inputs)
-        at_vectors = compare(tuple(contract.outputs.values()), vectors, contract.tolerance)
-        at_points = compare(controller.run(*inputs), drawn, contract.tolerance)
+        at_vectors = compare(tuple(contract.outputs.values()), vectors, own.tolerance, own.scales)
+        at_points = compare(controller.run(*inputs), drawn, own.tolerance, own.scales)
     except (RuntimeError, TypeError, AttributeError, IndexError) as error:
         if isinstance(error, ExportError):
             raise
         raise ExportError(f"{path}: cannot be run by its metadata ({error}).") from error
-    return Verdict(at_vectors, at_points, tuple(_differences(contract, controller)))
+    differences = tuple(
+        f"its {name} are not the model's ({str(contract.description.get(key))[:16]}, "
+        f"not {own.description[key][:16]})"
+        for name, key in (("model", "model"), ("parameters", "parameter_hash"))
+        if contract.description.get(key) != own.description[key]
+    )
+    return Verdict(at_vectors, at_points, differences)
 
 
 def _controller(
@@ -118,25 +127,9 @@ def _controller(
         raise ContractError(f"the metadata's filter or limit is damaged ({error}).") from error
 
 
-def _differences(contract: Contract, controller: Controller) -> list[str]:
-    """Differences of the metadata from the model, in words."""
-    pairs = {
-        "model": (contract.description.get("model"), type(controller.model).__name__),
-        "parameters": (
-            contract.description.get("parameter_hash"),
-            parameter_hash(controller.model.state_dict()),
-        ),
-    }
-    return [
-        f"its {name} are not the model's ({str(ours)[:16]}, not {theirs[:16]})"
-        for name, (ours, theirs) in pairs.items()
-        if ours != theirs
-    ]
+# Programs of torch and ONNX are run in a process of their own, which may perish of them.
 
-
-# Programs of torch are run in a process of their own, which may perish of them.
-
-TORCH_OPENERS = {".pt": open_torchscript, ".pt2": open_pt2}
+ISOLATED = {".pt": open_torchscript, ".pt2": open_pt2, ".onnx": open_onnx}
 # Processor time [s]: to begin with, and for a sample of a controller with a state.
 STARTING, BY_SAMPLE = 120.0, 0.01
 ROOM = 2**34
@@ -154,7 +147,8 @@ def open_apart(path: str | Path) -> tuple[Contract, Any]:
         ContractError: if its metadata are absent or damaged.
         OSError: if it cannot be read.
     """
-    contract = contract_of_archive(path)
+    onnx = Path(path).suffix == ".onnx"
+    contract = contract_of_onnx(path) if onnx else contract_of_archive(path)
 
     def run(*batches: Sequence[Tensor]) -> list[tuple[Tensor, ...]]:
         with tempfile.TemporaryDirectory() as folder:
@@ -198,7 +192,7 @@ def work(asked: Mapping[str, Any], folder: Path) -> None:
         ExportError, ContractError: as the openers do, or if its outputs are none of a controller.
     """
     path = Path(asked["path"])
-    _, run = TORCH_OPENERS[path.suffix](path)
+    _, run = ISOLATED[path.suffix](path)
     found: dict[str, Any] = {}
     with np.load(folder / _INPUTS, allow_pickle=False) as given:
         for k, count in enumerate(asked["batches"]):
@@ -217,19 +211,15 @@ def work(asked: Mapping[str, Any], folder: Path) -> None:
 Batches = Callable[..., Sequence[Sequence[Any]]]
 
 
-def _here(opener: Callable[[str | Path], tuple[Contract, Runner]]) -> Callable[..., Any]:
-    """An opener of artefacts that are run in this process."""
-
-    def opened(path: str | Path) -> tuple[Contract, Batches]:
-        contract, run = opener(path)
-        return contract, lambda *batches: [run(*batch) for batch in batches]
-
-    return opened
+def open_here(path: str | Path) -> tuple[Contract, Batches]:
+    """As `open_apart`, for C, which is run in this process."""
+    contract, run = open_c(path)
+    return contract, lambda *batches: [run(*batch) for batch in batches]
 
 
 OPENERS: dict[str, Callable[[str | Path], tuple[Contract, Batches]]] = {
-    ".c": _here(open_c),
+    ".c": open_here,
     ".pt": open_apart,
     ".pt2": open_apart,
-    ".onnx": _here(open_onnx),
+    ".onnx": open_apart,
 }

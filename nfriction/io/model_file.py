@@ -20,6 +20,7 @@ from nfriction.friction.models import FrictionModel
 from nfriction.io import strict_json
 from nfriction.io.atomic import write_atomically
 from nfriction.io.model_info import FORMAT, SCHEMA, ModelInfo, describe
+from nfriction.io.strict_json import numbers
 from nfriction.plant import Plant
 from nfriction.plant.rigs import from_dict
 
@@ -121,8 +122,7 @@ def load_info(path: str | Path) -> ModelInfo:
         ModelFileError: the file is absent or damaged.
     """
     content = read_model_file(path)
-    with _naming(path):
-        return ModelInfo(**{f.name: content[f.name] for f in fields(ModelInfo)})
+    return _info(content)
 
 
 def load_plant(path: str | Path) -> Plant:
@@ -183,7 +183,9 @@ def read_model_file(path: str | Path) -> dict[str, Any]:
         if content.pop("checksum") != _checksum(content):
             raise ValueError("the checksum does not match; damaged or edited.")
         _check_sizes(content, size)
-        _check_names(content)
+        info = _info(content)
+        if len(info.joint_names) not in (0, content["joints"]):
+            raise ValueError(f"`joint_names` must be {content['joints']} texts, or none.")
         _check_depth([v for k, v in content.items() if k != "state"])
     return content
 
@@ -201,6 +203,10 @@ def _naming(path: str | Path) -> Iterator[None]:
         raise ModelFileError(f"{path}: nested too deeply for a model file.") from None
     except (ValueError, TypeError) as error:
         raise ModelFileError(f"{path}: {error}") from error
+
+
+def _info(content: Mapping[str, Any]) -> ModelInfo:
+    return ModelInfo(**{f.name: content[f.name] for f in fields(ModelInfo)})
 
 
 def _named_model(content: Mapping[str, Any]) -> FrictionModel:
@@ -223,9 +229,9 @@ def _check_same_model(content: Mapping[str, Any], model: FrictionModel) -> None:
         "v_smooth": (content["v_smooth"], model.v_smooth),
         "options": (content["options"], model.schedule.options()),
     }
-    # By key, so that the message names the first difference.
+    # By key, so that the message names the first difference; as JSON, where true is not 1.
     for key, (ours, theirs) in pairs.items():
-        if ours != theirs:
+        if json.dumps(ours, sort_keys=True) != json.dumps(theirs, sort_keys=True):
             raise ValueError(
                 f"`{key}` is {_short(ours)} in the file, {_short(theirs)} in the model."
             )
@@ -243,8 +249,8 @@ def _check_torque(model: FrictionModel, state: Mapping[str, Tensor]) -> None:
 
 def _parameter(name: str, given: Any, expected: Tensor) -> Tensor:
     try:
-        value = torch.tensor(given, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        value = torch.tensor(numbers(name, given), dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"parameter `{name}` is no array of numbers.") from error
     if value.shape != expected.shape or not torch.isfinite(value).all():
         raise ValueError(
@@ -263,16 +269,6 @@ def _checksum(content: Mapping[str, Any]) -> str:
 def _short(value: object) -> str:
     text = repr(value)
     return text if len(text) <= 80 else f"{text[:77]}..."
-
-
-def _check_names(content: Mapping[str, Any]) -> None:
-    names, digests, step = (content[k] for k in ("joint_names", "training_data", "sample_time"))
-    if not all(isinstance(n, str) for n in names) or len(names) not in (0, content["joints"]):
-        raise ValueError(f"`joint_names` must be {content['joints']} texts, or none.")
-    if not all(isinstance(digest, str) for digest in digests.values()):
-        raise ValueError("`training_data` must map names to digests.")
-    if step is not None and not 0 < step < 1e6:
-        raise ValueError(f"`sample_time` must be positive seconds, got {_short(step)}.")
 
 
 def _check_depth(content: list[Any]) -> None:

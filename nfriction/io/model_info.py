@@ -1,6 +1,7 @@
 """Description of a model: its form, units, and origin, as plain JSON."""
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -9,6 +10,7 @@ import torch
 from torch import Tensor
 
 from nfriction.friction.models import FrictionModel
+from nfriction.io.strict_json import numbers
 from nfriction.version import __version__
 
 FORMAT, SCHEMA = "nfriction model", 1
@@ -29,7 +31,7 @@ class ModelInfo:
         fit: how the fit ended.
 
     Raises:
-        ValueError: another unit.
+        ValueError: an entry is of another kind.
     """
 
     joint_names: Sequence[str] = ()
@@ -43,6 +45,24 @@ class ModelInfo:
     def __post_init__(self) -> None:
         if self.unit not in ("rad", "m"):
             raise ValueError(f'`unit` must be "rad" or "m", got {str(self.unit)[:80]!r}.')
+        step = self.sample_time
+        if step is not None and not 0 < numbers("sample_time", step) < math.inf:
+            raise ValueError(f"`sample_time` must be positive and finite [s], or None, got {step}.")
+        texts = [*self.joint_names, *self.training_data, *self.training_data.values()]
+        for text in texts:
+            if not isinstance(text, str):
+                raise ValueError(
+                    "`joint_names` must be texts, and `training_data` map names to digests, got "
+                    f"{str(text)[:80]!r}."
+                )
+        for name, given in self.input_ranges.items():
+            pairs = numbers(f"input_ranges[{name!r}]", given)
+            sound = isinstance(pairs, list) and all(isinstance(p, list) for p in pairs)
+            if not sound or not all(len(p) == 2 and p[0] <= p[1] for p in pairs):
+                raise ValueError(
+                    f"`input_ranges` of {name} must be [lowest, highest] for each joint, got "
+                    f"{str(given)[:80]}."
+                )
 
 
 def parameter_hash(state: Mapping[str, Tensor]) -> str:

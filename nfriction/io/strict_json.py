@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 
@@ -16,12 +16,35 @@ def parse(
         pairs_hook: as `object_pairs_hook` of `json.loads`.
 
     Raises:
-        ValueError: no JSON, cut short, or with a number that is not finite.
+        ValueError: no JSON, cut short, or with a number that is not finite or beyond all floats.
         RecursionError: nested too deeply.
     """
     return json.loads(
-        text, parse_constant=_finite, parse_float=_finite, object_pairs_hook=pairs_hook
-    )
+        text, parse_constant=_finite, parse_float=_finite, parse_int=_whole,
+        object_pairs_hook=pairs_hook,
+    )  # fmt: skip
+
+
+def numbers(name: str, given: Any, words: Sequence[str] = ()) -> Any:
+    """Nested lists of floats, or one float, of nested lists of numbers.
+
+    Args:
+        name: of the entry, for errors.
+        given: parsed JSON.
+        words: that count as numbers too, such as "nan".
+
+    Raises:
+        ValueError: anything else is among them, such as true and false.
+    """
+    if isinstance(given, (list, tuple)):
+        return [numbers(name, x, words) for x in given]
+    # To Python true is a number.
+    if isinstance(given, bool) or not (isinstance(given, (int, float)) or given in words):
+        raise ValueError(f"`{name}` must be numbers, got {str(given)[:40]!r}.")
+    try:
+        return float(given)
+    except OverflowError:
+        raise ValueError(f"`{name}` is too large: {str(given)[:40]}.") from None
 
 
 def _finite(text: str) -> float:
@@ -29,3 +52,8 @@ def _finite(text: str) -> float:
     if not math.isfinite(value):
         raise ValueError(f"numbers must be finite, got {text[:40]}.")
     return value
+
+
+def _whole(text: str) -> int:
+    _finite(text)  # arithmetic with floats would overflow on a larger one
+    return int(text)

@@ -3,6 +3,7 @@
 import argparse
 import json
 import re
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +54,29 @@ def test_to_controllers_and_back(
     said = capsys.readouterr().out
     assert "DIFFERENT" in said
     assert "lfm.pt IS NOT other.json" in said
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="needs a C compiler")
+def test_two_exports_link_into_one_program(tmp_path: Path) -> None:
+    """By default names, which are those of the model files; one is a word of C."""
+    torques = {"upper-arm 2": "upper_arm_2", "int": "nf_int"}
+    for scale, (stem, name) in enumerate(torques.items(), 1):
+        path = save(LFM(1, [0.1 * scale, 0.0]), tmp_path / f"{stem}.json")
+        assert cli.main(["export", str(path), "--format", "c", "--out", str(tmp_path)]) == 0
+        assert (tmp_path / f"{name}.c").is_file()
+    calls = "".join(
+        f"{name}_step(&x, &x, &x, &tau, c, &s); sum += tau; " for name in torques.values()
+    )
+    includes = "".join(f'#include "{name}.h"\n' for name in torques.values())
+    (tmp_path / "main.c").write_text(
+        f"{includes}int main(void) {{ double x = 1, tau, sum = 0, c[2]; int s; {calls}"
+        "return (int)(100 * sum + 0.5); }\n"
+    )
+    sources = ["main.c", *(f"{name}.c" for name in torques.values())]
+    compiler = find_compiler()
+    assert compiler is not None
+    subprocess.run([*compiler, *sources, "-o", "both", "-lm"], cwd=tmp_path, check=True)
+    assert subprocess.run([tmp_path / "both"], check=False).returncode == 30
 
 
 def test_artefacts_beside_a_model_leave_it_whole(model: Path) -> None:

@@ -86,8 +86,10 @@ def build(command, folder: Path) -> None:
     assert not result.returncode, result.stderr
 
 
-def self_test(folder: Path, *flags: str, source: str = "nfriction.c") -> None:
-    build(["gcc", *flags, "nf_selftest.c", source, "-o", "selftest", "-lm"], folder)
+def self_test(
+    folder: Path, *flags: str, source: str = "nfriction.c", name: str = "nfriction"
+) -> None:
+    build(["gcc", *flags, f"{name}_selftest.c", source, "-o", "selftest", "-lm"], folder)
     result = subprocess.run([folder / "selftest"], capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stdout[-500:]
     assert "0 wrong" in result.stdout
@@ -165,7 +167,7 @@ def test_the_self_test_can_fail(exported, tmp_path):
     source = tmp_path / "c" / "nfriction.c"
     number = re.search(r"\d\.\d{9,}", source.read_text()).group()
     source.write_text(source.read_text().replace(number, f"{float(number) * (1 + 1e-9)!r}"))
-    build(["gcc", "nf_selftest.c", "nfriction.c", "-o", "selftest", "-lm"], source.parent)
+    build(["gcc", "nfriction_selftest.c", "nfriction.c", "-o", "selftest", "-lm"], source.parent)
     assert subprocess.run([tmp_path / "c" / "selftest"], capture_output=True).returncode == 1
 
 
@@ -258,22 +260,36 @@ def test_hostile_names_do_not_become_code(tmp_path):
     symbols = subprocess.run(["nm", "n.o"], cwd=tmp_path, capture_output=True, text=True).stdout
     assert "evil" not in symbols
     for bad in ("int", "a b", "1a", "x;y", "", "a" * 40, "ß"):
-        for key in ("name", "prefix"):
-            with pytest.raises(ValueError, match=key):
-                c(random_model("LFM"), tmp_path, **{key: bad})
+        with pytest.raises(ValueError, match="name"):
+            c(random_model("LFM"), tmp_path, name=bad)
 
 
 def test_two_controllers_live_in_one_program(tmp_path):
-    for name in ("NFLFM", "NLFM"):
-        c(random_model(name), tmp_path, name=name.lower(), prefix=f"{name.lower()}_c")
-    (tmp_path / "main.c").write_text(
-        '#include "nflfm.h"\n#include "nlfm.h"\nint main(void) {\n'
-        "    double x[3] = {1, 1, 1}, tau[3], c[15];\n    int s[3];\n"
-        "    nflfm_c_step(x, x, x, tau, c, s);\n    nlfm_c_step(x, x, x, tau, c, s);\n"
-        "    return s[0];\n}\n"
-    )
-    build([*C89, "main.c", "nflfm.c", "nlfm.c", "-o", "both", "-lm"], tmp_path)
-    assert subprocess.run([tmp_path / "both"]).returncode == 0
+    """Each as alone, with memory and filter, in one folder and by either header."""
+    names = ("ALFM", "NFLFM", "NLFM")
+    for name in names:
+        c(random_model(name), tmp_path, INFO, name=name.lower(), with_filter=name == "ALFM")
+        self_test(tmp_path, source=f"{name.lower()}.c", name=name.lower())
+    for suffix, command in (("h", C89), ("hpp", CXX)):
+        main = tmp_path / ("main.c" if suffix == "h" else "main.cpp")
+        main.write_text(
+            "".join(f'#include "{name.lower()}.{suffix}"\n' for name in names)
+            + "#include <stdio.h>\nint main(void) {\n"
+            "    double x[3] = {1, 1, 1}, tau[3], c[15];\n    int s[3];\n    alfm_state memory;\n"
+            "    alfm_init(&memory, x, x);\n    alfm_step(&memory, x, x, x, tau, c, s);\n"
+            '    printf("%.17g ", tau[2]);\n'
+            '    nflfm_step(x, x, x, tau, c, s);\n    printf("%.17g ", tau[2]);\n'
+            '    nlfm_step(x, x, x, tau, c, s);\n    printf("%.17g", tau[2]);\n'
+            "    return 0;\n}\n"
+        )
+        for name in names:
+            build([*C89, "-c", f"{name.lower()}.c"], tmp_path)
+        objects = [f"{name.lower()}.o" for name in names]
+        build([*command, main.name, *objects, "-o", "all", "-lm"], tmp_path)
+        said = subprocess.run([tmp_path / "all"], capture_output=True, text=True, check=True).stdout
+        one = torch.ones(3, dtype=torch.float64)
+        expected = [random_model(name)(one, one, one)[2].item() for name in names]
+        np.testing.assert_allclose([float(x) for x in said.split()], expected, rtol=1e-13)
 
 
 @cases
@@ -291,7 +307,7 @@ def test_skeletons_and_wrapper_compile(exported, name, dtype, with_filter):
             "-fsyntax-only",
             "-x",
             "c++",
-            "nf.hpp",
+            "nfriction.hpp",
             "-Wno-pragma-once-outside-header",
         ],
         folder,
@@ -301,15 +317,17 @@ def test_skeletons_and_wrapper_compile(exported, name, dtype, with_filter):
 def test_simulink_and_cpp_give_the_torque_of_the_c(exported):
     _, _, folder = exported("ALFM", "float64")
     (folder / "main.cpp").write_text(
-        '#include <cstdio>\n#include "nf.hpp"\n#include "simstruc.h"\n'
+        '#include <cstdio>\n#include "nfriction.hpp"\n#include "simstruc.h"\n'
         'extern "C" { void stub_sizes(SimStruct *); void stub_outputs(SimStruct *); }\n'
-        "int main() {\n    static SimStruct S;\n    nf::Friction friction;\n    stub_sizes(&S);\n"
+        "int main() {\n    static SimStruct S;\n"
+        "    nfriction::Friction friction;\n    stub_sizes(&S);\n"
         "    double worst = 0;\n    for (int k = 0; k < 500; ++k) {\n"
-        "        nf::Joints qd{}, qdd{}, load{};\n        for (unsigned j = 0; j < 3; ++j) {\n"
+        "        nfriction::Joints qd{}, qdd{}, load{};\n"
+        "        for (unsigned j = 0; j < 3; ++j) {\n"
         "            S.in[0][j] = qd[j] = 0.01 * k - j;\n"
         "            S.in[1][j] = qdd[j] = 300.0 / (1 + k) - 2.0 * j;\n"
         "            S.in[2][j] = load[j] = 1;\n        }\n        stub_outputs(&S);\n"
-        "        const nf::Output out = friction.step(qd, qdd, load);\n"
+        "        const nfriction::Output out = friction.step(qd, qdd, load);\n"
         "        for (unsigned j = 0; j < 3; ++j) {\n"
         "            const double d = S.out[0][j] - out.tau[j];\n"
         "            worst = d > worst ? d : -d > worst ? -d : worst;\n        }\n    }\n"
@@ -391,21 +409,21 @@ def test_a_schedule_of_ones_own_with_a_memory_exports(tmp_path, dtype, flags):
 @cases
 @pytest.mark.parametrize("schedule", [Rising, Fading])
 def test_a_schedule_that_has_no_range_is_clamped_in_c_too(tmp_path, schedule, dtype):
-    """Under a prefix that begins as the usual one does."""
+    """Under a name that begins as those in the templates do."""
 
     class Unbounded(schedule):
         handles_range = False
 
     model = FrictionModel(DRAG, Unbounded(DRAG, 3, [[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]]))
-    c(model, tmp_path, INFO, dtype=dtype, prefix="nf_max")
-    build([*C89, "-c", "nfriction.c", "-o", "n.o"], tmp_path)
+    c(model, tmp_path, INFO, dtype=dtype, name="nf_max")
+    build([*C89, "-c", "nf_max.c", "-o", "n.o"], tmp_path)
     controller = controller_of(model, INFO)
     assert controller.clamps
     inputs = points(controller, dtype, 500)
-    found = c_runner(tmp_path / "nfriction.c")(*inputs)
+    found = c_runner(tmp_path / "nf_max.c")(*inputs)
     parity = compare(controller.run(*inputs), found, TOLERANCE[dtype])
     assert parity.passed, parity
-    assert verify(c_runner(tmp_path / "nfriction.c"), c_contract(tmp_path / "nfriction.c")).passed
+    assert verify(c_runner(tmp_path / "nf_max.c"), c_contract(tmp_path / "nf_max.c")).passed
 
 
 @pytest.mark.parametrize("terms", [(3, 5), (6, 2)])
@@ -477,7 +495,7 @@ def test_passes_on_a_cortex_m4(exported, name, flags):
     _, _, folder = exported(name, "float32")
     (folder / "start.c").write_text(START)
     build(["arm-none-eabi-gcc", *flags, *ARM, "--specs=rdimon.specs", *PLACES, "start.c",
-           "nf_selftest.c", "nfriction.c", "-o", "m4.elf", "-lm"], folder)  # fmt: skip
+           "nfriction_selftest.c", "nfriction.c", "-o", "m4.elf", "-lm"], folder)  # fmt: skip
     machine = ["qemu-system-arm", "-M", "mps2-an386", "-nographic", "-monitor", "none",
                "-serial", "none", "-semihosting-config", "enable=on,target=native"]  # fmt: skip
     result = subprocess.run(
@@ -509,8 +527,8 @@ def test_a_joint_fits_a_small_flash(tmp_path):
 @pytest.mark.parametrize(("name", "flags"), [("NFLFM", ("-O1",)), ("ALFM", ("-O3", "-ffast-math"))])
 def test_passes_on_a_big_endian_powerpc(exported, name, dtype, flags):
     _, _, folder = exported(name, dtype)
-    build(["powerpc-linux-gnu-gcc", *flags, "-static", "nf_selftest.c", "nfriction.c", "-o", "ppc",
-           "-lm"], folder)  # fmt: skip
+    build(["powerpc-linux-gnu-gcc", *flags, "-static", "nfriction_selftest.c", "nfriction.c",
+           "-o", "ppc", "-lm"], folder)  # fmt: skip
     result = subprocess.run(
         ["qemu-ppc", folder / "ppc"], capture_output=True, text=True, timeout=120
     )

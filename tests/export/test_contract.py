@@ -16,9 +16,10 @@ from nfriction.export.contract import (
 )
 from nfriction.export.controller import NOT_FINITE, controller_of
 from nfriction.export.errors import ContractError
-from nfriction.friction.models import LFM
+from nfriction.friction.laws import LINEAR
+from nfriction.friction.models import LFM, FrictionModel
 from nfriction.io.model_info import ModelInfo
-from tests.export.artefacts import INFO
+from tests.export.artefacts import INFO, Rising
 from tests.friction.samples import named_models
 
 MODELS = named_models()
@@ -76,7 +77,15 @@ def test_it_says_what_a_host_needs() -> None:
     assert told["training_data"] == {"run": "ab12"}
     assert told["torque_limit"] == [2.0, 2.0, 2.0]
     assert told["status_bits"] == {"outside": 1, "not_finite": 2, "saturated": 4}
-    assert {"version", "schema", "parameter_hash", "model", "edges", "tolerance"} <= told.keys()
+    assert {
+        "version",
+        "schema",
+        "parameter_hash",
+        "model",
+        "edges",
+        "tolerance",
+        "scales",
+    } <= told.keys()
 
 
 def broken_torque(tau_f: Tensor, coefficients: Tensor, status: Tensor) -> tuple[Tensor, ...]:
@@ -124,9 +133,29 @@ def test_errors_are_relative_to_each_joints_own_scale() -> None:
         compare((tau_f, *rest), (tau_f[:1], *rest), 1e-12)
 
 
-def test_single_precision_is_judged_by_what_it_costs_the_model() -> None:
-    assert contract("LFM", dtype="float32").tolerance == pytest.approx(5e-7, rel=0.5)
-    assert 5e-7 <= contract("NFLFM", dtype="float32").tolerance < 1e-5
+@pytest.mark.parametrize("name", list(MODELS))
+def test_scales_are_the_largest_values_and_more_where_roundings_cost_it(name: str) -> None:
+    for dtype, tolerance in (("float64", 1e-12), ("float32", 5e-7)):
+        found = contract(name, dtype=dtype)
+        assert found.tolerance == tolerance
+        for key, scale in found.scales.items():
+            largest = found.outputs[key].abs().nan_to_num(0.0).flatten(0, -2).amax(0)
+            assert (scale >= largest).all()
+            assert (scale <= 20.0 * largest).all()
+
+
+def test_a_model_that_computes_in_double_alone_is_judged_by_its_values() -> None:
+    class Double(Rising):
+        def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
+            return super().forward(qd, qdd) @ torch.eye(2, dtype=torch.float64)
+
+    model = FrictionModel(LINEAR, Double(LINEAR, 3, [1e-3, 2e-3]))
+    found = contract_of(model, controller_of(model, INFO), INFO)
+    largest = found.outputs["tau_f"].abs().nan_to_num(0.0).amax(0)
+    assert torch.equal(found.scales["tau_f"], largest)
+
+
+def test_the_type_is_one_of_two() -> None:
     with pytest.raises(ValueError, match="float32"):
         contract("LFM", dtype="float16")
 
@@ -161,6 +190,13 @@ VECTORS = contract().to_dict()["vectors"]
         (edited(vectors={**VECTORS, "inputs": {"qd": [0.0] * 200_000}}), "too long"),
         (edited(tolerance="wide"), "damaged"),
         (edited(tolerance=2.0), "do not fit"),
+        (edited(tolerance=True), "damaged"),
+        (edited(tolerance=10**400), "finite"),
+        (edited(scales=None), "missing or damaged"),
+        (edited(scales={"tau_f": [1.0] * 3}), "do not fit"),
+        (edited(scales={"tau_f": [1.0] * 3, "coefficients": ["nan"] * 2}), "do not fit"),
+        (edited(scales={"tau_f": [1.0] * 3, "coefficients": [True] * 2}), "damaged"),
+        (edited(vectors={**VECTORS, "inputs": {"qd": [[10**400]]}}), "finite"),
         (edited(state_size=-1), "lack"),
         (edited(state_size=10**9), "lack"),
         (edited(dtype="float8"), "lack"),

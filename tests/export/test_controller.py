@@ -1,6 +1,7 @@
 """The contract: the model in range, its edge beyond, NaN for what is broken, limits, states."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -194,6 +195,9 @@ def test_the_model_stays_as_it_was_and_is_not_shared() -> None:
         ({"qdd": [[1.0, -1.0]] * 2}, "lowest, highest"),
         ({"qd": [[math.nan, 1.0]] * 2}, "lowest, highest"),
         ({"qd": "wide"}, "must be numbers"),
+        ({"qd": [[False, True]] * 2}, "must be numbers"),
+        ({"qd": [[-(10**400), 1.0]] * 2}, "too large"),
+        ({"qd": [[1.0]] * 2}, "lowest, highest"),
     ],
 )
 def test_malformed_ranges_are_refused(ranges: dict, message: str) -> None:
@@ -201,10 +205,30 @@ def test_malformed_ranges_are_refused(ranges: dict, message: str) -> None:
         controller_of(LFM(2), ModelInfo(input_ranges=ranges))
 
 
-@pytest.mark.parametrize("limit", [0.0, -1.0, math.nan, math.inf, [1.0, 2.0, 3.0]])
-def test_malformed_limits_are_refused(limit: float) -> None:
+LIMITS = [0.0, -1.0, math.nan, math.inf, [1.0, 2.0, 3.0], True, [1.0, True], 10**400, "1"]
+
+
+@pytest.mark.parametrize("limit", LIMITS)
+def test_malformed_limits_are_refused(limit: Any) -> None:
     with pytest.raises(ValueError, match="torque_limit"):
         controller_of(LFM(2), torque_limit=limit)
+
+
+@pytest.mark.parametrize("step", [0, 0.0, -1e-3, math.nan, math.inf, True, "1", 10**400])
+def test_malformed_sample_times_and_cutoffs_are_refused(step: Any) -> None:
+    with pytest.raises(ValueError, match="sample_time"):
+        ModelInfo(sample_time=step)
+    with pytest.raises(ValueError, match="cutoff_hz"):
+        controller_of(LFM(2), ModelInfo(sample_time=1e-3), with_filter=True, cutoff_hz=step)
+
+
+@pytest.mark.parametrize("name", ["LFM", "NFLFM", "ALFM"])
+@pytest.mark.parametrize("with_filter", [False, True])
+def test_no_samples_give_no_torques(name: str, with_filter: bool) -> None:
+    controller = controller_of(MODELS[name], INFO, with_filter=with_filter)
+    none = torch.zeros(0, 3, dtype=torch.float64)
+    found = controller.run(*[none] * len(controller.inputs))
+    assert [len(x) for x in found] == [0, 0, 0]
 
 
 def test_a_filter_needs_the_sample_time_and_inputs_their_joints() -> None:

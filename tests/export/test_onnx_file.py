@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nfriction.export import ExportError, onnx
+from nfriction.export import ExportError, onnx, verify_artefact
 from nfriction.export.contract import compare, verify
 from nfriction.export.controller import controller_of
 from nfriction.export.errors import ContractError
@@ -80,8 +80,8 @@ def check_parity(
     inputs = draw(controller, points if not model.state_size else min(points // 20, 3000), seed=11)
     if dtype == "float32":
         inputs = tuple(x.float().double() for x in inputs)
-    tolerance = 1e-12 if dtype == "float64" else contract.tolerance
-    parity = compare(controller.run(*inputs), run(*inputs), tolerance)
+    scales = None if dtype == "float64" else contract.scales
+    parity = compare(controller.run(*inputs), run(*inputs), contract.tolerance, scales)
     assert parity.passed, parity
 
 
@@ -147,6 +147,29 @@ def test_hostile_files_are_refused(tmp_path: Path) -> None:
     package.save(file, bad)
     with pytest.raises(ContractError, match="no JSON"):
         open_onnx(bad)
+
+
+@needs_onnx
+def test_a_graph_that_fills_the_memory_ends_in_an_error(tmp_path: Path) -> None:
+    package: Any = pytest.importorskip("onnx")
+    path = onnx(LFM(2), tmp_path / "m.onnx")
+    assert verify_artefact(path, LFM(2), points=50).passed
+    file = package.load(path)
+    helper = package.helper
+    file.graph.initializer.append(
+        package.numpy_helper.from_array(np.array([200_000, 200_000], dtype=np.int64), "huge")
+    )
+    file.graph.node.extend([
+        helper.make_node("ConstantOfShape", ["huge"], ["filled"]),
+        helper.make_node("ReduceSum", ["filled"], ["total"], keepdims=0),
+        helper.make_node("Cast", ["total"], ["real"], to=package.TensorProto.DOUBLE),
+    ])  # fmt: skip
+    torque = next(node for node in file.graph.node if "tau_f" in node.output)
+    torque.output[0] = "small"
+    file.graph.node.append(helper.make_node("Add", ["small", "real"], ["tau_f"]))
+    package.save(file, path)
+    with pytest.raises(ExportError, match=r"m\.onnx: (ONNX Runtime refuses|cannot be run)"):
+        verify_artefact(path, LFM(2), points=50)
 
 
 def test_a_filter_in_single_precision_is_refused(tmp_path: Path) -> None:

@@ -1,13 +1,26 @@
 """Proofs of artefacts: those of the model pass, those of another model or doctored ones do not."""
 
+import json
+import subprocess
 from pathlib import Path
 
 import pytest
+import torch
 
-from nfriction.export import ContractError, ExportError, c, torchscript, verify_artefact
+from nfriction.export import (
+    ContractError,
+    ExportError,
+    c,
+    contract_of,
+    controller_of,
+    onnx,
+    pt2,
+    torchscript,
+    verify_artefact,
+)
 from nfriction.export.c_code.run import find_compiler
-from nfriction.export.contract import Contract
-from nfriction.friction.models import LFM
+from nfriction.export.contract import Contract, verify
+from nfriction.friction.models import LFM, NFNLFM
 from tests.export.artefacts import INFO
 from tests.friction.samples import named_models, randomise
 
@@ -31,6 +44,68 @@ def test_c_is_its_model(name: str, with_filter: bool, dtype: str, tmp_path: Path
     c(MODELS[name], tmp_path, INFO, name="m", with_filter=with_filter, dtype=dtype)
     verdict = verify_artefact(tmp_path / "m.c", MODELS[name], INFO, points=200)
     assert verdict.passed, verdict
+
+
+def vanishing(names: set[str]) -> NFNLFM:
+    """A model whose named coefficients training has driven to some 1e-9 of their scale."""
+    model = NFNLFM(3)
+    randomise(model, 0.1)
+    chosen = [name in names for name in model.law.names]
+    with torch.no_grad():
+        model.schedule.network.anfis.consequents[:, chosen, :, 2] -= 15.0
+    return model
+
+
+@pytest.mark.parametrize("names", [{"f_a"}, {"f_c", "f_v", "f_a", "f_b"}])
+@pytest.mark.parametrize("kind", ["c", "c float", "pt", "pt2", "onnx", "onnx float"])
+def test_a_coefficient_near_zero_is_no_fault_of_the_artefact(
+    kind: str, names: set[str], tmp_path: Path
+) -> None:
+    """It is a small difference of large numbers: rounding errors are relative to those."""
+    if kind.startswith("c") and find_compiler() is None:
+        pytest.skip("needs a C compiler")
+    model = vanishing(names)
+    ending, _, single = kind.partition(" ")
+    dtype = {"dtype": "float32"} if single else {}
+    path = tmp_path / f"m.{ending}"
+    if ending != "c":  # compared with the model as it is written
+        {"pt": torchscript, "pt2": pt2, "onnx": onnx}[ending](model, path, INFO, **dtype)
+        return
+    c(model, tmp_path, INFO, name="m", **dtype)
+    verdict = verify_artefact(path, model, INFO, points=500)
+    assert verdict.passed, verdict
+    for command in (["cc", "m_selftest.c", "m.c", "-o", "m", "-lm"], ["./m"]):
+        subprocess.run(command, cwd=tmp_path, check=True)
+
+
+def test_an_error_that_the_torque_feels_is_found_beside_a_coefficient_near_zero() -> None:
+    model = vanishing({"f_a"})
+    controller = controller_of(model, INFO)
+    contract = contract_of(model, controller, INFO)
+    names = list(model.law.names)
+    for name in set(names) - {"f_a"}:
+        factor = torch.ones(len(names), dtype=torch.float64)
+        factor[names.index(name)] += 1e-9
+
+        def run(*x: torch.Tensor, factor: torch.Tensor = factor) -> tuple[torch.Tensor, ...]:
+            tau_f, coefficients, status = controller.run(*x)
+            return tau_f, coefficients * factor, status
+
+        assert not verify(run, contract).passed, name
+
+
+def test_an_artefact_is_not_judged_by_its_own_scales(tmp_path: Path) -> None:
+    if find_compiler() is None:
+        pytest.skip("needs a C compiler")
+    other = LFM(3, [1e-3, 2.1e-3])
+    c(other, tmp_path, INFO, name="m")
+    beside = tmp_path / "m.contract.json"
+    content = json.loads(beside.read_text())
+    content["tolerance"] = 0.9
+    content["scales"] = {name: [1e9] * len(x) for name, x in content["scales"].items()}
+    beside.write_text(json.dumps(content))
+    verdict = verify_artefact(tmp_path / "m.c", LFM(3, [1e-3, 2e-3]), INFO, points=100)
+    assert not verdict.points.passed
 
 
 def test_an_artefact_of_another_model_is_found_out(tmp_path: Path) -> None:
@@ -86,6 +161,4 @@ def test_huge_files_are_refused_before_they_are_read(tmp_path: Path) -> None:
 
 
 def a_contract() -> Contract:
-    from nfriction.export import contract_of, controller_of
-
     return contract_of(LFM(2), controller_of(LFM(2)))

@@ -16,6 +16,7 @@ from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.models import LFM, NCFM, NLFM, FrictionModel
 from nfriction.friction.neurofuzzy import NFLFM, NFNLFM, NeuroFuzzy
+from nfriction.friction.__init__ import model_by_name
 from nfriction.io.model_file import (
     ModelFileError,
     load,
@@ -339,8 +340,26 @@ FORGED: dict[str, tuple[Callable[[dict], Any], str]] = {
     "object": (lambda c: c["state"].update({"schedule.raw": {"a": 1}}), "no array of numbers"),
     "huge integer": (
         lambda c: c["state"].update({"schedule.raw": [[10**400, 1], [1, 1]]}),
+        "numbers must be finite, got 1000",
+    ),
+    "true for a number": (
+        lambda c: c["state"].update({"schedule.raw": [[True, 1.0], [1.0, 1.0]]}),
         "no array of numbers",
     ),
+    "no sample time": (lambda c: c.update(sample_time=0), "`sample_time` must be positive"),
+    "true for a sample time": (lambda c: c.update(sample_time=True), "of the wrong type"),
+    "true for a range": (
+        lambda c: c["input_ranges"].update(qd=[[False, True]]),
+        "`input_ranges.*must be numbers",
+    ),
+    "range upside down": (
+        lambda c: c["input_ranges"].update(qd=[[1.0, -1.0]]),
+        "lowest, highest",
+    ),
+    "no range": (lambda c: c["input_ranges"].update(qd=None), "must be numbers"),
+    "names no texts": (lambda c: c.update(joint_names=["a", 2]), "must be texts"),
+    "too few names": (lambda c: c.update(joint_names=["a"]), "must be 2 texts"),
+    "digest no text": (lambda c: c["training_data"].update(run=1), "map names to digests"),
     "deep": (lambda c: c["state"].update({"schedule.raw": nested(500)}), "no array|got shape"),
     "extra": (lambda c: c["state"].update(other=[1.0]), "missing or not the model's: .*other"),
     "absent": (lambda c: c["state"].pop("schedule.raw"), "missing or not the model's: .*raw"),
@@ -388,6 +407,20 @@ def test_a_network_that_cannot_be_is_refused(options: dict, message: str, tmp_pa
     path = save(NFLFM(1), tmp_path / "model.json")
     content = json.loads(path.read_bytes())
     content["options"] |= options
+    path.write_bytes(resigned(content))
+    with pytest.raises(ModelFileError, match=message):
+        load(path)
+
+
+@pytest.mark.parametrize("option", ["time_constant", "sample_time", "hysteresis"])
+@pytest.mark.parametrize(("value", "message"), [(10**400, "finite"), (True, "`options` is")])
+def test_numbers_of_a_schedule_are_numbers(
+    option: str, value: Any, message: str, tmp_path: Path
+) -> None:
+    path = save(model_by_name("ALFM")(1), tmp_path / "model.json")
+    content = json.loads(path.read_bytes())
+    assert option in content["options"]
+    content["options"][option] = value
     path.write_bytes(resigned(content))
     with pytest.raises(ModelFileError, match=message):
         load(path)

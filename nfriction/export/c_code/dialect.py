@@ -42,7 +42,7 @@ class ControllerC:
     """
 
     real: Real = "double"
-    prefix: str = "nf"
+    prefix: str = "nfriction"
 
     def literal(self, value: float | bool) -> str:
         """A number as C spells it, in brackets where it is negative."""

@@ -26,7 +26,6 @@ def c(
     *,
     dtype: str = "float64",
     name: str = "nfriction",
-    prefix: str = "nf",
     with_filter: bool = False,
     torque_limit: float | Sequence[float] | None = None,
     cutoff_hz: float = 20.0,
@@ -43,15 +42,15 @@ def c(
         folder: where to write; made if missing. The same model gives the same bytes.
         info: description of the model besides its parameters.
         dtype: "float64" or "float32", in which the controller computes.
-        name: of the files.
-        prefix: of functions and types, so that two controllers can live in one program.
+        name: of the files, and prefix of all functions, types and macros: controllers of
+            different names link into one program.
         with_filter: write the causal filter from raw positions too.
         torque_limit, cutoff_hz: see `controller_of`.
 
     Returns:
         What was written: `<name>.c` and `<name>.h`; `<name>.contract.json` with the metadata
-        and test vectors; `<prefix>_selftest.c`, a program that returns 0 where these agree;
-        `<prefix>.hpp` for C++; `<name>_sfun.c` for Simulink and `<name>.ino` for Arduino.
+        and test vectors; `<name>_selftest.c`, a program that returns 0 where these agree;
+        `<name>.hpp` for C++; `<name>_sfun.c` for Simulink and `<name>.ino` for Arduino.
 
     Raises:
         ExportError: if the law or schedule uses an operation that has no C form.
@@ -60,26 +59,21 @@ def c(
     """
     if dtype not in REALS:
         raise ValueError(f'`dtype` must be "float64" or "float32", got {dtype!r}.')
-    for key, value in (("name", name), ("prefix", prefix)):
-        if not is_identifier(value):
-            raise ValueError(
-                f"`{key}` must be an identifier of C of up to 31 letters, got {value!r}."
-            )
+    if not is_identifier(name):
+        raise ValueError(f"`name` must be an identifier of C of up to 31 letters, got {name!r}.")
     controller = controller_of(
         model, info, torque_limit=torque_limit, with_filter=with_filter, cutoff_hz=cutoff_hz
     )
     contract = contract_of(model, controller, info, dtype=dtype)
-    described = {**contract.description, "prefix": prefix}
-    contract = Contract(described, contract.inputs, contract.outputs, contract.tolerance)
-    dialect = ControllerC(REALS[dtype], prefix)
-    source = source_of(controller, described, dialect, name)
+    dialect = ControllerC(REALS[dtype], name)
+    source = source_of(controller, contract.description, dialect, name)
     words = _words(contract, name)
     files = {
         f"{name}.c": source.code,
         f"{name}.h": source.header,
         f"{name}.contract.json": contract.to_json() + "\n",
-        f"{prefix}_selftest.c": dialect.text("selftest.c", **words, **_vectors(contract, dialect)),
-        f"{prefix}.hpp": dialect.text("wrapper.hpp", **words),
+        f"{name}_selftest.c": dialect.text("selftest.c", **words, **_vectors(contract, dialect)),
+        f"{name}.hpp": dialect.text("wrapper.hpp", **words),
         f"{name}_sfun.c": dialect.text("simulink.c", **words),
         f"{name}.ino": dialect.text("arduino.ino", **words),
     }
@@ -115,13 +109,12 @@ def _vectors(contract: Contract, dialect: ControllerC) -> dict[str, str]:
     # What the filter gives is rounded to single precision on its way to the model.
     rounded = dialect.real == "float" and contract.description["filter"] is not None
     tolerance = (ROUNDED if rounded else 1.0) * contract.tolerance
-    scales = tau.abs().amax(0)[None], coefficients.abs().amax((0, 1))[None]
     tables += [
         _table("test_tau", tau, dialect),
         _table("test_coefficients", coefficients.flatten(1), dialect),
         _table("test_status", status, dialect, "unsigned char"),
-        _table("test_torque_scale", scales[0], dialect),
-        _table("test_coefficient_scale", scales[1], dialect),
+        _table("test_torque_scale", contract.scales["tau_f"][None], dialect),
+        _table("test_coefficient_scale", contract.scales["coefficients"][None], dialect),
     ]
     return {
         "count": str(len(tau)),

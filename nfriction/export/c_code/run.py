@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from nfriction.export.c_code.dialect import ControllerC
+from nfriction.export.c_code.dialect import ControllerC, is_identifier
 from nfriction.export.contract import Contract, Runner
 from nfriction.export.errors import ContractError, ExportError
 
@@ -61,9 +61,8 @@ def c_runner(source: str | Path, flags: Sequence[str] = FLAGS) -> Callable[..., 
     """
     source = Path(source)
     description = c_contract(source).description
-    prefix, joints = str(description["prefix"]), int(description["joints"])
-    count = len(description["coefficients"])
-    function = _library(source, prefix, description["filter"] is not None, flags).run_rows
+    joints, count = int(description["joints"]), len(description["coefficients"])
+    function = _library(source, description["filter"] is not None, flags).run_rows
     function.restype = None
 
     def run(*inputs: Any) -> tuple[Any, ...]:
@@ -94,20 +93,20 @@ def open_c(path: str | Path) -> tuple[Contract, Runner]:
         raise ContractError(f"{path}: its metadata, {metadata.name}, do not lie beside it.")
     if max(path.stat().st_size, metadata.stat().st_size) > LARGEST_FILE:
         raise ExportError(f"{path}: too large for a controller of nfriction.")
-    contract = c_contract(path)
-    prefix = contract.description.get("prefix")
-    if not isinstance(prefix, str) or not prefix.isidentifier():
-        raise ContractError(f"{metadata}: lacks the prefix of the functions.")
-    return contract, c_runner(path)
+    if not is_identifier(path.stem):
+        raise ContractError(
+            f"{path}: the file is named as its functions are; give it its old name."
+        )
+    return c_contract(path), c_runner(path)
 
 
-def _library(source: Path, prefix: str, filters: bool, flags: Sequence[str]) -> ctypes.CDLL:
+def _library(source: Path, filters: bool, flags: Sequence[str]) -> ctypes.CDLL:
     compiler = find_compiler()
     if compiler is None:
         raise ExportError("no C compiler (CC, cc, gcc, clang) was found to run the C with.")
     # Behind a filter the first motion is that of a joint at rest.
     first = "t, t" if filters else "x[0], x[1]"
-    text = ControllerC(prefix=prefix).text("rows.c", name=source.stem, first=first)
+    text = ControllerC(prefix=source.stem).text("rows.c", name=source.stem, first=first)
     with tempfile.TemporaryDirectory(prefix="nfriction-") as folder:
         driver = Path(folder) / "rows.c"
         driver.write_text(text, encoding="ascii")

@@ -21,8 +21,6 @@ from nfriction.friction.models import FrictionModel
 from nfriction.io.atomic import atomic_write
 from nfriction.io.model_info import ModelInfo
 
-# Largest difference from the model over the largest torque: sums may be taken in another order.
-TOLERANCE = 1e-12
 # All that an archive of ours holds.
 _OURS = re.compile(
     r"data\.pkl|code/__torch__/[\w./]+\.py(\.debug_pkl)?|constants/\d+|constants\.pkl|version"
@@ -245,8 +243,9 @@ def _check(controller: Controller, loaded: Any, contract: Contract) -> None:
         rows = list(zip(*(x[:ONE_BY_ONE] for x in inputs), strict=True))
         single = torch.stack([loaded(*row) for row in rows])
         difference = torch.cat([got - expected, single - expected[:ONE_BY_ONE]])
-        error = float(difference.abs().max() / expected.abs().max().clamp_min(1e-300))
-        if not error <= TOLERANCE:
+        scale = torch.maximum(expected.abs().amax(0), contract.scales["tau_f"]).clamp_min(1e-300)
+        error = float((difference.abs() / scale).max())
+        if not error <= contract.tolerance:
             raise ExportError(
                 f"the TorchScript differs from its model by {error:.1e} of full scale."
             )
