@@ -11,7 +11,7 @@ _MODULES = {
     **dict.fromkeys(
         ("NCFM", "LFM", "NLFM", "CFM", "CVFM", "Stribeck"), "nfriction.friction.models"
     ),
-    **dict.fromkeys(("ANCFM", "ALFM", "ANLFM", "ACFM", "ACVFM"), "nfriction.papers.afem.models"),
+    **dict.fromkeys(("ANCFM", "ALFM", "ANLFM", "ACFM", "ACVFM"), "nfriction.papers.afem.adaptive"),
     **dict.fromkeys(
         ("NFNCFM", "NFLFM", "NFNLFM", "NFCFM", "NFCVFM", "NFStribeck"), "nfriction.friction.models"
     ),

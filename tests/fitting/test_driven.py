@@ -10,7 +10,7 @@ from nfriction import LFM, NLFM, PendulumChain, Recording, fit, rollout
 from nfriction.evaluation.cross_validation import block_errors, blocked_k_fold
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.models import CFM, CVFM, NFCVFM, FrictionModel
-from nfriction.papers.afem.models import ACVFM
+from nfriction.papers.afem.adaptive import ACVFM
 from nfriction.signals import quantise
 from tests.fitting.recordings import F64, pendulum, swing
 

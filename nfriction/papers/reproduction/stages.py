@@ -1,14 +1,21 @@
-"""The stages of a reproduction: fits, each kept when it is finished, and their scores."""
+"""Stages of a reproduction: fits and their scores, several at a time, kept when finished."""
 
 import logging
+import os
+import signal
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass, replace
 from functools import partial
+from multiprocessing import get_context, parent_process
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from nfriction.evaluation.compare import coefficient_summary
 from nfriction.evaluation.results import model_info
@@ -28,7 +35,14 @@ from nfriction.papers.afem.fit_by_search import SearchMethod, SearchOptions, fit
 from nfriction.papers.nffem.refine_adaptive import refine_adaptive
 from nfriction.papers.nffem.train_network import TrainingOptions
 from nfriction.papers.reproduction.procedure import papers_neuro_fuzzy
-from nfriction.papers.reproduction.workspace import Array, Bench, Workspace, smoothed
+from nfriction.papers.reproduction.workspace import (
+    FULL,
+    Array,
+    Bench,
+    Settings,
+    Workspace,
+    smoothed,
+)
 from nfriction.recording import Recording
 from nfriction.signals import causal_motion
 from nfriction.simulation.rk4 import required_substeps
@@ -78,6 +92,92 @@ def stages() -> dict[str, Stage]:
     constant = partial(fitted, fit=fit_constant, name="Stribeck")
     found.append(Stage("Stribeck", ("twin-tlrip",), constant))
     return {stage.name: stage for stage in found}
+
+
+def reproduce(
+    folder: str | Path,
+    settings: Settings = FULL,
+    *,
+    jobs: int = 2,
+    progress: bool = False,
+) -> Workspace:
+    """Run every stage that is not finished.
+
+    Each stage runs in a worker process and writes its result last, whole or not at all, so a run
+    that was ended by Ctrl-C or by force resumes with what is not finished.
+
+    Args:
+        folder: where all files go; made where it is missing.
+        settings: how thorough. Results made with others are replaced.
+        jobs: stages at a time.
+        progress: show a bar of stages.
+
+    Returns:
+        The workspace, every stage finished.
+
+    Raises:
+        ValueError: if `jobs` is not positive.
+    """
+    if jobs < 1:
+        raise ValueError(f"`jobs` must be at least 1, got {jobs}.")
+    workspace = Workspace(Path(folder), settings)
+    waiting = {n: s for n, s in stages().items() if workspace.result(n) is None}
+    total = len(stages())
+    with tqdm(total=total, initial=total - len(waiting), unit="stage", disable=not progress) as bar:
+        if waiting:
+            _run_all(workspace, waiting, jobs, bar)
+    return workspace
+
+
+def _run_all(workspace: Workspace, waiting: dict[str, Stage], jobs: int, bar: "tqdm[Any]") -> None:
+    running: dict[Future[None], str] = {}
+    finished = False
+    pool = ProcessPoolExecutor(
+        jobs, mp_context=get_context("spawn"), initializer=_end_with_the_caller
+    )
+    try:
+        while waiting or running:
+            for name in _ready(waiting, running.values()):
+                if len(running) == jobs:
+                    break
+                running[pool.submit(run_stage, workspace, name)] = name
+                del waiting[name]
+            bar.set_postfix_str(", ".join(running.values()))
+            # The timeout keeps the bar's clock running.
+            done, _ = wait(running, timeout=1.0, return_when=FIRST_COMPLETED)
+            for future in done:
+                del running[future]
+                future.result()
+                bar.update()
+            bar.refresh()
+        finished = True
+    finally:
+        if not finished:
+            # An error or an interrupt. Only an interrupt of the keyboard reaches the workers, and
+            # one of them may have been started just before, so it is not among `running` yet.
+            for worker in list((pool._processes or {}).values()):
+                worker.terminate()
+        pool.shutdown(cancel_futures=True)
+
+
+def _ready(waiting: Mapping[str, Stage], running: Iterable[str]) -> list[str]:
+    """Stages whose needs are finished, in their order."""
+    blocked = {*waiting, *running}
+    return [name for name, stage in waiting.items() if not blocked & set(stage.needs)]
+
+
+def _end_with_the_caller() -> None:
+    # A solver keeps its best point on Ctrl-C; such a fit would pass for a finished one.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    caller = parent_process()
+    assert caller is not None
+
+    def watch() -> None:
+        caller.join()
+        os._exit(1)
+
+    # A caller that is killed cannot end its workers, which would wait for work for ever.
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def run_stage(workspace: Workspace, name: str) -> None:

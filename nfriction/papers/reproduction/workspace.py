@@ -19,7 +19,7 @@ from nfriction.fitting.result.identifiability import Interval
 from nfriction.io.atomic import atomic_write, write_atomically
 from nfriction.io.model_file import load, load_plant, save
 from nfriction.papers.afem.fit_by_search import SearchState
-from nfriction.papers.twin.releases import Split
+from nfriction.papers.twin.dataset import Split
 from nfriction.plant import Plant, rigs
 from nfriction.recording import Recording, read_initial_states
 from nfriction.signals import Motion, kalman_smoother
@@ -223,16 +223,16 @@ class Workspace:
     def search_state(self, stage: str) -> SearchState | None:
         """The state of an unfinished search of a stage; None at its start."""
         state = self.result(f"{stage}-search")
-        return None if state is None else SearchState.from_dict(state)
+        return None if state is None else SearchState(**state)
 
     def keep_search(self, stage: str, step: Callback) -> Callable[[SearchState], None]:
         """A callback that keeps every state of a pattern search."""
 
         def keep(state: SearchState) -> None:
             step()
-            # SQP has no state that would continue it exactly.
-            if state.pattern is not None:
-                self.finish(f"{stage}-search", state.to_dict())
+            # SQP has no state that would continue it exactly, and JSON no infinity.
+            if state.method == "pattern" and np.isfinite(state.value):
+                self.finish(f"{stage}-search", asdict(state))
 
         return keep
 

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from nfriction import Recording
+from nfriction.papers.afem.adaptive import ALFM
 from nfriction.papers.afem.classes import ClassOptions, find_classes, otsu
-from nfriction.papers.afem.models import ALFM
 from nfriction.signals import Motion
 
 STEP = 2e-3
