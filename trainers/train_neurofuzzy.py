@@ -14,31 +14,32 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 
+import common
+
 from nfriction.evaluation.results import model_info
-from nfriction.papers.reproduction import training
 from nfriction.papers.reproduction.stages import fit_by_class, fit_network, network_by_controller
 
 
 def train(argv: Sequence[str] | None) -> str:
-    parser = training.parser(__doc__.splitlines()[0])
+    parser = common.parser(__doc__.splitlines()[0])
     parser.add_argument("--model", choices=("NFNCFM", "NFLFM", "NFNLFM"), default="NFLFM")
     parser.add_argument("--procedure", choices=("ours", "papers"), default="ours")
     parser.add_argument("--samples", type=int, default=40_000,
                         help="of the papers' controller, a joint")  # fmt: skip
     given = parser.parse_args(argv)
-    workspace, bench = training.start(given, controller_samples=given.samples)
+    workspace, bench = common.start(given, controller_samples=given.samples)
     if given.procedure == "ours":
         found = fit_network(workspace, bench, given.model)
-        return training.finish(given, bench, found)
+        return common.finish(given, bench, found)
     law = given.model.removeprefix("NF")
     adaptive = fit_by_class(workspace, bench, f"A{law}")
     model = network_by_controller(workspace, bench, law, progress=sys.stderr.isatty())
     info = replace(model_info(adaptive, bench.train), fit={"status": "by the papers' procedure"})
-    return training.write(given, bench, model, info, adaptive.plant)
+    return common.write(given, bench, model, info, adaptive.plant)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    print(training.run(train, argv))
+    print(common.run(train, argv))
     return 0
 
 

@@ -1,5 +1,6 @@
 """The scripts that train: what they write, and that an interruption changes no result."""
 
+import importlib
 import json
 import runpy
 import signal
@@ -13,10 +14,11 @@ import pytest
 
 from nfriction import load
 from nfriction.io.model_file import load_info
-from nfriction.papers.reproduction import training
 
 TRAINERS = Path(__file__).resolve().parents[2] / "trainers"
+sys.path.insert(0, str(TRAINERS))  # as when a script of that folder runs
 SCRIPTS = sorted(path.name for path in TRAINERS.glob("train_*.py"))
+common = importlib.import_module("common")
 QUICK = ["--seconds", "1", "--windows", "0.5", "--max-steps", "2"]
 SEARCH = ["train_constant.py", "--twin", "rtip", "--seconds", "2", "--model", "LFM",
           "--method", "pattern", "--horizon", "1", "--max-evaluations", "400"]  # fmt: skip
@@ -63,8 +65,8 @@ def test_a_model_is_trained_written_and_read_by_resume(
 
 def test_checkpoints_of_other_options_are_refused(tmp_path: Path) -> None:
     def start(*words: str) -> None:
-        given = training.parser("").parse_args([*words, "--out", str(tmp_path)])
-        training.checkpoints(given)
+        given = common.parser("").parse_args([*words, "--out", str(tmp_path)])
+        common.checkpoints(given)
 
     start("--seed", "3")
     start("--seed", "3", "--resume")
