@@ -33,8 +33,8 @@ def train(argv: Sequence[str] | None) -> str:
         return common.finish(given, bench, found)
     law = given.model.removeprefix("NF")
     adaptive = fit_by_class(workspace, bench, f"A{law}")
-    model = network_by_controller(workspace, bench, law, progress=sys.stderr.isatty())
-    info = replace(model_info(adaptive, bench.train), fit={"status": "by the papers' procedure"})
+    model, ended = network_by_controller(workspace, bench, law, progress=sys.stderr.isatty())
+    info = replace(model_info(adaptive, bench.train), fit=ended)
     return common.write(given, bench, model, info, adaptive.plant)
 
 

@@ -1,4 +1,4 @@
-"""Causal motion, as in a controller: frequency counting and a second-order low-pass filter."""
+"""Causal motion, as in a controller: period counting and a second-order low-pass filter."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nfriction.signals.encoder import frequency_counting, quantise
+from nfriction.signals.encoder import period_counting, quantise
 from nfriction.signals.motion import Motion, check_motion
 
 Array = NDArray[np.float64]
@@ -90,7 +90,7 @@ def causal_motion(
 ) -> Motion:
     """Motion from past and present samples alone, as in a controller.
 
-    Velocity is frequency counting through the low-pass filter; acceleration is the difference of
+    Velocity is period counting through the low-pass filter; acceleration is the difference of
     that velocity through the same filter again. The filter runs at the median step even if the
     stamps jitter, as a controller's does.
 
@@ -104,11 +104,12 @@ def causal_motion(
     Returns:
         The quantised position with velocity and acceleration.
     References:
-        TLRIP paper: frequency counting, then a second-order IIR filter.
+        TLRIP paper: frequency counting, then a second-order IIR filter; `frequency_counting` is
+            coarse at low speed, so edges are timed here.
     """
     time, q = check_motion(time, q)
     low_pass = SecondOrderLowPass(cutoff_hz, float(np.median(np.diff(time))), damping)
-    qd = low_pass(frequency_counting(time, q, counts_per_revolution, offset=offset))
+    qd = low_pass(period_counting(time, q, counts_per_revolution, offset=offset))
     # A difference needs a past sample; the first has none.
     rate = np.zeros_like(qd)
     rate[1:] = np.diff(qd, axis=0) / np.diff(time)[:, None]

@@ -181,13 +181,11 @@ class PositionError:
     """Position error of simulated windows as a function of a schedule's parameter vector.
 
     Args:
-        plant: the mechanism.
-        friction: the friction model; its schedule is overwritten and restored.
+        plant, friction: the mechanism and its friction, whose schedule is overwritten and restored.
         windows: what was measured, with the states from which simulations start.
         measurement: matrix (joint, joint) from joint coordinates to those of the recording.
         substeps: integration steps per sample.
-        drive: class of every sample, (window, step, joint), that chooses the coefficients; None
-            lets the simulated motion choose them.
+        drive: class of every sample (window, step, joint), instead of that of the simulation.
         memory: of the coefficients at the start of each window, (window, joint, state_size).
         threads: candidates are divided among this many.
     """
@@ -265,11 +263,9 @@ class ClassFit:
         task: the fit, without the encoders' offsets.
         motions: of the recordings, as recorded.
         constant: fit of the constant law, from which every class starts.
-        classes: of the recordings.
+        classes, windows: of the recordings.
         schedule: of the model to be fitted, set to these classes.
-        table: the coefficients that a fit with given classes varies.
-        given: the model of that table.
-        windows: of the recordings.
+        table, given: the coefficients that a fit with given classes varies, and their model.
     """
 
     task: FitTask
@@ -326,12 +322,9 @@ class ClassFit:
         return driving
 
     def backtracked(self, found: FitResult, windows: Windows, baseline: float) -> FitResult:
-        """The classes' coefficients as far as they also improve simulations of the model itself.
+        """The fit `found` as far as it improves on `baseline` [rad], the constant law's error.
 
-        Args:
-            found: the fit of the given classes.
-            windows: with the initial states that it found.
-            baseline: root mean square error of the constant law [rad].
+        Windows start at the states that the fit found.
         """
         task, constant, model, schedule = self.task, self.constant, self.task.model, self.schedule
         flat = constant.model.schedule.coefficient_sets()["always"][:, None]

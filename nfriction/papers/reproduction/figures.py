@@ -12,17 +12,20 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from nfriction.evaluation.score import RMSE, Score
 from nfriction.io.atomic import atomic_write
-from nfriction.io.model_file import load
-from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.controller.mamdani import paper_controller
 from nfriction.papers.controller.rules import Variable
 from nfriction.papers.reproduction import tables
-from nfriction.papers.reproduction.stages import ADAPTIVE, LAWS, NEURO_FUZZY, SECOND_PAPER
+from nfriction.papers.reproduction.stages import (
+    ADAPTIVE,
+    EXPERIMENT,
+    LAWS,
+    NEURO_FUZZY,
+    SECOND_PAPER,
+)
 from nfriction.papers.reproduction.workspace import Array, Workspace
 from nfriction.plant import rigs
 from nfriction.plots import controller_surface, positions, rmse_bars, style
@@ -126,22 +129,18 @@ def experiment(workspace: Workspace) -> Figure:
         TLRIP paper, Fig. 4 and Table 6.
     """
     bench = workspace.bench("tlrip")
-    motion = next(m for _, r, m in bench.parts() if r.name == "train_hanging")
-    schedule = load(workspace.model(ADAPTIVE[-1])).schedule
-    assert isinstance(schedule, Adaptive)
-    classes = schedule.classes(torch.tensor(motion.qd), torch.tensor(motion.qdd)).numpy()
+    motion = next(m for _, r, m in bench.parts() if r.name == EXPERIMENT)
+    intervals = workspace.found(ADAPTIVE[-1])["intervals"]
     figure, axes = style.panels(3, len(tables.JOINTS), style.PAGE, 4.6, sharex=True)
     rows = (
         ("position [rad]", motion.q),
         ("velocity [rad/s]", motion.qd),
         ("acceleration [rad/s²]", motion.qdd),
     )
-    labels = list(CLASS_COLOURS)
     for joint, name in enumerate(tables.JOINTS):
         for ax, (label, values) in zip(axes[:, joint], rows, strict=True):
-            for first, last, known in _runs(classes[:, joint]):
-                span = motion.time[first], motion.time[last]
-                ax.axvspan(*span, color=CLASS_COLOURS[labels[known]], linewidth=0, zorder=0)
+            for known, start, end in intervals[joint]:
+                ax.axvspan(start, end, color=CLASS_COLOURS[known], linewidth=0, zorder=0)
             ax.plot(motion.time, values[:, joint], color=style.INK, linewidth=0.6)
             ax.grid(False)
             ax.yaxis.set_major_locator(MaxNLocator(4))
@@ -153,7 +152,7 @@ def experiment(workspace: Workspace) -> Figure:
         _strip(axes[0, joint], tables.TABLE_6[name])
     figure.align_ylabels(axes[:, 0])
     handles: list[Any] = [Patch(facecolor=colour) for colour in CLASS_COLOURS.values()]
-    texts = [f"{known} acceleration" for known in labels]
+    texts = [f"{known} acceleration" for known in CLASS_COLOURS]
     texts[-1] += "; strip at the top: as printed"
     style.legend(figure, handles, texts)
     return figure
@@ -299,14 +298,6 @@ def _sets(ax: Axes, variable: Variable) -> None:
     ax.xaxis.set_major_locator(MaxNLocator(5))
     name = style.symbol(variable.name) if len(variable.name) == 1 else variable.name
     ax.set_xlabel(f"{name} [{unit.replace('^2', '²')}]")
-
-
-def _runs(values: NDArray[np.int64]) -> list[tuple[int, int, int]]:
-    """First and last sample of every run of equal values, with the value."""
-    edges = np.flatnonzero(np.diff(values)) + 1
-    # Ends at the next start, so that the shading has no gaps.
-    firsts, lasts = [0, *edges.tolist()], [*edges.tolist(), len(values) - 1]
-    return [(a, b, int(values[a])) for a, b in zip(firsts, lasts, strict=True)]
 
 
 def _strip(ax: Axes, intervals: Sequence[tuple[str, float, float]]) -> None:

@@ -30,6 +30,7 @@ from nfriction.io.model_file import load, load_info, save
 from nfriction.io.model_info import ModelInfo
 from nfriction.papers import twin
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
+from nfriction.papers.afem.classes import class_intervals
 from nfriction.papers.afem.fit_adaptive import fit_adaptive
 from nfriction.papers.afem.fit_by_search import SearchMethod, SearchOptions, fit_by_search
 from nfriction.papers.nffem.refine_adaptive import refine_adaptive
@@ -59,6 +60,8 @@ PAPERS_WAY = tuple(f"{name}-papers" for name in NEURO_FUZZY)
 SECOND_PAPER = tuple(f"rtip-{law}" for law in LAWS)
 SEARCH: dict[str, SearchMethod] = {"NCFM": "sqp", "LFM": "pattern", "NLFM": "pattern"}
 """The second paper's method for each model."""
+EXPERIMENT = "train_hanging"
+"""The TLRIP paper's friction experiment, of which its Table 6 gives the classes."""
 COUNTS = 8192
 """Counts a revolution of the papers' encoders, four edges to each of 2048 lines."""
 
@@ -263,14 +266,21 @@ def fit_searched(
 
 def network_by_controller(
     workspace: Workspace, bench: Bench, law: str, *, progress: bool = False
-) -> FrictionModel:
-    """A neuro-fuzzy model the papers' way, from the coefficients by class."""
+) -> tuple[FrictionModel, dict[str, Any]]:
+    """A neuro-fuzzy model the papers' way, from the coefficients by class; how its fit ended."""
     settings = workspace.settings
-    return papers_neuro_fuzzy(
+    model, fits = papers_neuro_fuzzy(
         load(workspace.model(f"A{law}")), bench.train_motions,
         samples=settings.controller_samples,
         options=TrainingOptions(seed=settings.seed, progress=progress),
     )  # fmt: skip
+    unfinished = [fit.evidence.message for fit in fits if not fit.evidence.converged]
+    status = f"Not converged: {len(unfinished)} of {len(fits)} networks. {' '.join(unfinished[:1])}"
+    return model, {
+        "procedure": "classes, fuzzy controller, network by Bayesian regularisation",
+        "status": status if unfinished else "Converged.",
+        "converged": not unfinished,
+    }
 
 
 def fitted(
@@ -291,11 +301,10 @@ def second_paper(workspace: Workspace, law: str) -> dict[str, Any]:
 def papers_way(workspace: Workspace, law: str) -> dict[str, Any]:
     """Result of the papers' own neuro-fuzzy procedure."""
     bench, name = workspace.bench("tlrip"), f"NF{law}-papers"
-    model = network_by_controller(workspace, bench, law)
-    way = {"procedure": "classes, fuzzy controller, network by Bayesian regularisation"}
-    info = replace(load_info(workspace.model(f"A{law}")), fit=way)
+    model, ended = network_by_controller(workspace, bench, law)
+    info = replace(load_info(workspace.model(f"A{law}")), fit=ended)
     save(model, workspace.model(name), info)
-    return _judged(workspace, name, bench, model, info)
+    return {"fit": ended} | _judged(workspace, name, bench, model, info)
 
 
 def _finish(workspace: Workspace, stage: str, bench: Bench, found: FitResult) -> dict[str, Any]:
@@ -316,20 +325,23 @@ def _judged(
             logger.warning("%s was not exported: %s", stage, " ".join(str(error).split()))
     scores, simulated = judge(bench, model)
     workspace.write_arrays(stage, simulated)
-    return {"scores": scores, "coefficients": coefficient_summary(model)} | _classes(model)
+    return {"scores": scores, "coefficients": coefficient_summary(model)} | _classes(bench, model)
 
 
-def _classes(model: FrictionModel) -> dict[str, Any]:
-    """Coefficients of an adaptive model by class, joint and name."""
-    if not isinstance(model.schedule, Adaptive):
+def _classes(bench: Bench, model: FrictionModel) -> dict[str, Any]:
+    """Coefficients of an adaptive model by class, joint and name; its classes in the experiment."""
+    schedule = model.schedule
+    if not isinstance(schedule, Adaptive):
         return {}
-    names, values = model.schedule.coefficient_names, model.schedule.values
+    motion = next(m for _, r, m in bench.parts() if r.name == EXPERIMENT)
+    labels = schedule.classes(torch.tensor(motion.qd), torch.tensor(motion.qdd)).T.numpy()
     return {
         "classes": {
-            known: {n: values[:, c, k].tolist() for k, n in enumerate(names)}
+            known: {n: schedule.values[:, c, k].tolist() for k, n in enumerate(model.law.names)}
             for c, known in enumerate(CLASSES)
         },
-        "thresholds": model.schedule.thresholds.tolist(),
+        "thresholds": schedule.thresholds.tolist(),
+        "intervals": [class_intervals(motion.time, known) for known in labels],
     }
 
 
@@ -357,7 +369,7 @@ def judge(bench: Bench, model: FrictionModel) -> tuple[dict[str, Any], dict[str,
 def driven_by_measurement(bench: Bench, model: FrictionModel, recording: Recording) -> Array:
     """Positions of a free run whose coefficients follow the measured motion, as in the papers.
 
-    Velocity and acceleration are those that a controller has: frequency counting and filters.
+    Velocity and acceleration are those that a controller has: period counting and filters.
 
     Returns:
         Positions in the recording's convention, (sample, joint).

@@ -109,7 +109,7 @@ class Bench:
 
     @property
     def train_motions(self) -> list[Motion]:
-        """In the order of `train`."""
+        """Motions of the recordings in `train`."""
         return self.motions[: len(self.train)]
 
     def parts(self) -> list[tuple[Split, Recording, Motion]]:
@@ -132,12 +132,7 @@ class Workspace:
     """The files of a run and the settings that they are made with.
 
     A stage is finished where its file bears these settings; that file is the last one that the
-    stage writes, so a stage that was killed counts as not begun.
-
-    Attributes:
-        folder: where all files go.
-        settings: of the run.
-        progress: show a bar for each fit.
+    stage writes, so a stage that was killed counts as not begun. `progress` shows a bar a fit.
     """
 
     folder: Path
@@ -160,11 +155,7 @@ class Workspace:
         return self._file(stage, "json").exists()
 
     def found(self, stage: str) -> dict[str, Any]:
-        """Result of a stage.
-
-        Raises:
-            ValueError: if it is not finished.
-        """
+        """Result of a stage; a `ValueError` where it is not finished."""
         result: dict[str, Any] | None = self.result(stage)
         if result is None:
             raise ValueError(f"{self.folder}: the stage {stage!r} is not finished; run it first.")
@@ -194,13 +185,7 @@ class Workspace:
         return self.folder / "models" / f"{stage}.json"
 
     def fit(self, stage: str, bench: Bench, make: Callable[[Callback], FitResult]) -> FitResult:
-        """The fit of a stage: read where it is finished, else made and kept.
-
-        Args:
-            stage: names its files.
-            bench: the recordings fitted.
-            make: fits, given a callback for every step.
-        """
+        """The fit of a stage: read where it is finished, else made by `make(callback)` and kept."""
         name, path = f"{stage}-fit", self.model(stage)
         if (kept := self.result(name)) is not None:
             return _restored(kept, path, self.arrays(name), bench)

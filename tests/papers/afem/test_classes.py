@@ -51,9 +51,6 @@ def test_a_dying_motion_goes_through_all_classes_in_time():
         assert 14.0 <= ends[1] < 16.0
     assert schedule.sample_time == pytest.approx(STEP)
     assert torch.equal(schedule.thresholds, classes.thresholds)
-    table = classes.table()
-    assert list(table.columns) == ["recording", "joint", "class", "start_s", "end_s"]
-    assert len(table) >= 6
 
 
 def test_given_intervals_are_taken_and_their_thresholds_tell_them_apart():
