@@ -265,7 +265,7 @@ def order(workspace: Workspace) -> Order:
 
 
 def fit_ends(workspace: Workspace) -> str:
-    """How every fit ended, and which did not converge."""
+    """The end of every fit in words, and the fits that did not converge."""
     fits = {name: workspace.found(name)["fit"] for name in (*TLRIP, *SECOND_PAPER)}
     lines = [f"{name:13} {fit['status']}" for name, fit in fits.items()]
     open_ended = [name for name, fit in fits.items() if not fit["converged"]]
