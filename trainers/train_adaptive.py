@@ -15,10 +15,12 @@ import common
 
 from nfriction.papers.reproduction.stages import fit_by_class, fit_constant, fit_searched
 
+MODELS = ("ANCFM", "ACFM", "ACVFM", "ALFM", "ANLFM")
+
 
 def train(argv: Sequence[str] | None) -> str:
     parser = common.parser(__doc__.splitlines()[0])
-    parser.add_argument("--model", choices=("ANCFM", "ALFM", "ANLFM"), default="ALFM")
+    parser.add_argument("--model", choices=MODELS, default="ALFM")
     parser.add_argument("--method", choices=("gauss-newton", "pattern", "sqp"),
                         default="gauss-newton")  # fmt: skip
     parser.add_argument("--max-evaluations", type=int, default=5000, help="of a search")

@@ -17,10 +17,12 @@ import common
 
 from nfriction.papers.reproduction.stages import fit_constant, fit_searched
 
+MODELS = ("NCFM", "CFM", "CVFM", "LFM", "NLFM", "Stribeck")
+
 
 def train(argv: Sequence[str] | None) -> str:
     parser = common.parser(__doc__.splitlines()[0])
-    parser.add_argument("--model", choices=("NCFM", "LFM", "NLFM", "Stribeck"), default="NLFM")
+    parser.add_argument("--model", choices=MODELS, default="NLFM")
     parser.add_argument("--method", choices=("trajectory", "pattern", "sqp"), default="trajectory")
     parser.add_argument("--horizon", type=float, default=5.0,
                         help="length of the windows that a search simulates [s]")  # fmt: skip

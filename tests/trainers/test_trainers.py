@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from nfriction import load
+from nfriction.friction.registry import model_names
 from nfriction.io.model_file import load_info
 
 TRAINERS = Path(__file__).resolve().parents[2] / "trainers"
@@ -63,6 +64,12 @@ def test_a_model_is_trained_written_and_read_by_resume(
     assert (tmp_path / "NCFM.json").read_bytes() == model
 
 
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_every_offered_model_exists(script: str) -> None:
+    offered = runpy.run_path(str(TRAINERS / script))["MODELS"]
+    assert set(offered) <= set(model_names())
+
+
 def test_checkpoints_of_other_options_are_refused(tmp_path: Path) -> None:
     def start(*words: str) -> None:
         given = common.parser("").parse_args([*words, "--out", str(tmp_path)])
@@ -87,7 +94,7 @@ def test_recordings_need_a_rig(tmp_path: Path) -> None:
     ("script", "model", "options"),
     [
         ("train_adaptive.py", "ANCFM", []),
-        ("train_neurofuzzy.py", "NFNCFM", []),
+        ("train_neurofuzzy.py", "NFNCFM", ["--terms", "3", "2", "--units", "4"]),
         ("train_neurofuzzy.py", "NFNCFM", ["--procedure", "papers", "--samples", "200"]),
     ],
 )

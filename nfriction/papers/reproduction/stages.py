@@ -271,7 +271,7 @@ def network_by_controller(
     settings = workspace.settings
     model, fits = papers_neuro_fuzzy(
         load(workspace.model(f"A{law}")), bench.train_motions,
-        samples=settings.controller_samples,
+        samples=settings.controller_samples, units=settings.network_units,
         options=TrainingOptions(seed=settings.seed, progress=progress),
     )  # fmt: skip
     unfinished = [fit.evidence.message for fit in fits if not fit.evidence.converged]

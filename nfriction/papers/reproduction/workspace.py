@@ -40,6 +40,7 @@ class Settings:
         max_steps: of the fits, at each length.
         network_steps: of the neuro-fuzzy models' fits.
         terms, head_units: of the neuro-fuzzy models.
+        network_units: of the papers' network.
         controller_samples: a joint, on which the papers' network learns.
         search_horizon: length of the windows that a search simulates [s].
         search_evaluations: most simulations of a search on the position error.
@@ -56,6 +57,7 @@ class Settings:
     network_steps: int = 8
     terms: tuple[int, int] = (5, 5)
     head_units: int = 10
+    network_units: int = 10
     controller_samples: int = 40_000
     search_horizon: float = 5.0
     search_evaluations: int = 1500
