@@ -35,8 +35,10 @@ from nfriction.simulation.rollout import rollout
 DPI = 150
 SHOWN, SECOND_SHOWN = "test_hanging", "test_bent"
 """Held-out recordings that the figures show: the poses of the papers' own model checks."""
-INERTIA_SECONDS = 5.0
+INERTIA_SECONDS = 3.0
 """Beyond this a frictionless swing from upright shows rounding rather than inertia."""
+FULL_TENSOR = tuple((0.1 * izz, izz, izz, 0.0, 0.0, 0.0) for izz in (0.04, 0.05, 0.05))
+"""Ixx, Iyy, Izz, products of each link [kg m^2]: the printed Izz across, a tenth along it."""
 CLASS_COLOURS = {"low": "#eef3f7", "medium": "#cfe0ec", "high": "#a3c4dc"}
 _POINTS = 600  # of a membership's line
 
@@ -66,6 +68,10 @@ def figures(workspace: Workspace) -> dict[str, Callable[[], Figure]]:
         f"fig_{11 + joint}_joint_{joint + 2}": partial(model_groups, workspace, joint)
         for joint in range(3)
     }
+    surfaces = {
+        f"fig_08_surfaces_joint_{joint}": partial(controller_surface, paper_controller(joint))
+        for joint in (2, 3, 4)
+    }
     seconds = {
         f"second_fig_{number}_{law}": partial(second_positions, workspace, law)
         for number, law in zip((5, 6, 7), LAWS, strict=True)
@@ -74,7 +80,7 @@ def figures(workspace: Workspace) -> dict[str, Callable[[], Figure]]:
         "fig_02_inertia": inertia_cases,
         "fig_04_experiment": partial(experiment, workspace),
         "fig_07_memberships": controller_memberships,
-        "fig_08_surfaces": lambda: controller_surface(paper_controller(2)),
+        **surfaces,
         **groups,
         "fig_14_rmse": partial(error_bars, workspace),
         "second_fig_3_motion": partial(recorded_motion, workspace),
@@ -86,35 +92,32 @@ def figures(workspace: Workspace) -> dict[str, Callable[[], Figure]]:
 
 
 def inertia_cases() -> Figure:
-    """Frictionless swings of the TLRIP rig, a panel a joint, for three cases of inertia.
+    """Frictionless swings of the TLRIP rig with its arm free, a panel a joint.
 
-    Links as point masses, as slender rods with the printed Izz, and with a full tensor. With the
-    arm fixed the motion stays in a plane and only Izz enters, so the last two coincide.
+    Links as point masses, with the printed Izz alone, and with a full tensor (`FULL_TENSOR`; the
+    paper prints none). The last two nearly agree while the arm turns slowly, and part later.
 
     References:
         TLRIP paper, Fig. 2.
     """
-    izz = (0.04, 0.05, 0.05)
-    # Elements other than Izz are arbitrary: the figure shows that they do not matter.
-    full = [[0.1 * i, i, i, 0.0, 0.0, 0.0] for i in izz]
     cases = {
-        "inertia neglected": rigs.tlrip(inertia="none"),
-        "Izz only": rigs.tlrip(inertia="izz"),
-        "full tensor": rigs.tlrip(inertia=full),
+        "inertia neglected": rigs.tlrip("free", "none"),
+        "Izz only": rigs.tlrip("free", "izz"),
+        "full tensor": rigs.tlrip("free", FULL_TENSOR),
     }
-    q0 = torch.deg2rad(torch.tensor([20.0, 30.0, 40.0], dtype=torch.float64))
+    q0 = torch.deg2rad(torch.tensor([0.0, 20.0, 30.0, 40.0], dtype=torch.float64))
     steps = round(INERTIA_SECONDS * 1000)
-    figure, axes = style.panels(3, 1, style.PAGE, 4.3, sharex=True)
+    figure, axes = style.panels(len(q0), 1, style.PAGE, 5.2, sharex=True)
     looks = style.looks(cases)
     handles: list[Any] = []
-    # Later lines are thinner, so that lines that coincide can be distinguished.
+    # Later lines are thinner, so that lines can be distinguished where they coincide.
     for (label, plant), width in zip(cases.items(), (2.2, 1.6, 1.0), strict=True):
         run = rollout(plant, None, q0, torch.zeros_like(q0), sample_time=1e-3, steps=steps)
         line = looks[label].line | {"linewidth": width}
         for ax, q in zip(axes[:, 0], run.q.numpy().T, strict=True):
             ax.plot(run.time.numpy(), q, **line)
         handles.append(Line2D([], [], **line))
-    _joint_axes(axes[:, 0].tolist(), tables.JOINTS, "rad")
+    _joint_axes(axes[:, 0].tolist(), ("joint 1", *tables.JOINTS), "rad")
     figure.align_ylabels(axes[:, 0])
     style.legend(figure, handles, list(cases))
     return figure
