@@ -1,6 +1,6 @@
 """The papers' figures from the results of a reproduction."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from nfriction.evaluation.score import RMSE, Score
 from nfriction.io.atomic import atomic_write
+from nfriction.io.model_file import load
 from nfriction.papers.controller.mamdani import paper_controller
 from nfriction.papers.controller.rules import Variable
 from nfriction.papers.reproduction import tables
@@ -27,9 +28,18 @@ from nfriction.papers.reproduction.stages import (
     SECOND_PAPER,
 )
 from nfriction.papers.reproduction.workspace import Array, Workspace
-from nfriction.plant import rigs
-from nfriction.plots import controller_surface, positions, rmse_bars, style
+from nfriction.papers.twin.mechanics import Links, simulate
+from nfriction.plant import PendulumChain, rigs
+from nfriction.plots import (
+    coefficients_over_time,
+    controller_surface,
+    positions,
+    rmse_bars,
+    style,
+    torque_over_velocity,
+)
 from nfriction.recording import Recording
+from nfriction.signals import Motion
 from nfriction.simulation.rollout import rollout
 
 DPI = 150
@@ -64,28 +74,33 @@ def draw_all(workspace: Workspace, *, progress: bool = False) -> list[Path]:
 
 def figures(workspace: Workspace) -> dict[str, Callable[[], Figure]]:
     """The function that draws each figure, by the name of its file."""
-    groups = {
-        f"fig_{11 + joint}_joint_{joint + 2}": partial(model_groups, workspace, joint)
-        for joint in range(3)
-    }
-    surfaces = {
-        f"fig_08_surfaces_joint_{joint}": partial(controller_surface, paper_controller(joint))
-        for joint in (2, 3, 4)
-    }
     seconds = {
         f"second_fig_{number}_{law}": partial(second_positions, workspace, law)
         for number, law in zip((5, 6, 7), LAWS, strict=True)
     }
     return {
         "fig_02_inertia": inertia_cases,
-        "fig_04_experiment": partial(experiment, workspace),
+        "fig_04_without_friction": partial(without_friction, workspace),
         "fig_07_memberships": controller_memberships,
-        **surfaces,
-        **groups,
-        "fig_14_rmse": partial(error_bars, workspace),
-        "second_fig_3_motion": partial(recorded_motion, workspace),
+        **{
+            f"fig_08_surfaces_joint_{joint}": partial(controller_surface, paper_controller(joint))
+            for joint in (2, 3, 4)
+        },
+        **{
+            f"fig_{number}_coefficients_{model}": partial(coefficients, workspace, model)
+            for number, model in zip((11, 12, 13), NEURO_FUZZY, strict=True)
+        },
+        f"fig_14_positions_{NEURO_FUZZY[-1]}": partial(best_positions, workspace),
+        "second_fig_3_free_arm": second_swing,
         **seconds,
-        "second_fig_8_rmse": lambda: rmse_bars(
+        "second_fig_8_torque": partial(second_torque, workspace),
+        "experiment_classes": partial(experiment, workspace),
+        **{
+            f"positions_joint_{joint + 2}": partial(model_groups, workspace, joint)
+            for joint in range(3)
+        },
+        "rmse": lambda: rmse_bars(tables.rmse(workspace, tables.NINE), "rad"),
+        "second_rmse": lambda: rmse_bars(
             tables.rmse(workspace, SECOND_PAPER).set_axis(list(LAWS)), "rad"
         ),
     }
@@ -105,13 +120,27 @@ def inertia_cases() -> Figure:
         "Izz only": rigs.tlrip("free", "izz"),
         "full tensor": rigs.tlrip("free", FULL_TENSOR),
     }
+    return _swings(cases, INERTIA_SECONDS)
+
+
+def second_swing() -> Figure:
+    """Frictionless swing of the RTIP rig with its arm free, a panel a joint.
+
+    References:
+        RTIP paper, Fig. 3.
+    """
+    return _swings({"without friction": rigs.rtip("free")}, 2.0 * INERTIA_SECONDS)
+
+
+def _swings(plants: Mapping[str, PendulumChain], seconds: float) -> Figure:
+    """Joint positions of rigs with a free arm, released at 0, 20, 30, 40 degrees."""
     q0 = torch.deg2rad(torch.tensor([0.0, 20.0, 30.0, 40.0], dtype=torch.float64))
-    steps = round(INERTIA_SECONDS * 1000)
     figure, axes = style.panels(len(q0), 1, style.PAGE, 5.2, sharex=True)
-    looks = style.looks(cases)
+    looks = style.looks(plants)
     handles: list[Any] = []
     # Later lines are thinner, so that lines can be distinguished where they coincide.
-    for (label, plant), width in zip(cases.items(), (2.2, 1.6, 1.0), strict=True):
+    for (label, plant), width in zip(plants.items(), (2.2, 1.6, 1.0), strict=False):
+        steps = round(seconds * 1000)
         run = rollout(plant, None, q0, torch.zeros_like(q0), sample_time=1e-3, steps=steps)
         line = looks[label].line | {"linewidth": width}
         for ax, q in zip(axes[:, 0], run.q.numpy().T, strict=True):
@@ -119,8 +148,78 @@ def inertia_cases() -> Figure:
         handles.append(Line2D([], [], **line))
     _joint_axes(axes[:, 0].tolist(), ("joint 1", *tables.JOINTS), "rad")
     figure.align_ylabels(axes[:, 0])
-    style.legend(figure, handles, list(cases))
+    style.legend(figure, handles, list(plants))
     return figure
+
+
+def without_friction(workspace: Workspace) -> Figure:
+    """Measured positions and two frictionless simulations from the same release.
+
+    One simulation is the library's, one the twin's own mechanics, which share no code with it; the
+    paper compares its equations with SimMechanics.
+
+    References:
+        TLRIP paper, Fig. 4.
+    """
+    bench = workspace.bench("tlrip")
+    recording = next(r for r in bench.test if r.name == SHOWN)
+    convention = recording.resolve_convention(bench.plant)
+    q0, qd0 = bench.states[SHOWN]
+    start = convention.position_to_joint(q0), convention.rate_to_joint(qd0)
+    run = rollout(
+        bench.plant,
+        None,
+        *map(torch.tensor, start),
+        sample_time=torch.tensor(np.diff(recording.time)),
+    )
+    assert isinstance(bench.plant, PendulumChain)
+    own = simulate(
+        Links.of(bench.plant), None, *(tuple(x.tolist()) for x in start), samples=len(recording)
+    )
+    simulated = {"equations": run.q.numpy(), "independent mechanics": own.q}
+    return positions(
+        recording,
+        {n: _score(recording, convention.position_from_joint(q)) for n, q in simulated.items()},
+    )
+
+
+def coefficients(workspace: Workspace, name: str) -> Figure:
+    """Coefficients of a neuro-fuzzy model over the friction experiment, a column a joint.
+
+    References:
+        TLRIP paper, Figs. 11 to 13.
+    """
+    motion = _experiment_motion(workspace)
+    return coefficients_over_time(
+        {name: load(workspace.model(name))}, motion, joint_names=tables.JOINTS
+    )
+
+
+def best_positions(workspace: Workspace) -> Figure:
+    """Measured position of every joint, and simulated by the nonlinear neuro-fuzzy model.
+
+    References:
+        TLRIP paper, Fig. 14.
+    """
+    recording = next(r for r in workspace.bench("tlrip").test if r.name == SHOWN)
+    best = NEURO_FUZZY[-1]
+    return positions(recording, {best: _score(recording, workspace.arrays(best)[SHOWN])})
+
+
+def second_torque(workspace: Workspace) -> Figure:
+    """Friction torque of each law over velocity on the second paper's rig, a panel a joint.
+
+    References:
+        RTIP paper, Fig. 8.
+    """
+    bench = workspace.bench("rtip")
+    models = {law: load(workspace.model(f"rtip-{law}")) for law in LAWS}
+    return torque_over_velocity(bench.plant, models, bench.train, bench.train_motions)
+
+
+def _experiment_motion(workspace: Workspace) -> Motion:
+    parts = workspace.bench("tlrip").parts()
+    return next(m for _, r, m in parts if r.name == EXPERIMENT)
 
 
 def experiment(workspace: Workspace) -> Figure:
@@ -129,10 +228,9 @@ def experiment(workspace: Workspace) -> Figure:
     Shaded by the class of acceleration found; a strip at the top shows the printed classes.
 
     References:
-        TLRIP paper, Fig. 4 and Table 6.
+        TLRIP paper, Table 6.
     """
-    bench = workspace.bench("tlrip")
-    motion = next(m for _, r, m in bench.parts() if r.name == EXPERIMENT)
+    motion = _experiment_motion(workspace)
     intervals = workspace.found(ADAPTIVE[-1])["intervals"]
     figure, axes = style.panels(3, len(tables.JOINTS), style.PAGE, 4.6, sharex=True)
     rows = (
@@ -177,11 +275,7 @@ def controller_memberships() -> Figure:
 
 
 def model_groups(workspace: Workspace, joint: int) -> Figure:
-    """Measured and simulated position of one joint, a column a kind of model, error below.
-
-    References:
-        TLRIP paper, Figs. 11 to 13.
-    """
+    """Measured and simulated position of one joint, a column a kind of model, error below."""
     bench = workspace.bench("tlrip")
     recording = next(r for r in bench.test if r.name == SHOWN)
     groups = {"constant": tuple(LAWS), "adaptive": ADAPTIVE, "neuro-fuzzy": NEURO_FUZZY}
@@ -213,36 +307,6 @@ def model_groups(workspace: Workspace, joint: int) -> Figure:
     handles = [Line2D([], [], **line) for line in (style.MEASURED, *(x.line for x in looks))]
     labels = [", ".join(models) for models in zip(*groups.values(), strict=True)]
     style.legend(figure, handles, ["measured", *labels])
-    return figure
-
-
-def error_bars(workspace: Workspace) -> Figure:
-    """Position error of every model by joint.
-
-    References:
-        TLRIP paper, Fig. 14.
-    """
-    return rmse_bars(tables.rmse(workspace, tables.NINE), "rad")
-
-
-def recorded_motion(workspace: Workspace) -> Figure:
-    """Measured positions on the second paper's rig, a panel a joint, a column a recording.
-
-    References:
-        RTIP paper, Fig. 3.
-    """
-    recordings = workspace.bench("rtip").train
-    joints = recordings[0].joints
-    figure, axes = style.panels(
-        joints, len(recordings), style.PAGE, 0.3 + 1.2 * joints, sharex="col", sharey="row"
-    )
-    for column, recording in zip(axes.T, recordings, strict=True):
-        for ax, q in zip(column, recording.q.T, strict=True):
-            ax.plot(recording.time, q, color=style.INK, linewidth=0.7)
-        style.title(column[0], recording.name.replace("_", " "))
-        column[-1].set_xlabel("time [s]")
-    _joint_axes(axes[:, 0].tolist(), recordings[0].names, recordings[0].unit)
-    figure.align_ylabels(axes[:, 0])
     return figure
 
 
