@@ -11,18 +11,21 @@ again. The result is that of an uninterrupted run.
 import sys
 from collections.abc import Sequence
 
-from nfriction.papers.reproduction import training
+import common
+
 from nfriction.papers.reproduction.stages import fit_by_class, fit_constant, fit_searched
+
+MODELS = ("ANCFM", "ACFM", "ACVFM", "ALFM", "ANLFM")
 
 
 def train(argv: Sequence[str] | None) -> str:
-    parser = training.parser(__doc__.splitlines()[0])
-    parser.add_argument("--model", choices=("ANCFM", "ALFM", "ANLFM"), default="ALFM")
+    parser = common.parser(__doc__.splitlines()[0])
+    parser.add_argument("--model", choices=MODELS, default="ALFM")
     parser.add_argument("--method", choices=("gauss-newton", "pattern", "sqp"),
                         default="gauss-newton")  # fmt: skip
     parser.add_argument("--max-evaluations", type=int, default=5000, help="of a search")
     given = parser.parse_args(argv)
-    workspace, bench = training.start(
+    workspace, bench = common.start(
         given, search_horizon=given.windows[-1], search_evaluations=given.max_evaluations
     )
     if given.method == "gauss-newton":
@@ -30,11 +33,11 @@ def train(argv: Sequence[str] | None) -> str:
     else:
         constant = fit_constant(workspace, bench, given.model.removeprefix("A"))
         found = fit_searched(workspace, bench, given.model, given.method, start=constant)
-    return training.finish(given, bench, found)
+    return common.finish(given, bench, found)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    print(training.run(train, argv))
+    print(common.run(train, argv))
     return 0
 
 

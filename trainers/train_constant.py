@@ -13,30 +13,33 @@ minutes, start again. The result is that of an uninterrupted run.
 import sys
 from collections.abc import Sequence
 
-from nfriction.papers.reproduction import training
+import common
+
 from nfriction.papers.reproduction.stages import fit_constant, fit_searched
+
+MODELS = ("NCFM", "CFM", "CVFM", "LFM", "NLFM", "Stribeck")
 
 
 def train(argv: Sequence[str] | None) -> str:
-    parser = training.parser(__doc__.splitlines()[0])
-    parser.add_argument("--model", choices=("NCFM", "LFM", "NLFM", "Stribeck"), default="NLFM")
+    parser = common.parser(__doc__.splitlines()[0])
+    parser.add_argument("--model", choices=MODELS, default="NLFM")
     parser.add_argument("--method", choices=("trajectory", "pattern", "sqp"), default="trajectory")
     parser.add_argument("--horizon", type=float, default=5.0,
                         help="length of the windows that a search simulates [s]")  # fmt: skip
     parser.add_argument("--max-evaluations", type=int, default=5000, help="of a search")
     given = parser.parse_args(argv)
-    workspace, bench = training.start(
+    workspace, bench = common.start(
         given, search_horizon=given.horizon, search_evaluations=given.max_evaluations
     )
     if given.method == "trajectory":
         found = fit_constant(workspace, bench, given.model)
     else:
         found = fit_searched(workspace, bench, given.model, given.method)
-    return training.finish(given, bench, found)
+    return common.finish(given, bench, found)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    print(training.run(train, argv))
+    print(common.run(train, argv))
     return 0
 
 

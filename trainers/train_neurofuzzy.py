@@ -14,31 +14,44 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 
+import common
+
 from nfriction.evaluation.results import model_info
-from nfriction.papers.reproduction import training
 from nfriction.papers.reproduction.stages import fit_by_class, fit_network, network_by_controller
+
+# Those whose law has an adaptive model, too.
+MODELS = ("NFNCFM", "NFCFM", "NFCVFM", "NFLFM", "NFNLFM")
 
 
 def train(argv: Sequence[str] | None) -> str:
-    parser = training.parser(__doc__.splitlines()[0])
-    parser.add_argument("--model", choices=("NFNCFM", "NFLFM", "NFNLFM"), default="NFLFM")
+    parser = common.parser(__doc__.splitlines()[0])
+    parser.add_argument("--model", choices=MODELS, default="NFLFM")
     parser.add_argument("--procedure", choices=("ours", "papers"), default="ours")
     parser.add_argument("--samples", type=int, default=40_000,
                         help="of the papers' controller, a joint")  # fmt: skip
+    parser.add_argument("--terms", type=int, nargs=2, default=[5, 5], metavar="SETS",
+                        help="fuzzy sets of velocity and of acceleration, ours")  # fmt: skip
+    parser.add_argument("--units", type=int, default=10, help="of the radial basis network")
     given = parser.parse_args(argv)
-    workspace, bench = training.start(given, controller_samples=given.samples)
+    workspace, bench = common.start(
+        given,
+        controller_samples=given.samples,
+        terms=tuple(given.terms),
+        head_units=given.units,
+        network_units=given.units,
+    )
     if given.procedure == "ours":
         found = fit_network(workspace, bench, given.model)
-        return training.finish(given, bench, found)
+        return common.finish(given, bench, found)
     law = given.model.removeprefix("NF")
     adaptive = fit_by_class(workspace, bench, f"A{law}")
-    model = network_by_controller(workspace, bench, law, progress=sys.stderr.isatty())
-    info = replace(model_info(adaptive, bench.train), fit={"status": "by the papers' procedure"})
-    return training.write(given, bench, model, info, adaptive.plant)
+    model, ended = network_by_controller(workspace, bench, law, progress=sys.stderr.isatty())
+    info = replace(model_info(adaptive, bench.train), fit=ended)
+    return common.write(given, bench, model, info, adaptive.plant)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    print(training.run(train, argv))
+    print(common.run(train, argv))
     return 0
 
 

@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from nfriction.papers.reproduction import tables
-    from nfriction.papers.reproduction.run import reproduce
+    from nfriction.papers.reproduction.stages import reproduce
     from nfriction.papers.reproduction.workspace import FULL, QUICK
 
     check_writable(arguments.out)

@@ -93,8 +93,7 @@ class Controller(nn.Module):
         memory_size: those of the schedule alone.
 
     References:
-        TLRIP paper: a second-order IIR filter on the velocity (there from frequency counting, which
-        needs time stamps of encoder edges).
+        TLRIP paper: a second-order IIR filter on the velocity (there from frequency counting).
     """
 
     qd_lower: Tensor

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 # not import the papers' own models.
 _MODULES = {
     "nfriction.friction.models": ("NCFM", "LFM", "NLFM", "CFM", "CVFM", "Stribeck"),
-    "nfriction.papers.afem.models": ("ANCFM", "ALFM", "ANLFM", "ACFM", "ACVFM"),
+    "nfriction.papers.afem.adaptive": ("ANCFM", "ALFM", "ANLFM", "ACFM", "ACVFM"),
     "nfriction.friction.neurofuzzy": (
         *("NFNCFM", "NFLFM", "NFNLFM", "NFCFM", "NFCVFM", "NFStribeck"),
     ),

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from nfriction.friction.laws import Law
 from nfriction.friction.parameters import Sensitivity, checked_coefficients
-from nfriction.fuzzy.rules import FuzzyRules
+from nfriction.fuzzy.membership import FuzzyRules
 
 # Smallest value of a positive coefficient: far below the resolution of any torque sensor.
 SMALLEST = 1e-12

@@ -14,7 +14,7 @@ from nfriction.friction.laws import Law
 from nfriction.friction.models import NamedModel
 from nfriction.friction.parameters import Sensitivity, positive_number
 from nfriction.fuzzy import AnfisRBF
-from nfriction.fuzzy.rules import FuzzyRules
+from nfriction.fuzzy.membership import FuzzyRules
 
 # A coefficient below a thousandth of its scale starts there: from zero it could not rise.
 LEAST_RATIO = 1e-3

@@ -115,8 +115,8 @@ class Anfis(LinearOutputModule):
 
     def sets(self) -> tuple[Tensor, Tensor]:
         """Centres and widths (sigma, or `a` of a bell), each (groups, sets), input by input."""
-        centres, widths = self.partition()
-        return centres, widths
+        found: tuple[Tensor, Tensor] = self.partition()
+        return found
 
     def memberships(self, x: Tensor) -> list[Tensor]:
         """Membership of every set, one tensor (*batch, groups, terms) for each input."""
@@ -264,7 +264,11 @@ class Anfis(LinearOutputModule):
             lower, upper: range of each input, broadcastable to (groups, inputs).
         """
         low, high = self._range(lower, upper)
-        self._take_crossing(even_centres(self.terms, low, high), low, high)
+        centres = even_centres(self.terms, low, high)
+        # Half-widths by which neighbours cross at 0.5 or more.
+        half = torch.cat(crossing_half_widths(centres, high - low), 1)
+        widths = half if self.kind == "bell" else half / HALF_WIDTH_OF_GAUSSIAN
+        self.partition.assign(torch.cat(centres, 1), widths, low, high)
 
     def init_from_sets(
         self,
@@ -344,12 +348,6 @@ class Anfis(LinearOutputModule):
             [piece.expand(self.groups, n) for piece, n in zip(pieces, self.terms, strict=True)], 1
         )
         return packed.to(self.consequents)
-
-    def _take_crossing(self, centres: list[Tensor], low: Tensor, high: Tensor) -> None:
-        """Give the sets these centres and widths by which neighbours cross at 0.5 or more."""
-        half = torch.cat(crossing_half_widths(centres, high - low), 1)
-        widths = half if self.kind == "bell" else half / HALF_WIDTH_OF_GAUSSIAN
-        self.partition.assign(torch.cat(centres, 1), widths, low, high)
 
 
 def _check_sizes(

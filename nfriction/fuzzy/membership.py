@@ -1,4 +1,4 @@
-"""Fuzzy sets: membership functions, sets from printed ranges, and their coverage.
+"""Fuzzy sets: membership functions, sets from printed ranges, and the sets of a network's rules.
 
 The functions work elementwise on tensors of any shape that broadcast, keep dtype and device, and
 script. Those that begin with `log_` stay finite where the membership itself underflows.
@@ -80,17 +80,6 @@ def trapezoid(x: Tensor, a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
 def triangle(x: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
     """Membership that rises from 0 at a to 1 at b and falls to 0 at c."""
     return trapezoid(x, a, b, b, c)
-
-
-def coverage(memberships: Tensor) -> Tensor:
-    """Least of the largest membership: how well the sets cover a universe.
-
-    Args:
-        memberships: shape (*batch, points, terms), over the points of the universe.
-    Returns:
-        Shape (*batch); 0.5 or more means that something holds everywhere.
-    """
-    return memberships.amax(-1).amin(-1)
 
 
 SHAPES: dict[str, tuple[str, ...]] = {
@@ -197,3 +186,29 @@ def sets_from_ranges(
     sets[0] = FuzzySet(first, "left_shoulder", (low, (high - low) / 2))
     sets[-1] = FuzzySet(last, "right_shoulder", (last_high, (last_high - last_low) / 2))
     return tuple(sets)
+
+
+@dataclass(frozen=True, eq=False)
+class FuzzyRules:
+    """Gaussian sets over |velocity| and acceleration, and the coefficients of every pair of them.
+
+    Attributes:
+        lower, upper: trained range of both inputs, (joint, input).
+        centres, widths: of the sets of each input, (joint, set) each.
+        coefficients: where both sets of a rule hold fully, (joint, rule, coefficient); the rules of
+            velocity's first set come first.
+        along_motion: whether acceleration is positive where the motion speeds up.
+    """
+
+    lower: Tensor
+    upper: Tensor
+    centres: tuple[Tensor, ...]
+    widths: tuple[Tensor, ...]
+    coefficients: Tensor
+    along_motion: bool
+
+    def memberships(self, variable: int, joint: int, x: Tensor) -> Tensor:
+        """Memberships (point, set) of values (point,) of an input, clamped to its range."""
+        held = x.clamp(self.lower[joint, variable], self.upper[joint, variable])[:, None]
+        z = (held - self.centres[variable][joint]) / self.widths[variable][joint]
+        return torch.exp(-0.5 * z * z)

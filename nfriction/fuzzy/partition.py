@@ -7,6 +7,9 @@ MIN_SPACING, MAX_SPACING = 0.25, 1.0
 """Spacing of neighbouring centres over the sum of their half-widths. At 1 the sets cross at 0.5,
 at 0.25 (Gaussians) at 0.96, beyond which two words would mean the same."""
 
+# Place of a set alone in its range.
+_MIDDLE = torch.tensor([0.5], dtype=torch.float64)
+
 
 class FreePartition(nn.Module):
     """Sets with free centres and positive widths.
@@ -151,7 +154,8 @@ def even_centres(terms: list[int], lower: Tensor, upper: Tensor) -> list[Tensor]
     centres = []
     for i, count in enumerate(terms):
         low, span = lower[:, i, None], (upper - lower)[:, i, None]
-        centres.append(low + span * _fractions(count).to(lower))
+        shares = torch.linspace(0, 1, count, dtype=torch.float64) if count > 1 else _MIDDLE
+        centres.append(low + span * shares.to(lower))
     return centres
 
 
@@ -171,9 +175,3 @@ def crossing_half_widths(centres: list[Tensor], span: Tensor) -> list[Tensor]:
             padded = torch.cat([gaps[:, :1], gaps, gaps[:, -1:]], 1)
             half_widths.append(0.5 * torch.maximum(padded[:, :-1], padded[:, 1:]))
     return half_widths
-
-
-def _fractions(count: int) -> Tensor:
-    if count == 1:
-        return torch.full((1,), 0.5, dtype=torch.float64)
-    return torch.linspace(0, 1, count, dtype=torch.float64)

@@ -14,7 +14,7 @@ from nfriction.fitting.result.identifiability import NORMAL_95
 from nfriction.fitting.result.uncertainty import CoefficientUncertainty
 from nfriction.friction.laws import Coefficient
 from nfriction.friction.models import FrictionModel
-from nfriction.fuzzy.rules import FuzzyRules
+from nfriction.fuzzy.membership import FuzzyRules
 from nfriction.plots import style
 from nfriction.plots.fuzzy import draw_map, fuzzy_rules, input_labels
 from nfriction.signals import Motion

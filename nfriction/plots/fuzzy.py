@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nfriction.friction.models import FrictionModel
-from nfriction.fuzzy.rules import FuzzyRules
+from nfriction.fuzzy.membership import FuzzyRules
 from nfriction.plots import style
 
 Array = NDArray[np.float64]

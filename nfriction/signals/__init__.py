@@ -1,6 +1,6 @@
 """From encoder positions to motion: quantisation, causal velocity, smoothing.
 
-Velocity and acceleration come causally (`causal_motion`), as in a controller, by frequency counting
+Velocity and acceleration come causally (`causal_motion`), as in a controller, by period counting
 and a second-order IIR filter, or for a fit from a smoother of the whole record (`kalman_smoother`).
 
 Arrays are (time, joint); time is (time,) in seconds; positions are in radians (or metres).
@@ -11,6 +11,7 @@ from nfriction.signals.causal import (
     causal_motion,
     count_seen,
     frequency_counting,
+    period_counting,
     quantise,
 )
 from nfriction.signals.kalman import kalman_smoother
@@ -23,5 +24,6 @@ __all__ = [
     "count_seen",
     "frequency_counting",
     "kalman_smoother",
+    "period_counting",
     "quantise",
 ]

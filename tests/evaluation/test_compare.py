@@ -11,7 +11,7 @@ from nfriction.cli.tables import error_tables, verdict
 from nfriction.evaluation.compare import Comparison, coefficient_summary
 from nfriction.evaluation.parallel import Progress
 from nfriction.evaluation.score import RMSE, Score
-from nfriction.papers.afem.models import ALFM
+from nfriction.papers.afem.adaptive import ALFM
 from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import pendulum, swing
 

@@ -11,7 +11,7 @@ from nfriction.evaluation.cross_validation import block_errors, blocked_k_fold
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.models import CFM, CVFM, FrictionModel
 from nfriction.friction.neurofuzzy import NFCVFM
-from nfriction.papers.afem.models import ACVFM
+from nfriction.papers.afem.adaptive import ACVFM
 from nfriction.signals import quantise
 from tests.fitting.recordings import F64, pendulum, swing
 

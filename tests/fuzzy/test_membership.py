@@ -1,4 +1,4 @@
-"""Memberships: where they are one half, that they stay in [0, 1], ranges and coverage."""
+"""Memberships: where they are one half, that they stay in [0, 1], and ranges."""
 
 import math
 
@@ -12,7 +12,6 @@ from nfriction.fuzzy.membership import (
     SHAPES,
     FuzzySet,
     bell,
-    coverage,
     gaussian,
     left_shoulder,
     log_bell,
@@ -95,11 +94,6 @@ def test_trapezoid_with_a_cliff() -> None:
     x = torch.tensor([-0.1, 0.0, 0.5, 1.0, 1.5, 2.0, 2.1], dtype=FLOAT64)
     held = trapezoid(x, t(0.0), t(0.0), t(1.0), t(2.0))
     assert held.tolist() == [0, 1, 1, 1, 0.5, 0, 0]
-
-
-def test_coverage_is_the_least_of_the_largest() -> None:
-    held = torch.tensor([[0.9, 0.1], [0.3, 0.4], [0.0, 1.0]], dtype=FLOAT64)
-    assert coverage(held).item() == 0.4
 
 
 def test_sets_from_ranges_fall_alike_at_the_ends_of_their_range() -> None:

@@ -12,11 +12,11 @@ import pytest
 import torch
 
 from nfriction import PendulumChain, __version__, rollout, score
+from nfriction.friction import model_by_name
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.models import LFM, NCFM, NLFM, FrictionModel
 from nfriction.friction.neurofuzzy import NFLFM, NFNLFM, NeuroFuzzy
-from nfriction.friction.__init__ import model_by_name
 from nfriction.io.model_file import (
     ModelFileError,
     load,

@@ -22,7 +22,7 @@ STAGES = ["train_neurofuzzy.py", "--seconds", "1", "--windows", "0.5", "--max-st
           "--model", "NFNCFM"]  # fmt: skip
 REPRODUCE = """
 import sys
-from nfriction.papers.reproduction.run import reproduce
+from nfriction.papers.reproduction.stages import reproduce
 from nfriction.papers.reproduction.workspace import Settings
 if __name__ == "__main__":
     reproduce(sys.argv[1], Settings(
@@ -107,7 +107,7 @@ class Kept:
             if path.suffix == ".json":
                 json.loads(path.read_text())  # none is half of one
             if path.name.endswith("-search.json"):
-                state = SearchState.from_dict(json.loads(path.read_text())["result"])
+                state = SearchState(**json.loads(path.read_text())["result"])
                 assert state.evaluations >= self.evaluations
                 self.evaluations = state.evaluations
             # The result is written anew by a run that only reads its stages.

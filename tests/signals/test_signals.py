@@ -18,6 +18,7 @@ from nfriction.signals import (
     count_seen,
     frequency_counting,
     kalman_smoother,
+    period_counting,
     quantise,
 )
 
@@ -154,10 +155,10 @@ def test_quantise_is_nearest_and_idempotent(q: float, counts: int, offset: float
 
 
 @pytest.mark.parametrize("speed", [-3.1, -0.2, 0.05, 0.9, 40.0])
-def test_frequency_counting_of_a_steady_turn(speed: float) -> None:
+def test_period_counting_of_a_steady_turn(speed: float) -> None:
     time = np.arange(4000) * 1e-3
     q = quantise(speed * time[:, None] + 0.01, COUNTS)
-    found = frequency_counting(time, q, COUNTS)[1000:, 0]
+    found = period_counting(time, q, COUNTS)[1000:, 0]
     # An edge is known to one sample: between edges that lie a time T apart the speed is off by at
     # most a share 1 ms / T; faster than a count a sample, by a count in 1 ms.
     share = 1e-3 * abs(speed) / QUANTUM
@@ -167,26 +168,26 @@ def test_frequency_counting_of_a_steady_turn(speed: float) -> None:
     assert abs(found.mean() - speed) < 0.02 * abs(speed)
 
 
-def test_latched_edge_times_make_frequency_counting_exact() -> None:
+def test_latched_edge_times_make_period_counting_exact() -> None:
     speed, time = 2.3, np.arange(1000) * 1e-3
     q = speed * time[:, None]
     edge = (np.floor(q / QUANTUM - 0.5) + 0.5) * QUANTUM / speed
-    found = frequency_counting(time, q, COUNTS, edge_time=np.maximum(edge, 0))
+    found = period_counting(time, q, COUNTS, edge_time=np.maximum(edge, 0))
     np.testing.assert_allclose(found[10:], speed, rtol=1e-9)
     with pytest.raises(ValueError, match="`edge_time` must be shaped like"):
-        frequency_counting(time, q, COUNTS, edge_time=edge[:-1])
+        period_counting(time, q, COUNTS, edge_time=edge[:-1])
 
 
-def test_frequency_counting_falls_to_zero_at_rest_and_ignores_dither() -> None:
+def test_period_counting_falls_to_zero_at_rest_and_ignores_dither() -> None:
     time = np.arange(3000) * 1e-3
     moving = np.minimum(time, 1.0)[:, None]
-    found = frequency_counting(time, quantise(moving, COUNTS), COUNTS)[:, 0]
+    found = period_counting(time, quantise(moving, COUNTS), COUNTS)[:, 0]
     rest = time > 1.1
     assert np.all(np.diff(found[rest]) < 0)
     # No edge for t seconds: at most one count in that time; the last edge lies at most at 1 s.
     assert np.all(found[rest] <= QUANTUM / (time[rest] - 1.0) * (1 + 1e-12))
     dither = QUANTUM * (np.arange(3000) % 2)[:, None]
-    assert np.all(frequency_counting(time, dither, COUNTS)[2:] == 0)
+    assert np.all(period_counting(time, dither, COUNTS)[2:] == 0)
 
 
 # --- the causal way --------------------------------------------------------------------------
@@ -409,3 +410,27 @@ def test_a_count_is_seen_where_changes_repeat():
         np.testing.assert_allclose(count_seen(q), quantum, rtol=0.02)
     # Windows have no change from one to the next.
     np.testing.assert_allclose(count_seen(read[:3600].reshape(9, 400, 2)), quantum)
+
+
+@pytest.mark.parametrize("interval", [0.005, 0.02])
+def test_frequency_counting_resolves_a_count_over_its_interval(interval: float) -> None:
+    time = np.arange(4000) / 1000
+    resolution = 2 * np.pi / COUNTS / interval
+    for speed in (50.0, -3.0, 0.4 * resolution):
+        found = frequency_counting(time, speed * time[:, None], COUNTS, interval=interval)[100:, 0]
+        assert np.abs(found - speed).max() <= resolution * (1 + 1e-6)
+        np.testing.assert_allclose(found / resolution, np.rint(found / resolution), atol=1e-6)
+        assert found.mean() == pytest.approx(speed, rel=0.02)
+    # Slower than that it jumps between zero and one count; edges that are timed do not.
+    assert set(np.rint(found / resolution)) == {0.0, 1.0}
+    timed = period_counting(time, speed * time[:, None], COUNTS)[1000:, 0]
+    assert np.abs(timed - speed).max() < 0.1 * np.abs(found - speed).max()
+
+
+def test_frequency_counting_starts_at_zero_and_needs_an_interval() -> None:
+    time = np.arange(100) / 1000
+    found = frequency_counting(time, 10.0 * time[:, None], COUNTS)
+    assert found[0] == 0.0
+    assert np.abs(found[1:, 0] - 10.0).max() < 2 * np.pi / COUNTS / 1e-3
+    with pytest.raises(ValueError, match="interval"):
+        frequency_counting(time, time[:, None], COUNTS, interval=0.0)

@@ -1,5 +1,6 @@
 """The scripts that train: what they write, and that an interruption changes no result."""
 
+import importlib
 import json
 import runpy
 import signal
@@ -12,11 +13,13 @@ from pathlib import Path
 import pytest
 
 from nfriction import load
+from nfriction.friction import model_names
 from nfriction.io.model_file import load_info
-from nfriction.papers.reproduction import training
 
 TRAINERS = Path(__file__).resolve().parents[2] / "trainers"
+sys.path.insert(0, str(TRAINERS))  # as when a script of that folder runs
 SCRIPTS = sorted(path.name for path in TRAINERS.glob("train_*.py"))
+common = importlib.import_module("common")
 QUICK = ["--seconds", "1", "--windows", "0.5", "--max-steps", "2"]
 SEARCH = ["train_constant.py", "--twin", "rtip", "--seconds", "2", "--model", "LFM",
           "--method", "pattern", "--horizon", "1", "--max-evaluations", "400"]  # fmt: skip
@@ -61,10 +64,16 @@ def test_a_model_is_trained_written_and_read_by_resume(
     assert (tmp_path / "NCFM.json").read_bytes() == model
 
 
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_every_offered_model_exists(script: str) -> None:
+    offered = runpy.run_path(str(TRAINERS / script))["MODELS"]
+    assert set(offered) <= set(model_names())
+
+
 def test_checkpoints_of_other_options_are_refused(tmp_path: Path) -> None:
     def start(*words: str) -> None:
-        given = training.parser("").parse_args([*words, "--out", str(tmp_path)])
-        training.checkpoints(given)
+        given = common.parser("").parse_args([*words, "--out", str(tmp_path)])
+        common.checkpoints(given)
 
     start("--seed", "3")
     start("--seed", "3", "--resume")
@@ -85,7 +94,7 @@ def test_recordings_need_a_rig(tmp_path: Path) -> None:
     ("script", "model", "options"),
     [
         ("train_adaptive.py", "ANCFM", []),
-        ("train_neurofuzzy.py", "NFNCFM", []),
+        ("train_neurofuzzy.py", "NFNCFM", ["--terms", "3", "2", "--units", "4"]),
         ("train_neurofuzzy.py", "NFNCFM", ["--procedure", "papers", "--samples", "200"]),
     ],
 )

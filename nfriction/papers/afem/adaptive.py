@@ -1,4 +1,4 @@
-"""Coefficients by class of acceleration: low, medium, high."""
+"""Coefficients by class of acceleration (low, medium, high), and the models that have them."""
 
 import math
 from collections.abc import Sequence
@@ -7,8 +7,9 @@ from typing import Any, Final
 import torch
 from torch import Tensor
 
+from nfriction.friction import laws
 from nfriction.friction.coefficients import Tabulated
-from nfriction.friction.laws import Law
+from nfriction.friction.models import NamedModel
 from nfriction.friction.parameters import Sensitivity
 
 CLASSES = ("low", "medium", "high")
@@ -70,7 +71,7 @@ class Adaptive(Tabulated):
 
     def __init__(
         self,
-        law: Law,
+        law: laws.Law,
         joints: int,
         initial: Tensor | Sequence | None = None,
         *,
@@ -244,3 +245,46 @@ class Adaptive(Tabulated):
             mean = [f"{n}={v:.4g}" for n, v in zip(self.coefficient_names, row, strict=True)]
             sets.append(f"{name} {', '.join(mean)}")
         return f"joints={self.joints}, mean of {'; '.join(sets)}"
+
+
+class AdaptiveModel(NamedModel):
+    """A law with constant coefficients for each class of acceleration: low, medium, high.
+
+    Args:
+        joints, v_smooth: see `NamedModel`.
+        initial: start values in SI, shape (joint, class, coefficient), (joint, coefficient) or
+            (coefficient,).
+        options: `hysteresis`, `time_constant` and `sample_time`, see `Adaptive`.
+    """
+
+    make_schedule = Adaptive
+
+
+class ANCFM(AdaptiveModel):
+    """Viscous friction, one constant for each class of acceleration (TLRIP paper)."""
+
+    definition = laws.VISCOUS
+
+
+class ACFM(AdaptiveModel):
+    """Coulomb friction, F_c for each class of acceleration."""
+
+    definition = laws.COULOMB
+
+
+class ACVFM(AdaptiveModel):
+    """Coulomb plus viscous friction, F_c and F_v for each class of acceleration."""
+
+    definition = laws.COULOMB_VISCOUS
+
+
+class ALFM(AdaptiveModel):
+    """Viscous plus load-dependent Coulomb friction, B and C for each class (TLRIP paper)."""
+
+    definition = laws.LINEAR
+
+
+class ANLFM(AdaptiveModel):
+    """Five constants f_o, f_c, f_v, f_a, f_b for each class of acceleration (TLRIP paper)."""
+
+    definition = laws.NONLINEAR

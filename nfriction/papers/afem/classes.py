@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,9 +15,6 @@ from torch import Tensor
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive, peak_envelope
 from nfriction.recording import Recording
 from nfriction.signals import Motion
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 Array = NDArray[np.float64]
 # By recording, by joint: (class, start [s], end [s]).
@@ -34,10 +31,10 @@ DYNAMIC_RANGE = 1e-2
 
 @dataclass(frozen=True)
 class ClassOptions:
-    """Search for the classes, and the prior of their coefficients.
+    """Classes, found or given, and the prior of their coefficients.
 
     Attributes:
-        thresholds: given ones [rad/s^2], (joint, 2) or (2,), instead of searched ones.
+        thresholds: given ones [rad/s^2], (joint, 2) or (2,).
         intervals: given ones, by recording and joint; samples outside belong to the nearest.
         window: length of the moving window [s], longer than half a swing.
         least: a class with less data than this takes its neighbour's coefficients [s].
@@ -89,31 +86,19 @@ class AccelerationClasses:
         """Time intervals by recording and joint: (class, start, end) [s]."""
         found: dict[str, dict[str, list[tuple[str, float, float]]]] = {}
         for name, time, labels in zip(self.recordings, self.times, self.labels, strict=True):
-            found[name] = {}
-            for joint, known in zip(self.joints, labels.T.numpy(), strict=True):
-                edges = [0, *(np.flatnonzero(np.diff(known)) + 1).tolist(), len(known) - 1]
-                found[name][joint] = [
-                    (CLASSES[known[a]], float(time[a]), float(time[b]))
-                    for a, b in pairwise(edges)
-                    if b > a
-                ]
+            columns = zip(self.joints, labels.T.numpy(), strict=True)
+            found[name] = {joint: class_intervals(time, known) for joint, known in columns}
         return found
 
-    def table(self) -> pd.DataFrame:
-        """Intervals as rows: recording, joint, class, start_s, end_s.
 
-        References:
-            TLRIP paper, Table 6.
-        """
-        import pandas as pd
-
-        rows = [
-            (recording, joint, *interval)
-            for recording, joints in self.intervals().items()
-            for joint, intervals in joints.items()
-            for interval in intervals
-        ]
-        return pd.DataFrame(rows, columns=["recording", "joint", "class", "start_s", "end_s"])
+def class_intervals(
+    time: Array, labels: NDArray[np.integer[Any]]
+) -> list[tuple[str, float, float]]:
+    """Class, start and end [s] of every run of equal labels (sample,): a joint in Table 6."""
+    edges = [0, *(np.flatnonzero(np.diff(labels)) + 1).tolist(), len(labels) - 1]
+    return [
+        (CLASSES[labels[a]], float(time[a]), float(time[b])) for a, b in pairwise(edges) if b > a
+    ]
 
 
 def find_classes(
@@ -173,11 +158,7 @@ def find_classes(
 
 
 def otsu(values: Array, bins: int = 128) -> tuple[float, float]:
-    """Two thresholds that divide values into three classes of least variance.
-
-    References:
-        N. Otsu, IEEE Trans. SMC 9 (1979), for three classes.
-    """
+    """Two thresholds that divide values into three classes of least variance (Otsu, 1979)."""
     count, edges = np.histogram(values, bins)
     centre = 0.5 * (edges[:-1] + edges[1:])
     # Cumulative sums, so that every pair of thresholds costs the same few operations.

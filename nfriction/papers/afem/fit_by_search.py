@@ -5,9 +5,10 @@ Every poll, and every gradient, is one batch of simulated candidates.
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -26,50 +27,47 @@ from nfriction.friction.coefficients import Constant, Tabulated
 from nfriction.friction.models import FrictionModel
 from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.afem.classes import DEFAULTS, ClassOptions
-from nfriction.papers.afem.fit_adaptive import like_start
-from nfriction.papers.afem.given_classes import ClassFit, PositionError
-from nfriction.papers.afem.pattern_search import PatternSearch, PatternState, VariableScaling
+from nfriction.papers.afem.fit_adaptive import ClassFit, PositionError, like_start
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
 SearchMethod = Literal["pattern", "sqp"]
+# First mesh of a pattern search, and its factor after a poll without a better point.
+INITIAL_MESH, CONTRACTION = 0.25, 0.5
 # Forward differences of a smooth simulation: half the digits.
 DIFFERENCE = 1e-6
 # Cost of a diverged candidate in a gradient, relative to the start: finite, but beyond all others.
 DIVERGED = 1e6
 # Lower bound of a logarithmic variable, in place of zero.
 TINY = 1e-300
+CONVERGED = "No poll point is better and the mesh is as fine as asked for."
+LIMIT = "The limit of evaluations was reached."
+STOPPED = "Stopped by the callback or by an interrupt; the best point found is kept."
 
 
 @dataclass(frozen=True)
 class SearchState:
-    """An unfinished search in plain types, to resume it.
+    """An unfinished search in plain types, ready for JSON, to resume it.
+
+    A pattern search continues bit for bit; SQP restarts at the best point.
 
     Attributes:
         method: `"pattern"` or `"sqp"`.
-        vector: best parameter vector.
-        value: its cost.
-        evaluations: candidates simulated so far.
-        pattern: resumes a pattern search bit for bit; None for SQP, which restarts at the vector.
+        point: best point, in the search's coordinates (see `Box`).
+        value: its cost; infinite before the first evaluation.
+        evaluations, iterations: candidates simulated and steps made so far.
+        mesh: mesh size of a pattern search, in the same coordinates.
+        step: last successful move of a pattern search; zero if the last poll found nothing.
     """
 
     method: SearchMethod
-    vector: list[float]
+    point: list[float]
     value: float
     evaluations: int
-    pattern: PatternState | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain types, ready for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, state: Mapping[str, Any]) -> SearchState:
-        """Inverse of `to_dict`, also after a trip through JSON."""
-        pattern = state["pattern"]
-        known = None if pattern is None else PatternState.from_dict(pattern)
-        return cls(**{**state, "pattern": known})
+    iterations: int = 0
+    mesh: float = INITIAL_MESH
+    step: Sequence[float] = ()
 
 
 @dataclass(frozen=True)
@@ -86,10 +84,9 @@ class SearchOptions:
         seed: of the pattern's rotations.
         threads: candidates are divided among this many; all processors by default.
         state: of an earlier search, to resume it.
-        progress: show a bar (pattern search).
 
     Raises:
-        ValueError: if there is no such method.
+        ValueError: if there is no such method, or the tolerance is not positive.
     """
 
     method: SearchMethod = "pattern"
@@ -99,18 +96,19 @@ class SearchOptions:
     seed: int = 0
     threads: int | None = None
     state: SearchState | None = None
-    progress: bool = False
 
     def __post_init__(self) -> None:
         if self.method not in get_args(SearchMethod):
             raise ValueError(
                 f"`method` must be one of {get_args(SearchMethod)}, got {self.method!r}."
             )
+        if not self.tolerance > 0:
+            raise ValueError(f"`tolerance` must be positive, got {self.tolerance}.")
 
 
 @dataclass(frozen=True)
 class SearchResult:
-    """Outcome of a search: the best vector, and in words why it ended there."""
+    """Outcome of a search: the best vector, its cost, and in words why the search ended there."""
 
     vector: Tensor
     value: float
@@ -119,14 +117,18 @@ class SearchResult:
     iterations: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Box:
-    """The variables of a search.
+    """The variables of a search, and their map to coordinates of order 1 in which it works.
 
     Attributes:
         start, lower, upper: (parameter,); equal bounds keep a parameter as it is.
         scale: a change that counts as large; in decades where logarithmic.
-        logarithmic: variables searched by their logarithm, bool.
+        logarithmic: variables searched by their logarithm, bool; they must be positive.
+
+    Raises:
+        ValueError: if bounds cross, a scale is not positive, or the start is not finite, or not
+            positive where logarithmic.
     """
 
     start: Tensor
@@ -135,24 +137,49 @@ class Box:
     scale: Tensor
     logarithmic: Tensor
 
+    def __post_init__(self) -> None:
+        if not (self.lower <= self.upper).all():
+            raise ValueError("`lower` must not exceed `upper`, and neither may be NaN.")
+        if not (torch.isfinite(self.scale) & (self.scale > 0)).all():
+            raise ValueError(f"`scale` must be positive and finite, got {self.scale.tolist()}.")
+        if not (torch.isfinite(self.start) & ((self.start > 0) | ~self.logarithmic)).all():
+            raise ValueError(
+                f"`start` must be finite, and positive where logarithmic, got "
+                f"{self.start.tolist()}."
+            )
+
     @property
     def free(self) -> Tensor:
         """Variables that the search may change, bool."""
         return self.lower < self.upper
 
-    def whole(self, part: Tensor) -> Tensor:
-        """Vectors (..., parameter) from their free variables (..., free)."""
-        vectors = self.start.expand(*part.shape[:-1], -1).clone()
-        vectors[..., self.free] = part
+    @property
+    def ends(self) -> tuple[Tensor, Tensor]:
+        """Lower and upper bounds in the search's coordinates, (free,)."""
+        return self.to_unit(self.lower), self.to_unit(self.upper)
+
+    def to_unit(self, vector: Tensor) -> Tensor:
+        """The search's coordinates (free,) of a vector (parameter,)."""
+        x, log = vector[self.free], self.logarithmic[self.free]
+        return torch.where(log, x.clamp_min(TINY).log10(), x) / self.scale[self.free]
+
+    def from_unit(self, points: Tensor) -> Tensor:
+        """Vectors (..., parameter) of points (..., free) in the search's coordinates."""
+        free, (low, high) = self.free, self.ends
+        log, lower, upper = self.logarithmic[free], self.lower[free], self.upper[free]
+        lower = torch.where(log, lower.clamp_min(TINY), lower)
+        x = points * self.scale[free]
+        x = torch.where(log, 10.0**x, x).clamp(lower, upper)
+        # A variable at its bound is there to the last bit, however the logarithm is rounded.
+        x = torch.where(points <= low, lower, x)
+        x = torch.where(points >= high, upper, x)
+        vectors = self.start.expand(*points.shape[:-1], -1).clone()
+        vectors[..., free] = x
         return vectors
 
-    def scaling(self) -> VariableScaling:
-        """Scaling of the free variables."""
-        free, log = self.free, self.logarithmic
-        lower = torch.where(log, self.lower.clamp_min(TINY), self.lower)
-        return VariableScaling.build(
-            self.start[free], lower[free], self.upper[free], self.scale[free], log[free]
-        )
+    def tensor(self, point: Sequence[float]) -> Tensor:
+        """A point of a `SearchState` as a tensor."""
+        return torch.tensor(point, dtype=self.start.dtype)
 
 
 Cost = Callable[[Tensor], Tensor]
@@ -165,7 +192,7 @@ def search(
     """Minimise a cost within bounds by pattern search or sequential quadratic programming.
 
     Args:
-        cost: values (m,) of candidates (m, parameter).
+        cost: values (m,) of candidates (m, parameter); any that is not finite is rejected.
         box: start, bounds and scales.
         options: method, limits and the state to resume.
         callback: called after every iteration; True stops.
@@ -173,35 +200,88 @@ def search(
     Raises:
         ValueError: if the state is another search's.
     """
-    state = options.state
-    if state is not None and (state.method, len(state.vector)) != (options.method, len(box.start)):
+    state, size = options.state, int(box.free.sum())
+    if state is not None and (state.method, len(state.point)) != (options.method, size):
         raise ValueError(
-            f"`state` is of {state.method!r} with {len(state.vector)} parameters, the search is "
-            f"{options.method!r} with {len(box.start)}."
+            f"`state` is of {state.method!r} with {len(state.point)} variables, the search is "
+            f"{options.method!r} with {size}."
         )
     method = _sqp if options.method == "sqp" else _pattern
     return method(cost, box, options, callback or (lambda _: None))
 
 
 def _pattern(cost: Cost, box: Box, options: SearchOptions, callback: Callback) -> SearchResult:
-    scaling, state = box.scaling(), options.state
+    """Generalised pattern search, every poll one batch of candidates.
 
-    def step(at: PatternState) -> bool | None:
-        best = box.whole(scaling.from_unit(scaling.tensor(at.x)))
-        # A copy: the live state changes with the next iteration.
-        kept = PatternState.from_dict(at.to_dict())
-        return callback(SearchState("pattern", best.tolist(), at.value, at.evaluations, kept))
+    An iteration polls x ± mesh along every axis and one point beyond x along the last successful
+    step. It moves to the best of these and doubles the mesh if that is better than x, else it
+    contracts the mesh. Points outside the bounds are moved onto them. The axes are turned at random
+    in every iteration, so that a ridge or a kink askew to them cannot stop the search.
 
-    result = PatternSearch(
-        max_evaluations=options.max_evaluations, mesh_tolerance=options.tolerance, rotate=True,
-        speculate=True, seed=options.seed, progress=options.progress,
-    ).minimise(
-        lambda part: cost(box.whole(part)), box.start[box.free], lower=scaling.lower,
-        upper=scaling.upper, scale=scaling.scale, logarithmic=scaling.logarithmic,
-        state=None if state is None else state.pattern, callback=step,
-    )  # fmt: skip
-    value, iterations = result.state.value, result.state.iterations
-    return SearchResult(box.whole(result.x), value, result.converged, result.message, iterations)
+    References:
+        V. Torczon, SIAM J. Optim. 7 (1997); C. Audet and J. E. Dennis, SIAM J. Optim. 17 (2006).
+    """
+    start = box.to_unit(box.start.clamp(box.lower, box.upper))
+    poll = 2 * len(start) + 1
+    state = options.state or SearchState(
+        "pattern", start.tolist(), math.inf, 0, step=[0.0] * len(start)
+    )
+    message = CONVERGED
+    try:
+        if state.evaluations == 0:
+            value = _values(cost, box, box.tensor(state.point)[None])[0]
+            state = replace(state, value=float(value), evaluations=1)
+        while state.mesh >= options.tolerance:
+            # A partial poll would depend on the limit, and a resumed search would differ from a
+            # whole one.
+            if state.evaluations + poll > options.max_evaluations:
+                message = LIMIT
+                break
+            state = _polled(cost, box, state, options.seed)
+            if callback(state):
+                message = STOPPED
+                break
+    except KeyboardInterrupt:
+        message = STOPPED
+    if not math.isfinite(state.value) and message == CONVERGED:
+        message = "The cost is finite nowhere that was tried."
+    vector = box.from_unit(box.tensor(state.point))
+    return SearchResult(vector, state.value, message == CONVERGED, message, state.iterations)
+
+
+def _polled(cost: Cost, box: Box, state: SearchState, seed: int) -> SearchState:
+    x, last = box.tensor(state.point), box.tensor(state.step)
+    # A generator of its own per iteration: a resumed search needs no generator state.
+    random = torch.Generator().manual_seed(seed * 1_000_003 + state.iterations)
+    axes, triangle = torch.linalg.qr(
+        torch.randn(len(x), len(x), generator=random, dtype=torch.float64)
+    )
+    # The sign makes the factorisation unique, and so the rotations uniform.
+    axes = axes * triangle.diagonal().sign()
+    steps = state.mesh * torch.cat([axes, -axes])
+    # The direction of the last success comes first: ties then keep going the same way.
+    steps = steps[(steps @ last).argsort(descending=True, stable=True)]
+    # Projected, not rejected: a minimum at a bound is approached along it.
+    candidates = (x + torch.cat([last[None], steps])).clamp(*box.ends)
+    values = _values(cost, box, candidates)
+    best = int(values.argmin())
+    better = bool(values[best] < state.value)
+    return replace(
+        state,
+        point=candidates[best].tolist() if better else state.point,
+        value=float(values[best]) if better else state.value,
+        # A direction that failed once must not be preferred.
+        step=(candidates[best] - x).tolist() if better else [0.0] * len(x),
+        # A mesh beyond the range of the variables would only poll the bounds.
+        mesh=min(2.0 * state.mesh, 1.0) if better else CONTRACTION * state.mesh,
+        evaluations=state.evaluations + len(candidates),
+        iterations=state.iterations + 1,
+    )
+
+
+def _values(cost: Cost, box: Box, points: Tensor) -> Tensor:
+    values = cost(box.from_unit(points))
+    return torch.where(torch.isfinite(values), values, math.inf)
 
 
 # SLSQP ignores the result of its callback; only an exception ends it.
@@ -213,25 +293,24 @@ def _sqp(cost: Cost, box: Box, options: SearchOptions, callback: Callback) -> Se
     """SciPy's SLSQP with forward differences, every gradient one batch of candidates."""
     from scipy.optimize import minimize  # slow to import
 
-    scaling, state = box.scaling(), options.state
-    lower, upper = scaling.to_unit(scaling.lower), scaling.to_unit(scaling.upper)
-    start = box.start if state is None else torch.tensor(state.vector, dtype=box.start.dtype)
+    (lower, upper), state = box.ends, options.state
+    vector = box.start if state is None else box.from_unit(box.tensor(state.point))
+    reference, start = float(cost(vector[None])[0]), box.to_unit(vector)
     # SLSQP returns its last iterate, which need not be the best point that it evaluated.
-    least, best, iterations = np.inf, start, 0
+    least, best, iterations = math.inf, start, 0
     evaluations = 0 if state is None else state.evaluations
-    reference = float(cost(start[None])[0])
 
     def value_and_gradient(u: np.ndarray) -> tuple[float, np.ndarray]:
         nonlocal least, best, evaluations
         point = torch.as_tensor(u)
         # Backward at an upper bound, where forward would not move.
         step = torch.where(point + DIFFERENCE > upper, -DIFFERENCE, DIFFERENCE)
-        vectors = box.whole(scaling.from_unit(torch.cat([point[None], point + torch.diag(step)])))
-        values = cost(vectors).nan_to_num(np.inf, np.inf)
-        evaluations += len(vectors)
+        points = torch.cat([point[None], point + torch.diag(step)])
+        values = cost(box.from_unit(points)).nan_to_num(math.inf, math.inf)
+        evaluations += len(points)
         at = int(values.argmin())
         if values[at] < least:
-            least, best = float(values[at]), vectors[at]
+            least, best = float(values[at]), points[at]
         # In units of the start, so that the tolerance is relative.
         values = (values / reference).clamp_max(DIVERGED)
         return float(values[0]), ((values[1:] - values[0]) / step).numpy()
@@ -239,25 +318,23 @@ def _sqp(cost: Cost, box: Box, options: SearchOptions, callback: Callback) -> Se
     def step(xk: np.ndarray) -> None:
         nonlocal iterations
         iterations += 1
-        at = SearchState("sqp", best.tolist(), least, evaluations)
+        state = SearchState("sqp", best.tolist(), least, evaluations, iterations)
         # SciPy limits iterations, but simulations are what takes time.
-        if evaluations >= options.max_evaluations or callback(at):
+        if evaluations >= options.max_evaluations or callback(state):
             raise _StoppedError
 
     # SLSQP tests the change of one step, which is smaller than the distance to the minimum.
     settings: Any = {"ftol": 1e-2 * options.tolerance, "maxiter": 1000}
     try:
         end = minimize(
-            value_and_gradient, scaling.to_unit(start[box.free]).numpy(), jac=True, method="SLSQP",
-            bounds=list(zip(lower.tolist(), upper.tolist(), strict=True)), callback=step,
-            options=settings,
+            value_and_gradient, start.numpy(), jac=True, method="SLSQP", callback=step,
+            bounds=list(zip(lower.tolist(), upper.tolist(), strict=True)), options=settings,
         )  # fmt: skip
         converged, message = bool(end.success), str(end.message)
-    except _StoppedError:
-        converged, message = False, "Stopped by the callback or the limit of evaluations."
-    except KeyboardInterrupt:
-        converged, message = False, "Interrupted; the best point found is kept."
-    return SearchResult(best, least, converged, message, iterations)
+    except (_StoppedError, KeyboardInterrupt):
+        converged = False
+        message = LIMIT if evaluations >= options.max_evaluations else STOPPED
+    return SearchResult(box.from_unit(best), least, converged, message, iterations)
 
 
 def fit_by_search(
@@ -285,15 +362,15 @@ def fit_by_search(
         callback: called after every iteration; True stops.
 
     Returns:
-        The fit.
+        The fit; read `converged` and `status`.
 
     Raises:
         ValueError: if the model's coefficients are neither constant nor adaptive, or recordings
             and plant do not match.
 
     References:
-        Second paper: NCFM by sequential quadratic programming, LFM and NLFM by pattern search,
-        on 80 s; TLRIP paper, AFEM.
+        RTIP paper: NCFM by sequential quadratic programming, LFM and NLFM by pattern search, on
+        80 s; TLRIP paper, AFEM.
     """
     schedule = model.schedule
     if not isinstance(schedule, Constant | Adaptive):
@@ -319,7 +396,7 @@ def fit_by_search(
     step = max(r.longest_step for r in task.recordings)
     error = PositionError(
         constant.plant, varied, windows, task.measurement,
-        integration_substeps(plant, varied, step), threads=options.threads or available_threads(),
+        integration_substeps(plant, varied, step), threads=options.threads or _processors(),
         drive=None if by_class is None else by_class.drive(),
     )  # fmt: skip
     box = _box(table, varied, constant, task)
@@ -366,7 +443,7 @@ def _box(table: Tabulated, model: FrictionModel, constant: FitResult, task: FitT
     return Box(table.parameter_vector(), lower, upper, scale.reshape(-1), log.reshape(-1))
 
 
-def available_threads() -> int:
+def _processors() -> int:
     """Processors that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))

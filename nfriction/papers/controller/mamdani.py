@@ -1,72 +1,17 @@
 """The papers' fuzzy controller: rule table, min and max, centroid; differentiable and batched."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from importlib import resources
 
 import torch
 from torch import Tensor, nn
 
-from nfriction.fuzzy.membership import FuzzySet, bell, coverage, trapezoid, two_sided_gaussian
-from nfriction.papers.controller.rules import ANY, SI_FACTOR, RuleBase, Variable, parse_rules
+from nfriction.fuzzy.membership import FuzzySet, bell, trapezoid, two_sided_gaussian
+from nfriction.papers.controller.rules import ANY, SI_FACTOR, RuleBase, parse_rules
 
 _SAMPLES_AT_ONCE = 512  # the clipped output sets of this many fit a core's cache
 # Families of membership functions.
 _GAUSSIAN, _BELL, _TRAPEZOID = 0, 1, 2
-_POINTS = 2001
-COVERED = 0.5
-"""Membership that some set should have everywhere."""
-
-
-@dataclass(frozen=True)
-class InputCoverage:
-    """Coverage of one input.
-
-    Attributes:
-        name, unit: of the variable.
-        least: smallest of the largest memberships over the universe.
-        gaps: intervals of the universe, in `unit`, where no set holds at 0.5.
-        poorly_covered: share of the samples that fall where no set holds at 0.5.
-        outside: share of the samples beyond the universe.
-    """
-
-    name: str
-    unit: str
-    least: float
-    gaps: tuple[tuple[float, float], ...]
-    poorly_covered: float
-    outside: float
-
-
-@dataclass(frozen=True)
-class RuleReport:
-    """Gaps in the coverage of the inputs, and rules never fired by a recording.
-
-    Attributes:
-        inputs: one for each input.
-        fired: strength from which a rule counts as fired.
-        never_fired: conditions of the rules that never do.
-        rules, samples: numbers of them.
-    """
-
-    inputs: tuple[InputCoverage, ...]
-    fired: float
-    never_fired: tuple[tuple[str, ...], ...]
-    rules: int
-    samples: int
-
-    def __str__(self) -> str:
-        lines = [f"{self.samples} samples, {self.rules} rules"]
-        for entry in self.inputs:
-            lines.append(
-                f"{entry.name} [{entry.unit}]: coverage at least {entry.least:.3f}, "
-                f"{entry.poorly_covered:.1%} of the samples below {COVERED}, "
-                f"{entry.outside:.1%} outside the universe"
-            )
-            lines += [f"  gap from {low:.6g} to {high:.6g}" for low, high in entry.gaps]
-        lines.append(f"{len(self.never_fired)} rules never reach a strength of {self.fired}")
-        lines += ["  " + " and ".join(condition) for condition in self.never_fired]
-        return "\n".join(lines)
 
 
 class LinguisticTerms(nn.Module):
@@ -172,26 +117,16 @@ class MamdaniController(nn.Module):
         return y.reshape(x.shape[:-1] + self.middle.shape)
 
     def rule_strengths(self, x: Tensor) -> Tensor:
-        """Strength of every rule (*batch, rules), for inputs (*batch, inputs) in own units."""
+        """Strength of every rule (*batch, rules), for inputs (*batch, inputs) in own units.
+
+        A recording never fires the rules whose largest strength over its samples is near zero.
+        """
         return self._rule_strengths(x).movedim(0, -1).reshape(x.shape[:-1] + self.weights.shape[:1])
 
     def memberships(self, x: Tensor) -> list[Tensor]:
         """Membership of every term, one (*batch, terms) for each input, in own units."""
         clamped = torch.clamp(x, self.lower, self.upper)
         return [terms(clamped[..., i]).movedim(0, -1) for i, terms in enumerate(self.terms)]
-
-    def report(self, qd: Tensor, qdd: Tensor, *, fired: float = 0.1) -> RuleReport:
-        """Gaps in the coverage of the sets, and rules that a recording never fires.
-
-        Args:
-            qd, qdd: velocity (either sign) [rad/s] and acceleration [rad/s^2] of one joint.
-            fired: strength from which a rule counts as fired.
-        """
-        # Rules are written over the speed: friction opposes motion in both directions alike.
-        x = torch.stack([qd.abs(), qdd], -1).reshape(-1, 2) / self.si_factor
-        return _rule_report(
-            self.rule_base, x, self.memberships(x), self.rule_strengths(x), fired=fired
-        )
 
     def _rule_strengths(self, x: Tensor) -> Tensor:
         """Strengths (rules, samples): the least membership of a rule's terms, times its weight."""
@@ -307,44 +242,3 @@ def _canonical(term: FuzzySet) -> tuple[int, tuple[float, ...]]:
     if term.shape == "triangle":
         return _TRAPEZOID, (p[0], p[1], p[1], p[2])
     return _TRAPEZOID, p
-
-
-def _rule_report(
-    rules: RuleBase, x: Tensor, memberships: list[Tensor], strengths: Tensor, *, fired: float
-) -> RuleReport:
-    """Report on samples `x` (samples, inputs) with their memberships and rule strengths."""
-    if len(x) == 0 or not bool(torch.isfinite(x).all()):
-        raise ValueError("the recording must have samples, all finite; drop the others first.")
-    inputs = tuple(
-        _input_coverage(variable, x[:, i], memberships[i])
-        for i, variable in enumerate(rules.inputs)
-    )
-    strongest = strengths.amax(0)
-    never = tuple(
-        rule.given
-        for rule, strength in zip(rules.rules, strongest.tolist(), strict=True)
-        if strength < fired
-    )
-    return RuleReport(inputs, fired, never, len(rules.rules), len(x))
-
-
-def _input_coverage(variable: Variable, x: Tensor, memberships: Tensor) -> InputCoverage:
-    low, high = variable.universe
-    universe = torch.linspace(low, high, _POINTS, dtype=torch.float64)
-    held = torch.stack([term(universe) for term in variable.sets], -1)
-    return InputCoverage(
-        name=variable.name,
-        unit=variable.unit,
-        least=float(coverage(held)),
-        gaps=_intervals(universe, held.amax(-1) < COVERED),
-        poorly_covered=float((memberships.amax(-1) < COVERED).double().mean()),
-        outside=float(((x < low) | (x > high)).double().mean()),
-    )
-
-
-def _intervals(universe: Tensor, inside: Tensor) -> tuple[tuple[float, float], ...]:
-    """First and last point of every run of True."""
-    # Padded, so that runs at either end have both edges.
-    edges = torch.nn.functional.pad(inside.long(), (1, 1)).diff()
-    starts, ends = (edges == 1).nonzero()[:, 0], (edges == -1).nonzero()[:, 0] - 1
-    return tuple(zip(universe[starts].tolist(), universe[ends].tolist(), strict=True))

@@ -1,7 +1,7 @@
 """Variable projection: least-squares placement of sets (or units), the output layer eliminated.
 
-For given sets the best output layer follows by linear least squares, so only the sets are left to
-search; the search is shorter and better conditioned than one over all parameters.
+Only the sets remain to be searched, which is shorter and better conditioned than a search over all
+parameters.
 """
 
 from __future__ import annotations
@@ -44,14 +44,10 @@ def project(layer: Anfis | RBFNetwork, x: Tensor, y: Tensor, steps: int) -> None
 
 
 class Projection:
-    """Squared errors of a layer as a function of its sets alone.
-
-    The layer's parameters are overwritten by every evaluation.
+    """Squared errors of a layer as a function of its sets alone; evaluations overwrite the layer.
 
     Args:
-        layer: of one group.
-        x: inputs, shape (samples, 1, inputs).
-        y: targets, shape (samples, 1, outputs).
+        layer, x, y: as in `project`.
         ridge: precision of the output layer around zero, over that of the errors.
     """
 
@@ -90,10 +86,7 @@ class Projection:
 
     @torch.no_grad()
     def cost(self, theta: Tensor) -> Tensor:
-        """Half the squares that the best output layer for the sets `theta` leaves.
-
-        The ridge's share is counted in. That output layer is written into the layer.
-        """
+        """Half the squares, with the ridge's, of the best output layer, which the layer takes."""
         w = flatten(trainable(self.layer)).clone()
         w[self.moving] = theta
         self._assign(w)

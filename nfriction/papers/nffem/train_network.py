@@ -77,7 +77,7 @@ class NetworkFit:
     Args:
         evidence: result in scaled units (inputs and outputs on [-1, 1]); log evidences of fits to
             the same samples can be compared.
-        scaling: between these and the samples' own units, of one group.
+        scaling: between these and the samples' own units.
     """
 
     evidence: EvidenceResult
@@ -241,14 +241,7 @@ def _check(network: nn.Module, x: Tensor, y: Tensor) -> None:
 
 
 class NetworkGroup:
-    """One group (joint) of a network in training, in scaled units.
-
-    Args:
-        network: of any number of groups; written to by `write_back` only.
-        group: which of them.
-        scaling: of all groups.
-        x, y: samples of all groups, scaled, (samples, groups, inputs) and (..., outputs).
-    """
+    """One group (joint) of a network in training, in scaled units; `x`, `y` are of all groups."""
 
     def __init__(
         self, network: FuzzyNetwork, group: int, scaling: Scaling, x: Tensor, y: Tensor
@@ -337,9 +330,9 @@ def _regularised(
 ) -> EvidenceResult:
     """Bayesian regularisation with a prior of its own for each kind of parameter."""
     parameters = trainable(layer)
+    # Each kind has a scale of its own, so the evidence weights each prior separately.
     groups: dict[str, list[str]] = {}
     for name in parameters:
-        # Each kind has a scale of its own, so the evidence weights each prior separately.
         groups.setdefault(_kind(name), []).append(name)
     # Frozen parameters have no prior.
     wanted = {name: value for name, value in prior.items() if name in parameters}

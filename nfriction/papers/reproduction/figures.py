@@ -1,6 +1,6 @@
 """The papers' figures from the results of a reproduction."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,28 +12,43 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from nfriction.evaluation.score import RMSE, Score
 from nfriction.io.atomic import atomic_write
 from nfriction.io.model_file import load
-from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.controller.mamdani import paper_controller
 from nfriction.papers.controller.rules import Variable
 from nfriction.papers.reproduction import tables
-from nfriction.papers.reproduction.stages import ADAPTIVE, LAWS, NEURO_FUZZY, SECOND_PAPER
+from nfriction.papers.reproduction.stages import (
+    ADAPTIVE,
+    EXPERIMENT,
+    LAWS,
+    NEURO_FUZZY,
+    SECOND_PAPER,
+)
 from nfriction.papers.reproduction.workspace import Array, Workspace
-from nfriction.plant import rigs
-from nfriction.plots import controller_surface, positions, rmse_bars, style
+from nfriction.papers.twin.mechanics import Links, simulate
+from nfriction.plant import PendulumChain, rigs
+from nfriction.plots import (
+    coefficients_over_time,
+    controller_surface,
+    positions,
+    rmse_bars,
+    style,
+    torque_over_velocity,
+)
 from nfriction.recording import Recording
+from nfriction.signals import Motion
 from nfriction.simulation.rollout import rollout
 
 DPI = 150
 SHOWN, SECOND_SHOWN = "test_hanging", "test_bent"
 """Held-out recordings that the figures show: the poses of the papers' own model checks."""
-INERTIA_SECONDS = 5.0
+INERTIA_SECONDS = 3.0
 """Beyond this a frictionless swing from upright shows rounding rather than inertia."""
+FULL_TENSOR = tuple((0.1 * izz, izz, izz, 0.0, 0.0, 0.0) for izz in (0.04, 0.05, 0.05))
+"""Ixx, Iyy, Izz, products of each link [kg m^2]: the printed Izz across, a tenth along it."""
 CLASS_COLOURS = {"low": "#eef3f7", "medium": "#cfe0ec", "high": "#a3c4dc"}
 _POINTS = 600  # of a membership's line
 
@@ -59,62 +74,152 @@ def draw_all(workspace: Workspace, *, progress: bool = False) -> list[Path]:
 
 def figures(workspace: Workspace) -> dict[str, Callable[[], Figure]]:
     """The function that draws each figure, by the name of its file."""
-    groups = {
-        f"fig_{11 + joint}_joint_{joint + 2}": partial(model_groups, workspace, joint)
-        for joint in range(3)
-    }
     seconds = {
         f"second_fig_{number}_{law}": partial(second_positions, workspace, law)
         for number, law in zip((5, 6, 7), LAWS, strict=True)
     }
     return {
         "fig_02_inertia": inertia_cases,
-        "fig_04_experiment": partial(experiment, workspace),
+        "fig_04_without_friction": partial(without_friction, workspace),
         "fig_07_memberships": controller_memberships,
-        "fig_08_surfaces": lambda: controller_surface(paper_controller(2)),
-        **groups,
-        "fig_14_rmse": partial(error_bars, workspace),
-        "second_fig_3_motion": partial(recorded_motion, workspace),
+        **{
+            f"fig_08_surfaces_joint_{joint}": partial(controller_surface, paper_controller(joint))
+            for joint in (2, 3, 4)
+        },
+        **{
+            f"fig_{number}_coefficients_{model}": partial(coefficients, workspace, model)
+            for number, model in zip((11, 12, 13), NEURO_FUZZY, strict=True)
+        },
+        f"fig_14_positions_{NEURO_FUZZY[-1]}": partial(best_positions, workspace),
+        "second_fig_3_free_arm": second_swing,
         **seconds,
-        "second_fig_8_rmse": lambda: rmse_bars(
+        "second_fig_8_torque": partial(second_torque, workspace),
+        "experiment_classes": partial(experiment, workspace),
+        **{
+            f"positions_joint_{joint + 2}": partial(model_groups, workspace, joint)
+            for joint in range(3)
+        },
+        "rmse": lambda: rmse_bars(tables.rmse(workspace, tables.NINE), "rad"),
+        "second_rmse": lambda: rmse_bars(
             tables.rmse(workspace, SECOND_PAPER).set_axis(list(LAWS)), "rad"
         ),
     }
 
 
 def inertia_cases() -> Figure:
-    """Frictionless swings of the TLRIP rig, a panel a joint, for three cases of inertia.
+    """Frictionless swings of the TLRIP rig with its arm free, a panel a joint.
 
-    Links as point masses, as slender rods with the printed Izz, and with a full tensor. With the
-    arm fixed the motion stays in a plane and only Izz enters, so the last two coincide.
+    Links as point masses, with the printed Izz alone, and with a full tensor (`FULL_TENSOR`; the
+    paper prints none). The last two nearly agree while the arm turns slowly, and part later.
 
     References:
         TLRIP paper, Fig. 2.
     """
-    izz = (0.04, 0.05, 0.05)
-    # Elements other than Izz are arbitrary: the figure shows that they do not matter.
-    full = [[0.1 * i, i, i, 0.0, 0.0, 0.0] for i in izz]
     cases = {
-        "inertia neglected": rigs.tlrip(inertia="none"),
-        "Izz only": rigs.tlrip(inertia="izz"),
-        "full tensor": rigs.tlrip(inertia=full),
+        "inertia neglected": rigs.tlrip("free", "none"),
+        "Izz only": rigs.tlrip("free", "izz"),
+        "full tensor": rigs.tlrip("free", FULL_TENSOR),
     }
-    q0 = torch.deg2rad(torch.tensor([20.0, 30.0, 40.0], dtype=torch.float64))
-    steps = round(INERTIA_SECONDS * 1000)
-    figure, axes = style.panels(3, 1, style.PAGE, 4.3, sharex=True)
-    looks = style.looks(cases)
+    return _swings(cases, INERTIA_SECONDS)
+
+
+def second_swing() -> Figure:
+    """Frictionless swing of the RTIP rig with its arm free, a panel a joint.
+
+    References:
+        RTIP paper, Fig. 3.
+    """
+    return _swings({"without friction": rigs.rtip("free")}, 2.0 * INERTIA_SECONDS)
+
+
+def _swings(plants: Mapping[str, PendulumChain], seconds: float) -> Figure:
+    """Joint positions of rigs with a free arm, released at 0, 20, 30, 40 degrees."""
+    q0 = torch.deg2rad(torch.tensor([0.0, 20.0, 30.0, 40.0], dtype=torch.float64))
+    figure, axes = style.panels(len(q0), 1, style.PAGE, 5.2, sharex=True)
+    looks = style.looks(plants)
     handles: list[Any] = []
-    # Later lines are thinner, so that lines that coincide can be distinguished.
-    for (label, plant), width in zip(cases.items(), (2.2, 1.6, 1.0), strict=True):
+    # Later lines are thinner, so that lines can be distinguished where they coincide.
+    for (label, plant), width in zip(plants.items(), (2.2, 1.6, 1.0), strict=False):
+        steps = round(seconds * 1000)
         run = rollout(plant, None, q0, torch.zeros_like(q0), sample_time=1e-3, steps=steps)
         line = looks[label].line | {"linewidth": width}
         for ax, q in zip(axes[:, 0], run.q.numpy().T, strict=True):
             ax.plot(run.time.numpy(), q, **line)
         handles.append(Line2D([], [], **line))
-    _joint_axes(axes[:, 0].tolist(), tables.JOINTS, "rad")
+    _joint_axes(axes[:, 0].tolist(), ("joint 1", *tables.JOINTS), "rad")
     figure.align_ylabels(axes[:, 0])
-    style.legend(figure, handles, list(cases))
+    style.legend(figure, handles, list(plants))
     return figure
+
+
+def without_friction(workspace: Workspace) -> Figure:
+    """Measured positions and two frictionless simulations from the same release.
+
+    One simulation is the library's, one the twin's own mechanics, which share no code with it; the
+    paper compares its equations with SimMechanics.
+
+    References:
+        TLRIP paper, Fig. 4.
+    """
+    bench = workspace.bench("tlrip")
+    recording = next(r for r in bench.test if r.name == SHOWN)
+    convention = recording.resolve_convention(bench.plant)
+    q0, qd0 = bench.states[SHOWN]
+    start = convention.position_to_joint(q0), convention.rate_to_joint(qd0)
+    run = rollout(
+        bench.plant,
+        None,
+        *map(torch.tensor, start),
+        sample_time=torch.tensor(np.diff(recording.time)),
+    )
+    assert isinstance(bench.plant, PendulumChain)
+    own = simulate(
+        Links.of(bench.plant), None, *(tuple(x.tolist()) for x in start), samples=len(recording)
+    )
+    simulated = {"equations": run.q.numpy(), "independent mechanics": own.q}
+    return positions(
+        recording,
+        {n: _score(recording, convention.position_from_joint(q)) for n, q in simulated.items()},
+    )
+
+
+def coefficients(workspace: Workspace, name: str) -> Figure:
+    """Coefficients of a neuro-fuzzy model over the friction experiment, a column a joint.
+
+    References:
+        TLRIP paper, Figs. 11 to 13.
+    """
+    motion = _experiment_motion(workspace)
+    return coefficients_over_time(
+        {name: load(workspace.model(name))}, motion, joint_names=tables.JOINTS
+    )
+
+
+def best_positions(workspace: Workspace) -> Figure:
+    """Measured position of every joint, and simulated by the nonlinear neuro-fuzzy model.
+
+    References:
+        TLRIP paper, Fig. 14.
+    """
+    recording = next(r for r in workspace.bench("tlrip").test if r.name == SHOWN)
+    best = NEURO_FUZZY[-1]
+    return positions(recording, {best: _score(recording, workspace.arrays(best)[SHOWN])})
+
+
+def second_torque(workspace: Workspace) -> Figure:
+    """Friction torque of each law over velocity on the second paper's rig, a panel a joint.
+
+    References:
+        RTIP paper, Fig. 8.
+    """
+    bench = workspace.bench("rtip")
+    models = {law: load(workspace.model(f"rtip-{law}")) for law in LAWS}
+    return torque_over_velocity(bench.plant, models, bench.train, bench.train_motions)
+
+
+def _experiment_motion(workspace: Workspace) -> Motion:
+    parts = workspace.bench("tlrip").parts()
+    return next(m for _, r, m in parts if r.name == EXPERIMENT)
 
 
 def experiment(workspace: Workspace) -> Figure:
@@ -123,25 +228,20 @@ def experiment(workspace: Workspace) -> Figure:
     Shaded by the class of acceleration found; a strip at the top shows the printed classes.
 
     References:
-        TLRIP paper, Fig. 4 and Table 6.
+        TLRIP paper, Table 6.
     """
-    bench = workspace.bench("tlrip")
-    motion = next(m for _, r, m in bench.parts() if r.name == "train_hanging")
-    schedule = load(workspace.model(ADAPTIVE[-1])).schedule
-    assert isinstance(schedule, Adaptive)
-    classes = schedule.classes(torch.tensor(motion.qd), torch.tensor(motion.qdd)).numpy()
+    motion = _experiment_motion(workspace)
+    intervals = workspace.found(ADAPTIVE[-1])["intervals"]
     figure, axes = style.panels(3, len(tables.JOINTS), style.PAGE, 4.6, sharex=True)
     rows = (
         ("position [rad]", motion.q),
         ("velocity [rad/s]", motion.qd),
         ("acceleration [rad/s²]", motion.qdd),
     )
-    labels = list(CLASS_COLOURS)
     for joint, name in enumerate(tables.JOINTS):
         for ax, (label, values) in zip(axes[:, joint], rows, strict=True):
-            for first, last, known in _runs(classes[:, joint]):
-                span = motion.time[first], motion.time[last]
-                ax.axvspan(*span, color=CLASS_COLOURS[labels[known]], linewidth=0, zorder=0)
+            for known, start, end in intervals[joint]:
+                ax.axvspan(start, end, color=CLASS_COLOURS[known], linewidth=0, zorder=0)
             ax.plot(motion.time, values[:, joint], color=style.INK, linewidth=0.6)
             ax.grid(False)
             ax.yaxis.set_major_locator(MaxNLocator(4))
@@ -153,7 +253,7 @@ def experiment(workspace: Workspace) -> Figure:
         _strip(axes[0, joint], tables.TABLE_6[name])
     figure.align_ylabels(axes[:, 0])
     handles: list[Any] = [Patch(facecolor=colour) for colour in CLASS_COLOURS.values()]
-    texts = [f"{known} acceleration" for known in labels]
+    texts = [f"{known} acceleration" for known in CLASS_COLOURS]
     texts[-1] += "; strip at the top: as printed"
     style.legend(figure, handles, texts)
     return figure
@@ -175,11 +275,7 @@ def controller_memberships() -> Figure:
 
 
 def model_groups(workspace: Workspace, joint: int) -> Figure:
-    """Measured and simulated position of one joint, a column a kind of model, error below.
-
-    References:
-        TLRIP paper, Figs. 11 to 13.
-    """
+    """Measured and simulated position of one joint, a column a kind of model, error below."""
     bench = workspace.bench("tlrip")
     recording = next(r for r in bench.test if r.name == SHOWN)
     groups = {"constant": tuple(LAWS), "adaptive": ADAPTIVE, "neuro-fuzzy": NEURO_FUZZY}
@@ -211,36 +307,6 @@ def model_groups(workspace: Workspace, joint: int) -> Figure:
     handles = [Line2D([], [], **line) for line in (style.MEASURED, *(x.line for x in looks))]
     labels = [", ".join(models) for models in zip(*groups.values(), strict=True)]
     style.legend(figure, handles, ["measured", *labels])
-    return figure
-
-
-def error_bars(workspace: Workspace) -> Figure:
-    """Position error of every model by joint.
-
-    References:
-        TLRIP paper, Fig. 14.
-    """
-    return rmse_bars(tables.rmse(workspace, tables.NINE), "rad")
-
-
-def recorded_motion(workspace: Workspace) -> Figure:
-    """Measured positions on the second paper's rig, a panel a joint, a column a recording.
-
-    References:
-        RTIP paper, Fig. 3.
-    """
-    recordings = workspace.bench("rtip").train
-    joints = recordings[0].joints
-    figure, axes = style.panels(
-        joints, len(recordings), style.PAGE, 0.3 + 1.2 * joints, sharex="col", sharey="row"
-    )
-    for column, recording in zip(axes.T, recordings, strict=True):
-        for ax, q in zip(column, recording.q.T, strict=True):
-            ax.plot(recording.time, q, color=style.INK, linewidth=0.7)
-        style.title(column[0], recording.name.replace("_", " "))
-        column[-1].set_xlabel("time [s]")
-    _joint_axes(axes[:, 0].tolist(), recordings[0].names, recordings[0].unit)
-    figure.align_ylabels(axes[:, 0])
     return figure
 
 
@@ -299,14 +365,6 @@ def _sets(ax: Axes, variable: Variable) -> None:
     ax.xaxis.set_major_locator(MaxNLocator(5))
     name = style.symbol(variable.name) if len(variable.name) == 1 else variable.name
     ax.set_xlabel(f"{name} [{unit.replace('^2', '²')}]")
-
-
-def _runs(values: NDArray[np.int64]) -> list[tuple[int, int, int]]:
-    """First and last sample of every run of equal values, with the value."""
-    edges = np.flatnonzero(np.diff(values)) + 1
-    # Ends at the next start, so that the shading has no gaps.
-    firsts, lasts = [0, *edges.tolist()], [*edges.tolist(), len(values) - 1]
-    return [(a, b, int(values[a])) for a, b in zip(firsts, lasts, strict=True)]
 
 
 def _strip(ax: Axes, intervals: Sequence[tuple[str, float, float]]) -> None:

@@ -15,7 +15,12 @@ from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.controller.mamdani import MamdaniController, paper_controller
 from nfriction.papers.controller.rules import Rule, RuleBase, Variable
 from nfriction.papers.nffem.rbf_coefficients import RBFCoefficients
-from nfriction.papers.nffem.train_network import DEFAULTS, TrainingOptions, train_on_controller
+from nfriction.papers.nffem.train_network import (
+    DEFAULTS,
+    NetworkFit,
+    TrainingOptions,
+    train_on_controller,
+)
 from nfriction.signals import Motion
 
 Ranges = list[tuple[float, float]]
@@ -31,7 +36,7 @@ def papers_neuro_fuzzy(
     samples: int = 40_000,
     units: int = 10,
     options: TrainingOptions = DEFAULTS,
-) -> NeuroFuzzyModel:
+) -> tuple[NeuroFuzzyModel, list[NetworkFit]]:
     """The neuro-fuzzy model of an adaptive one, by the papers' procedure.
 
     The coefficients by class span the outputs of a fuzzy controller with the papers' rules, the
@@ -46,7 +51,8 @@ def papers_neuro_fuzzy(
         options: of its training, see `train_on_controller`.
 
     Returns:
-        A model of the same law with the network for its schedule, without gradients.
+        A model of the same law with the network for its schedule, without gradients; and the fit
+        of each joint's network.
 
     Raises:
         ValueError: if the model is not adaptive, or its law has no neuro-fuzzy model.
@@ -66,7 +72,7 @@ def papers_neuro_fuzzy(
         np.concatenate([m.qdd for m in motions]),
     )
     network = RBFNetwork(joints, 2, units, len(law.names))
-    train_on_controller(network, controllers, samples=samples, options=options)
+    fits = train_on_controller(network, controllers, samples=samples, options=options)
     model = _neuro_fuzzy_class(law)(
         joints,
         adaptive.schedule.values.mean(1),
@@ -80,7 +86,7 @@ def papers_neuro_fuzzy(
     inputs = torch.stack(ends, 1)
     outputs = torch.tensor([[v.universe for v in c.rule_base.outputs] for c in controllers])
     model.schedule.set_network(network, inputs, outputs.to(inputs).permute(2, 0, 1))
-    return model.requires_grad_(False)
+    return model.requires_grad_(False), fits
 
 
 def controllers_from_classes(

@@ -1,14 +1,21 @@
-"""The stages of a reproduction: fits, each kept when it is finished, and their scores."""
+"""Stages of a reproduction: fits and their scores, several at a time, kept when finished."""
 
 import logging
+import os
+import signal
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass, replace
 from functools import partial
+from multiprocessing import get_context, parent_process
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from nfriction.evaluation.compare import coefficient_summary
 from nfriction.evaluation.results import model_info
@@ -23,12 +30,20 @@ from nfriction.io.model_file import load, load_info, save
 from nfriction.io.model_info import ModelInfo
 from nfriction.papers import twin
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
+from nfriction.papers.afem.classes import class_intervals
 from nfriction.papers.afem.fit_adaptive import fit_adaptive
 from nfriction.papers.afem.fit_by_search import SearchMethod, SearchOptions, fit_by_search
 from nfriction.papers.nffem.refine_adaptive import refine_adaptive
 from nfriction.papers.nffem.train_network import TrainingOptions
 from nfriction.papers.reproduction.procedure import papers_neuro_fuzzy
-from nfriction.papers.reproduction.workspace import Array, Bench, Workspace, smoothed
+from nfriction.papers.reproduction.workspace import (
+    FULL,
+    Array,
+    Bench,
+    Settings,
+    Workspace,
+    smoothed,
+)
 from nfriction.recording import Recording
 from nfriction.signals import causal_motion
 from nfriction.simulation.rk4 import required_substeps
@@ -45,6 +60,8 @@ PAPERS_WAY = tuple(f"{name}-papers" for name in NEURO_FUZZY)
 SECOND_PAPER = tuple(f"rtip-{law}" for law in LAWS)
 SEARCH: dict[str, SearchMethod] = {"NCFM": "sqp", "LFM": "pattern", "NLFM": "pattern"}
 """The second paper's method for each model."""
+EXPERIMENT = "train_hanging"
+"""The TLRIP paper's friction experiment, of which its Table 6 gives the classes."""
 COUNTS = 8192
 """Counts a revolution of the papers' encoders, four edges to each of 2048 lines."""
 
@@ -78,6 +95,92 @@ def stages() -> dict[str, Stage]:
     constant = partial(fitted, fit=fit_constant, name="Stribeck")
     found.append(Stage("Stribeck", ("twin-tlrip",), constant))
     return {stage.name: stage for stage in found}
+
+
+def reproduce(
+    folder: str | Path,
+    settings: Settings = FULL,
+    *,
+    jobs: int = 2,
+    progress: bool = False,
+) -> Workspace:
+    """Run every stage that is not finished.
+
+    Each stage runs in a worker process and writes its result last, whole or not at all, so a run
+    that was ended by Ctrl-C or by force resumes with what is not finished.
+
+    Args:
+        folder: where all files go; made where it is missing.
+        settings: how thorough. Results made with others are replaced.
+        jobs: stages at a time.
+        progress: show a bar of stages.
+
+    Returns:
+        The workspace, every stage finished.
+
+    Raises:
+        ValueError: if `jobs` is not positive.
+    """
+    if jobs < 1:
+        raise ValueError(f"`jobs` must be at least 1, got {jobs}.")
+    workspace = Workspace(Path(folder), settings)
+    waiting = {n: s for n, s in stages().items() if workspace.result(n) is None}
+    total = len(stages())
+    with tqdm(total=total, initial=total - len(waiting), unit="stage", disable=not progress) as bar:
+        if waiting:
+            _run_all(workspace, waiting, jobs, bar)
+    return workspace
+
+
+def _run_all(workspace: Workspace, waiting: dict[str, Stage], jobs: int, bar: "tqdm[Any]") -> None:
+    running: dict[Future[None], str] = {}
+    finished = False
+    pool = ProcessPoolExecutor(
+        jobs, mp_context=get_context("spawn"), initializer=_end_with_the_caller
+    )
+    try:
+        while waiting or running:
+            for name in _ready(waiting, running.values()):
+                if len(running) == jobs:
+                    break
+                running[pool.submit(run_stage, workspace, name)] = name
+                del waiting[name]
+            bar.set_postfix_str(", ".join(running.values()))
+            # The timeout keeps the bar's clock running.
+            done, _ = wait(running, timeout=1.0, return_when=FIRST_COMPLETED)
+            for future in done:
+                del running[future]
+                future.result()
+                bar.update()
+            bar.refresh()
+        finished = True
+    finally:
+        if not finished:
+            # An error or an interrupt. Only an interrupt of the keyboard reaches the workers, and
+            # one of them may have been started just before, so it is not among `running` yet.
+            for worker in list((pool._processes or {}).values()):
+                worker.terminate()
+        pool.shutdown(cancel_futures=True)
+
+
+def _ready(waiting: Mapping[str, Stage], running: Iterable[str]) -> list[str]:
+    """Stages whose needs are finished, in their order."""
+    blocked = {*waiting, *running}
+    return [name for name, stage in waiting.items() if not blocked & set(stage.needs)]
+
+
+def _end_with_the_caller() -> None:
+    # A solver keeps its best point on Ctrl-C; such a fit would pass for a finished one.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    caller = parent_process()
+    assert caller is not None
+
+    def watch() -> None:
+        caller.join()
+        os._exit(1)
+
+    # A caller that is killed cannot end its workers, which would wait for work for ever.
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def run_stage(workspace: Workspace, name: str) -> None:
@@ -163,14 +266,21 @@ def fit_searched(
 
 def network_by_controller(
     workspace: Workspace, bench: Bench, law: str, *, progress: bool = False
-) -> FrictionModel:
-    """A neuro-fuzzy model the papers' way, from the coefficients by class."""
+) -> tuple[FrictionModel, dict[str, Any]]:
+    """A neuro-fuzzy model the papers' way, from the coefficients by class; how its fit ended."""
     settings = workspace.settings
-    return papers_neuro_fuzzy(
+    model, fits = papers_neuro_fuzzy(
         load(workspace.model(f"A{law}")), bench.train_motions,
-        samples=settings.controller_samples,
+        samples=settings.controller_samples, units=settings.network_units,
         options=TrainingOptions(seed=settings.seed, progress=progress),
     )  # fmt: skip
+    unfinished = [fit.evidence.message for fit in fits if not fit.evidence.converged]
+    status = f"Not converged: {len(unfinished)} of {len(fits)} networks. {' '.join(unfinished[:1])}"
+    return model, {
+        "procedure": "classes, fuzzy controller, network by Bayesian regularisation",
+        "status": status if unfinished else "Converged.",
+        "converged": not unfinished,
+    }
 
 
 def fitted(
@@ -191,11 +301,10 @@ def second_paper(workspace: Workspace, law: str) -> dict[str, Any]:
 def papers_way(workspace: Workspace, law: str) -> dict[str, Any]:
     """Result of the papers' own neuro-fuzzy procedure."""
     bench, name = workspace.bench("tlrip"), f"NF{law}-papers"
-    model = network_by_controller(workspace, bench, law)
-    way = {"procedure": "classes, fuzzy controller, network by Bayesian regularisation"}
-    info = replace(load_info(workspace.model(f"A{law}")), fit=way)
+    model, ended = network_by_controller(workspace, bench, law)
+    info = replace(load_info(workspace.model(f"A{law}")), fit=ended)
     save(model, workspace.model(name), info)
-    return _judged(workspace, name, bench, model, info)
+    return {"fit": ended} | _judged(workspace, name, bench, model, info)
 
 
 def _finish(workspace: Workspace, stage: str, bench: Bench, found: FitResult) -> dict[str, Any]:
@@ -216,20 +325,23 @@ def _judged(
             logger.warning("%s was not exported: %s", stage, " ".join(str(error).split()))
     scores, simulated = judge(bench, model)
     workspace.write_arrays(stage, simulated)
-    return {"scores": scores, "coefficients": coefficient_summary(model)} | _classes(model)
+    return {"scores": scores, "coefficients": coefficient_summary(model)} | _classes(bench, model)
 
 
-def _classes(model: FrictionModel) -> dict[str, Any]:
-    """Coefficients of an adaptive model by class, joint and name."""
-    if not isinstance(model.schedule, Adaptive):
+def _classes(bench: Bench, model: FrictionModel) -> dict[str, Any]:
+    """Coefficients of an adaptive model by class, joint and name; its classes in the experiment."""
+    schedule = model.schedule
+    if not isinstance(schedule, Adaptive):
         return {}
-    names, values = model.schedule.coefficient_names, model.schedule.values
+    motion = next(m for _, r, m in bench.parts() if r.name == EXPERIMENT)
+    labels = schedule.classes(torch.tensor(motion.qd), torch.tensor(motion.qdd)).T.numpy()
     return {
         "classes": {
-            known: {n: values[:, c, k].tolist() for k, n in enumerate(names)}
+            known: {n: schedule.values[:, c, k].tolist() for k, n in enumerate(model.law.names)}
             for c, known in enumerate(CLASSES)
         },
-        "thresholds": model.schedule.thresholds.tolist(),
+        "thresholds": schedule.thresholds.tolist(),
+        "intervals": [class_intervals(motion.time, known) for known in labels],
     }
 
 
@@ -257,7 +369,7 @@ def judge(bench: Bench, model: FrictionModel) -> tuple[dict[str, Any], dict[str,
 def driven_by_measurement(bench: Bench, model: FrictionModel, recording: Recording) -> Array:
     """Positions of a free run whose coefficients follow the measured motion, as in the papers.
 
-    Velocity and acceleration are those that a controller has: frequency counting and filters.
+    Velocity and acceleration are those that a controller has: period counting and filters.
 
     Returns:
         Positions in the recording's convention, (sample, joint).

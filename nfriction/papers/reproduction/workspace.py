@@ -19,7 +19,7 @@ from nfriction.fitting.result.identifiability import Interval
 from nfriction.io.atomic import atomic_write, write_atomically
 from nfriction.io.model_file import load, load_plant, save
 from nfriction.papers.afem.fit_by_search import SearchState
-from nfriction.papers.twin.releases import Split
+from nfriction.papers.twin.dataset import Split
 from nfriction.plant import Plant, rigs
 from nfriction.recording import Recording, read_initial_states
 from nfriction.signals import Motion, kalman_smoother
@@ -40,6 +40,7 @@ class Settings:
         max_steps: of the fits, at each length.
         network_steps: of the neuro-fuzzy models' fits.
         terms, head_units: of the neuro-fuzzy models.
+        network_units: of the papers' network.
         controller_samples: a joint, on which the papers' network learns.
         search_horizon: length of the windows that a search simulates [s].
         search_evaluations: most simulations of a search on the position error.
@@ -56,6 +57,7 @@ class Settings:
     network_steps: int = 8
     terms: tuple[int, int] = (5, 5)
     head_units: int = 10
+    network_units: int = 10
     controller_samples: int = 40_000
     search_horizon: float = 5.0
     search_evaluations: int = 1500
@@ -109,7 +111,7 @@ class Bench:
 
     @property
     def train_motions(self) -> list[Motion]:
-        """In the order of `train`."""
+        """Motions of the recordings in `train`."""
         return self.motions[: len(self.train)]
 
     def parts(self) -> list[tuple[Split, Recording, Motion]]:
@@ -132,12 +134,7 @@ class Workspace:
     """The files of a run and the settings that they are made with.
 
     A stage is finished where its file bears these settings; that file is the last one that the
-    stage writes, so a stage that was killed counts as not begun.
-
-    Attributes:
-        folder: where all files go.
-        settings: of the run.
-        progress: show a bar for each fit.
+    stage writes, so a stage that was killed counts as not begun. `progress` shows a bar a fit.
     """
 
     folder: Path
@@ -160,11 +157,7 @@ class Workspace:
         return self._file(stage, "json").exists()
 
     def found(self, stage: str) -> dict[str, Any]:
-        """Result of a stage.
-
-        Raises:
-            ValueError: if it is not finished.
-        """
+        """Result of a stage; a `ValueError` where it is not finished."""
         result: dict[str, Any] | None = self.result(stage)
         if result is None:
             raise ValueError(f"{self.folder}: the stage {stage!r} is not finished; run it first.")
@@ -194,13 +187,7 @@ class Workspace:
         return self.folder / "models" / f"{stage}.json"
 
     def fit(self, stage: str, bench: Bench, make: Callable[[Callback], FitResult]) -> FitResult:
-        """The fit of a stage: read where it is finished, else made and kept.
-
-        Args:
-            stage: names its files.
-            bench: the recordings fitted.
-            make: fits, given a callback for every step.
-        """
+        """The fit of a stage: read where it is finished, else made by `make(callback)` and kept."""
         name, path = f"{stage}-fit", self.model(stage)
         if (kept := self.result(name)) is not None:
             return _restored(kept, path, self.arrays(name), bench)
@@ -223,16 +210,16 @@ class Workspace:
     def search_state(self, stage: str) -> SearchState | None:
         """The state of an unfinished search of a stage; None at its start."""
         state = self.result(f"{stage}-search")
-        return None if state is None else SearchState.from_dict(state)
+        return None if state is None else SearchState(**state)
 
     def keep_search(self, stage: str, step: Callback) -> Callable[[SearchState], None]:
         """A callback that keeps every state of a pattern search."""
 
         def keep(state: SearchState) -> None:
             step()
-            # SQP has no state that would continue it exactly.
-            if state.pattern is not None:
-                self.finish(f"{stage}-search", state.to_dict())
+            # SQP has no state that would continue it exactly, and JSON no infinity.
+            if state.method == "pattern" and np.isfinite(state.value):
+                self.finish(f"{stage}-search", asdict(state))
 
         return keep
 

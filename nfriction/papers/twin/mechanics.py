@@ -36,12 +36,9 @@ class Links:
     """Constants of three links on a fixed pivot.
 
     Attributes:
-        mass: [kg].
-        com: joint to mass centre [m].
-        length: joint to joint [m].
+        mass, com, length: of each link [kg], joint to mass centre and to the next joint [m].
         coupling: a22, a33, a44, a23, a24, a34 in the paper's numbering [kg m^2].
-        gravity: [m/s^2].
-        moment: g b_i [N m].
+        gravity, moment: [m/s^2], and g b_i [N m].
     """
 
     mass: Vector

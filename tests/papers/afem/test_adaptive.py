@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nfriction.friction.laws import LINEAR, NONLINEAR
-from nfriction.papers.afem.adaptive import Adaptive, peak_envelope
-from nfriction.papers.afem.models import ALFM
+from nfriction.papers.afem.adaptive import ALFM, Adaptive, peak_envelope
 from tests.friction.samples import motion, normal
 
 F64 = torch.float64

@@ -9,11 +9,10 @@ from nfriction.fitting.options import FitOptions
 from nfriction.fitting.plant_parameters import plant_parameters
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.friction.models import FrictionModel
+from nfriction.papers.afem.adaptive import ALFM
 from nfriction.papers.afem.classes import ClassOptions
-from nfriction.papers.afem.fit_adaptive import fit_adaptive
+from nfriction.papers.afem.fit_adaptive import GivenClasses, GivenClassesProblem, fit_adaptive
 from nfriction.papers.afem.fit_by_search import SearchOptions, fit_by_search
-from nfriction.papers.afem.given_classes import GivenClasses, GivenClassesProblem
-from nfriction.papers.afem.models import ALFM
 from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import F64, pendulum, swing
 from tests.fitting.test_trajectory import ABSOLUTE, point, windows
@@ -109,7 +108,7 @@ def test_without_a_difference_between_classes_the_constant_law_stays(case):
 
 def test_coefficients_that_serve_worse_are_not_taken(case, monkeypatch):
     constant = case[-1]
-    monkeypatch.setattr("nfriction.papers.afem.given_classes.PositionError.residuals",
+    monkeypatch.setattr("nfriction.papers.afem.fit_adaptive.PositionError.residuals",
                         lambda self, vector: torch.full((1, 1, 2), 1e9, dtype=F64))  # fmt: skip
     model = ALFM(2, v_smooth=V_SMOOTH)
     found = fitted(case, model, max_steps=1)

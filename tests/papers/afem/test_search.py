@@ -1,12 +1,14 @@
 """Searches of the position error find what made the recording, stop and go on."""
 
 import json
+from dataclasses import asdict
 
 import pytest
 import torch
 
 from nfriction import LFM, NCFM, NFLFM
 from nfriction.fitting.data.windows import cut_windows
+from nfriction.papers.afem.fit_adaptive import PositionError
 from nfriction.papers.afem.fit_by_search import (
     Box,
     SearchOptions,
@@ -14,7 +16,6 @@ from nfriction.papers.afem.fit_by_search import (
     fit_by_search,
     search,
 )
-from nfriction.papers.afem.given_classes import PositionError
 from nfriction.signals import kalman_smoother
 from nfriction.simulation.protocols import RolloutInputs
 from nfriction.simulation.rollout import integrate
@@ -65,12 +66,12 @@ def test_a_resumed_search_is_the_uninterrupted_one(recorded):
     kept = []
 
     def stop(state: SearchState) -> bool:
-        kept.append(json.dumps(state.to_dict()))
+        kept.append(json.dumps(asdict(state)))
         return len(kept) == 4
 
     part = fitted(recorded, LFM(2, v_smooth=V_SMOOTH), max_evaluations=150, seed=3, callback=stop)
     assert not part.converged
-    state = SearchState.from_dict(json.loads(kept[-1]))
+    state = SearchState(**json.loads(kept[-1]))
     rest = fitted(recorded, LFM(2, v_smooth=V_SMOOTH), max_evaluations=150, seed=3, state=state)
     assert torch.equal(rest.model.schedule.values, whole.model.schedule.values)
 

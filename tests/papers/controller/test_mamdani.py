@@ -226,27 +226,6 @@ def test_where_no_rule_fires_the_middle_is_given_with_zero_gradient() -> None:
     assert (gradient[0] == 0).all()
 
 
-def test_the_report_finds_gaps_and_rules_never_fired() -> None:
-    controller = MamdaniController(parse_fis(GAPPED, units=("rad/s", "rad/s^2")))
-    qd = torch.linspace(-3, 3, 61, dtype=FLOAT64)
-    report = controller.report(qd, torch.zeros_like(qd))
-    velocity = report.inputs[0]
-    assert velocity.least == 0
-    assert len(velocity.gaps) == 1
-    # Memberships are one half at 2 and 8.
-    assert velocity.gaps[0] == pytest.approx((2.0, 8.0), abs=0.01)
-    assert velocity.poorly_covered == pytest.approx(20 / 61)
-    assert report.never_fired == (("fast", "any"),)
-    text = str(report)
-    assert "fast and any" in text
-    assert "gap from" in text
-    outside = controller.report(qd * 10, torch.zeros_like(qd))
-    assert outside.inputs[0].outside == pytest.approx(40 / 61)
-    assert outside.never_fired == ()
-    with pytest.raises(ValueError, match="finite"):
-        controller.report(qd * math.nan, qd)
-
-
 def test_unsound_options_are_refused() -> None:
     with pytest.raises(ValueError, match="joint"):
         paper_controller(1)

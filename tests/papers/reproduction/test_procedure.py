@@ -68,7 +68,8 @@ def test_outputs_lie_within_the_span_of_the_classes(name: str) -> None:
 def test_the_network_says_what_the_controller_says() -> None:
     adaptive = model_by_name("ALFM")(3, RISING)
     motion = swing()
-    model = papers_neuro_fuzzy(adaptive, [motion], samples=4000)
+    model, fits = papers_neuro_fuzzy(adaptive, [motion], samples=4000)
+    assert len(fits) == 3
     assert isinstance(model.schedule, RBFCoefficients)
     assert type(model).__name__ == "NFLFM"
     controllers = controllers_from_classes(model.law, RISING, motion.qd, motion.qdd)
@@ -85,13 +86,13 @@ def test_the_network_says_what_the_controller_says() -> None:
 @pytest.mark.slow
 def test_equal_seeds_give_equal_networks() -> None:
     adaptive = model_by_name("ANCFM")(3, RISING[..., :1])
-    first, second = (papers_neuro_fuzzy(adaptive, [swing(1.0)], samples=300) for _ in range(2))
+    first, second = (papers_neuro_fuzzy(adaptive, [swing(1.0)], samples=300)[0] for _ in range(2))
     for a, b in zip(first.state_dict().values(), second.state_dict().values(), strict=True):
         assert torch.equal(a, b)
 
 
 def test_classes_that_agree_still_span_a_universe() -> None:
-    model = papers_neuro_fuzzy(model_by_name("ANCFM")(3, [0.02]), [swing(1.0)], samples=300)
+    model, _ = papers_neuro_fuzzy(model_by_name("ANCFM")(3, [0.02]), [swing(1.0)], samples=300)
     qd = torch.as_tensor(swing(1.0).qd)
     # Within the one percent that such a universe is wide.
     torch.testing.assert_close(

@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from nfriction.papers.reproduction import tables
-from nfriction.papers.reproduction.run import _ready, reproduce
-from nfriction.papers.reproduction.stages import Stage, run_stage, stages
+from nfriction.papers.reproduction.stages import Stage, _ready, reproduce, run_stage, stages
 from nfriction.papers.reproduction.workspace import Settings, Workspace
 
 TINY = Settings(
@@ -71,7 +70,7 @@ def test_workers_end_with_a_killed_caller(tmp_path: Path) -> None:
         "import os, signal, sys\n"
         "from concurrent.futures import ProcessPoolExecutor\n"
         "from multiprocessing import get_context\n"
-        "from nfriction.papers.reproduction.run import _end_with_the_caller\n"
+        "from nfriction.papers.reproduction.stages import _end_with_the_caller\n"
         "if __name__ == '__main__':\n"
         "    pool = ProcessPoolExecutor(\n"
         "        1, mp_context=get_context('spawn'), initializer=_end_with_the_caller\n"
@@ -107,7 +106,7 @@ def test_a_run_that_is_killed_goes_on_where_it_was(tmp_path: Path) -> None:
     script = tmp_path / "run.py"
     script.write_text(
         "import sys\n"
-        "from nfriction.papers.reproduction.run import reproduce\n"
+        "from nfriction.papers.reproduction.stages import reproduce\n"
         "from nfriction.papers.reproduction.workspace import Settings\n"
         f"if __name__ == '__main__':\n    reproduce(sys.argv[1], {TINY!r}, jobs=2)\n"
     )

@@ -38,6 +38,9 @@ def workspace(folder: Path, errors: Mapping[str, float | None]) -> Workspace:
                     "c": entry(0.0, "test"),
                 },
                 "coefficients": {k: [1.0, 2.0, 3.0] for k in names},
+                "classes": {"low": {"B": [1.0, 2.0, 3.0]}, "high": {"B": [4.0, 5.0, 6.0]}},
+                "intervals": [[["high", 0.0, 7.5], ["low", 7.5, 40.0]]] * 3,
+                "fit": {"status": "ended", "converged": name != "ALFM"},
             },
         )
     return made
@@ -66,8 +69,35 @@ def test_table_10_stands_beside_the_print(tmp_path: Path) -> None:
     pd.testing.assert_frame_equal(2 * measured["ours"], table["ours"])
 
 
-def test_table_11_is_what_is_saved(tmp_path: Path) -> None:
-    table = tables.table_11(workspace(tmp_path, {"NFLFM": 0.25}))
+def test_table_11_compares_the_best_model_with_each_other_one(tmp_path: Path) -> None:
+    table = tables.table_11(workspace(tmp_path, {"NFNLFM": 0.25}))
+    np.testing.assert_allclose(table["ours"], 75.0)
+    printed = table["printed"].dropna()
+    # As the paper's text says, 11.56 to 94.55 %.
+    assert printed.to_numpy().min() == pytest.approx(11.57, abs=0.01)
+    assert printed.to_numpy().max() == pytest.approx(94.55, abs=0.005)
+    assert list(printed.index) == ["ANCFM", "ALFM", "ANLFM", "NFNCFM", "NFLFM"]
+
+
+def test_tables_6_to_9_are_the_classes(tmp_path: Path) -> None:
+    made = workspace(tmp_path, {})
+    table = tables.table_6(made)
+    assert list(table["ours"].loc["joint 3, 1"]) == ["high", 0.0, 7.5]
+    assert list(table["printed"].loc["joint 4, 4"]) == ["low", 13.0, 30.0]
+    assert table["ours"].loc["joint 4, 4"].isna().all()
+    assert list(table.index) == sorted(table.index)
+    by_class = tables.adaptive_coefficients(made, "LFM")["ours"]
+    assert tuple(by_class.loc["B, high"]) == (4.0, 5.0, 6.0)
+
+
+def test_fits_that_did_not_converge_are_named_at_the_end(tmp_path: Path) -> None:
+    said = tables.text(workspace(tmp_path, {})).splitlines()
+    assert "1 of 16 fits did not converge (ALFM)" in said[-1]
+    assert any(line.split() == ["NFLFM-papers", "ended"] for line in said)
+
+
+def test_what_a_step_saves_within_a_law(tmp_path: Path) -> None:
+    table = tables.steps_saved(workspace(tmp_path, {"NFLFM": 0.25}))
     np.testing.assert_allclose(table["ours"].loc["NFLFM against ALFM"], 75.0)
     np.testing.assert_allclose(table["ours"].loc["ANCFM against NCFM"], 0.0, atol=1e-12)
     theirs = tables.TABLE_10

@@ -14,9 +14,8 @@ from scipy.integrate import trapezoid
 
 from nfriction import Recording, rigs, rollout
 from nfriction.papers import twin
-from nfriction.papers.twin.dataset import Encoder
+from nfriction.papers.twin.dataset import Encoder, specification
 from nfriction.papers.twin.mechanics import HiddenFriction, Links, simulate
-from nfriction.papers.twin.releases import specification
 from nfriction.recording import read_initial_states
 from nfriction.signals import quantise
 
