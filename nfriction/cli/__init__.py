@@ -6,6 +6,7 @@ that help and usage errors come at once.
 """
 
 import argparse
+import io
 import logging
 import shlex
 import sys
@@ -33,6 +34,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     141 says that the reader of the output closed it.
     """
     words = list(sys.argv[1:] if argv is None else argv)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # Names of files and recordings may be no valid Unicode.
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         try:
             return _answer(words)

@@ -99,13 +99,18 @@ def run_comparison(
     from nfriction.cli import tables
     from nfriction.evaluation.compare import check_recordings, compare
     from nfriction.evaluation.cross_validation import select
-    from nfriction.evaluation.results import write_results
+    from nfriction.evaluation.results import exclusive, report_of, write_results
+    from nfriction.report import write_report
 
     check_recordings(train, test)  # before a choice that takes long
     states = _initial_states(arguments, plant, [*train, *test])
     check_writable(arguments.out)
     selection = None
-    with _log(arguments.log_file) as logger, Progress(logger) as progress:
+    with (
+        exclusive(arguments.out),
+        _log(arguments.log_file) as logger,
+        Progress(logger) as progress,
+    ):
         settings = settings | {"progress": progress, "jobs": arguments.jobs}
         logger.info(arguments.command_line)
         if arguments.select:
@@ -114,10 +119,13 @@ def run_comparison(
             plant, arguments.models, train, test, initial_states=states, **settings
         )
         progress.stage("write results and figures")
+        page = report_of(arguments.out)
         write_results(
             comparison, train, test, arguments.out, selection=selection,
             command=arguments.command_line, figures=not arguments.no_figures,
         )  # fmt: skip
+        if page is not None:
+            write_report(arguments.out, page)  # else the earlier run's page would be missed
         logger.info(tables.verdict(comparison))
     print(f"\n{tables.error_tables(comparison)}\n")
     for name, fit in comparison.fits.items():
@@ -145,7 +153,7 @@ def _log(path: Path | None) -> Iterator[logging.Logger]:
     if path is None:
         yield package
         return
-    handler = logging.FileHandler(path, encoding="utf-8")
+    handler = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     before = package.level
     package.addHandler(handler)

@@ -24,17 +24,14 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Read, write."""
-    from nfriction.io.atomic import write_atomically
-    from nfriction.report import read_run, to_html
+    from nfriction.report import write_report
 
     if not arguments.folder.is_dir():
         raise UsageError(f"{arguments.folder} is no folder; give one that compare or demo wrote.")
     out = arguments.out or arguments.folder / "report.html"
     if out.is_dir():
         raise UsageError(f"--out is a file, and {out} is a folder.")
-    found = read_run(arguments.folder)
-    write_atomically(out, to_html(found).encode())
-    for note in found.notes:
+    for note in write_report(arguments.folder, out).notes:
         warn(note)
     print(f"wrote {out}")
     return 0

@@ -21,10 +21,12 @@ from nfriction.plots.style import DARK_GROUND, for_dark_screen
 from nfriction.recording import Recording
 
 DPI = 150
+RUN_KEY = "nfriction run"
+"""Of the text in a PNG file that names its run."""
 
 
 def save_all(
-    comparison: Comparison, recordings: Sequence[Recording], folder: str | Path
+    comparison: Comparison, recordings: Sequence[Recording], folder: str | Path, *, run: str = ""
 ) -> list[Path]:
     """Write every figure of a comparison as PNG, and as `NAME.dark.png` for a dark screen.
 
@@ -36,6 +38,7 @@ def save_all(
         comparison: fits and scores.
         recordings: those compared, or some of them.
         folder: made where it does not exist; files of the same name are replaced.
+        run: id of the run, kept in each file.
 
     Returns:
         The files written.
@@ -64,9 +67,10 @@ def save_all(
             if path not in written:
                 break
             path = folder / f"{stem}_{count}.png"
-        figure.savefig(path, dpi=DPI)
+        kept = {RUN_KEY: run} if run else {}
+        figure.savefig(path, dpi=DPI, metadata=kept)
         shade = path.with_suffix(".dark.png")
-        for_dark_screen(figure, ground=DARK_GROUND).savefig(shade, dpi=DPI)
+        for_dark_screen(figure, ground=DARK_GROUND).savefig(shade, dpi=DPI, metadata=kept)
         figure.clear()
         written += [path, shade]
     return written

@@ -9,6 +9,8 @@ from pathlib import Path
 # Far above any run of ours; larger files are no figures.
 LARGEST_FIGURE, MOST_FIGURES = 16 * 2**20, 100
 _PNG = b"\x89PNG\r\n\x1a\n"
+# Text that `plots.save_all` puts before the picture.
+_RUN = re.compile(rb"tEXtnfriction run\0([0-9a-f]{16})")
 # A figure's twin for a dark screen.
 _DARK = ".dark"
 # In the order of the page: errors first, then motions, then the insides of the models.
@@ -33,12 +35,13 @@ _CAPTIONS = {
 
 @dataclass(frozen=True)
 class Figure:
-    """A PNG file with its size in pixels."""
+    """A PNG file with its size in pixels, and the id of its run if it bears one."""
 
     name: str
     png: bytes
     width: int
     height: int
+    run: str = ""
 
     @property
     def source(self) -> str:
@@ -69,7 +72,8 @@ def read_figures(folder: Path) -> tuple[tuple[Figure, ...], list[str]]:
         width, height = (int.from_bytes(png[k : k + 4], "big") for k in (16, 20))
         # Earlier versions said `held_out` for `test`.
         name = re.sub(r"^(rmse|horizons|positions)_held_out", r"\1_test", path.stem)
-        found.append(Figure(name, png, width, height))
+        run = _RUN.search(png[:4096])
+        found.append(Figure(name, png, width, height, run[1].decode() if run else ""))
     return tuple(found), notes
 
 

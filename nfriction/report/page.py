@@ -11,6 +11,7 @@ import re
 import shlex
 from collections.abc import Iterator, Sequence
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import jinja2
@@ -26,10 +27,11 @@ from nfriction.evaluation.tables import (
     interval_table,
     selection_table,
 )
+from nfriction.io.atomic import write_atomically
 from nfriction.io.model_info import ModelInfo
 from nfriction.report.figures import with_dark_twins
 from nfriction.report.rules import JointRules, rules_in_words
-from nfriction.report.run import Run
+from nfriction.report.run import Run, read_run
 from nfriction.version import __version__
 
 _TEMPLATES = resources.files("nfriction.report") / "templates"
@@ -84,6 +86,19 @@ def to_html(run: Run) -> str:
         commands=_commands(run),
     )
     return page.lstrip() + "\n"
+
+
+def write_report(folder: str | Path, path: str | Path) -> Run:
+    """Write the page of a comparison's folder to a file; returns the run.
+
+    Raises:
+        RunError: if the folder is not one that a comparison wrote; see `read_run`.
+        OSError: if it cannot be read or the file cannot be written.
+    """
+    run = read_run(folder)
+    # A recording's name may come from a file name that is no valid UTF-8.
+    write_atomically(path, to_html(run).encode(errors="backslashreplace"))
+    return run
 
 
 def _policy(style: str, script: str) -> str:

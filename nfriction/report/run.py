@@ -3,7 +3,7 @@
 import math
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import numpy as np
 
 from nfriction.evaluation.compare import SCHEMA, Comparison, Part
 from nfriction.evaluation.cross_validation import Candidate, Selection
+from nfriction.evaluation.results import exclusive, interrupted
 from nfriction.evaluation.score import Score
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.registry import model_names
@@ -61,6 +62,7 @@ class Run:
     """A comparison as read from its folder.
 
     Attributes:
+        id: of the run, in every file that it wrote; empty of older versions.
         folder: as it was given.
         comparison: the scores, without simulated positions and without fits.
         fits: status of each fit, by model.
@@ -78,6 +80,7 @@ class Run:
         selection: the choice on the training recordings alone, where there is one.
     """
 
+    id: str
     folder: Path
     comparison: Comparison
     fits: dict[str, FitRecord]
@@ -96,11 +99,17 @@ class Run:
 def read_run(folder: str | Path) -> Run:
     """Read the folder of `nfriction compare` or `nfriction demo`.
 
+    Where a process was killed while it put its files in place, they are put there first.
+
     Raises:
-        RunError: if the folder has no sound `results.json`; one line says what is wrong.
-        OSError: if it cannot be read.
+        RunError: if the folder has no sound `results.json`, or files of two runs; one line says
+            what is wrong.
+        OSError: if it cannot be read, or another process is writing it.
     """
     folder = Path(folder)
+    if interrupted(folder):
+        with exclusive(folder):
+            pass
     path = folder / "results.json"
     if not path.is_file():
         raise RunError(
@@ -146,8 +155,12 @@ def _run(folder: Path, content: dict[str, Any]) -> Run:
     fits = {n: _fit(e["fit"], f"fit of {n}") for n, e in entries.items() if "fit" in e}
     models, notes = _models(folder, fits, len(joints))
     figures, unread = read_figures(folder / "figures")
+    run_id = _read(str, content.get("run", ""), "`run`")
+    trained_on = recordings.get("train", {})
+    _require_one_run(folder, run_id, trained_on, models, figures)
     failed = _read(dict[str, str], content.get("failed", {}), "`failed`")
     return Run(
+        id=run_id,
         folder=folder,
         comparison=Comparison({}, scores["train"], scores["test"], unit, joints, failed=failed),
         fits=fits,
@@ -256,6 +269,31 @@ def _models(
             continue
         found[name] = (model, info)
     return found, notes
+
+
+def _require_one_run(
+    folder: Path,
+    run_id: str,
+    trained_on: Mapping[str, str],
+    models: Mapping[str, tuple[FrictionModel, ModelInfo]],
+    figures: Sequence[Figure],
+) -> None:
+    """Refuse models and figures of another run than the results'."""
+    foreign = [
+        f"models/{name}.json"
+        for name, (_, info) in models.items()
+        if info.fit.get("run", "") != run_id
+        # Runs of older versions have no id, but the digests of their recordings.
+        or (info.training_data and info.training_data != trained_on)
+    ]
+    foreign += [
+        f"figures/{figure.name}.png" for figure in figures if figure.run not in ("", run_id)
+    ]
+    if foreign:
+        raise RunError(
+            f"{folder}: has files of two runs: {', '.join(foreign)} belong to another run than "
+            f"results.json; run the comparison again, or give a folder that a single run wrote."
+        )
 
 
 def _read(kind: Any, value: Any, where: str) -> Any:

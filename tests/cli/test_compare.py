@@ -1,7 +1,9 @@
 """`compare` and `demo` as a user meets them: what they write and print, how they stop."""
 
 import logging
+import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,7 +17,7 @@ import torch
 
 from nfriction import cli, load
 from nfriction.cli.console import Progress
-from tests.cli.benches import compare, results
+from tests.cli.benches import QUICK, compare, results
 
 
 def test_compare_writes_the_promised_schema(compared: Path) -> None:
@@ -161,6 +163,20 @@ def test_warnings_and_intervals_of_fits_are_told(
         words = row.removeprefix(name).split()[1:]
         told = [None if word == "unknown" else float(word) for word in words]
         assert told == [pytest.approx(x, rel=1e-3) for x in (low, high)]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems refuse such a file name")
+def test_a_file_name_that_is_no_unicode_loses_no_fits(bench: Path, tmp_path: Path) -> None:
+    odd, out = tmp_path / os.fsdecode(b"surr\xff.csv"), tmp_path / "out"
+    shutil.copy(bench / "b.csv", odd)
+    command = [sys.executable, "-m", "nfriction"]
+    words = [bench / "a.csv.gz", "--test", odd, "--rig", bench / "bench.json", "--models", "NCFM"]
+    words += [*QUICK, "--out", out, "--log-file", tmp_path / "log"]
+    subprocess.run([*command, "compare", *words], check=True, capture_output=True)
+    assert (out / "models" / "NCFM.pt").is_file()
+    subprocess.run([*command, "report", out], check=True, capture_output=True)
+    for file in (tmp_path / "log", out / "table.csv", out / "report.html"):
+        assert "surr" in file.read_text(encoding="utf-8")
 
 
 def test_ctrl_c_ends_the_run_though_the_solver_survives_it(
