@@ -24,7 +24,8 @@ def positions(
     """Measured against simulated position, a pair of panels a joint: position, error below.
 
     A panel spans the measured range, and the errors of models that did not diverge, up to half of
-    that; larger ones, such as of a simulation without friction, are cut off.
+    that. The error without friction, which would leave it at every swing, is drawn only where
+    there is no other model.
 
     Args:
         recording: the measured motion, in its own convention and unit.
@@ -44,7 +45,7 @@ def positions(
             )
     joints = recording.joints
     figure, axes = style.panels(
-        2 * joints, 1, width, 0.4 + 1.7 * joints, sharex=True, height_ratios=[1.5, 1] * joints
+        2 * joints, 1, width, 0.4 + 1.7 * joints, sharex=True, height_ratios=[1, 1] * joints
     )
     looks = style.looks(scores)
     # Errors that diverge or ignore friction would hide all others.
@@ -61,7 +62,8 @@ def positions(
         factor, unit = style.scaled(recording.unit, shown)
         for model, error in errors.items():
             position.plot(recording.time, scores[model].simulated[:, joint], **looks[model].line)
-            below.plot(recording.time, factor * error, **looks[model].line)
+            if model != NO_FRICTION or len(scores) == 1:
+                below.plot(recording.time, factor * error, **looks[model].line)
         low, high = float(measured.min()), float(measured.max())
         position.set_ylim(low - 0.25 * span, high + 0.25 * span)
         below.set_ylim(style.padded(-factor * shown, factor * shown))
@@ -92,14 +94,14 @@ def rmse_bars(table: pd.DataFrame, unit: str, *, width: float | None = None) -> 
     values = table.to_numpy(dtype=np.float64)
     if values.size == 0:
         raise ValueError("`table` is empty; it needs a row a model and a column a joint.")
-    factor, unit = style.scaled(unit, values)
+    values = 1e3 * values  # as in every table
     models, joints = [str(name) for name in table.index], [str(name) for name in table.columns]
     # Numbers above bars must not overlap.
     room = _BAR * (len(models) + 1) * len(joints) + 0.6
     width = width or (style.COLUMN if room <= style.COLUMN else style.PAGE)
     figure, axes = style.panels(1, 1, width, 2.2)
     ax = axes[0, 0]
-    finite = factor * values[np.isfinite(values) & (values > 0)]
+    finite = values[np.isfinite(values) & (values > 0)]
     largest, smallest = (finite.max(), finite.min()) if finite.size else (1.0, 1.0)
     if style.spread(values) > style.LOG_FROM:
         # A number above a bar takes a share of the axis, not of the value.
@@ -112,15 +114,15 @@ def rmse_bars(table: pd.DataFrame, unit: str, *, width: float | None = None) -> 
     looks = style.looks(models)
     for m, model in enumerate(models):
         x = np.arange(len(joints)) + (m - 0.5 * (len(models) - 1)) * bar
-        height = np.where(np.isinf(values[m]), top, factor * values[m])
+        height = np.where(np.isinf(values[m]), top, values[m])
         bars = ax.bar(x, height - bottom, 0.92 * bar, bottom=bottom, **looks[model].bar)
         for patch, value in zip(bars, values[m], strict=True):
-            _name_bar(ax, patch.get_x() + patch.get_width() / 2, factor * value, top, bottom)
+            _name_bar(ax, patch.get_x() + patch.get_width() / 2, value, top, bottom)
             patch.set_alpha(0.35 if np.isinf(value) else 1.0)
     ax.set_xticks(range(len(joints)), joints)
     ax.tick_params(axis="x", length=0)
     ax.grid(False, axis="x")
-    ax.set_ylabel(f"position RMSE [{unit}]")
+    ax.set_ylabel(f"position RMSE [m{unit}]")
     style.legend(figure, ax.containers, models)
     return figure
 
@@ -146,13 +148,12 @@ def horizon_curve(
     part = part or comparison.parts[0]
     horizons = [*comparison.horizons(), None]
     tables = [comparison.table(horizon, part=part)[column] for horizon in horizons]
-    values = np.stack([table.to_numpy(dtype=np.float64) for table in tables], -1)
+    # In thousandths, as in every table.
+    values = 1e3 * np.stack([table.to_numpy(dtype=np.float64) for table in tables], -1)
     floor = comparison.floor(column, part=part)
-    shown = values[np.isfinite(values)]
-    factor, unit = style.scaled(comparison.unit, shown)
     figure, axes = style.panels(1, 1, width, 2.2)
     ax = axes[0, 0]
-    known = factor * np.append(shown, [] if floor is None else floor)
+    known = np.append(values[np.isfinite(values)], [] if floor is None else 1e3 * floor)
     known = known[known > 0] if (known > 0).any() else np.ones(1)
     bottom, top = known.min() / 1.6, known.max() * 1.6
     diverged = np.isinf(values)
@@ -163,7 +164,7 @@ def horizon_curve(
     looks = style.looks(models)
     x = np.arange(len(horizons))
     handles = []
-    for model, errors in zip(models, factor * values, strict=True):
+    for model, errors in zip(models, values, strict=True):
         # A diverged run has no number; its line leaves through the top.
         y = np.where(np.isinf(errors), top, errors)
         handles += ax.plot(x, y, **looks[model].line, **looks[model].marker)
@@ -175,13 +176,13 @@ def horizon_curve(
     if floor is not None:
         ends = [x[-1] - 0.3, x[-1] + 0.3]
         # Only at the free run: shorter windows restart from other states.
-        band = ax.fill_between(ends, bottom, factor * floor, color=style.BAND, alpha=0.6, lw=0)
+        band = ax.fill_between(ends, bottom, 1e3 * floor, color=style.BAND, alpha=0.6, lw=0)
         handles.append(band)
         models = [*models, "one encoder count"]
     ax.set_xlim(-0.3, x[-1] + 0.3)
     ax.set_xticks(x, [f"{h} s" if h else "free run" for h in horizons])
     ax.set_xlabel("length of simulation")
-    ax.set_ylabel(f"position RMSE [{unit}]")
+    ax.set_ylabel(f"position RMSE [m{comparison.unit}]")
     style.legend(figure, handles, models)
     return figure
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+import numpy as np
 from markupsafe import Markup
 
 from nfriction.evaluation.compare import NO_FRICTION, PART_NAMES
@@ -165,14 +166,25 @@ def _fuzzy_models(run: Run) -> Iterator[dict[str, Any]]:
             continue
         heads = [f"{coefficient} = [{u}]" for coefficient, u in _units(run, name).items()]
         joints = []
-        for of in rules_in_words(model, run.comparison.joint_names):
+        in_words = rules_in_words(model, run.comparison.joint_names)
+        first = [[of.rules[0].values] * len(of.rules) for of in in_words]
+        # All rules of a rejected network say the same, but for rounding.
+        if np.allclose([[rule.values for rule in of.rules] for of in in_words], first, 1e-9, 0.0):
+            yield {"name": name, "constant": True}
+            continue
+        for of in in_words:
             rows: list[tuple[Value, ...]] = [
                 (f"{rule.condition} THEN", *rule.values) for rule in of.rules
             ]
             caption = f"{name}, {of.joint}: {len(rows)} rules"
             rules = Table(caption, ("rule", *heads), tuple(rows))
             joints.append({"rules": rules, "terms": _term_table(of, name, unit)})
-        yield {"name": name, "along_motion": fuzzy.along_motion, "joints": joints}
+        yield {
+            "name": name,
+            "constant": False,
+            "along_motion": fuzzy.along_motion,
+            "joints": joints,
+        }
 
 
 def _term_table(of: JointRules, model: str, unit: str) -> Table:
@@ -211,7 +223,7 @@ def _data_table(run: Run) -> Table:
         for part in reversed(PART_NAMES)
         for name, digest in run.recordings[part].items()
     )
-    return Table("Recordings", ("recording", "part", "SHA-256 of its samples, in part"), rows)
+    return Table("Recordings", ("recording", "part", "digest of its samples"), rows)
 
 
 def _range_table(info: ModelInfo, joints: Sequence[str], unit: str) -> Table | None:

@@ -1,90 +1,125 @@
-"""`nfriction compare`: fit models, score them, write and print the results."""
+"""`nfriction fit` and `nfriction compare`: fit models to recordings, write and print what comes."""
 
 from __future__ import annotations
 
 import argparse
 import logging
+import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nfriction.cli import estimation, names
+from nfriction.cli import inputs
 from nfriction.cli.console import Parser, Progress, UsageError, check_writable, warn
 
 if TYPE_CHECKING:
-    from nfriction.evaluation.compare import InitialStates
+    from nfriction.evaluation.compare import Comparison, InitialStates
+    from nfriction.evaluation.cross_validation import Selection
     from nfriction.plant import Plant
     from nfriction.recording import Recording
 
-EXAMPLE = """example:
+FIT_EXAMPLE = """example:
+  nfriction fit run1.csv run2.csv --rig rig.json --model LFM --out lfm.json"""
+COMPARE_EXAMPLE = """example:
   nfriction compare run1.csv run2.csv --test run3.csv --rig rig.json \\
       --models NCFM,LFM,NFLFM --out runs/mine"""
 
 
-def add(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
-    """Register the command."""
+def add_fit(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
+    """Register `fit`."""
     parser = commands.add_parser(
-        "compare", parents=[common], help="fit models and score them", epilog=EXAMPLE,
+        "fit", parents=[common], help="fit one model", epilog=FIT_EXAMPLE,
+        description="Fit one friction model to recordings and write it as a model file.",
+    )  # fmt: skip
+    parser.add_argument("recordings", nargs="+", type=inputs.file, metavar="RECORDING",
+                        help=f"with columns time, q1, ... ({inputs.FORMATS})")  # fmt: skip
+    parser.add_argument("--model", type=inputs.model, default="NFLFM",
+                        help=f"one of {', '.join(inputs.MODELS)}")  # fmt: skip
+    parser.add_argument("--out", type=Path, default=Path("model.json"), help="model file to write")
+    inputs.add_fit_options(parser)
+    parser.set_defaults(run=run_fit)
+
+
+def add_compare(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
+    """Register `compare`."""
+    parser = commands.add_parser(
+        "compare", parents=[common], help="fit models and score them", epilog=COMPARE_EXAMPLE,
         description="Fit friction models to recordings and score each by simulating recordings "
         "that no fit has seen.",
     )  # fmt: skip
-    parser.add_argument(
-        "train",
-        nargs="+",
-        type=names.file,
-        metavar="TRAIN",
-        help=f"recordings to fit, with columns time, q1, ... ({names.FORMATS})",
-    )
-    parser.add_argument("--test", nargs="+", type=names.file, default=[], metavar="TEST",
+    parser.add_argument("train", nargs="+", type=inputs.file, metavar="TRAIN", help="recordings to "
+                        f"fit, with columns time, q1, ... ({inputs.FORMATS})")  # fmt: skip
+    parser.add_argument("--test", nargs="+", type=inputs.file, default=[], metavar="TEST",
                         help="recordings to judge by, which no fit sees")  # fmt: skip
     add_comparison_options(parser)
-    estimation.add_options(parser)
-    parser.set_defaults(run=run)
+    inputs.add_fit_options(parser)
+    parser.set_defaults(run=run_compare)
 
 
 def add_comparison_options(parser: argparse.ArgumentParser) -> None:
     """Options of `compare` and `demo`."""
-    parser.add_argument("--models", type=names.models, default=names.DEFAULT_MODELS,
-                        help=f"of {', '.join(names.MODELS)}")  # fmt: skip
-    parser.add_argument("--out", type=Path, default=Path("runs/compare"), help="folder to write")
-    parser.add_argument("--initial-states", type=names.file, metavar="FILE",
-                        help="table with columns id, q0_1, qd0_1, ... of the recordings' initial "
-                        "states (default: estimated from each recording)")  # fmt: skip
-    parser.add_argument("--select", action="store_true",
-                        help="also choose a model on the training recordings alone, by "
-                        "cross-validation over blocks of time")  # fmt: skip
-    parser.add_argument("--no-figures", action="store_true", help="draw no figures")
-    parser.add_argument("--jobs", type=jobs, default=1, metavar="N",
-                        help="fits at the same time, each in a process of its own; -1 for one to "
-                        "each core (needs joblib; the results are the same)")  # fmt: skip
-    parser.add_argument("--log-file", type=Path, metavar="FILE",
-                        help="append a log of stages, times and results")  # fmt: skip
+    add = parser.add_argument
+    add("--models", type=inputs.models, default=inputs.DEFAULT_MODELS,
+        help=f"of {', '.join(inputs.MODELS)}")  # fmt: skip
+    add("--out", type=Path, default=Path("runs/compare"), help="folder to write")
+    add("--initial-states", type=inputs.file, metavar="FILE",
+        help="table with columns id, q0_1, qd0_1, ... of the recordings' initial states (default: "
+        "estimated from each recording)")  # fmt: skip
+    add("--select", action="store_true", help="also choose a model on the training recordings "
+        "alone, by cross-validation over blocks of time")  # fmt: skip
+    add("--no-figures", action="store_true", help="draw no figures")
+    add("--jobs", type=inputs.jobs, default=1, metavar="N",
+        help="fits at the same time, each in a process of its own; -1 for one to each core (needs "
+        "joblib; the results are the same)")  # fmt: skip
+    add("--log-file", type=Path, metavar="FILE",
+        help="append a log of stages, times and results")  # fmt: skip
 
 
-def jobs(text: str) -> int:
-    """A number of processes from 1, or -1, for argparse."""
-    try:
-        value = int(text)
-    except ValueError:
-        value = 0
-    if value < 1 and value != -1:
-        raise argparse.ArgumentTypeError(
-            f"must be a whole number from 1, or -1 for one to each core, got {text!r}"
-        )
-    return value
+def run_fit(arguments: argparse.Namespace) -> int:
+    """Fit, write the model, report."""
+    from nfriction.cli.tables import coefficient_table, fit_lines, interval_table
+    from nfriction.evaluation.results import model_info
+    from nfriction.fitting.fit import fit
+    from nfriction.friction.registry import model_by_name
+    from nfriction.io.model_file import save
+
+    plant = inputs.read_rig(arguments.rig)
+    model = model_by_name(arguments.model)(plant.joints)
+    recordings = inputs.read_recordings(arguments.recordings, plant, arguments)
+    if arguments.out.is_dir():
+        raise UsageError(f"--out of fit is a file, and {arguments.out} is a folder.")
+    check_writable(arguments.out.parent)
+    with Progress() as progress:
+        progress.stage(f"fit {arguments.model}")
+        found = fit(
+            model, plant, recordings, callback=lambda stage, _: progress.step(stage),
+            **inputs.fit_settings(arguments),
+        )  # fmt: skip
+        progress.stage("write the model")
+    save(model, arguments.out, model_info(found, recordings))
+    print(fit_lines(arguments.model, found))
+    print(f"position error over training windows: {1e3 * found.residual:.3g} m{plant.unit}")
+    print(coefficient_table(model, plant.joint_names, plant.unit))
+    if intervals := interval_table(found):
+        print(intervals)
+    print(f"wrote {arguments.out}")
+    if found.converged:
+        further = ["nfriction", "export", str(arguments.out), "--format", "torchscript"]
+        print(f"next: {shlex.join(further)}")
+    return 0
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run_compare(arguments: argparse.Namespace) -> int:
     """Read, then compare."""
-    plant = estimation.read_rig(arguments.rig)
+    plant = inputs.read_rig(arguments.rig)
     paths = [*arguments.train, *arguments.test]
-    recordings = estimation.read_recordings(paths, plant, arguments)
+    recordings = inputs.read_recordings(paths, plant, arguments)
     train, test = recordings[: len(arguments.train)], recordings[len(arguments.train) :]
-    return run_comparison(plant, train, test, arguments, estimation.fit_settings(arguments))
+    return compare_and_report(plant, train, test, arguments, inputs.fit_settings(arguments))
 
 
-def run_comparison(
+def compare_and_report(
     plant: Plant,
     train: list[Recording],
     test: list[Recording],
@@ -96,7 +131,7 @@ def run_comparison(
     Returns:
         The exit status: 1 where a model could not be fitted.
     """
-    from nfriction.cli import tables
+    from nfriction.cli.tables import verdict
     from nfriction.evaluation.compare import check_recordings, compare
     from nfriction.evaluation.cross_validation import select
     from nfriction.evaluation.results import exclusive, report_of, write_results
@@ -126,7 +161,19 @@ def run_comparison(
         )  # fmt: skip
         if page is not None:
             write_report(arguments.out, page)  # else the earlier run's page would be missed
-        logger.info(tables.verdict(comparison))
+        logger.info(verdict(comparison))
+    _print(comparison, selection, plant, arguments)
+    return 1 if comparison.failed else 0
+
+
+def _print(
+    comparison: Comparison,
+    selection: Selection | None,
+    plant: Plant,
+    arguments: argparse.Namespace,
+) -> None:
+    from nfriction.cli import tables
+
     print(f"\n{tables.error_tables(comparison)}\n")
     for name, fit in comparison.fits.items():
         print(tables.fit_lines(name, fit))
@@ -143,7 +190,6 @@ def run_comparison(
         print(f"its model file: {arguments.out / 'models' / f'{comparison.best()}.json'}")
     what = "results and models" if arguments.no_figures else "results, models and figures"
     print(f"\n{what} are in {arguments.out}")
-    return 1 if comparison.failed else 0
 
 
 @contextmanager
