@@ -99,6 +99,8 @@ def exclusive(folder: str | Path) -> Iterator[None]:
         yield
     finally:
         if outermost:
+            with suppress(OSError):
+                _put_in_place(folder)  # of a run that Ctrl-C ended here
             # Windows removes it by itself, and refuses to as long as it is open.
             with suppress(OSError):
                 (folder / LOCK).unlink()

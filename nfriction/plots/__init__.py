@@ -5,8 +5,14 @@ from nfriction.plots.coefficients import (
     coefficient_surfaces,
     coefficients_over_time,
 )
-from nfriction.plots.comparison import horizon_curve, positions, rmse_bars
-from nfriction.plots.fits import coefficient_intervals, convergence, torque_over_velocity
+from nfriction.plots.comparison import (
+    coefficient_intervals,
+    convergence,
+    horizon_curve,
+    positions,
+    rmse_bars,
+    torque_over_velocity,
+)
 from nfriction.plots.fuzzy import controller_surface, memberships
 from nfriction.plots.saving import save_all
 from nfriction.plots.style import for_dark_screen

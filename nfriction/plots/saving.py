@@ -16,8 +16,7 @@ from nfriction.plots.coefficients import (
     coefficient_surfaces,
     coefficients_over_time,
 )
-from nfriction.plots.comparison import horizon_curve, positions, rmse_bars
-from nfriction.plots.fits import torque_over_velocity
+from nfriction.plots.comparison import horizon_curve, positions, rmse_bars, torque_over_velocity
 from nfriction.plots.fuzzy import memberships
 from nfriction.plots.style import DARK_GROUND, for_dark_screen
 from nfriction.recording import Recording

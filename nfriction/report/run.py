@@ -1,16 +1,17 @@
 """Read a comparison's folder without trusting any of it."""
 
 import math
+import re
 import types
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from nfriction.evaluation.compare import SCHEMA, Comparison, Part
+from nfriction.evaluation.compare import PART_NAMES, SCHEMA, Comparison, Part
 from nfriction.evaluation.cross_validation import Candidate, Selection
 from nfriction.evaluation.results import exclusive, interrupted
 from nfriction.evaluation.score import Score
@@ -19,13 +20,17 @@ from nfriction.friction.registry import model_names
 from nfriction.io import strict_json
 from nfriction.io.model_file import ModelFileError, load, load_info
 from nfriction.io.model_info import ModelInfo
-from nfriction.report.figures import Figure, read_figures
 
-# Far above any run of ours; a larger file is no results file.
-LARGEST_RESULTS = 64 * 2**20
+# Far above any run of ours; larger files are none of it.
+LARGEST_RESULTS, LARGEST_FIGURE, MOST_FIGURES = 64 * 2**20, 16 * 2**20, 100
+_PNG = b"\x89PNG\r\n\x1a\n"
+# Text that `plots.save_all` puts before the picture.
+_RUN = re.compile(rb"tEXtnfriction run\0([0-9a-f]{16})")
 # Squares of smaller numbers are finite.
 LARGEST_NUMBER = 10**100
 
+# Entries whose names have changed since the first schema.
+_RENAMED = {"held_out": "test", "alike": "indistinguishable", "lost": "unidentifiable"}
 Coefficients = dict[str, dict[str, tuple[float, ...]]]
 
 
@@ -55,6 +60,17 @@ class FitRecord:
     unidentifiable: tuple[str, ...] = ()
     plant: dict[str, float] = field(default_factory=dict)
     intervals: dict[str, tuple[float, float]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A PNG file with its size in pixels, and the id of its run if it bears one."""
+
+    name: str
+    png: bytes
+    width: int
+    height: int
+    run: str = ""
 
 
 @dataclass(frozen=True)
@@ -121,6 +137,8 @@ def read_run(folder: str | Path) -> Run:
         raise RunError(f"{path}: is too large for results of a comparison.")
     try:
         content = strict_json.parse(path.read_text(encoding="utf-8"))
+        if isinstance(content, dict) and "schema" not in content:
+            content = _renamed(content)
     except (ValueError, RecursionError) as error:
         raise RunError(f"{path}: is no JSON, or cut short ({error}).") from error
     try:
@@ -129,12 +147,19 @@ def read_run(folder: str | Path) -> Run:
         raise RunError(f"{path}: not results of a comparison: {error}.") from error
 
 
+def _renamed(value: Any) -> Any:
+    """JSON of the first schema with today's names."""
+    if isinstance(value, list):
+        return [_renamed(entry) for entry in value]
+    if isinstance(value, dict):
+        return {_RENAMED.get(key, key): _renamed(entry) for key, entry in value.items()}
+    return value
+
+
 def _run(folder: Path, content: dict[str, Any]) -> Run:
     schema = _read(float, content.get("schema", 1), "`schema`")
     if schema > SCHEMA:
         raise _EntryError(f"its schema {schema:g} is newer than {SCHEMA}; update nfriction")
-    # The first schema named test recordings differently.
-    keys: dict[Part, str] = {"train": "train", "test": "test" if schema > 1 else "held_out"}
     joints = _read(tuple[str, ...], content.get("joints"), "`joints`")
     unit = content.get("units")
     if unit not in ("rad", "m"):
@@ -142,25 +167,22 @@ def _run(folder: Path, content: dict[str, Any]) -> Run:
     entries = _read(dict[str, dict[str, Any]], content.get("models"), "`models`")
     if not joints or not entries:
         raise _EntryError("it has no joints or no models")
-    scores = {part: _scores(entries, key, len(joints)) for part, key in keys.items()}
+    scores = {part: _scores(entries, part, len(joints)) for part in PART_NAMES}
     if not any(scores.values()):
         raise _EntryError("it has no scores")
     best = _read(dict[str, Any], content.get("best") or {}, "`best`")
     # Names select files and table rows further on.
     if best and _read(str, best.get("model"), "`best`") not in entries:
         raise _EntryError("its best model is none of its models")
-    # Also renamed since the first schema.
-    tied = best.get("indistinguishable" if schema > 1 else "alike", [])
     recordings = _read(dict[str, dict[str, str]], content.get("recordings", {}), "`recordings`")
-    fits = {n: _fit(e["fit"], f"fit of {n}") for n, e in entries.items() if "fit" in e}
+    fits: dict[str, FitRecord] = {
+        n: _read(FitRecord, e["fit"], f"fit of {n}") for n, e in entries.items() if "fit" in e
+    }
     models, notes = _models(folder, fits, len(joints))
-    figures, unread = read_figures(folder / "figures")
-    run_id = _read(str, content.get("run", ""), "`run`")
-    trained_on = recordings.get("train", {})
-    _require_one_run(folder, run_id, trained_on, models, figures)
+    figures, unread = _figures(folder / "figures")
     failed = _read(dict[str, str], content.get("failed", {}), "`failed`")
-    return Run(
-        id=run_id,
+    run = Run(
+        id=_read(str, content.get("run", ""), "`run`"),
         folder=folder,
         comparison=Comparison({}, scores["train"], scores["test"], unit, joints, failed=failed),
         fits=fits,
@@ -171,29 +193,31 @@ def _run(folder: Path, content: dict[str, Any]) -> Run:
         },
         best=best.get("model"),
         judged_by=_read(str, best.get("by", ""), "`best`"),
-        indistinguishable=_read(tuple[str, ...], tied, "`best`"),
+        indistinguishable=_read(tuple[str, ...], best.get("indistinguishable", []), "`best`"),
         command=_read(str, content.get("command", ""), "`command`"),
-        recordings={part: recordings.get(key, {}) for part, key in keys.items()},
+        recordings={part: recordings.get(part, {}) for part in PART_NAMES},
         models=models,
         figures=figures,
         notes=(*notes, *unread),
         selection=_selection(content.get("selection"), unit),
     )
+    _require_one_run(run)
+    return run
 
 
 def _scores(
-    entries: Mapping[str, Mapping[str, Any]], key: str, joints: int
+    entries: Mapping[str, Mapping[str, Any]], part: Part, joints: int
 ) -> dict[str, list[Score]]:
     found: dict[str, list[Score]] = {}
     nothing = np.zeros(0)
     for name, entry in entries.items():
-        where = f"{name}, {key}"
+        where = f"{name}, {part}"
         found[name] = [
             _read_record(
                 Score, {"windows": {}, "diverged_at": None, "floor": None} | of,
                 f"{where}, {recording}", recording=recording, time=nothing, simulated=nothing,
             )
-            for recording, of in _read(dict[str, dict], entry.get(key, {}), where).items()
+            for recording, of in _read(dict[str, dict], entry.get(part, {}), where).items()
         ]  # fmt: skip
         for score in found[name]:
             for rmse in filter(None, (score.free_run, score.floor, *score.windows.values())):
@@ -208,16 +232,8 @@ def _scores(
                     raise _EntryError(f"{where} has windows of {horizon!r} seconds") from None
     # Tables pool the recordings of a model, so all must have been scored on the same.
     if len({tuple((s.recording, *s.windows) for s in many) for many in found.values()}) > 1:
-        raise _EntryError(f"its models were scored on different recordings ({key})")
+        raise _EntryError(f"its models were scored on different recordings ({part})")
     return {name: many for name, many in found.items() if many}
-
-
-def _fit(value: Any, where: str) -> FitRecord:
-    entry = _read(dict[str, Any], value, where)
-    # The first schema's name of it.
-    known = {"unidentifiable": entry.get("lost", [])} | entry
-    fit: FitRecord = _read(FitRecord, known, where)
-    return fit
 
 
 def _selection(value: Any, unit: str) -> Selection | None:
@@ -271,27 +287,40 @@ def _models(
     return found, notes
 
 
-def _require_one_run(
-    folder: Path,
-    run_id: str,
-    trained_on: Mapping[str, str],
-    models: Mapping[str, tuple[FrictionModel, ModelInfo]],
-    figures: Sequence[Figure],
-) -> None:
+def _figures(folder: Path) -> tuple[tuple[Figure, ...], list[str]]:
+    """Those in the order of their names, and a sentence on each that could not be read."""
+    found: list[Figure] = []
+    notes = []
+    for path in sorted(folder.glob("*.png"))[:MOST_FIGURES]:
+        if not path.is_file() or path.stat().st_size > LARGEST_FIGURE:
+            notes.append(f"figure {path.name}: no file, or too large")
+            continue
+        png = path.read_bytes()
+        if not png.startswith(_PNG) or len(png) < 24:
+            notes.append(f"figure {path.name}: not a PNG file")
+            continue
+        width, height = (int.from_bytes(png[k : k + 4], "big") for k in (16, 20))
+        # Earlier versions said `held_out` for `test`.
+        name = re.sub(r"^(rmse|horizons|positions)_held_out", r"\1_test", path.stem)
+        run = _RUN.search(png[:4096])
+        found.append(Figure(name, png, width, height, run[1].decode() if run else ""))
+    return tuple(found), notes
+
+
+def _require_one_run(run: Run) -> None:
     """Refuse models and figures of another run than the results'."""
+    trained_on = run.recordings["train"]
     foreign = [
         f"models/{name}.json"
-        for name, (_, info) in models.items()
-        if info.fit.get("run", "") != run_id
+        for name, (_, info) in run.models.items()
+        if info.fit.get("run", "") != run.id
         # Runs of older versions have no id, but the digests of their recordings.
         or (info.training_data and info.training_data != trained_on)
     ]
-    foreign += [
-        f"figures/{figure.name}.png" for figure in figures if figure.run not in ("", run_id)
-    ]
+    foreign += [f"figures/{f.name}.png" for f in run.figures if f.run not in ("", run.id)]
     if foreign:
         raise RunError(
-            f"{folder}: has files of two runs: {', '.join(foreign)} belong to another run than "
+            f"{run.folder}: has files of two runs: {', '.join(foreign)} belong to another run than "
             f"results.json; run the comparison again, or give a folder that a single run wrote."
         )
 

@@ -257,6 +257,30 @@ def test_a_kill_at_any_moment_never_mixes_two_runs(
     assert set(found.values()) == {second}
 
 
+@pytest.mark.usefixtures("quick_scripts")
+def test_ctrl_c_between_two_files_leaves_a_whole_run(
+    comparison: Comparison, other: Comparison, recording: Recording, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    results.write_results(comparison, [recording], [], tmp_path, figures=False)
+    replace = Path.replace
+
+    def interrupt(path: Path, to: Path) -> Path:
+        if path.suffix == ".pt" and path.parent.parent.name == results.COMPLETE:
+            monkeypatch.undo()
+            raise KeyboardInterrupt
+        return replace(path, to)
+
+    monkeypatch.setattr(Path, "replace", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        results.write_results(other, [recording], [], tmp_path, figures=False)
+    found = run_ids(tmp_path)
+    assert len(set(found.values())) == 1
+    assert set(found) >= {"results.json", "table.csv", "models/good.json"}
+    assert "models/wild.json" not in found
+    assert not list(tmp_path.glob(".*"))
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a second process")
 @pytest.mark.usefixtures("quick_scripts")
 def test_two_processes_do_not_write_one_folder_at_once(
