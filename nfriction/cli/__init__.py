@@ -103,5 +103,6 @@ def _run(arguments: argparse.Namespace) -> int:
     try:
         with interruptible(), one_line_warnings():
             return arguments.run(arguments)
-    except (CodegenError, ExportError) as error:
+    # Algebra on hopeless data fails in torch's own terms.
+    except (CodegenError, ExportError, ArithmeticError, torch.linalg.LinAlgError) as error:
         raise UsageError(str(error)) from error

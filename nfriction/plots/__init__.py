@@ -7,7 +7,6 @@ from nfriction.plots.coefficients import (
 )
 from nfriction.plots.comparison import (
     coefficient_intervals,
-    convergence,
     horizon_curve,
     positions,
     rmse_bars,
@@ -23,7 +22,6 @@ __all__ = [
     "coefficient_surfaces",
     "coefficients_over_time",
     "controller_surface",
-    "convergence",
     "for_dark_screen",
     "horizon_curve",
     "memberships",

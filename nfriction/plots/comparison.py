@@ -1,4 +1,4 @@
-"""Figures of a comparison: errors, torque over velocity, intervals, convergence of its fits."""
+"""Figures of a comparison: errors, torque over velocity, intervals of its fits."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,6 @@ from nfriction.evaluation.score import Score
 from nfriction.fitting.equation_error import friction_torque
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction.models import FrictionModel
-from nfriction.optim.least_squares import Step
 from nfriction.plant import Plant
 from nfriction.plots import style
 from nfriction.recording import Recording
@@ -303,49 +302,6 @@ def coefficient_intervals(fits: Mapping[str, FitResult], *, width: float | None 
         ax.grid(False, axis="x")
     if len(fits) > 1:
         style.legend(figure, [Line2D([], [], **looks[name]) for name in fits], list(fits))
-    return figure
-
-
-def convergence(
-    history: Sequence[float | Step] | Mapping[str, Sequence[float | Step]],
-    *,
-    quantity: str = "cost",
-    width: float = style.COLUMN,
-) -> Figure:
-    """A solver's cost over its steps, logarithmic where it falls far.
-
-    Args:
-        history: values before each step, or a solver's `Step`s; by name to compare several.
-        quantity: label of the values, with their unit.
-        width: of the figure [in].
-
-    Raises:
-        ValueError: if there is no finite value.
-    """
-    named = history if isinstance(history, Mapping) else {"": history}
-    curves = {
-        str(name): np.array([s.cost if isinstance(s, Step) else float(s) for s in steps])
-        for name, steps in named.items()
-    }
-    values = np.concatenate([np.zeros(0), *curves.values()])
-    finite = values[np.isfinite(values)]
-    if not finite.size:
-        raise ValueError("`history` has no finite value; give the cost at each step.")
-    figure, axes = style.panels(1, 1, width, 2.3)
-    ax = axes[0, 0]
-    looks = style.looks(curves)
-    for name, curve in curves.items():
-        ax.plot(np.arange(len(curve)), curve, **looks[name].line, marker=".", markersize=4)
-    if finite.min() > 0 and style.spread(finite) > style.LOG_FROM:
-        ax.set_yscale("log")
-    else:
-        # Offsets hide the size of a cost that changes little.
-        ax.ticklabel_format(axis="y", useOffset=False)
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.set_xlabel("step")
-    ax.set_ylabel(quantity)
-    if any(curves):
-        style.legend(figure, ax.lines, list(curves))
     return figure
 
 

@@ -79,19 +79,15 @@ class Run:
 
     Attributes:
         id: of the run, in every file that it wrote; empty of older versions.
-        folder: as it was given.
         comparison: the scores, without simulated positions and without fits.
         fits: status of each fit, by model.
         coefficients: by model, then by where they apply (`"always"` for a constant model),
             then by name: a value a joint.
         best: name of the best model, None where there was no test recording.
-        judged_by: criterion of the verdict.
         indistinguishable: the best and all models tied with it, simplest first; of older versions
             none.
-        command: reproduces the results.
         recordings: digest by name of the `"train"` and `"test"` recordings.
-        models: models and the information of their files; those that could be read.
-        figures: in the order of their names.
+        models: those whose files could be read, with the information in them.
         notes: a sentence on everything that could not be read.
         selection: the choice on the training recordings alone, where there is one.
     """

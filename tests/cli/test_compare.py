@@ -200,6 +200,17 @@ def test_ctrl_c_ends_the_run_though_the_solver_survives_it(
     assert signal.getsignal(signal.SIGINT) is before
 
 
+def test_data_on_which_the_algebra_fails_are_an_error_in_a_line(
+    bench: Path, monkeypatch: pytest.MonkeyPatch, failing: Callable[..., str]
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise torch.linalg.LinAlgError("linalg.cholesky:\nnot positive definite")
+
+    monkeypatch.setattr("nfriction.evaluation.parallel.fit", fail)
+    words = [bench / "a.csv.gz", "--rig", bench / "bench.json", "--models", "NCFM"]
+    assert "not positive definite" in failing("compare", *words, "--out", bench / "hopeless")
+
+
 def test_interrupt_outside_a_solver(
     bench: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

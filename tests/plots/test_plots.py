@@ -21,7 +21,6 @@ from nfriction.evaluation.score import RMSE, Score
 from nfriction.fitting.fit import fit
 from nfriction.friction.models import LFM, NCFM, NFLFM, NFNCFM, NFNLFM, NLFM
 from nfriction.friction.registry import model_names
-from nfriction.optim.least_squares import Step
 from nfriction.papers.controller.mamdani import paper_controller
 from nfriction.plant import LinearAxis, rigs
 from nfriction.plots import style
@@ -287,20 +286,6 @@ def test_only_neuro_fuzzy_models_have_sets_and_maps():
             draw(NFLFM(2), joint_names=["one"])
     with pytest.raises(ValueError, match="before"):
         plots.memberships(NFLFM(2), NFLFM(2, terms=(3, 5)))
-
-
-def test_convergence_takes_numbers_and_steps():
-    costs = [1e4, 1e2, 1.0]
-    steps = [Step(cost, 1e-3, 0.0) for cost in costs]
-    figure = plots.convergence({"0.5 s windows": costs, "2 s windows": steps})
-    for line in figure.axes[0].lines:
-        np.testing.assert_array_equal(line.get_ydata(), costs)
-    assert figure.axes[0].get_yscale() == "log"
-    assert_tidy(figure)
-    evidence = plots.convergence([-3.0, -2.0], quantity="log evidence [nat]").axes[0]
-    assert (evidence.get_yscale(), evidence.get_ylabel()) == ("linear", "log evidence [nat]")
-    with pytest.raises(ValueError, match="no finite value"):
-        plots.convergence([])
 
 
 def test_controller_map_is_the_controller_in_si():
