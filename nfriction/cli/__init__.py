@@ -1,17 +1,18 @@
 """Command line: fit, compare, inspect and export friction models.
 
-Each command is a module with `add(commands, common)`, which registers its parser, and
-`run(arguments) -> int`. Only `run` imports what is slow to load (torch, pandas, matplotlib), so
+A function `add(commands, common)` registers a command's parser, whose default `run(arguments)`
+returns the exit status. Only `run` imports what is slow to load (torch, pandas, matplotlib), so
 that help and usage errors come at once.
 """
 
 import argparse
+import io
 import logging
 import shlex
 import sys
 from collections.abc import Sequence
 
-from nfriction.cli import compare, demo, export, fit, info, report, reproduce, verify
+from nfriction.cli import demo, estimate, export, inspect, reproduce, verify
 from nfriction.cli.console import (
     Parser,
     UsageError,
@@ -22,8 +23,11 @@ from nfriction.cli.console import (
 )
 from nfriction.version import __version__
 
-# In the order in which the help lists them.
-COMMANDS = (fit, compare, demo, report, info, export, verify, reproduce)
+# They register the commands, in the order in which the help lists them.
+COMMANDS = (
+    estimate.add_fit, estimate.add_compare, demo.add, inspect.add_report, inspect.add_info,
+    export.add, verify.add, reproduce.add,
+)  # fmt: skip
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -33,6 +37,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     141 says that the reader of the output closed it.
     """
     words = list(sys.argv[1:] if argv is None else argv)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # Names of files and recordings may be no valid Unicode.
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         try:
             return _answer(words)
@@ -78,8 +85,8 @@ def make_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(metavar="COMMAND")
     common = Parser(add_help=False)
     common.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    for command in COMMANDS:
-        command.add(commands, common)
+    for add in COMMANDS:
+        add(commands, common)
     return parser
 
 
@@ -98,5 +105,6 @@ def _run(arguments: argparse.Namespace) -> int:
     try:
         with interruptible(), one_line_warnings():
             return arguments.run(arguments)
-    except (CodegenError, ExportError) as error:
+    # Algebra on hopeless data fails in torch's own terms.
+    except (CodegenError, ExportError, ArithmeticError, torch.linalg.LinAlgError) as error:
         raise UsageError(str(error)) from error

@@ -2,7 +2,6 @@
 
 import argparse
 import logging
-import math
 import os
 import re
 import signal
@@ -39,24 +38,6 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         raise UsageError(f"{message}; see {self.prog} --help.")
-
-
-def count(text: str) -> int:
-    """A whole number from 0, for argparse."""
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"must be a whole number from 0, got {text!r}")
-    return int(text)
-
-
-def seconds(text: str) -> float:
-    """A positive duration, for argparse."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"must be positive seconds, got {text!r}")
-    return value
 
 
 def check_writable(folder: Path) -> None:
@@ -172,12 +153,12 @@ class Progress:
         if self._logger is not None:
             self._logger.info(what)
         self._what = what
-        self._bar.set_description(what)
+        self._bar.set_description_str(what)
 
     def step(self, stage: str) -> None:
         """Count a step of a solver."""
         self._check()
-        self._bar.set_description(f"{self._what}, {stage}")
+        self._bar.set_description_str(f"{self._what}, {stage}")
         self._bar.update()
 
     def _check(self) -> None:

@@ -4,8 +4,9 @@ import argparse
 import sys
 from pathlib import Path
 
-from nfriction.cli.compare import add_comparison_options, run_comparison
-from nfriction.cli.console import Parser, count, seconds
+from nfriction.cli.console import Parser
+from nfriction.cli.estimate import add_comparison_options, compare_and_report
+from nfriction.cli.inputs import count, seconds
 
 # Held equal to `twin.QUICK_DURATION` by a test; the twin itself loads torch.
 DURATION = 10.0
@@ -44,4 +45,4 @@ def run(arguments: argparse.Namespace) -> int:
         f"simulated the papers' rig with friction unknown to every model: {len(train)} recordings "
         f"of {arguments.seconds:g} s to train on, {len(test)} to test on"
     )
-    return run_comparison(plant, train, test, arguments, {"fit_plant": False})
+    return compare_and_report(plant, train, test, arguments, {"fit_plant": False})

@@ -4,8 +4,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nfriction.cli import estimation, names
-from nfriction.cli.console import Parser, UsageError, check_writable, seconds
+from nfriction.cli import inputs
+from nfriction.cli.console import Parser, UsageError, check_writable
+from nfriction.cli.inputs import seconds
 
 if TYPE_CHECKING:
     from nfriction.friction.models import FrictionModel
@@ -29,7 +30,7 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
         description="Write a fitted model as artefacts for controllers, proven equal to it, or as "
         "the nearest joint parameters of a simulator.", epilog=EXAMPLE,
     )  # fmt: skip
-    parser.add_argument("model", type=names.file, metavar="MODEL", help="model file")
+    parser.add_argument("model", type=inputs.file, metavar="MODEL", help="model file")
     parser.add_argument("--format", type=_targets, default="torchscript", metavar="FORMATS",
                         help=f"with commas between them: {', '.join(TARGETS)}")  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path(), help="folder to write to")
@@ -42,18 +43,18 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
     parser.add_argument("--cutoff", type=_numbers, default="20", metavar="HZ",
                         help="cut-off of that filter [Hz]")  # fmt: skip
     group = parser.add_argument_group("mjcf and urdf")
-    group.add_argument("--recording", type=names.file, action="append", default=[],
+    group.add_argument("--recording", type=inputs.file, action="append", default=[],
                        help="motion along which the nearest parameters are sought; can be given "
                        "several times")  # fmt: skip
-    group.add_argument("--rig", type=names.rig,
+    group.add_argument("--rig", type=inputs.rig,
                        help="rig file or name (default: the one in the model file)")  # fmt: skip
-    group.add_argument("--patch", type=names.file, metavar="ROBOT",
+    group.add_argument("--patch", type=inputs.file, metavar="ROBOT",
                        help="robot description whose joints of these names get them")  # fmt: skip
     group.add_argument("--angles", metavar="HOW,ZERO",
                        help="how the recordings write angles, e.g. absolute,hanging "
                        "(default: as file or rig say)")  # fmt: skip
     group.add_argument("--degrees", action="store_true", help="the recordings are in degrees")
-    group.add_argument("--columns", type=estimation._columns, metavar="OURS=THEIRS,...",
+    group.add_argument("--columns", type=inputs.columns, metavar="OURS=THEIRS,...",
                        help="the recordings' names of time, q1, ..., tau1, ... where they differ, "
                        "e.g. time=t,q1=enc_1,q2=enc_2")  # fmt: skip
     parser.set_defaults(run=run)
@@ -113,12 +114,12 @@ def _write_simulator(
     from nfriction.signals import kalman_smoother
 
     if arguments.rig:
-        plant = estimation.read_rig(arguments.rig)
+        plant = inputs.read_rig(arguments.rig)
     elif info.rig is not None:
         plant = rigs.from_dict(info.rig)
     else:
         raise UsageError("the model file has no rig; give --rig, whose loads friction needs.")
-    recordings = estimation.read_recordings(arguments.recording, plant, arguments)
+    recordings = inputs.read_recordings(arguments.recording, plant, arguments)
     moved = (recording.joint_coordinates(plant) for recording in recordings)
     motions = [kalman_smoother(recording.time, recording.q) for recording in moved]
     path = arguments.out / f"{arguments.model.stem}{SIMULATORS[target]}"

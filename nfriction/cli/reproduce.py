@@ -6,7 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from nfriction.cli.console import Parser, check_writable, count
+from nfriction.cli.console import Parser, check_writable
+from nfriction.cli.inputs import count
 
 EXAMPLE = """example:
   nfriction reproduce --quick --out runs/papers

@@ -3,8 +3,8 @@
 import argparse
 from pathlib import Path
 
-from nfriction.cli import names
-from nfriction.cli.console import Parser, UsageError, count
+from nfriction.cli import inputs
+from nfriction.cli.console import Parser, UsageError
 
 EXAMPLE = """example:
   nfriction verify artefacts/model.pt model.json"""
@@ -19,8 +19,8 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
         "differ. C is compiled and run as it is: verify it from hands that you trust.",
     )  # fmt: skip
     parser.add_argument("artefact", type=Path, metavar="ARTEFACT", help="what export wrote")
-    parser.add_argument("model", type=names.file, metavar="MODEL", help="model file")
-    parser.add_argument("--points", type=count, default=5000, metavar="N",
+    parser.add_argument("model", type=inputs.file, metavar="MODEL", help="model file")
+    parser.add_argument("--points", type=inputs.count, default=5000, metavar="N",
                         help="points to draw, to 10 %% beyond the range")  # fmt: skip
     parser.set_defaults(run=run)
 

@@ -1,30 +1,43 @@
-"""Write a comparison's folder: tables, results, models, artefacts and figures."""
+"""Write a comparison's folder: tables, results, models, artefacts and figures, all of one run."""
 
+import errno
+import hashlib
 import json
 import logging
 import re
-import tempfile
-from collections.abc import Iterable, Sequence
+import shutil
+import unicodedata
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from filelock import FileLock, Timeout
 
 from nfriction.evaluation.compare import Comparison
 from nfriction.evaluation.cross_validation import Selection
+from nfriction.evaluation.score import Score
 from nfriction.export import ExportError, torchscript
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.io.atomic import write_atomically
 from nfriction.io.model_file import save
-from nfriction.io.model_info import ModelInfo
+from nfriction.io.model_info import ModelInfo, parameter_hash
 from nfriction.recording import Recording
 
 logger = logging.getLogger(__name__)
 
-RESULTS, TABLE = "results.json", "table.csv"
+RESULTS, TABLE, REPORT = "results.json", "table.csv", "report.html"
+# Files that a run may have written and a later one removes: in its own folders, no way out of them.
+OURS = re.compile(r"table\.csv|models/[\w-]+\.(json|pt)|figures/\w[\w.-]*\.png")
+REPORT_MARK = b'<meta name="generator" content="nfriction'
+"""Near the top of every report; a `report.html` without it is the user's own."""
+# In the folder while it is written: the lock, files that are not complete, files that are.
+LOCK, UNFINISHED, COMPLETE = ".nfriction.lock", ".nfriction-unfinished", ".nfriction-complete"
+EARLIER = "earlier.json"
 # Largest ratio of sample times that differ by the clocks of hosts, and not by what was set.
 CLOCKS = 1.05
-# Files that a run may have written and a later one removes: in its own folders, no way out of them.
-OURS = re.compile(r"table\.csv|models/\w+\.(json|pt)|figures/\w[\w.-]*\.png")
 
 
 def digests(recordings: Sequence[Recording]) -> dict[str, str]:
@@ -36,8 +49,8 @@ def digests(recordings: Sequence[Recording]) -> dict[str, str]:
     }
 
 
-def model_info(fit: FitResult, recordings: Sequence[Recording]) -> ModelInfo:
-    """Entries of a model file that describe a fit to these recordings."""
+def model_info(fit: FitResult, recordings: Sequence[Recording], run: str = "") -> ModelInfo:
+    """Entries of a model file that describe a fit to these recordings, in a run of that id."""
     qd = np.concatenate([m.qd for m in fit.motions])
     qdd = np.concatenate([m.qdd for m in fit.motions])
     times = sorted(r.sample_time for r in recordings)
@@ -52,8 +65,46 @@ def model_info(fit: FitResult, recordings: Sequence[Recording]) -> ModelInfo:
         },
         training_data=digests(recordings),
         rig=fit.plant.to_dict(),
-        fit=fit.to_dict(),
+        fit=fit.to_dict() | ({"run": run} if run else {}),
     )
+
+
+@contextmanager
+def exclusive(folder: str | Path) -> Iterator[None]:
+    """Keep other processes from writing a run into this folder, which is made if need be.
+
+    First puts in order what a killed process left: complete files are put in place, others are
+    removed.
+
+    Raises:
+        OSError: another process is writing it, or it cannot be written.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    # One object for all uses of a path in a process, so that `write_results` may run within.
+    lock = FileLock(folder.resolve() / LOCK, timeout=0, is_singleton=True)
+    outermost = not lock.is_locked
+    try:
+        lock.acquire()
+    except Timeout:
+        raise OSError(
+            errno.EBUSY,
+            "another process is writing a run there; wait until it ends, or give another folder",
+            str(folder),
+        ) from None
+    try:
+        if outermost:
+            _put_in_place(folder)
+            shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
+        yield
+    finally:
+        if outermost:
+            with suppress(OSError):
+                _put_in_place(folder)  # of a run that Ctrl-C ended here
+            # Windows removes it by itself, and refuses to as long as it is open.
+            with suppress(OSError):
+                (folder / LOCK).unlink()
+        lock.release()
 
 
 def write_results(
@@ -68,8 +119,9 @@ def write_results(
 ) -> list[Path]:
     """Write `table.csv`, `results.json`, the models with their TorchScript, and figures.
 
-    `results.json` lists the files. Those that an earlier run listed there are removed, so that
-    the folder afterwards holds files of this run, and the user's own.
+    Every file bears the id of the run, and at no time does the folder hold files of two runs:
+    those of an earlier run, which its `results.json` lists, and its `report.html` are removed
+    before the first of this one is there; `results.json` comes last. The user's own files stay.
 
     Args:
         comparison: fits and scores.
@@ -78,61 +130,139 @@ def write_results(
         selection: the choice on the training recordings alone, if there is one.
         command: reproduces the results.
         figures: draw them.
+
+    Raises:
+        OSError: another process is writing a run into the folder, or it cannot be written.
     """
     folder = Path(folder)
     results = comparison.to_dict() | {
         "selection": None if selection is None else selection.to_dict(),
-        "command": command,
         "recordings": {"train": digests(train), "test": digests(test)},
     }
+    run = _run_id(results, comparison)
+    results |= {"run": run, "command": command}
+    unfinished = folder / UNFINISHED
 
-    def write_index(files: Iterable[Path]) -> Path:
-        own = {"files": sorted({path.relative_to(folder).as_posix() for path in files})}
-        text = json.dumps(results | own, indent=1, allow_nan=False)
-        return write_atomically(folder / RESULTS, text.encode())
+    def write_index(place: Path, files: Sequence[str]) -> None:
+        text = json.dumps(results | {"files": sorted(files)}, indent=1, allow_nan=False)
+        write_atomically(place / RESULTS, text.encode())
 
-    earlier = files_of(folder)
-    models = {name: folder / "models" / f"{name}.json" for name in comparison.fits}
-    table = write_atomically(folder / TABLE, comparison.to_frame().to_csv(index=False).encode())
-    # Listed before they exist: if this run is interrupted, the next one knows its files.
-    write_index(
-        [*earlier, table, *models.values(), *(m.with_suffix(".pt") for m in models.values())]
-    )
-    written = [table]
-    for name, path in models.items():
-        written += _write_model(comparison.fits[name], path, train)
-    for path in set(earlier) - set(written):
-        path.unlink(missing_ok=True)
-    index = write_index(written)
-    if figures:
-        from nfriction import plots  # matplotlib takes half a second that other commands save
+    with exclusive(folder):
+        try:
+            write_atomically(unfinished / TABLE, _table(comparison, run).encode())
+            written = [TABLE]
+            for name, fit in comparison.fits.items():
+                info = model_info(fit, train, run)
+                paths = _write_model(fit, unfinished / "models" / f"{name}.json", info)
+                written += [f"models/{path.name}" for path in paths]
+            write_index(unfinished, written)
+            unfinished.rename(folder / COMPLETE)
+            _put_in_place(folder)
+            # Drawn when the fits are safe: it takes long, and may be interrupted.
+            if figures:
+                from nfriction import plots  # matplotlib takes half a second that others save
 
-        (folder / "figures").mkdir(exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder, prefix=".") as unfinished:
-            drawn = plots.save_all(comparison, [*train, *test], unfinished)
-            places = [folder / "figures" / path.name for path in drawn]
-            write_index([*written, *places])
-            written += [path.replace(to) for path, to in zip(drawn, places, strict=True)]
-    return [index, *written]
+                drawn = plots.save_all(comparison, [*train, *test], unfinished, run=run)
+                (folder / "figures").mkdir(exist_ok=True)
+                # Listed before they are there, so that a later run knows them in any case.
+                written += [f"figures/{path.name}" for path in drawn]
+                write_index(folder, written)
+                for path in drawn:
+                    path.replace(folder / "figures" / path.name)
+        finally:
+            shutil.rmtree(unfinished, ignore_errors=True)
+    return [folder / RESULTS, *(folder / name for name in written)]
 
 
-def files_of(folder: Path) -> list[Path]:
-    """Files that an earlier run listed in its `results.json`.
+def files_of(index: Path) -> list[str]:
+    """Files that an earlier run listed in its `results.json`, relative to its folder.
 
     Only names that a run writes count, because the file may be anybody's.
     """
     try:
-        content = json.loads((folder / RESULTS).read_text(encoding="utf-8"))
+        content = json.loads(index.read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError, ValueError, RecursionError):
         return []
     listed = content.get("files") if isinstance(content, dict) else None
     names = listed if isinstance(listed, list) else []
-    return [folder / name for name in names if isinstance(name, str) and OURS.fullmatch(name)]
+    return [name for name in names if isinstance(name, str) and OURS.fullmatch(name)]
 
 
-def _write_model(fit: FitResult, path: Path, recordings: Sequence[Recording]) -> list[Path]:
+def report_of(folder: Path) -> Path | None:
+    """The folder's `report.html` if it is a report of ours."""
+    path = folder / REPORT
+    if not path.is_file():
+        return None
+    with path.open("rb") as file:
+        return path if REPORT_MARK in file.read(1000) else None
+
+
+def interrupted(folder: Path) -> bool:
+    """True where a process was killed, or is busy, putting a run's files in place."""
+    return (folder / COMPLETE).is_dir()
+
+
+def _put_in_place(folder: Path) -> None:
+    """Replace the earlier run's files by the complete ones.
+
+    Killed at any point, it ends properly when called again: the earlier index moves away first
+    and is the list of files to remove, the new index comes last.
+    """
+    complete, index = folder / COMPLETE, folder / RESULTS
+    earlier = complete / EARLIER
+    if (complete / RESULTS).is_file():
+        if index.is_file():
+            index.replace(earlier)
+        if earlier.is_file():
+            for name in files_of(earlier):
+                (folder / name).unlink(missing_ok=True)
+            if report := report_of(folder):
+                report.unlink()
+            earlier.unlink()
+        for path in sorted(complete.rglob("*.*")):
+            if path.is_file() and path != complete / RESULTS:
+                place = folder / path.relative_to(complete)
+                place.parent.mkdir(exist_ok=True)
+                path.replace(place)
+        (complete / RESULTS).replace(index)
+    shutil.rmtree(complete, ignore_errors=True)
+
+
+def _run_id(results: dict[str, Any], comparison: Comparison) -> str:
+    """Digest of results and parameters: runs that come to the same have the same files."""
+    parameters = {n: parameter_hash(f.model.state_dict()) for n, f in comparison.fits.items()}
+    content = json.dumps([results, parameters], sort_keys=True)
+    return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+
+def _table(comparison: Comparison, run: str) -> str:
+    """Every error as a line of CSV."""
+
+    def renamed(scores: dict[str, list[Score]]) -> dict[str, list[Score]]:
+        return {
+            model: [replace(score, recording=_plain_cell(score.recording)) for score in of_model]
+            for model, of_model in scores.items()
+        }
+
+    joints = tuple(map(_plain_cell, comparison.joint_names))
+    train, test = renamed(comparison.train), renamed(comparison.test)
+    table = replace(comparison, train=train, test=test, joint_names=joints).to_frame()
+    table.insert(0, "run", run)
+    text: str = table.to_csv(index=False)
+    return text
+
+
+def _plain_cell(name: str) -> str:
+    """A name that is valid Unicode, and that no spreadsheet will compute as a formula."""
+    # File names may hold bytes that are no UTF-8.
+    text = name.encode(errors="backslashreplace").decode()
+    # Spreadsheets also take full-width signs, and skip white space before them.
+    start = unicodedata.normalize("NFKC", text.lstrip())[:1]
+    return f"'{text}" if start in tuple("=+-@") else text
+
+
+def _write_model(fit: FitResult, path: Path, info: ModelInfo) -> list[Path]:
     """The model file and its TorchScript, where it has one."""
-    info = model_info(fit, recordings)
     written = [save(fit.model, path, info)]
     try:
         written.append(torchscript(fit.model, path.with_suffix(".pt"), info))

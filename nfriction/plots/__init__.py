@@ -5,8 +5,13 @@ from nfriction.plots.coefficients import (
     coefficient_surfaces,
     coefficients_over_time,
 )
-from nfriction.plots.comparison import horizon_curve, positions, rmse_bars
-from nfriction.plots.fits import coefficient_intervals, convergence, torque_over_velocity
+from nfriction.plots.comparison import (
+    coefficient_intervals,
+    horizon_curve,
+    positions,
+    rmse_bars,
+    torque_over_velocity,
+)
 from nfriction.plots.fuzzy import controller_surface, memberships
 from nfriction.plots.saving import save_all
 from nfriction.plots.style import for_dark_screen
@@ -17,7 +22,6 @@ __all__ = [
     "coefficient_surfaces",
     "coefficients_over_time",
     "controller_surface",
-    "convergence",
     "for_dark_screen",
     "horizon_curve",
     "memberships",

@@ -1,21 +1,33 @@
-"""Figures of position errors: along recordings, by model and joint, by horizon."""
+"""Figures of a comparison: errors, torque over velocity, intervals of its fits."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
+import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
 
 from nfriction.evaluation.compare import NO_FRICTION, Comparison, Part
 from nfriction.evaluation.score import Score
+from nfriction.fitting.equation_error import friction_torque
+from nfriction.fitting.result.fit_result import FitResult
+from nfriction.friction.models import FrictionModel
+from nfriction.plant import Plant
 from nfriction.plots import style
 from nfriction.recording import Recording
+from nfriction.signals import Motion, kalman_smoother
+
+Array = NDArray[np.float64]
 
 # Room that a bar and its number need side by side with others [in].
 _BAR = 0.13
+_POINTS = 3000  # of the scatter of torques, a joint
+_BINS = 24  # of its medians
 
 
 def positions(
@@ -24,7 +36,8 @@ def positions(
     """Measured against simulated position, a pair of panels a joint: position, error below.
 
     A panel spans the measured range, and the errors of models that did not diverge, up to half of
-    that; larger ones, such as of a simulation without friction, are cut off.
+    that. The error without friction, which would leave it at every swing, is drawn only where
+    there is no other model.
 
     Args:
         recording: the measured motion, in its own convention and unit.
@@ -44,7 +57,7 @@ def positions(
             )
     joints = recording.joints
     figure, axes = style.panels(
-        2 * joints, 1, width, 0.4 + 1.7 * joints, sharex=True, height_ratios=[1.5, 1] * joints
+        2 * joints, 1, width, 0.4 + 1.7 * joints, sharex=True, height_ratios=[1, 1] * joints
     )
     looks = style.looks(scores)
     # Errors that diverge or ignore friction would hide all others.
@@ -61,7 +74,8 @@ def positions(
         factor, unit = style.scaled(recording.unit, shown)
         for model, error in errors.items():
             position.plot(recording.time, scores[model].simulated[:, joint], **looks[model].line)
-            below.plot(recording.time, factor * error, **looks[model].line)
+            if model != NO_FRICTION or len(scores) == 1:
+                below.plot(recording.time, factor * error, **looks[model].line)
         low, high = float(measured.min()), float(measured.max())
         position.set_ylim(low - 0.25 * span, high + 0.25 * span)
         below.set_ylim(style.padded(-factor * shown, factor * shown))
@@ -92,14 +106,14 @@ def rmse_bars(table: pd.DataFrame, unit: str, *, width: float | None = None) -> 
     values = table.to_numpy(dtype=np.float64)
     if values.size == 0:
         raise ValueError("`table` is empty; it needs a row a model and a column a joint.")
-    factor, unit = style.scaled(unit, values)
+    values = 1e3 * values  # as in every table
     models, joints = [str(name) for name in table.index], [str(name) for name in table.columns]
     # Numbers above bars must not overlap.
     room = _BAR * (len(models) + 1) * len(joints) + 0.6
     width = width or (style.COLUMN if room <= style.COLUMN else style.PAGE)
     figure, axes = style.panels(1, 1, width, 2.2)
     ax = axes[0, 0]
-    finite = factor * values[np.isfinite(values) & (values > 0)]
+    finite = values[np.isfinite(values) & (values > 0)]
     largest, smallest = (finite.max(), finite.min()) if finite.size else (1.0, 1.0)
     if style.spread(values) > style.LOG_FROM:
         # A number above a bar takes a share of the axis, not of the value.
@@ -112,15 +126,15 @@ def rmse_bars(table: pd.DataFrame, unit: str, *, width: float | None = None) -> 
     looks = style.looks(models)
     for m, model in enumerate(models):
         x = np.arange(len(joints)) + (m - 0.5 * (len(models) - 1)) * bar
-        height = np.where(np.isinf(values[m]), top, factor * values[m])
+        height = np.where(np.isinf(values[m]), top, values[m])
         bars = ax.bar(x, height - bottom, 0.92 * bar, bottom=bottom, **looks[model].bar)
         for patch, value in zip(bars, values[m], strict=True):
-            _name_bar(ax, patch.get_x() + patch.get_width() / 2, factor * value, top, bottom)
+            _name_bar(ax, patch.get_x() + patch.get_width() / 2, value, top, bottom)
             patch.set_alpha(0.35 if np.isinf(value) else 1.0)
     ax.set_xticks(range(len(joints)), joints)
     ax.tick_params(axis="x", length=0)
     ax.grid(False, axis="x")
-    ax.set_ylabel(f"position RMSE [{unit}]")
+    ax.set_ylabel(f"position RMSE [m{unit}]")
     style.legend(figure, ax.containers, models)
     return figure
 
@@ -146,13 +160,12 @@ def horizon_curve(
     part = part or comparison.parts[0]
     horizons = [*comparison.horizons(), None]
     tables = [comparison.table(horizon, part=part)[column] for horizon in horizons]
-    values = np.stack([table.to_numpy(dtype=np.float64) for table in tables], -1)
+    # In thousandths, as in every table.
+    values = 1e3 * np.stack([table.to_numpy(dtype=np.float64) for table in tables], -1)
     floor = comparison.floor(column, part=part)
-    shown = values[np.isfinite(values)]
-    factor, unit = style.scaled(comparison.unit, shown)
     figure, axes = style.panels(1, 1, width, 2.2)
     ax = axes[0, 0]
-    known = factor * np.append(shown, [] if floor is None else floor)
+    known = np.append(values[np.isfinite(values)], [] if floor is None else 1e3 * floor)
     known = known[known > 0] if (known > 0).any() else np.ones(1)
     bottom, top = known.min() / 1.6, known.max() * 1.6
     diverged = np.isinf(values)
@@ -163,7 +176,7 @@ def horizon_curve(
     looks = style.looks(models)
     x = np.arange(len(horizons))
     handles = []
-    for model, errors in zip(models, factor * values, strict=True):
+    for model, errors in zip(models, values, strict=True):
         # A diverged run has no number; its line leaves through the top.
         y = np.where(np.isinf(errors), top, errors)
         handles += ax.plot(x, y, **looks[model].line, **looks[model].marker)
@@ -175,14 +188,120 @@ def horizon_curve(
     if floor is not None:
         ends = [x[-1] - 0.3, x[-1] + 0.3]
         # Only at the free run: shorter windows restart from other states.
-        band = ax.fill_between(ends, bottom, factor * floor, color=style.BAND, alpha=0.6, lw=0)
+        band = ax.fill_between(ends, bottom, 1e3 * floor, color=style.BAND, alpha=0.6, lw=0)
         handles.append(band)
         models = [*models, "one encoder count"]
     ax.set_xlim(-0.3, x[-1] + 0.3)
     ax.set_xticks(x, [f"{h} s" if h else "free run" for h in horizons])
     ax.set_xlabel("length of simulation")
-    ax.set_ylabel(f"position RMSE [{unit}]")
+    ax.set_ylabel(f"position RMSE [m{comparison.unit}]")
     style.legend(figure, handles, models)
+    return figure
+
+
+def torque_over_velocity(
+    plant: Plant,
+    models: Mapping[str, FrictionModel],
+    recordings: Sequence[Recording],
+    motions: Sequence[Motion] | None = None,
+    *,
+    width: float | None = None,
+) -> Figure:
+    """Friction torque of each law over velocity, a panel a joint, over that of the motion.
+
+    Lines are at the load at rest and without acceleration; dots are `tau - M qdd - bias` along the
+    recordings, with their median in bins of equally many samples.
+
+    Args:
+        plant: the mechanism, with its fitted terms where there are any.
+        models: friction models by name.
+        recordings: in any convention.
+        motions: their smoothed motion in joint coordinates; computed where not given.
+        width: of the figure [in].
+    """
+    joint = [r.joint_coordinates(plant) for r in recordings]
+    motions = motions or [kalman_smoother(r.time, r.q) for r in joint]
+    with torch.no_grad():
+        parts = [friction_torque(plant, r, m) for r, m in zip(joint, motions, strict=True)]
+        qd = torch.cat([p[0] for p in parts]).numpy()
+        torque = torch.cat([p[2] for p in parts]).numpy()
+    columns = min(plant.joints, 3) if plant.joints != 4 else 2
+    figure, axes = style.panel_each(plant.joints, columns, width, 2.0)
+    looks = style.looks(models)
+    for k, ax in enumerate(axes):
+        grid = _velocities(qd[:, k])
+        lines = {name: _torque(model, grid, k) for name, model in models.items()}
+        bins = np.array_split(np.argsort(qd[:, k]), min(_BINS, len(qd)))
+        middle = [np.array([np.median(x[b, k]) for b in bins]) for x in (qd, torque)]
+        # The dots scatter far beyond any friction; the laws and most medians set the limits.
+        extremes = np.concatenate([*lines.values(), np.quantile(middle[1], [0.05, 0.95])])
+        factor, unit = style.scaled(style.sliding("N m", plant.unit), extremes)
+        some = np.linspace(0, len(qd) - 1, min(_POINTS, len(qd))).astype(int)
+        ax.plot(
+            qd[some, k], factor * torque[some, k], ".", color=style.FAINT, markersize=2.0,
+            alpha=0.35, markeredgewidth=0, rasterized=True,
+        )  # fmt: skip
+        for name, line in lines.items():
+            ax.plot(grid, factor * line, **looks[name].line)
+        ax.plot(middle[0], factor * middle[1], "o", color=style.INK, markersize=2.2, zorder=3)
+        ax.set_ylim(style.padded(factor * extremes.min(), factor * extremes.max(), 0.15))
+        ax.margins(x=0.02)
+        style.title(ax, plant.joint_names[k])
+        ax.set_ylabel(f"friction {'torque' if plant.unit == 'rad' else 'force'} [{unit}]")
+        if k + columns >= plant.joints:
+            ax.set_xlabel(f"joint velocity [{plant.unit}/s]")
+    handles = [
+        Line2D([], [], linestyle="", marker=".", color=style.FAINT),
+        Line2D([], [], linestyle="", marker="o", color=style.INK, markersize=2.2),
+        *(looks[name].handle for name in models),
+    ]
+    style.legend(figure, handles, ["from the motion", "its median", *models])
+    return figure
+
+
+def coefficient_intervals(fits: Mapping[str, FitResult], *, width: float | None = None) -> Figure:
+    """Fitted coefficients with their 95 % intervals, a panel a coefficient; joints side by side.
+
+    Intervals of unidentifiable coefficients reach from edge to edge of a panel.
+
+    Args:
+        fits: of models with constant coefficients of one law, by name: of other recordings, say.
+        width: of the figure [in].
+
+    Raises:
+        ValueError: if there is no such fit, or one is of another law.
+    """
+    laws = {found.model.law.name for found in fits.values()}
+    if len(laws) != 1 or any(found.model.schedule.follows_motion for found in fits.values()):
+        raise ValueError(
+            f"`fits` must be of constant coefficients of one law, got laws {sorted(laws)}."
+        )
+    first = next(iter(fits.values()))
+    joints, law = first.plant.joint_names, first.model.law
+    columns = min(len(law.coefficients), 3)
+    width = width or (style.COLUMN if columns < 3 else style.PAGE)
+    figure, axes = style.panel_each(len(law.coefficients), columns, width, 1.7)
+    looks = {name: {**look.line, "linestyle": "", **look.marker}
+             for name, look in style.looks(fits).items()}  # fmt: skip
+    for k, (ax, coefficient) in enumerate(zip(axes, law.coefficients, strict=True)):
+        ends = {name: _intervals(found, coefficient.name, k) for name, found in fits.items()}
+        known = np.concatenate([e.ravel() for e in ends.values()])
+        known = known[np.isfinite(known)]
+        low, high = style.padded(float(known.min()), float(known.max()), 0.1)
+        factor = style.coefficient_axis(ax, coefficient, first.plant.unit, [low, high])
+        for m, (name, of) in enumerate(ends.items()):
+            x = np.arange(len(joints)) + 0.6 * ((m + 0.5) / len(fits) - 0.5)
+            # Open intervals end at the edges of the panel.
+            value, bottom, top = (factor * np.clip(e, low, high) for e in of)
+            ax.errorbar(
+                x, value, [value - bottom, top - value], capsize=2, elinewidth=1.0, **looks[name]
+            )
+        ax.set_ylim(factor * low, factor * high)
+        ax.set_xlim(-0.6, len(joints) - 0.4)
+        ax.set_xticks(range(len(joints)), joints)
+        ax.grid(False, axis="x")
+    if len(fits) > 1:
+        style.legend(figure, [Line2D([], [], **looks[name]) for name in fits], list(fits))
     return figure
 
 
@@ -208,3 +327,30 @@ def _name_bar(ax: Axes, x: float, value: float, top: float, bottom: float) -> No
 
 def _digits(value: float) -> str:
     return f"{value:.0f}" if value >= 100 else f"{value:#.3g}"
+
+
+def _velocities(qd: Array) -> Array:
+    """The range of the data, dense about zero, where laws turn over a few thousandths."""
+    low, high = float(qd.min()), float(qd.max())
+    # Evenly spaced velocities would draw the step at zero as a slope.
+    near = np.geomspace(1e-5, 1.0, 100) * max(abs(low), abs(high))
+    grid = np.unique(np.concatenate([np.linspace(low, high, 300), -near, [0.0], near]))
+    return grid[(grid >= low) & (grid <= high)]
+
+
+def _torque(model: FrictionModel, qd: Array, joint: int) -> Array:
+    """Torque of one joint over its velocity, at the load at rest and without acceleration."""
+    velocity = torch.as_tensor(qd)[:, None].expand(-1, model.joints)
+    with torch.no_grad():
+        torque = model(velocity, torch.zeros_like(velocity), torch.ones_like(velocity))
+    return torque[:, joint].numpy()
+
+
+def _intervals(found: FitResult, name: str, k: int) -> Array:
+    """Value, lower and upper end of a coefficient of every joint, (3, joint)."""
+    ends = {i.name: (i.low, i.high) for i in found.intervals}
+    values = found.model.schedule.coefficient_sets()["always"][:, k].tolist()
+    return np.array([
+        (value, *ends.get(f"{name} of {joint}", (-math.inf, math.inf)))
+        for joint, value in zip(found.plant.joint_names, values, strict=True)
+    ]).T  # fmt: skip

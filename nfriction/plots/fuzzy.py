@@ -1,7 +1,7 @@
 """Figures of fuzzy models: memberships, maps, and a controller's surface."""
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
-from torch import Tensor
 
 from nfriction.friction.models import FrictionModel
 from nfriction.fuzzy.membership import FuzzyRules
@@ -21,21 +20,6 @@ Array = NDArray[np.float64]
 _BEFORE: dict[str, Any] = {"linestyle": (0, (3, 1.5)), "linewidth": 0.8}
 _AFTER: dict[str, Any] = {"linestyle": "-", "linewidth": 1.3}
 _POINTS = 400  # of a membership's line
-
-
-class RuleTableController(Protocol):
-    """A controller with two inputs, such as `nfriction.papers.controller.MamdaniController`.
-
-    Attributes:
-        rule_base: `inputs` and `outputs` of it have `name`, `unit` and `universe`.
-        si_factor: of each input, SI units in one of the rule base's.
-    """
-
-    rule_base: Any
-    si_factor: Tensor
-
-    def infer(self, x: Tensor) -> Tensor:
-        """Outputs (*batch, outputs) of inputs (*batch, inputs) in the rule base's units."""
 
 
 def memberships(
@@ -90,13 +74,12 @@ def memberships(
     return figure
 
 
-def controller_surface(
-    controller: RuleTableController, *, points: int = 81, width: float = style.PAGE
-) -> Figure:
+def controller_surface(controller: Any, *, points: int = 81, width: float = style.PAGE) -> Figure:
     """A rule-table controller's outputs over its two inputs, a map an output, inputs in SI.
 
     Args:
-        controller: with two inputs.
+        controller: with two inputs, such as `nfriction.papers.controller.MamdaniController`:
+            `infer` gives outputs in the units of its `rule_base`, `si_factor` those of the inputs.
         points: of the map along each axis.
         width: of the figure [in].
 
@@ -150,15 +133,10 @@ def draw_map(
     seen: NDArray[np.bool_] | None = None,
     opacity: Array | None = None,
 ) -> None:
-    """Draw a map with its colour bar.
+    """Draw a map (y, x) of cells with these edges, or a smooth one of these middles.
 
-    Args:
-        ax: the panel.
-        axes: edges of the cells, or their middles for a smooth map.
-        values: (y, x).
-        label: name and SI unit.
-        seen: cells that show; the others are a hatched ground.
-        opacity: of each cell, over the same ground.
+    Cells that are not `seen` are a hatched ground, over which others have their `opacity`. The
+    colour bar's `label` is a name and its SI unit.
     """
     shown = values if seen is None else np.ma.masked_where(~seen, values)
     low, high = (float(shown.min()), float(shown.max())) if np.ma.count(shown) else (0.0, 1.0)

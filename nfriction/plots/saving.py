@@ -6,36 +6,41 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from matplotlib.figure import Figure
 
 from nfriction.evaluation.compare import Comparison
+from nfriction.friction.models import FrictionModel
 from nfriction.plots.coefficients import (
     coefficient_sections,
     coefficient_surfaces,
     coefficients_over_time,
 )
-from nfriction.plots.comparison import horizon_curve, positions, rmse_bars
-from nfriction.plots.fits import torque_over_velocity
+from nfriction.plots.comparison import horizon_curve, positions, rmse_bars, torque_over_velocity
 from nfriction.plots.fuzzy import memberships
 from nfriction.plots.style import DARK_GROUND, for_dark_screen
 from nfriction.recording import Recording
 
 DPI = 150
+RUN_KEY = "nfriction run"
+"""Of the text in a PNG file that names its run."""
 
 
 def save_all(
-    comparison: Comparison, recordings: Sequence[Recording], folder: str | Path
+    comparison: Comparison, recordings: Sequence[Recording], folder: str | Path, *, run: str = ""
 ) -> list[Path]:
     """Write every figure of a comparison as PNG, and as `NAME.dark.png` for a dark screen.
 
     `rmse_*` and `horizons_*` for test and training recordings, `positions_*` for each
     recording given, `torque_over_velocity`, `over_time_*` for each law of which a model follows the
-    motion, and for each neuro-fuzzy model `coefficients_*`, `sections_*` and `memberships_*`.
+    motion, and for each neuro-fuzzy model `coefficients_*`, `sections_*` and `memberships_*`. A
+    network that was rejected has constant coefficients and none of these.
 
     Args:
         comparison: fits and scores.
         recordings: those compared, or some of them.
         folder: made where it does not exist; files of the same name are replaced.
+        run: id of the run, kept in each file.
 
     Returns:
         The files written.
@@ -64,9 +69,10 @@ def save_all(
             if path not in written:
                 break
             path = folder / f"{stem}_{count}.png"
-        figure.savefig(path, dpi=DPI)
+        kept = {RUN_KEY: run} if run else {}
+        figure.savefig(path, dpi=DPI, metadata=kept)
         shade = path.with_suffix(".dark.png")
-        for_dark_screen(figure, ground=DARK_GROUND).savefig(shade, dpi=DPI)
+        for_dark_screen(figure, ground=DARK_GROUND).savefig(shade, dpi=DPI, metadata=kept)
         figure.clear()
         written += [path, shade]
     return written
@@ -104,11 +110,21 @@ def _figures(
     for law in dict.fromkeys(model.law.name for model in models.values()):
         of_law = {name: model for name, model in models.items() if model.law.name == law}
         # Constants along the motion are worth a figure beside coefficients that follow it.
-        if any(model.schedule.follows_motion for model in of_law.values()):
+        if any(_follows_motion(model) for model in of_law.values()):
             yield f"over_time_{law}", coefficients_over_time(of_law, last.motions[0], **labels)
     for name, found in comparison.fits.items():
-        if found.model.schedule.fuzzy_rules() is not None:
+        if found.model.schedule.fuzzy_rules() is not None and _follows_motion(found.model):
             known = labels | {"motions": last.motions, "uncertainty": found.uncertainty}
             yield f"coefficients_{name}", coefficient_surfaces(found.model, **known)
             yield f"sections_{name}", coefficient_sections(found.model, **known)
             yield f"memberships_{name}", memberships(found.model, **labels)
+
+
+def _follows_motion(model: FrictionModel) -> bool:
+    """True unless the coefficients are constants, as also those of a rejected network."""
+    rules = model.schedule.fuzzy_rules()
+    if rules is None:
+        return model.schedule.follows_motion
+    first = rules.coefficients[:, :1].expand_as(rules.coefficients)
+    # A network's sums round.
+    return not torch.allclose(rules.coefficients, first, rtol=1e-9, atol=0.0)

@@ -116,13 +116,9 @@ def title(ax: Axes, text: str) -> None:
 
 
 def coefficient_axis(ax: Axes, coefficient: Coefficient, position: str, values: Any) -> float:
-    """Label the y axis with a coefficient; the factor from SI to the unit of the label.
+    """Label the y axis with a coefficient; the factor from SI to the label's unit, by the values.
 
-    Args:
-        ax: the panel.
-        coefficient: of a law.
-        position: unit of a position, `"rad"` or `"m"`.
-        values: that will be shown, any shape.
+    `position` is the unit of a position, `"rad"` or `"m"`.
     """
     factor, unit = scaled(sliding(coefficient.unit, position), values)
     ax.set_ylabel(f"{symbol(coefficient.name)} [{unit}]")
@@ -144,13 +140,7 @@ def log_axis(ax: Axes, bottom: float, top: float) -> None:
 
 @dataclass(frozen=True)
 class Look:
-    """Options by which a model is drawn, the same in every figure of a comparison.
-
-    Attributes:
-        line: of a line.
-        marker: further ones of a line with points.
-        bar: of a bar.
-    """
+    """Options of a model's lines, their points and its bars, the same in all figures of a run."""
 
     line: dict[str, Any]
     marker: dict[str, Any]
@@ -182,12 +172,7 @@ def _look(colour: str, dashes: Any, marker: str, hatch: str) -> Look:
 
 
 def scaled(unit: str, values: Any) -> tuple[float, str]:
-    """Factor and unit with prefix in which values are read easily: small radians as mrad.
-
-    Args:
-        unit: SI unit, `"rad"`, `"N m s/rad"`, `"-"` ...
-        values: that will be shown, any shape; infinite ones and NaN do not count.
-    """
+    """Factor and unit with prefix in which finite values are read easily: small radians as mrad."""
     sizes = np.abs(np.asarray(values, dtype=np.float64))
     largest = float(np.max(sizes, where=np.isfinite(sizes), initial=0.0))
     if unit in ("", "1", "-") or largest == 0.0 or largest >= 0.2:

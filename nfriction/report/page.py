@@ -11,9 +11,11 @@ import re
 import shlex
 from collections.abc import Iterator, Sequence
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import jinja2
+import numpy as np
 from markupsafe import Markup
 
 from nfriction.evaluation.compare import NO_FRICTION, PART_NAMES
@@ -26,11 +28,32 @@ from nfriction.evaluation.tables import (
     interval_table,
     selection_table,
 )
+from nfriction.io.atomic import write_atomically
 from nfriction.io.model_info import ModelInfo
-from nfriction.report.figures import with_dark_twins
-from nfriction.report.rules import JointRules, rules_in_words
-from nfriction.report.run import Run
+from nfriction.report.rules import rules_in_words
+from nfriction.report.run import Figure, Run, read_run
 from nfriction.version import __version__
+
+# A figure's twin for a dark screen.
+_DARK = ".dark"
+# In the order of the page: errors first, then motions, then the insides of the models.
+_CAPTIONS = {
+    "rmse_test": "Position error by model and joint, test recordings",
+    "horizons_test": "Position error over the length of the simulation, test recordings; the band "
+    "is the effect of one encoder count in the initial state",
+    "rmse_train": "Position error by model and joint, training recordings",
+    "horizons_train": "Position error over the length of the simulation, training recordings",
+    "positions_test_": "Measured and simulated position with the error below, test: ",
+    "positions_train_": "Measured and simulated position with the error below, training: ",
+    "torque_over_velocity": "Friction torque over velocity: the models' laws over the torque that "
+    "the recorded motion implies",
+    "over_time_": "Coefficients along the first training recording, models of the law: ",
+    "coefficients_": "Coefficients over velocity and acceleration (hatched: no data; faded: "
+    "uncertain; lines enclose 50 % and 90 % of the samples) of ",
+    "sections_": "Coefficients over velocity at three accelerations, with 95 % intervals (faint: "
+    "no data) of ",
+    "memberships_": "Fuzzy sets of velocity and acceleration of ",
+}
 
 _TEMPLATES = resources.files("nfriction.report") / "templates"
 _JINJA = jinja2.Environment(
@@ -78,12 +101,44 @@ def to_html(run: Run) -> str:
             "data": _data_table(run),
             "ranges": info and _range_table(info, comparison.joint_names, comparison.unit),
         },
-        figures=list(with_dark_twins(run.figures)),
+        figures=_pictures(run.figures),
         fit_articles=[_fit(run, name) for name in run.fits],
         fuzzy_models=list(_fuzzy_models(run)),
         commands=_commands(run),
     )
     return page.lstrip() + "\n"
+
+
+def write_report(folder: str | Path, path: str | Path) -> Run:
+    """Write the page of a comparison's folder to a file; returns the run.
+
+    Raises:
+        RunError: if the folder is not one that a comparison wrote; see `read_run`.
+        OSError: if it cannot be read or the file cannot be written.
+    """
+    run = read_run(folder)
+    # A recording's name may come from a file name that is no valid UTF-8.
+    write_atomically(path, to_html(run).encode(errors="backslashreplace"))
+    return run
+
+
+def _pictures(figures: Sequence[Figure]) -> list[dict[str, Any]]:
+    """Figures in the order of the page as URLs, each with its twin for a dark screen if any."""
+    by_name, found = {figure.name: figure for figure in figures}, []
+    for figure in figures:
+        name = figure.name
+        if name.removesuffix(_DARK) in by_name.keys() - {name}:
+            continue  # shown with the other
+        rank, caption = len(_CAPTIONS), name.replace("_", " ")
+        for k, (prefix, words) in enumerate(_CAPTIONS.items()):
+            if name == prefix or (prefix.endswith("_") and name.startswith(prefix)):
+                rank, caption = k, words + name.removeprefix(prefix)
+        picture = {"caption": caption, "width": figure.width, "height": figure.height}
+        for screen, of in (("light", figure), ("dark", by_name.get(name + _DARK))):
+            data = of and base64.b64encode(of.png).decode()
+            picture[screen] = data and f"data:image/png;base64,{data}"
+        found.append((rank, picture))
+    return [picture for _, picture in sorted(found, key=lambda pair: pair[0])]
 
 
 def _policy(style: str, script: str) -> str:
@@ -150,26 +205,35 @@ def _fuzzy_models(run: Run) -> Iterator[dict[str, Any]]:
             continue
         heads = [f"{coefficient} = [{u}]" for coefficient, u in _units(run, name).items()]
         joints = []
-        for of in rules_in_words(model, run.comparison.joint_names):
-            rows: list[tuple[Value, ...]] = [
+        in_words = rules_in_words(model, run.comparison.joint_names)
+        first = [[of.rules[0].values] * len(of.rules) for of in in_words]
+        # All rules of a rejected network say the same, but for rounding.
+        if np.allclose([[rule.values for rule in of.rules] for of in in_words], first, 1e-9, 0.0):
+            yield {"name": name, "constant": True}
+            continue
+        for of in in_words:
+            rows: tuple[tuple[Value, ...], ...] = tuple(
                 (f"{rule.condition} THEN", *rule.values) for rule in of.rules
-            ]
-            caption = f"{name}, {of.joint}: {len(rows)} rules"
-            rules = Table(caption, ("rule", *heads), tuple(rows))
-            joints.append({"rules": rules, "terms": _term_table(of, name, unit)})
-        yield {"name": name, "along_motion": fuzzy.along_motion, "joints": joints}
-
-
-def _term_table(of: JointRules, model: str, unit: str) -> Table:
-    rows = tuple(
-        (f"{quantity}: {term.name}", term.centre, term.width, u)
-        for quantity, terms, u in (
-            ("velocity", of.velocity, f"{unit}/s"), ("acceleration", of.acceleration, f"{unit}/s²")
-        )
-        for term in terms
-    )  # fmt: skip
-    caption = f"{model}, {of.joint}: meaning of the words"
-    return Table(caption, ("word", "middle", "standard deviation", "unit"), rows)
+            )
+            terms: tuple[tuple[Value, ...], ...] = tuple(
+                (f"{quantity}: {term.name}", term.centre, term.width, u)
+                for quantity, terms, u in (
+                    ("velocity", of.velocity, f"{unit}/s"),
+                    ("acceleration", of.acceleration, f"{unit}/s²"),
+                )
+                for term in terms
+            )
+            head, columns = f"{name}, {of.joint}", ("word", "middle", "standard deviation", "unit")
+            joints.append({
+                "rules": Table(f"{head}: {len(rows)} rules", ("rule", *heads), rows),
+                "terms": Table(f"{head}: meaning of the words", columns, terms),
+            })  # fmt: skip
+        yield {
+            "name": name,
+            "constant": False,
+            "along_motion": fuzzy.along_motion,
+            "joints": joints,
+        }
 
 
 def _recording_table(run: Run) -> Table:
@@ -196,7 +260,7 @@ def _data_table(run: Run) -> Table:
         for part in reversed(PART_NAMES)
         for name, digest in run.recordings[part].items()
     )
-    return Table("Recordings", ("recording", "part", "SHA-256 of its samples, in part"), rows)
+    return Table("Recordings", ("recording", "part", "digest of its samples"), rows)
 
 
 def _range_table(info: ModelInfo, joints: Sequence[str], unit: str) -> Table | None:
@@ -204,23 +268,17 @@ def _range_table(info: ModelInfo, joints: Sequence[str], unit: str) -> Table | N
     columns: list[str] = []
     ends: list[list[float]] = []
     for key, quantity, u in (("qd", "velocity", "s"), ("qdd", "acceleration", "s²")):
-        pairs: Any = info.input_ranges.get(key)
-        if _are_pairs(pairs, len(joints)):
+        try:
+            pairs = np.array(info.input_ranges.get(key), dtype=np.float64)
+        except (ValueError, TypeError, OverflowError):
+            continue
+        if pairs.shape == (len(joints), 2):
             columns += [f"{quantity} {end} [{unit}/{u}]" for end in ("from", "to")]
-            ends += [[float(pair[k]) for pair in pairs] for k in range(2)]
+            ends += pairs.T.tolist()
     if not ends:
         return None
     rows = tuple(zip(joints, *ends, strict=True))
     return Table("Motion that the models were trained on", ("joint", *columns), rows)
-
-
-def _are_pairs(value: Any, joints: int) -> bool:
-    return (
-        isinstance(value, list)
-        and len(value) == joints
-        and all(isinstance(pair, list) and len(pair) == 2 for pair in value)
-        and all(isinstance(x, (int, float)) for pair in value for x in pair)
-    )
 
 
 def _commands(run: Run) -> list[str]:

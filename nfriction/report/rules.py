@@ -17,12 +17,7 @@ _SIZES = ("", "strongly ", "very strongly ")
 
 @dataclass(frozen=True)
 class Term:
-    """A fuzzy set of one input.
-
-    Attributes:
-        name: in words.
-        centre, width: its middle and its standard deviation, in SI.
-    """
+    """A fuzzy set of one input: its name in words, middle and standard deviation in SI."""
 
     name: str
     centre: float
@@ -31,12 +26,9 @@ class Term:
 
 @dataclass(frozen=True)
 class Rule:
-    """One rule: its terms, and the coefficients where these hold fully.
+    """One rule: the names of its terms, and the coefficients in SI where these hold fully.
 
-    Attributes:
-        velocity, acceleration: names of the terms.
-        values: of each coefficient in SI, as the whole model gives them at the middle of both
-            terms, neighbouring rules and the radial basis head included.
+    The values are those of the whole model, neighbouring rules and radial basis head included.
     """
 
     velocity: str
@@ -91,9 +83,10 @@ def rules_in_words(model: FrictionModel, joint_names: Sequence[str] = ()) -> lis
         (speeds, speed_widths), (accelerations, widths) = (
             (c[j].tolist(), w[j].tolist()) for c, w in zip(fuzzy.centres, fuzzy.widths, strict=True)
         )
-        v = tuple(map(Term, _speed_names(speeds), speeds, speed_widths))
-        named = _acceleration_names(accelerations, fuzzy.along_motion)
-        a = tuple(map(Term, named, accelerations, widths))
+        names_v = _in_order(speeds, _speed_names(len(speeds)))
+        names_a = _acceleration_names(sorted(accelerations), fuzzy.along_motion)
+        v = tuple(map(Term, names_v, speeds, speed_widths))
+        a = tuple(map(Term, _in_order(accelerations, names_a), accelerations, widths))
         # The order of the rule table: the acceleration varies faster.
         pairs = [(x.name, y.name) for x in v for y in a]
         values = fuzzy.coefficients[j].tolist()
@@ -102,21 +95,20 @@ def rules_in_words(model: FrictionModel, joint_names: Sequence[str] = ()) -> lis
     return described
 
 
-def _speed_names(centres: Sequence[float]) -> list[str]:
+def _speed_names(count: int) -> Sequence[str]:
     # Language has no words for more than five.
-    names = _SPEEDS.get(len(centres)) or [f"speed {k + 1}" for k in range(len(centres))]
-    return _in_order(centres, names)
+    return _SPEEDS.get(count) or [f"speed {k + 1}" for k in range(count)]
 
 
-def _acceleration_names(centres: Sequence[float], along_motion: bool) -> list[str]:
+def _acceleration_names(ordered: Sequence[float], along_motion: bool) -> list[str]:
     below, above = ("braking", "speeding up") if along_motion else ("negative", "positive")
-    ordered = sorted(centres)
     # The set nearest to zero: after training none need lie exactly there.
     zero = min(range(len(ordered)), key=lambda k: abs(ordered[k]))
-    names = [_size(zero - k) + below for k in range(zero)]
-    names += ["about zero"]
-    names += [_size(k - zero) + above for k in range(zero + 1, len(ordered))]
-    return _in_order(centres, names)
+    return [
+        *(_size(zero - k) + below for k in range(zero)),
+        "about zero",
+        *(_size(k - zero) + above for k in range(zero + 1, len(ordered))),
+    ]
 
 
 def _size(rank: int) -> str:

@@ -1,6 +1,7 @@
 """Read a comparison's folder without trusting any of it."""
 
 import math
+import re
 import types
 import typing
 from collections.abc import Mapping
@@ -10,21 +11,26 @@ from typing import Any
 
 import numpy as np
 
-from nfriction.evaluation.compare import SCHEMA, Comparison, Part
+from nfriction.evaluation.compare import PART_NAMES, SCHEMA, Comparison, Part
 from nfriction.evaluation.cross_validation import Candidate, Selection
+from nfriction.evaluation.results import exclusive, interrupted
 from nfriction.evaluation.score import Score
 from nfriction.friction import model_names
 from nfriction.friction.models import FrictionModel
 from nfriction.io import strict_json
 from nfriction.io.model_file import ModelFileError, load, load_info
 from nfriction.io.model_info import ModelInfo
-from nfriction.report.figures import Figure, read_figures
 
-# Far above any run of ours; a larger file is no results file.
-LARGEST_RESULTS = 64 * 2**20
+# Far above any run of ours; larger files are none of it.
+LARGEST_RESULTS, LARGEST_FIGURE, MOST_FIGURES = 64 * 2**20, 16 * 2**20, 100
+_PNG = b"\x89PNG\r\n\x1a\n"
+# Text that `plots.save_all` puts before the picture.
+_RUN = re.compile(rb"tEXtnfriction run\0([0-9a-f]{16})")
 # Squares of smaller numbers are finite.
 LARGEST_NUMBER = 10**100
 
+# Entries whose names have changed since the first schema.
+_RENAMED = {"held_out": "test", "alike": "indistinguishable", "lost": "unidentifiable"}
 Coefficients = dict[str, dict[str, tuple[float, ...]]]
 
 
@@ -57,27 +63,36 @@ class FitRecord:
 
 
 @dataclass(frozen=True)
+class Figure:
+    """A PNG file with its size in pixels, and the id of its run if it bears one."""
+
+    name: str
+    png: bytes
+    width: int
+    height: int
+    run: str = ""
+
+
+@dataclass(frozen=True)
 class Run:
     """A comparison as read from its folder.
 
     Attributes:
-        folder: as it was given.
+        id: of the run, in every file that it wrote; empty of older versions.
         comparison: the scores, without simulated positions and without fits.
         fits: status of each fit, by model.
         coefficients: by model, then by where they apply (`"always"` for a constant model),
             then by name: a value a joint.
         best: name of the best model, None where there was no test recording.
-        judged_by: criterion of the verdict.
         indistinguishable: the best and all models tied with it, simplest first; of older versions
             none.
-        command: reproduces the results.
         recordings: digest by name of the `"train"` and `"test"` recordings.
-        models: models and the information of their files; those that could be read.
-        figures: in the order of their names.
+        models: those whose files could be read, with the information in them.
         notes: a sentence on everything that could not be read.
         selection: the choice on the training recordings alone, where there is one.
     """
 
+    id: str
     folder: Path
     comparison: Comparison
     fits: dict[str, FitRecord]
@@ -96,11 +111,17 @@ class Run:
 def read_run(folder: str | Path) -> Run:
     """Read the folder of `nfriction compare` or `nfriction demo`.
 
+    Where a process was killed while it put its files in place, they are put there first.
+
     Raises:
-        RunError: if the folder has no sound `results.json`; one line says what is wrong.
-        OSError: if it cannot be read.
+        RunError: if the folder has no sound `results.json`, or files of two runs; one line says
+            what is wrong.
+        OSError: if it cannot be read, or another process is writing it.
     """
     folder = Path(folder)
+    if interrupted(folder):
+        with exclusive(folder):
+            pass
     path = folder / "results.json"
     if not path.is_file():
         raise RunError(
@@ -112,6 +133,8 @@ def read_run(folder: str | Path) -> Run:
         raise RunError(f"{path}: is too large for results of a comparison.")
     try:
         content = strict_json.parse(path.read_text(encoding="utf-8"))
+        if isinstance(content, dict) and "schema" not in content:
+            content = _renamed(content)
     except (ValueError, RecursionError) as error:
         raise RunError(f"{path}: is no JSON, or cut short ({error}).") from error
     try:
@@ -120,12 +143,19 @@ def read_run(folder: str | Path) -> Run:
         raise RunError(f"{path}: not results of a comparison: {error}.") from error
 
 
+def _renamed(value: Any) -> Any:
+    """JSON of the first schema with today's names."""
+    if isinstance(value, list):
+        return [_renamed(entry) for entry in value]
+    if isinstance(value, dict):
+        return {_RENAMED.get(key, key): _renamed(entry) for key, entry in value.items()}
+    return value
+
+
 def _run(folder: Path, content: dict[str, Any]) -> Run:
     schema = _read(float, content.get("schema", 1), "`schema`")
     if schema > SCHEMA:
         raise _EntryError(f"its schema {schema:g} is newer than {SCHEMA}; update nfriction")
-    # The first schema named test recordings differently.
-    keys: dict[Part, str] = {"train": "train", "test": "test" if schema > 1 else "held_out"}
     joints = _read(tuple[str, ...], content.get("joints"), "`joints`")
     unit = content.get("units")
     if unit not in ("rad", "m"):
@@ -133,21 +163,22 @@ def _run(folder: Path, content: dict[str, Any]) -> Run:
     entries = _read(dict[str, dict[str, Any]], content.get("models"), "`models`")
     if not joints or not entries:
         raise _EntryError("it has no joints or no models")
-    scores = {part: _scores(entries, key, len(joints)) for part, key in keys.items()}
+    scores = {part: _scores(entries, part, len(joints)) for part in PART_NAMES}
     if not any(scores.values()):
         raise _EntryError("it has no scores")
     best = _read(dict[str, Any], content.get("best") or {}, "`best`")
     # Names select files and table rows further on.
     if best and _read(str, best.get("model"), "`best`") not in entries:
         raise _EntryError("its best model is none of its models")
-    # Also renamed since the first schema.
-    tied = best.get("indistinguishable" if schema > 1 else "alike", [])
     recordings = _read(dict[str, dict[str, str]], content.get("recordings", {}), "`recordings`")
-    fits = {n: _fit(e["fit"], f"fit of {n}") for n, e in entries.items() if "fit" in e}
+    fits: dict[str, FitRecord] = {
+        n: _read(FitRecord, e["fit"], f"fit of {n}") for n, e in entries.items() if "fit" in e
+    }
     models, notes = _models(folder, fits, len(joints))
-    figures, unread = read_figures(folder / "figures")
+    figures, unread = _figures(folder / "figures")
     failed = _read(dict[str, str], content.get("failed", {}), "`failed`")
-    return Run(
+    run = Run(
+        id=_read(str, content.get("run", ""), "`run`"),
         folder=folder,
         comparison=Comparison({}, scores["train"], scores["test"], unit, joints, failed=failed),
         fits=fits,
@@ -158,29 +189,31 @@ def _run(folder: Path, content: dict[str, Any]) -> Run:
         },
         best=best.get("model"),
         judged_by=_read(str, best.get("by", ""), "`best`"),
-        indistinguishable=_read(tuple[str, ...], tied, "`best`"),
+        indistinguishable=_read(tuple[str, ...], best.get("indistinguishable", []), "`best`"),
         command=_read(str, content.get("command", ""), "`command`"),
-        recordings={part: recordings.get(key, {}) for part, key in keys.items()},
+        recordings={part: recordings.get(part, {}) for part in PART_NAMES},
         models=models,
         figures=figures,
         notes=(*notes, *unread),
         selection=_selection(content.get("selection"), unit),
     )
+    _require_one_run(run)
+    return run
 
 
 def _scores(
-    entries: Mapping[str, Mapping[str, Any]], key: str, joints: int
+    entries: Mapping[str, Mapping[str, Any]], part: Part, joints: int
 ) -> dict[str, list[Score]]:
     found: dict[str, list[Score]] = {}
     nothing = np.zeros(0)
     for name, entry in entries.items():
-        where = f"{name}, {key}"
+        where = f"{name}, {part}"
         found[name] = [
             _read_record(
                 Score, {"windows": {}, "diverged_at": None, "floor": None} | of,
                 f"{where}, {recording}", recording=recording, time=nothing, simulated=nothing,
             )
-            for recording, of in _read(dict[str, dict], entry.get(key, {}), where).items()
+            for recording, of in _read(dict[str, dict], entry.get(part, {}), where).items()
         ]  # fmt: skip
         for score in found[name]:
             for rmse in filter(None, (score.free_run, score.floor, *score.windows.values())):
@@ -195,16 +228,8 @@ def _scores(
                     raise _EntryError(f"{where} has windows of {horizon!r} seconds") from None
     # Tables pool the recordings of a model, so all must have been scored on the same.
     if len({tuple((s.recording, *s.windows) for s in many) for many in found.values()}) > 1:
-        raise _EntryError(f"its models were scored on different recordings ({key})")
+        raise _EntryError(f"its models were scored on different recordings ({part})")
     return {name: many for name, many in found.items() if many}
-
-
-def _fit(value: Any, where: str) -> FitRecord:
-    entry = _read(dict[str, Any], value, where)
-    # The first schema's name of it.
-    known = {"unidentifiable": entry.get("lost", [])} | entry
-    fit: FitRecord = _read(FitRecord, known, where)
-    return fit
 
 
 def _selection(value: Any, unit: str) -> Selection | None:
@@ -256,6 +281,44 @@ def _models(
             continue
         found[name] = (model, info)
     return found, notes
+
+
+def _figures(folder: Path) -> tuple[tuple[Figure, ...], list[str]]:
+    """Those in the order of their names, and a sentence on each that could not be read."""
+    found: list[Figure] = []
+    notes = []
+    for path in sorted(folder.glob("*.png"))[:MOST_FIGURES]:
+        if not path.is_file() or path.stat().st_size > LARGEST_FIGURE:
+            notes.append(f"figure {path.name}: no file, or too large")
+            continue
+        png = path.read_bytes()
+        if not png.startswith(_PNG) or len(png) < 24:
+            notes.append(f"figure {path.name}: not a PNG file")
+            continue
+        width, height = (int.from_bytes(png[k : k + 4], "big") for k in (16, 20))
+        # Earlier versions said `held_out` for `test`.
+        name = re.sub(r"^(rmse|horizons|positions)_held_out", r"\1_test", path.stem)
+        run = _RUN.search(png[:4096])
+        found.append(Figure(name, png, width, height, run[1].decode() if run else ""))
+    return tuple(found), notes
+
+
+def _require_one_run(run: Run) -> None:
+    """Refuse models and figures of another run than the results'."""
+    trained_on = run.recordings["train"]
+    foreign = [
+        f"models/{name}.json"
+        for name, (_, info) in run.models.items()
+        if info.fit.get("run", "") != run.id
+        # Runs of older versions have no id, but the digests of their recordings.
+        or (info.training_data and info.training_data != trained_on)
+    ]
+    foreign += [f"figures/{f.name}.png" for f in run.figures if f.run not in ("", run.id)]
+    if foreign:
+        raise RunError(
+            f"{run.folder}: has files of two runs: {', '.join(foreign)} belong to another run than "
+            f"results.json; run the comparison again, or give a folder that a single run wrote."
+        )
 
 
 def _read(kind: Any, value: Any, where: str) -> Any:

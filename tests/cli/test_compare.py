@@ -3,6 +3,7 @@
 import logging
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -165,6 +166,20 @@ def test_warnings_and_intervals_of_fits_are_told(
         assert told == [pytest.approx(x, rel=1e-3) for x in (low, high)]
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems refuse such a file name")
+def test_a_file_name_that_is_no_unicode_loses_no_fits(bench: Path, tmp_path: Path) -> None:
+    odd, out = tmp_path / os.fsdecode(b"surr\xff.csv"), tmp_path / "out"
+    shutil.copy(bench / "b.csv", odd)
+    command = [sys.executable, "-m", "nfriction"]
+    words = [bench / "a.csv.gz", "--test", odd, "--rig", bench / "bench.json", "--models", "NCFM"]
+    words += [*QUICK, "--out", out, "--log-file", tmp_path / "log"]
+    subprocess.run([*command, "compare", *words], check=True, capture_output=True)
+    assert (out / "models" / "NCFM.pt").is_file()
+    subprocess.run([*command, "report", out], check=True, capture_output=True)
+    for file in (tmp_path / "log", out / "table.csv", out / "report.html"):
+        assert "surr" in file.read_text(encoding="utf-8")
+
+
 def test_ctrl_c_ends_the_run_though_the_solver_survives_it(
     bench: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -184,6 +199,17 @@ def test_ctrl_c_ends_the_run_though_the_solver_survives_it(
     assert "interrupted (fit NCFM)" in capsys.readouterr().err
     assert not list(out.iterdir())
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_data_on_which_the_algebra_fails_are_an_error_in_a_line(
+    bench: Path, monkeypatch: pytest.MonkeyPatch, failing: Callable[..., str]
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise torch.linalg.LinAlgError("linalg.cholesky:\nnot positive definite")
+
+    monkeypatch.setattr("nfriction.evaluation.parallel.fit", fail)
+    words = [bench / "a.csv.gz", "--rig", bench / "bench.json", "--models", "NCFM"]
+    assert "not positive definite" in failing("compare", *words, "--out", bench / "hopeless")
 
 
 def test_interrupt_outside_a_solver(

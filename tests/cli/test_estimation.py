@@ -10,15 +10,15 @@ import pandas as pd
 import pytest
 
 from nfriction import cli, rigs
-from nfriction.cli import estimation
+from nfriction.cli import inputs
 from nfriction.fitting.options import DEFAULTS
 from tests.cli.benches import compare, pendulum, results
 
 
 def test_what_is_not_given_is_left_to_the_fit() -> None:
     parser = argparse.ArgumentParser()
-    estimation.add_options(parser)
-    settings = estimation.fit_settings(parser.parse_args(["--rig", "tlrip"]))
+    inputs.add_fit_options(parser)
+    settings = inputs.fit_settings(parser.parse_args(["--rig", "tlrip"]))
     assert "windows" not in settings
     assert settings["drag"] is None
     assert settings["encoder_reference"] == "auto"
@@ -39,7 +39,7 @@ def test_what_is_not_given_is_left_to_the_fit() -> None:
             "penalty",
         ]
     )
-    settings = estimation.fit_settings(told)
+    settings = inputs.fit_settings(told)
     assert settings["windows"] == (1.0, 3.0)
     assert settings["drag"] is False
     assert settings["encoder_reference"] == "per_recording"
@@ -165,10 +165,10 @@ def test_torque_that_is_not_read_is_told_once_with_the_option_that_helps(
     for path in paths:
         path.write_text(f"{header}\n{rows}")
     parser = argparse.ArgumentParser()
-    estimation.add_options(parser)
+    inputs.add_fit_options(parser)
     arguments = parser.parse_args(["--rig", "multiarm-double"])
     with warnings.catch_warnings():
-        estimation.read_recordings(paths, estimation.read_rig("multiarm-double"), arguments)
+        inputs.read_recordings(paths, inputs.read_rig("multiarm-double"), arguments)
     assert capsys.readouterr().err == f"nfriction: warning: a, b: {said}\n"
 
 

@@ -1,9 +1,11 @@
 """`nfriction report` as a user meets it."""
 
+import shutil
 from pathlib import Path
 
 from nfriction import cli
-from tests.cli.benches import results
+from nfriction.evaluation.results import COMPLETE
+from tests.cli.benches import compare, results
 
 
 def test_a_comparison_becomes_a_page(compared: Path, tmp_path: Path, capsys) -> None:
@@ -40,3 +42,33 @@ def test_a_missing_model_is_warned_of(tmp_path: Path, compared: Path, capsys) ->
     (tmp_path / "results.json").write_bytes((compared / "results.json").read_bytes())
     assert cli.main(["report", str(tmp_path)]) == 0
     assert "warning: NCFM: its model file could not be read" in capsys.readouterr().err
+
+
+def test_a_rerun_refreshes_the_page_in_its_folder(bench: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    for models in ("NCFM", "LFM"):
+        assert compare(bench, out, "--no-figures", models=models) == 0
+        if models == "NCFM":
+            assert cli.main(["report", str(out)]) == 0
+    html = (out / "report.html").read_text(encoding="utf-8")
+    assert f'content="{results(out)["run"]}"' in html
+    assert "<h3>NCFM</h3>" not in html
+
+
+def test_files_of_two_runs_are_refused(
+    bench: Path, compared: Path, tmp_path: Path, failing
+) -> None:
+    assert compare(bench, tmp_path, "--no-figures", "--max-steps", "1") == 0
+    (tmp_path / "models" / "NCFM.json").write_bytes((compared / "models/NCFM.json").read_bytes())
+    assert "files of two runs: models/NCFM.json" in failing("report", tmp_path)
+
+
+def test_a_run_that_was_killed_at_its_end_is_completed(
+    compared: Path, tmp_path: Path, capsys
+) -> None:
+    whole = tmp_path / "whole"
+    shutil.copytree(compared, whole / COMPLETE)
+    assert cli.main(["report", str(whole)]) == 0
+    assert "warning" not in capsys.readouterr().err
+    assert results(whole) == results(compared)
+    assert not list(whole.glob(".*"))

@@ -3,12 +3,17 @@
 import dataclasses
 import json
 import logging
+import os
+import shutil
+import signal
+import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
-from nfriction import NCFM, PendulumChain, Recording
+from nfriction import NCFM, ModelInfo, PendulumChain, Recording
 from nfriction.cli.tables import error_tables
 from nfriction.evaluation import results
 from nfriction.evaluation.compare import Comparison
@@ -16,6 +21,7 @@ from nfriction.evaluation.cross_validation import Candidate, Selection
 from nfriction.evaluation.score import RMSE, Score
 from nfriction.export import ExportError
 from nfriction.fitting.fit import fit
+from nfriction.report import RunError, read_run, write_report
 
 TIME = 2e-3 * np.arange(200)
 
@@ -140,7 +146,7 @@ def test_no_list_of_files_leads_out_of_the_folder(
     for content in ({"files": listed}, {"files": "models/a.json"}, [], "[", {"files": None}):
         text = content if isinstance(content, str) else json.dumps(content)
         (folder / "results.json").write_text(text)
-        assert results.files_of(folder) == []
+        assert results.files_of(folder / "results.json") == []
         results.write_results(comparison, [recording], [], folder, figures=False)
     assert all(victim.read_text() == "keep" for victim in victims)
 
@@ -157,11 +163,201 @@ def test_a_choice_is_kept_with_the_results(
         assert found["selection"] == (None if selection is None else selection.to_dict())
 
 
+def run_ids(folder: Path) -> dict[str, str]:
+    """Id of the run in each file of ours; TorchScript is a stub here."""
+    ids = {}
+    for path in folder.rglob("*"):
+        name = path.relative_to(folder).as_posix()
+        if path.suffix == ".json":
+            content = json.loads(path.read_text())
+            ids[name] = content.get("run") or content["fit"]["run"]
+        elif path.suffix == ".csv":
+            ids[name] = path.read_text().splitlines()[1].split(",")[0]
+        elif path.suffix in (".pt", ".html"):
+            ids[name] = path.read_text().partition("run:")[2][:16]
+    return {name: run for name, run in ids.items() if not name.startswith(".")}
+
+
+@pytest.fixture
+def quick_scripts(monkeypatch: pytest.MonkeyPatch) -> None:
+    def script(_: object, path: Path, info: ModelInfo) -> Path:
+        path.write_text(f"run:{info.fit['run']}")
+        return path
+
+    monkeypatch.setattr(results, "torchscript", script)
+
+
+@pytest.fixture
+def other(comparison: Comparison) -> Comparison:
+    """A later run: another score, one model less."""
+    train = {"no friction": [scored(0.3)], "good": [scored(0.2)]}
+    return dataclasses.replace(comparison, fits={"good": comparison.fits["good"]}, train=train)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes that share what was fitted")
+@pytest.mark.usefixtures("quick_scripts")
+def test_a_kill_at_any_moment_never_mixes_two_runs(
+    comparison: Comparison, other: Comparison, recording: Recording, tmp_path: Path
+) -> None:
+    def write(made: Comparison, folder: Path) -> str:
+        results.write_results(made, [recording], [], folder, figures=False)
+        return str(json.loads((folder / "results.json").read_text())["run"])
+
+    def write_and_die(folder: Path, moment: int) -> int:
+        """Write in a child that is killed at its file operation of this number; its status."""
+        child = os.fork()
+        if child:
+            return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        left = moment
+
+        def count(event: str, _: object) -> None:
+            nonlocal left
+            left -= event in ("os.rename", "os.remove", "os.mkdir", "os.rmdir")
+            if left < 0 and event != "os.kill":
+                os.kill(os.getpid(), signal.SIGKILL)
+
+        sys.addaudithook(count)
+        status = 1
+        try:
+            write(other, folder)
+            status = 0
+        finally:
+            os._exit(status)
+
+    second = write(other, tmp_path / "second")
+    assert write(other, tmp_path / "again") == second  # equal results have equal ids
+    ended = set()
+    for moment in range(200):
+        folder = tmp_path / str(moment)
+        first = write(comparison, folder)
+        assert first != second
+        (folder / "notes.md").write_text("mine")
+        (folder / "report.html").write_text(f'{results.REPORT_MARK.decode()}" run:{first}>')
+        status = write_and_die(folder, moment)
+        assert status in (-signal.SIGKILL, 0)
+        found = run_ids(folder)
+        assert len(set(found.values())) <= 1
+        if "results.json" in found:
+            listed = json.loads((folder / "results.json").read_text())["files"]
+            assert {*listed} <= {*found}
+        with results.exclusive(folder):
+            pass
+        found = run_ids(folder)
+        assert set(found.values()) in ({first}, {second})
+        assert ("models/wild.json" in found) == (first in found.values())
+        assert ("report.html" in found) == (first in found.values())
+        assert (folder / "notes.md").read_text() == "mine"
+        assert not list(folder.glob(".*"))
+        ended |= set(found.values())
+        if status == 0:
+            break
+    else:
+        pytest.fail("never came to the end")
+    assert ended == {first, second}
+    assert set(found.values()) == {second}
+
+
+@pytest.mark.usefixtures("quick_scripts")
+def test_ctrl_c_between_two_files_leaves_a_whole_run(
+    comparison: Comparison, other: Comparison, recording: Recording, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    results.write_results(comparison, [recording], [], tmp_path, figures=False)
+    replace = Path.replace
+
+    def interrupt(path: Path, to: Path) -> Path:
+        if path.suffix == ".pt" and path.parent.parent.name == results.COMPLETE:
+            monkeypatch.undo()
+            raise KeyboardInterrupt
+        return replace(path, to)
+
+    monkeypatch.setattr(Path, "replace", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        results.write_results(other, [recording], [], tmp_path, figures=False)
+    found = run_ids(tmp_path)
+    assert len(set(found.values())) == 1
+    assert set(found) >= {"results.json", "table.csv", "models/good.json"}
+    assert "models/wild.json" not in found
+    assert not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a second process")
+@pytest.mark.usefixtures("quick_scripts")
+def test_two_processes_do_not_write_one_folder_at_once(
+    comparison: Comparison, recording: Recording, tmp_path: Path
+) -> None:
+    reader, writer = os.pipe()
+    child = os.fork()
+    if not child:
+        with results.exclusive(tmp_path):
+            os.write(writer, b"x")
+            signal.pause()
+    os.read(reader, 1)
+    try:
+        with pytest.raises(OSError, match="another process is writing"):
+            results.write_results(comparison, [recording], [], tmp_path, figures=False)
+        assert not list(tmp_path.glob("[!.]*"))
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+    # A killed process keeps nobody out.
+    with results.exclusive(tmp_path):
+        results.write_results(comparison, [recording], [], tmp_path, figures=False)
+    assert not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.usefixtures("quick_scripts")
+def test_a_report_of_two_runs_is_refused(
+    comparison: Comparison, other: Comparison, recording: Recording, tmp_path: Path
+) -> None:
+    one, two = tmp_path / "one", tmp_path / "two"
+    renamed = {"NCFM": comparison.fits["good"]}
+    for made, folder in ((comparison, one), (other, two)):
+        train = {"no friction": made.train["no friction"], "NCFM": made.train["good"]}
+        made = dataclasses.replace(made, fits=renamed, train=train)
+        results.write_results(made, [recording], [], folder)
+        assert read_run(folder).id in (folder / "models/NCFM.pt").read_text()
+    for name in ("models/NCFM.json", "figures/rmse_train.png"):
+        mixed = tmp_path / "mixed" / name.replace("/", "-")
+        shutil.copytree(two, mixed)
+        read_run(mixed)
+        shutil.copy(one / name, mixed / name)
+        with pytest.raises(RunError, match=f"files of two runs: {name} .*run the comparison again"):
+            read_run(mixed)
+    # Runs of older versions have no id, but their recordings' digests.
+    index = json.loads((one / "results.json").read_text())
+    index["recordings"]["train"]["r"] = "0" * 64
+    (one / "results.json").write_text(json.dumps(index))
+    with pytest.raises(RunError, match=r"files of two runs: models/NCFM.json"):
+        read_run(one)
+
+
+@pytest.mark.usefixtures("quick_scripts")
+def test_names_are_no_formulas_and_need_be_no_unicode(
+    comparison: Comparison, recording: Recording, tmp_path: Path
+) -> None:
+    names = ["=cmd|' /C calc'!A0", "+1", "-1", "@SUM(1)", "\t=1", "＝1", "surr\udcff", "a=b"]
+    recordings = [dataclasses.replace(recording, name=name) for name in names]
+    train = {"no friction": [dataclasses.replace(scored(0.1), recording=n) for n in names]}
+    fits = {"good": comparison.fits["good"]}
+    made = dataclasses.replace(comparison, fits=fits, train=train | {"good": train["no friction"]})
+    made = dataclasses.replace(made, joint_names=("=joint()",))
+    results.write_results(made, recordings, [], tmp_path, figures=False)
+    table = pd.read_csv(tmp_path / "table.csv")
+    assert set(table.joint) == {"'=joint()", "all"}
+    safe = [f"'{name}" for name in names[:6]]
+    assert list(dict.fromkeys(table.recording)) == [*safe, "surr\\udcff", "a=b"]
+    page = tmp_path / "report.html"
+    write_report(tmp_path, page)
+    assert "surr\\udcff" in page.read_text(encoding="utf-8")
+
+
 def test_figures_that_fail_leave_nothing_half_drawn(
     comparison: Comparison, recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def half(_: object, __: object, folder: str) -> list[Path]:
-        (Path(folder) / "half.png").write_bytes(b"\x89")
+    def half(_: object, __: object, folder: Path, **___: object) -> list[Path]:
+        folder.mkdir()
+        (folder / "half.png").write_bytes(b"\x89")
         raise KeyboardInterrupt
 
     monkeypatch.setattr("nfriction.plots.save_all", half)

@@ -22,7 +22,6 @@ from nfriction.fitting.fit import fit
 from nfriction.friction import model_names
 from nfriction.friction.models import LFM, NCFM, NLFM
 from nfriction.friction.neurofuzzy import NFLFM, NFNCFM, NFNLFM
-from nfriction.optim.least_squares import Step
 from nfriction.papers.controller.mamdani import paper_controller
 from nfriction.plant import LinearAxis, rigs
 from nfriction.plots import style
@@ -106,8 +105,11 @@ def test_positions_show_the_measurement_the_simulations_and_their_difference(joi
         factor = {f"error [{unit}]": 1.0, f"error [m{unit}]": 1e3}[below.get_ylabel()]
         measured, *simulated = (line.get_ydata() for line in above.lines)
         np.testing.assert_array_equal(measured, recording.q[:, j])
-        for shown, error, score in zip(simulated, below.lines, scores.values(), strict=True):
+        for shown, score in zip(simulated, scores.values(), strict=True):
             np.testing.assert_array_equal(shown, score.simulated[:, j])
+        # Without friction, the error would leave the panel at every swing.
+        drawn = [score for name, score in scores.items() if name != NO_FRICTION]
+        for error, score in zip(below.lines, drawn, strict=True):
             expected = score.simulated[:, j] - recording.q[:, j]
             np.testing.assert_allclose(error.get_ydata() / factor, expected, rtol=1e-12)
     labels = [t.get_text() for t in figure.legends[0].get_texts()]
@@ -287,20 +289,6 @@ def test_only_neuro_fuzzy_models_have_sets_and_maps():
         plots.memberships(NFLFM(2), NFLFM(2, terms=(3, 5)))
 
 
-def test_convergence_takes_numbers_and_steps():
-    costs = [1e4, 1e2, 1.0]
-    steps = [Step(cost, 1e-3, 0.0) for cost in costs]
-    figure = plots.convergence({"0.5 s windows": costs, "2 s windows": steps})
-    for line in figure.axes[0].lines:
-        np.testing.assert_array_equal(line.get_ydata(), costs)
-    assert figure.axes[0].get_yscale() == "log"
-    assert_tidy(figure)
-    evidence = plots.convergence([-3.0, -2.0], quantity="log evidence [nat]").axes[0]
-    assert (evidence.get_yscale(), evidence.get_ylabel()) == ("linear", "log evidence [nat]")
-    with pytest.raises(ValueError, match="no finite value"):
-        plots.convergence([])
-
-
 def test_controller_map_is_the_controller_in_si():
     controller = paper_controller(2)
     figure = plots.controller_surface(controller, points=9)
@@ -330,7 +318,11 @@ def test_save_all_writes_every_figure_and_leaves_matplotlib_alone(tmp_path):
     plant, recording, motion = axis_data(NCFM(1, [3.0]))
     unseen = swing(1, "m", name="unseen")
     found = fit(NCFM(1), plant, recording, method="equation_error", motions=[motion])
-    fits = {"NCFM": found, "NFNCFM": replace(found, model=NFNCFM(1))}
+    network = NFNCFM(1)
+    start = network.schedule.parameter_vector()
+    noise = torch.randn(len(start), generator=torch.Generator().manual_seed(1), dtype=start.dtype)
+    network.schedule.set_parameter_vector(start + 0.1 * noise)
+    fits = {"NCFM": found, "NFNCFM": replace(found, model=network)}
     train, test = (
         {n: [score_of(r, 0.01)] for n in (NO_FRICTION, *fits)} for r in (recording, unseen)
     )
@@ -345,6 +337,11 @@ def test_save_all_writes_every_figure_and_leaves_matplotlib_alone(tmp_path):
     assert {f.name for f in files} == {f"{n}{of}.png" for n in expected for of in ("", ".dark")}
     assert all(f.read_bytes().startswith(b"\x89PNG") for f in files)
     assert rc_params() == before
+    # A network whose coefficients are constants, as of one that was rejected, has nothing to show.
+    rejected = replace(comparison, fits=fits | {"NFNCFM": replace(found, model=NFNCFM(1))})
+    names = {f.name for f in plots.save_all(rejected, [recording], tmp_path / "fewer")}
+    assert "torque_over_velocity.png" in names
+    assert not any("NFNCFM" in name or "over_time" in name for name in names)
     only_train = plots.save_all(replace(comparison, fits={}, test={}), [], tmp_path)
     assert not any("test" in f.name or "positions" in f.name for f in only_train)
     with pytest.raises(ValueError, match="not in the comparison"):

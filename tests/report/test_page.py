@@ -7,9 +7,10 @@ from html.parser import HTMLParser
 
 import pytest
 
+from nfriction import LFM, NFLFM, ModelInfo, save
 from nfriction.evaluation.tables import Table, error_table
 from nfriction.report import read_run, to_html
-from tests.report.runs import EVIL, write
+from tests.report.runs import EVIL, JOINTS, write
 
 
 class Page(HTMLParser):
@@ -113,6 +114,17 @@ def test_verdicts_warnings_and_rules_are_told(page):
     ):
         assert said in text
     assert text.count("At a bound") == 1
+
+
+def test_a_rejected_network_has_no_rules_and_an_unnamed_rig_is_called_so(tmp_path):
+    folder = write(tmp_path)
+    info = ModelInfo(joint_names=JOINTS, rig={"name": ""})
+    for model in (LFM(2, [2e-3, 1e-2]), NFLFM(2, [2e-3, 1e-2])):
+        save(model, folder / "models" / f"{type(model).__name__}.json", info)
+    text = " ".join("".join(Page(to_html(read_run(folder))).text).split())
+    assert "Its network was rejected" in text
+    assert "THEN" not in text
+    assert "Rig: unnamed." in text
 
 
 def test_the_least_error_of_a_column_is_marked_and_a_diverged_one_never(tmp_path):

@@ -1,32 +1,63 @@
-"""`nfriction info`: describe a model file."""
+"""`nfriction info` and `nfriction report`: describe a model file, a comparison's folder."""
 
 import argparse
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nfriction.cli import names
-from nfriction.cli.console import Parser
+from nfriction.cli import inputs
+from nfriction.cli.console import Parser, UsageError, warn
 
 if TYPE_CHECKING:
     from nfriction.friction.models import FrictionModel
     from nfriction.io.model_info import ModelInfo
 
-EXAMPLE = """example:
+INFO_EXAMPLE = """example:
   nfriction info runs/mine/models/LFM.json"""
+REPORT_EXAMPLE = """example:
+  nfriction report runs/mine --out mine.html"""
 
 
-def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
-    """Register the command."""
+def add_report(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
+    """Register `report`."""
     parser = commands.add_parser(
-        "info", parents=[common], help="describe a model file", epilog=EXAMPLE,
+        "report", parents=[common], help="write a page of a comparison's folder",
+        description="Write the folder of compare or demo as one self-contained HTML file: tables "
+        "that sort, figures that zoom, fuzzy rules, verdicts.", epilog=REPORT_EXAMPLE,
+    )  # fmt: skip
+    parser.add_argument("folder", type=Path, metavar="RUN", help="folder of compare or demo")
+    parser.add_argument("--out", type=Path, metavar="FILE",
+                        help="file to write (default: report.html in the folder)")  # fmt: skip
+    parser.set_defaults(run=run_report)
+
+
+def add_info(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
+    """Register `info`."""
+    parser = commands.add_parser(
+        "info", parents=[common], help="describe a model file", epilog=INFO_EXAMPLE,
         description="Describe a model file: model, joints, coefficients, trained ranges, status of "
         "the fit, rig.",
     )  # fmt: skip
-    parser.add_argument("model", type=names.file, metavar="MODEL", help="model file")
-    parser.set_defaults(run=run)
+    parser.add_argument("model", type=inputs.file, metavar="MODEL", help="model file")
+    parser.set_defaults(run=run_info)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run_report(arguments: argparse.Namespace) -> int:
+    """Read, write."""
+    from nfriction.report import write_report
+
+    if not arguments.folder.is_dir():
+        raise UsageError(f"{arguments.folder} is no folder; give one that compare or demo wrote.")
+    out = arguments.out or arguments.folder / "report.html"
+    if out.is_dir():
+        raise UsageError(f"--out is a file, and {out} is a folder.")
+    for note in write_report(arguments.folder, out).notes:
+        warn(note)
+    print(f"wrote {out}")
+    return 0
+
+
+def run_info(arguments: argparse.Namespace) -> int:
     """Load and print."""
     from nfriction.cli.tables import coefficient_table
     from nfriction.io.model_file import load, load_info
@@ -42,7 +73,7 @@ def _facts(model: "FrictionModel", info: "ModelInfo") -> Iterator[tuple[str, str
     yield "model", f"{type(model).__name__}, law {model.law.name}"
     yield "joints", ", ".join(info.joint_names) or str(model.joints)
     if info.rig is not None:
-        yield "rig", str(info.rig.get("name", "unnamed"))
+        yield "rig", str(info.rig.get("name") or "unnamed")
     if info.sample_time is not None:
         yield "sample time", f"{info.sample_time:.4g} s"
     yield "sign turns", f"over {model.v_smooth:g} {info.unit}/s"

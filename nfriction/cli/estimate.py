@@ -1,0 +1,235 @@
+"""`nfriction fit` and `nfriction compare`: fit models to recordings, write and print what comes."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import shlex
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from nfriction.cli import inputs
+from nfriction.cli.console import Parser, Progress, UsageError, check_writable, warn
+
+if TYPE_CHECKING:
+    from nfriction.evaluation.compare import Comparison, InitialStates
+    from nfriction.evaluation.cross_validation import Selection
+    from nfriction.plant import Plant
+    from nfriction.recording import Recording
+
+FIT_EXAMPLE = """example:
+  nfriction fit run1.csv run2.csv --rig rig.json --model LFM --out lfm.json"""
+COMPARE_EXAMPLE = """example:
+  nfriction compare run1.csv run2.csv --test run3.csv --rig rig.json \\
+      --models NCFM,LFM,NFLFM --out runs/mine"""
+
+
+def add_fit(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
+    """Register `fit`."""
+    parser = commands.add_parser(
+        "fit", parents=[common], help="fit one model", epilog=FIT_EXAMPLE,
+        description="Fit one friction model to recordings and write it as a model file.",
+    )  # fmt: skip
+    parser.add_argument("recordings", nargs="+", type=inputs.file, metavar="RECORDING",
+                        help=f"with columns time, q1, ... ({inputs.FORMATS})")  # fmt: skip
+    parser.add_argument("--model", type=inputs.model, default="NFLFM",
+                        help=f"one of {', '.join(inputs.MODELS)}")  # fmt: skip
+    parser.add_argument("--out", type=Path, default=Path("model.json"), help="model file to write")
+    inputs.add_fit_options(parser)
+    parser.set_defaults(run=run_fit)
+
+
+def add_compare(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
+    """Register `compare`."""
+    parser = commands.add_parser(
+        "compare", parents=[common], help="fit models and score them", epilog=COMPARE_EXAMPLE,
+        description="Fit friction models to recordings and score each by simulating recordings "
+        "that no fit has seen.",
+    )  # fmt: skip
+    parser.add_argument("train", nargs="+", type=inputs.file, metavar="TRAIN", help="recordings to "
+                        f"fit, with columns time, q1, ... ({inputs.FORMATS})")  # fmt: skip
+    parser.add_argument("--test", nargs="+", type=inputs.file, default=[], metavar="TEST",
+                        help="recordings to judge by, which no fit sees")  # fmt: skip
+    add_comparison_options(parser)
+    inputs.add_fit_options(parser)
+    parser.set_defaults(run=run_compare)
+
+
+def add_comparison_options(parser: argparse.ArgumentParser) -> None:
+    """Options of `compare` and `demo`."""
+    add = parser.add_argument
+    add("--models", type=inputs.models, default=inputs.DEFAULT_MODELS,
+        help=f"of {', '.join(inputs.MODELS)}")  # fmt: skip
+    add("--out", type=Path, default=Path("runs/compare"), help="folder to write")
+    add("--initial-states", type=inputs.file, metavar="FILE",
+        help="table with columns id, q0_1, qd0_1, ... of the recordings' initial states (default: "
+        "estimated from each recording)")  # fmt: skip
+    add("--select", action="store_true", help="also choose a model on the training recordings "
+        "alone, by cross-validation over blocks of time")  # fmt: skip
+    add("--no-figures", action="store_true", help="draw no figures")
+    add("--jobs", type=inputs.jobs, default=1, metavar="N",
+        help="fits at the same time, each in a process of its own; -1 for one to each core (needs "
+        "joblib; the results are the same)")  # fmt: skip
+    add("--log-file", type=Path, metavar="FILE",
+        help="append a log of stages, times and results")  # fmt: skip
+
+
+def run_fit(arguments: argparse.Namespace) -> int:
+    """Fit, write the model, report."""
+    from nfriction.cli.tables import coefficient_table, fit_lines, interval_table
+    from nfriction.evaluation.results import model_info
+    from nfriction.fitting.fit import fit
+    from nfriction.friction import model_by_name
+    from nfriction.io.model_file import save
+
+    plant = inputs.read_rig(arguments.rig)
+    model = model_by_name(arguments.model)(plant.joints)
+    recordings = inputs.read_recordings(arguments.recordings, plant, arguments)
+    if arguments.out.is_dir():
+        raise UsageError(f"--out of fit is a file, and {arguments.out} is a folder.")
+    check_writable(arguments.out.parent)
+    with Progress() as progress:
+        progress.stage(f"fit {arguments.model}")
+        found = fit(
+            model, plant, recordings, callback=lambda stage, _: progress.step(stage),
+            **inputs.fit_settings(arguments),
+        )  # fmt: skip
+        progress.stage("write the model")
+    save(model, arguments.out, model_info(found, recordings))
+    print(fit_lines(arguments.model, found))
+    print(f"position error over training windows: {1e3 * found.residual:.3g} m{plant.unit}")
+    print(coefficient_table(model, plant.joint_names, plant.unit))
+    if intervals := interval_table(found):
+        print(intervals)
+    print(f"wrote {arguments.out}")
+    if found.converged:
+        further = ["nfriction", "export", str(arguments.out), "--format", "torchscript"]
+        print(f"next: {shlex.join(further)}")
+    return 0
+
+
+def run_compare(arguments: argparse.Namespace) -> int:
+    """Read, then compare."""
+    plant = inputs.read_rig(arguments.rig)
+    paths = [*arguments.train, *arguments.test]
+    recordings = inputs.read_recordings(paths, plant, arguments)
+    train, test = recordings[: len(arguments.train)], recordings[len(arguments.train) :]
+    return compare_and_report(plant, train, test, arguments, inputs.fit_settings(arguments))
+
+
+def compare_and_report(
+    plant: Plant,
+    train: list[Recording],
+    test: list[Recording],
+    arguments: argparse.Namespace,
+    settings: dict[str, Any],
+) -> int:
+    """Fit, score, write and print.
+
+    Returns:
+        The exit status: 1 where a model could not be fitted.
+    """
+    from nfriction.cli.tables import verdict
+    from nfriction.evaluation.compare import check_recordings, compare
+    from nfriction.evaluation.cross_validation import select
+    from nfriction.evaluation.results import exclusive, report_of, write_results
+    from nfriction.report import write_report
+
+    check_recordings(train, test)  # before a choice that takes long
+    states = _initial_states(arguments, plant, [*train, *test])
+    check_writable(arguments.out)
+    selection = None
+    with (
+        exclusive(arguments.out),
+        _log(arguments.log_file) as logger,
+        Progress(logger) as progress,
+    ):
+        settings = settings | {"progress": progress, "jobs": arguments.jobs}
+        logger.info(arguments.command_line)
+        if arguments.select:
+            selection = select(plant, arguments.models, train, **settings)
+        comparison = compare(
+            plant, arguments.models, train, test, initial_states=states, **settings
+        )
+        progress.stage("write results and figures")
+        page = report_of(arguments.out)
+        write_results(
+            comparison, train, test, arguments.out, selection=selection,
+            command=arguments.command_line, figures=not arguments.no_figures,
+        )  # fmt: skip
+        if page is not None:
+            write_report(arguments.out, page)  # else the earlier run's page would be missed
+        logger.info(verdict(comparison))
+    _print(comparison, selection, plant, arguments)
+    return 1 if comparison.failed else 0
+
+
+def _print(
+    comparison: Comparison,
+    selection: Selection | None,
+    plant: Plant,
+    arguments: argparse.Namespace,
+) -> None:
+    from nfriction.cli import tables
+
+    print(f"\n{tables.error_tables(comparison)}\n")
+    for name, fit in comparison.fits.items():
+        print(tables.fit_lines(name, fit))
+    for name, why in comparison.failed.items():
+        print(f"{name}: not fitted: {why}")
+    if selection is not None:
+        print(f"\n{tables.choice(selection)}")
+    print(f"\n{tables.verdict(comparison)}")
+    best = comparison.fits.get(comparison.best() or "")
+    if best is not None:
+        print(tables.coefficient_table(best.model, plant.joint_names, plant.unit))
+        if intervals := tables.interval_table(best):
+            print(intervals)
+        print(f"its model file: {arguments.out / 'models' / f'{comparison.best()}.json'}")
+    what = "results and models" if arguments.no_figures else "results, models and figures"
+    print(f"\n{what} are in {arguments.out}")
+
+
+@contextmanager
+def _log(path: Path | None) -> Iterator[logging.Logger]:
+    """The command's logger, which with all others of the package writes into a file."""
+    package = logging.getLogger("nfriction")
+    if path is None:
+        yield package
+        return
+    handler = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    before = package.level
+    package.addHandler(handler)
+    package.setLevel(logging.INFO)
+    try:
+        yield package
+    finally:
+        package.setLevel(before)
+        package.removeHandler(handler)
+        handler.close()
+
+
+def _initial_states(
+    arguments: argparse.Namespace,
+    plant: Plant,
+    recordings: Sequence[Recording],
+) -> InitialStates | None:
+    """States of these recordings; warns of those that start from their smoothed motion."""
+    from nfriction.recording import read_initial_states
+
+    path = arguments.initial_states
+    if path is None:
+        return None
+    states = read_initial_states(path, degrees=arguments.degrees)
+    of = [recording.name for recording in recordings]
+    for name in of:
+        if name in states and len(states[name][0]) != plant.joints:
+            raise UsageError(f"{path}: the state of {name} has {len(states[name][0])} joints, "
+                             f"the rig {plant.joints}.")  # fmt: skip
+    without = [name for name in of if name not in states]
+    if without:
+        warn(f"{path} has no state of {', '.join(without)}; estimated from the recording instead.")
+    return states

@@ -1,0 +1,209 @@
+"""Names, numbers and files that options take, and the options of fits.
+
+Importing it needs no torch; a test holds `RIGS` equal to `rigs.names()`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import math
+import warnings
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from nfriction.cli.console import UsageError, one_line, warn
+from nfriction.fitting.options import CHOICES
+from nfriction.friction import model_names
+
+if TYPE_CHECKING:
+    from nfriction.plant import Plant
+    from nfriction.recording import Recording
+
+MODELS = model_names()
+RIGS = (
+    "tlrip", "rtip", "multiarm-single", "multiarm-double", "multiarm-triple",
+    "dfki-A0", "dfki-C0", "dfki-C1", "emps", "xl330",
+)  # fmt: skip
+FORMATS = "CSV, TSV, TXT, Parquet, NPZ, MAT, HDF5 or MDF4"
+RIG_FILES = (".json", ".toml", ".urdf", ".xml", ".mjcf")
+DEFAULT_MODELS = "NCFM,LFM,NLFM,NFLFM"
+# Of `nfriction.fit`; where an option is not given, its own default.
+_FIT_OPTIONS = (
+    "windows", "fit_plant", "drag", "eccentricity", "encoder_reference", "continuity", "max_steps",
+)  # fmt: skip
+
+
+def model(text: str) -> str:
+    """The name of a friction model, for argparse."""
+    if text not in MODELS:
+        raise argparse.ArgumentTypeError(
+            f"no friction model is called {text!r}{_similar(text, MODELS)}; there are "
+            f"{', '.join(MODELS)}"
+        )
+    return text
+
+
+def models(text: str) -> list[str]:
+    """Names of friction models with commas between them, for argparse."""
+    names = [model(name.strip()) for name in text.split(",") if name.strip()]
+    if not names:
+        raise argparse.ArgumentTypeError(f"takes names of {', '.join(MODELS)}, got none")
+    return names
+
+
+def rig(text: str) -> str:
+    """A named rig or a rig file, for argparse."""
+    if text in RIGS:
+        return text
+    if Path(text).suffix.lower() not in RIG_FILES:
+        raise argparse.ArgumentTypeError(
+            f"no rig is called {text!r}{_similar(text, RIGS)}; give a file "
+            f"({', '.join(RIG_FILES)}) or one of {', '.join(RIGS)}"
+        )
+    return str(file(text))
+
+
+def _similar(text: str, names: Iterable[str]) -> str:
+    """A question for the name that may be meant; empty where none is near."""
+    by_lower = {name.lower(): name for name in names}
+    near = difflib.get_close_matches(text.lower(), by_lower, 1)
+    return f" (did you mean {by_lower[near[0]]}?)" if near else ""
+
+
+def file(text: str) -> Path:
+    """A file that is there, for argparse."""
+    path = Path(text)
+    if not path.is_file():
+        what = "is no file" if path.exists() else "is not there"
+        raise argparse.ArgumentTypeError(f"{text} {what}; check the path")
+    return path
+
+
+def count(text: str) -> int:
+    """A whole number from 0, for argparse."""
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"must be a whole number from 0, got {text!r}")
+    return int(text)
+
+
+def jobs(text: str) -> int:
+    """A number of processes from 1, or -1, for argparse."""
+    if text != "-1" and not (text.isdecimal() and int(text)):
+        raise argparse.ArgumentTypeError(
+            f"must be a whole number from 1, or -1 for one to each core, got {text!r}"
+        )
+    return int(text)
+
+
+def seconds(text: str) -> float:
+    """A positive duration, for argparse."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"must be positive seconds, got {text!r}")
+    return value
+
+
+def columns(text: str) -> dict[str, str]:
+    """Names of columns, ours and the file's, for argparse."""
+    pairs = [part.split("=", 1) for part in text.split(",")]
+    if any(len(pair) < 2 or not all(map(str.strip, pair)) for pair in pairs):
+        raise argparse.ArgumentTypeError(f"takes pairs like time=t,q1=enc_1, got {text!r}")
+    return {ours.strip(): theirs.strip() for ours, theirs in pairs}
+
+
+def _windows(text: str) -> tuple[float, ...]:
+    try:
+        return tuple(seconds(part) for part in text.split(","))
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(
+            f"takes positive seconds like 0.5,2, got {text!r}"
+        ) from None
+
+
+def add_fit_options(parser: argparse.ArgumentParser) -> None:
+    """Options of `fit` and `compare`."""
+    add = parser.add_argument
+    add("--rig", required=True, type=rig,
+        help="a rig file (.json, .toml), a robot description (.urdf, MuJoCo's .xml), or one of "
+        f"{', '.join(RIGS)}")  # fmt: skip
+    add("--angles", metavar="HOW,ZERO",
+        help="angle convention of the files: relative or absolute, from upright or hanging, e.g. "
+        "absolute,hanging (default: of the file or the rig)")  # fmt: skip
+    add("--degrees", action="store_true", help="the files are in degrees")
+    add("--columns", type=columns, metavar="OURS=THEIRS,...",
+        help="the files' names of time, q1, ..., tau1, ... where they differ, e.g. "
+        "time=t,q1=enc_1,q2=enc_2")  # fmt: skip
+    add("--windows", type=_windows, metavar="SECONDS",
+        help="lengths of the shooting windows, in the order of their use [s] (default: 0.5,2,5)"
+        )  # fmt: skip
+    add("--fit-plant", action=argparse.BooleanOptionalAction, default=True,
+        help="adjust the rig's inertia and gravity terms within bounds (default: yes)"
+        )  # fmt: skip
+    add("--drag", action=argparse.BooleanOptionalAction,
+        help="fit air drag on the links (default: if nothing drives the rig)")  # fmt: skip
+    add("--eccentricity", choices=CHOICES["eccentricity"], default="off",
+        help="fit the eccentricity of the encoders; auto: if the evidence favours it (default: off)"
+        )  # fmt: skip
+    add("--encoder-reference", choices=CHOICES["encoder_reference"], default="auto",
+        help="when incremental encoders were set to zero: before all recordings (shared), or at "
+        "the start of each in a pose held by stiction (default: per_recording if all recordings "
+        "of a driven rig begin at rest at zero)")  # fmt: skip
+    add("--continuity", choices=CHOICES["continuity"], default="none",
+        help="continuity between shooting windows: none, penalised, or enforced (default: none)"
+        )  # fmt: skip
+    add("--max-steps", type=count, default=30, metavar="N",
+        help="limit of search steps at each window length (default: 30)")  # fmt: skip
+
+
+def fit_settings(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Arguments of `nfriction.fit` among these options; its own windows where none are given."""
+    settings = {name: getattr(arguments, name) for name in _FIT_OPTIONS}
+    if settings["windows"] is None:
+        del settings["windows"]
+    return settings
+
+
+def read_rig(name: str) -> Plant:
+    """The rig that `--rig` names."""
+    from nfriction.plant import rigs
+
+    return rigs.by_name(name) if name in RIGS else rigs.read(name)
+
+
+def read_recordings(
+    paths: Sequence[Path], plant: Plant, arguments: argparse.Namespace
+) -> list[Recording]:
+    """The recordings in files, in the angles and units of the options."""
+    from nfriction.recording import Recording, RecordingWarning
+
+    unit: Literal["rad", "m"] = "m" if plant.unit == "m" else "rad"
+    recordings: list[Recording] = []
+    said_of: dict[str, list[str]] = {}
+    for path in paths:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            recording = Recording.read(
+                path, columns=arguments.columns, degrees=arguments.degrees,
+                convention=arguments.angles, unit=unit,
+            )  # fmt: skip
+        if recording.joints != plant.joints:
+            raise UsageError(f"{path} has {recording.joints} joints, the rig has {plant.joints}.")
+        recordings.append(recording)
+        for warning in caught:
+            message = str(warning.message).removeprefix(f"recording '{recording.name}': ")
+            said_of.setdefault(message, []).append(recording.name)
+    in_degrees = [name for text, of in said_of.items() if "degrees=True" in text for name in of]
+    for text, of in said_of.items():
+        if "degrees=True" not in text:
+            warn(f"{', '.join(of)}: {one_line(text)}")
+    # Every change of coordinates would repeat the warning.
+    warnings.simplefilter("ignore", RecordingWarning)
+    if in_degrees:
+        # If the option is missing for one file, it is missing for all.
+        warn(f"{', '.join(in_degrees)}: positions look like degrees; if they are, add --degrees.")
+    return recordings
