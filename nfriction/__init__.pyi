@@ -8,6 +8,8 @@ from .evaluation.cross_validation import select as select
 from .evaluation.estimators import FrictionEstimator as FrictionEstimator
 from .evaluation.score import Score as Score
 from .evaluation.score import score as score
+from .evaluation.sessions import SessionsResult as SessionsResult
+from .evaluation.sessions import fit_sessions as fit_sessions
 from .fitting.fit import fit as fit
 from .fitting.result.fit_result import FitResult as FitResult
 from .friction.models import CFM as CFM

@@ -50,9 +50,18 @@ class FitOptions:
     zero_reading: float = 2e-3
     # Below so many counts, quantisation is most of a joint's apparent motion.
     min_counts: int = 10
-    # Wrong vertical reference: a free swing then seems to need twice its weight in friction, which
-    # on the public benches is 40 times the friction torque and more.
-    reference_ratio: float = 5.0
+    # A sample is a spike if it is off its neighbours by so many times the 99 % quantile.
+    spike_ratio: float = 20.0
+    # A mistake is named if its correction leaves half of the unexplained torque, a quarter of its
+    # power: errors of a rig's data within their bounds change it by less.
+    diagnosis_ratio: float = 2.0
+    # Corrections that leave so much more than the best are not distinguished from it.
+    diagnosis_tie: float = 1.25
+    # Torques are averaged over so long, short against a swing [s], and so many samples are used.
+    diagnosis_block: float = 0.03
+    diagnosis_samples: int = 8_000
+    # Longest delay between torques and positions: some samples of a slow bus [s].
+    largest_delay: float = 0.1
     # More substeps would mean a sign function too steep for the sample time.
     max_substeps: int = 8
 

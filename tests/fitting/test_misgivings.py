@@ -36,12 +36,6 @@ def test_a_free_swing_tells_which_zero_its_angles_have(zero, start):
     assert "`convention`" in told
 
 
-def test_what_a_torque_may_hold_up_is_not_judged():
-    hanging = swing(pendulum(), MODEL, seconds=1.0, convention="absolute,hanging")
-    held = Recording(hanging.time, hanging.q, tau=np.full(hanging.q.shape, 0.1))
-    assert said(pendulum(convention=("absolute", "upright")), held) == ()
-
-
 def test_a_fit_says_it_once_and_by_either_method():
     recording = as_plant_says(swing(pendulum(), MODEL, seconds=1.0, convention="absolute,hanging"))
     plant = pendulum(convention=("absolute", "upright"))

@@ -1,15 +1,13 @@
 """Signs in recordings that they are not what the plant and the fit assume."""
 
-import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nfriction.fitting.data.inputs import is_undriven_pendulum, largest_torques
 from nfriction.fitting.data.windows import begins_at_rest
-from nfriction.fitting.equation_error import friction_torque
+from nfriction.fitting.diagnosis import likely_mistakes, mistake_warning
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.plant import PendulumChain, Plant
 from nfriction.recording import Recording
@@ -21,6 +19,8 @@ ZEROED_PER_RECORDING = (
     "Every recording begins at rest with all encoders at zero; assumed that they were zeroed "
     'there, in whatever pose. If not: `encoder_reference="shared"`.'
 )
+# Density of lead [kg/m^3].
+LEAD = 11_340.0
 # Error of angles from one conversion to the next, with room.
 ROUNDING = 1e-9
 
@@ -53,7 +53,11 @@ def data_warnings(
 ) -> tuple[str, ...]:
     """Warnings about recordings as written and in joint coordinates, a sentence each."""
     still = _still_joints(plant, given, joint, options.min_counts)
-    return (*still, *_other_vertical(plant, given, joint, motions, options.reference_ratio))
+    heavy = _implausible_masses(plant) if is_undriven_pendulum(plant, joint) else ()
+    convention = given[0].resolve_convention(plant)
+    stated, mistakes = likely_mistakes(plant, joint, motions, convention, options)
+    named = mistake_warning(stated, mistakes)
+    return (*named, *_spikes(given, options), *still, *heavy)
 
 
 def require_motion(plant: Plant, joint: Sequence[Recording]) -> None:
@@ -92,31 +96,36 @@ def _still_joints(
             )
 
 
-def _other_vertical(
-    plant: Plant,
-    given: Sequence[Recording],
-    joint: Sequence[Recording],
-    motions: Sequence[Motion],
-    ratio: float,
-) -> Iterator[str]:
-    """Warn if a free swing needs far less friction with its angles measured from the other end."""
-    if not is_undriven_pendulum(plant, joint):
-        return
-    turned = [replace(m, q=m.q + np.eye(1, m.q.shape[1]) * math.pi) for m in motions]
-    stated, opposite = (_friction_rms(plant, joint, of) for of in (motions, turned))
-    if stated > ratio * opposite:
-        reference = given[0].resolve_convention(plant).measured_from
-        other = "upright" if reference == "hanging" else "hanging"
-        yield (
-            f"The angles look measured from {other}, not from {reference}: friction would then "
-            f"have to explain {opposite:.3g} N m, and not {stated:.3g}. Correct `convention` of "
-            "the rig, or of the recordings."
-        )
+def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[str]:
+    """Single samples far off the line between their neighbours."""
+    for recording in recordings:
+        q, time = recording.q, recording.time
+        off = q[1:-1] - (q[2:] + q[:-2]) / 2
+        # Beside a spike of height h its neighbours are off by -h/2 each.
+        pattern = (off[1:-1] - (off[2:] + off[:-2])) / 2
+        usual = np.maximum(np.quantile(np.abs(pattern), 0.99, axis=0), count_seen(q))
+        far = np.abs(pattern) > options.spike_ratio * usual
+        for name, column, size in zip(recording.names, far.T, np.abs(pattern).T, strict=True):
+            # Each is seen from its neighbours, too.
+            peaks = [
+                k for k in np.flatnonzero(column) if size[k] == size[max(0, k - 2) : k + 3].max()
+            ]
+            if peaks:
+                when = ", ".join(f"{time[k + 2]:.6g}" for k in peaks[:3])
+                more = f" and {len(peaks) - 3} more" if len(peaks) > 3 else ""
+                yield (
+                    f"{recording.name or 'A recording'}: {name} jumps for one sample at {when} s"
+                    f"{more}; such spikes are errors of the sensor, leave these samples out."
+                )
 
 
-def _friction_rms(plant: Plant, joint: Sequence[Recording], motions: Sequence[Motion]) -> float:
-    """Root mean square of the torque that friction would have to explain [N m]."""
-    pairs = zip(joint, motions, strict=True)
-    squares = [friction_torque(plant, r, m)[2].square() for r, m in pairs]
-    count = sum(part.numel() for part in squares)
-    return math.sqrt(sum(float(part.sum()) for part in squares) / max(count, 1))
+def _implausible_masses(plant: Plant) -> Iterator[str]:
+    """Warn of masses that look like g; a free swing shows only their ratios."""
+    data = plant.to_dict()
+    for k, (mass, length) in enumerate(zip(data.get("mass", ()), data["length"], strict=True)):
+        if mass > LEAD * length**3:
+            yield (
+                f"Link {k + 1} of {mass:g} kg and {length:g} m would be heavier than a cube of "
+                "lead that long; a free swing does not show the scale of masses, so friction is "
+                "too large by the same factor if they are in g."
+            )

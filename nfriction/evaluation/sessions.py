@@ -1,0 +1,226 @@
+"""Friction over many sessions or units of one machine: the mean, and the spread between them.
+
+Every session is fitted by itself, so a thousand recordings need the memory of one a process. A
+random-effects model then combines the estimates: each session has friction of its own, drawn from
+a normal distribution whose mean and spread are estimated (Paule and Mandel 1982, J. Res. NBS 87,
+p. 377), and the interval for the next session contains both (Higgins, Thompson and Spiegelhalter
+2009, J. R. Stat. Soc. A 172, p. 137).
+"""
+
+import copy
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from nfriction.evaluation.parallel import Progress, as_completed, check_jobs
+from nfriction.fitting.fit import fit
+from nfriction.friction.models import FrictionModel
+from nfriction.plant import Plant
+from nfriction.recording import Recording
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+Session: TypeAlias = (
+    Recording | str | os.PathLike[str] | Sequence[Recording | str | os.PathLike[str]]
+)
+
+
+class SessionFit(NamedTuple):
+    """Estimates of one session.
+
+    Attributes:
+        values: of the coefficients and plant terms, by name.
+        sd: their standard deviations; infinite where the session does not determine them.
+        residual: root mean square position error of its windows [rad; m].
+        status: of its fit.
+        warnings: of its fit.
+    """
+
+    values: dict[str, float]
+    sd: dict[str, float]
+    residual: float
+    status: str
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A parameter over all sessions.
+
+    Attributes:
+        name: of the parameter.
+        mean: over sessions.
+        between: standard deviation between sessions, beyond what their own errors explain.
+        low, high: 95 % confidence interval of the mean.
+        next_low, next_high: 95 % prediction interval of the next session's value.
+        sessions: number of sessions that determine it.
+    """
+
+    name: str
+    mean: float
+    between: float
+    low: float
+    high: float
+    next_low: float
+    next_high: float
+    sessions: int
+
+
+@dataclass(frozen=True, eq=False)
+class SessionsResult:
+    """Friction of a machine over its sessions.
+
+    Attributes:
+        model: with the mean coefficients.
+        spreads: mean, spread and intervals of each parameter.
+        fits: estimates by session.
+        failed: reason by session that could not be fitted.
+    """
+
+    model: FrictionModel
+    spreads: tuple[Spread, ...]
+    fits: Mapping[str, SessionFit]
+    failed: Mapping[str, str]
+
+    def to_pandas(self) -> "pd.DataFrame":
+        """Table with a row a parameter."""
+        import pandas as pd  # slow to import
+
+        return pd.DataFrame([vars(s) for s in self.spreads]).set_index("name")
+
+
+def fit_sessions(
+    model: FrictionModel,
+    plant: Plant,
+    sessions: Mapping[str, Session],
+    *,
+    jobs: int = 1,
+    progress: Progress | None = None,
+    **fit_settings: Any,
+) -> SessionsResult:
+    """Fit a constant model to every session, and its spread between sessions.
+
+    Args:
+        model: with constant coefficients; it stays as it is.
+        plant: the mechanism as given, the same for all.
+        sessions: recordings, or paths of recordings, by session: a day, a temperature, a unit. A
+            path is read in the process that fits it, so memory does not grow with their number.
+        jobs: processes, -1 for one to each core; with `joblib.parallel_config(backend="dask")`
+            those of a cluster.
+        progress: receives the labels.
+        **fit_settings: as for `fit`.
+
+    Returns:
+        Means, spreads and intervals. Sessions that cannot be fitted are listed, not fatal.
+
+    Raises:
+        ValueError: for fewer than 3 sessions, coefficients that follow the motion, or if fewer than
+            3 sessions could be fitted.
+        ImportError: if `jobs` needs joblib and it is not installed.
+    """
+    check_jobs(jobs)
+    if model.schedule.follows_motion:
+        raise ValueError("a spread between sessions is estimated for constant coefficients only.")
+    if len(sessions) < 3:
+        raise ValueError(
+            f"a spread needs at least 3 sessions, got {len(sessions)}; `fit` takes recordings of "
+            "one session together."
+        )
+    fits: dict[str, SessionFit] = {}
+    failed: dict[str, str] = {}
+    tasks = {label: (model, plant, session, fit_settings) for label, session in sessions.items()}
+    for label, found in as_completed(_fit_session, tasks, jobs=jobs, progress=progress):
+        if isinstance(found, str):
+            failed[label] = found
+        else:
+            fits[label] = found
+    if len(fits) < 3:
+        first = next(iter(failed.items()))
+        raise ValueError(
+            f"{len(failed)} of {len(sessions)} sessions could not be fitted, and a spread needs 3; "
+            f"{first[0]}: {first[1]}"
+        )
+    # In the order given, whichever ended first.
+    fits = {label: fits[label] for label in sessions if label in fits}
+    names = list(next(iter(fits.values())).values)
+    spreads = tuple(
+        random_effects(
+            name,
+            np.array([f.values[name] for f in fits.values()]),
+            np.array([f.sd[name] for f in fits.values()]),
+        )
+        for name in names
+    )
+    mean = copy.deepcopy(model)
+    count = mean.schedule.parameter_vector().numel()
+    vector = torch.tensor([s.mean for s in spreads[:count]], dtype=torch.float64)
+    mean.schedule.set_parameter_vector(torch.where(vector.isnan(), 0.0, vector))
+    return SessionsResult(mean.requires_grad_(False), spreads, fits, failed)
+
+
+def _fit_session(
+    model: FrictionModel, plant: Plant, session: Session, settings: dict[str, Any]
+) -> SessionFit | str:
+    """Estimates of a session, or the reason why there are none."""
+    many = [session] if isinstance(session, (Recording, str, os.PathLike)) else session
+    try:
+        recordings = [r if isinstance(r, Recording) else Recording.read(r) for r in many]
+        found = fit(copy.deepcopy(model), plant, recordings, **settings)
+    except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
+        return str(error)
+    unknown = set(" with ".join(found.unidentifiable).split(" with "))
+    return SessionFit(
+        {i.name: i.value for i in found.intervals},
+        {i.name: math.inf if i.name in unknown else i.sd for i in found.intervals},
+        found.residual,
+        found.status,
+        found.warnings,
+    )
+
+
+def random_effects(name: str, values: Array, sd: Array) -> Spread:
+    """Mean and spread of estimates that have errors of their own.
+
+    The spread is the one at which the weighted squares of the deviations sum to their expectation,
+    the number of estimates less one.
+
+    Args:
+        name: of the parameter.
+        values: an estimate a session.
+        sd: its standard deviations; sessions with an infinite one do not count.
+    """
+    from scipy.optimize import brentq  # slow to import
+    from scipy.stats import t as student
+
+    known = np.isfinite(sd)
+    values, variance = values[known], sd[known] ** 2
+    count = len(values)
+    if count < 3:
+        nan, inf = math.nan, math.inf
+        return Spread(name, nan, nan, -inf, inf, -inf, inf, count)
+    # Estimates without an error, at a bound, would have all the weight.
+    variance = np.maximum(variance, 1e-12 * max(float(variance.max()), np.finfo(float).tiny))
+
+    def excess(between: float) -> float:
+        weight = 1 / (variance + between)
+        mean = weight @ values / weight.sum()
+        return float(weight @ (values - mean) ** 2) - (count - 1)
+
+    largest = float(values.var(ddof=1)) + float(variance.max())
+    between = 0.0 if excess(0.0) <= 0 else brentq(excess, 0.0, 10 * largest)
+    weight = 1 / (variance + between)
+    mean = float(weight @ values / weight.sum())
+    error = 1 / float(weight.sum())
+    reach = float(student.ppf(0.975, count - 1)) * math.sqrt(error)
+    # One degree of freedom less, as the spread is estimated.
+    ahead = float(student.ppf(0.975, count - 2)) * math.sqrt(between + error)
+    limits = mean - reach, mean + reach, mean - ahead, mean + ahead
+    return Spread(name, mean, math.sqrt(between), *limits, count)

@@ -1,0 +1,366 @@
+"""Typical mistakes in recordings and rigs, found by the balance of torques.
+
+A mistake leaves torque that no friction explains. Each hypothesis corrects one mistake; the balance
+shows which correction explains the motion. One pass of inverse dynamics each, no simulation.
+"""
+
+import math
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from nfriction.fitting.options import DEFAULTS, FitOptions
+from nfriction.fitting.plant_parameters import plant_parameters
+from nfriction.plant import PendulumChain, Plant
+from nfriction.recording import Recording
+from nfriction.recording.angles import AngleConvention, Angles, MeasuredFrom
+from nfriction.signals import Motion
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """A mistake that would explain why no friction fits.
+
+    Attributes:
+        text: a clause such as "the sign of joint2's position is reversed".
+        unexplained: share of the torque that friction does not explain once it is corrected [-].
+    """
+
+    text: str
+    unexplained: float
+
+
+@dataclass(frozen=True)
+class _Data:
+    """Samples in joint coordinates, (sample, joint) each, in blocks of equal length."""
+
+    q: Tensor
+    qd: Tensor
+    qdd: Tensor
+    tau: Tensor
+    block: int
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Means over blocks, (block, ...)."""
+        return values.reshape(-1, self.block, *values.shape[1:]).mean(1)
+
+    def moving(self) -> Tensor:
+        """1 where a joint turns one way during a block, else 0, (block, joint).
+
+        Dry friction takes any value at rest, so the balance says nothing there.
+        """
+        return (self.mean(torch.sign(self.qd)).abs() == 1).to(self.qd)
+
+
+def likely_mistakes(
+    plant: Plant,
+    recordings: Sequence[Recording],
+    motions: Sequence[Motion],
+    convention: AngleConvention,
+    options: FitOptions = DEFAULTS,
+) -> tuple[float, tuple[Mistake, ...]]:
+    """Share of unexplained torque as recorded, and mistakes whose correction explains far more.
+
+    Args:
+        plant: the mechanism as given.
+        recordings: in joint coordinates.
+        motions: theirs, smoothed.
+        convention: of the recorded angles.
+        options: `diagnosis_ratio` and the like.
+
+    Returns:
+        The share [-], and the mistakes that the data support, best first: several where the data
+        do not distinguish them, none where no correction divides the share by `diagnosis_ratio`.
+    """
+    given = _collect(recordings, motions, options)
+    if not len(given.q):
+        return math.nan, ()
+    stated = _unexplained(plant, given)
+    found = [
+        Mistake(text, share)
+        for text, share in _tested(plant, recordings, motions, convention, given, options)
+        if share < stated / options.diagnosis_ratio
+    ]
+    # Nearly equal shares: the data do not distinguish these corrections; simple ones come first.
+    least = min((mistake.unexplained for mistake in found), default=0.0)
+    return stated, tuple(m for m in found if m.unexplained < options.diagnosis_tie * least)[:3]
+
+
+def mistake_warning(stated: float, mistakes: Sequence[Mistake]) -> tuple[str, ...]:
+    """The mistakes in a sentence."""
+    if not mistakes:
+        return ()
+    causes = ", or ".join(mistake.text for mistake in mistakes)
+    return (
+        f"A mistake in the data is likely: {causes}. Corrected, friction leaves "
+        f"{mistakes[0].unexplained:.2g} of the torque unexplained, and not {stated:.2g}.",
+    )
+
+
+def _tested(
+    plant: Plant,
+    recordings: Sequence[Recording],
+    motions: Sequence[Motion],
+    convention: AngleConvention,
+    given: _Data,
+    options: FitOptions,
+) -> Iterator[tuple[str, float]]:
+    for text, data in _corrected_positions(plant, convention, given):
+        yield text, _unexplained(plant, data)
+    for text, rig in _corrected_rigs(plant):
+        yield text, _unexplained(rig, given)
+    if given.tau.any():
+        for text, data in _corrected_torques(plant, given, options):
+            yield text, _unexplained(plant, data)
+        yield _delay(plant, recordings, motions, options)
+    for text, rig in _corrected_terms(plant, given, options):
+        yield text, _unexplained(rig, given)
+
+
+def _collect(
+    recordings: Sequence[Recording],
+    motions: Sequence[Motion],
+    options: FitOptions,
+    delay: float = 0.0,
+) -> _Data:
+    """Samples away from the ends, with the torque that was recorded `delay` [s] later."""
+    # Both sides of the balance are averaged alike, which takes the noise of accelerations out.
+    block = max(1, round(options.diagnosis_block / recordings[0].sample_time))
+    # Blocks are left out evenly where there are more samples than needed.
+    stride = block * math.ceil(sum(map(len, recordings)) / options.diagnosis_samples)
+    parts: list[tuple[Array, ...]] = []
+    for recording, motion in zip(recordings, motions, strict=True):
+        time, margin = motion.time, options.edge + options.largest_delay
+        inside = np.flatnonzero((time >= time[0] + margin) & (time <= time[-1] - margin))
+        starts = np.arange(0, max(0, len(inside) - block + 1), stride)
+        chosen = inside[(starts[:, None] + np.arange(block)).ravel()]
+        tau = np.zeros_like(motion.q) if recording.tau is None else recording.tau
+        moved = [np.interp(time[chosen] + delay, time, column) for column in tau.T]
+        parts.append((motion.q[chosen], motion.qd[chosen], motion.qdd[chosen], np.stack(moved, 1)))
+    q, qd, qdd, torque = (torch.as_tensor(np.concatenate(x)) for x in zip(*parts, strict=True))
+    return _Data(q, qd, qdd, torque, block)
+
+
+def _corrected_positions(
+    plant: Plant, convention: AngleConvention, given: _Data
+) -> Iterator[tuple[str, _Data]]:
+    names, first, joints = plant.joint_names, plant.first_link, plant.joints
+    chain = isinstance(plant, PendulumChain)
+    eye, none = np.eye(joints), np.zeros(joints)
+
+    def recorded(
+        matrix: Array, offset: Array = none, reading: AngleConvention = convention
+    ) -> _Data:
+        """The data if recorded positions were `matrix @ q + offset` in the convention `reading`."""
+        if not chain:
+            return replace(given, q=given.q @ torch.as_tensor(matrix.T),
+                           qd=given.qd @ torch.as_tensor(matrix.T),
+                           qdd=given.qdd @ torch.as_tensor(matrix.T))  # fmt: skip
+        q = convention.position_from_joint(given.q, first) @ matrix.T + offset
+        rates = (convention.rate_from_joint(x, first) @ matrix.T for x in (given.qd, given.qdd))
+        qd, qdd = (torch.as_tensor(reading.rate_to_joint(x, first)) for x in rates)
+        return replace(
+            given, q=torch.as_tensor(reading.position_to_joint(q, first)), qd=qd, qdd=qdd
+        )
+
+    for j, name in enumerate(names):
+        scale = eye.copy()
+        for factor in (-1.0, 0.25, 0.5, 2.0, 4.0):
+            scale[j, j] = factor
+            # The counts of an encoder's revolution, in quadrature or not.
+            text = (
+                f"the sign of {name}'s position is reversed"
+                if factor < 0
+                else f"{name}'s position is {1 / factor:g} times too large (counts a revolution)"
+            )
+            yield text, recorded(scale)
+        # The first link's half turn is the convention's.
+        turns = (-90, 90) if j == first else (-90, 90, 180)
+        for degrees in turns if chain and j >= first else ():
+            text = f"{name}'s position is {-degrees if degrees < 180 else 180} degrees off"
+            yield text, recorded(eye, math.radians(degrees) * eye[j])
+    yield "the signs of all positions are reversed", recorded(-eye)
+    for unit, factor in (("degrees", math.pi / 180), (f"m{plant.unit}", 1e-3)):
+        yield f"positions are in {unit}", recorded(factor * eye)
+    yield "time is in ms", replace(given, qd=given.qd * 1e3, qdd=given.qdd * 1e6)
+    yield "time runs backwards: the motion gains energy", replace(given, qd=-given.qd)
+    if chain:
+        zero: MeasuredFrom = "hanging" if convention.measured_from == "upright" else "upright"
+        other = AngleConvention(convention.angles, zero)
+        text = f"angles are measured from {zero}, not from {convention.measured_from}"
+        yield f"{text} (`convention`)", recorded(eye, reading=other)
+    if chain and joints - first > 1:
+        angles: Angles = "relative" if convention.angles == "absolute" else "absolute"
+        other = AngleConvention(angles, convention.measured_from)
+        text = f"angles are {angles}, not {convention.angles} (`convention`)"
+        yield text, recorded(eye, reading=other)
+    for i in range(joints):
+        for j in range(i + 1, joints):
+            order = np.arange(joints)
+            order[[i, j]] = j, i
+            swapped, both = recorded(eye[order]), f"{names[i]} and {names[j]}"
+            yield f"the positions of {both} are exchanged", swapped
+            if given.tau.any():
+                tau = given.tau[:, order]
+                yield f"the torques of {both} are exchanged", replace(given, tau=tau)
+                yield f"the columns of {both} are exchanged", replace(swapped, tau=tau)
+
+
+def _corrected_rigs(plant: Plant) -> Iterator[tuple[str, Plant]]:
+    data = plant.to_dict()
+    if "buffers" in data:
+        return  # they would override the corrected arguments
+    mistakes: dict[str, dict[str, float]] = {
+        "masses are in g": {"mass": 1e-3},
+        "masses are in g, and inertias in g m^2": {"mass": 1e-3, "inertia": 1e-3},
+        "lengths are in mm": {"length": 1e-3, "com": 1e-3},
+    }
+    changes = {
+        text: {k: np.array(data[k]) * f for k, f in factors.items() if data.get(k) is not None}
+        for text, factors in mistakes.items()
+    }
+    inertia = np.array(data.get("inertia") or ())
+    if inertia.ndim == 1 and len(inertia):
+        central = inertia - np.array(data["mass"]) * np.array(data["com"]) ** 2
+        changes["inertias are about the joints, not about the mass centres"] = {"inertia": central}
+    for text, change in changes.items():
+        if change and change.keys() <= data.keys():
+            parts = {key: values.tolist() for key, values in change.items()}
+            # Some would be no mechanism, or an odd one.
+            with suppress(ValueError), warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                corrected = plant.from_dict({**data, **parts})
+                yield text, corrected
+
+
+def _corrected_terms(
+    plant: Plant, given: _Data, options: FitOptions
+) -> Iterator[tuple[str, Plant]]:
+    own = dict(plant.named_buffers())
+    driven = np.flatnonzero(given.tau.abs().amax(0)).tolist()
+    for term in plant_parameters(plant, driven=driven, options=options):
+        if term.ratio and term.name.startswith(("inertia", "gravity", "mass")):
+            change = {name: own[name] * part for name, part in term.change.items()}
+            x = _amount(plant, change, given)
+            if x > term.upper or -1 < x < term.lower:
+                changed = {name: own[name] + x * part for name, part in change.items()}
+                yield f"{term.name} is {1 + x:.3g} times that of the rig", plant.replace(**changed)
+    for j, name in enumerate(plant.joint_names) if "armature" in own else ():
+        unit = torch.zeros_like(own["armature"])
+        unit[j] = 1.0
+        x = _amount(plant, {"armature": unit}, given)
+        if x > options.ratio_term[0] * float(own["armature"][j]):
+            armature = own["armature"] + x * unit
+            text = f"{name} has a rotor inertia (`armature`) of {float(armature[j]):.3g} kg m^2"
+            yield text, plant.replace(armature=armature)
+
+
+def _corrected_torques(
+    plant: Plant, given: _Data, options: FitOptions
+) -> Iterator[tuple[str, _Data]]:
+    kind = "force" if plant.unit == "m" else "torque"
+    driven = np.flatnonzero(given.tau.abs().amax(0)).tolist()
+    groups = [(f"the {kind} of {plant.joint_names[j]}", [j]) for j in driven]
+    if len(driven) > 1:
+        groups.append((f"every {kind}", driven))
+    for what, joints in groups:
+        part = torch.zeros_like(given.tau)
+        part[:, joints] = given.tau[:, joints]
+        gain = _balance(plant, replace(given, tau=given.tau - part), part)[1]
+        if abs(gain - 1) > options.gain_term[0]:
+            # Three digits: 1000 and not 1e+03.
+            times = f"{float(f'{1 / gain:.3g}'):g} times too large"
+            wrong = f"is {times} (a unit, torque constant or gear ratio)"
+            cause = "has the wrong sign" if -1.5 < gain < -0.7 else wrong
+            yield f"{what} {cause}", replace(given, tau=given.tau + (gain - 1) * part)
+
+
+def _delay(
+    plant: Plant, recordings: Sequence[Recording], motions: Sequence[Motion], options: FitOptions
+) -> tuple[str, float]:
+    """The delay between torques and positions that explains most."""
+    from scipy.optimize import minimize_scalar  # slow to import
+
+    def unexplained(delay: float) -> float:
+        return _unexplained(plant, _collect(recordings, motions, options, delay))
+
+    # One valley is as wide as a swing: a coarse grid finds it.
+    grid = np.linspace(-options.largest_delay, options.largest_delay, 9)
+    best = grid[int(np.argmin([unexplained(delay) for delay in grid]))]
+    around = np.clip((best - grid[1] + grid[0], best + grid[1] - grid[0]), grid[0], grid[-1])
+    found = minimize_scalar(unexplained, bounds=around, method="bounded", options={"xatol": 1e-4})
+    words = ("torques", "positions") if found.x > 0 else ("positions", "torques")
+    lag = f"{words[0]} are recorded {1e3 * abs(found.x):.1f} ms later than {words[1]}"
+    return lag, float(found.fun)
+
+
+def _amount(plant: Plant, change: dict[str, Tensor], given: _Data) -> float:
+    """Factor of a change of buffers, in which torques are linear, that fits best."""
+    own = dict(plant.named_buffers())
+    moved = plant.replace(**{name: own[name] + part for name, part in change.items()})
+    states = given.q, given.qd, given.qdd
+    column = plant.inverse_dynamics(*states) - moved.inverse_dynamics(*states)
+    return _balance(plant, given, column)[1]
+
+
+def _unexplained(plant: Plant, data: _Data) -> float:
+    """Share of the torque that Coulomb and viscous friction do not explain [-].
+
+    Root mean square over joints; the torque of a joint is the sum of squares of the drive's, of
+    gravity's and of inertia's.
+    """
+    target = _balance(plant, data)[0]
+    states = data.q, data.qd, data.qdd
+    rest = torch.zeros_like(data.q)
+    static = plant.inverse_dynamics(data.q, rest, rest)
+    parts = data.tau, static, plant.inverse_dynamics(*states) - static
+    moving = data.moving()
+    size = torch.stack([(moving * data.mean(x)).square().mean(0) for x in parts]).sum(0)
+    return float((target / size.clamp_min(torch.finfo(size.dtype).tiny)).mean().sqrt())
+
+
+def _balance(plant: Plant, data: _Data, extra: Tensor | None = None) -> tuple[Tensor, float]:
+    """Mean square of the unexplained torque, (joint,), and the factor of an `extra` torque."""
+    from scipy.optimize import lsq_linear  # slow to import
+
+    torque = data.tau - plant.inverse_dynamics(data.q, data.qd, data.qdd)
+    moving = data.moving()
+    left = moving * data.mean(torque)
+    weight = left.square().mean(0).sqrt()
+    weight = torch.where(weight > 0, weight, 1.0)
+    columns, lower = [], []
+    for j in range(plant.joints):
+        # Friction that adds energy is excluded; a drive may have an offset.
+        shapes = [(torch.sign(data.qd[:, j]), 0.0), (data.qd[:, j], 0.0)]
+        if data.tau[:, j].any():
+            shapes.append((torch.ones_like(torque[:, j]), -np.inf))
+        for shape, bound in shapes:
+            column = torch.zeros_like(left)
+            column[:, j] = moving[:, j] * data.mean(shape)
+            columns.append(column)
+            lower.append(bound)
+    if extra is not None:
+        columns.append(-moving * data.mean(extra))
+        lower.append(-np.inf)
+    design = torch.stack(columns, -1)
+    scaled = (design / weight[:, None]).reshape(-1, len(columns)).numpy()
+    norm = np.linalg.norm(scaled, axis=0)
+    norm[norm == 0] = 1.0
+    rows = np.column_stack([scaled / norm, (left / weight).flatten().numpy()])
+    if not np.isfinite(rows).all():
+        return torch.full_like(weight, math.inf), math.nan
+    # The triangular factor has the same normal equations.
+    _, factor = np.linalg.qr(rows)
+    bounds = (lower, np.inf)
+    with np.errstate(all="ignore"):  # a wrong hypothesis may be far from any number
+        found = lsq_linear(factor[:, :-1], factor[:, -1], bounds=bounds, tol=1e-12).x / norm
+    residual = left - design @ torch.as_tensor(found)
+    return residual.square().mean(0), float(found[-1])

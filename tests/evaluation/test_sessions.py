@@ -1,0 +1,86 @@
+"""Friction over many sessions: the mean, the spread between them, and the next session."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from nfriction import CVFM, NFCVFM, PendulumChain, Recording, fit_sessions, rollout
+from nfriction.evaluation.sessions import random_effects
+
+COUNT = 2 * math.pi / 8192
+PLANT = PendulumChain([0.4], [0.4], position_quantum=COUNT)
+
+
+def session(coefficients: np.ndarray) -> Recording:
+    """A free swing with this friction, rounded to encoder counts."""
+    model = CVFM(1, torch.as_tensor(coefficients)[None]).requires_grad_(False)
+    start = torch.tensor([math.pi + 1.5], dtype=torch.float64)
+    found = rollout(PLANT, model, start, 0 * start, sample_time=0.01, steps=400, substeps=6)
+    q = COUNT * np.round(found.q.numpy() / COUNT)
+    return Recording(0.01 * np.arange(401), q, convention="relative,upright")
+
+
+def test_the_spread_between_sessions_is_found_beside_the_mean(tmp_path):
+    rng = np.random.default_rng(0)
+    truth = np.array([0.02, 0.006]) * (1 + 0.2 * rng.normal(size=(6, 2)))
+    sessions = {f"day {k}": session(c) for k, c in enumerate(truth)}
+    path = tmp_path / "day.csv"
+    sessions["day 0"].write(path)
+    sessions["day 0"] = path  # read where it is fitted
+    found = fit_sessions(CVFM(1), PLANT, sessions, windows=(0.5, 2.0), drag=False)
+    assert list(found.fits) == list(sessions)
+    assert not found.failed
+    for column, spread in zip(truth.T, found.spreads, strict=False):
+        assert spread.mean == pytest.approx(column.mean(), rel=0.02)
+        assert spread.between == pytest.approx(column.std(ddof=1), rel=0.1)
+        assert spread.next_low < column.min() < column.max() < spread.next_high
+    means = [s.mean for s in found.spreads[:2]]
+    assert found.model.schedule.parameter_vector().tolist() == pytest.approx(means)
+    assert found.to_pandas().loc["F_c of joint1", "sessions"] == 6
+
+
+def test_a_session_that_fails_is_listed(tmp_path):
+    sessions = {f"day {k}": session(np.array([0.02, 0.006])) for k in range(3)}
+    sessions["lost"] = tmp_path / "missing.csv"
+    found = fit_sessions(CVFM(1), PLANT, sessions, windows=(0.5,), drag=False)
+    assert "missing.csv" in found.failed["lost"]
+    with pytest.raises(ValueError, match=r"1 of 3 sessions could not be fitted.*missing.csv"):
+        fit_sessions(CVFM(1), PLANT, {k: sessions[k] for k in ("day 0", "day 1", "lost")},
+                     windows=(0.5,), drag=False)  # fmt: skip
+
+
+def test_what_cannot_have_a_spread_is_refused():
+    one = session(np.array([0.02, 0.006]))
+    with pytest.raises(ValueError, match="at least 3 sessions, got 1"):
+        fit_sessions(CVFM(1), PLANT, {"a": one})
+    with pytest.raises(ValueError, match="constant coefficients only"):
+        fit_sessions(NFCVFM(1), PLANT, dict.fromkeys("abc", one))
+
+
+def test_intervals_cover_the_mean_and_the_next_session():
+    rng = np.random.default_rng(1)
+    mean_hit, next_hit, trials = 0, 0, 500
+    for _ in range(trials):
+        sd = rng.uniform(0.05, 0.3, 12)
+        values = 1 + rng.normal(size=12) * 0.2 + rng.normal(size=12) * sd
+        found = random_effects("x", values, sd)
+        mean_hit += found.low < 1 < found.high
+        next_hit += found.next_low < 1 + 0.2 * rng.normal() < found.next_high
+    assert 0.92 <= mean_hit / trials <= 0.98
+    assert 0.88 <= next_hit / trials <= 0.98
+
+
+def test_without_spread_errors_alone_decide():
+    rng = np.random.default_rng(0)
+    sd = np.full(200, 0.1)
+    found = random_effects("x", 1 + sd * rng.normal(size=200), sd)
+    assert found.between < 0.05
+    assert found.high - found.low == pytest.approx(2 * 1.97 * 0.1 / math.sqrt(200), rel=0.3)
+
+
+def test_a_parameter_that_few_sessions_determine_has_no_interval():
+    found = random_effects("x", np.ones(5), np.array([0.1, 0.1, *[math.inf] * 3]))
+    assert math.isnan(found.mean)
+    assert (found.next_low, found.next_high) == (-math.inf, math.inf)

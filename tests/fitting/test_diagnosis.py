@@ -1,0 +1,148 @@
+"""Typical mistakes in recordings and rigs are named, and sound data raise no alarm."""
+
+import functools
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from nfriction import CVFM, LinearAxis, PendulumChain, Plant, Recording, fit, rollout
+from nfriction.fitting.data.checks import data_warnings
+from nfriction.signals import kalman_smoother
+
+COUNT = 2 * math.pi / 4096
+STEP, SAMPLES = 2e-3, 3001
+DOUBLE = {"mass": [0.5, 0.3], "length": [0.3, 0.25], "com": [0.15, 0.12],
+          "inertia": [3.75e-3, 1.56e-3]}  # fmt: skip
+MOTOR = {"mass": [1.0], "length": [0.3], "com": [0.15], "inertia": [0.0075], "armature": [0.05]}
+
+
+def torque(peaks: list[float], seed: int) -> np.ndarray:
+    """Sums of sines with these peaks, (sample, joint)."""
+    rng = np.random.default_rng(seed)
+    time = STEP * np.arange(SAMPLES)
+    columns = []
+    for peak in peaks:
+        waves = [rng.normal() * np.sin(2 * np.pi * f * time) for f in rng.uniform(0.3, 2.5, 6)]
+        columns.append(peak * sum(waves) / np.abs(sum(waves)).max())
+    return np.stack(columns, 1)
+
+
+@functools.cache
+def measured(name: str) -> tuple[Plant, np.ndarray, np.ndarray | None]:
+    """Rig, positions in joint coordinates as encoders round them, and torques."""
+    plants = {"free": PendulumChain(**DOUBLE), "driven": PendulumChain(**DOUBLE),
+              "motor": PendulumChain(**MOTOR), "axis": LinearAxis(0.13)}  # fmt: skip
+    plant, joints = plants[name], 2 if name in ("free", "driven") else 1
+    friction = {"free": [[0.02, 0.004], [0.008, 0.003]], "driven": [[0.1, 0.05], [0.02, 0.01]]}
+    model = CVFM(joints, friction.get(name, [[0.3, 0.12]])).requires_grad_(False)
+    tau = {"free": None, "driven": torque([1.5, 0.3], 1)}.get(name, torque([3.0], 2))
+    start = {"free": [math.pi + 1.2, -0.5], "driven": [math.pi, 0.0], "motor": [math.pi]}
+    q0 = torch.tensor(start.get(name, [0.0]), dtype=torch.float64)
+    found = rollout(
+        plant, model, q0, torch.zeros_like(q0), sample_time=STEP, steps=SAMPLES - 1, substeps=8,
+        tau=None if tau is None else torch.as_tensor(tau[:-1]),
+    )  # fmt: skip
+    return plant, COUNT * np.round(found.q.numpy() / COUNT), tau
+
+
+def warnings_of(plant: Plant, q: np.ndarray, tau: np.ndarray | None, **given) -> tuple[str, ...]:
+    convention = None if plant.unit == "m" else given.get("convention", "relative,upright")
+    time = given.get("time", STEP * np.arange(len(q)))
+    recording = Recording(time, q, tau, convention=convention, unit=plant.unit)
+    joint = recording.joint_coordinates(plant)
+    return data_warnings(plant, [recording], [joint], [kalman_smoother(joint.time, joint.q)])
+
+
+def later(values: np.ndarray, samples: int) -> np.ndarray:
+    return np.concatenate([np.repeat(values[:1], samples, 0), values[:-samples]])
+
+
+@pytest.mark.parametrize("name", ["free", "driven", "motor", "axis"])
+def test_sound_data_raise_no_alarm(name):
+    assert warnings_of(*measured(name)) == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "finding"),
+    [
+        ("free", lambda q: q * [1, -1], "the sign of joint2's position is reversed"),
+        ("free", lambda q: q[:, ::-1], "the positions of joint1 and joint2 are exchanged"),
+        ("free", lambda q: q + np.array([math.pi / 2, 0]), "joint1's position is 90 degrees off"),
+        ("free", np.degrees, "positions are in degrees"),
+        ("free", lambda q: q * [4, 1], "4 times too large"),
+        ("free", lambda q: q[::-1], "time runs backwards"),
+        ("driven", lambda q: q * [-1, 1], "the sign of joint1's position is reversed"),
+        ("driven", lambda q: q + np.array([0, math.pi]), "joint2's position is 180 degrees off"),
+        ("driven", lambda q: later(q, 10), "positions are recorded 2"),
+        ("motor", np.degrees, "positions are in degrees"),
+        ("axis", lambda q: 1e3 * q, "positions are in mm"),
+    ],
+)  # fmt: skip
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_mistakes_in_positions(name, change, finding):
+    plant, q, tau = measured(name)
+    assert finding in warnings_of(plant, np.ascontiguousarray(change(q)), tau)[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "finding"),
+    [
+        ("driven", lambda tau: -tau, "every torque has the wrong sign"),
+        ("driven", lambda tau: 1e3 * tau, "every torque is 1000 times too large"),
+        ("driven", lambda tau: tau[:, ::-1], "the torques of joint1 and joint2 are exchanged"),
+        ("driven", lambda tau: later(tau, 10), "torques are recorded 18"),
+        ("motor", lambda tau: tau / 0.12, "the torque of joint1 is 8.3"),
+        ("axis", lambda tau: -tau, "the force of joint1 has the wrong sign"),
+    ],
+)
+def test_mistakes_in_torques(name, change, finding):
+    plant, q, tau = measured(name)
+    assert finding in warnings_of(plant, q, np.ascontiguousarray(change(tau)))[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "rig", "finding"),
+    [
+        ("motor", {"armature": None}, "rotor inertia (`armature`) of 0.05"),
+        ("motor", {"inertia": [0.0075 + 0.15**2]}, "inertias are about the joints"),
+        ("motor", {"mass": [1e3], "inertia": [7.5]}, "masses are in g"),
+        ("driven", {"length": [300, 250], "com": [150, 120]}, "lengths are in mm"),
+        ("free", {"length": [300, 250], "com": [150, 120]}, "lengths are in mm"),
+        ("free", {"mass": [500, 300], "inertia": [3.75, 1.56]}, "heavier than a cube of lead"),
+    ],
+)
+def test_mistakes_in_rigs(name, rig, finding):
+    _, q, tau = measured(name)
+    plant = PendulumChain(**{**(MOTOR if name == "motor" else DOUBLE), **rig})
+    assert finding in warnings_of(plant, q, tau)[0]
+
+
+def test_mistakes_in_conventions_and_time():
+    plant, q, tau = measured("driven")
+    assert (
+        "angles are relative, not absolute"
+        in warnings_of(plant, q, tau, convention="absolute,upright")[0]
+    )
+    assert (
+        "angles are measured from upright, not from hanging"
+        in warnings_of(plant, q, tau, convention="relative,hanging")[0]
+    )
+    with pytest.warns(UserWarning, match="milliseconds"):
+        assert "time is in ms" in warnings_of(plant, q, tau, time=2.0 * np.arange(len(q)))[0]
+
+
+def test_a_spike_is_named_with_its_time():
+    plant, q, tau = measured("driven")
+    q = q.copy()
+    q[1000, 1] += 0.5
+    (found,) = (w for w in warnings_of(plant, q, tau) if "one sample" in w)
+    assert "joint2 jumps for one sample at 2 s" in found
+
+
+def test_a_fit_names_the_mistake_first():
+    plant, q, tau = measured("motor")
+    recording = Recording(STEP * np.arange(len(q)), -q, tau, convention="relative,upright")
+    found = fit(CVFM(1), plant, recording, method="equation_error")
+    assert "the sign of joint1's position is reversed" in found.warnings[0]
