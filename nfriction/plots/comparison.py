@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from nfriction.evaluation.compare import NO_FRICTION, Comparison, Part
+from nfriction.evaluation.compare import LIMIT, NO_FRICTION, Comparison, Part
 from nfriction.evaluation.score import Score
 from nfriction.plots import style
 from nfriction.recording import Recording
@@ -134,8 +134,8 @@ def horizon_curve(
 ) -> Figure:
     """Position error over the length of the simulation, by model.
 
-    The band at the free run is the effect of one encoder count in the initial state on the best
-    model: differences between models below it are not meaningful.
+    The band is the limit of these data, the effect of the start's uncertainty on the best model:
+    differences between models below it are not meaningful.
 
     Args:
         comparison: fits and scores.
@@ -147,12 +147,13 @@ def horizon_curve(
     horizons = [*comparison.horizons(), None]
     tables = [comparison.table(horizon, part=part)[column] for horizon in horizons]
     values = np.stack([table.to_numpy(dtype=np.float64) for table in tables], -1)
-    floor = comparison.floor(column, part=part)
+    limits = [comparison.limit(h, column, part=part) for h in horizons]
+    limit = np.array([np.nan if value is None else value for value in limits])
     shown = values[np.isfinite(values)]
     factor, unit = style.scaled(comparison.unit, shown)
     figure, axes = style.panels(1, 1, width, 2.2)
     ax = axes[0, 0]
-    known = factor * np.append(shown, [] if floor is None else floor)
+    known = factor * np.append(shown, limit[np.isfinite(limit)])
     known = known[known > 0] if (known > 0).any() else np.ones(1)
     bottom, top = known.min() / 1.6, known.max() * 1.6
     diverged = np.isinf(values)
@@ -172,12 +173,10 @@ def horizon_curve(
             "diverged", (float(k), top), xytext=(0, 5), textcoords="offset points",
             ha="right" if k == x[-1] else "center", fontsize=style.TINY, color=style.INK,
         )  # fmt: skip
-    if floor is not None:
-        ends = [x[-1] - 0.3, x[-1] + 0.3]
-        # Only at the free run: shorter windows restart from other states.
-        band = ax.fill_between(ends, bottom, factor * floor, color=style.BAND, alpha=0.6, lw=0)
+    if np.isfinite(limit).any():
+        band = ax.fill_between(x, bottom, factor * limit, color=style.BAND, alpha=0.6, lw=0)
         handles.append(band)
-        models = [*models, "one encoder count"]
+        models = [*models, LIMIT]
     ax.set_xlim(-0.3, x[-1] + 0.3)
     ax.set_xticks(x, [f"{h} s" if h else "free run" for h in horizons])
     ax.set_xlabel("length of simulation")
