@@ -190,7 +190,8 @@ class Row:
         """Count the time since the start, and judge what was found in it."""
         self.spent += time.process_time() - start
         for one in left:
-            told = score(plant, model, **one._asdict())
+            given = one.initial_state if isinstance(one, Left) else None
+            told = score(plant, model, one.recording, initial_state=given, limit=False)
             self.free.append(1e3 * told.free_run.all)
             five = told.windows.get("5")
             self.short.append(1e3 * five.all if five else math.nan)

@@ -5,13 +5,16 @@ from collections.abc import Sequence
 from nfriction.evaluation import tables
 from nfriction.evaluation.compare import NO_FRICTION, Comparison, coefficients_by_set
 from nfriction.evaluation.cross_validation import Selection
+from nfriction.evaluation.lead_in import LEAD_IN
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction.models import FrictionModel
 
 LEGEND = (
     "free run: one simulation over the whole recording; windows: simulations restarted every 1, 2 "
-    "or 5 s\nfrom the measured state, over all joints; error reduction: of the free run, against "
-    "no friction,\nwhich is simulated on the rig as given"
+    "or 5 s,\nover all joints; each starts from the state that its model estimates from the "
+    f"{LEAD_IN:g} s before, which are not\nscored, or from a given one; error reduction: of the "
+    "free run, against no friction, which is simulated\non the rig as given; limit of these data: "
+    "error that the uncertainty of the start alone may cause;\n=: within that of the least"
 )
 
 
@@ -23,11 +26,6 @@ def error_tables(comparison: Comparison) -> str:
         names = (s.recording for s in next(iter(comparison.scores(part).values())))
         # The names of the recordings belong to the caption, the first line.
         lines[0] = lines[0].replace("\n", f": {', '.join(names)}\n", 1)
-        floor = comparison.floor(part=part)
-        if floor is not None:
-            lines.append(
-                f"floor of the free run (one encoder count in the initial state): {1e3 * floor:.4g}"
-            )
         for horizon, short in comparison.too_short(part).items():
             lasts = ", ".join(f"{name} lasts {duration:.3g} s" for name, duration in short.items())
             lines.append(f"windows of {horizon} s: none, {lasts}")
@@ -71,14 +69,14 @@ def verdict(comparison: Comparison) -> str:
         f"best on test recordings: {best} (free run over all joints: {error:.3g} "
         f"m{comparison.unit}){end}"
     )
-    tied, floor = comparison.indistinguishable(), comparison.floor()
-    # Without a floor no difference can be called insignificant.
-    if len(tied) < 2 or floor is None:
+    tied, limit = comparison.indistinguishable(), comparison.limit()
+    # Without a limit no difference can be called insignificant.
+    if len(tied) < 2 or limit is None:
         return found
     others = ", ".join(name for name in tied if name != best)
     return (
-        f"{found}\nstatistically tied with {others} (differences below the floor of "
-        f"{1e3 * floor:.3g} m{comparison.unit} are not meaningful); the simplest of them is "
+        f"{found}\nstatistically tied with {others} (differences below the limit of these data, "
+        f"{1e3 * limit:.3g} m{comparison.unit}, are not meaningful); the simplest of them is "
         f"{tied[0]}"
     )
 

@@ -1,14 +1,14 @@
 """Compare friction models: fit each to training recordings, score it on test recordings."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 
 from nfriction.evaluation.parallel import Data, Progress, fit_models
-from nfriction.evaluation.score import HORIZONS, Score, score
+from nfriction.evaluation.score import HORIZONS, RMSE, Score, score
 from nfriction.fitting.data.inputs import warn_of_undriven
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction.models import FrictionModel
@@ -17,9 +17,11 @@ from nfriction.recording import Recording
 from nfriction.signals import kalman_smoother
 
 NO_FRICTION = "no friction"
+LIMIT = "limit of these data"
 JUDGED_BY = "free-run RMSE over all joints and test recordings"
-SCHEMA = 2
-"""Of `results.json`; the first had no number, and `held_out` where it now says `test`."""
+SCHEMA = 3
+"""Of `results.json`; the second had a `floor` by one encoder count in place of the `limit`, the
+first no number, and `held_out` where it now says `test`."""
 # Models whose errors agree to three digits are tied.
 TIE = 1e-3
 InitialStates = Mapping[str, tuple[np.ndarray, np.ndarray]]
@@ -119,12 +121,25 @@ class Comparison:
         return found
 
     def to_frame(self) -> pd.DataFrame:
-        """Every error as one row: model, recording, part, horizon, joint, rmse with its unit."""
-        rows = [
-            (model, s.recording, part, horizon, joint, value)
+        """Every error as one row: model, recording, part, horizon, joint, rmse with its unit.
+
+        The limit of these data, in simulations of the best model of each part, comes last.
+        """
+        scores = [
+            (model, s, part)
             for part in reversed(PART_NAMES)
             for model, of_model in getattr(self, part).items()
             for s in of_model
+        ]
+        limits = [
+            (LIMIT, replace(s, free_run=s.limit.free_run, windows=s.limit.windows), part)
+            for part in reversed(self.parts)
+            for s in self.scores(part)[self._nearest(part)]
+            if s.limit is not None
+        ]
+        rows = [
+            (model, s.recording, part, horizon, joint, value)
+            for model, s, part in (*scores, *limits)
             for horizon, rmse in (("free run", s.free_run), *s.windows.items())
             for joint, value in zip(
                 (*self.joint_names, "all"), (*rmse.joints, rmse.all), strict=True
@@ -147,38 +162,48 @@ class Comparison:
             return None
         return min(rmse.index[rmse <= (1 + TIE) * rmse.min()], key=self._parameters)
 
-    def floor(self, column: str = "all", *, part: Part = "test") -> float | None:
-        """Free-run error caused by one encoder count in the initial state.
+    def limit(
+        self, horizon: str | None = None, column: str = "all", *, part: Part = "test"
+    ) -> float | None:
+        """Error that the uncertainty of the start alone may cause, in the best model's simulations.
 
         Smaller differences between models are not meaningful.
 
         Args:
+            horizon: window length as in `Score.windows`; None for the free run.
             column: joint of the tables, or `"all"`.
             part: over which recordings.
 
         Returns:
-            Root mean square over them [rad or m], of the model with the least error; None where
-            the count is not known or a simulation diverged.
+            Root mean square over them [rad or m]; None where it was not asked for or a simulation
+            diverged.
         """
-        free_run = self.table(part=part)[column]
-        models = free_run.drop(NO_FRICTION, errors="ignore")
-        nearest = str((free_run if models.empty else models).idxmin())
-        floors = [s.floor for s in self.scores(part)[nearest]]
         place = [*self.joint_names, "all"].index(column)
-        values = [np.nan if f is None else [*f.joints, f.all][place] for f in floors]
-        floor = float(np.sqrt(np.mean(np.square(values))))
-        return floor if np.isfinite(floor) else None
+        squares = []
+        for of in (s.limit for s in self.scores(part)[self._nearest(part)]):
+            error = of and (of.free_run if horizon is None else of.windows.get(horizon))
+            if not isinstance(error, RMSE):
+                return None
+            squares.append([*error.joints, error.all][place] ** 2)
+        limit = float(np.sqrt(np.mean(squares)))
+        return limit if np.isfinite(limit) else None
+
+    def _nearest(self, part: Part) -> str:
+        """The model with the least error of free runs; no friction where it is alone."""
+        free_run = self.table(part=part)["all"]
+        models = free_run.drop(NO_FRICTION, errors="ignore")
+        return str((free_run if models.empty else models).idxmin())
 
     def indistinguishable(self) -> tuple[str, ...]:
-        """The best and all models within the floor of it, `"no friction"` among them.
+        """The best and all models within the limit of it, `"no friction"` among them.
 
-        Simplest first. The best alone where there is no floor; empty where there is no best.
+        Simplest first. The best alone where there is no limit; empty where there is no best.
         """
         best = self.best()
         if best is None:
             return ()
-        rmse, floor = self.table()["all"], self.floor()
-        near = () if floor is None else rmse.index[rmse <= rmse.min() + floor]
+        rmse, limit = self.table()["all"], self.limit()
+        near = () if limit is None else rmse.index[rmse <= rmse.min() + limit]
         return tuple(sorted({best, *near}, key=lambda name: (self._parameters(name), rmse[name])))
 
     def _parameters(self, name: str) -> int:
@@ -201,7 +226,7 @@ class Comparison:
         best, judged = self.best(), None
         if best is not None:
             judged = {
-                "model": best, "by": JUDGED_BY, "floor": self.floor(),
+                "model": best, "by": JUDGED_BY, "limit": self.limit(),
                 "indistinguishable": list(self.indistinguishable()),
             }  # fmt: skip
         return {
@@ -237,7 +262,8 @@ def compare(
             an adaptive or neuro-fuzzy model from the constant fit of its law.
         train: recordings to fit, or one.
         test: recordings to judge by, or one; never seen by a fit.
-        initial_states: q0 and qd0 by recording name, in the recording's convention.
+        initial_states: q0 and qd0 by recording name, in the recording's convention; free runs of
+            other recordings start from a lead-in, see `score`.
         horizons: window lengths of the scores [s].
         progress: receives what is being done; steps only of searches in this process.
         jobs: fits at the same time, each in a process of its own; -1 for one to each core. The
@@ -260,23 +286,25 @@ def compare(
     check_recordings(train, test)
     warn_of_undriven([*train, *test])
     progress = progress or Progress()
-    parts = {"train": _smoothed(plant, train), "test": _smoothed(plant, test)}
+    joint = [recording.joint_coordinates(plant) for recording in train]
+    # Smoothed once for all fits.
+    data = Data(train, [kalman_smoother(r.time, r.q) for r in joint])
     fits, failed = fit_models(
-        plant, models, {"fit": parts["train"]}, jobs=jobs, progress=progress, **fit_settings
+        plant, models, {"fit": data}, jobs=jobs, progress=progress, **fit_settings
     )["fit"]
     scores: dict[str, dict[str, list[Score]]] = {"train": {}, "test": {}}
     states = initial_states or {}
     for name in (NO_FRICTION, *fits):
         progress.stage(f"score {name}")
         found = fits.get(name)
-        for part, data in parts.items():
-            if data.recordings:
+        for part, recordings in (("train", train), ("test", test)):
+            if recordings:
                 scores[part][name] = [
                     score(
                         found.plant if found else plant, found.model if found else None, recording,
-                        motion=motion, initial_state=states.get(recording.name), horizons=horizons,
+                        initial_state=states.get(recording.name), horizons=horizons,
                     )
-                    for recording, motion in zip(*data, strict=True)
+                    for recording in recordings
                 ]  # fmt: skip
     return Comparison(
         fits, **scores, unit=plant.unit, joint_names=tuple(plant.joint_names),
@@ -319,9 +347,3 @@ def coefficient_summary(model: FrictionModel) -> dict[str, Any]:
     """Coefficients by name, a value a joint; by set first where a model has several."""
     sets = coefficients_by_set(model)
     return sets.get("always", sets)
-
-
-def _smoothed(plant: Plant, recordings: Sequence[Recording]) -> Data:
-    """Recordings with their motions, smoothed once for all fits and scores."""
-    joint = [recording.joint_coordinates(plant) for recording in recordings]
-    return Data(recordings, [kalman_smoother(r.time, r.q) for r in joint])

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from nfriction.evaluation.lead_in import longest_window
 from nfriction.evaluation.parallel import Data, Fits, Progress, fit_models
 from nfriction.evaluation.score import score
 from nfriction.fitting.data.checks import looks_zeroed_per_recording
@@ -153,9 +154,7 @@ def select(
         # Blocks no longer show where their recording began.
         per_recording = looks_zeroed_per_recording(plant, recordings)
         fit_settings["encoder_reference"] = "per_recording" if per_recording else "shared"
-    horizon = min(
-        horizon, *(longest_segment(f.test.recording) for row in by_recording for f in row)
-    )
+    horizon = min(horizon, *(longest_window(f.test.recording) for row in by_recording for f in row))
     train, test = {}, {}
     for k in range(folds):
         label = f"fold {k + 1} of {folds}: fit"
@@ -199,11 +198,6 @@ def _part(motion: Motion, mask: NDArray[np.bool_]) -> Motion:
     return Motion(motion.time[mask], motion.q[mask], motion.qd[mask], motion.qdd[mask])
 
 
-def longest_segment(recording: Recording) -> float:
-    """Duration of the longest segment without a gap [s]."""
-    return max(float(recording.time[b] - recording.time[a]) for a, b in recording.segments)
-
-
 def with_fitted_offsets(found: FitResult, blocks: Sequence[TimeBlock]) -> list[TimeBlock]:
     """Blocks with the encoder offsets that a fit found in the rest, one block a recording."""
     recordings, motions = apply_encoder_offsets(
@@ -218,7 +212,7 @@ def with_fitted_offsets(found: FitResult, blocks: Sequence[TimeBlock]) -> list[T
 def block_errors(found: FitResult, blocks: Sequence[TimeBlock], horizon: float) -> list[float]:
     """Root mean square position error of simulations of `horizon` seconds over each block."""
     return [
-        score(found.plant, found.model, block.recording, motion=block.motion, horizons=(horizon,))
+        score(found.plant, found.model, block.recording, horizons=(horizon,), limit=False)
         .windows[f"{horizon:g}"].all
         for block in with_fitted_offsets(found, blocks)
     ]  # fmt: skip

@@ -11,6 +11,7 @@ import pandas as pd
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from nfriction.evaluation.lead_in import longest_window
 from nfriction.evaluation.score import score
 from nfriction.fitting.fit import fit
 from nfriction.fitting.result.fit_result import FitResult
@@ -181,7 +182,7 @@ class FrictionEstimator(BaseEstimator):
             return model(velocity, acceleration, loads).numpy()
 
     def simulate(self, recording: Sample) -> pd.DataFrame:
-        """The motion that the model predicts from a recording's initial state and torques.
+        """The motion that the model predicts from a recording's lead-in and torques.
 
         Returns:
             Table with columns time [s], q1, ... in the recording's convention and unit, a row a
@@ -189,7 +190,7 @@ class FrictionEstimator(BaseEstimator):
             recording has the same columns.
         """
         (given,) = _recordings(recording, self.plant_)
-        run = score(self.plant_, self.model_, given, horizons=())
+        run = score(self.plant_, self.model_, given, horizons=(), limit=False)
         table = given.to_pandas()[["time", *(f"q{k + 1}" for k in range(given.joints))]]
         table.iloc[:, 1:] = run.simulated
         return table
@@ -198,7 +199,8 @@ class FrictionEstimator(BaseEstimator):
         """Minus the root mean square position error of simulations [rad; m of a sliding axis].
 
         Simulations last `horizon` seconds (a recording where that is shorter) and are restarted
-        from the measured motion. Higher is better, 0 is perfect, a diverged one gives -inf.
+        from the measured motion, see `nfriction.score`. Higher is better, 0 is perfect, a diverged
+        one gives -inf.
 
         Args:
             X: recordings to judge by.
@@ -206,8 +208,8 @@ class FrictionEstimator(BaseEstimator):
         """
         errors = []
         for recording in _recordings(X, self.plant_):
-            horizon = min(self.horizon, recording.duration)
-            found = score(self.plant_, self.model_, recording, horizons=(horizon,))
+            horizon = min(self.horizon, longest_window(recording))
+            found = score(self.plant_, self.model_, recording, horizons=(horizon,), limit=False)
             errors.append(found.windows[f"{horizon:g}"].all)
         return -math.sqrt(sum(e * e for e in errors) / len(errors))
 

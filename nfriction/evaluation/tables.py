@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 
-from nfriction.evaluation.compare import NO_FRICTION, PART_NAMES, Comparison, Part
+from nfriction.evaluation.compare import LIMIT, NO_FRICTION, PART_NAMES, Comparison, Part
 from nfriction.evaluation.cross_validation import Selection
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_info import ModelInfo, describe
@@ -26,6 +26,7 @@ class Table:
         rows: text and numbers.
         infinite: word for an infinite number.
         marked: places of columns of which the least number is marked.
+        limit: a last row with differences that are not meaningful; empty where they are unknown.
     """
 
     caption: str
@@ -33,6 +34,7 @@ class Table:
     rows: tuple[tuple[Value, ...], ...]
     infinite: str = "unknown"
     marked: tuple[int, ...] = ()
+    limit: tuple[Value, ...] = ()
 
     def text(self, value: Value) -> str:
         """A value to four digits; "n/a" for NaN."""
@@ -54,8 +56,19 @@ class Table:
         """True where a row has the least number of a marked column, and that is finite."""
         if column not in self.marked:
             return False
-        least = min(float(other[column]) for other in self.rows)
+        least = self._least(column)
         return math.isfinite(least) and row[column] == least
+
+    def is_tied(self, row: Sequence[Value], column: int) -> bool:
+        """True where a marked column's least number has others within the limit, and row is one."""
+        if column not in self.marked or not self.limit:
+            return False
+        most = self._least(column) + float(self.limit[column])
+        near = [other for other in self.rows if float(other[column]) <= most < math.inf]
+        return len(near) > 1 and float(row[column]) <= most
+
+    def _least(self, column: int) -> float:
+        return min(float(row[column]) for row in self.rows)
 
     def __str__(self) -> str:
         """Lines of text, a group of columns named once above its own."""
@@ -65,12 +78,30 @@ class Table:
             pairs = zip(above, ("", *above), strict=False)
             heads = [tuple("" if group == before else group for group, before in pairs), own]
         lines = [("", *head) for head in heads]
-        lines += [tuple(self.text(value) for value in row) for row in self.rows]
+        lines += [
+            tuple(self.text(v) + "=" * self.is_tied(row, k) for k, v in enumerate(row))
+            for row in self.rows
+        ]
+        if self.limit:
+            lines.append(tuple(self.text(value) for value in self.limit))
+        lines = _room_for_marks(lines)
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         just = [str.rjust if self.is_numeric(k) else str.ljust for k in range(len(widths))]
         printed = ("  ".join(j(v, w) for j, v, w in zip(just, line, widths, strict=True))
                    for line in lines)  # fmt: skip
         return "\n".join([self.caption, *(line.rstrip() for line in printed)])
+
+
+def _room_for_marks(lines: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """Lines whose unmarked entries keep the place of a mark, so that digits are aligned."""
+    marked = [any(value.endswith("=") for value in column) for column in zip(*lines, strict=True)]
+    return [
+        tuple(
+            value + " " * (room and not value.endswith("="))
+            for value, room in zip(line, marked, strict=True)
+        )
+        for line in lines
+    ]
 
 
 def error_table(comparison: Comparison, part: Part) -> Table:
@@ -83,11 +114,17 @@ def error_table(comparison: Comparison, part: Part) -> Table:
         error = 1e3 * comparison.table(horizon, part=part)["all"]
         columns[f"windows, {horizon} s"] = error.tolist()
     marked = tuple(range(1, len(columns) + 1))
+    limits = [comparison.limit(column=str(name), part=part) for name in free]
+    limits += [comparison.limit(horizon, part=part) for horizon in comparison.horizons(part)]
+    limit: tuple[Value, ...] = ()
+    if any(of is not None for of in limits):
+        limit = (LIMIT, *(math.nan if of is None else 1e3 * of for of in limits))
     if free.index[0] == NO_FRICTION:
         columns["error reduction, %"] = comparison.improvement(part=part)["all"].tolist()
+        limit = (*limit, "") if limit else ()
     rows = zip(map(str, free.index), *columns.values(), strict=True)
     caption = f"Position RMSE [m{comparison.unit}] over {PART_NAMES[part]}"
-    return Table(caption, ("model", *columns), tuple(rows), "diverged", marked)
+    return Table(caption, ("model", *columns), tuple(rows), "diverged", marked, limit)
 
 
 def selection_table(selection: Selection) -> Table:

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from nfriction.evaluation.compare import NO_FRICTION, Comparison, Part
+from nfriction.evaluation.compare import LIMIT, NO_FRICTION, Comparison, Part
 from nfriction.evaluation.score import Score
 from nfriction.fitting.equation_error import friction_torque
 from nfriction.fitting.result.fit_result import FitResult
@@ -148,8 +148,8 @@ def horizon_curve(
 ) -> Figure:
     """Position error over the length of the simulation, by model.
 
-    The band at the free run is the effect of one encoder count in the initial state on the best
-    model: differences between models below it are not meaningful.
+    The band is the limit of these data, the effect of the start's uncertainty on the best model:
+    differences between models below it are not meaningful.
 
     Args:
         comparison: fits and scores.
@@ -162,10 +162,11 @@ def horizon_curve(
     tables = [comparison.table(horizon, part=part)[column] for horizon in horizons]
     # In thousandths, as in every table.
     values = 1e3 * np.stack([table.to_numpy(dtype=np.float64) for table in tables], -1)
-    floor = comparison.floor(column, part=part)
+    limits = [comparison.limit(h, column, part=part) for h in horizons]
+    limit = 1e3 * np.array([np.nan if value is None else value for value in limits])
     figure, axes = style.panels(1, 1, width, 2.2)
     ax = axes[0, 0]
-    known = np.append(values[np.isfinite(values)], [] if floor is None else 1e3 * floor)
+    known = np.append(values[np.isfinite(values)], limit[np.isfinite(limit)])
     known = known[known > 0] if (known > 0).any() else np.ones(1)
     bottom, top = known.min() / 1.6, known.max() * 1.6
     diverged = np.isinf(values)
@@ -185,12 +186,10 @@ def horizon_curve(
             "diverged", (float(k), top), xytext=(0, 5), textcoords="offset points",
             ha="right" if k == x[-1] else "center", fontsize=style.TINY, color=style.INK,
         )  # fmt: skip
-    if floor is not None:
-        ends = [x[-1] - 0.3, x[-1] + 0.3]
-        # Only at the free run: shorter windows restart from other states.
-        band = ax.fill_between(ends, bottom, 1e3 * floor, color=style.BAND, alpha=0.6, lw=0)
+    if np.isfinite(limit).any():
+        band = ax.fill_between(x, bottom, limit, color=style.BAND, alpha=0.6, lw=0)
         handles.append(band)
-        models = [*models, "one encoder count"]
+        models = [*models, LIMIT]
     ax.set_xlim(-0.3, x[-1] + 0.3)
     ax.set_xticks(x, [f"{h} s" if h else "free run" for h in horizons])
     ax.set_xlabel("length of simulation")

@@ -18,7 +18,7 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 
-from nfriction.evaluation.compare import NO_FRICTION, PART_NAMES
+from nfriction.evaluation.compare import LIMIT, NO_FRICTION, PART_NAMES
 from nfriction.evaluation.tables import (
     Table,
     Value,
@@ -237,18 +237,18 @@ def _fuzzy_models(run: Run) -> Iterator[dict[str, Any]]:
 
 
 def _recording_table(run: Run) -> Table:
-    """The free-run error of every model on every recording, beside that of one encoder count."""
+    """The free-run error of every model on every recording, beside the limit of these data."""
     rows: list[tuple[Value, ...]] = []
     for part in run.comparison.parts:
         for model, scores in run.comparison.scores(part).items():
             for s in scores:
-                floor = math.nan if s.floor is None else 1e3 * s.floor.all
+                limit = math.nan if s.limit is None else 1e3 * s.limit.free_run.all
                 at = "no" if math.isinf(s.diverged_at) else f"at {s.diverged_at:.3g} s"
-                rows.append((s.recording, model, part, 1e3 * s.free_run.all, floor, at))
+                rows.append((s.recording, model, part, 1e3 * s.free_run.all, limit, at))
     unit = run.comparison.unit
     return Table(
         "Every recording: free run over all joints",
-        ("recording", "model", "part", f"RMSE [m{unit}]", f"one encoder count [m{unit}]",
+        ("recording", "model", "part", f"RMSE [m{unit}]", f"{LIMIT} [m{unit}]",
          "diverged"),
         tuple(rows), "diverged",
     )  # fmt: skip

@@ -210,13 +210,14 @@ def _scores(
         where = f"{name}, {part}"
         found[name] = [
             _read_record(
-                Score, {"windows": {}, "diverged_at": None, "floor": None} | of,
+                Score, {"windows": {}, "diverged_at": None, "limit": None} | of,
                 f"{where}, {recording}", recording=recording, time=nothing, simulated=nothing,
             )
             for recording, of in _read(dict[str, dict], entry.get(part, {}), where).items()
         ]  # fmt: skip
         for score in found[name]:
-            for rmse in filter(None, (score.free_run, score.floor, *score.windows.values())):
+            for rmse in (e for part in (score, score.limit) if part
+                         for e in (part.free_run, *part.windows.values())):  # fmt: skip
                 if len(rmse.joints) != joints:
                     raise _EntryError(f"{where} needs an error for each of {joints} joints")
                 if min(*rmse.joints, rmse.all) < 0:

@@ -21,12 +21,12 @@ def pendulum(**changes: object) -> PendulumChain:
 
 
 def swing(name: str, start: float) -> Recording:
-    """A second of a released pendulum with known friction, seen by an encoder."""
+    """A released pendulum with known friction, seen by an encoder, over 1 s and a lead-in."""
     q0 = torch.tensor([start + np.pi], dtype=torch.float64)
     friction = LFM(1, [[2e-4, 1e-3]])
     with torch.no_grad():
         run = rollout(
-            pendulum(), friction, q0, torch.zeros_like(q0), sample_time=2e-3, steps=500
+            pendulum(), friction, q0, torch.zeros_like(q0), sample_time=2e-3, steps=600
         )  # fmt: skip
     q = np.round((run.q.numpy() - np.pi) / 1e-4) * 1e-4
     time = 2e-3 * np.arange(len(q))

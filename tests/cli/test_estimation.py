@@ -184,6 +184,8 @@ def test_a_robot_description_is_as_good_as_a_rig_file(bench: Path, compared: Pat
     assert compare(bench, bench / "robot", *rig, models="NCFM,LFM") == 0
     ours, theirs = (results(out)["models"] for out in (bench / "robot", compared))
     for model in ("NCFM", "LFM"):
+        for name, value in ours[model]["coefficients"].items():
+            assert value == pytest.approx(theirs[model]["coefficients"][name], rel=1e-9)
+        # The rig file knows the encoder's rounding besides, which weighs the samples of a lead-in.
         mine, other = (m[model]["test"]["b"]["free_run"]["all"] for m in (ours, theirs))
-        # The rig file knows the encoder's noise besides, which the fit does not ask for.
-        assert mine == pytest.approx(other, rel=1e-6)
+        assert mine == pytest.approx(other, rel=1e-4)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from nfriction import LFM, NFLFM, compare
 from nfriction.cli.tables import error_tables, verdict
 from nfriction.evaluation.compare import Comparison, coefficient_summary
 from nfriction.evaluation.parallel import Progress
-from nfriction.evaluation.score import RMSE, Score
+from nfriction.evaluation.score import RMSE, Limit, Score
 from nfriction.papers.afem.adaptive import ALFM
 from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import pendulum, swing
@@ -84,8 +85,13 @@ def test_its_frame_has_every_error_once(comparison):
     keys = ["model", "recording", "part", "horizon", "joint"]
     assert list(table.columns) == [*keys, "rmse [rad]"]
     assert not table.duplicated(keys).any()
-    # models × kinds × (free run and two horizons) × (joints and all)
-    assert len(table) == 3 * 2 * 3 * 3
+    # (models and limit) × kinds × (free run and two horizons) × (joints and all)
+    assert len(table) == 4 * 2 * 3 * 3
+    limit = table[(table.model == "limit of these data") & (table.part == "test")]
+    of = found.test[found.best()][0].limit
+    assert limit["rmse [rad]"].tolist() == [
+        x for e in (of.free_run, *of.windows.values()) for x in (*e.joints, e.all)
+    ]
     metres = dataclasses.replace(found, unit="m").to_frame()
     assert "rmse [m]" in metres.columns
 
@@ -154,10 +160,11 @@ def test_every_recording_is_smoothed_once(monkeypatch):
         smoothed.append(len(time))
         return kalman_smoother(time, q, **settings)
 
-    for user in ("evaluation.compare", "evaluation.score", "fitting.data.inputs"):
+    for user in ("evaluation.compare", "fitting.data.inputs"):
         monkeypatch.setattr(f"nfriction.{user}.kalman_smoother", counting)
     compare(pendulum(), ["NCFM", "LFM"], [A], [B], windows=(0.5,), max_steps=1)
-    assert len(smoothed) == 2
+    # No score needs the smoothed motion.
+    assert len(smoothed) == 1
 
 
 def test_recordings_too_short_for_a_window_are_named(comparison):
@@ -172,16 +179,16 @@ def test_recordings_too_short_for_a_window_are_named(comparison):
     assert mixed.horizons("test") == ["0.5", "1"]
 
 
-def scored(found: Comparison, count: float | None = None, **errors: float) -> Comparison:
-    """A comparison in which these were the errors of free runs, and that of one count at the start.
+def scored(found: Comparison, limit: float | None = None, **errors: float) -> Comparison:
+    """A comparison in which these were the errors of free runs, and their limit.
 
-    Errors are of each of two recordings; the count's is of the first, and twice that of the second.
+    Errors are of each of two recordings; the limit is of the first, and twice that of the second.
     """
     test = {
         name.replace("_", " "): [
             Score(
                 recording, RMSE((e, e), e), {},
-                None if count is None else RMSE((0.0, 0.0), k * count),
+                None if limit is None else Limit(RMSE((0.0, 0.0), k * limit), {}),
                 np.zeros(1), np.zeros((1, 2)), np.inf,
             )
             for k, recording in enumerate("bc", 1)
@@ -210,31 +217,34 @@ def test_best_is_the_least_error_and_of_equals_the_simplest(comparison):
     assert alone.to_dict()["best"] is None
 
 
-def test_models_within_the_floor_of_the_best_are_not_told_apart(comparison):
+def test_models_within_the_limit_of_the_best_are_not_told_apart(comparison):
     found, _ = comparison
     errors = {"no_friction": 5.0, "NCFM": 2.0, "LFM": 1.0}
     assert scored(found, **errors).indistinguishable() == ("LFM",)
     assert "tied" not in verdict(scored(found, **errors))
-    # Without a floor equal errors say nothing of it, as those of a network that kept its law.
+    # Without a limit equal errors say nothing of it, as those of a network that kept its law.
     equal = scored(found, no_friction=5.0, NCFM=1.0, LFM=1.0)
     assert equal.indistinguishable() == (equal.best(),)
     near, far = scored(found, 0.7, **errors), scored(found, 0.6, **errors)
     # Over both recordings root 2.5 of it: 1.1 and 0.95.
-    assert near.floor() == pytest.approx(0.7 * 2.5**0.5)
-    assert near.floor("joint1") == 0
+    assert near.limit() == pytest.approx(0.7 * 2.5**0.5)
+    assert near.limit(column="joint1") == 0
     assert near.indistinguishable() == ("NCFM", "LFM")
     assert far.indistinguishable() == ("LFM",)
     assert near.best() == far.best() == "LFM"
     assert near.to_dict()["best"]["indistinguishable"] == ["NCFM", "LFM"]
     assert "statistically tied with NCFM (" in verdict(near)
     assert verdict(near).endswith("; the simplest of them is NCFM")
-    assert "floor of the free run (one encoder count in the initial state): 1107" in error_tables(
-        near
-    )
+    printed = error_tables(near)
+    assert re.search(r"limit of these data +0 +0 +1107\n", printed)
+    # Joints are known exactly here, and over all of them the two are tied.
+    assert re.search(r"NCFM +2000 +2000 +2000= +60\n", printed)
+    assert re.search(r"LFM +1000 +1000 +1000= +80\n", printed)
+    assert "=" not in error_tables(far).partition("free run: one")[0]
     assert verdict(far).count("\n") == 0
     all_alike = scored(found, 10.0, **errors)
     assert all_alike.indistinguishable() == ("no friction", "NCFM", "LFM")
-    assert scored(found, np.inf, **errors).floor() is None
+    assert scored(found, np.inf, **errors).limit() is None
     assert dataclasses.replace(found, test={}).indistinguishable() == ()
 
 

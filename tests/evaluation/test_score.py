@@ -2,18 +2,21 @@
 
 import json
 import re
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from nfriction import LFM, PendulumChain, score
+from nfriction import LFM, PendulumChain, Recording, rollout, score
 from nfriction.evaluation.compare import Comparison
+from nfriction.evaluation.lead_in import Simulator, estimate_starts, lead_in_samples
 from nfriction.evaluation.score import RMSE, Score
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.models import FrictionModel
+from nfriction.signals import quantise
 from tests.fitting.recordings import pendulum, swing
 
 MODEL = LFM(2, [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]], v_smooth=0.05)
@@ -57,7 +60,7 @@ def test_angles_are_written_as_the_plant_says_unless_the_recording_says_otherwis
     said = swing(plant(), MODEL, convention="absolute,hanging", seconds=1.0)
     unsaid = replace(said, convention=None)
     q0 = said.convention.position_from_joint(np.array([1.6, 0.8]))
-    start = {"initial_state": (q0, np.zeros(2))}
+    start = {"initial_state": (q0, np.zeros(2)), "horizons": (0.5,)}
     found = [score(hanging, MODEL, r, **start) for r in (said, unsaid)]
     assert found[0].free_run == found[1].free_run
     assert found[0].windows == found[1].windows
@@ -84,7 +87,8 @@ def test_friction_too_steep_to_simulate_is_diverged_and_said(caplog):
     ):
         caplog.clear()
         found = score(plant(), model, recording, horizons=(0.5,))
-        assert found.free_run.all == found.windows["0.5"].all == found.floor.all == np.inf
+        assert found.free_run.all == found.windows["0.5"].all == np.inf
+        assert found.limit.free_run.all == found.limit.windows["0.5"].all == np.inf
         assert found.diverged_at == 0.0
         assert found.simulated.shape == recording.q.shape
         assert json.dumps(found.to_dict(), allow_nan=False)
@@ -110,22 +114,110 @@ def test_windows_are_those_that_fit(monkeypatch):
         starts[round(float(steps.sum(-1).max()))] = len(q0)
         return original(plant, friction, q0, *rest, **settings)
 
-    import nfriction.evaluation.score as scoring
+    import nfriction.evaluation.lead_in as scoring
 
     original = scoring.rollout
     recording = swing(plant(), MODEL, seconds=9.98, sample_time=4e-3, start=(1.0, 0.0))
     monkeypatch.setattr(scoring, "rollout", counted)
-    found = score(plant(), MODEL, recording, horizons=(2.0, 5.0, 20.0))
+    found = score(plant(), MODEL, recording, horizons=(2.0, 5.0, 20.0), limit=False)
     assert list(found.windows) == ["2", "5"]
+    assert found.limit is None
     assert starts[5] == 2
-    assert starts[2] == 5
+    # The first begins behind its lead-in.
+    assert starts[2] == 4
 
 
-def test_the_floor_scales_with_the_encoder_s_count():
-    recording = swing(plant(), MODEL, seconds=1.0, start=(1.0, 0.0))
-    floors = [score(plant(q), MODEL, recording, horizons=()).floor for q in (1e-5, 2e-5)]
-    assert floors[1].all == pytest.approx(2 * floors[0].all, rel=1e-2)  # chaos is not linear
-    assert score(pendulum(), MODEL, recording, horizons=()).floor is None
+def test_the_limit_scales_with_the_encoder_s_count():
+    fine = swing(plant(), MODEL, seconds=1.5, start=(2.8, 0.3))
+    coarse = replace(fine, q=quantise(fine.q, 2048))
+    limits = [
+        score(plant(quantum), MODEL, recording, horizons=(0.5,)).limit
+        for quantum, recording in ((QUANTUM, fine), (4 * QUANTUM, coarse), (None, coarse))
+    ]
+    for each in ([limit.free_run.all, limit.windows["0.5"].all] for limit in limits):
+        assert QUANTUM / 12**0.5 < min(each) <= max(each) < 20 * QUANTUM
+    ratio = limits[1].free_run.all / limits[0].free_run.all
+    assert 2 < ratio < 8
+    # Where the count is unknown, positions show it.
+    assert limits[2].free_run.all == pytest.approx(limits[1].free_run.all, rel=0.5)
+
+
+def test_samples_that_are_scored_do_not_influence_the_start():
+    recording = swing(plant(), MODEL, seconds=3.0, sample_time=4e-3)
+    lead, noise = lead_in_samples(recording), np.random.default_rng(0)
+    assert lead == 50
+
+    def changed(samples: np.ndarray) -> Recording:
+        q = recording.q.copy()
+        q[samples] += 0.1 * noise.standard_normal(q[samples].shape)
+        return replace(recording, q=q)
+
+    found, other = (
+        score(plant(), MODEL, r, horizons=(), limit=False)
+        for r in (recording, changed(np.arange(lead, len(recording))))
+    )
+    np.testing.assert_array_equal(found.simulated, other.simulated)
+    assert other.free_run.all > 10 * found.free_run.all
+    runs = Simulator(plant(), MODEL, recording, "rk4", 0).windows(1.0)
+    assert len(runs.samples) == 2
+    for window, samples in enumerate(runs.samples):
+        after = changed(samples[lead:])
+        again = Simulator(plant(), MODEL, after, "rk4", 0).windows(1.0)
+        np.testing.assert_array_equal(again.q[window], runs.q[window])
+
+
+def test_the_start_is_as_well_known_as_its_covariance_says():
+    """Errors of estimated starts of a known motion, in standard deviations, are near 1."""
+    deviations = []
+    for k in range(20):
+        rig, recording, truth = release(k)
+        runs = Simulator(rig, MODEL, recording, "rk4", 0)
+        lead = np.arange(runs.lead)[None]
+        starts = estimate_starts(
+            lambda x, runs=runs, lead=lead: runs.simulate(x, lead)[0],
+            recording.time[lead], recording.q[lead], rig.position_quantum,
+        )  # fmt: skip
+        deviations.append(np.linalg.solve(starts.root[0], truth - starts.state[0]))
+    assert 0.5 < np.sqrt(np.mean(np.square(deviations))) < 1.3
+
+
+def test_scores_of_the_true_model_are_below_the_limit():
+    assert below_the_limit(range(12)) >= 11
+
+
+@pytest.mark.slow
+def test_scores_of_the_true_model_are_below_the_limit_in_95_of_100_releases():
+    assert below_the_limit(range(100)) >= 95
+
+
+def below_the_limit(seeds: Iterable[int]) -> int:
+    """Number of random releases whose score by the true model is within the limit."""
+    scores = (score(rig, MODEL, r, horizons=()) for rig, r, _ in map(release, seeds))
+    return sum(found.free_run.all <= found.limit.free_run.all for found in scores)
+
+
+def release(seed: int) -> tuple[PendulumChain, Recording, np.ndarray]:
+    """A random motion of 4 s, every other one driven, as an encoder reads it, and its start."""
+    random = np.random.default_rng(seed)
+    time = 2e-3 * np.arange(2001)
+    tau = np.zeros((2001, 2))
+    if seed % 2:
+        rates = random.uniform(2.0, 12.0, (3, 2))
+        tau = (random.uniform(0.02, 0.1, (3, 2)) * np.sin(rates * time[:, None, None])).sum(1)
+    q0, qd0 = random.uniform(-2.0, 2.0, 2) + np.array([np.pi, 0.0]), random.uniform(-3.0, 3.0, 2)
+    run = rollout(
+        plant(), MODEL, *map(torch.tensor, (q0, qd0)), torch.tensor(tau[:-1]), sample_time=2e-3,
+        gradients=False,
+    )  # fmt: skip
+    q = quantise(run.q.numpy(), 8192)
+    recording = Recording(time, q, tau=tau, convention="relative,upright", name=f"release {seed}")
+    return plant(), recording, np.concatenate([q0, qd0])
+
+
+def test_a_recording_without_room_for_a_lead_in_is_refused():
+    short = swing(plant(), MODEL, seconds=0.15)
+    with pytest.raises(ValueError, match=r"swing is too short to be scored: .* lead-in of 0.2 s"):
+        score(plant(), MODEL, short)
 
 
 def test_divergence_is_infinite_and_null():

@@ -17,7 +17,7 @@ from matplotlib.transforms import Bbox
 
 from nfriction import plots
 from nfriction.evaluation.compare import NO_FRICTION, Comparison
-from nfriction.evaluation.score import RMSE, Score
+from nfriction.evaluation.score import RMSE, Limit, Score
 from nfriction.fitting.fit import fit
 from nfriction.friction import model_names
 from nfriction.friction.models import LFM, NCFM, NLFM
@@ -38,7 +38,7 @@ def swing(joints: int, unit: str = "rad", name: str = "swing") -> Recording:
 
 
 def score_of(
-    recording: Recording, error: float, *, lost: bool = False, floor: bool = True
+    recording: Recording, error: float, *, lost: bool = False, limited: bool = True
 ) -> Score:
     """A score whose free run is off by a growing error; a lost one ends in NaN at 1 s."""
     simulated = recording.q + error * np.linspace(0.0, 1.0, len(recording))[:, None]
@@ -46,16 +46,17 @@ def score_of(
         simulated[50:] = np.nan
     free_run = RMSE.of(simulated - recording.q)
     windows = {h: RMSE.of(s * (simulated - recording.q)) for h, s in (("1", 0.5), ("2", 0.8))}
-    floors = RMSE.of(np.full((2, recording.joints), 1e-3)) if floor else None
+    floor = RMSE.of(np.full((2, recording.joints), 1e-3))
+    limit = Limit(floor, dict.fromkeys(windows, floor)) if limited else None
     end = 1.0 if lost else np.inf
-    return Score(recording.name, free_run, windows, floors, recording.time, simulated, end)
+    return Score(recording.name, free_run, windows, limit, recording.time, simulated, end)
 
 
 def scores_of(
-    recording: Recording, *, lost: Sequence[str] = (), floor: bool = True
+    recording: Recording, *, lost: Sequence[str] = (), limited: bool = True
 ) -> dict[str, Score]:
     return {
-        name: score_of(recording, 0.1 * 4.0**-k, lost=name in lost, floor=floor)
+        name: score_of(recording, 0.1 * 4.0**-k, lost=name in lost, limited=limited)
         for k, name in enumerate(NAMES)
     }
 
@@ -159,7 +160,7 @@ def test_bars_hold_every_model_of_four_joints_and_runs_that_all_diverged():
 
 @pytest.mark.parametrize("part", ["test", "train"])
 @pytest.mark.parametrize("unit", ["rad", "m"])
-def test_horizon_curve_is_the_table_of_each_horizon_over_a_floor(part, unit):
+def test_horizon_curve_is_the_table_of_each_horizon_over_the_limit(part, unit):
     comparison = comparison_of(swing(2, unit), part=part)
     figure = plots.horizon_curve(comparison)
     ax = figure.axes[0]
@@ -174,8 +175,8 @@ def test_horizon_curve_is_the_table_of_each_horizon_over_a_floor(part, unit):
     assert_tidy(figure)
 
 
-def test_horizon_curve_names_what_diverged_and_draws_no_floor_where_none_is_known():
-    figure = plots.horizon_curve(comparison_of(swing(1), lost=("NCFM",), floor=False))
+def test_horizon_curve_names_what_diverged_and_draws_no_limit_where_none_is_known():
+    figure = plots.horizon_curve(comparison_of(swing(1), lost=("NCFM",), limited=False))
     ax = figure.axes[0]
     assert set(texts(ax)) == {"diverged"}
     assert not ax.collections

@@ -22,7 +22,7 @@ def score(scale: float | None) -> dict[str, Any]:
     return {
         "free_run": errors(scale),
         "windows": {"1": errors(None if scale is None else scale / 10)},
-        "floor": errors(1e-4),
+        "limit": {"free_run": errors(1e-4), "windows": {"1": errors(1e-4)}},
         "diverged_at": 0.5 if scale is None else None,
     }
 
@@ -58,13 +58,13 @@ def results() -> dict[str, Any]:
     sets = {label: {"B": [1e-3, 2e-3], "C": [1e-3, 1e-2]} for label in ("at_rest", "reference")}
     models["NFLFM"] |= {"fit": fit(intervals={}), "coefficients": sets}
     return {
-        "schema": 2,
+        "schema": 3,
         "models": models,
         "best": {
             "model": "LFM",
             "by": "free-run RMSE",
             "indistinguishable": [EVIL, "LFM"],
-            "floor": 1e-3,
+            "limit": 1e-3,
         },
         "units": "rad",
         "joints": JOINTS,

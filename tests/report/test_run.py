@@ -66,7 +66,7 @@ def test_truncated_results_are_refused(tmp_path, keep):
     ("where", "value", "said"),
     [
         (("units",), "deg", "units"),
-        (("schema",), 3, "newer"),
+        (("schema",), 4, "newer"),
         (("joints",), [], "no joints"),
         (("joints",), ["only one"], "each of 1 joints"),
         (("models",), [], "models"),

@@ -328,7 +328,7 @@ def _score(recording: Recording, simulated: Array) -> Score:
         recording=recording.name,
         free_run=RMSE.of(simulated - recording.q),
         windows={},
-        floor=None,
+        limit=None,
         time=recording.time,
         simulated=simulated,
         diverged_at=float(recording.time[lost.argmax()]) if lost.any() else np.inf,

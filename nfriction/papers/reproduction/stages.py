@@ -353,9 +353,9 @@ def judge(bench: Bench, model: FrictionModel) -> tuple[dict[str, Any], dict[str,
     """
     scores: dict[str, Any] = {}
     simulated: dict[str, Array] = {}
-    for split, recording, motion in bench.parts():
+    for split, recording, _ in bench.parts():
         name, state = recording.name, bench.states[recording.name]
-        found = score(bench.plant, model, recording, motion=motion, initial_state=state)
+        found = score(bench.plant, model, recording, initial_state=state, limit=False)
         driven = found.simulated
         if model.schedule.follows_motion:
             driven = driven_by_measurement(bench, model, recording)

@@ -1,0 +1,338 @@
+"""Simulations of a recording's parts, each from a start estimated just before what is scored.
+
+A simulation that is scored begins a *lead-in* early, with the state from which the model itself
+follows the lead-in best. The score then measures what a model predicts from what it has seen. No
+sample that is scored influences the start.
+"""
+
+import logging
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from nfriction.friction.models import FrictionModel
+from nfriction.plant import Plant
+from nfriction.recording import Recording
+from nfriction.signals import causal_motion
+from nfriction.simulation.rk4 import required_substeps
+from nfriction.simulation.rollout import Scheme, rollout
+
+logger = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+
+LEAD_IN = 0.2
+"""Length of the lead-in [s].
+
+The slope at the end of a line through N positions that are rounded to counts has a standard
+deviation of a count over LEAD_IN sqrt(N): with 0.2 s at 500 Hz half a count a second, so that
+windows of 1 s show hardly more than the rounding. An acceleration that a model misses biases the
+velocity at the end by half of LEAD_IN times it, which adds a fifth of the model's own error to 1 s
+windows, and less to longer ones; a longer lead-in would add more.
+"""
+FEWEST = 8  # samples
+# Friction that needs more integration steps to a sample than this is a wall: scoring it would take
+# minutes, and the search that found it has failed anyhow.
+MOST_SUBSTEPS = 100
+# Starts drawn for the limit. The true start is one more like them, so that it errs by less than the
+# worst of them in 39 of 40 cases.
+DRAWS = 39
+# Filters of a controller's velocity and acceleration [Hz].
+CUTOFF = 20.0
+# The time-stepping scheme is of first order: such steps keep its error below an encoder's [s].
+STOP_STEP = 2e-4
+# Iterations of Gauss-Newton, and the change of the state, in standard deviations, that ends them.
+MOST_STEPS = 8
+SMALL = 0.05
+# Shares of a Gauss-Newton step that are tried; none of it where no other is better.
+SHARES = np.array([1.0, 0.5, 0.2, 0.05, 0.0])
+
+
+def lead_in_samples(recording: Recording) -> int:
+    """Samples of a lead-in: of 0.2 s, and at least 8."""
+    return max(FEWEST, round(LEAD_IN / recording.sample_time))
+
+
+def longest_window(recording: Recording) -> float:
+    """Duration of the longest segment without a gap, its lead-in aside [s]."""
+    lead, time = lead_in_samples(recording), recording.time
+    return max(
+        float(time[last] - time[min(first + lead, last)]) for first, last in recording.segments
+    )
+
+
+@dataclass(frozen=True)
+class Starts:
+    """States at the first samples of lead-ins, with their uncertainty.
+
+    Attributes:
+        state: position and velocity in the recording's coordinates, (window, 2 joint).
+        root: of the states' covariance root @ root.T, (window, 2 joint, 2 joint).
+        noise: standard deviation of a measured position, (window, joint).
+    """
+
+    state: Array
+    root: Array
+    noise: Array
+
+    def deviations(self, count: int) -> Array:
+        """Random errors of the states, (count, window, 2 joint); the same every time."""
+        normal = np.random.default_rng(0).standard_normal((count, *self.state.shape))
+        return (self.root @ normal[..., None])[..., 0]
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Simulations over windows of equal length, in the recording's coordinates.
+
+    Attributes:
+        samples: of the recording, (window, sample).
+        q: positions, (window, sample, joint).
+        error: of those that are scored, (window, scored sample, joint).
+        squares: mean square error from each start that the lead-in allows, (draw, joint).
+        diverged_at: time of the first divergence [s].
+    """
+
+    samples: NDArray[np.intp]
+    q: Array
+    error: Array
+    squares: Array
+    diverged_at: float
+
+
+class Simulator:
+    """Simulates parts of a recording, driven by its torques; all in the recording's coordinates."""
+
+    def __init__(
+        self,
+        plant: Plant,
+        friction: FrictionModel | None,
+        recording: Recording,
+        scheme: Scheme,
+        draws: int,
+    ) -> None:
+        self.plant, self.friction, self.recording = plant, friction, recording
+        self.scheme, self.draws = scheme, draws
+        self.convention = recording.resolve_convention(plant)
+        self.lead = lead_in_samples(recording)
+        # From zero, so that the rounding of large stamps costs no window its last sample.
+        self.time = recording.time - recording.time[0]
+        self.substeps: int | None = math.ceil(recording.longest_step / STOP_STEP)
+        if scheme != "time_stepping":
+            self.substeps = _substeps(plant, friction, recording)
+        self.states: torch.Tensor | None = None
+        if friction is not None and friction.state_size:
+            # Those of a controller at every sample, from which windows go on.
+            motion = _causal_motion(plant, recording)
+            self.states = friction.schedule.states(*map(torch.tensor, motion))
+
+    def free_runs(self, initial_state: tuple[Array, Array] | None) -> list[Runs]:
+        """One run of each segment that is longer than a lead-in."""
+        runs = []
+        for first, last in self.recording.segments:
+            if last - first >= self.lead:
+                state = None
+                if initial_state is not None and first == 0:
+                    state = np.concatenate(initial_state)[None]
+                runs.append(self._score(np.arange(first, last + 1)[None], state))
+        return runs
+
+    def windows(self, horizon: float) -> Runs | None:
+        """Runs over windows that follow each other, the first behind the first lead-in."""
+        starts: list[int] = []
+        length = len(self.time)
+        for first, last in self.recording.segments:
+            first += self.lead
+            if first >= last:
+                continue
+            stamps = self.time[first : last + 1] - self.time[first]
+            # A stretch short of a whole number of windows by less than a twentieth of one, such as
+            # for its lead-in, still gives that number.
+            count = int(stamps[-1] / horizon + 0.05)
+            width = min(horizon, stamps[-1] / max(count, 1))
+            edges = first + np.searchsorted(stamps, width * np.arange(count + 1) - 1e-9)
+            starts += edges[:-1].tolist()
+            length = min([length, *np.diff(edges).tolist()])
+        if not starts or length < 1:
+            return None
+        return self._score(np.array(starts)[:, None] + np.arange(-self.lead, length + 1))
+
+    def _score(self, samples: NDArray[np.intp], state: Array | None = None) -> Runs:
+        """Simulate windows of samples (window, sample), each beginning with its lead-in.
+
+        From a given state (1, 2 joint) all samples are scored.
+        """
+        lead_in = samples[:, : self.lead]
+        measured = self.recording.q[samples]
+        starts = estimate_starts(
+            lambda states: self.simulate(states, lead_in)[0],
+            self.time[lead_in], measured[:, : self.lead], self.plant.position_quantum,
+        )  # fmt: skip
+        scored = slice(self.lead if state is None else 0, None)
+        state = starts.state if state is None else state
+        q, diverged_at = self.simulate(state, samples)
+        squares = np.zeros((self.draws, self.plant.joints))
+        # One draw after another, as a long recording takes much memory.
+        for k, off in enumerate(starts.deviations(self.draws)):
+            drawn, _ = self.simulate(state + off, samples)
+            apart = self._as_read(drawn, measured) - q
+            squares[k] = np.mean(apart[:, scored] ** 2, axis=(0, 1))
+        return Runs(
+            samples, q, (q - measured)[:, scored], squares + self._noise_beyond_rounding(starts),
+            float((self.time[samples[:, 0]] + diverged_at).min()),
+        )  # fmt: skip
+
+    def _as_read(self, q: Array, measured: Array) -> Array:
+        """Positions as the encoder reads them, its counts in line with the measured ones."""
+        quantum = self.plant.position_quantum
+        return q if quantum is None else measured + quantum * np.rint((q - measured) / quantum)
+
+    def _noise_beyond_rounding(self, starts: Starts) -> Array:
+        """Variance of a measured position beside the rounding error, (joint,)."""
+        rounding = (self.plant.position_quantum or 0.0) ** 2 / 12
+        return np.mean(np.maximum(starts.noise**2 - rounding, 0.0), axis=0)
+
+    def simulate(self, states: Array, samples: NDArray[np.intp]) -> tuple[Array, Array]:
+        """Positions (*batch, window, sample, joint), and when they diverged (*batch, window).
+
+        Args:
+            states: positions and velocities at the first samples, (*batch, window, 2 joint).
+            samples: (window, sample).
+        """
+        joints, first_link = self.plant.joints, self.plant.first_link
+        if self.substeps is None:
+            lost = np.full((*states.shape[:-1], samples.shape[-1], joints), np.nan)
+            return lost, np.zeros(states.shape[:-1])
+        q0 = self.convention.position_to_joint(states[..., :joints], first_link)
+        qd0 = self.convention.rate_to_joint(states[..., joints:], first_link)
+        # Copies, because a recording's arrays are read-only, which tensors cannot be.
+        held = samples[:, :-1]
+        tau = None if self.recording.tau is None else torch.tensor(self.recording.tau[held])
+        step = torch.tensor(np.diff(self.time)[held])
+        memory = None if self.states is None else self.states[samples[:, 0]]
+        with torch.no_grad():
+            run = rollout(
+                self.plant, self.friction, torch.tensor(q0), torch.tensor(qd0), tau,
+                sample_time=step, substeps=self.substeps, scheme=self.scheme, hidden_state=memory,
+            )  # fmt: skip
+        q = self.convention.position_from_joint(run.q.numpy(), first_link)
+        return q, run.diverged_at.numpy()
+
+
+def estimate_starts(
+    simulate: Callable[[Array], Array], time: Array, y: Array, quantum: float | None
+) -> Starts:
+    """States from which simulations follow the measured positions of lead-ins best.
+
+    Gauss-Newton on the squared errors, weighed by the sensor's noise, with the kinematic estimate
+    of a cubic through the lead-in as a weak prior: friction may stop a joint so soon that the
+    motion does not depend on its velocity.
+
+    Args:
+        simulate: positions (*batch, window, sample, joint) from states (*batch, window, 2 joint).
+        time: of the samples [s], (window, sample).
+        y: measured positions, (window, sample, joint).
+        quantum: one count of the encoder; None where unknown.
+    """
+    count = y.shape[1]
+    time = time - time[:, :1]
+    noise = _noise(y, quantum)
+    # Samples within one count of the encoder share their rounding error.
+    distinct = (1 + np.count_nonzero(np.diff(y, axis=1), axis=1)) / count
+    weight = distinct / noise**2
+    kinematic, prior = _cubic(time, y, noise, distinct)
+    # Derivatives over steps of the noise's size see friction as the motion does.
+    nudge = noise[:, None, :] / np.stack([np.ones(len(y)), time[:, -1]], 1)[..., None]
+    nudge = nudge.reshape(kinematic.shape)
+    state, run = kinematic, simulate(kinematic)
+    for _ in range(MOST_STEPS):
+        gradient, information = _linearised(simulate, state, nudge, y - run, weight)
+        gradient += (prior @ (kinematic - state)[..., None])[..., 0]
+        information += prior
+        step = np.linalg.solve(information, gradient[..., None])[..., 0]
+        trials = state + SHARES[:, None, None] * step
+        runs = simulate(trials)
+        away = trials - kinematic
+        cost = np.einsum("swkj,wj->sw", (y - runs) ** 2, weight)
+        cost += np.einsum("swa,wab,swb->sw", away, prior, away)
+        best = np.where(np.isfinite(cost), cost, np.inf).argmin(0), np.arange(len(y))
+        state, run = trials[best], runs[best]
+        if np.all(np.sum(gradient * step, axis=-1) < SMALL**2):
+            break
+    # A model that misses the lead-in knows its state less well than the encoder would allow.
+    misfit = np.mean(((y - run) / noise[:, None]) ** 2, axis=(1, 2))
+    root = np.linalg.cholesky(np.linalg.inv(information))
+    excess = np.sqrt(np.maximum(np.nan_to_num(misfit, nan=1.0), 1.0))
+    return Starts(state, root * excess[:, None, None], noise)
+
+
+def _linearised(
+    simulate: Callable[[Array], Array], state: Array, nudge: Array, error: Array, weight: Array
+) -> tuple[Array, Array]:
+    """Gradient and Gauss-Newton matrix of half the squared errors, by central differences."""
+    nudges = np.eye(state.shape[-1])[:, None, :] * nudge
+    ahead, back = simulate(state + np.stack([nudges, -nudges]))
+    slopes = (ahead - back) / (2 * nudge.T[..., None, None])
+    # A simulation that diverges says nothing.
+    slopes, error = np.nan_to_num(slopes), np.nan_to_num(error)
+    gradient = np.einsum("awkj,wj,wkj->wa", slopes, weight, error)
+    return gradient, np.einsum("awkj,wj,bwkj->wab", slopes, weight, slopes)
+
+
+def _cubic(time: Array, y: Array, noise: Array, distinct: Array) -> tuple[Array, Array]:
+    """First state of a cubic through each window, and the inverse of its covariance."""
+    span = time[:, -1:]
+    basis = (time / span)[..., None] ** np.arange(4)
+    inverse = np.linalg.pinv(basis)
+    coefficients = inverse @ y
+    misfit = np.mean((y - basis @ coefficients) ** 2, axis=1)
+    inverse = inverse[:, :2] / np.stack([np.ones_like(span), span], 1)
+    precision = np.linalg.inv(inverse @ inverse.swapaxes(-1, -2))
+    joints = y.shape[-1]
+    # Motion that is no cubic errs alike over all samples, unlike noise.
+    by_joint = 1 / (noise**2 / distinct + y.shape[1] * np.maximum(misfit - noise**2, 0.0))
+    whole = np.einsum("wab,wj,jk->wajbk", precision, by_joint, np.eye(joints))
+    state = np.concatenate([coefficients[:, 0], coefficients[:, 1] / span], -1)
+    return state, whole.reshape(len(y), 2 * joints, 2 * joints)
+
+
+def _noise(y: Array, quantum: float | None) -> Array:
+    """Standard deviation of a measured position, (window, joint), at least the rounding error."""
+    # Fourth differences see noise, and of a smooth motion nothing; their weights squared sum to 70.
+    seen = np.sqrt(np.mean(np.diff(y, n=4, axis=1) ** 2, axis=1) / 70)
+    # Joints that rest show none: theirs is that of the others.
+    seen = np.where(seen > 0, seen, seen.max(axis=-1, keepdims=True))
+    least = 0.0 if quantum is None else quantum / math.sqrt(12)
+    return np.maximum(seen, np.maximum(least, 1e-12 * np.maximum(np.abs(y).max(axis=1), 1.0)))
+
+
+def _causal_motion(plant: Plant, recording: Recording) -> tuple[Array, Array]:
+    """Velocity and acceleration in joint coordinates as a controller has them, (sample, joint)."""
+    joint = recording.joint_coordinates(plant)
+    quantum = plant.position_quantum or np.finfo(np.float64).eps
+    cutoff = min(CUTOFF, 0.2 / joint.sample_time)
+    motion = causal_motion(joint.time, joint.q, math.tau / quantum, cutoff)
+    return motion.qd, motion.qdd
+
+
+def _substeps(plant: Plant, friction: FrictionModel | None, recording: Recording) -> int | None:
+    # None where friction is too steep to be simulated.
+    if friction is None:
+        return 1
+    longest = recording.longest_step
+    if torch.isfinite(friction.zero_velocity_damping()).all():
+        needed = required_substeps(plant, friction, longest)
+        if needed <= MOST_SUBSTEPS:
+            return needed
+        found = f"needs {needed} integration steps to the longest sample of {longest:g} s"
+    else:
+        found = "has no finite slope"
+    logger.warning(
+        "%s: friction %s at rest (limit: %d); scored as diverged. A larger `v_smooth` makes it "
+        "less steep.", recording.name, found, MOST_SUBSTEPS,
+    )  # fmt: skip
+    return None
