@@ -41,12 +41,16 @@ class Schedule(nn.Module, ABC):
         limits: lower and upper bound of each coefficient in a fit.
         positive: which coefficients are positive by physics, a buffer (coefficient,).
         state_size: size of each joint's hidden state.
+        follows_motion: False where the coefficients are constants.
+        handles_range: False where exports must clamp the inputs to the trained range.
+        fit_strategy: function that fits such coefficients, as `"module:function"`; it takes a
+            `nfriction.fitting.fit.FitTask`. Empty where there is none.
+        form: formula that exports have code of their own for; others are traced.
     """
 
-    follows_motion: ClassVar[bool] = True  # False where the coefficients are constants
-    handles_range: ClassVar[bool] = False  # else exports clamp the inputs to the trained range
-    form: ClassVar[str] = "traced"  # or a formula for which exports have code of their own
-    # Function that fits such coefficients, "module:function"; it takes a `fitting.fit.FitTask`.
+    follows_motion: ClassVar[bool] = True
+    handles_range: ClassVar[bool] = False
+    form: ClassVar[str] = "traced"
     fit_strategy: ClassVar[str] = ""
 
     positive: Tensor

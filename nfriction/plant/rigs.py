@@ -250,9 +250,6 @@ def by_name(name: str) -> Plant:
 _KINDS: dict[str, type[PendulumChain] | type[LinearAxis]] = {
     plant.kind: plant for plant in (PendulumChain, LinearAxis)
 }
-# Mass over the cube of the length of a link [kg/m^3]: from a wooden rod a thousand times as long as
-# thick to a steel cube. Grams for kilograms and millimetres for metres usually fall outside.
-LIGHTEST, HEAVIEST = 4e-4, 7850.0
 # Far beyond any rig; the memory of a chain's matrices grows with the square of its links.
 LARGEST_FILE, MOST_LINKS, LARGEST_NUMBER = 2**20, 100, 1e30
 _TEXTS = ("kind", "name", "convention", "joint_names")
@@ -281,8 +278,6 @@ def from_dict(data: Mapping[str, Any]) -> Plant:
 def read(path: str | Path) -> Plant:
     """Read a rig file: .json, .toml from Python 3.11 on, .urdf, or .xml (MJCF or URDF).
 
-    Warns of masses and lengths that seem to be in other units.
-
     Raises:
         ValueError: for another ending, a file that does not parse, or parameters that
             `from_dict` refuses; the message names the file.
@@ -296,25 +291,11 @@ def read(path: str | Path) -> Plant:
         if path.is_file() and path.stat().st_size > LARGEST_FILE:
             # Before it is read into memory.
             raise ValueError(f"rig files are at most {LARGEST_FILE} bytes.")
-        plant = from_dict(_parse(path.read_bytes().decode(), path.suffix.lower()))
+        return from_dict(_parse(path.read_bytes().decode(), path.suffix.lower()))
     except RecursionError:
         raise ValueError(f"{path}: nested too deeply for a rig.") from None
     except ValueError as error:  # those of JSON, TOML and Unicode too
         raise ValueError(f"{path}: {str(error)[:600]}") from error
-    _warn_of_units(plant)
-    return plant
-
-
-def _warn_of_units(plant: Plant) -> None:
-    """Warn of links whose mass does not fit their length: a fit would only scale the friction."""
-    given = plant.to_dict() if isinstance(plant, PendulumChain) else {"mass": [], "length": []}
-    for k, (mass, length) in enumerate(zip(given["mass"], given["length"], strict=True)):
-        if not LIGHTEST * length**3 <= mass <= HEAVIEST * length**3:
-            warnings.warn(
-                f"link {k + 1} with {mass:g} kg on {length:g} m is lighter than a thin wooden rod "
-                "or heavier than a steel cube; check that `mass` is in kg and `length` in m.",
-                stacklevel=3,
-            )
 
 
 def write(plant: Plant, path: str | Path) -> None:

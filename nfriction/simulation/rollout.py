@@ -102,8 +102,8 @@ def rollout(
             where they ought to rest. `"time_stepping"` takes semi-implicit steps of first order
             in which dry friction stops a joint and holds it, however steep; it needs shorter
             steps, and has no gradients, measured drive or hidden state.
-        drive: motion at which the coefficients c(qd, qdd) are evaluated: the `"simulated"` one,
-            or the `"measured"` one, as in the papers.
+        drive: motion that drives the coefficients: the `"simulated"` one, or the `"measured"` one,
+            as in the papers.
         measured: velocity and acceleration for `drive="measured"`, each (*batch, steps, joint).
         hidden_state: of the coefficients after the first sample, (*batch, joint, state_size), to
             continue an earlier motion (see `Schedule.states`); by default that of the first

@@ -217,19 +217,3 @@ def test_an_arm_is_one_and_keeps_plain_numbers() -> None:
     for wrong in (None, [1.0], "rig"):
         with pytest.raises(ValueError, match="a rig is one table"):
             rigs.from_dict(wrong)  # type: ignore[arg-type]
-
-
-def test_grams_and_millimetres_are_doubted(tmp_path: Path) -> None:
-    chain = {"mass": [0.73, 0.12], "length": [0.27, 0.23]}
-    for key, factor in (("mass", 1e3), ("length", 1e3)):
-        text = json.dumps(chain | {key: [factor * x for x in chain[key]]})
-        with pytest.warns(UserWarning, match=r"link 1 with .* check that `mass` is in kg"):
-            rigs.read(write(tmp_path / "rig.json", text))
-
-
-@pytest.mark.filterwarnings("error:link")
-@pytest.mark.filterwarnings("ignore:the inertia of link")
-def test_published_rigs_have_plausible_links(tmp_path: Path) -> None:
-    for name in rigs.names():
-        rigs.write(rigs.by_name(name), tmp_path / "rig.json")
-        rigs.read(tmp_path / "rig.json")
