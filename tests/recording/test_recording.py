@@ -176,12 +176,6 @@ def test_a_column_is_named_once(columns: dict[str, str]) -> None:
         Recording.from_pandas(table, columns=columns)
 
 
-def test_whole_numbers_that_whirl_look_like_counts() -> None:
-    counts = np.rint(8192 * np.arange(200) / 20)[:, None]
-    with pytest.warns(RecordingWarning, match="looks like encoder counts .*q1:counts/8192"):
-        Recording(np.arange(200) / 1000, counts)
-
-
 def test_named_columns_must_be_there_and_of_joints_that_are() -> None:
     table = swing().to_pandas()
     with pytest.raises(ValueError, match="column motor is missing; found time"):
@@ -614,6 +608,9 @@ def test_initial_states_name_their_faults(tmp_path: Path) -> None:
     path = tmp_path / "recordings.csv"
     path.write_text("id,q0_1\na,0.5\n")
     with pytest.raises(ValueError, match=r"lacks columns qd0_1;"):
+        read_initial_states(path)
+    path.write_text("id,q0_1,qd0_1\n")
+    with pytest.raises(ValueError, match="has no rows; write one with id, q0_1, qd0_1"):
         read_initial_states(path)
     path.write_text(f"id,q0_1,qd0_1,q0_{'1' * 5000}\na,0.5,0,1\n")
     assert list(read_initial_states(path)) == ["a"]
