@@ -291,6 +291,13 @@ def test_files_go_to_folders_that_are_made(tmp_path: Path) -> None:
     assert Recording.read(tmp_path / "a" / "b" / "run.csv").digest() == recording.digest()
 
 
+def test_text_in_a_table_from_elsewhere_is_not_guessed_at() -> None:
+    table = swing().to_pandas().astype({"q1": object})
+    table["q1"] = "35,000"
+    with pytest.raises(ValueError, match=r"column q1, row 0 .* must be a number, got '35,000'"):
+        Recording.from_pandas(table)
+
+
 def test_tables_from_elsewhere_may_number_or_repeat_their_columns() -> None:
     time, q = np.arange(20) / 1000, np.arange(20) / 50
     numbered = pd.DataFrame({0: time, 1: q})
