@@ -205,5 +205,8 @@ def read_recordings(
     warnings.simplefilter("ignore", RecordingWarning)
     if in_degrees:
         # If the option is missing for one file, it is missing for all.
-        warn(f"{', '.join(in_degrees)}: positions look like degrees; if they are, add --degrees.")
+        warn(
+            f"{', '.join(in_degrees)}: positions look like degrees or encoder counts; if so, add "
+            "--degrees, or state the counts of a turn, as in --columns q1=q1:counts/8192."
+        )
     return recordings

@@ -382,6 +382,8 @@ def read_initial_states(
                 f"joints."
             )
         states[label] = (state[0, present], state[1, present])
+    if not states:
+        raise ValueError(f"'{path}' has no rows; write one with {', '.join(wanted)} a recording.")
     return states
 
 

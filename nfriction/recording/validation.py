@@ -151,15 +151,12 @@ def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> list[tuple
     with np.errstate(over="ignore"):  # stamps may be as close as numbers get
         speed = np.abs(np.diff(q, axis=0) / step[:, None]).max()
     if turns > 1 and speed > 30.0 and not slow:
-        unit, remedy = "degrees", "if so, read it with `degrees=True`"
-        if np.array_equal(q, np.rint(q)):
-            unit = "encoder counts"
-            remedy = 'if so, state how many make a turn, as in columns={"q1": "q1:counts/8192"}'
         found.append(
             (
-                f"`q` looks like {unit} (every joint turns at least {turns:.1f} times, at up to "
-                f"{speed:.0f} rad/s)",
-                remedy,
+                f"`q` looks like degrees or encoder counts (every joint turns at least {turns:.1f} "
+                f"times, at up to {speed:.0f} rad/s)",
+                "if so, read it with `degrees=True`, or state the counts of a turn, as in "
+                'columns={"q1": "q1:counts/8192"}',
             )
         )
     jumps = _turns_between_samples(q, pauses)

@@ -130,6 +130,7 @@ def test_degrees_are_told_once_with_the_option_that_helps(
     first, second = capsys.readouterr().err.splitlines()
     assert first.startswith("nfriction: warning: wheel, cart: positions look like degrees")
     assert "--degrees" in first
+    assert "--columns q1=q1:counts/8192" in first
     assert second == "nfriction: error: enough"
 
 

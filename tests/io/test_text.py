@@ -217,6 +217,9 @@ def test_thousands_and_decimals_in_one_number(tmp_path: Path) -> None:
 def test_numbers_in_quotation_marks_may_hold_commas(tmp_path: Path) -> None:
     text = log([f'"{x:,}"' for x in [0, *COUNTS.tolist(), 1_234_567]], separator=",")
     assert np.array_equal(read(tmp_path, text).q[:, 0], [0, *COUNTS, 1_234_567])
+    # What nobody asks for decides nothing.
+    noted = written(",", False, "time{0}q1{0}q2{0}note").replace("\n", ',"0,5"\n')
+    assert np.array_equal(read(tmp_path, noted.replace(',"0,5"', "", 1)).q, Q)
 
 
 @pytest.mark.parametrize(

@@ -176,12 +176,6 @@ def test_a_column_is_named_once(columns: dict[str, str]) -> None:
         Recording.from_pandas(table, columns=columns)
 
 
-def test_whole_numbers_that_whirl_look_like_counts() -> None:
-    counts = np.rint(8192 * np.arange(200) / 20)[:, None]
-    with pytest.warns(RecordingWarning, match="looks like encoder counts .*q1:counts/8192"):
-        Recording(np.arange(200) / 1000, counts)
-
-
 def test_named_columns_must_be_there_and_of_joints_that_are() -> None:
     table = swing().to_pandas()
     with pytest.raises(ValueError, match="column motor is missing; found time"):
@@ -295,6 +289,13 @@ def test_files_go_to_folders_that_are_made(tmp_path: Path) -> None:
     recording = Recording(np.arange(9.0) / 100, np.zeros((9, 1)))
     recording.write(tmp_path / "a" / "b" / "run.csv")
     assert Recording.read(tmp_path / "a" / "b" / "run.csv").digest() == recording.digest()
+
+
+def test_text_in_a_table_from_elsewhere_is_not_guessed_at() -> None:
+    table = swing().to_pandas().astype({"q1": object})
+    table["q1"] = "35,000"
+    with pytest.raises(ValueError, match=r"column q1, row 0 .* must be a number, got '35,000'"):
+        Recording.from_pandas(table)
 
 
 def test_tables_from_elsewhere_may_number_or_repeat_their_columns() -> None:
@@ -614,6 +615,9 @@ def test_initial_states_name_their_faults(tmp_path: Path) -> None:
     path = tmp_path / "recordings.csv"
     path.write_text("id,q0_1\na,0.5\n")
     with pytest.raises(ValueError, match=r"lacks columns qd0_1;"):
+        read_initial_states(path)
+    path.write_text("id,q0_1,qd0_1\n")
+    with pytest.raises(ValueError, match="has no rows; write one with id, q0_1, qd0_1"):
         read_initial_states(path)
     path.write_text(f"id,q0_1,qd0_1,q0_{'1' * 5000}\na,0.5,0,1\n")
     assert list(read_initial_states(path)) == ["a"]

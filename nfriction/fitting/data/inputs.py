@@ -98,6 +98,7 @@ def in_joint_coordinates(
                 f"model {model.joints}; they must agree."
             )
     conventions = {str(r.resolve_convention(plant)) for r in recordings}
+    # Residuals are formed as the encoders read, by one matrix for all windows.
     if len(conventions) > 1:
         raise ValueError(
             "recordings fitted together must share one angle convention, got "

@@ -91,6 +91,7 @@ def cut_windows(
     for w, (place, first, last) in enumerate(spans):
         recording, n = recordings[place], last - first
         q[w, : n + 1] = recording.q[first : last + 1]
+        # Steps of no length and no weight: padding changes neither motion nor cost.
         q[w, n + 1 :] = recording.q[last]
         step[w, :n] = np.diff(recording.time[first : last + 1])
         weight[w, : n + 1] = 1.0
@@ -108,6 +109,7 @@ def _cut(recording: Recording, length: float) -> Iterator[tuple[int, int]]:
     """First and last sample of each window."""
     for first, last in recording.segments:
         duration = recording.time[last] - recording.time[first]
+        # Windows of equal length: a short remainder would hardly determine its initial state.
         count = max(1, int(duration / length + 0.5))
         if count > last - first:
             raise ValueError(

@@ -46,15 +46,16 @@ def decimal_sign(table: pd.DataFrame, stated: str | None, usual: str) -> tuple[s
         return ".", []
     point = {name for name, cells in columns.items() if _fits(cells, ".")}
     only_comma, only_point = comma - point, point - comma
-    if only_comma and only_point:
+    # Between commas, what is in quotation marks may be anything.
+    if only_comma and only_point and usual == ",":
         raise ValueError(
             f"column {min(only_comma)} has decimal commas and column {min(only_point)} decimal "
             "points; write all numbers alike"
         )
-    found = "," if only_comma else "." if only_point else None
+    found = "." if only_point else "," if only_comma else None
     if stated and found not in (stated, None):
         raise ValueError(
-            f"column {min(only_comma | only_point)} has {found!r} as its decimal sign, the line "
+            f"column {min(only_point or only_comma)} has {found!r} as its decimal sign, the line "
             f"`# decimal:` states {stated!r}; correct one of them"
         )
     decimal = stated or found
@@ -78,10 +79,11 @@ def column_numbers(table: pd.DataFrame, column: str) -> Array:
         ValueError: a cell is no number; names it.
     """
     cells = table[column].to_numpy(dtype=object, na_value=np.nan)
-    decimal = table.attrs.get("decimal", ".")
-    texts = _texts(table[column])
+    # A table from elsewhere states none: its text is read as Python reads it.
+    decimal = str(table.attrs.get("decimal"))
+    texts = _texts(table[column]) if decimal in THOUSANDS else []
     # Cells that are no such numbers stay as they are, for the message.
-    if (decimal == "," or any("," in text for text in texts)) and _fits(texts, decimal):
+    if texts and (decimal == "," or any("," in x for x in texts)) and _fits(texts, decimal):
         cells = np.array([_plain(c, decimal) if isinstance(c, str) else c for c in cells], object)
     try:
         return cells.astype(np.float64)
