@@ -81,11 +81,7 @@ def warn(message: str) -> None:
 
 
 def drop_output() -> int:
-    """End quietly where the reader of the output is gone (`nfriction info FILE | head -1`).
-
-    Returns:
-        The status of a program that the closed pipe ended.
-    """
+    """End quietly where the reader of the output is gone: the status of a closed pipe."""
     # Python flushes once more on its way out.
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 128 + 13  # SIGPIPE, which not every system has

@@ -126,11 +126,7 @@ def compare_and_report(
     arguments: argparse.Namespace,
     settings: dict[str, Any],
 ) -> int:
-    """Fit, score, write and print.
-
-    Returns:
-        The exit status: 1 where a model could not be fitted.
-    """
+    """Fit, score, write and print; the status is 1 where a model could not be fitted."""
     from nfriction.cli.tables import verdict
     from nfriction.evaluation.compare import check_recordings, compare
     from nfriction.evaluation.cross_validation import select
@@ -141,11 +137,7 @@ def compare_and_report(
     states = _initial_states(arguments, plant, [*train, *test])
     check_writable(arguments.out)
     selection = None
-    with (
-        exclusive(arguments.out),
-        _log(arguments.log_file) as logger,
-        Progress(logger) as progress,
-    ):
+    with exclusive(arguments.out), _log(arguments.log_file) as logger, Progress(logger) as progress:
         settings = settings | {"progress": progress, "jobs": arguments.jobs}
         logger.info(arguments.command_line)
         if arguments.select:
@@ -167,10 +159,7 @@ def compare_and_report(
 
 
 def _print(
-    comparison: Comparison,
-    selection: Selection | None,
-    plant: Plant,
-    arguments: argparse.Namespace,
+    comparison: Comparison, selection: Selection | None, plant: Plant, arguments: argparse.Namespace
 ) -> None:
     from nfriction.cli import tables
 
@@ -213,9 +202,7 @@ def _log(path: Path | None) -> Iterator[logging.Logger]:
 
 
 def _initial_states(
-    arguments: argparse.Namespace,
-    plant: Plant,
-    recordings: Sequence[Recording],
+    arguments: argparse.Namespace, plant: Plant, recordings: Sequence[Recording]
 ) -> InitialStates | None:
     """States of these recordings; warns of those that start from their smoothed motion."""
     from nfriction.recording import read_initial_states

@@ -197,11 +197,6 @@ def report_of(folder: Path) -> Path | None:
         return path if REPORT_MARK in file.read(1000) else None
 
 
-def interrupted(folder: Path) -> bool:
-    """True where a process was killed, or is busy, putting a run's files in place."""
-    return (folder / COMPLETE).is_dir()
-
-
 def _put_in_place(folder: Path) -> None:
     """Replace the earlier run's files by the complete ones.
 

@@ -1,4 +1,7 @@
-"""Figures from results, as matplotlib figures that need no display: `figure.savefig(path)`."""
+"""Figures from results, as matplotlib figures that need no display: `figure.savefig(path)`.
+
+They are as wide as one or both columns of a paper; `figure.set_figwidth(inches)` changes that.
+"""
 
 from nfriction.plots.coefficients import (
     coefficient_sections,
@@ -17,16 +20,7 @@ from nfriction.plots.saving import save_all
 from nfriction.plots.style import for_dark_screen
 
 __all__ = [
-    "coefficient_intervals",
-    "coefficient_sections",
-    "coefficient_surfaces",
-    "coefficients_over_time",
-    "controller_surface",
-    "for_dark_screen",
-    "horizon_curve",
-    "memberships",
-    "positions",
-    "rmse_bars",
-    "save_all",
-    "torque_over_velocity",
-]
+    "coefficient_intervals", "coefficient_sections", "coefficient_surfaces",
+    "coefficients_over_time", "controller_surface", "for_dark_screen", "horizon_curve",
+    "memberships", "positions", "rmse_bars", "save_all", "torque_over_velocity",
+]  # fmt: skip

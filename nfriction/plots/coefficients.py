@@ -40,7 +40,6 @@ def coefficients_over_time(
     *,
     joint_names: Sequence[str] | None = None,
     unit: str = "rad",
-    width: float = style.PAGE,
 ) -> Figure:
     """Coefficients of models of one law along a motion, a panel a coefficient and joint.
 
@@ -49,7 +48,6 @@ def coefficients_over_time(
         motion: in joint coordinates.
         joint_names: for the titles.
         unit: of a position, `"rad"` or `"m"`.
-        width: of the figure [in].
 
     Raises:
         ValueError: if there is no model, or their coefficients differ.
@@ -61,7 +59,7 @@ def coefficients_over_time(
     names = style.joint_labels(joint_names, first.joints)
     along = [_along(model, motion) for model in models.values()]
     rows = len(first.law.coefficients)
-    figure, axes = style.panels(rows, first.joints, width, 0.4 + 1.25 * rows, sharex=True)
+    figure, axes = style.panels(rows, first.joints, style.PAGE, 0.4 + 1.25 * rows, sharex=True)
     looks = style.looks(models)
     for k, coefficient in enumerate(first.law.coefficients):
         for j, ax in enumerate(axes[k]):
@@ -97,7 +95,6 @@ def coefficient_surfaces(
     uncertainty: CoefficientUncertainty | None = None,
     joint_names: Sequence[str] | None = None,
     unit: str = "rad",
-    width: float | None = None,
 ) -> Figure:
     """Coefficients of a neuro-fuzzy model as maps over |velocity| and acceleration.
 
@@ -110,7 +107,6 @@ def coefficient_surfaces(
             size.
         joint_names: for the titles.
         unit: of a position, `"rad"` or `"m"`.
-        width: of the figure [in].
 
     Returns:
         A map a joint and fitted coefficient.
@@ -125,7 +121,7 @@ def coefficient_surfaces(
     rows, columns = sorted((model.joints, len(coefficients)), reverse=True)
     share = "col" if across else "row"
     figure, axes = style.panels(
-        rows, columns, width or (style.COLUMN if columns == 1 else style.PAGE), 0.7 + 1.5 * rows,
+        rows, columns, style.COLUMN if columns == 1 else style.PAGE, 0.7 + 1.5 * rows,
         sharex=share, sharey=share,
     )  # fmt: skip
     for j, maps in enumerate(axes.T if across else axes):
@@ -156,7 +152,6 @@ def coefficient_sections(
     uncertainty: CoefficientUncertainty | None = None,
     joint_names: Sequence[str] | None = None,
     unit: str = "rad",
-    width: float | None = None,
 ) -> Figure:
     """Coefficients of a neuro-fuzzy model over |velocity|, at three accelerations.
 
@@ -170,7 +165,7 @@ def coefficient_sections(
     names = style.joint_labels(joint_names, model.joints)
     rows, columns = model.joints, len(coefficients)
     figure, axes = style.panels(
-        rows, columns, width or (style.COLUMN if columns == 1 else style.PAGE), 0.4 + 1.5 * rows,
+        rows, columns, style.COLUMN if columns == 1 else style.PAGE, 0.4 + 1.5 * rows,
         sharex="row",
     )  # fmt: skip
     levels = ("negative", "none", "positive")

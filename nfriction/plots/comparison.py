@@ -30,9 +30,7 @@ _POINTS = 3000  # of the scatter of torques, a joint
 _BINS = 24  # of its medians
 
 
-def positions(
-    recording: Recording, scores: Mapping[str, Score], *, width: float = style.PAGE
-) -> Figure:
+def positions(recording: Recording, scores: Mapping[str, Score]) -> Figure:
     """Measured against simulated position, a pair of panels a joint: position, error below.
 
     A panel spans the measured range, and the errors of models that did not diverge, up to half of
@@ -42,7 +40,6 @@ def positions(
     Args:
         recording: the measured motion, in its own convention and unit.
         scores: scores on this very recording by model name, simulated positions included.
-        width: of the figure [in].
 
     Raises:
         ValueError: if there are no scores, or one belongs to another recording.
@@ -57,7 +54,7 @@ def positions(
             )
     joints = recording.joints
     figure, axes = style.panels(
-        2 * joints, 1, width, 0.4 + 1.7 * joints, sharex=True, height_ratios=[1, 1] * joints
+        2 * joints, 1, style.PAGE, 0.4 + 1.7 * joints, sharex=True, height_ratios=[1, 1] * joints
     )
     looks = style.looks(scores)
     # Errors that diverge or ignore friction would hide all others.
@@ -91,14 +88,13 @@ def positions(
     return figure
 
 
-def rmse_bars(table: pd.DataFrame, unit: str, *, width: float | None = None) -> Figure:
+def rmse_bars(table: pd.DataFrame, unit: str) -> Figure:
     """Bars of the position error by joint and model; those that diverged reach the top.
 
     Args:
         table: a row a model, a column a joint, as `Comparison.table` gives it; infinite where a
             simulation diverged.
         unit: of its values, `"rad"` or `"m"`.
-        width: of the figure [in]; default by the number of bars.
 
     Raises:
         ValueError: if the table is empty.
@@ -110,7 +106,7 @@ def rmse_bars(table: pd.DataFrame, unit: str, *, width: float | None = None) -> 
     models, joints = [str(name) for name in table.index], [str(name) for name in table.columns]
     # Numbers above bars must not overlap.
     room = _BAR * (len(models) + 1) * len(joints) + 0.6
-    width = width or (style.COLUMN if room <= style.COLUMN else style.PAGE)
+    width = style.COLUMN if room <= style.COLUMN else style.PAGE
     figure, axes = style.panels(1, 1, width, 2.2)
     ax = axes[0, 0]
     finite = values[np.isfinite(values) & (values > 0)]
@@ -144,7 +140,6 @@ def horizon_curve(
     *,
     part: Part | None = None,
     column: str = "all",
-    width: float = style.COLUMN,
 ) -> Figure:
     """Position error over the length of the simulation, by model.
 
@@ -155,7 +150,6 @@ def horizon_curve(
         comparison: fits and scores.
         part: `"test"` or `"train"`; default test recordings where there are any.
         column: joint of the tables, or `"all"`.
-        width: of the figure [in].
     """
     part = part or comparison.parts[0]
     horizons = [*comparison.horizons(), None]
@@ -164,7 +158,7 @@ def horizon_curve(
     values = 1e3 * np.stack([table.to_numpy(dtype=np.float64) for table in tables], -1)
     limits = [comparison.limit(h, column, part=part) for h in horizons]
     limit = 1e3 * np.array([np.nan if value is None else value for value in limits])
-    figure, axes = style.panels(1, 1, width, 2.2)
+    figure, axes = style.panels(1, 1, style.COLUMN, 2.2)
     ax = axes[0, 0]
     known = np.append(values[np.isfinite(values)], limit[np.isfinite(limit)])
     known = known[known > 0] if (known > 0).any() else np.ones(1)
@@ -203,8 +197,6 @@ def torque_over_velocity(
     models: Mapping[str, FrictionModel],
     recordings: Sequence[Recording],
     motions: Sequence[Motion] | None = None,
-    *,
-    width: float | None = None,
 ) -> Figure:
     """Friction torque of each law over velocity, a panel a joint, over that of the motion.
 
@@ -216,7 +208,6 @@ def torque_over_velocity(
         models: friction models by name.
         recordings: in any convention.
         motions: their smoothed motion in joint coordinates; computed where not given.
-        width: of the figure [in].
     """
     joint = [r.joint_coordinates(plant) for r in recordings]
     motions = motions or [kalman_smoother(r.time, r.q) for r in joint]
@@ -225,7 +216,9 @@ def torque_over_velocity(
         qd = torch.cat([p[0] for p in parts]).numpy()
         torque = torch.cat([p[2] for p in parts]).numpy()
     columns = min(plant.joints, 3) if plant.joints != 4 else 2
-    figure, axes = style.panel_each(plant.joints, columns, width, 2.0)
+    figure, axes = style.panel_each(
+        plant.joints, columns, style.PAGE if columns > 1 else style.COLUMN, 2.0
+    )
     looks = style.looks(models)
     for k, ax in enumerate(axes):
         grid = _velocities(qd[:, k])
@@ -258,14 +251,13 @@ def torque_over_velocity(
     return figure
 
 
-def coefficient_intervals(fits: Mapping[str, FitResult], *, width: float | None = None) -> Figure:
+def coefficient_intervals(fits: Mapping[str, FitResult]) -> Figure:
     """Fitted coefficients with their 95 % intervals, a panel a coefficient; joints side by side.
 
     Intervals of unidentifiable coefficients reach from edge to edge of a panel.
 
     Args:
         fits: of models with constant coefficients of one law, by name: of other recordings, say.
-        width: of the figure [in].
 
     Raises:
         ValueError: if there is no such fit, or one is of another law.
@@ -278,7 +270,7 @@ def coefficient_intervals(fits: Mapping[str, FitResult], *, width: float | None 
     first = next(iter(fits.values()))
     joints, law = first.plant.joint_names, first.model.law
     columns = min(len(law.coefficients), 3)
-    width = width or (style.COLUMN if columns < 3 else style.PAGE)
+    width = style.COLUMN if columns < 3 else style.PAGE
     figure, axes = style.panel_each(len(law.coefficients), columns, width, 1.7)
     looks = {name: {**look.line, "linestyle": "", **look.marker}
              for name, look in style.looks(fits).items()}  # fmt: skip

@@ -28,7 +28,6 @@ def memberships(
     *,
     joint_names: Sequence[str] | None = None,
     unit: str = "rad",
-    width: float = style.PAGE,
 ) -> Figure:
     """Fuzzy sets of velocity and acceleration, a row a joint.
 
@@ -37,7 +36,6 @@ def memberships(
         before: the same model before its training, drawn dashed over the range of `model`.
         joint_names: for the labels.
         unit: of a position, `"rad"` or `"m"`.
-        width: of the figure [in].
 
     Raises:
         ValueError: if a model is no neuro-fuzzy one, or the two differ in joints or sets.
@@ -54,7 +52,7 @@ def memberships(
             )
         drawn.insert(0, (start, _BEFORE))
     names = style.joint_labels(joint_names, model.joints)
-    figure, axes = style.panels(model.joints, 2, width, 0.45 + 1.1 * model.joints, sharey=True)
+    figure, axes = style.panels(model.joints, 2, style.PAGE, 0.45 + 1.1 * model.joints, sharey=True)
     for j, row in enumerate(axes):
         for i, ax in enumerate(row):
             low, high = rules.lower[j, i], rules.upper[j, i]
@@ -74,14 +72,13 @@ def memberships(
     return figure
 
 
-def controller_surface(controller: Any, *, points: int = 81, width: float = style.PAGE) -> Figure:
+def controller_surface(controller: Any, *, points: int = 81) -> Figure:
     """A rule-table controller's outputs over its two inputs, a map an output, inputs in SI.
 
     Args:
         controller: with two inputs, such as `nfriction.papers.controller.MamdaniController`:
             `infer` gives outputs in the units of its `rule_base`, `si_factor` those of the inputs.
         points: of the map along each axis.
-        width: of the figure [in].
 
     Raises:
         ValueError: if the controller has not two inputs.
@@ -99,7 +96,7 @@ def controller_surface(controller: Any, *, points: int = 81, width: float = styl
         f"{variable.name} [{variable.unit.replace('deg', 'rad').replace('^2', '²')}]"
         for variable in rules.inputs
     ]
-    figure, axes = style.panels(1, len(rules.outputs), width, 2.5, sharey=True)
+    figure, axes = style.panels(1, len(rules.outputs), style.PAGE, 2.5, sharey=True)
     for k, (ax, output) in enumerate(zip(axes[0], rules.outputs, strict=True)):
         draw_map(ax, (x, y), values[..., k], label=(output.name, output.unit))
         ax.set_xlabel(labels[0])

@@ -65,12 +65,9 @@ def panels(
     return figure, axes
 
 
-def panel_each(
-    count: int, columns: int, width: float | None, height: float
-) -> tuple[Figure, list[Axes]]:
+def panel_each(count: int, columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
     """A grid of panels of a height, as many as asked for; the rest of the grid is blank."""
     rows = -(-count // columns)
-    width = width or (PAGE if columns > 1 else COLUMN)
     figure, axes = panels(rows, columns, width, 0.2 + height * rows)
     for ax in axes.flat[count:]:
         ax.set_visible(False)
@@ -116,10 +113,7 @@ def title(ax: Axes, text: str) -> None:
 
 
 def coefficient_axis(ax: Axes, coefficient: Coefficient, position: str, values: Any) -> float:
-    """Label the y axis with a coefficient; the factor from SI to the label's unit, by the values.
-
-    `position` is the unit of a position, `"rad"` or `"m"`.
-    """
+    """Label the y axis with a coefficient; the factor from SI to the unit that suits the values."""
     factor, unit = scaled(sliding(coefficient.unit, position), values)
     ax.set_ylabel(f"{symbol(coefficient.name)} [{unit}]")
     ax.yaxis.set_major_locator(MaxNLocator(4))
@@ -195,11 +189,7 @@ def symbol(name: str) -> str:
 
 
 def joint_labels(names: Sequence[str] | None, joints: int) -> list[str]:
-    """The names given, or joint1, joint2, ...
-
-    Raises:
-        ValueError: if there is not one for each joint.
-    """
+    """The names given, or joint1, joint2, ...; ValueError if there is not one for each joint."""
     if names is not None and len(names) != joints:
         raise ValueError(f"`joint_names` must be {joints} names, got {list(names)}.")
     return list(names) if names is not None else [f"joint{k + 1}" for k in range(joints)]

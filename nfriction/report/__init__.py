@@ -5,13 +5,6 @@ from nfriction.report.rules import JointRules, Rule, Term, rules_in_words
 from nfriction.report.run import Run, RunError, read_run
 
 __all__ = [
-    "JointRules",
-    "Rule",
-    "Run",
-    "RunError",
-    "Term",
-    "read_run",
-    "rules_in_words",
-    "to_html",
+    "JointRules", "Rule", "Run", "RunError", "Term", "read_run", "rules_in_words", "to_html",
     "write_report",
-]
+]  # fmt: skip

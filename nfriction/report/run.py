@@ -13,7 +13,7 @@ import numpy as np
 
 from nfriction.evaluation.compare import PART_NAMES, SCHEMA, Comparison, Part
 from nfriction.evaluation.cross_validation import Candidate, Selection
-from nfriction.evaluation.results import exclusive, interrupted
+from nfriction.evaluation.results import COMPLETE, exclusive
 from nfriction.evaluation.score import Score
 from nfriction.friction import model_names
 from nfriction.friction.models import FrictionModel
@@ -119,7 +119,7 @@ def read_run(folder: str | Path) -> Run:
         OSError: if it cannot be read, or another process is writing it.
     """
     folder = Path(folder)
-    if interrupted(folder):
+    if (folder / COMPLETE).is_dir():
         with exclusive(folder):
             pass
     path = folder / "results.json"
