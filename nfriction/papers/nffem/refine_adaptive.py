@@ -157,10 +157,8 @@ def _cross_fitted(
 
 
 def _improves(whole: ShootingProblem, vector: Tensor) -> bool:
-    """A correction is kept only if it is no worse on any joint over the windows it learned from.
-
-    The shares were chosen for the corrections of the parts, and may not suit this one.
-    """
+    """True if a correction is no worse on any joint over the windows it learned from."""
+    # The shares were chosen for the corrections of the parts, and may not suit this one.
     ratio = _errors(whole, vector) / _errors(whole, torch.zeros_like(vector))
     return bool((ratio.log().mean(0) <= 0).all())
 

@@ -74,13 +74,10 @@ class Scaling:
 
 
 @torch.no_grad()
-def to_own_units(network: nn.Module, scaling: Scaling) -> None:
+def to_own_units(network: FuzzyNetwork, scaling: Scaling) -> None:
     """Rewrite a network of scaled inputs and outputs as the same one in own units, in place.
 
     Exact: centres, widths and output layers are rewritten. `scaling.inverse()` reverts it.
-
-    Raises:
-        TypeError: for other networks than `Anfis`, `AnfisRBF` and `RBFNetwork`.
     """
     if isinstance(network, AnfisRBF):
         # The head reads inputs and the layer's outputs, and adds to these without a middle.
@@ -94,12 +91,8 @@ def to_own_units(network: nn.Module, scaling: Scaling) -> None:
         _rescale_rbf(network.head, head)
     elif isinstance(network, Anfis):
         _rescale_anfis(network, scaling)
-    elif isinstance(network, RBFNetwork):
-        _rescale_rbf(network, scaling)
     else:
-        raise TypeError(
-            f"a network must be an Anfis, AnfisRBF or RBFNetwork, got {type(network).__name__}."
-        )
+        _rescale_rbf(network, scaling)
 
 
 def _rescale_rbf(network: RBFNetwork, scaling: Scaling) -> None:

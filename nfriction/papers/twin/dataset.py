@@ -176,14 +176,6 @@ class Encoder:
         return self.quantum * (count + (place >= above) - (place < below))
 
 
-def jitter(random: np.random.Generator, samples: int, deviation: float) -> Array:
-    """Delay of each sample [s], (samples,): normal, cut at three deviations, zero at the first."""
-    late = deviation * np.clip(random.standard_normal(samples), -3.0, 3.0)
-    # The release is the origin of time, and its state is given as exact.
-    late[0] = 0.0
-    return late
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Twin:
     """Recordings of a rig that does not exist, and the truth behind them.
@@ -255,9 +247,10 @@ def make(
             truth[release.label] = motion
             # A stream for each release: a shorter twin is the beginning of a longer one.
             random = np.random.default_rng([seed, index + 1])
-            recordings[release.label] = _record(
-                motion, encoders, jitter(random, samples, JITTER), plant, release.label
-            )
+            late = JITTER * np.clip(random.standard_normal(samples), -3.0, 3.0)
+            # The release is the origin of time, and its state is given as exact.
+            late[0] = 0.0
+            recordings[release.label] = _record(motion, encoders, late, plant, release.label)
     return Twin(
         name=name,
         plant=plant,
@@ -321,13 +314,9 @@ def main(name: str, argv: Sequence[str] | None = None) -> int:
 
 
 def _record(
-    motion: TrueMotion,
-    encoders: list[Encoder],
-    late: Array,
-    plant: PendulumChain,
-    label: str,
+    motion: TrueMotion, encoders: list[Encoder], late: Array, plant: PendulumChain, label: str
 ) -> Recording:
-    """A motion as the rig's computer logs it; its stamps are those of an even clock."""
+    """A motion as the rig's computer logs it, on an even clock, each sample `late` [s]."""
     convention = AngleConvention.of(plant)
     late = late[:, None]
     # Jitter is far below a sample: two terms of the series err far less than a count.

@@ -64,7 +64,7 @@ def test_table_10_stands_beside_the_print(tmp_path: Path) -> None:
     table, measured = tables.table_10(made), tables.table_10(made, "measured_drive")
     assert len(table) == 13
     for name, row in tables.TABLE_10.items():
-        assert tuple(table["printed"].loc[name]) == row
+        assert list(table["printed"].loc[name]) == row
     assert table["printed"].loc["LFM"].isna().all()
     pd.testing.assert_frame_equal(2 * measured["ours"], table["ours"])
 
