@@ -7,7 +7,7 @@ computed here and written as a constant.
 
 import importlib
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -71,6 +71,7 @@ class OnnxGraph:
         real: Any,
     ) -> None:
         self.real = np.dtype(real)
+        self.helper = importlib.import_module("onnx.helper")
         self.nodes: list[Any] = []
         self.constants: dict[str, np.ndarray] = {}
         self._known: dict[tuple[Any, ...], str] = {}
@@ -78,10 +79,10 @@ class OnnxGraph:
         values: dict[Any, Any] = {}
         names = iter(inputs)
         for node in program.graph.nodes:
-            if node.op == "placeholder":
-                values[node] = (
-                    owned[node.name] if node.name in owned else Value(next(names), torch.float64)
-                )
+            if node.op == "placeholder" and node.name in owned:
+                values[node] = owned[node.name]
+            elif node.op == "placeholder":
+                values[node] = Value(next(names), torch.float64)
             elif node.op == "call_function":
                 values[node] = self._call(node, values)
         for name, node in zip(outputs, program.graph.output_node().args[0], strict=True):
@@ -112,14 +113,12 @@ class OnnxGraph:
         return self._known[key]
 
     def _node(self, op: str, inputs: list[str], output: str, **attributes: Any) -> None:
-        helper = importlib.import_module("onnx.helper")
-        self.nodes.append(helper.make_node(op, inputs, [output], **attributes))
+        self.nodes.append(self.helper.make_node(op, inputs, [output], **attributes))
 
     def _call(self, node: Any, values: dict[Any, Any]) -> Any:
         """Result of a node of the program: a value, or a tensor where all is known."""
         args, kwargs = torch.fx.node.map_arg((node.args, node.kwargs), lambda n: values[n])
-        leaves = list(_leaves((args, kwargs)))
-        if not any(isinstance(leaf, (Value, Unknown)) for leaf in leaves):
+        if not any(isinstance(values[n], (Value, Unknown)) for n in node.all_input_nodes):
             return node.target(*args, **kwargs)
         name = str(node.target).removeprefix("aten.").partition(".")[0]
         rule = _RULES.get(name)
@@ -135,29 +134,12 @@ def _owned(program: torch.export.ExportedProgram) -> dict[str, Tensor]:
     """Parameters, buffers and constants, by the name of their placeholder."""
     signature = program.graph_signature
     held = {**program.state_dict, **program.constants}
-    return {
-        placeholder: held[target].detach()
-        for table in (
-            signature.inputs_to_parameters,
-            signature.inputs_to_buffers,
-            signature.inputs_to_lifted_tensor_constants,
-        )
-        for placeholder, target in table.items()
+    placeholders = {
+        **signature.inputs_to_parameters,
+        **signature.inputs_to_buffers,
+        **signature.inputs_to_lifted_tensor_constants,
     }
-
-
-def _leaves(x: Any) -> Iterator[Any]:
-    """Leaves of nested arguments."""
-    if isinstance(x, Value):
-        yield x
-    elif isinstance(x, dict):
-        for inner in x.values():
-            yield from _leaves(inner)
-    elif isinstance(x, (tuple, list)):
-        for inner in x:
-            yield from _leaves(inner)
-    else:
-        yield x
+    return {name: held[target].detach() for name, target in placeholders.items()}
 
 
 # Rules: the arguments are those of the ATen operation.
@@ -202,9 +184,8 @@ def _cast(g: OnnxGraph, a: Value, dtype: torch.dtype | None = None, **_: Any) ->
 
 
 def _onnx_type(g: OnnxGraph, dtype: torch.dtype) -> int:
-    helper = importlib.import_module("onnx.helper")
-    array = torch.zeros((), dtype=dtype).numpy()
-    return int(helper.np_dtype_to_tensor_dtype(g.real if dtype.is_floating_point else array.dtype))
+    kind = g.real if dtype.is_floating_point else torch.zeros((), dtype=dtype).numpy().dtype
+    return int(g.helper.np_dtype_to_tensor_dtype(kind))
 
 
 def _full_like(g: OnnxGraph, a: Value, value: float, **_: Any) -> Value:
@@ -399,22 +380,18 @@ def read_onnx(path: str | Path) -> tuple[Any, Contract]:
 def _package() -> Any:
     """The package `onnx`, which is an extra."""
     try:
-        package = importlib.import_module("onnx")
+        return importlib.import_module("onnx")
     except ImportError as error:
         raise ImportError(
             "ONNX needs the packages `onnx` and, to run it, `onnxruntime`; install them with "
             "`pip install nfriction[onnx]`."
         ) from error
-    return package
 
 
 def _model_file(
-    package: Any,
-    graph: OnnxGraph,
-    inputs: Sequence[str],
-    outputs: Sequence[str],
+    package: Any, graph: OnnxGraph, inputs: Sequence[str], outputs: Sequence[str],
     contract: Contract,
-) -> Any:
+) -> Any:  # fmt: skip
     """The whole file as a protocol buffer."""
     helper = package.helper
     real = helper.np_dtype_to_tensor_dtype(graph.real)
