@@ -26,7 +26,7 @@ import torch
 
 from nfriction import NFLFM, FrictionModel
 from nfriction.export import c
-from nfriction.export.c_code.run import find_compiler
+from nfriction.export.c_code.export import find_compiler
 from nfriction.export.controller import controller_of
 from nfriction.export.test_vectors import draw
 from nfriction.io.model_info import ModelInfo

@@ -100,9 +100,28 @@ def _write_controller(
     if target == "c":
         name = "".join(x if x.isascii() and x.isalnum() else "_" for x in stem)[:24]
         name = name if is_identifier(name) else f"nf_{name}"
-        return export.c(model, arguments.out, info, name=name, **options)
+        paths = export.c(model, arguments.out, info, name=name, **options)
+        _prove(paths[0], model, info)
+        return paths
     writer = getattr(export, target)
     return [writer(model, arguments.out / f"{stem}{CONTROLLERS[target]}", info, **options)]
+
+
+def _prove(source: Path, model: "FrictionModel", info: "ModelInfo") -> None:
+    """Run exported C on this machine and compare it with the model; where that cannot be, say so.
+
+    The other targets are compared as they are written.
+    """
+    from nfriction import export
+
+    try:
+        verdict = export.verify_artefact(source, model, info, points=1000)
+    except export.ExportError as error:
+        # There may be no compiler, or CC may be one for another machine.
+        print(f"{source} was not run here; run its self-test on the target ({error})")
+    else:
+        if not verdict.passed:
+            raise export.ExportError(f"{source} differs from its model: {verdict.points}.")
 
 
 def _write_simulator(

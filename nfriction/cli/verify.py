@@ -34,16 +34,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("--points must be at least 1.")
     model, info = load(arguments.model), load_info(arguments.model)
     verdict = verify_artefact(arguments.artefact, model, info, points=arguments.points)
-    head = (
-        "compared at",
-        "points",
-        "torque error",
-        "tolerance",
-        "coefficients",
-        "edges",
-        "verdict",
-    )
-    print("{:<14}{:>8}{:>14}{:>11}{:>14}{:>7}  {}".format(*head))
+    head = ("compared at", "points", "torque error", "tolerance", "coefficients", "edges")
+    print("{:<14}{:>8}{:>14}{:>11}{:>14}{:>7}  verdict".format(*head))
     for name, parity in (("its vectors", verdict.vectors), ("drawn points", verdict.points)):
         print(
             f"{name:<14}{parity.points:>8}{parity.torque_error:>14.1e}{parity.tolerance:>11.0e}"

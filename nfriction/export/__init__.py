@@ -1,13 +1,19 @@
 """Artefacts for controllers, each proven equal to the model that was scored."""
 
 from nfriction.export.c_code.export import c
-from nfriction.export.contract import Contract, Parity, contract_of, verify
+from nfriction.export.contract import (
+    Contract,
+    ContractError,
+    ExportError,
+    Parity,
+    contract_of,
+    verify,
+)
 from nfriction.export.controller import controller_of
-from nfriction.export.errors import ContractError, ExportError
 from nfriction.export.onnx_file import onnx
+from nfriction.export.pt2_file import pt2
 from nfriction.export.simulators import DampingFit, fit_damping_frictionloss, mjcf, urdf
-from nfriction.export.torch_code.pt2 import pt2
-from nfriction.export.torch_code.torchscript import torchscript
+from nfriction.export.torchscript_file import torchscript
 from nfriction.export.verification import Verdict, verify_artefact
 
 __all__ = [

@@ -60,12 +60,8 @@ def controller_of(
             "a filter needs `ModelInfo.sample_time` [s], got None: none was given, or the model "
             "was fitted to recordings of different ones."
         )
-    return Controller(
-        model,
-        info,
-        torque_limit,
-        SecondOrderLowPass(numbers("cutoff_hz", cutoff_hz), float(info.sample_time)),
-    )
+    low_pass = SecondOrderLowPass(numbers("cutoff_hz", cutoff_hz), float(info.sample_time))
+    return Controller(model, info, torque_limit, low_pass)
 
 
 class Controller(nn.Module):
@@ -134,15 +130,11 @@ class Controller(nn.Module):
         self.b0, self.b1, self.b2, self.a1, self.a2, self.sample_time = 6 * (0.0,)
         self.filter_options: dict[str, float] | None = None
         if low_pass is not None:
-            (self.b0, self.b1, self.b2), (_, self.a1, self.a2) = (
-                c.tolist() for c in low_pass.coefficients
-            )
+            numerator, denominator = (c.tolist() for c in low_pass.coefficients)
+            (self.b0, self.b1, self.b2), (_, self.a1, self.a2) = numerator, denominator
             self.sample_time = float(low_pass.sample_time)
-            self.filter_options = {
-                "cutoff_hz": float(low_pass.cutoff_hz),
-                "damping": float(low_pass.damping),
-                "sample_time": self.sample_time,
-            }
+            names = ("cutoff_hz", "damping", "sample_time")
+            self.filter_options = {name: float(getattr(low_pass, name)) for name in names}
 
     @torch.jit.unused
     def forward(self, *given: Tensor) -> tuple[Tensor, ...]:
@@ -267,10 +259,7 @@ def run_in_order(
 ) -> tuple[Tensor, ...]:
     """Torque, coefficients and status of samples in order, (sample, joint, ...).
 
-    Args:
-        step: takes one sample of each input and the state, gives the next state last.
-        inputs: (sample, joint) each.
-        state: before the first sample.
+    `step` takes one sample of each input and the state, and gives the next state last.
     """
     found = []
     for sample in zip(*inputs, strict=True):

@@ -1,19 +1,32 @@
-"""ONNX: a graph for ONNX Runtime and its kin, in double or single precision."""
+"""ONNX: a graph for ONNX Runtime and its kin, in double or single precision.
+
+torch's own exporter writes Python numbers as float32 and leaves `Atan` in double, for which ONNX
+Runtime has no kernel; either costs a controller its parity. Whatever depends on parameters alone is
+computed here and written as a constant.
+"""
 
 import importlib
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from nfriction.export.contract import OUTPUTS, Contract, Runner, contract_of, write_verified
+from nfriction.export.contract import (
+    OUTPUTS,
+    Contract,
+    ExportError,
+    Runner,
+    contract_of,
+    first_line,
+    write_verified,
+)
 from nfriction.export.controller import controller_of, for_single_precision
-from nfriction.export.errors import ExportError, first_line
-from nfriction.export.onnx_graph import OnnxGraph
-from nfriction.export.torch_code.archive import METADATA
-from nfriction.export.torch_code.pt2 import exported, run_from_nan, silent
+from nfriction.export.pt2_file import exported, run_from_nan, silent
+from nfriction.export.torch_archive import METADATA
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_info import ModelInfo
 
@@ -21,6 +34,250 @@ from nfriction.io.model_info import ModelInfo
 OPSET, IR_VERSION = 18, 8
 LARGEST_FILE = 256 * 2**20
 REAL = {"float64": np.float64, "float32": np.float32}
+
+
+class Value(NamedTuple):
+    """A value known at run time only: its name in the graph and its type in torch."""
+
+    name: str
+    dtype: torch.dtype
+
+
+class Unknown(int):
+    """The size of the batch, known at run time only; -1 as `view` spells it."""
+
+
+class OnnxGraph:
+    """Nodes and constants of a program.
+
+    Args:
+        program: of `torch.export`, decomposed, with a dynamic first axis.
+        inputs, outputs: names in the ONNX graph, in the program's order.
+        real: type of its floating-point tensors, `np.float64` or `np.float32`.
+
+    Attributes:
+        nodes: ONNX nodes, in order.
+        constants: arrays that they read, by name.
+
+    Raises:
+        ExportError: an operation has no translation; it is named.
+    """
+
+    def __init__(
+        self,
+        program: torch.export.ExportedProgram,
+        inputs: Sequence[str],
+        outputs: Sequence[str],
+        real: Any,
+    ) -> None:
+        self.real = np.dtype(real)
+        self.helper = importlib.import_module("onnx.helper")
+        self.nodes: list[Any] = []
+        self.constants: dict[str, np.ndarray] = {}
+        self._known: dict[tuple[Any, ...], str] = {}
+        owned = _owned(program)
+        values: dict[Any, Any] = {}
+        names = iter(inputs)
+        for node in program.graph.nodes:
+            if node.op == "placeholder" and node.name in owned:
+                values[node] = owned[node.name]
+            elif node.op == "placeholder":
+                values[node] = Value(next(names), torch.float64)
+            elif node.op == "call_function":
+                values[node] = self._call(node, values)
+        for name, node in zip(outputs, program.graph.output_node().args[0], strict=True):
+            self._node("Identity", [self.name(values[node])], name)
+
+    def emit(
+        self, op: str, *operands: Any, dtype: torch.dtype | None = None, **attributes: Any
+    ) -> Value:
+        """Add a node, by default of its first operand's type; constants may be given as such."""
+        like = next(x.dtype for x in operands if isinstance(x, (Value, Tensor)))
+        value = Value(f"v{len(self.nodes)}", dtype or like)
+        self._node(op, [self.name(x, like) for x in operands], value.name, **attributes)
+        return value
+
+    def name(self, x: Any, like: torch.dtype = torch.float64) -> str:
+        """The name of a value, or of the constant that holds a tensor or number."""
+        if isinstance(x, Value):
+            return x.name
+        tensor = x.detach() if isinstance(x, Tensor) else torch.tensor(x, dtype=like)
+        array = np.ascontiguousarray(tensor.numpy())
+        if tensor.is_floating_point():
+            array = array.astype(self.real)
+        array = array.reshape(tuple(tensor.shape))
+        key = (str(array.dtype), array.shape, array.tobytes())
+        if key not in self._known:
+            self._known[key] = f"c{len(self.constants)}"
+            self.constants[self._known[key]] = array
+        return self._known[key]
+
+    def _node(self, op: str, inputs: list[str], output: str, **attributes: Any) -> None:
+        self.nodes.append(self.helper.make_node(op, inputs, [output], **attributes))
+
+    def _call(self, node: Any, values: dict[Any, Any]) -> Any:
+        """Result of a node of the program: a value, or a tensor where all is known."""
+        args, kwargs = torch.fx.node.map_arg((node.args, node.kwargs), lambda n: values[n])
+        if not any(isinstance(values[n], (Value, Unknown)) for n in node.all_input_nodes):
+            return node.target(*args, **kwargs)
+        name = str(node.target).removeprefix("aten.").partition(".")[0]
+        rule = _RULES.get(name)
+        if rule is None:
+            raise ExportError(
+                f"the operation `{node.target}` has no ONNX form here; export the model as "
+                "TorchScript, C or torch.export instead."
+            )
+        return rule(self, *args, **kwargs)
+
+
+def _owned(program: torch.export.ExportedProgram) -> dict[str, Tensor]:
+    """Parameters, buffers and constants, by the name of their placeholder."""
+    signature = program.graph_signature
+    held = {**program.state_dict, **program.constants}
+    placeholders = {
+        **signature.inputs_to_parameters,
+        **signature.inputs_to_buffers,
+        **signature.inputs_to_lifted_tensor_constants,
+    }
+    return {name: held[target].detach() for name, target in placeholders.items()}
+
+
+# Rules: the arguments are those of the ATen operation.
+
+Rule = Callable[..., Any]
+
+
+def _plain(op: str, dtype: torch.dtype | None = None) -> Rule:
+    return lambda g, *operands: g.emit(op, *operands, dtype=dtype)
+
+
+def _scaled(op: str) -> Rule:
+    def rule(g: OnnxGraph, a: Any, b: Any, alpha: float = 1) -> Value:
+        return g.emit(op, a, b if alpha == 1 else g.emit("Mul", b, alpha))
+
+    return rule
+
+
+def _integers(*numbers: int) -> Tensor:
+    return torch.tensor(numbers, dtype=torch.int64)
+
+
+def _not_equal(g: OnnxGraph, a: Any, b: Any) -> Value:
+    return g.emit("Not", g.emit("Equal", a, b, dtype=torch.bool))
+
+
+def _clamp(g: OnnxGraph, a: Any, low: Any = None, high: Any = None) -> Value:
+    raised = a if low is None else g.emit("Max", a, low)
+    return raised if high is None else g.emit("Min", raised, high)
+
+
+def _where(g: OnnxGraph, condition: Any, a: Any, b: Any) -> Value:
+    like = next(x.dtype for x in (a, b) if isinstance(x, (Value, Tensor)))
+    a, b = (x if isinstance(x, (Value, Tensor)) else torch.tensor(x, dtype=like) for x in (a, b))
+    return g.emit("Where", condition, a, b, dtype=like)
+
+
+def _cast(g: OnnxGraph, a: Value, dtype: torch.dtype | None = None, **_: Any) -> Value:
+    if dtype is None or dtype == a.dtype:
+        return a
+    return g.emit("Cast", a, dtype=dtype, to=_onnx_type(g, dtype))
+
+
+def _onnx_type(g: OnnxGraph, dtype: torch.dtype) -> int:
+    kind = g.real if dtype.is_floating_point else torch.zeros((), dtype=dtype).numpy().dtype
+    return int(g.helper.np_dtype_to_tensor_dtype(kind))
+
+
+def _full_like(g: OnnxGraph, a: Value, value: float, **_: Any) -> Value:
+    shape = g.emit("Shape", a, dtype=torch.int64)
+    return g.emit("Expand", torch.tensor(value, dtype=a.dtype), shape)
+
+
+def _select(g: OnnxGraph, a: Any, dim: int, index: int) -> Value:
+    return g.emit("Gather", a, torch.tensor(index), axis=dim)
+
+
+def _slice(
+    g: OnnxGraph, a: Any, dim: int = 0, start: Any = None, end: Any = None, step: int = 1
+) -> Value:
+    ends = (start or 0, 2**62 if end is None else end)
+    return g.emit("Slice", a, *(_integers(n) for n in (*ends, dim, step)))
+
+
+def _cat(g: OnnxGraph, parts: Sequence[Any], dim: int = 0) -> Value:
+    return g.emit("Concat", *parts, axis=dim)
+
+
+def _view(g: OnnxGraph, a: Any, size: Sequence[int]) -> Value:
+    if sum(n == -1 for n in size) > 1:
+        raise ExportError("a view with two sizes that are known at run time has no ONNX form here.")
+    return g.emit("Reshape", a, _integers(*size))
+
+
+def _softmax(g: OnnxGraph, a: Any, dim: int, _half_to_float: bool = False) -> Value:
+    return g.emit("Softmax", a, axis=dim)
+
+
+def _sum(g: OnnxGraph, a: Any, dim: Sequence[int], keepdim: bool = False, **_: Any) -> Value:
+    return g.emit("ReduceSum", a, _integers(*dim), keepdims=int(keepdim))
+
+
+def _atan(g: OnnxGraph, x: Value) -> Value:
+    """ONNX Runtime has Atan in single precision only; one Newton step makes it double."""
+    if g.real == np.float32:
+        return g.emit("Atan", x)
+    single = g.emit("Atan", g.emit("Cast", x, to=1))
+    y = g.emit("Cast", single, dtype=torch.float64, to=11)
+    # With s = sin y and c = cos y this is tan(arctan(x) - y), of which the arctangent is itself.
+    s, c = g.emit("Sin", y), g.emit("Sin", g.emit("Add", y, 0.5 * math.pi))
+    tangent = g.emit(
+        "Div",
+        g.emit("Sub", g.emit("Mul", x, c), s),
+        g.emit("Add", c, g.emit("Mul", x, s)),
+    )
+    return g.emit("Add", y, tangent)
+
+
+_RULES: dict[str, Rule] = {
+    **{
+        aten: _plain(op)
+        for aten, op in {
+            "abs": "Abs", "exp": "Exp", "neg": "Neg", "tanh": "Tanh", "log": "Log",
+            "sqrt": "Sqrt", "sin": "Sin", "sigmoid": "Sigmoid", "reciprocal": "Reciprocal",
+            "bitwise_not": "Not", "logical_not": "Not", "mul": "Mul", "div": "Div",
+            "maximum": "Max", "minimum": "Min", "pow": "Pow", "bitwise_or": "Or",
+            "logical_or": "Or", "bitwise_and": "And", "logical_and": "And", "bmm": "MatMul",
+        }.items()
+    },
+    **{
+        aten: _plain(op, torch.bool)
+        for aten, op in {
+            "eq": "Equal", "lt": "Less", "le": "LessOrEqual", "gt": "Greater",
+            "ge": "GreaterOrEqual",
+        }.items()
+    },
+    "add": _scaled("Add"),
+    "sub": _scaled("Sub"),
+    "ne": _not_equal,
+    "clamp": _clamp,
+    "where": _where,
+    "_to_copy": _cast,
+    "clone": lambda g, a, **_: a,
+    "alias": lambda g, a: a,
+    "full_like": _full_like,
+    "select": _select,
+    "slice": _slice,
+    "squeeze": lambda g, a, dim: g.emit("Squeeze", a, _integers(*dim)),
+    "unsqueeze": lambda g, a, dim: g.emit("Unsqueeze", a, _integers(dim)),
+    "cat": _cat,
+    "view": _view,
+    "permute": lambda g, a, dims: g.emit("Transpose", a, perm=list(dims)),
+    "_softmax": _softmax,
+    "sum": _sum,
+    "atan": _atan,
+    "sym_size": lambda g, a, dim: Unknown(-1),
+    "_assert_tensor_metadata": lambda g, *_, **__: None,
+}  # fmt: skip
 
 
 def onnx(
@@ -87,7 +344,7 @@ def open_onnx(path: str | Path) -> tuple[Contract, Runner]:
         ContractError: if its metadata are absent or damaged.
     """
     package = _package()
-    file, contract = _read(path)
+    file, contract = read_onnx(path)
     try:
         package.checker.check_model(file)
     except (ValueError, RuntimeError, package.checker.ValidationError) as error:
@@ -103,16 +360,11 @@ def open_onnx(path: str | Path) -> tuple[Contract, Runner]:
     return contract, lambda *x: run_from_nan(step, x, size)
 
 
-def contract_of_onnx(path: str | Path) -> Contract:
-    """Read the contract of an ONNX graph.
+def read_onnx(path: str | Path) -> tuple[Any, Contract]:
+    """Read a file as a protocol buffer, and its contract.
 
     Raises: as `open_onnx`.
     """
-    return _read(path)[1]
-
-
-def _read(path: str | Path) -> tuple[Any, Contract]:
-    """The file as a protocol buffer, and its contract."""
     package = _package()
     if Path(path).stat().st_size > LARGEST_FILE:
         raise ExportError(f"{path}: too large for a graph of nfriction.")
@@ -128,22 +380,18 @@ def _read(path: str | Path) -> tuple[Any, Contract]:
 def _package() -> Any:
     """The package `onnx`, which is an extra."""
     try:
-        package = importlib.import_module("onnx")
+        return importlib.import_module("onnx")
     except ImportError as error:
         raise ImportError(
             "ONNX needs the packages `onnx` and, to run it, `onnxruntime`; install them with "
             "`pip install nfriction[onnx]`."
         ) from error
-    return package
 
 
 def _model_file(
-    package: Any,
-    graph: OnnxGraph,
-    inputs: Sequence[str],
-    outputs: Sequence[str],
+    package: Any, graph: OnnxGraph, inputs: Sequence[str], outputs: Sequence[str],
     contract: Contract,
-) -> Any:
+) -> Any:  # fmt: skip
     """The whole file as a protocol buffer."""
     helper = package.helper
     real = helper.np_dtype_to_tensor_dtype(graph.real)

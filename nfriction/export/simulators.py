@@ -223,12 +223,7 @@ def patched(
     damping: Sequence[float],
     frictionloss: Sequence[float],
 ) -> bytes:
-    """A robot description with the friction of the named joints replaced.
-
-    Args:
-        path: an MJCF or URDF file, in UTF-8.
-        root: name of its root element, "mujoco" or "robot".
-        names, damping, frictionloss: of the joints.
+    """A robot description with that root element, and the friction of the named joints replaced.
 
     Raises:
         ValueError: if the file is of another kind, declares entities, or a joint is missing or

@@ -32,11 +32,6 @@ def draw(controller: Controller, count: int, seed: int = 0) -> Series:
     """Finite inputs to 10 % beyond the trained range, (sample, joint) each.
 
     Motions are drawn by `draw_motion`; positions are those of a swing, in successive samples.
-
-    Args:
-        controller: what will take them.
-        count: how many samples.
-        seed: of the draw.
     """
     qd, qdd, load = draw_motion(controller, count, seed)
     return (_sweep(controller, count), load) if controller.filters else (qd, qdd, load)

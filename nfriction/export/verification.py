@@ -10,15 +10,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.export.c_code.run import open_c
-from nfriction.export.contract import Contract, Parity, compare, contract_of
+from nfriction.export.c_code.export import open_c
+from nfriction.export.contract import (
+    Contract,
+    ContractError,
+    ExportError,
+    Parity,
+    compare,
+    contract_of,
+)
 from nfriction.export.controller import Controller, controller_of
-from nfriction.export.errors import ContractError, ExportError
-from nfriction.export.onnx_file import contract_of_onnx, open_onnx
+from nfriction.export.onnx_file import open_onnx, read_onnx
+from nfriction.export.pt2_file import open_pt2
 from nfriction.export.test_vectors import draw
-from nfriction.export.torch_code.archive import contract_of_archive
-from nfriction.export.torch_code.pt2 import open_pt2
-from nfriction.export.torch_code.torchscript import open_torchscript
+from nfriction.export.torch_archive import contract_of_archive
+from nfriction.export.torchscript_file import open_torchscript
 from nfriction.friction.models import FrictionModel
 from nfriction.io import sandbox
 from nfriction.io.model_info import ModelInfo
@@ -139,16 +145,9 @@ _INPUTS, _OUTPUTS = "inputs.npz", "outputs.npz"
 
 
 def open_apart(path: str | Path) -> tuple[Contract, Any]:
-    """Read the metadata of an artefact, and give a function that runs batches of samples by it.
-
-    Raises:
-        ExportError: if it is no artefact; when run, also if it holds more than arithmetic of
-            tensors, or ends the process that runs it.
-        ContractError: if its metadata are absent or damaged.
-        OSError: if it cannot be read.
-    """
+    """Read the metadata of an artefact, and give a function that runs batches of samples by it."""
     onnx = Path(path).suffix == ".onnx"
-    contract = contract_of_onnx(path) if onnx else contract_of_archive(path)
+    contract = read_onnx(path)[1] if onnx else contract_of_archive(path)
 
     def run(*batches: Sequence[Tensor]) -> list[tuple[Tensor, ...]]:
         with tempfile.TemporaryDirectory() as folder:
@@ -182,11 +181,7 @@ def main() -> None:
 
 
 def work(asked: Mapping[str, Any], folder: Path) -> None:
-    """Run batches of a file through an artefact, and write what comes out.
-
-    Args:
-        asked: `path` of the artefact, and for every one of `batches` its number of inputs.
-        folder: where inputs lie and outputs go.
+    """Run batches of inputs in the folder through the artefact at `path`, and write what comes out.
 
     Raises:
         ExportError, ContractError: as the openers do, or if its outputs are none of a controller.

@@ -13,7 +13,8 @@ import pytest
 from nfriction import LFM, ModelInfo, Recording, cli, rigs, save
 from nfriction.cli import verify
 from nfriction.cli.console import Parser
-from nfriction.export.c_code.run import find_compiler
+from nfriction.export.c_code.dialect import ControllerC
+from nfriction.export.c_code.export import find_compiler
 from tests.friction.samples import randomise
 
 RIG = rigs.tlrip()
@@ -77,6 +78,21 @@ def test_two_exports_link_into_one_program(tmp_path: Path) -> None:
     assert compiler is not None
     subprocess.run([*compiler, *sources, "-o", "both", "-lm"], cwd=tmp_path, check=True)
     assert subprocess.run([tmp_path / "both"], check=False).returncode == 30
+
+
+def test_exported_c_is_run_or_said_not_to_be(
+    model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ["export", str(model), "--format", "c", "--out", str(tmp_path / "out")]
+    if find_compiler() is not None:
+        assert cli.main(words) == 0
+        assert "not run" not in capsys.readouterr().out
+        monkeypatch.setattr(ControllerC, "literal", lambda self, value: "0.5")
+        assert cli.main(words) == 2
+        assert "lfm.c differs from its model" in capsys.readouterr().err
+    monkeypatch.setenv("CC", "absent-compiler")
+    assert cli.main(words) == 0
+    assert "lfm.c was not run here; run its self-test" in capsys.readouterr().out
 
 
 def test_artefacts_beside_a_model_leave_it_whole(model: Path) -> None:

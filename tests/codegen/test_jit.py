@@ -14,7 +14,7 @@ import torch
 
 from nfriction.codegen import NoBackend, compile_function
 from nfriction.codegen.llvm import jit
-from nfriction.export.c_code.run import find_compiler
+from nfriction.export.c_code.export import find_compiler
 
 F64 = torch.float64
 SOURCE = """

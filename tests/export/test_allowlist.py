@@ -11,10 +11,9 @@ import torch
 from torch import Tensor, nn
 
 from nfriction.export import ExportError, pt2, torchscript, verification, verify_artefact
-from nfriction.export.torch_code.allowlist import check_program, check_source
-from nfriction.export.torch_code.archive import METADATA
-from nfriction.export.torch_code.pt2 import open_pt2
-from nfriction.export.torch_code.torchscript import open_torchscript
+from nfriction.export.pt2_file import open_pt2
+from nfriction.export.torch_archive import METADATA, check_program, check_source
+from nfriction.export.torchscript_file import open_torchscript
 from nfriction.friction.models import LFM
 from tests.export.artefacts import INFO
 from tests.export.test_pt2 import rewritten

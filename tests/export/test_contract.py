@@ -10,12 +10,12 @@ from torch import Tensor
 
 from nfriction.export.contract import (
     Contract,
+    ContractError,
     compare,
     contract_of,
     verify,
 )
 from nfriction.export.controller import NOT_FINITE, controller_of
-from nfriction.export.errors import ContractError
 from nfriction.friction.laws import LINEAR
 from nfriction.friction.models import LFM, FrictionModel
 from nfriction.io.model_info import ModelInfo

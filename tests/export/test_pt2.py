@@ -8,12 +8,11 @@ import pytest
 import torch
 
 from nfriction.export import ExportError, pt2
-from nfriction.export.contract import compare, verify
+from nfriction.export.contract import ContractError, compare, verify
 from nfriction.export.controller import controller_of
-from nfriction.export.errors import ContractError
+from nfriction.export.pt2_file import open_pt2
 from nfriction.export.test_vectors import draw
-from nfriction.export.torch_code.archive import METADATA
-from nfriction.export.torch_code.pt2 import open_pt2
+from nfriction.export.torch_archive import METADATA
 from nfriction.friction.models import FrictionModel
 from tests.export.artefacts import INFO, rising
 from tests.friction.samples import motion, named_models

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from nfriction.export.controller import controller_of
-from nfriction.export.torch_code.single_sample import SingleSample, with_single_sample
+from nfriction.export.neurofuzzy import SingleSample, with_single_sample
 from nfriction.friction.laws import NONLINEAR
 from nfriction.friction.models import LFM, FrictionModel
 from nfriction.friction.neurofuzzy import NFLFM, NFNCFM, NFNLFM, NeuroFuzzy

@@ -14,8 +14,8 @@ from nfriction.export import ExportError, torchscript
 from nfriction.export.contract import compare, verify
 from nfriction.export.controller import controller_of
 from nfriction.export.test_vectors import draw
-from nfriction.export.torch_code.archive import METADATA
-from nfriction.export.torch_code.torchscript import open_torchscript, sample_inputs
+from nfriction.export.torch_archive import METADATA
+from nfriction.export.torchscript_file import open_torchscript, sample_inputs
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law, TorqueFunction
 from nfriction.friction.models import LFM, FrictionModel

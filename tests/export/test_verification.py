@@ -18,7 +18,7 @@ from nfriction.export import (
     torchscript,
     verify_artefact,
 )
-from nfriction.export.c_code.run import find_compiler
+from nfriction.export.c_code.export import find_compiler
 from nfriction.export.contract import Contract, verify
 from nfriction.friction.models import LFM, NFNLFM
 from tests.export.artefacts import INFO

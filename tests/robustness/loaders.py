@@ -25,12 +25,18 @@ import torch
 
 from nfriction import LFM, NFLFM, NLFM, ModelInfo, save
 from nfriction.export import onnx, pt2, torchscript
-from nfriction.export.contract import Contract, ContractError, Runner, contract_of, verify
+from nfriction.export.contract import (
+    Contract,
+    ContractError,
+    ExportError,
+    Runner,
+    contract_of,
+    verify,
+)
 from nfriction.export.controller import controller_of
-from nfriction.export.errors import ExportError
 from nfriction.export.onnx_file import open_onnx
-from nfriction.export.torch_code.pt2 import open_pt2
-from nfriction.export.torch_code.torchscript import open_torchscript
+from nfriction.export.pt2_file import open_pt2
+from nfriction.export.torchscript_file import open_torchscript
 from nfriction.io.formats import matlab, mdf
 from nfriction.io.formats.signals import load_signals, save_signals
 from nfriction.io.model_file import ModelFileError, load, load_info, load_plant

@@ -3,7 +3,6 @@
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,15 +12,14 @@ from torch import Tensor
 from nfriction.codegen.errors import UnsupportedOperation
 from nfriction.codegen.graph import Program, trace
 from nfriction.codegen.scalar import Node, evaluate, reachable
-from nfriction.export.c_code.dialect import ControllerC, Real, comment
-from nfriction.export.c_code.emit import statements
+from nfriction.export.c_code.dialect import ControllerC, Real, comment, statements
+from nfriction.export.contract import ExportError
 from nfriction.export.controller import (
     FILTER_STATE,
     UNBOUNDED,
     Controller,
     for_single_precision,
 )
-from nfriction.export.errors import ExportError
 from nfriction.export.neurofuzzy import tables
 from nfriction.friction.models import FrictionModel
 
@@ -43,29 +41,10 @@ _LN2: dict[Real, tuple[float, float]] = {
 }
 
 
-@dataclass(frozen=True)
-class Source:
-    """The texts of an export.
-
-    Attributes:
-        code: the `.c` file.
-        header: the `.h` file.
-    """
-
-    code: str
-    header: str
-
-
 def source_of(
     controller: Controller, description: Mapping[str, Any], dialect: ControllerC, name: str
-) -> Source:
-    """C of a controller.
-
-    Args:
-        controller: of `controller_of`.
-        description: of the contract, for the header's comment.
-        dialect: the C.
-        name: of the files, without suffix.
+) -> tuple[str, str]:
+    """Texts of a controller's `.c` and `.h`; the description is for the header's comment.
 
     Raises:
         ExportError: if the law or schedule uses an operation that has no C form, or a number of
@@ -95,7 +74,8 @@ def source_of(
     )
     code = "\n".join([head, dialect.functions(body), body])
     header = dialect.text("controller.h", **words)
-    return Source(*(re.sub(r"\n{3,}", "\n\n", text) for text in (code, header)))
+    code, header = (re.sub(r"\n{3,}", "\n\n", text) for text in (code, header))
+    return code, header
 
 
 def _words(controller: Controller, dialect: ControllerC) -> dict[str, Any]:
@@ -193,13 +173,8 @@ _DEEP = 40.0
 
 
 def _deepest(slope: Tensor, shift: Tensor) -> float:
-    """Largest exponent (slope x + shift)^2 of the nearest set, over inputs of -1 to 1.
-
-    It lies at an end of the range, or where two sets are alike.
-
-    Args:
-        slope, shift: (joint, input, set).
-    """
+    """Largest exponent (slope x + shift)^2 of the nearest set, over inputs of -1 to 1."""
+    # It lies at an end of the range, or where two sets are alike.
     meetings = [
         (sign * shift[..., :, None] - shift[..., None, :])
         / (slope[..., None, :] - sign * slope[..., :, None])
@@ -225,10 +200,8 @@ def _law(
 ) -> str:
     """The law as C: of joint j in a loop, or of every joint where they differ.
 
-    Args:
-        coefficients: name of the array that they are read from.
-        signs: filled with the arguments of hyperbolic tangents of the motion alone, which are then
-            read from `sign`; None to leave such calls in place.
+    `signs` is filled with the arguments of hyperbolic tangents of the motion alone, which are then
+    read from `sign`; where it is None such calls stay in place.
     """
     names = ("qd", "load", "c")
 

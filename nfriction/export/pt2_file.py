@@ -12,12 +12,17 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from nfriction.export.contract import Contract, Runner, contract_of, write_verified
+from nfriction.export.contract import (
+    Contract,
+    ExportError,
+    Runner,
+    contract_of,
+    first_line,
+    write_verified,
+)
 from nfriction.export.controller import Controller, controller_of, run_in_order
-from nfriction.export.errors import ExportError, first_line
 from nfriction.export.test_vectors import draw
-from nfriction.export.torch_code.allowlist import check_program
-from nfriction.export.torch_code.archive import METADATA, contents, repacked
+from nfriction.export.torch_archive import METADATA, check_program, contents, repacked
 from nfriction.friction.models import FrictionModel
 from nfriction.io import strict_json
 from nfriction.io.model_info import ModelInfo
@@ -98,15 +103,8 @@ def open_pt2(path: str | Path) -> tuple[Contract, Runner]:
     try:
         with silent():
             module = torch.export.load(repacked(files)).module()
-    except (
-        RuntimeError,
-        ArithmeticError,
-        AttributeError,
-        AssertionError,
-        LookupError,
-        TypeError,
-        ValueError,
-    ) as error:
+    except (RuntimeError, ArithmeticError, AttributeError, AssertionError, LookupError, TypeError,
+            ValueError) as error:  # fmt: skip
         raise ExportError(f"{path}: no program of nfriction ({first_line(error)}).") from error
     size = contract.state_size
 
@@ -135,13 +133,7 @@ def _refuse_foreign_objects(path: str | Path, files: Mapping[str, bytes]) -> Non
 
 
 def run_from_nan(step: Any, inputs: Sequence[Tensor], state_size: int) -> tuple[Any, ...]:
-    """Run a program over samples in order; its state starts as NaN.
-
-    Args:
-        step: takes the inputs and, where there is one, the state, (batch, joint, ...) each.
-        inputs: (sample, joint) each.
-        state_size: numbers a joint that it carries from sample to sample.
-    """
+    """Run a program over samples (sample, joint) in order; its state, if any, starts as NaN."""
     if not state_size:
         return tuple(step(*inputs))
     state = inputs[0].new_full((1, inputs[0].shape[1], state_size), math.nan)

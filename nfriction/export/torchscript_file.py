@@ -11,12 +11,18 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from nfriction.export.contract import Contract, Runner, contract_of, verify
+from nfriction.export.contract import (
+    Contract,
+    ContractError,
+    ExportError,
+    Runner,
+    contract_of,
+    first_line,
+    verify,
+)
 from nfriction.export.controller import Controller, controller_of, run_in_order
-from nfriction.export.errors import ExportError, first_line
-from nfriction.export.torch_code.allowlist import check_script, check_source
-from nfriction.export.torch_code.archive import METADATA, contents, repacked
-from nfriction.export.torch_code.single_sample import with_single_sample
+from nfriction.export.neurofuzzy import with_single_sample
+from nfriction.export.torch_archive import METADATA, check_script, check_source, contents, repacked
 from nfriction.friction.models import FrictionModel
 from nfriction.io.atomic import atomic_write
 from nfriction.io.model_info import ModelInfo
@@ -78,13 +84,7 @@ def torchscript(
 
 
 def run_torchscript(module: Any, inputs: Sequence[Tensor], state_size: int) -> tuple[Tensor, ...]:
-    """Torque, coefficients and status of samples in order, as `verify` asks for them.
-
-    Args:
-        module: what `torch.jit.load` gave.
-        inputs: (sample, joint) each.
-        state_size: numbers a joint that the module carries from sample to sample.
-    """
+    """Torque, coefficients and status of samples (sample, joint) in order, for `verify`."""
     if not state_size:
         return tuple(module.step(*inputs))
     # The load, which comes last, has no part in the state.
@@ -103,29 +103,26 @@ def open_torchscript(path: str | Path) -> tuple[Contract, Runner]:
         OSError: if it cannot be read.
     """
     files = contents(path, _OURS, "TorchScript")
+    # Pickles of line numbers are not looked at, and so not handed on.
+    needed = {name: x for name, x in files.items() if not name.endswith(".debug_pkl")}
     try:
         for name, content in files.items():
             check_source(name, content)
-    except ExportError as error:
-        raise ExportError(f"{path}: {error}") from None
-    contract = Contract.from_json(files.get(f"extra/{METADATA}", b""))
-    # Pickles of line numbers are not looked at, and so not handed on.
-    needed = {name: x for name, x in files.items() if not name.endswith(".debug_pkl")}
-    with _silent():
-        try:
+        contract = Contract.from_json(files.get(f"extra/{METADATA}", b""))
+        with _silent():
             module = torch.jit.load(repacked(needed), map_location="cpu")
-            graphs = [getattr(module, name).inlined_graph for name in _methods(module)]
-        except (RuntimeError, ValueError, LookupError, AttributeError, TypeError) as error:
-            raise ExportError(f"{path}: no TorchScript ({first_line(error)}).") from error
-    if not hasattr(module, "step"):
-        raise ExportError(f"{path}: a TorchScript, but none of nfriction: it has no `step`.")
-    try:
-        for graph in graphs:
-            check_script(graph)
+        if not hasattr(module, "step"):
+            raise ExportError("a TorchScript, but none of nfriction: it has no `step`.")
+        for name in _methods(module):
+            check_script(getattr(module, name).inlined_graph)
     except ExportError as error:
         raise ExportError(f"{path}: {error}") from None
+    except ContractError:
+        raise
     except RecursionError:
         raise ExportError(f"{path}: nested without end.") from None
+    except (RuntimeError, ValueError, LookupError, AttributeError, TypeError) as error:
+        raise ExportError(f"{path}: no TorchScript ({first_line(error)}).") from error
     size = contract.state_size
 
     @torch.no_grad()

@@ -1,18 +1,81 @@
-"""Allowlist of what a program of torch may hold: arithmetic of tensors, and nothing else.
+"""Artefacts of torch, read without torch, and refused unless they are arithmetic of tensors.
 
 torch evaluates sizes and guards of a `.pt2` as Python, resolves names of functions in it, and a
-TorchScript may read and write files. Whatever is not on the list is refused unread.
+TorchScript may read and write files. Whatever is not on a list here is refused unread.
 """
 
+import io
 import re
-from collections.abc import Iterator
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import torch
 
 from nfriction.codegen.operations import supported_operations
-from nfriction.export.errors import ExportError
+from nfriction.export.contract import Contract, ExportError, first_line
+
+# Name under which the metadata lie in an artefact.
+METADATA = "nfriction.json"
+LARGEST = 256 * 2**20
+_DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError,
+            ValueError, LookupError, OverflowError)  # fmt: skip
+
+
+def contents(path: str | Path, ours: re.Pattern[str], what: str) -> dict[str, bytes]:
+    """All files of an archive by their name inside its one folder.
+
+    Raises:
+        ExportError: it is damaged, too large, or holds names other than `ours`.
+        OSError: it cannot be read.
+    """
+    found: dict[str, bytes] = {}
+    known: set[str] = set()
+    if Path(path).stat().st_size > LARGEST:
+        raise ExportError(f"{path}: too large for a {what} of nfriction.")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = archive.infolist()
+            if sum(max(entry.file_size, entry.compress_size) for entry in entries) > LARGEST:
+                raise ExportError(f"{path}: too large for a {what} of nfriction.")
+            for entry in entries:
+                name = entry.filename.partition("/")[2]
+                # torch looks for names without regard to case.
+                if name.lower() in known or not ours.fullmatch(name):
+                    raise ExportError(f"{path}: holds {entry.filename[:80]!r}, which is not ours.")
+                known.add(name.lower())
+                found[name] = archive.read(entry)
+    except _DAMAGED as error:
+        if isinstance(error, ExportError):
+            raise
+        raise ExportError(f"{path}: no {what} of nfriction ({first_line(error)}).") from error
+    return found
+
+
+def repacked(files: Mapping[str, bytes]) -> io.BytesIO:
+    """An archive of just these files, so that torch reads what was looked at."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(f"archive/{name}", content)
+    buffer.seek(0)
+    return buffer
+
+
+def contract_of_archive(path: str | Path) -> Contract:
+    """Read the contract of an artefact of torch.
+
+    Raises:
+        ExportError: it is no archive, or too large.
+        ContractError: its metadata are absent or damaged.
+        OSError: it cannot be read.
+    """
+    found = contents(path, re.compile(r"(?s).*"), "artefact")
+    return Contract.from_json(found.get(f"extra/{METADATA}", b""))
+
 
 # ATen operations on tensors besides those that can be compiled, without the "_" of in-place forms.
 _MORE = """
@@ -86,18 +149,13 @@ def check_program(document: Any) -> None:
 
 
 def check_source(name: str, content: bytes) -> None:
-    """Refuse a file of a TorchScript that does more than arithmetic of tensors as it is loaded.
-
-    torch evaluates defaults of arguments and constants of classes then, before a graph is there,
-    and lets objects of its own classes restore themselves.
-
-    Args:
-        name: of the file in the archive.
-        content: of the file.
+    """Refuse a file in a TorchScript that does more than arithmetic of tensors as it is loaded.
 
     Raises:
         ExportError: names what it holds.
     """
+    # torch evaluates defaults of arguments and constants of classes then, before a graph is there,
+    # and lets objects of its own classes restore themselves.
     found: set[bytes] = set()
     if name.endswith(".py"):
         found |= {*_DETOUR.findall(content)} | (_foreign_words() & {*_DOTTED.findall(content)})

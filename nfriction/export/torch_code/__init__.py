@@ -1,1 +1,0 @@
-"""Artefacts of torch: TorchScript and `torch.export` programs, read back with suspicion."""
