@@ -150,24 +150,9 @@ def _sign(g: Graph, a: Nodes) -> Nodes:
     return where(g, _gt(g, a, 0.0), 1.0, where(g, numbers(g, "lt", a, 0.0), -1.0, 0.0))
 
 
-@handles("silu")
-def _silu(g: Graph, a: Nodes) -> Nodes:
-    return numbers(g, "mul", a, _sigmoid(g, a))
-
-
 @handles("addcmul")
 def _addcmul(g: Graph, a: Nodes, b: Nodes, c: Nodes, value: float = 1) -> Nodes:
     return add(g, a, numbers(g, "mul", b, c), value)
-
-
-@handles("addcdiv")
-def _addcdiv(g: Graph, a: Nodes, b: Nodes, c: Nodes, value: float = 1) -> Nodes:
-    return add(g, a, numbers(g, "div", b, c), value)
-
-
-@handles("lerp")
-def _lerp(g: Graph, a: Nodes, b: Nodes, weight: Any) -> Nodes:
-    return add(g, a, numbers(g, "mul", weight, sub(g, b, a)))
 
 
 @handles("relu")
@@ -187,15 +172,10 @@ def _remainder(g: Graph, a: Any, b: Any) -> Nodes:
     return elementwise(g, remainder, a, b)
 
 
-@handles("clamp")
+@handles("clamp", "clamp_min")
 def _clamp(g: Graph, a: Nodes, min: Any = None, max: Any = None) -> Nodes:
     raised = a if min is None else numbers(g, "max", a, min)
     return raised if max is None else numbers(g, "min", raised, max)
-
-
-@handles("clamp_min")
-def _clamp_min(g: Graph, a: Nodes, min: Any) -> Nodes:
-    return _clamp(g, a, min=min)
 
 
 @handles("clamp_max")
@@ -290,22 +270,19 @@ def _prod(g: Graph, a: Nodes, dim: Any = None, keepdim: bool = False, **_: Any) 
     return _reduce(g, lambda xs: g.total(xs, "mul"), a, dim, keepdim)
 
 
-@handles("amax", "max")
-def _amax(g: Graph, a: Nodes, dim: Any = None, keepdim: bool = False) -> Nodes:
-    if isinstance(dim, int):
-        raise UnsupportedOperation("max.dim", "returns indices; use `torch.amax`")
-    if isinstance(dim, np.ndarray):
-        return numbers(g, "max", a, dim)
-    return _reduce(g, lambda xs: g.total(xs, "max"), a, dim, keepdim)
+def _extreme(op: str) -> Operation:
+    def extreme(g: Graph, a: Nodes, dim: Any = None, keepdim: bool = False) -> Nodes:
+        if isinstance(dim, int):
+            raise UnsupportedOperation(f"{op}.dim", f"returns indices; use `torch.a{op}`")
+        if isinstance(dim, np.ndarray):
+            return numbers(g, op, a, dim)
+        return _reduce(g, lambda xs: g.total(xs, op), a, dim, keepdim)
+
+    return extreme
 
 
-@handles("amin", "min")
-def _amin(g: Graph, a: Nodes, dim: Any = None, keepdim: bool = False) -> Nodes:
-    if isinstance(dim, int):
-        raise UnsupportedOperation("min.dim", "returns indices; use `torch.amin`")
-    if isinstance(dim, np.ndarray):
-        return numbers(g, "min", a, dim)
-    return _reduce(g, lambda xs: g.total(xs, "min"), a, dim, keepdim)
+_amax = OPERATIONS["amax"] = OPERATIONS["max"] = _extreme("max")
+OPERATIONS["amin"] = OPERATIONS["min"] = _extreme("min")
 
 
 @handles("logsumexp")
@@ -324,11 +301,6 @@ def _logsumexp(g: Graph, a: Nodes, dim: Any, keepdim: bool = False) -> Nodes:
 def _softmax(g: Graph, a: Nodes, dim: int, half_to_float: bool) -> Nodes:
     exps = numbers(g, "exp", sub(g, a, _amax(g, a, [dim], True)))
     return numbers(g, "mul", exps, reciprocal(g, _sum(g, exps, dim, True)))
-
-
-@handles("_log_softmax")
-def _log_softmax(g: Graph, a: Nodes, dim: int, half_to_float: bool) -> Nodes:
-    return sub(g, a, _logsumexp(g, a, dim, True))
 
 
 @handles("cumsum")
@@ -390,17 +362,24 @@ def _to_copy(g: Graph, a: Nodes, dtype: Any = None, **_: Any) -> Nodes:
     return numbers(g, "trunc", a)
 
 
-@handles("copy")
+@handles("copy", "fill")
 def _copy(g: Graph, a: Nodes, source: Any, non_blocking: bool = False) -> Nodes:
     return np.broadcast_to(elementwise(g, lambda x: number(g, x), source), a.shape)
 
 
-@handles("fill")
-def _fill(g: Graph, a: Nodes, value: Any) -> Nodes:
-    return _copy(g, a, value)
+@handles("new_full")
+def _full(g: Graph, a: Nodes, size: Sequence[int] | None, value: Any, **_: Any) -> Nodes:
+    shape = a.shape if size is None else size
+    return elementwise(g, lambda x: x, np.broadcast_to(as_nodes(g, value), shape))
 
 
-@handles("zero", "zeros_like", "new_zeros")
+@handles("full_like")
+def _full_like(g: Graph, a: Nodes, value: Any, **_: Any) -> Nodes:
+    return _full(g, a, None, value)
+
+
+# Memory that torch leaves uninitialised is zero, so that a trace does not depend on chance.
+@handles("zero", "zeros_like", "new_zeros", "empty_like", "new_empty")
 def _zeros(g: Graph, a: Nodes, size: Sequence[int] | None = None, **_: Any) -> Nodes:
     return _full(g, a, size, 0.0)
 
@@ -408,23 +387,6 @@ def _zeros(g: Graph, a: Nodes, size: Sequence[int] | None = None, **_: Any) -> N
 @handles("ones_like", "new_ones")
 def _ones(g: Graph, a: Nodes, size: Sequence[int] | None = None, **_: Any) -> Nodes:
     return _full(g, a, size, 1.0)
-
-
-@handles("empty_like", "new_empty")
-def _empty(g: Graph, a: Nodes, size: Sequence[int] | None = None, **_: Any) -> Nodes:
-    return _full(g, a, size, 0.0)
-
-
-@handles("new_full")
-def _full(g: Graph, a: Nodes, size: Sequence[int] | None, value: Any, **_: Any) -> Nodes:
-    return elementwise(
-        g, lambda x: x, np.broadcast_to(as_nodes(g, value), a.shape if size is None else size)
-    )
-
-
-@handles("full_like")
-def _full_like(g: Graph, a: Nodes, value: Any, **_: Any) -> Nodes:
-    return _full(g, a, None, value)
 
 
 @handles("view", "_unsafe_view", "reshape", "_reshape_alias")

@@ -198,7 +198,11 @@ class _Walk:
         if value.layout is not torch.strided:
             raise Incomparable(f"a tensor with layout {value.layout}")
         exact = value.float() if value.dtype is torch.bfloat16 else value  # NumPy has none
-        self.parts += (value.shape, value.dtype, exact.numpy(force=True).tobytes())
+        try:
+            content = exact.numpy(force=True).tobytes()
+        except RuntimeError:  # within `torch.func`, for example
+            raise Incomparable("a tensor without memory of its own") from None
+        self.parts += (value.shape, value.dtype, content)
 
     def _array(self, value: Any) -> None:
         if value.dtype.hasobject:

@@ -134,3 +134,14 @@ def test_what_cannot_be_compared_is_named(value, named):
         chain = [chain]
     with pytest.raises(Incomparable, match="too long"):
         fingerprint((), chain)
+
+
+def test_tensors_of_a_transformation_cannot_be_compared():
+    def function(x):
+        with pytest.raises(Incomparable, match="memory of its own"):
+            fingerprint((), x)
+        return x.sum()
+
+    torch.func.vmap(function)(torch.ones(2, 2))
+    with pytest.raises(Incomparable, match="memory of its own"):
+        fingerprint((), torch.ones(2, device="meta"))
