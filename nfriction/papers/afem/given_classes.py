@@ -23,7 +23,7 @@ from nfriction.papers.afem.adaptive import CLASSES, Adaptive
 from nfriction.papers.afem.classes import AccelerationClasses, ClassOptions, find_classes
 from nfriction.plant import Plant
 from nfriction.signals import Motion
-from nfriction.simulation.compiled import integrate_compiled
+from nfriction.simulation.compiled import System, integrate_compiled
 from nfriction.simulation.protocols import RolloutInputs
 from nfriction.simulation.rollout import Rollout, integrate
 
@@ -135,7 +135,8 @@ class PositionError:
         q0, qd0 = of.q0[w].expand(m, -1), of.qd0[w].expand(m, -1)
         inputs = RolloutInputs(q0, qd0, of.tau[w], of.step[w], self.substeps, measured, memory)
         # All candidates of a window in one call; without a compiler one after the other.
-        states = integrate_compiled(self.plant, self.friction, inputs, "auto", self.threads, own)
+        system = System.of(self.plant, self.friction)
+        states = integrate_compiled(system, inputs, "auto", self.threads, own)
         if states is not None:
             return states[0]
         schedule = self.friction.schedule
