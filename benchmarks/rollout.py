@@ -158,6 +158,7 @@ def main(argv: list[str] | None = None) -> int:
         print(f"  {label}")
         ratio(times, "ours, compiled", "C by hand", limits[0], True)
         ratio(times, "ours, bare", "C by hand", limits[0], True)
+        ratio(times, "ours, compiled", "ours, bare", 1.1, True)
         ratio(times, "diffrax", "ours, compiled", limits[1], False)
     ratio(plain, "MuJoCo", "ours, compiled", 30.0, False)
     ratio(fuzzy, "ours, torch", "ours, compiled", 300.0, False)

@@ -20,12 +20,13 @@ from nfriction.codegen.rollout import (
     compile_rollout,
     trace_rollout,
 )
-from nfriction.codegen.staleness import fingerprint
+from nfriction.codegen.staleness import Fingerprint, fingerprint
 
 __all__ = [
     "CodegenError",
     "CompiledFunction",
     "CompiledRollout",
+    "Fingerprint",
     "Incomparable",
     "NoBackend",
     "RolloutSignals",

@@ -107,25 +107,10 @@ def sub(g: Graph, a: Any, b: Any, alpha: float = 1) -> Nodes:
     return numbers(g, "sub", a, numbers(g, "mul", b, alpha))
 
 
-@handles("rsub")
-def _rsub(g: Graph, a: Any, b: Any, alpha: float = 1) -> Nodes:
-    return sub(g, b, a, alpha)
-
-
 @handles("div")
 def div(g: Graph, a: Any, b: Any, rounding_mode: str | None = None) -> Nodes:
     quotient = numbers(g, "div", a, b)
     return quotient if rounding_mode is None else numbers(g, rounding_mode, quotient)
-
-
-@handles("reciprocal")
-def reciprocal(g: Graph, a: Nodes) -> Nodes:
-    return div(g, 1.0, a)
-
-
-@handles("rsqrt")
-def _rsqrt(g: Graph, a: Nodes) -> Nodes:
-    return div(g, 1.0, numbers(g, "sqrt", a))
 
 
 @handles("sigmoid")
@@ -137,42 +122,12 @@ def _sigmoid(g: Graph, a: Nodes) -> Nodes:
 def _softplus(g: Graph, a: Nodes, beta: float = 1, threshold: float = 20) -> Nodes:
     scaled = numbers(g, "mul", a, beta)
     soft = div(g, numbers(g, "log1p", numbers(g, "exp", scaled)), beta)
-    return where(g, _gt(g, scaled, threshold), a, soft)
-
-
-@handles("hypot")
-def _hypot(g: Graph, a: Nodes, b: Nodes) -> Nodes:
-    return numbers(g, "sqrt", add(g, numbers(g, "mul", a, a), numbers(g, "mul", b, b)))
+    return where(g, numbers(g, "lt", threshold, scaled), a, soft)
 
 
 @handles("sign", "sgn")
 def _sign(g: Graph, a: Nodes) -> Nodes:
-    return where(g, _gt(g, a, 0.0), 1.0, where(g, numbers(g, "lt", a, 0.0), -1.0, 0.0))
-
-
-@handles("silu")
-def _silu(g: Graph, a: Nodes) -> Nodes:
-    return numbers(g, "mul", a, _sigmoid(g, a))
-
-
-@handles("addcmul")
-def _addcmul(g: Graph, a: Nodes, b: Nodes, c: Nodes, value: float = 1) -> Nodes:
-    return add(g, a, numbers(g, "mul", b, c), value)
-
-
-@handles("addcdiv")
-def _addcdiv(g: Graph, a: Nodes, b: Nodes, c: Nodes, value: float = 1) -> Nodes:
-    return add(g, a, numbers(g, "div", b, c), value)
-
-
-@handles("lerp")
-def _lerp(g: Graph, a: Nodes, b: Nodes, weight: Any) -> Nodes:
-    return add(g, a, numbers(g, "mul", weight, sub(g, b, a)))
-
-
-@handles("relu")
-def _relu(g: Graph, a: Nodes) -> Nodes:
-    return numbers(g, "max", a, 0.0)
+    return where(g, numbers(g, "lt", 0.0, a), 1.0, where(g, numbers(g, "lt", a, 0.0), -1.0, 0.0))
 
 
 @handles("remainder")
@@ -187,35 +142,10 @@ def _remainder(g: Graph, a: Any, b: Any) -> Nodes:
     return elementwise(g, remainder, a, b)
 
 
-@handles("clamp")
+@handles("clamp", "clamp_min")
 def _clamp(g: Graph, a: Nodes, min: Any = None, max: Any = None) -> Nodes:
     raised = a if min is None else numbers(g, "max", a, min)
     return raised if max is None else numbers(g, "min", raised, max)
-
-
-@handles("clamp_min")
-def _clamp_min(g: Graph, a: Nodes, min: Any) -> Nodes:
-    return _clamp(g, a, min=min)
-
-
-@handles("clamp_max")
-def _clamp_max(g: Graph, a: Nodes, max: Any) -> Nodes:
-    return _clamp(g, a, max=max)
-
-
-@handles("gt")
-def _gt(g: Graph, a: Any, b: Any) -> Nodes:
-    return numbers(g, "lt", b, a)
-
-
-@handles("ge")
-def _ge(g: Graph, a: Any, b: Any) -> Nodes:
-    return numbers(g, "le", b, a)
-
-
-@handles("isnan")
-def _isnan(g: Graph, a: Nodes) -> Nodes:
-    return numbers(g, "ne", a, a)
 
 
 @handles("where")
@@ -229,11 +159,6 @@ def where(g: Graph, condition: Nodes, a: Any = None, b: Any = None) -> Nodes:
         return g.apply("where", c, x, y)
 
     return elementwise(g, choose, condition, a, b)
-
-
-@handles("masked_fill")
-def _masked_fill(g: Graph, a: Nodes, mask: Nodes, value: Any) -> Nodes:
-    return where(g, mask, value, a)
 
 
 def _logical(op: str) -> Operation:
@@ -290,22 +215,19 @@ def _prod(g: Graph, a: Nodes, dim: Any = None, keepdim: bool = False, **_: Any) 
     return _reduce(g, lambda xs: g.total(xs, "mul"), a, dim, keepdim)
 
 
-@handles("amax", "max")
-def _amax(g: Graph, a: Nodes, dim: Any = None, keepdim: bool = False) -> Nodes:
-    if isinstance(dim, int):
-        raise UnsupportedOperation("max.dim", "returns indices; use `torch.amax`")
-    if isinstance(dim, np.ndarray):
-        return numbers(g, "max", a, dim)
-    return _reduce(g, lambda xs: g.total(xs, "max"), a, dim, keepdim)
+def _extreme(op: str) -> Operation:
+    def extreme(g: Graph, a: Nodes, dim: Any = None, keepdim: bool = False) -> Nodes:
+        if isinstance(dim, int):
+            raise UnsupportedOperation(f"{op}.dim", f"returns indices; use `torch.a{op}`")
+        if isinstance(dim, np.ndarray):
+            return numbers(g, op, a, dim)
+        return _reduce(g, lambda xs: g.total(xs, op), a, dim, keepdim)
+
+    return extreme
 
 
-@handles("amin", "min")
-def _amin(g: Graph, a: Nodes, dim: Any = None, keepdim: bool = False) -> Nodes:
-    if isinstance(dim, int):
-        raise UnsupportedOperation("min.dim", "returns indices; use `torch.amin`")
-    if isinstance(dim, np.ndarray):
-        return numbers(g, "min", a, dim)
-    return _reduce(g, lambda xs: g.total(xs, "min"), a, dim, keepdim)
+_amax = OPERATIONS["amax"] = OPERATIONS["max"] = _extreme("max")
+OPERATIONS["amin"] = OPERATIONS["min"] = _extreme("min")
 
 
 @handles("logsumexp")
@@ -323,12 +245,7 @@ def _logsumexp(g: Graph, a: Nodes, dim: Any, keepdim: bool = False) -> Nodes:
 @handles("_softmax")
 def _softmax(g: Graph, a: Nodes, dim: int, half_to_float: bool) -> Nodes:
     exps = numbers(g, "exp", sub(g, a, _amax(g, a, [dim], True)))
-    return numbers(g, "mul", exps, reciprocal(g, _sum(g, exps, dim, True)))
-
-
-@handles("_log_softmax")
-def _log_softmax(g: Graph, a: Nodes, dim: int, half_to_float: bool) -> Nodes:
-    return sub(g, a, _logsumexp(g, a, dim, True))
+    return numbers(g, "mul", exps, div(g, 1.0, _sum(g, exps, dim, True)))
 
 
 @handles("cumsum")
@@ -372,11 +289,6 @@ def _addmm(g: Graph, c: Nodes, a: Nodes, b: Nodes, beta: float = 1, alpha: float
 # Copies, creation, views, joining and indexing compute nothing.
 
 
-@handles("clone", "contiguous", "lift_fresh", "lift_fresh_copy")
-def _clone(g: Graph, a: Nodes, memory_format: Any = None) -> Nodes:
-    return a.copy()
-
-
 @handles("_to_copy")
 def _to_copy(g: Graph, a: Nodes, dtype: Any = None, **_: Any) -> Nodes:
     if dtype is None:
@@ -390,17 +302,19 @@ def _to_copy(g: Graph, a: Nodes, dtype: Any = None, **_: Any) -> Nodes:
     return numbers(g, "trunc", a)
 
 
-@handles("copy")
+@handles("copy", "fill")
 def _copy(g: Graph, a: Nodes, source: Any, non_blocking: bool = False) -> Nodes:
     return np.broadcast_to(elementwise(g, lambda x: number(g, x), source), a.shape)
 
 
-@handles("fill")
-def _fill(g: Graph, a: Nodes, value: Any) -> Nodes:
-    return _copy(g, a, value)
+@handles("new_full")
+def _full(g: Graph, a: Nodes, size: Sequence[int] | None, value: Any, **_: Any) -> Nodes:
+    shape = a.shape if size is None else size
+    return elementwise(g, lambda x: x, np.broadcast_to(as_nodes(g, value), shape))
 
 
-@handles("zero", "zeros_like", "new_zeros")
+# Memory that torch leaves uninitialised is zero, so that a trace does not depend on chance.
+@handles("zero", "zeros_like", "new_zeros", "empty_like", "new_empty")
 def _zeros(g: Graph, a: Nodes, size: Sequence[int] | None = None, **_: Any) -> Nodes:
     return _full(g, a, size, 0.0)
 
@@ -408,23 +322,6 @@ def _zeros(g: Graph, a: Nodes, size: Sequence[int] | None = None, **_: Any) -> N
 @handles("ones_like", "new_ones")
 def _ones(g: Graph, a: Nodes, size: Sequence[int] | None = None, **_: Any) -> Nodes:
     return _full(g, a, size, 1.0)
-
-
-@handles("empty_like", "new_empty")
-def _empty(g: Graph, a: Nodes, size: Sequence[int] | None = None, **_: Any) -> Nodes:
-    return _full(g, a, size, 0.0)
-
-
-@handles("new_full")
-def _full(g: Graph, a: Nodes, size: Sequence[int] | None, value: Any, **_: Any) -> Nodes:
-    return elementwise(
-        g, lambda x: x, np.broadcast_to(as_nodes(g, value), a.shape if size is None else size)
-    )
-
-
-@handles("full_like")
-def _full_like(g: Graph, a: Nodes, value: Any, **_: Any) -> Nodes:
-    return _full(g, a, None, value)
 
 
 @handles("view", "_unsafe_view", "reshape", "_reshape_alias")
@@ -435,19 +332,9 @@ def _view(g: Graph, a: Nodes, size: Sequence[int], *_: Any) -> Nodes:
     return out
 
 
-@handles("permute")
-def _permute(g: Graph, a: Nodes, dims: Sequence[int]) -> Nodes:
-    return a.transpose([d % a.ndim for d in dims])
-
-
 @handles("transpose")
 def _transpose(g: Graph, a: Nodes, dim0: int, dim1: int) -> Nodes:
     return a.swapaxes(dim0, dim1) if a.ndim else a
-
-
-@handles("t", "numpy_T")
-def _t(g: Graph, a: Nodes) -> Nodes:
-    return a.T
 
 
 @handles("expand")
@@ -475,11 +362,6 @@ def _squeeze(g: Graph, a: Nodes, dim: Any = None) -> Nodes:
     return a.squeeze(axes)
 
 
-@handles("unsqueeze")
-def _unsqueeze(g: Graph, a: Nodes, dim: int) -> Nodes:
-    return np.expand_dims(a, dim)
-
-
 @handles("unbind")
 def _unbind(g: Graph, a: Nodes, dim: int = 0) -> list[Nodes]:
     return [_select(g, a, dim, i) for i in range(a.shape[dim])]
@@ -497,19 +379,9 @@ def _split_with_sizes(g: Graph, a: Nodes, sizes: Sequence[int], dim: int = 0) ->
     return [_slice(g, a, dim, s - n, s) for s, n in zip(stops, sizes, strict=True)]
 
 
-@handles("alias", "detach")
-def _alias(g: Graph, a: Nodes) -> Nodes:
-    return a
-
-
 @handles("diagonal")
 def _diagonal(g: Graph, a: Nodes, offset: int = 0, dim1: int = 0, dim2: int = 1) -> Nodes:
     return np.diagonal(a, offset, dim1, dim2)  # read-only: writing through it is refused
-
-
-@handles("flip")
-def _flip(g: Graph, a: Nodes, dims: Sequence[int]) -> Nodes:
-    return np.flip(a, tuple(dims)).copy()
 
 
 @handles("roll")
@@ -522,22 +394,6 @@ def _pad(g: Graph, a: Nodes, pad: Sequence[int], value: float = 0.0) -> Nodes:
     widths = [(0, 0)] * (a.ndim - len(pad) // 2)
     widths += [(pad[i], pad[i + 1]) for i in range(len(pad) - 2, -1, -2)]
     return np.pad(a, widths, constant_values=g.constant(value))  # type: ignore[call-overload]
-
-
-@handles("cat")
-def _cat(g: Graph, tensors: Sequence[Nodes], dim: int = 0) -> Nodes:
-    # torch ignores the historic empty 1-D tensor.
-    return np.concatenate([t for t in tensors if t.shape != (0,)] or list(tensors), axis=dim)
-
-
-@handles("stack")
-def _stack(g: Graph, tensors: Sequence[Nodes], dim: int = 0) -> Nodes:
-    return np.stack(tensors, axis=dim)
-
-
-@handles("repeat")
-def _repeat(g: Graph, a: Nodes, repeats: Sequence[int]) -> Nodes:
-    return np.tile(a, tuple(repeats))
 
 
 def _static(name: str, index: Nodes) -> np.ndarray:
@@ -568,11 +424,43 @@ def _index_put(
     return out
 
 
-@handles("index_select")
-def _index_select(g: Graph, a: Nodes, dim: int, index: Nodes) -> Nodes:
-    return np.take(a, _static("index_select", index), axis=dim)
-
-
 @handles("gather")
 def _gather(g: Graph, a: Nodes, dim: int, index: Nodes, sparse_grad: bool = False) -> Nodes:
     return np.take_along_axis(a, _static("gather", index), axis=dim)
+
+
+def _cat(g: Graph, tensors: Sequence[Nodes], dim: int = 0) -> Nodes:
+    # torch ignores the historic empty 1-D tensor.
+    return np.concatenate([t for t in tensors if t.shape != (0,)] or list(tensors), axis=dim)
+
+
+# All that is one expression.
+OPERATIONS |= {
+    "addcmul": lambda g, a, b, c, value=1: add(g, a, numbers(g, "mul", b, c), value),
+    "clamp_max": lambda g, a, max: _clamp(g, a, max=max),
+    "full_like": lambda g, a, value, **_: _full(g, a, None, value),
+    "ge": lambda g, a, b: numbers(g, "le", b, a),
+    "gt": lambda g, a, b: numbers(g, "lt", b, a),
+    "hypot": lambda g, a, b: numbers(
+        g, "sqrt", add(g, numbers(g, "mul", a, a), numbers(g, "mul", b, b))
+    ),
+    "isnan": lambda g, a: numbers(g, "ne", a, a),
+    "masked_fill": lambda g, a, mask, value: where(g, mask, value, a),
+    "reciprocal": lambda g, a: div(g, 1.0, a),
+    "relu": lambda g, a: numbers(g, "max", a, 0.0),
+    "rsqrt": lambda g, a: div(g, 1.0, numbers(g, "sqrt", a)),
+    "rsub": lambda g, a, b, alpha=1: sub(g, b, a, alpha),
+    "cat": _cat,
+    "flip": lambda g, a, dims: np.flip(a, tuple(dims)).copy(),
+    "index_select": lambda g, a, dim, index: np.take(a, _static("index_select", index), axis=dim),
+    "permute": lambda g, a, dims: a.transpose([d % a.ndim for d in dims]),
+    "repeat": lambda g, a, repeats: np.tile(a, tuple(repeats)),
+    "stack": lambda g, tensors, dim=0: np.stack(tensors, axis=dim),
+    "unsqueeze": lambda g, a, dim: np.expand_dims(a, dim),
+    **dict.fromkeys(("t", "numpy_T"), lambda g, a: a.T),
+    **dict.fromkeys(("alias", "detach"), lambda g, a: a),
+    **dict.fromkeys(
+        ("clone", "contiguous", "lift_fresh", "lift_fresh_copy"),
+        lambda g, a, memory_format=None: a.copy(),
+    ),
+}

@@ -45,6 +45,16 @@ _ATOMS = frozenset({
 _MAPPINGS = (dict, types.MappingProxyType)
 _SEQUENCES = (list, tuple, set, frozenset, deque)
 _TENSORS = frozenset({Tensor, nn.Parameter})
+# Attributes that decide what objects of these classes compute.
+_HOLDING: dict[type, tuple[str, ...]] = {
+    types.MethodType: ("__func__", "__self__"),
+    functools.partial: ("func", "args", "keywords"),
+    slice: ("start", "stop", "step"),
+    staticmethod: ("__func__",),
+    classmethod: ("__func__",),
+    property: ("fget", "fset"),
+    functools.cached_property: ("func",),
+}
 _METHODS = (types.BuiltinFunctionType, types.MethodWrapperType)
 # Descriptors of what an object holds, which is followed in the object.
 _FIELDS = (types.MemberDescriptorType, types.GetSetDescriptorType, type(_Read.names))
@@ -57,8 +67,24 @@ _LIMIT = 20_000
 _HEAP_TYPE = 1 << 9  # of a class's flags: made by Python code
 
 
-def fingerprint(modules: Iterable[nn.Module], *others: Any) -> Hashable:
-    """A key that differs where a trace of these objects may differ.
+class Fingerprint(NamedTuple):
+    """All that a trace may read.
+
+    Attributes:
+        key: it differs where the traced code may differ.
+        inputs: values of the traced code's inputs, which the key leaves out.
+    """
+
+    key: Hashable
+    inputs: tuple[Tensor, ...]
+
+    def values(self) -> Hashable:
+        """The contents of the inputs."""
+        return tuple(map(_content, self.inputs))
+
+
+def fingerprint(modules: Iterable[nn.Module], *others: Any) -> Fingerprint:
+    """A fingerprint of these objects.
 
     Args:
         modules: their floating-point parameters and buffers are inputs of the traced code, so that
@@ -74,7 +100,22 @@ def fingerprint(modules: Iterable[nn.Module], *others: Any) -> Hashable:
             walk.add(value)
     except RecursionError:
         raise Incomparable("a chain of objects that is too long to follow") from None
-    return tuple(walk.parts)
+    return Fingerprint(tuple(walk.parts), tuple(walk.inputs))
+
+
+def _content(value: Any) -> bytes:
+    """Elements of a tensor or an array."""
+    if not isinstance(value, Tensor):
+        if value.dtype.hasobject:
+            raise Incomparable("an array of objects")
+        return bytes(value.tobytes())
+    if value.layout is not torch.strided:
+        raise Incomparable(f"a tensor with layout {value.layout}")
+    exact = value.float() if value.dtype is torch.bfloat16 else value  # NumPy has none
+    try:
+        return exact.numpy(force=True).tobytes()
+    except RuntimeError:  # within `torch.func`, for example
+        raise Incomparable("a tensor without memory of its own") from None
 
 
 @functools.lru_cache(1024)
@@ -103,11 +144,12 @@ class _Walk:
     def __init__(self, modules: Iterable[nn.Module]) -> None:
         self.parts: list[Any] = []
         self.seen: dict[Any, int] = {}
-        self.inputs: set[int] = set()
+        self.inputs: list[Tensor] = []
+        self.modules: set[int] = set()
         found = list(modules)
         while found:
             module = found.pop()
-            self.inputs.add(id(module))
+            self.modules.add(id(module))
             found += [m for m in module._modules.values() if m is not None]
 
     def add(self, value: Any) -> None:
@@ -118,10 +160,8 @@ class _Walk:
             parts.append(value)
         elif kind is float or kind is complex:
             parts.append(repr(value))  # tells signs of zero apart, and NaN equals itself
-        elif kind in _TENSORS:
-            self._tensor(value)
-        elif isinstance(value, np.ndarray | np.generic):
-            self._array(value)
+        elif kind in _TENSORS or isinstance(value, np.ndarray | np.generic):
+            parts += (value.shape, value.dtype, _content(value))
         elif self._is_new(id(value)):
             self._compound(kind, value)
 
@@ -142,21 +182,11 @@ class _Walk:
             self._subclass(kind, value, _MAPPINGS)
         elif kind is types.FunctionType:
             self._function(value)
-        elif kind is types.MethodType:
-            self.add(value.__func__)
-            self.add(value.__self__)
-        elif kind is functools.partial:
-            self._all((value.func, value.args, value.keywords))
-        elif kind is slice:
-            self._all((value.start, value.stop, value.step))
+        elif kind in _HOLDING:
+            for name in _HOLDING[kind]:
+                self.add(getattr(value, name))
         elif isinstance(value, type):
             self._class(value)
-        elif kind in (staticmethod, classmethod):
-            self.add(value.__func__)
-        elif kind is property:
-            self.add(value.fget)
-        elif kind is functools.cached_property:
-            self.add(value.func)
         elif isinstance(value, enum.Enum):
             self.parts.append(value.name)
             self._class(kind)
@@ -194,24 +224,14 @@ class _Walk:
             if hasattr(value, "__dict__"):
                 self._mapping(vars(value))
 
-    def _tensor(self, value: Tensor) -> None:
-        if value.layout is not torch.strided:
-            raise Incomparable(f"a tensor with layout {value.layout}")
-        exact = value.float() if value.dtype is torch.bfloat16 else value  # NumPy has none
-        self.parts += (value.shape, value.dtype, exact.numpy(force=True).tobytes())
-
-    def _array(self, value: Any) -> None:
-        if value.dtype.hasobject:
-            raise Incomparable("an array of objects")
-        self.parts += (value.shape, value.dtype.str, value.tobytes())
-
     def _module(self, module: nn.Module) -> None:
-        own = id(module) in self.inputs
+        own = id(module) in self.modules
         for tensors in (module._parameters, module._buffers):
             for name, tensor in tensors.items():
                 self.parts.append(name)
                 if tensor is not None and own and tensor.is_floating_point():
                     self.parts += (tensor.shape, tensor.dtype)
+                    self.inputs.append(tensor)
                 else:
                     self.add(tensor)
         for name, part in module._modules.items():

@@ -79,13 +79,14 @@ def contract_of_archive(path: str | Path) -> Contract:
 
 # ATen operations on tensors besides those that can be compiled, without the "_" of in-place forms.
 _MORE = """
-    __and__ __or__ __xor__ _assert_tensor_metadata acosh all any arange argmax argmin asinh atanh
-    broadcast_to bucketize concat copysign cummax cummin cumprod deg2rad diff einsum elu empty erf
-    erfc exp2 expand_as eye flatten floor_divide fmax fmin frac full gelu hardtanh heaviside
-    isfinite isinf leaky_relu linalg_norm linear linspace log10 log2 log_sigmoid log_softmax
-    logaddexp logit matmul movedim moveaxis nan_to_num narrow norm ones outer positive rad2deg
-    reshape_as round scalar_tensor searchsorted sinc size softmax square std swapaxes sym_size take
-    tile to tril triu true_divide type_as unflatten unfold var vdot view_as xlogy zeros
+    __and__ __or__ __xor__ _assert_tensor_metadata _log_softmax acosh addcdiv all any arange argmax
+    argmin asinh atanh broadcast_to bucketize concat copysign cummax cummin cumprod deg2rad diff
+    einsum elu empty erf erfc exp2 expand_as eye flatten floor_divide fmax fmin frac full gelu
+    hardtanh heaviside isfinite isinf leaky_relu lerp linalg_norm linear linspace log10 log2
+    log_sigmoid log_softmax logaddexp logit matmul moveaxis movedim nan_to_num narrow norm ones
+    outer positive rad2deg reshape_as round scalar_tensor searchsorted silu sinc size softmax square
+    std swapaxes sym_size take tile to tril triu true_divide type_as unflatten unfold var vdot
+    view_as xlogy zeros
 """
 # One of those that can be compiled sees memory beyond its tensor, unchecked.
 _TENSORS = {*supported_operations(), *_MORE.split()} - {"_reshape_alias"}

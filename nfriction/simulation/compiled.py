@@ -8,6 +8,7 @@ of the code, whether an attribute, a global or a closure holds them; a change of
 import logging
 from collections import OrderedDict
 from collections.abc import Hashable, Mapping
+from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import torch
@@ -30,6 +31,29 @@ _compiled_graphs: OrderedDict[Hashable, "codegen.CompiledRollout"] = OrderedDict
 _warned: set[str] = set()
 
 
+@dataclass(frozen=True)
+class System:
+    """Plant and friction, with a fingerprint by which a later change is noticed.
+
+    Attributes:
+        plant, friction: the mechanism and its friction model.
+        fingerprint: of all that they read; the error that says why there is none.
+    """
+
+    plant: Any
+    friction: Any
+    fingerprint: "codegen.Fingerprint | codegen.Incomparable"
+
+    @classmethod
+    def of(cls, plant: Any, friction: Any) -> "System":
+        """The two as they are now."""
+        modules = [m for m in (plant, friction) if isinstance(m, nn.Module)]
+        try:
+            return cls(plant, friction, codegen.fingerprint(modules, plant, friction))
+        except codegen.Incomparable as reason:
+            return cls(plant, friction, reason.with_traceback(None))
+
+
 def wants_compiled(backend: Backend, q: Tensor, gradients: bool) -> bool:
     """Return true if compiled code should be tried.
 
@@ -48,8 +72,7 @@ def wants_compiled(backend: Backend, q: Tensor, gradients: bool) -> bool:
 
 
 def integrate_compiled(
-    plant: Any,
-    friction: Any,
+    system: System,
     inputs: RolloutInputs,
     backend: Backend,
     threads: int,
@@ -60,7 +83,7 @@ def integrate_compiled(
     """States at every sample: q, qd, qdd, each (*batch, steps + 1, joint).
 
     Args:
-        plant, friction, inputs: as in `integrate`.
+        system, inputs: what moves, and how.
         backend: `"auto"` or `"compiled"`.
         threads: number of threads that share a batch.
         parameters: values of the friction model's parameters by name that differ from its own,
@@ -76,7 +99,7 @@ def integrate_compiled(
     Raises:
         CodegenError: if compiled code is asked for and cannot be made.
     """
-    compiled = _compiled(plant, friction, backend, step_function, jacobian)
+    compiled = _compiled(system, backend, step_function, jacobian)
     if compiled is None:
         return None
     q, qd, measured, memory = inputs.q0, inputs.qd0, inputs.measured, inputs.hidden_state
@@ -91,7 +114,7 @@ def integrate_compiled(
         return x[0] if x.ndim == trailing and not x.stride(0) else x
 
     drive = None if measured is None else (rows(measured[0], 2), rows(measured[1], 2))
-    values = _values(plant, friction, compiled.parameter_names)
+    values = _values(system.plant, system.friction, compiled.parameter_names)
     for name, value in (parameters or {}).items():
         own = value.shape[len(batch) :]
         values[f"friction.{name}"] = value.detach().reshape(-1, *own)
@@ -114,13 +137,13 @@ def integrate_compiled(
 
 
 def _compiled(
-    plant: Any,
-    friction: Any,
+    system: System,
     backend: Backend,
     step_function: StepFunction = rk4_step,
     jacobian: tuple[str, ...] = (),
 ) -> "codegen.CompiledRollout | None":
-    """The compiled rollout of this structure, from the cache where it is there."""
+    """The compiled rollout of this system, from the cache where it is there."""
+    plant, friction = system.plant, system.friction
     if backend == "torch":
         return None
     if not all(isinstance(m, nn.Module) for m in (plant, friction)):
@@ -130,17 +153,15 @@ def _compiled(
             "only a plant and a friction model that are torch modules can be compiled; use "
             'backend="torch".'
         )
-    try:
-        key = codegen.fingerprint((plant, friction), step_function, jacobian)
-    except codegen.Incomparable as reason:
-        key = None
+    if isinstance(system.fingerprint, codegen.Incomparable):
         _warn_once(
-            f"compiled rollouts are traced anew in every call, because they may read {reason}"
+            "compiled rollouts are traced anew in every call, because they may read "
+            f"{system.fingerprint}"
         )
-    found = _known.get(key)
-    if found is None:
         found = _attempt(plant, friction, step_function, jacobian)
-    if key is not None:
+    else:
+        key = system.fingerprint.key, step_function, jacobian
+        found = _known.get(key) or _attempt(plant, friction, step_function, jacobian)
         _keep(_known, key, found)
     if isinstance(found, codegen.CodegenError):
         if backend != "auto":

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from nfriction.codegen.rollout_program import SPEED_LIMIT
 from nfriction.simulation.adjoint import adjoint_rollout, own_tensors
-from nfriction.simulation.compiled import Backend, integrate_compiled, wants_compiled
+from nfriction.simulation.compiled import Backend, System, integrate_compiled, wants_compiled
 from nfriction.simulation.protocols import Friction, NoFriction, Plant, RolloutInputs
 from nfriction.simulation.rk4 import simulate_eager
 from nfriction.simulation.stiction import simulate_stiction
@@ -133,31 +133,26 @@ def rollout(
     if scheme not in get_args(Scheme):
         raise ValueError(f"`scheme` must be one of {get_args(Scheme)}, got {scheme!r}.")
     if scheme == "time_stepping":
-        if friction is None or gradients or measured is not None or hidden_state is not None:
-            raise ValueError(
-                '`scheme="time_stepping"` needs a friction model, and has no gradients, measured '
-                'drive or hidden state; use scheme="rk4" for these.'
-            )
-        return _as_rollout(inputs, simulate_stiction(plant, model, inputs, progress))
-    require_stability(plant, model, inputs)
+        return _as_rollout(inputs, simulate_stiction(plant, model, inputs, progress, gradients))
+    system = System.of(plant, model)
+    require_stability(system, inputs)
     warn_of_sample_time(model, inputs)
     if gradients is None:
         able = backend in ("auto", "torch") and inputs.tau.shape[-2] <= GRADIENT_STEPS
         given = (inputs.q0, inputs.qd0, inputs.tau, *own_tensors(plant, model))
         gradients = able and torch.is_grad_enabled() and any(x.requires_grad for x in given)
-    states = _simulate(plant, model, inputs, gradients, backend, threads, progress)
+    states = _simulate(system, inputs, gradients, backend, threads, progress)
     return _as_rollout(inputs, states)
 
 
 def integrate(plant: Plant, friction: Friction | None, inputs: RolloutInputs) -> Rollout:
     """`rollout` without checks and gradients, for searches whose trials may well be unstable."""
     model = NoFriction(plant.joints) if friction is None else friction
-    return _as_rollout(inputs, _simulate(plant, model, inputs))
+    return _as_rollout(inputs, _simulate(System.of(plant, model), inputs))
 
 
 def _simulate(
-    plant: Plant,
-    friction: Friction,
+    system: System,
     inputs: RolloutInputs,
     gradients: bool = False,
     backend: Backend = "auto",
@@ -170,14 +165,14 @@ def _simulate(
     # With gradients the motion itself may still be compiled: the adjoint sweep adds them.
     if gradients and backend == "auto":
         states = adjoint_rollout(
-            lambda: _simulate(plant, friction, inputs, threads=threads, progress=progress),
-            plant, friction, inputs,
+            lambda: _simulate(system, inputs, threads=threads, progress=progress),
+            system.plant, system.friction, inputs,
         )  # fmt: skip
     elif compiled:
-        states = integrate_compiled(plant, friction, inputs, backend, threads)
+        states = integrate_compiled(system, inputs, backend, threads)
     if states is None:
         with torch.set_grad_enabled(gradients and torch.is_grad_enabled()):
-            states = simulate_eager(plant, friction, inputs, progress)
+            states = simulate_eager(system.plant, system.friction, inputs, progress)
     return states
 
 
@@ -195,11 +190,9 @@ def _as_rollout(inputs: RolloutInputs, states: tuple[Tensor, ...]) -> Rollout:
 @torch.no_grad()
 def _divergence(time: Tensor, q: Tensor, qd: Tensor) -> Tensor:
     """Time of the first sample that is not finite or beyond any speed, infinity where none."""
-    if not q.numel():
-        return time.new_full(q.shape[:-2], torch.inf)
     # Positions are finite while velocities are; a NaN fails every comparison.
-    low, high = qd.aminmax()
-    if float(low) > -SPEED_LIMIT and float(high) < SPEED_LIMIT:
+    low, high = map(float, qd.aminmax() if qd.numel() else (0.0, 0.0))
+    if -SPEED_LIMIT < low <= high < SPEED_LIMIT:
         return time.new_full(q.shape[:-2], torch.inf)
     lost = ~(torch.isfinite(q) & (qd.abs() < SPEED_LIMIT)).all(-1)
     first = lost.to(torch.int64).argmax(-1, keepdim=True)

@@ -10,8 +10,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from nfriction.simulation.compiled import integrate_compiled
-from nfriction.simulation.protocols import Friction, Plant, RolloutInputs, as_stateful
+from nfriction.simulation.compiled import System, integrate_compiled
+from nfriction.simulation.protocols import Friction, NoFriction, Plant, RolloutInputs, as_stateful
 from nfriction.simulation.rk4 import simulate_eager
 
 # In units of the smoothing velocity: from there on a joint slides, with the law's friction.
@@ -82,17 +82,18 @@ def moreau_step(
 
 @torch.no_grad()
 def simulate_stiction(
-    plant: Plant, friction: Friction, inputs: RolloutInputs, progress: bool
+    plant: Plant, friction: Friction, inputs: RolloutInputs, progress: bool, gradients: bool | None
 ) -> tuple[Tensor, ...]:
     """States at every sample: q, qd, qdd, each (*batch, steps + 1, joint).
 
     Raises:
-        ValueError: if the coefficients have a hidden state.
+        ValueError: for what this scheme does not have.
     """
-    if as_stateful(friction) is not None:
+    given = gradients or inputs.measured is not None or inputs.hidden_state is not None
+    if given or isinstance(friction, NoFriction) or as_stateful(friction) is not None:
         raise ValueError(
-            'scheme="time_stepping" does not simulate coefficients with a hidden state; use '
-            'scheme="rk4".'
+            '`scheme="time_stepping"` needs a friction model, and has no gradients, measured '
+            'drive or coefficients with a hidden state; use scheme="rk4" for these.'
         )
     double = replace(
         inputs,
@@ -101,7 +102,9 @@ def simulate_stiction(
         tau=inputs.tau.double(),
         step=inputs.step.double(),
     )
-    states = integrate_compiled(plant, friction, double, "auto", 1, step_function=moreau_step)
+    states = integrate_compiled(
+        System.of(plant, friction), double, "auto", 1, step_function=moreau_step
+    )
     if states is None:
         states = simulate_eager(plant, friction, double, progress, moreau_step)
     return tuple(x.to(inputs.q0) for x in states)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from nfriction import codegen
+from nfriction.simulation.compiled import System
 from nfriction.simulation.protocols import Friction, NoFriction, Plant, RolloutInputs
 from nfriction.simulation.rk4 import RK4_STABILITY, required_substeps
 
@@ -181,13 +182,14 @@ def with_hidden_state(
     return replace(inputs, q0=q0, qd0=qd0, hidden_state=given)
 
 
-def require_stability(plant: Plant, friction: Friction, inputs: RolloutInputs) -> None:
+def require_stability(system: System, inputs: RolloutInputs) -> None:
     """Refuse friction too steep at rest for stable Runge-Kutta steps."""
+    plant, friction = system.plant, system.friction
     if isinstance(friction, NoFriction):
         return
     sample_time = float(inputs.step.max())
     longest_step = sample_time / inputs.substeps
-    excess = _fastest_decay(plant, friction) * longest_step / RK4_STABILITY
+    excess = _fastest_decay(system) * longest_step / RK4_STABILITY
     # As much slack as `required_substeps` takes, so that its number is never refused.
     if not excess * (1 - 1e-9) > 1:  # false of NaN
         return
@@ -205,19 +207,19 @@ def require_stability(plant: Plant, friction: Friction, inputs: RolloutInputs) -
     )
 
 
-def _fastest_decay(plant: Plant, friction: Friction) -> float:
-    """Decay rate of the fastest mode at rest [1/s], kept for the same models with the same values.
+def _fastest_decay(system: System) -> float:
+    """Decay rate of the fastest mode at rest [1/s], kept for the same system with the same values.
 
     A derivative and eigenvalues take as long as simulating some thousand steps.
     """
-    try:
-        key = codegen.fingerprint((), plant, friction)
-    except codegen.Incomparable:
-        return float(plant.decay_rate(friction.zero_velocity_damping()).max())
+    if isinstance(system.fingerprint, codegen.Incomparable):
+        return float(system.plant.decay_rate(system.friction.zero_velocity_damping()).max())
+    key = system.fingerprint.key, system.fingerprint.values()
     if key not in _decay_rates:
         if len(_decay_rates) >= KEPT_RATES:
             _decay_rates.clear()
-        _decay_rates[key] = float(plant.decay_rate(friction.zero_velocity_damping()).max())
+        rates = system.plant.decay_rate(system.friction.zero_velocity_damping())
+        _decay_rates[key] = float(rates.max())
     return _decay_rates[key]
 
 

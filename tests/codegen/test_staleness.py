@@ -10,12 +10,17 @@ import pytest
 import torch
 from torch import nn
 
-from nfriction.codegen import Incomparable, fingerprint
+from nfriction.codegen import Incomparable
+from nfriction.codegen import fingerprint as full
 
 F64 = torch.float64
 Pair = namedtuple("Pair", "a b")
 KNOBS = {"list": [1.0], "array": np.zeros(5_000)}
 RUNNING = iter([1.0])
+
+
+def fingerprint(modules, *others):
+    return full(modules, *others).key
 
 
 class Grade(enum.Enum):
@@ -65,6 +70,7 @@ def test_the_same_is_equal_and_another_differs():
 def test_parameters_are_inputs_where_they_are_the_modules_own():
     module, other = nn.Linear(2, 2), nn.Linear(2, 2)
     assert fingerprint((module,)) == fingerprint((other,))
+    assert full((module,)).values() != full((other,)).values()
     # Held by a function, they are constants of the trace.
     assert fingerprint((), module) != fingerprint((), other)
     assert fingerprint((), lambda: module.weight) != fingerprint((), lambda: other.weight)
@@ -134,3 +140,14 @@ def test_what_cannot_be_compared_is_named(value, named):
         chain = [chain]
     with pytest.raises(Incomparable, match="too long"):
         fingerprint((), chain)
+
+
+def test_tensors_of_a_transformation_cannot_be_compared():
+    def function(x):
+        with pytest.raises(Incomparable, match="memory of its own"):
+            fingerprint((), x)
+        return x.sum()
+
+    torch.func.vmap(function)(torch.ones(2, 2))
+    with pytest.raises(Incomparable, match="memory of its own"):
+        fingerprint((), torch.ones(2, device="meta"))

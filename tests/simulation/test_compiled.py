@@ -300,7 +300,8 @@ def test_a_rollout_may_bring_the_derivatives_of_its_steps(compilations):
     q0 = torch.stack([Q0, 0.9 * Q0, Q0 - 0.1]).expand(2, 3, 2)
     given = (torch.zeros(1, 2, dtype=F64).expand(30, 2), torch.full((30,), 1e-3, dtype=F64))
     q, qd, qdd, slopes = compiled.integrate_compiled(
-        CHAIN, model, RolloutInputs(q0, QD0.expand(2, 3, 2), *given), "compiled", 1,
+        compiled.System.of(CHAIN, model), RolloutInputs(q0, QD0.expand(2, 3, 2), *given),
+        "compiled", 1,
         jacobian=("q", "qd", "held"),
     )  # fmt: skip
     plain = rollout(CHAIN, model, q0, QD0, steps=30, gradients=False)

@@ -38,7 +38,7 @@ from nfriction.papers.afem.classes import (
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
-from nfriction.simulation.compiled import integrate_compiled
+from nfriction.simulation.compiled import System, integrate_compiled
 from nfriction.simulation.protocols import RolloutInputs
 from nfriction.simulation.rollout import Rollout, integrate
 
@@ -236,10 +236,9 @@ class PositionError:
         )
         batch = [state.expand(len(vectors), -1) for state in (inputs.q0, inputs.qd0)]
         # All candidates of a window in one call; without a compiler one after the other.
-        states = integrate_compiled(
-            self.plant, self.friction, replace(inputs, q0=batch[0], qd0=batch[1]), "auto",
-            self.threads, parameters,
-        )  # fmt: skip
+        system = System.of(self.plant, self.friction)
+        moved = replace(inputs, q0=batch[0], qd0=batch[1])
+        states = integrate_compiled(system, moved, "auto", self.threads, parameters)
         if states is not None:
             return states[0]
         runs = (integrate(self.plant, self.friction, inputs) for _ in self._set_to_each(vectors))
