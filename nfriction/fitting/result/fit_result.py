@@ -12,12 +12,14 @@ from torch import Tensor
 from nfriction.fitting.equation_error import TorqueFit, peak_dynamics_torque
 from nfriction.fitting.options import Continuity
 from nfriction.fitting.result.identifiability import (
+    Information,
     Interval,
     confidence_intervals,
     covariance_root,
     exceeds_drive_torque,
     model_error_warning,
     null_directions,
+    standard_deviations,
     warnings_of,
     weakly_identified,
 )
@@ -29,6 +31,11 @@ from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import LeastSquaresResult
 from nfriction.plant import Plant
 from nfriction.signals import Motion, count_seen
+
+BLURRED = (
+    "The torque comes from a smoothed motion, which blurs friction at low speed and knows no error "
+    'of the plant; `method="output_error"` gives a better answer, and intervals that cover both.'
+)
 
 # A lower bound no larger exists only for the logarithm of a positive coefficient, in SI.
 NOTHING = 1e-9
@@ -53,7 +60,8 @@ class FitResult:
         residuals: position errors of the training windows [rad; m], (window, sample, joint); empty
             after an equation-error fit.
         intervals: 95 % confidence intervals of constant coefficients and plant terms, by the
-            effective sample size of autocorrelated residuals. None after an equation-error fit.
+            effective sample size of autocorrelated residuals. After an equation-error fit they take
+            the plant and the smoothed motion for exact.
         unidentifiable: parameters, or combinations `"a with b"`, that the data do not determine.
         warnings: a sentence each.
         encoder_offsets: added to the recorded positions to get true ones, in joint coordinates
@@ -132,6 +140,28 @@ def result_from_equation_error(
 ) -> FitResult:
     """The result of a regression on torques, which is written into the model."""
     model.schedule.set_parameter_vector(torque.coefficients.reshape(-1))
+    names = model.schedule.parameter_names(plant.joint_names)
+    lower, upper = model.schedule.bounds()
+    fitted = (lower < upper).nonzero().flatten()
+    fitted_names = [names[i] for i in fitted.tolist()]
+    values, lower, upper = (x[fitted] for x in (model.schedule.parameter_vector(), lower, upper))
+    known = Information(torch.block_diag(*torque.information), torch.zeros(len(names)).double())
+    known = known.subset(fitted)
+    sd = standard_deviations(known)
+    low, high = values <= lower + NOTHING, values >= upper
+    at_bounds, at_zero = (
+        tuple(fitted_names[i] for i in mask.nonzero().flatten().tolist())
+        for mask in (low | high, low & (lower.abs() <= NOTHING))
+    )
+    unidentifiable = null_directions(fitted_names, known)
+    unidentifiable += tuple(
+        name
+        for name in weakly_identified(fitted_names, values, known)
+        if not any(name in direction for direction in unidentifiable)
+    )
+    found = warnings_of(
+        converged=True, at_bounds=at_bounds, unidentifiable=unidentifiable, at_zero=at_zero
+    )
     return FitResult(
         model=model.requires_grad_(False),
         plant=start.plant if start else plant,
@@ -139,10 +169,13 @@ def result_from_equation_error(
         status="Converged: linear least squares of the torque.",
         converged=True,
         residual=float(torque.residual.square().mean().sqrt()),
-        at_bounds=(),
+        at_bounds=at_bounds,
         steps=0,
         motions=motions,
         residuals=torch.zeros(0, dtype=torch.float64),
+        intervals=confidence_intervals(fitted_names, values, sd, lower, upper),
+        unidentifiable=unidentifiable,
+        warnings=(*found, BLURRED) if found else (),
     )
 
 
