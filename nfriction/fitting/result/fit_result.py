@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -25,12 +24,12 @@ from nfriction.fitting.result.identifiability import (
 )
 from nfriction.fitting.result.uncertainty import CoefficientUncertainty
 from nfriction.fitting.shooting.autocorrelation import bandwidth, effective_noise, hac_sd
-from nfriction.fitting.shooting.problem import ShootingProblem
+from nfriction.fitting.shooting.problem import ShootingProblem, observed_count
 from nfriction.fitting.shooting.variables import model_at
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import LeastSquaresResult
 from nfriction.plant import Plant
-from nfriction.signals import Motion, count_seen
+from nfriction.signals import Motion
 
 BLURRED = (
     "The torque comes from a smoothed motion, which blurs friction at low speed and knows no error "
@@ -70,6 +69,8 @@ class FitResult:
             equation-error fit.
         continuity: of the fitted windows, see `fit`.
         data_warnings: warnings about the data; inherited by fits warm-started from this one.
+        stages: length of the windows of each stage that was kept [s], and its residual in
+            `residual_unit`; of constant coefficients.
         skipped_horizons: lengths of windows that the constant law could not follow [s].
     """
 
@@ -90,6 +91,7 @@ class FitResult:
     uncertainty: CoefficientUncertainty | None = None
     continuity: Continuity = "none"
     data_warnings: tuple[str, ...] = ()
+    stages: tuple[tuple[float, float], ...] = ()
     skipped_horizons: tuple[float, ...] = ()
 
     def longest_usable_horizon(self, windows: Sequence[float]) -> float:
@@ -125,6 +127,7 @@ class FitResult:
                 for i in self.intervals
             },
             "unidentifiable": list(self.unidentifiable),
+            "stages": [list(stage) for stage in self.stages],
             "warnings": list(self.warnings),
             **({} if self.continuity == "none" else {"continuity": self.continuity}),
             **(offsets if self.encoder_offsets else {}),
@@ -200,7 +203,7 @@ def result_from_shooting(
         tuple(names[i] for i in mask.nonzero().flatten().tolist())
         for mask in (hit, hit & result.at_lower[:count] & least)
     )
-    encoder_count = plant.position_quantum or _observed_count(problem)
+    encoder_count = plant.position_quantum or observed_count(problem)
     residuals = problem.errors(x)
     residual = float(residuals.square().mean().sqrt())
     intervals, unidentifiable, root = _identifiability(problem, result, names, residuals, motions)
@@ -276,13 +279,6 @@ def _identifiability(
             name for name in dict.fromkeys(weak) if not any(name in d for d in unidentifiable)
         )
     return intervals, unidentifiable, root[:friction_count].clone()
-
-
-def _observed_count(problem: ShootingProblem) -> float | None:
-    """Largest of the encoder counts that the positions show; None where none does."""
-    recorded = problem.windows.q @ problem.measurement.T
-    seen = float(np.fmax.reduce(count_seen(recorded.numpy())))
-    return None if math.isnan(seen) else seen
 
 
 def _torque_scale(
