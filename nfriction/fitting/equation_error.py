@@ -1,8 +1,9 @@
 """Equation error: constant coefficients by regression on the torque that a motion implies."""
 
 import itertools
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -10,8 +11,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nfriction.fitting.options import DEFAULTS, FitOptions
+from nfriction.fitting.result.identifiability import NORMAL_95
+from nfriction.fitting.shooting.autocorrelation import effective_noise
+from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Law
 from nfriction.friction.models import V_SMOOTH, FrictionModel
+from nfriction.optim.least_squares import Quadratic
+from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
@@ -25,11 +31,17 @@ class TorqueFit:
         coefficients: (joint, coefficient), in SI.
         residual: root mean square of the unexplained torque, (joint,) [N m].
         torque: root mean square of the friction torque, (joint,) [N m].
+        starts: the best coefficients at each combination of initial values of those in which the
+            torque is not linear, (start, joint, coefficient).
+        information: of the data about each joint's coefficients, (joint, coefficient,
+            coefficient), with residuals inflated for autocorrelation.
     """
 
     coefficients: Tensor
     residual: Tensor
     torque: Tensor
+    starts: Tensor = field(default_factory=lambda: torch.zeros(0, 0, 0, dtype=torch.float64))
+    information: Tensor = field(default_factory=lambda: torch.zeros(0, 0, 0, dtype=torch.float64))
 
 
 def friction_torque(
@@ -68,6 +80,82 @@ def _inside(time: NDArray[np.float64], edge: float) -> NDArray[np.bool_]:
     return (time >= time[0] + edge) & (time <= time[-1] - edge)
 
 
+@dataclass(frozen=True, eq=False)
+class _Balance:
+    """The torque balance of one recording: friction as its smoothed motion shows it.
+
+    A smoother sees an acceleration, and with it the jumps of dry friction, through a low-pass
+    filter. Where the torques and what a law makes of them pass the same filter, its bias cancels;
+    otherwise a reversal that is smeared over 50 ms would hide all friction that falls with speed.
+
+    Attributes:
+        qd, load: (sample, joint).
+        torque: friction torque, (sample, joint) [N m].
+        kept: samples away from the ends whose direction of motion is known, (sample, joint).
+        rate: angular frequency above which the smoother forgets, (joint,) [rad/s]; None for a
+            motion that was not smoothed.
+        step: [s].
+        segments: first and last sample of each stretch without a gap.
+
+    References:
+        M. Gautier, Dynamic identification of robots with power model, ICRA 1997 (both sides of
+        the regression through one low-pass filter).
+    """
+
+    qd: Tensor
+    load: Tensor
+    torque: Tensor
+    kept: Tensor
+    rate: Tensor | None
+    step: float
+    segments: Sequence[tuple[int, int]]
+
+    def smoothed(self, x: Tensor) -> Tensor:
+        """Torques (sample, joint, any) as the smoother would see them."""
+        if self.rate is None:
+            return x
+        parts = []
+        for first, last in self.segments:
+            part = x[first : last + 1]
+            # Mirrored, so that the ends meet.
+            spectrum = torch.fft.rfft(torch.cat([part, part.flip(0)]), dim=0)
+            frequency = 2 * math.pi * torch.fft.rfftfreq(2 * len(part), self.step)
+            gain = 1 / (1 + (frequency[:, None] / self.rate) ** 8)
+            back = torch.fft.irfft(spectrum * gain[..., None], n=2 * len(part), dim=0)
+            parts.append(back[: len(part)])
+        return torch.cat(parts)
+
+
+def _balance(plant: Plant, recording: Recording, motion: Motion, options: FitOptions) -> _Balance:
+    q, qd, qdd = (torch.as_tensor(x) for x in (motion.q, motion.qd, motion.qdd))
+    tau = torch.zeros_like(q) if recording.tau is None else torch.tensor(recording.tau)
+    kept = torch.as_tensor(_inside(motion.time, options.edge))[:, None].expand_as(q)
+    step = float(np.median(np.diff(motion.time)))
+    rate = _smoother_rate(motion)
+    found = _Balance(qd, plant.load(q, qd), tau, kept, rate, step, recording.segments)
+    if rate is not None and motion.std is not None:
+        # A torque is held until the next sample, so it acts half a sample late.
+        held = 0.5 * (tau + torch.cat([tau[:1], tau[:-1]]))
+        tau = found.smoothed(held[..., None])[..., 0]
+        # Stiction balances any torque, and noise around zero is no direction.
+        kept = kept & (qd.abs() > NORMAL_95 * torch.as_tensor(motion.std.qd))
+    return replace(found, torque=tau - plant.inverse_dynamics(q, qd, qdd), kept=kept)
+
+
+def _smoother_rate(motion: Motion) -> Tensor | None:
+    """Corner frequency of the low-pass filter that `kalman_smoother` is, (joint,) [rad/s].
+
+    Its gain is 1 / (1 + (w / rate)^8) far from the ends; the ratio of the standard deviations of
+    acceleration and position, the square of the rate but for a constant, shows the rate.
+    """
+    if motion.std is None:
+        return None
+    q, qdd = (torch.as_tensor(np.median(x, axis=0)) for x in (motion.std.q, motion.std.qdd))
+    shape = (math.sin(5 * math.pi / 8) / math.sin(math.pi / 8)) ** 0.25
+    rate = shape * (qdd / q).sqrt()
+    return rate if bool((torch.isfinite(rate) & (rate > 0)).all()) else None
+
+
 def fit_torque(
     law: Law,
     plant: Plant,
@@ -79,36 +167,97 @@ def fit_torque(
     """Least squares of the friction torque, joint by joint.
 
     Linear least squares within bounds where the torque is linear in the coefficients, for every
-    combination of the law's initial values of the others. Recordings and motions are in joint
-    coordinates.
+    combination of the law's initial values of the others, which are then refined. Samples whose
+    direction of motion is uncertain are left out. Recordings and motions are in joint coordinates.
 
     Raises:
         ValueError: if there are too few samples, or the law's torque is not finite along the
         motion.
     """
-    parts = [
-        friction_torque(plant, r, m, options) for r, m in zip(recordings, motions, strict=True)
-    ]
-    qd, load, torque = (torch.cat(x) for x in zip(*parts, strict=True))
-    if len(qd) <= len(law.coefficients):
+    parts = [_balance(plant, r, m, options) for r, m in zip(recordings, motions, strict=True)]
+    count = sum(int(_inside(m.time, options.edge).sum()) for m in motions)
+    if count <= len(law.coefficients):
         names = ", ".join(r.name or "a recording" for r in recordings)
         raise ValueError(
-            f"{names}: too few samples, {len(qd)} are left {options.edge:g} s away from the ends "
+            f"{names}: too few samples, {count} are left {options.edge:g} s away from the ends "
             f"for {len(law.coefficients)} coefficients a joint; record for longer."
         )
+    torque, kept = (torch.cat([getattr(p, name) for p in parts]) for name in ("torque", "kept"))
+    # A joint that hardly ever moved has to do with what there is.
+    inside = torch.cat([torch.as_tensor(_inside(m.time, options.edge)) for m in motions])
+    kept = torch.where(kept.sum(0) > len(law.coefficients), kept, inside[:, None])
     nonlinear = {i: c.initial_grid for i, c in enumerate(law.coefficients) if not c.linear}
     candidates = []
     for values in itertools.product(*nonlinear.values()):
         fixed = dict(zip(nonlinear, values, strict=True))
-        design = _design(law, qd, load, v_smooth, fixed)
-        candidates.append(_linear_fit(law, design, torque, fixed, options.ridge))
-    coefficients, residuals = (torch.stack(x) for x in zip(*candidates, strict=True))
+        design = torch.cat([p.smoothed(_design(law, p.qd, p.load, v_smooth, fixed)) for p in parts])
+        candidates.append(_linear_fit(law, design, torque, kept, fixed, options.ridge))
+    starts, residuals = (torch.stack(x) for x in zip(*candidates, strict=True))
     best = residuals.argmin(0)
+    coefficients = starts[best, torch.arange(len(best))]
+    regression = _Regression(law, parts, torque, kept, v_smooth)
+    if any(c.fitted for c in law.coefficients if not c.linear):
+        coefficients = regression.refined(coefficients)
+    slopes, error = regression.linearised(coefficients)
+    many = kept.sum(0)
     return TorqueFit(
-        coefficients[best, torch.arange(len(best))],
-        residuals.amin(0),
-        torque.square().mean(0).sqrt(),
-    )
+        coefficients,
+        (error.square().sum(0) / many).sqrt(),
+        (torch.where(kept, torque, 0.0).square().sum(0) / many).sqrt(),
+        starts,
+        torch.stack([
+            slopes[:, j].T @ slopes[:, j] / _effective_variance(error[kept[:, j], j])
+            for j in range(len(many))
+        ]),
+    )  # fmt: skip
+
+
+def _effective_variance(error: Tensor) -> float:
+    """Variance of a joint's residuals, inflated for autocorrelation."""
+    return max(effective_noise(error[None, :, None]) ** 2, 1e-300)
+
+
+@dataclass(frozen=True, eq=False)
+class _Regression:
+    """Residuals of torque balances as a function of all coefficients of a law."""
+
+    law: Law
+    parts: Sequence[_Balance]
+    torque: Tensor
+    kept: Tensor
+    v_smooth: float
+
+    def linearised(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+        """Slopes (sample, joint, coefficient) and residuals (sample, joint); 0 if left out."""
+        rows = []
+        for part in self.parts:
+
+            def torque(values: Tensor, part: _Balance = part) -> Tensor:
+                return self.law.torque(part.qd, part.load, values, self.v_smooth)
+
+            units = torch.eye(coefficients.shape[1], dtype=coefficients.dtype)
+            pairs = [
+                torch.func.jvp(torque, (coefficients,), (unit.expand_as(coefficients),))
+                for unit in units
+            ]
+            values = torch.stack([pairs[0][0], *(slope for _, slope in pairs)], -1)
+            rows.append(part.smoothed(values))
+        found = torch.where(self.kept[..., None], torch.cat(rows), 0.0)
+        return found[..., 1:], found[..., 0] - torch.where(self.kept, self.torque, 0.0)
+
+    def refined(self, coefficients: Tensor) -> Tensor:
+        """The coefficients at the minimum next to these, within the bounds of a fit."""
+        lower, upper = Constant(self.law, len(coefficients), coefficients).bounds()
+
+        def model(x: Tensor) -> Quadratic:
+            slopes, error = self.linearised(x.reshape(coefficients.shape))
+            blocks = torch.einsum("sjk,sjl->jkl", slopes, slopes)
+            gradient = torch.einsum("sjk,sj->jk", slopes, error).reshape(-1)
+            return Quadratic(0.5 * error.square().sum(), gradient, torch.block_diag(*blocks))
+
+        solver = LevenbergMarquardt(cost_tolerance=1e-12)
+        found = solver.minimise(model, coefficients.reshape(-1), lower=lower, upper=upper)
+        return found.x.reshape(coefficients.shape)
 
 
 def _design(law: Law, qd: Tensor, load: Tensor, v_smooth: float, fixed: dict[int, float]) -> Tensor:
@@ -133,7 +282,12 @@ def _design(law: Law, qd: Tensor, load: Tensor, v_smooth: float, fixed: dict[int
 
 
 def _linear_fit(
-    law: Law, design: Tensor, torque: Tensor, fixed: dict[int, float], ridge: float
+    law: Law,
+    design: Tensor,
+    torque: Tensor,
+    kept: Tensor,
+    fixed: dict[int, float],
+    ridge: float,
 ) -> tuple[Tensor, Tensor]:
     """Coefficients (joint, coefficient) and residual (joint,), the nonlinear ones given."""
     from scipy.optimize import lsq_linear  # slow to import
@@ -146,13 +300,14 @@ def _linear_fit(
         coefficients[:, k] = value
     residual = torch.zeros(joints, dtype=torque.dtype)
     for joint in range(joints):
-        a, y = design[:, joint].numpy(), torque[:, joint].numpy()
+        rows = kept[:, joint]
+        a, y = design[rows, joint].numpy(), torque[rows, joint].numpy()
         # Columns of unit length, as coefficients differ by orders of magnitude.
         scale = np.linalg.norm(a, axis=0)
         scale[scale == 0] = 1.0
-        rows = np.concatenate([a / scale, ridge * np.eye(len(linear))])
+        system = np.concatenate([a / scale, ridge * np.eye(len(linear))])
         target = np.concatenate([y, np.zeros(len(linear))])
-        solution = lsq_linear(rows, target, bounds=(lower, np.inf), tol=1e-12).x / scale
+        solution = lsq_linear(system, target, bounds=(lower, np.inf), tol=1e-12).x / scale
         coefficients[joint, linear] = torch.as_tensor(solution)
         residual[joint] = float(np.sqrt(np.mean((a @ solution - y) ** 2)))
     return coefficients, residual
@@ -165,7 +320,8 @@ def coefficient_scale(
 
     Shape (joint, coefficient); zero where the torque is not linear in the coefficient.
     """
-    torque = fit_torque(model.law, plant, recordings, motions, model.v_smooth).torque
+    pairs = zip(recordings, motions, strict=True)
+    torque = torch.cat([friction_torque(plant, r, m)[2] for r, m in pairs]).square().mean(0).sqrt()
     rms = torch.as_tensor(np.concatenate([m.qd for m in motions])).square().mean(0).sqrt()
     columns = []
     for c in model.law.coefficients:

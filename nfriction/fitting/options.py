@@ -132,12 +132,17 @@ class FitOptions:
     # Growth of the error from one horizon to the next that means a search lost the motion.
     max_growth: float = 10.0
 
+    # Chance that a stage is called worse at a shorter horizon by its noise alone.
+    loss_level: float = 0.01
+    # Residuals up to so many times the encoder's rounding leave no room for a better minimum.
+    explained_ratio: float = 1.1
+    # Search for the states of windows at given parameters: few unknowns, close by.
+    settling_steps: int = 6
+    settling_tolerance: float = 1e-4
+
     # --- Hold-out of a network.
     # Every so many-th window is held out, so that all sizes of the motion are represented.
     folds: int = 3
-    # Search for the initial states of hold-out windows: few unknowns, close by.
-    holdout_steps: int = 6
-    holdout_tolerance: float = 1e-4
     # Maximum hold-out RMSE ratio to the law fitted on the same windows.
     max_ratio_same: float = 0.8
     # Maximum hold-out RMSE ratio to the law fitted on all windows, which it would replace.

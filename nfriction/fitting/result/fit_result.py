@@ -5,30 +5,36 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from nfriction.fitting.equation_error import TorqueFit, peak_dynamics_torque
 from nfriction.fitting.options import Continuity
 from nfriction.fitting.result.identifiability import (
+    Information,
     Interval,
     confidence_intervals,
     covariance_root,
     exceeds_drive_torque,
     model_error_warning,
     null_directions,
+    standard_deviations,
     warnings_of,
     weakly_identified,
 )
 from nfriction.fitting.result.uncertainty import CoefficientUncertainty
 from nfriction.fitting.shooting.autocorrelation import bandwidth, effective_noise, hac_sd
-from nfriction.fitting.shooting.problem import ShootingProblem
+from nfriction.fitting.shooting.problem import ShootingProblem, observed_count
 from nfriction.fitting.shooting.variables import model_at
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import LeastSquaresResult
 from nfriction.plant import Plant
-from nfriction.signals import Motion, count_seen
+from nfriction.signals import Motion
+
+BLURRED = (
+    "The torque comes from a smoothed motion, which blurs friction at low speed and knows no error "
+    'of the plant; `method="output_error"` gives a better answer, and intervals that cover both.'
+)
 
 # A lower bound no larger exists only for the logarithm of a positive coefficient, in SI.
 NOTHING = 1e-9
@@ -53,7 +59,8 @@ class FitResult:
         residuals: position errors of the training windows [rad; m], (window, sample, joint); empty
             after an equation-error fit.
         intervals: 95 % confidence intervals of constant coefficients and plant terms, by the
-            effective sample size of autocorrelated residuals. None after an equation-error fit.
+            effective sample size of autocorrelated residuals. After an equation-error fit they take
+            the plant and the smoothed motion for exact.
         unidentifiable: parameters, or combinations `"a with b"`, that the data do not determine.
         warnings: a sentence each.
         encoder_offsets: added to the recorded positions to get true ones, in joint coordinates
@@ -62,6 +69,8 @@ class FitResult:
             equation-error fit.
         continuity: of the fitted windows, see `fit`.
         data_warnings: warnings about the data; inherited by fits warm-started from this one.
+        stages: length of the windows of each stage that was kept [s], and its residual in
+            `residual_unit`; of constant coefficients.
         skipped_horizons: lengths of windows that the constant law could not follow [s].
     """
 
@@ -82,6 +91,7 @@ class FitResult:
     uncertainty: CoefficientUncertainty | None = None
     continuity: Continuity = "none"
     data_warnings: tuple[str, ...] = ()
+    stages: tuple[tuple[float, float], ...] = ()
     skipped_horizons: tuple[float, ...] = ()
 
     def longest_usable_horizon(self, windows: Sequence[float]) -> float:
@@ -117,6 +127,7 @@ class FitResult:
                 for i in self.intervals
             },
             "unidentifiable": list(self.unidentifiable),
+            "stages": [list(stage) for stage in self.stages],
             "warnings": list(self.warnings),
             **({} if self.continuity == "none" else {"continuity": self.continuity}),
             **(offsets if self.encoder_offsets else {}),
@@ -132,6 +143,28 @@ def result_from_equation_error(
 ) -> FitResult:
     """The result of a regression on torques, which is written into the model."""
     model.schedule.set_parameter_vector(torque.coefficients.reshape(-1))
+    names = model.schedule.parameter_names(plant.joint_names)
+    lower, upper = model.schedule.bounds()
+    fitted = (lower < upper).nonzero().flatten()
+    fitted_names = [names[i] for i in fitted.tolist()]
+    values, lower, upper = (x[fitted] for x in (model.schedule.parameter_vector(), lower, upper))
+    known = Information(torch.block_diag(*torque.information), torch.zeros(len(names)).double())
+    known = known.subset(fitted)
+    sd = standard_deviations(known)
+    low, high = values <= lower + NOTHING, values >= upper
+    at_bounds, at_zero = (
+        tuple(fitted_names[i] for i in mask.nonzero().flatten().tolist())
+        for mask in (low | high, low & (lower.abs() <= NOTHING))
+    )
+    unidentifiable = null_directions(fitted_names, known)
+    unidentifiable += tuple(
+        name
+        for name in weakly_identified(fitted_names, values, known)
+        if not any(name in direction for direction in unidentifiable)
+    )
+    found = warnings_of(
+        converged=True, at_bounds=at_bounds, unidentifiable=unidentifiable, at_zero=at_zero
+    )
     return FitResult(
         model=model.requires_grad_(False),
         plant=start.plant if start else plant,
@@ -139,10 +172,13 @@ def result_from_equation_error(
         status="Converged: linear least squares of the torque.",
         converged=True,
         residual=float(torque.residual.square().mean().sqrt()),
-        at_bounds=(),
+        at_bounds=at_bounds,
         steps=0,
         motions=motions,
         residuals=torch.zeros(0, dtype=torch.float64),
+        intervals=confidence_intervals(fitted_names, values, sd, lower, upper),
+        unidentifiable=unidentifiable,
+        warnings=(*found, BLURRED) if found else (),
     )
 
 
@@ -167,7 +203,7 @@ def result_from_shooting(
         tuple(names[i] for i in mask.nonzero().flatten().tolist())
         for mask in (hit, hit & result.at_lower[:count] & least)
     )
-    encoder_count = plant.position_quantum or _observed_count(problem)
+    encoder_count = plant.position_quantum or observed_count(problem)
     residuals = problem.errors(x)
     residual = float(residuals.square().mean().sqrt())
     intervals, unidentifiable, root = _identifiability(problem, result, names, residuals, motions)
@@ -243,13 +279,6 @@ def _identifiability(
             name for name in dict.fromkeys(weak) if not any(name in d for d in unidentifiable)
         )
     return intervals, unidentifiable, root[:friction_count].clone()
-
-
-def _observed_count(problem: ShootingProblem) -> float | None:
-    """Largest of the encoder counts that the positions show; None where none does."""
-    recorded = problem.windows.q @ problem.measurement.T
-    seen = float(np.fmax.reduce(count_seen(recorded.numpy())))
-    return None if math.isnan(seen) else seen
 
 
 def _torque_scale(

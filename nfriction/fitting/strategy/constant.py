@@ -35,6 +35,11 @@ TOO_LONG = (
     "wrong."
 )
 
+LOSSY = (
+    "Windows of {:g} s were skipped: they would give parameters that are worse at shorter ones. "
+    "Errors of the torque add up over long windows, or law or plant are wrong."
+)
+
 
 def fit_constant(task: FitTask) -> FitResult:
     """Fit constant coefficients, by torques and then by simulated windows."""
@@ -45,31 +50,40 @@ def fit_constant(task: FitTask) -> FitResult:
         return result_from_equation_error(model, task.plant, start, task.motions, torque)
 
     def equation_error(plant: Plant) -> Tensor:
-        return regression(task, model, plant).coefficients
+        implied = regression(task, model, plant)
+        return torch.cat([implied.coefficients[None], implied.starts])
 
     eccentric = fits_eccentricity(options, start)
     fitter = _fitter(task, model, torque, eccentric)
     friction = torque.coefficients.reshape(-1)
     plant = known_terms(start, fitter.jacobian.terms)
     linear = all(c.linear or not c.fitted for c in model.law.coefficients)
-    found, skipped = horizon_continuation(
+    search = horizon_continuation(
         fitter, friction, plant, task.motions, None if linear else equation_error
     )
-    if (law := model.law.nested_law) is not None and not found.stopped:
+    if (law := model.law.nested_law) is not None and not search.end.stopped:
         contained = FrictionModel(law, Constant(law, model.joints), model.v_smooth)
         by_torque = regression(task, contained, begun)
-        found, skipped = warm_start_from_nested(
-            (found, skipped), fitter, _fitter(task, contained, by_torque, eccentric),
+        search = warm_start_from_nested(
+            search, fitter, _fitter(task, contained, by_torque, eccentric),
             (by_torque.coefficients.reshape(-1), plant), task.motions, equation_error,
         )  # fmt: skip
+    found = search.end
     undecided = start is None and options.eccentricity == "auto" and options.fit_plant
     if undecided and isinstance(task.plant, PendulumChain) and not found.stopped:
         richer = _fitter(task, model, torque, eccentric=True)
         tolerance = loglik_tolerance(found.result.cost, options)
         found = richer_by_evidence(found, richer, tolerance) or found
     fitted = result_from_shooting(model, found.problem, found.result, task.motions)
-    fitted = replace(fitted, continuity=options.continuity, skipped_horizons=skipped)
-    return fitted.with_warnings([TOO_LONG.format(length) for length in skipped])
+    lengths = zip(options.windows, search.stages, strict=False)
+    fitted = replace(
+        fitted,
+        continuity=options.continuity,
+        stages=tuple((float(length), stage.rms) for length, stage in lengths),
+        skipped_horizons=search.skipped,
+    )
+    reason = LOSSY if search.lossy else TOO_LONG
+    return fitted.with_warnings([reason.format(length) for length in search.skipped])
 
 
 def regression(task: FitTask, model: FrictionModel, plant: Plant) -> TorqueFit:

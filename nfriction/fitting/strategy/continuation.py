@@ -1,5 +1,6 @@
 """Horizon continuation: shooting windows of growing length, each started at the last end."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,7 +12,7 @@ from nfriction.fitting.data.inputs import integration_substeps
 from nfriction.fitting.data.windows import Windows, cut_windows
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.shooting.autocorrelation import effective_noise
-from nfriction.fitting.shooting.problem import ShootingProblem
+from nfriction.fitting.shooting.problem import ShootingProblem, observed_count
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.shooting.variables import Parts, model_at
 from nfriction.fitting.strategy.extrapolation_prior import ExtrapolationPrior
@@ -22,7 +23,8 @@ from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
-# Coefficients (joint, coefficient) that torques imply on a plant.
+# Coefficients (start, joint, coefficient) that torques imply on a plant: the best, then the best at
+# each of the law's initial values.
 EquationError = Callable[[Plant], Tensor]
 
 
@@ -37,6 +39,11 @@ class HorizonResult:
     def residuals(self) -> Tensor:
         """Position errors [rad; m], (window, step + 1, joint)."""
         return self.problem.errors(self.result.x)
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residuals [rad; m]."""
+        return float(self.residuals.square().mean().sqrt())
 
     @cached_property
     def parts(self) -> Parts:
@@ -53,10 +60,16 @@ class HorizonResult:
         """Standard deviation of a residual, inflated for autocorrelation."""
         return effective_noise(self.residuals)
 
+    @property
+    def explained(self) -> bool:
+        """True if the rounding of the encoder explains the residuals."""
+        quantum = self.problem.jacobian.plant.position_quantum or observed_count(self.problem)
+        limit = self.problem.options.explained_ratio * (quantum or 0.0) / 12**0.5
+        return self.rms <= limit
+
     def lost_motion(self, before: "HorizonResult", options: FitOptions) -> bool:
         """True if the longer windows only show that the motion forgets its start within them."""
-        rms = [float(found.residuals.square().mean().sqrt()) for found in (before, self)]
-        return not rms[1] <= options.max_growth * rms[0] and not self.result.converged
+        return not self.rms <= options.max_growth * before.rms and not self.result.converged
 
     def as_stopped(self) -> "HorizonResult":
         """The same, reported as stopped by the caller."""
@@ -181,6 +194,30 @@ class StallMonitor:
         return float(((x - before)[:count] / sd).abs().max())
 
 
+@dataclass(frozen=True, eq=False)
+class Continuation:
+    """The stages of a search, each of longer windows than the one before.
+
+    Attributes:
+        stages: those that were kept, one at least.
+        skipped: lengths of the windows that were skipped [s].
+        lossy: true if the first of these was searched, but lost what shorter windows had found.
+    """
+
+    stages: tuple[HorizonResult, ...]
+    skipped: tuple[float, ...] = ()
+    lossy: bool = False
+
+    @property
+    def end(self) -> HorizonResult:
+        """The last stage that was kept."""
+        return self.stages[-1]
+
+    def ending(self, end: HorizonResult) -> "Continuation":
+        """The same with another last stage."""
+        return replace(self, stages=(*self.stages[:-1], end))
+
+
 def horizon_continuation(
     fitter: ShootingFitter,
     friction: Tensor,
@@ -188,46 +225,145 @@ def horizon_continuation(
     motions: tuple[Motion, ...],
     equation_error: EquationError | None = None,
     of: str = "",
-) -> tuple[HorizonResult, tuple[float, ...]]:
+) -> Continuation:
     """Search windows of growing length, each from the states and with the noise of the last.
 
-    If a horizon fails, return the previous stage and the skipped horizons.
+    A horizon that fails, or whose parameters lose what shorter ones had found (`loses`), is
+    skipped, and longer ones with it.
 
     Args:
         fitter: of the model; `options.windows` are the lengths.
         friction, plant: parameters to start from.
         motions: smoothed, in joint coordinates.
-        equation_error: repeats the first stage from the coefficients that torques imply on the
-            plant that it found: a nonlinear law has several minima, and on a slightly wrong
-            inertia the torques lead to a worse one.
+        equation_error: repeats the first and the last stage from coefficients that torques imply
+            on the plant that it found: a nonlinear law has several minima, and on a slightly
+            wrong inertia the torques lead to a worse one.
         of: ending of the stages' names.
     """
     options = fitter.options
-    reached: HorizonResult | None = None
+    stages: list[HorizonResult] = []
     offsets: Tensor | None = None
     noise, simulated = options.first_noise, motions
     for place, length in enumerate(options.windows):
-        far = reached is None and len(options.windows) > 1
+        rest = tuple(options.windows[place:])
+        far, last = not stages and len(options.windows) > 1, len(rest) == 1
         problem = fitter.problem(fitter.cut(simulated, length), noise, friction, far=far)
         start = problem.variables.start(plant, offsets)
+        if stages:
+            # States of shorter windows drift apart within longer ones. Corrected together with
+            # the parameters, they would throw these far off at the first step.
+            start, stopped = settle_states(problem, start)
+            if stopped:
+                return Continuation((*stages[:-1], stages[-1].as_stopped()), rest)
         tolerance = options.loose_tolerance
-        if length == options.windows[-1]:
+        if last:
             # The cost far from the minimum says nothing about its value; the last stage's does.
-            near = reached and weighted_cost(reached.residuals, noise)
+            near = weighted_cost(stages[-1].residuals, noise) if stages else None
             tolerance = loglik_tolerance(near or float(problem.cost(start)), options)
         name = f"{length:g} s windows{of}"
         found = fitter.search(problem, start, tolerance, name)
-        if reached is None and equation_error is not None and not found.stopped:
-            found = restart_from_equation_error(fitter, found, tolerance, name, equation_error)
-        if reached is not None and found.lost_motion(reached, options):
-            return reached, tuple(options.windows[place:])
-        reached, noise = found, max(found.noise, options.min_noise)
+        ends = [found]
+        if equation_error is not None and not found.stopped and (last or not stages):
+            other = restart_from_equation_error(fitter, found, tolerance, name, equation_error)
+            ends = [other, found] if other is not found else ends
+        if stages and ends[0].lost_motion(stages[-1], options):
+            return Continuation(tuple(stages), rest)
+        kept = [end for end in ends if not stages or end.stopped or not loses(stages, end)]
+        if not kept:
+            return Continuation(tuple(stages), rest, lossy=True)
+        found = kept[0]
+        stages.append(found)
+        noise = max(found.noise, options.min_noise)
         friction, plant, _, offsets = found.parts
         if found.stopped:
             break
-        simulated = problem.simulated_motions(found.result.x, simulated)
-    assert reached is not None
-    return reached, ()
+        simulated = found.problem.simulated_motions(found.result.x, simulated)
+    return Continuation(tuple(stages))
+
+
+def settle_states(problem: ShootingProblem, x: Tensor) -> tuple[Tensor, bool]:
+    """Decision variables with states and encoder offsets at their best, the shared ones held.
+
+    True besides if the search was interrupted.
+    """
+    options, count = problem.options, problem.variables.shared_count
+    shared = x[:count]
+
+    def of_states(states: Tensor) -> Quadratic:
+        whole = problem.linearise(torch.cat([shared, states]))
+        blocks = (0, whole.blocks[1]) if whole.blocks else None
+        return Quadratic(whole.cost, whole.gradient[count:], whole.hessian[count:, count:], blocks)
+
+    solver = LevenbergMarquardt(
+        max_steps=options.settling_steps, cost_tolerance=options.settling_tolerance
+    )
+    result = solver.minimise(
+        of_states, x[count:], cost=lambda states: problem.cost(torch.cat([shared, states]))
+    )
+    return torch.cat([shared, result.x]), result.status == "stopped"
+
+
+def loses(stages: Sequence[HorizonResult], found: HorizonResult) -> bool:
+    """True if a stage's parameters lose what the stages before it had found.
+
+    Where the encoder's rounding explains the residuals of shorter windows, law and plant are right,
+    and a loss of likelihood there beyond that of other parameters within their uncertainty is
+    one: errors of the torque add up over a long window and lead its parameters astray. Elsewhere
+    law or plant are wrong, and short horizons may be traded for long ones. As the noise of each is
+    unknown, its log likelihood is that of the root mean square residual; parameters lose that are
+    worse at a shorter horizon by more than its noise, and gain less at their own.
+    """
+    from scipy.special import chdtri  # slow to import
+
+    before, chance = stages[-1], found.problem.options.loss_level
+    lower, upper = found.problem.variables.bounds()
+    fitted = int((lower < upper)[: found.problem.variables.shared_count].sum())
+    total, worse = 0.0, False
+    for at in (*stages, found):
+        new = _squares(at, found)
+        if at is not found and at.explained:
+            lost = float(new.sum() - at.residuals.square().sum()) / at.noise**2
+            if not lost <= float(chdtri(fitted, chance)):
+                return True
+            continue
+        old = _squares(at, before)
+        ratio, spread = log_ratio(new, old)
+        total += ratio
+        worse |= at is not found and ratio > spread * student_quantile(len(new) - 1, 1 - chance)
+    return worse and not total <= 0
+
+
+def _squares(at: HorizonResult, of: HorizonResult) -> Tensor:
+    """Squared residuals of each window of a stage with the parameters of another one, (window,)."""
+    if at is of:
+        return of.residuals.square().sum((1, 2))
+    count = at.problem.variables.shared_count
+    x, _ = settle_states(at.problem, torch.cat([of.result.x[:count], at.result.x[count:]]))
+    return at.problem.errors(x).square().sum((1, 2))
+
+
+def log_ratio(new: Tensor, old: Tensor) -> tuple[float, float]:
+    """Log of the ratio of two sums over windows (window,), and its standard deviation.
+
+    By the jackknife over the windows, as residuals are correlated within and not across them;
+    infinite of a single one.
+
+    References:
+        B. Efron, C. Stein, Annals of Statistics 9 (1981), 586-596.
+    """
+    count = len(new)
+    ratio = 0.5 * float(torch.log(new.sum() / old.sum()))
+    if count < 2:
+        return ratio, math.inf
+    without = 0.5 * torch.log((new.sum() - new) / (old.sum() - old))
+    return ratio, float(((count - 1) * without.var(correction=0)).sqrt())
+
+
+def student_quantile(freedom: int, level: float) -> float:
+    """Quantile of Student's distribution; infinite without a degree of freedom."""
+    from scipy.special import stdtrit  # slow to import
+
+    return float(stdtrit(freedom, level)) if freedom > 0 else math.inf
 
 
 def restart_from_equation_error(
@@ -237,13 +373,26 @@ def restart_from_equation_error(
     name: str,
     equation_error: EquationError,
 ) -> HorizonResult:
-    """A stage, or the same from the coefficients that torques imply on its plant, if lower."""
+    """A stage, or the lowest that starts where torques lead on its plant, if lower.
+
+    The starts after the first, from the law's grid of initial values, are tried only where the
+    encoder's rounding does not explain the residual: below that is no other minimum.
+    """
     problem, plant = found.problem, found.parts.plant
-    friction = equation_error(problem.plant_at(plant)).reshape(-1)
-    problem = replace(problem, friction=model_at(problem.friction, friction))
-    start = problem.variables.start(plant, found.parts.offsets)
-    other = fitter.search(problem, start, tolerance, name)
-    return other if other.stopped or other.result.cost < found.result.cost else found
+    best = found
+    for place, friction in enumerate(equation_error(problem.plant_at(plant))):
+        if place and best.explained:
+            break
+        begun = replace(problem, friction=model_at(problem.friction, friction.reshape(-1)))
+        start = begun.variables.start(plant, found.parts.offsets)
+        count = begun.variables.shared_count
+        start = torch.cat([start[:count], found.result.x[count:]]) if place else start
+        other = fitter.search(begun, start, tolerance, name)
+        if other.stopped:
+            return best.as_stopped() if place else other
+        if other.result.cost < best.result.cost * (1 - tolerance if place else 1):
+            best = other
+    return best
 
 
 def weighted_cost(residuals: Tensor, noise: float) -> float:

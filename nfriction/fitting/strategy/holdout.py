@@ -10,8 +10,7 @@ from torch import Tensor
 from nfriction.fitting.data.windows import Windows, cut_windows
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.shooting.problem import ShootingProblem
-from nfriction.optim.least_squares import Quadratic
-from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
+from nfriction.fitting.strategy.continuation import settle_states
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
@@ -82,23 +81,9 @@ def holdout_rmse(
     diverges, None where the search was interrupted. The problem is of other windows with the same
     friction model and plant, whose parameters are given.
     """
-    judged, options = replace(problem, windows=test), problem.options
-    x = judged.variables.start(plant, friction=friction)
-    shared = x[: judged.variables.shared_count]
-
-    def of_states(states: Tensor) -> Quadratic:
-        whole = judged.linearise(torch.cat([shared, states]))
-        first = len(shared)
-        blocks = (0, whole.blocks[1]) if whole.blocks else None
-        return Quadratic(whole.cost, whole.gradient[first:], whole.hessian[first:, first:], blocks)
-
-    solver = LevenbergMarquardt(
-        max_steps=options.holdout_steps, cost_tolerance=options.holdout_tolerance
-    )
-    result = solver.minimise(
-        of_states, x[len(shared) :], cost=lambda states: judged.cost(torch.cat([shared, states]))
-    )
-    if result.status == "stopped":
+    judged = replace(problem, windows=test)
+    x, stopped = settle_states(judged, judged.variables.start(plant, friction=friction))
+    if stopped:
         return None
-    error = float(judged.errors(torch.cat([shared, result.x])).square().mean().sqrt())
-    return max(error, options.min_noise) if math.isfinite(error) else math.inf
+    error = float(judged.errors(x).square().mean().sqrt())
+    return max(error, problem.options.min_noise) if math.isfinite(error) else math.inf

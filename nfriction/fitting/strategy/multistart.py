@@ -8,11 +8,13 @@ from torch import Tensor
 
 from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.strategy.continuation import (
+    Continuation,
     EquationError,
     HorizonResult,
     ShootingFitter,
     horizon_continuation,
     loglik_tolerance,
+    loses,
     weighted_cost,
 )
 from nfriction.friction.laws import Law
@@ -20,25 +22,30 @@ from nfriction.signals import Motion
 
 
 def warm_start_from_nested(
-    own: tuple[HorizonResult, tuple[float, ...]],
+    own: Continuation,
     fitter: ShootingFitter,
     nested: ShootingFitter,
     start: tuple[Tensor, Tensor],
     motions: tuple[Motion, ...],
     equation_error: EquationError,
-) -> tuple[HorizonResult, tuple[float, ...]]:
-    """The lowest end of a law and its skipped horizons, also searched from its nested law.
+) -> Continuation:
+    """The lowest end of a law, also searched from its nested law, unless it loses by that.
 
     Args:
-        own: end of the law and the skipped horizons on the way there.
+        own: search of the law itself.
         fitter, nested: of the law, and of the nested one.
         start: parameters of the nested law, and of the plant.
         motions, equation_error: see `horizon_continuation`.
     """
     stages = f", {nested.friction.law.name} law"
-    base, skipped = horizon_continuation(nested, *start, motions, of=stages)
-    best = best_of_starts(fitter, own[0], base, equation_error)
-    return best, own[1] if best.problem is own[0].problem else skipped
+    base = horizon_continuation(nested, *start, motions, of=stages)
+    best = best_of_starts(fitter, own.end, base.end, equation_error)
+    if best.problem is own.end.problem:
+        return own.ending(best)
+    longer = best.problem.windows.spans != own.end.problem.windows.spans
+    if (longer or len(own.stages) > 1) and not best.stopped and loses(own.stages, best):
+        return own
+    return Continuation((*own.stages[:-1], best), base.skipped, base.lossy)
 
 
 def best_of_starts(
@@ -65,7 +72,7 @@ def best_of_starts(
     # With the larger noise of the two, priors would outweigh the data.
     sizes = (own.noise, nested.noise, own.problem.noise_sd, nested.problem.noise_sd)
     noise = max(min(size for size in sizes if math.isfinite(size)), options.min_noise)
-    implied = equation_error(own.problem.plant_at(nested.parts.plant))
+    implied = equation_error(own.problem.plant_at(nested.parts.plant))[0]
     embedded = embed_nested(law, nested.parts.friction.reshape(len(implied), -1), implied)
     best, lowest = own, _misfit(own, noise) if same else math.inf
     limit = _misfit(nested, noise)

@@ -1,0 +1,196 @@
+"""Rigs of a new user: is the friction found, or does the fit say what it cannot tell?"""
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from nfriction import FrictionModel, LinearAxis, PendulumChain, Plant, Recording, rollout
+from nfriction.fitting.fit import fit
+from nfriction.fitting.plant_parameters import adjusted_buffers, plant_parameters
+from nfriction.fitting.result.fit_result import FitResult
+from nfriction.friction.registry import model_by_name
+from nfriction.signals import quantise
+
+COUNTS, RATE, SECONDS = 4096, 500, 10.0
+TORQUE_NOISE = 0.01  # [N m]
+FLYWHEEL = (0.35, 0.15, 0.12, 0.3, 2.0)
+# An error up to here counts as found.
+ENOUGH = 0.03
+LAWS = ("CFM", "CVFM", "LFM", "Stribeck", "NLFM")
+
+
+class Rig(NamedTuple):
+    """A mechanism with its true friction, and what a user knows of it."""
+
+    name: str
+    plant: Plant
+    given: Plant
+    law: str
+    truth: tuple[tuple[float, ...], ...]
+    driven: bool
+
+
+def own_rigs(seeds: int, rigs: int) -> None:
+    """Print the error of every coefficient of the flywheel over seeds, and of random rigs."""
+    print(f"{'rig':28} {'coefficient':20} {'truth':>9} {'error [%]':>10} {'95 % [%]':>9}  said")
+    counts = {"found": 0, "said": 0, "MISSED": 0}
+    for of in cases(seeds, rigs):
+        number = int(of.name.split()[-1])
+        begun = time.perf_counter()
+        recordings = recorded(of, number)
+        model = model_by_name(of.law)(of.plant.joints)
+        found = fit(model, of.given, recordings)
+        for line, verdict in judged(of, found):
+            counts[verdict] += 1
+            print(f"{of.name:28} {line}  {verdict}", flush=True)
+        windows = max((length for length, _ in found.stages), default=math.nan)
+        print(
+            f"{'':28} {found.status}  windows up to {windows:g} s, residual "
+            f"{1e3 * found.residual:.3g} m{of.plant.unit}, {time.perf_counter() - begun:.0f} s",
+            flush=True,
+        )
+    print(", ".join(f"{count} {verdict}" for verdict, count in counts.items()))
+
+
+def cases(seeds: int, rigs: int) -> Iterator[Rig]:
+    """The flywheel as axis and as chain, a seed each, then random rigs."""
+    axis = LinearAxis(0.13)
+    wheel = PendulumChain(
+        [1.0], [0.1], com=[0.0], inertia=[0.13], convention=("relative", "hanging")
+    )
+    for seed in range(seeds):
+        for name, plant in (("axis", axis), ("chain", wheel)):
+            yield Rig(f"flywheel as {name} {seed}", plant, known(plant, seed, True), "Stribeck",
+                      (FLYWHEEL,), driven=True)  # fmt: skip
+    for number in range(rigs):
+        yield random_rig(number)
+
+
+def random_rig(number: int) -> Rig:
+    """One link or two with a random law, driven if the number is even."""
+    random = np.random.default_rng(1000 + number)
+    driven = number % 2 == 0
+    links = int(random.integers(1, 3))
+    mass = random.uniform(0.2, 0.8, links)
+    length = random.uniform(0.15, 0.4, links)
+    plant = PendulumChain(
+        mass.tolist(), length.tolist(), inertia=(mass * length**2 / 12).tolist(),
+        convention=("relative", "hanging"),
+    )  # fmt: skip
+    law = str(random.choice(LAWS))
+    weights = 9.81 * np.cumsum((mass * length)[::-1])[::-1]
+    # Friction of a geared drive is a tenth of the weight and more, that of a bearing a hundredth.
+    size = (0.15 if driven else 0.015) * weights
+    truth = tuple(random_friction(law, scale, random) for scale in size)
+    name = f"{'driven' if driven else 'free'} {links} x {law} {number}"
+    return Rig(name, plant, known(plant, number, driven), law, truth, driven)
+
+
+def random_friction(law: str, scale: float, random: np.random.Generator) -> tuple[float, ...]:
+    """Coefficients of a law whose friction is of this size [N m]."""
+
+    def share(low: float, high: float) -> float:
+        return float(scale * random.uniform(low, high))
+
+    dry, slow, viscous = share(0.5, 1.0), share(0.2, 0.5), share(0.05, 0.15)
+    by_law: dict[str, Callable[[], tuple[float, ...]]] = {
+        "CFM": lambda: (dry,),
+        "CVFM": lambda: (dry, viscous),
+        "LFM": lambda: (viscous, dry),
+        "Stribeck": lambda: (dry, slow, viscous, float(random.uniform(0.2, 0.8)), 2.0),
+        "NLFM": lambda: (0.0, dry, viscous, slow, float(random.uniform(0.5, 3.0))),
+    }
+    return by_law[law]()
+
+
+def known(plant: Plant, seed: int, driven: bool) -> Plant:
+    """A plant whose terms are off by as much as a fit expects of a user's drawing."""
+    joints = range(plant.joints) if driven else ()
+    terms = plant_parameters(plant, driven=[*joints])
+    kept = [t for t in terms if t.ratio or "angle" in t.name]
+    sd = torch.tensor([t.prior_sd for t in kept], dtype=torch.float64)
+    random = torch.Generator().manual_seed(seed)
+    off = torch.randn(len(kept), generator=random, dtype=torch.float64).clamp(-2.0, 2.0)
+    return plant.replace(**adjusted_buffers(plant, kept, sd * off))
+
+
+def recorded(rig: Rig, seed: int) -> list[Recording]:
+    """Two recordings of ten seconds, rounded as an encoder reads them."""
+    unit = rig.plant.unit
+    friction = model_by_name(rig.law)(rig.plant.joints, rig.truth)
+    return [
+        recording(rig, friction, np.random.default_rng([seed, place]), f"{rig.name}.{place}", unit)
+        for place in (0, 1)
+    ]
+
+
+def recording(
+    rig: Rig, friction: FrictionModel, random: np.random.Generator, name: str, unit: str
+) -> Recording:
+    joints, steps = rig.plant.joints, round(SECONDS * RATE)
+    rest = torch.zeros(joints, dtype=torch.float64)
+    # Joint angles are from upright; a driven rig starts hanging at rest.
+    begin = rest.clone()
+    if isinstance(rig.plant, PendulumChain):
+        begin[0] = math.pi
+    if not rig.driven:
+        begin = begin + torch.as_tensor(random.uniform(0.5, 1.2, joints))
+    tau = torch.as_tensor(smooth_torque(rig, random)) if rig.driven else None
+    run = rollout(
+        rig.plant, friction, begin, rest, tau, sample_time=1 / RATE, steps=steps, substeps=8,
+        gradients=False,
+    )  # fmt: skip
+    q = run.q.numpy() - [
+        math.pi if isinstance(rig.plant, PendulumChain) else 0.0,
+        *[0.0] * (joints - 1),
+    ]
+    read = None
+    if tau is not None:
+        read = np.vstack([tau.numpy(), tau[-1:].numpy()])
+        read = read + TORQUE_NOISE * random.standard_normal(read.shape)
+    return Recording(run.time.numpy(), quantise(q, COUNTS), tau=read, unit=unit, name=name)
+
+
+def smooth_torque(rig: Rig, random: np.random.Generator) -> NDArray[np.float64]:
+    """Random smooth torque of a few hertz that overcomes friction again and again [N m]."""
+    t = np.arange(round(SECONDS * RATE))[:, None, None] / RATE
+    joints, waves = rig.plant.joints, 6
+    rates = 2 * math.pi * random.uniform(0.1, 1.5, (joints, waves))
+    phases = random.uniform(0, 2 * math.pi, (joints, waves))
+    dry = (
+        np.array([max(row) for row in rig.truth])
+        if rig.law == "CFM"
+        else np.array([sum(row[:2]) for row in rig.truth])
+    )
+    if rig.law != "Stribeck":
+        dry = 2 * dry
+    return 2.2 * dry * np.sin(rates * t + phases).sum(-1) / math.sqrt(waves / 2)
+
+
+def judged(rig: Rig, found: FitResult) -> Iterator[tuple[str, str]]:
+    """A line for every coefficient, and its verdict."""
+    names = found.model.schedule.parameter_names(rig.plant.joint_names)
+    truth = [value for row in rig.truth for value in row]
+    values = found.model.schedule.parameter_vector().tolist()
+    intervals = {i.name: i for i in found.intervals}
+    for name, true, value in zip(names, truth, values, strict=True):
+        if name not in intervals or true == 0.0:
+            continue
+        error, i = abs(value / true - 1), intervals[name]
+        width = (i.high - i.low) / 2 / true
+        lost = any(name in direction for direction in found.unidentifiable)
+        covered = width > ENOUGH and i.low <= true <= i.high
+        said = (
+            lost
+            or covered
+            or not found.converged
+            or bool(found.at_bounds and name in found.at_bounds)
+        )
+        verdict = "found" if error <= ENOUGH else "said" if said else "MISSED"
+        line = f"{name:20} {true:9.4g} {100 * error:10.2f} {100 * width:9.2f}"
+        yield f"{line} {'not identifiable' if lost else ''}", verdict
