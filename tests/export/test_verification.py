@@ -122,6 +122,13 @@ def test_an_artefact_of_another_model_is_found_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="needs a C compiler")
+def test_an_artefact_of_another_law_is_refused(tmp_path: Path) -> None:
+    c(LFM(3), tmp_path, name="m")
+    with pytest.raises(ContractError, match="the artefact gives shapes"):
+        verify_artefact(tmp_path / "m.c", NFNLFM(3), points=50)
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="needs a C compiler")
 def test_doctored_c_is_found_out(tmp_path: Path) -> None:
     c(MODELS["LFM"], tmp_path, INFO, name="m")
     source = tmp_path / "m.c"
