@@ -129,18 +129,6 @@ def _abs_slope(g: Graph, a: Node, value: Node) -> Node:
     return g.apply("where", negative, g.constant(-1.0), g.constant(1.0))
 
 
-def _tanh_slope(g: Graph, a: Node, value: Node) -> Node:
-    return g.apply("sub", g.constant(1.0), g.apply("mul", value, value))
-
-
-def _atan_slope(g: Graph, a: Node, value: Node) -> Node:
-    return g.apply("div", g.constant(1.0), g.apply("add", g.constant(1.0), g.apply("mul", a, a)))
-
-
-def _sqrt_slope(g: Graph, a: Node, value: Node) -> Node:
-    return g.apply("div", g.constant(0.5), value)
-
-
 _RULES: dict[str, Rule] = {
     "add": _add,
     "sub": _sub,
@@ -151,11 +139,17 @@ _RULES: dict[str, Rule] = {
     "min": _select("min"),
     "neg": lambda g, node, da: g.apply("neg", da),
     "abs": _chain(_abs_slope),
-    "sqrt": _chain(_sqrt_slope),
+    "sqrt": _chain(lambda g, a, value: g.apply("div", g.constant(0.5), value)),
     "exp": _chain(lambda g, a, value: value),
     "log": _chain(lambda g, a, value: g.apply("div", g.constant(1.0), a)),
     "sin": _chain(lambda g, a, value: g.apply("cos", a)),
     "cos": _chain(lambda g, a, value: g.apply("neg", g.apply("sin", a))),
-    "tanh": _chain(_tanh_slope),
-    "atan": _chain(_atan_slope),
+    "tanh": _chain(
+        lambda g, a, value: g.apply("sub", g.constant(1.0), g.apply("mul", value, value))
+    ),
+    "atan": _chain(
+        lambda g, a, value: g.apply(
+            "div", g.constant(1.0), g.apply("add", g.constant(1.0), g.apply("mul", a, a))
+        )
+    ),
 }

@@ -22,7 +22,6 @@ from nfriction.codegen.graph import FunctionalModule, Method, Program
 from nfriction.codegen.hoist import hoist
 from nfriction.codegen.llvm import jit
 from nfriction.codegen.llvm.emit import write_function
-from nfriction.codegen.scalar import Node
 
 _CHECK_TOLERANCE = 1e-10
 
@@ -150,16 +149,9 @@ def _tuple(found: Any) -> tuple[Tensor, ...]:
     return tuple(found) if isinstance(found, (tuple, list)) else (found,)
 
 
-def _hoisted(program: Program) -> tuple[list[tuple[Node, ...]], list[Node]]:
-    """Nodes of each output, and those to compute before."""
-    found = hoist(program.graph, [node for port in program.outputs for node in port.nodes])
-    nodes = iter(found.outputs)
-    return [tuple(next(nodes) for _ in port.nodes) for port in program.outputs], found.once
-
-
 def _driver(program: Program, layout: Layout, width: int) -> Driver:
     """A loop over rows."""
-    groups, once = _hoisted(program)
+    groups, once = hoist(program.graph, [port.nodes for port in program.outputs])
     outputs = dict(zip(layout.outputs, groups, strict=True))
     places: dict[int, tuple[str, int]] = {}
     sizes = {name: len(group) for name, group in outputs.items()}

@@ -2,26 +2,24 @@
 
 from collections.abc import Sequence
 from functools import partial, reduce
-from typing import NamedTuple
 
 from nfriction.codegen.scalar import Graph, Node, UpdateRate, reachable
 
+Groups = Sequence[Sequence[Node]]
 
-class Hoisted(NamedTuple):
-    """Outputs of a program, and the values to compute before.
 
-    Attributes:
-        outputs: nodes to compute in every step.
-        once: nodes that these read and parameters decide, arguments first.
+def hoist(graph: Graph, groups: Groups) -> tuple[list[tuple[Node, ...]], list[Node]]:
+    """Find what can be computed less often than the outputs themselves.
+
+    Args:
+        graph: extended where products are regrouped.
+        groups: outputs, in groups that belong together.
+
+    Returns:
+        The groups to compute in every step, and the nodes that these read and parameters decide,
+        arguments first.
     """
-
-    outputs: list[Node]
-    once: list[Node]
-
-
-def hoist(graph: Graph, outputs: Sequence[Node]) -> Hoisted:
-    """Find what can be computed less often than the outputs themselves."""
-    outputs = _regrouped(graph, outputs)
+    outputs = _regrouped(graph, [node for group in groups for node in group])
     read = {
         argument
         for node in reachable(outputs)
@@ -29,7 +27,9 @@ def hoist(graph: Graph, outputs: Sequence[Node]) -> Hoisted:
         for argument in node.args
     }
     once = {n for n in read.union(outputs) if n.rate == UpdateRate.PARAMETER and n.args}
-    return Hoisted(outputs, sorted(once, key=lambda node: node.number))
+    nodes = iter(outputs)
+    apart = [tuple(next(nodes) for _ in group) for group in groups]
+    return apart, sorted(once, key=lambda node: node.number)
 
 
 def _regrouped(graph: Graph, outputs: Sequence[Node]) -> list[Node]:

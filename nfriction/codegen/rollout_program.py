@@ -103,11 +103,8 @@ def arrange(program: Program, jacobian: Port | None) -> RolloutProgram:
     within = _within(graph, q, qd)
     slopes = jacobian.nodes if jacobian else ()
     groups = [start, held, (*q, *qd, *qdd), (within,), begin, advance, slopes]
-    found = hoist(graph, [node for group in groups for node in group])
-    nodes = iter(found.outputs)
-    start, held, step, (within,), begin, advance, slopes = (
-        tuple(next(nodes) for _ in group) for group in groups
-    )
+    groups, once = hoist(graph, groups)
+    start, held, step, (within,), begin, advance, slopes = groups
     at = {"q": ("state", 0), "qd": ("state", joints), "seen_qdd": ("seen", joints),
           "seen_qd": ("seen", 0)}  # fmt: skip
     places: dict[int, tuple[str, int]] = {}
@@ -117,8 +114,9 @@ def arrange(program: Program, jacobian: Port | None) -> RolloutProgram:
         array, offset = at.get(port.name, (port.name, 0)) if own else ("p", parameters)
         places |= {node.number: (array, offset + i) for i, node in enumerate(port.nodes)}
         parameters += 0 if own else len(port.nodes)
-    once = tuple(found.once)
-    return RolloutProgram(joints, once, start, held, step, within, begin, advance, slopes, places)
+    return RolloutProgram(
+        joints, tuple(once), start, held, step, within, begin, advance, slopes, places
+    )
 
 
 def _within(graph: Graph, q: Sequence[Node], qd: Sequence[Node]) -> Node:
