@@ -12,7 +12,7 @@ from torch.func import functional_call, jacrev
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import LINEAR, NONLINEAR, STRIBECK, VISCOUS
 from nfriction.friction.models import FrictionModel
-from nfriction.friction.neurofuzzy import LEAST_RATIO, NeuroFuzzy
+from nfriction.friction.neurofuzzy import LEAST_RATIO, LOGIT_SD, NeuroFuzzy
 from tests.friction.samples import LAWS, QUADRATIC, motion, normal, randomise
 
 every_law = pytest.mark.parametrize("law", [*LAWS, QUADRATIC], ids=lambda law: law.name)
@@ -186,7 +186,12 @@ def test_the_parameter_vector_goes_round_bit_for_bit() -> None:
 def test_the_prior_pulls_to_the_reference() -> None:
     schedule = trained(prior_sd=0.2)
     mean, sd = schedule.prior()
-    assert (sd == 0.2).all()
+    # Weights, widths relative to their start, spacings as logits, and centres in widths.
+    widths = schedule.network.head.log_widths.detach().exp().reshape(-1)
+    units = {"set spacings": LOGIT_SD / 0.2, "head centres": widths}
+    for k, name in enumerate(schedule.group_names()):
+        expected = torch.ones(int((schedule.groups() == k).sum())).double() * units.get(name, 1.0)
+        torch.testing.assert_close(sd[schedule.groups() == k], 0.2 * expected)
     with torch.no_grad():
         schedule.network.head.output_bias.zero_()
     schedule.set_parameter_vector(mean)
@@ -316,10 +321,14 @@ def test_parameter_names_say_where_a_parameter_acts() -> None:
     for k in tried:
         schedule.set_parameter_vector(vector + 0.1 * (torch.arange(len(vector)) == k))
         moved = (schedule(qd, qdd).detach() - before).abs().amax(0)
+        where = names[k].split(":")[0]
+        # Sets and units belong to a joint, consequents and weights to one of its coefficients.
+        whole = where.startswith("network")
         found = {
-            f"{schedule.coefficient_names[c]} of {joints[j]}" for j, c in moved.nonzero().tolist()
+            f"{'network' if whole else schedule.coefficient_names[c]} of {joints[j]}"
+            for j, c in moved.nonzero().tolist()
         }
-        assert found <= {names[k].split(":")[0]}
+        assert found <= {where}
         acting += len(found)
     # Rules that no sample of the motion fires do nothing.
     assert acting > 0.5 * len(tried)
@@ -346,3 +355,16 @@ def test_slopes_are_those_of_automatic_differentiation(law, acceleration: str, i
     one = schedule.slopes(qd[2, 3], qdd[2, 3], held[2, 3])
     for single, batch in zip(one, found, strict=True):
         torch.testing.assert_close(single, batch[2, 3], rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("interpretable", [False, True])
+def test_silence_leaves_the_constant_law_and_the_sets(interpretable: bool) -> None:
+    schedule = trained(interpretable=interpretable)
+    with torch.no_grad():
+        schedule.network.head.output_bias.zero_()
+    sets = [s.clone() for s in schedule.network.anfis.sets()]
+    schedule.silence()
+    expected = schedule.reference_coefficients().expand(5, -1, -1)
+    torch.testing.assert_close(schedule(*motion(5, 2)[:2]), expected, rtol=1e-14, atol=0)
+    for before, after in zip(sets, schedule.network.anfis.sets(), strict=True):
+        assert torch.equal(before, after)

@@ -100,14 +100,15 @@ def initialise_from_constant(
 ) -> FrictionModel:
     """A copy of a neuro-fuzzy model at a constant fit of its law, over the range of the motion.
 
-    Its network is zero; recordings and motions are in joint coordinates.
+    Its network is silent, its sets where the model has them; recordings and motions are in joint
+    coordinates.
     """
     network = copy.deepcopy(model)
     schedule = cast("NeuroFuzzy", network.schedule)
     scale = coefficient_scale(model, constant.plant, recordings, motions)
     schedule.set_range(*input_range(motions, schedule.along_motion, options))
     schedule.set_reference(constant.model.schedule.coefficient_sets()["always"], scale)
-    schedule.set_parameter_vector(torch.zeros_like(schedule.parameter_vector()))
+    schedule.silence()
     return network
 
 
@@ -118,7 +119,7 @@ def revert_to_constant(
     schedule = cast("NeuroFuzzy", model.schedule)
     values = constant.model.schedule.coefficient_sets()["always"]
     schedule.set_reference(values, schedule.scale, options.zero_reference)
-    schedule.set_parameter_vector(torch.zeros_like(schedule.parameter_vector()))
+    schedule.silence()
 
 
 def _with_narrowed_priors(free: ShootingFitter, start: FitResult) -> tuple[ShootingFitter, ...]:
@@ -201,10 +202,9 @@ class _Validation:
     ) -> _Trial | None:
         """A network under a prior, from zero: from another prior's end it would stay there."""
         widest = cast("NeuroFuzzy", fitter.friction.schedule).prior_sd
-        zeros = torch.zeros_like(fitter.friction.schedule.parameter_vector())
-        prior = (zeros, torch.full_like(zeros, share * widest))
-        fitter = replace(fitter, friction_prior=prior)
-        end = self._search(fitter, zeros, "network, hold-out")
+        mean, sd = fitter.friction.schedule.prior()
+        fitter = replace(fitter, friction_prior=(mean, share * sd))
+        end = self._search(fitter, mean, "network, hold-out")
         error = self._error(end)
         if error is None:
             return None

@@ -60,7 +60,10 @@ class AdaptiveNeuroFuzzy(Schedule):
         self._law = law
         self.adaptive = Adaptive(law, joints, initial, **(memory or {}))
         # The mean over the classes: the network corrects all of them alike.
+        network = {"interpretable": False, **network}
         self.deviation = NeuroFuzzy(law, joints, self.adaptive.values.mean(1), **network)
+        # Shares of a correction are shares of its parameters, so they have to enter linearly.
+        self.deviation.learn_sets = False
 
     @torch.no_grad()
     def set_adaptive(self, adaptive: Adaptive, scale: Tensor | None = None) -> None:
