@@ -97,7 +97,8 @@ def fit(
     refines them and the plant. Laws with several minima are also started from the simpler law that
     they contain (`Law.nested_law`); the lowest residual wins. A neuro-fuzzy model starts at the
     constant fit of its law and is kept only if its hold-out RMSE is 20 % below the law's; its
-    plant prior is relaxed only for a further 20 %. An adaptive model starts at the constant fit,
+    plant prior is relaxed only for a further 20 %. Evidence chooses the priors of its parameters,
+    its noise, and whether its sets move. An adaptive model starts at the constant fit,
     too; `fit_adaptive` has its further settings.
 
     Args:

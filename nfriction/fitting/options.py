@@ -147,8 +147,8 @@ class FitOptions:
     max_ratio_same: float = 0.8
     # Maximum hold-out RMSE ratio to the law fitted on all windows, which it would replace.
     max_ratio_all: float = 1.1
-    # Candidate priors, relative to the network's own.
-    prior_shares: tuple[float, ...] = (1.0, 1 / 3)
+    # Updates of a network's prior and noise by evidence; each searches on from the last.
+    evidence_updates: int = 10
 
     # --- Extrapolation prior of a network.
     # Grid cells along velocity and acceleration, cells around a visited one that count as

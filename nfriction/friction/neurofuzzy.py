@@ -20,8 +20,7 @@ from nfriction.fuzzy.partition import FreePartition
 
 # A coefficient below a thousandth of its scale starts there: from zero it could not rise.
 LEAST_RATIO = 1e-3
-# With a third of it the network is too stiff to follow large swings, and then wrong at smaller
-# ones: on later swings of a real pendulum 6.8 mrad instead of 3.0 (its constant law: 5.3).
+# Wide enough for large swings at once: from a stiffer prior the evidence has a longer way.
 PRIOR_SD = 0.3
 # Of the logistic distribution: that of the logit of a share about which nothing is known.
 LOGIT_SD = math.pi / math.sqrt(3.0)
@@ -73,7 +72,7 @@ class NeuroFuzzy(Schedule):
         interpretable: keep the sets ordered, in range and overlapping, also while a fit moves them.
         prior_sd: standard deviation of the network's parameters around the start of a fit:
             consequents and weights in units of the coefficients' scale, widths as logarithms,
-            centres in widths; a fit also tries a third of it.
+            centres in widths. A fit begins with it and finds that of each group by evidence.
 
     Attributes:
         learn_sets: whether a fit moves the sets and the head's units besides what they weigh.

@@ -72,6 +72,8 @@ class FitResult:
         stages: length of the windows of each stage that was kept [s], and its residual in
             `residual_unit`; of constant coefficients.
         skipped_horizons: lengths of windows that the constant law could not follow [s].
+        effective_parameters: of a network: name of each group of its parameters, how many of them
+            the data determine (MacKay's gamma), and how many there are.
     """
 
     model: FrictionModel
@@ -93,6 +95,7 @@ class FitResult:
     data_warnings: tuple[str, ...] = ()
     stages: tuple[tuple[float, float], ...] = ()
     skipped_horizons: tuple[float, ...] = ()
+    effective_parameters: tuple[tuple[str, float, int], ...] = ()
 
     def longest_usable_horizon(self, windows: Sequence[float]) -> float:
         """The last of growing window lengths that the constant law could follow [s]."""
@@ -115,6 +118,7 @@ class FitResult:
     def to_dict(self) -> dict[str, Any]:
         """Summary for JSON."""
         offsets = {"encoder_offsets": [list(row) for row in self.encoder_offsets]}
+        gamma = {name: value for name, value, _ in self.effective_parameters}
         return {
             "status": self.status,
             "converged": self.converged,
@@ -131,6 +135,7 @@ class FitResult:
             "warnings": list(self.warnings),
             **({} if self.continuity == "none" else {"continuity": self.continuity}),
             **(offsets if self.encoder_offsets else {}),
+            **({"effective_parameters": gamma} if gamma else {}),
         }
 
 

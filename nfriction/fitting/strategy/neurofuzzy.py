@@ -16,8 +16,14 @@ from nfriction.fitting.equation_error import coefficient_scale
 from nfriction.fitting.fit import FitTask
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.result.fit_result import FitResult, result_from_shooting
-from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
+from nfriction.fitting.result.identifiability import information
+from nfriction.fitting.shooting.autocorrelation import (
+    correlation_time,
+    decimation,
+    effective_noise,
+)
 from nfriction.fitting.shooting.sensitivity import StepJacobian
+from nfriction.fitting.shooting.variables import model_at
 from nfriction.fitting.strategy.constant import (
     constant_prior,
     constant_start,
@@ -35,9 +41,17 @@ from nfriction.fitting.strategy.extrapolation_prior import prior_on_unvisited_ce
 from nfriction.fitting.strategy.holdout import HoldoutScore, holdout_rmse, holdout_split
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
+from nfriction.optim.evidence import GroupEvidence, group_evidence
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
+# Consequents and head weights, the first groups of a network.
+LINEAR_GROUPS = 2
+# Share of a prior's width that holds a parameter where it is: no search feels what remains.
+HELD = 1e-6
+# Log ratio of evidences below which a hypothesis gains nothing worth mentioning (H. Jeffreys,
+# Theory of Probability, 3rd ed. 1961, appendix B).
+WORTH_MENTIONING = 0.5 * math.log(10.0)
 INTERRUPTED = "Stopped before the network was found; its constant law is kept."
 
 
@@ -73,7 +87,7 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     else:
         end = validation.fit_all(best)
         found = result_from_shooting(task.model, end.problem, end.result, motions)
-        cast("NeuroFuzzy", task.model.schedule).prior_sd = best.prior_sd
+        found = replace(found, effective_parameters=effective_parameters(end))
     found = replace(
         found, motions=task.motions, encoder_offsets=start.encoder_offsets,
         continuity=options.continuity, skipped_horizons=start.skipped_horizons,
@@ -122,6 +136,55 @@ def revert_to_constant(
     schedule.silence()
 
 
+def network_evidence(end: HorizonResult) -> GroupEvidence:
+    """Evidence for the prior of each group of a network's parameters, relative to the present one.
+
+    Of the marginal Gauss-Newton model: window states are integrated out, the plant's terms and the
+    prior on unvisited motion are known priors beside those of the groups.
+    """
+    problem, x = end.problem, end.result.x
+    variables = problem.variables
+    schedule = cast("NeuroFuzzy", model_at(problem.friction, end.parts.friction).schedule)
+    shared, count = variables.shared_count, variables.friction_count
+    precision, mean = variables.prior()
+    data = information(end.result.hessian, precision, shared).data
+    known = torch.diag(precision[:shared])
+    known[:count, :count] = 0.0
+    if problem.extrapolation is not None:
+        known[:count, :count] = problem.extrapolation.normal_equations(schedule)[1]
+        data = data - known.where(torch.arange(shared)[:, None].lt(count), 0.0)
+    groups = torch.full((shared,), -1)
+    groups[:count] = schedule.groups()
+    # In units of the present prior, in which every precision is one.
+    sd = precision[:shared].rsqrt()
+    data, known = (sd[:, None] * part * sd for part in (data, known))
+    lower, upper = (bound[:shared] for bound in variables.bounds())
+    fitted = (lower < upper).nonzero().flatten()
+    values, vectors = torch.linalg.eigh(data[fitted][:, fitted])
+    # Less than none is the rounding of states that grow by orders of magnitude.
+    data = (vectors * values.clamp_min(0.0)) @ vectors.T
+    offset = ((x - mean)[:shared] / sd)[fitted]
+    ones = torch.ones(len(schedule.group_names()), dtype=torch.float64)
+    return group_evidence(data, known[fitted][:, fitted], offset, groups[fitted], ones)
+
+
+def log_evidence(end: HorizonResult) -> float:
+    """Log evidence of a search's end, comparable at one noise; -inf where it is not finite."""
+    if not torch.isfinite(end.result.hessian).all():
+        return -math.inf
+    return network_evidence(end).occam - float(end.result.cost)
+
+
+def effective_parameters(end: HorizonResult) -> tuple[tuple[str, float, int], ...]:
+    """Name of each group of a network, how many parameters the data determine, and its size."""
+    schedule = cast("NeuroFuzzy", end.problem.friction.schedule)
+    if not torch.isfinite(end.result.hessian).all():
+        return ()
+    gamma = network_evidence(end).gamma.tolist()
+    sizes = schedule.groups().bincount().tolist()
+    return tuple(zip(schedule.group_names(), gamma, sizes, strict=True))
+
+
 def _with_narrowed_priors(free: ShootingFitter, start: FitResult) -> tuple[ShootingFitter, ...]:
     """Fitters with ever wider priors of the plant: the posterior sd of the constant fit first.
 
@@ -143,7 +206,6 @@ class _Trial:
 
     score: HoldoutScore
     fitter: ShootingFitter
-    prior_sd: float
     end: HorizonResult
 
 
@@ -176,13 +238,9 @@ class _Validation:
             return None
         best: _Trial | None = None
         for fitter in fitters:
-            trials = []
-            for share in self.options.prior_shares:
-                trial = self._trial(fitter, share, of_same, of_all)
-                if trial is None:
-                    return None
-                trials.append(trial)
-            trial = min(trials, key=lambda trial: trial.score.score)
+            trial = self._trial(fitter, of_same, of_all)
+            if trial is None:
+                return None
             limit = math.inf if best is None else self.options.max_ratio_same * best.score.score
             if best is None or trial.score.score < limit:
                 best = trial
@@ -192,25 +250,75 @@ class _Validation:
         """The network of a trial, fitted to all windows."""
         windows = trial.fitter.cut(self.motions, self.length)
         problem = trial.fitter.problem(
-            windows, self.noise, trial.end.parts.friction, stride=self.stride
+            windows, trial.end.problem.noise_sd, trial.end.parts.friction, stride=self.stride
         )
         start = problem.variables.start(trial.end.parts.plant)
         return trial.fitter.search(problem, start, self.tolerance, f"{self.length:g} s windows")
 
-    def _trial(
-        self, fitter: ShootingFitter, share: float, of_same: float, of_all: float
-    ) -> _Trial | None:
-        """A network under a prior, from zero: from another prior's end it would stay there."""
-        widest = cast("NeuroFuzzy", fitter.friction.schedule).prior_sd
-        mean, sd = fitter.friction.schedule.prior()
-        fitter = replace(fitter, friction_prior=(mean, share * sd))
-        end = self._search(fitter, mean, "network, hold-out")
+    def _trial(self, fitter: ShootingFitter, of_same: float, of_all: float) -> _Trial | None:
+        """A network that starts silent, its sets moved if the evidence favours that."""
+        schedule = cast("NeuroFuzzy", fitter.friction.schedule)
+        mean, sd = schedule.prior()
+        linear = schedule.groups() < LINEAR_GROUPS
+        held = replace(fitter, friction_prior=(mean, torch.where(linear, sd, HELD * sd)))
+        fitter, end = self._learn(held, self._search(held, mean, "network, hold-out"))
+        if schedule.learn_sets and not end.stopped:
+            assert fitter.friction_prior is not None
+            learnt = torch.where(linear, fitter.friction_prior[1], sd)
+            moved = replace(fitter, friction_prior=(mean, learnt))
+            # At the same noise, or the evidence would compare different errors.
+            noise = end.problem.noise_sd
+            moved, other = self._learn(moved, self._go_on(moved, end, noise), noise)
+            if other.stopped:
+                return None
+            if log_evidence(other) > log_evidence(end) + WORTH_MENTIONING:
+                fitter, end = self._learn(moved, other)
         error = self._error(end)
         if error is None:
             return None
         ratios = [error / law if math.isfinite(error) else math.inf for law in (of_same, of_all)]
-        score = HoldoutScore(ratios[0], ratios[1], self.options)
-        return _Trial(score, fitter, share * widest, end)
+        return _Trial(HoldoutScore(ratios[0], ratios[1], self.options), fitter, end)
+
+    def _learn(
+        self, fitter: ShootingFitter, end: HorizonResult, noise: float | None = None
+    ) -> tuple[ShootingFitter, HorizonResult]:
+        """Priors of a network's groups by evidence, and its noise if none is given."""
+        for _ in range(self.options.evidence_updates):
+            if end.stopped or not torch.isfinite(end.result.hessian).all():
+                break
+            found = network_evidence(end)
+            left = self._noise_of(end, float(found.gamma.sum())) if noise is None else noise
+            gain = max(float(found.slope.abs().max()), self._noise_gain(end, left))
+            if gain <= self.options.loglik_tolerance:
+                break
+            assert fitter.friction_prior is not None
+            mean, sd = fitter.friction_prior
+            groups = cast("NeuroFuzzy", fitter.friction.schedule).groups()
+            fitter = replace(fitter, friction_prior=(mean, sd * found.precision.rsqrt()[groups]))
+            end = self._go_on(fitter, end, left)
+        return fitter, end
+
+    def _go_on(self, fitter: ShootingFitter, end: HorizonResult, noise: float) -> HorizonResult:
+        """Search of the training windows from another search's end."""
+        problem = fitter.problem(self.train, noise, end.parts.friction, stride=self.stride)
+        return fitter.search(problem, end.result.x, self.tolerance, "network, hold-out")
+
+    def _noise_of(self, end: HorizonResult, gamma: float) -> float:
+        """Noise of what a network leaves: MacKay's, of as many residuals as are independent."""
+        residuals = end.residuals
+        # Of white residuals a fit counts no more than every `stride`-th.
+        lasting = max(correlation_time(residuals), float(self.stride))
+        independent = residuals.numel() / lasting
+        explained = gamma + len(self.train) * end.problem.variables.state_count
+        left = max(independent - explained, 1.0)
+        noise = end.rms * math.sqrt(lasting * independent / left)
+        # A network contains its law, so it cannot leave more.
+        return min(max(noise, self.options.min_noise), self.noise)
+
+    def _noise_gain(self, end: HorizonResult, noise: float) -> float:
+        """Gain in log likelihood by another noise, to first order."""
+        before = end.problem.noise_sd
+        return abs((noise / before) ** 2 - 1.0) * float(end.result.cost)
 
     def _search(self, fitter: ShootingFitter, friction: Tensor, name: str) -> HorizonResult:
         """Search of the training windows."""
