@@ -34,9 +34,11 @@ def error_tables(comparison: Comparison) -> str:
 
 
 def fit_lines(name: str, fit: FitResult) -> str:
-    """Status and warnings of a fit: bounds, unidentifiable directions, model error."""
+    """Usability, status and warnings of a fit."""
+    verdict, reason = fit.usability
     note = f"; at a bound: {', '.join(fit.at_bounds)}" if fit.at_bounds else ""
-    return "\n  - ".join([f"{name}: {fit.status.rstrip('.')}{note}", *fit.warnings])
+    head = f"{verdict} ({reason})" if reason else verdict
+    return "\n  - ".join([f"{name}: {head}. {fit.status.rstrip('.')}{note}", *fit.warnings])
 
 
 def interval_table(fit: FitResult) -> str:

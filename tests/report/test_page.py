@@ -104,7 +104,7 @@ def test_verdicts_warnings_and_rules_are_told(page):
     for said in (
         "LFM predicts the test recordings best: 100 mrad, where no friction leaves 2000.",
         f"it is statistically tied with {EVIL}; the simplest of them is {EVIL}.",
-        "Not converged.",
+        "Doubtful.",
         "Not identifiable: f_a with f_v.",
         "At a bound: f_b.",
         "IF velocity is slow AND acceleration is about zero THEN",
