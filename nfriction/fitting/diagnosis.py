@@ -298,7 +298,10 @@ def _delay(
     around = np.clip((best - grid[1] + grid[0], best + grid[1] - grid[0]), grid[0], grid[-1])
     found = minimize_scalar(unexplained, bounds=around, method="bounded", options={"xatol": 1e-4})
     words = ("torques", "positions") if found.x > 0 else ("positions", "torques")
-    lag = f"{words[0]} are recorded {1e3 * abs(found.x):.1f} ms later than {words[1]}"
+    lag = (
+        f"{words[0]} are recorded {1e3 * abs(found.x):.1f} ms later than {words[1]} "
+        f"(`recording.advance_torque({found.x:.4f})`)"
+    )
     return lag, float(found.fun)
 
 

@@ -132,6 +132,17 @@ def test_mistakes_in_conventions_and_time():
         assert "time is in ms" in warnings_of(plant, q, tau, time=2.0 * np.arange(len(q)))[0]
 
 
+def test_an_advanced_torque_is_in_line_again():
+    plant, q, tau = measured("motor")
+    late = Recording(STEP * np.arange(len(q)), q, later(tau, 10), convention="relative,upright")
+    aligned = late.advance_torque(10 * STEP)
+    np.testing.assert_allclose(aligned.tau, tau[: len(aligned)], atol=1e-12)
+    np.testing.assert_array_equal(aligned.q, q[: len(aligned)])
+    assert warnings_of(plant, aligned.q, aligned.tau) == ()
+    with pytest.raises(ValueError, match="no torque to advance"):
+        Recording(late.time, q).advance_torque(0.01)
+
+
 def test_a_spike_is_named_with_its_time():
     plant, q, tau = measured("driven")
     q = q.copy()
