@@ -240,7 +240,7 @@ class _Regression:
                 torch.func.jvp(torque, (coefficients,), (unit.expand_as(coefficients),))
                 for unit in units
             ]
-            values = torch.stack([pairs[0][0], *(slope for _, slope in pairs)], -1)
+            values = torch.stack([pairs[0][0], *(pair[1] for pair in pairs)], -1)
             rows.append(part.smoothed(values))
         found = torch.where(self.kept[..., None], torch.cat(rows), 0.0)
         return found[..., 1:], found[..., 0] - torch.where(self.kept, self.torque, 0.0)

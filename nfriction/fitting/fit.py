@@ -86,11 +86,12 @@ def fit(
     """Estimate a friction model from recordings.
 
     Regression on the friction torque that the smoothed motion implies gives constant coefficients;
-    simulated windows of growing length then refine them and the plant. Nonlinear laws are also
-    started from their nested law; the lowest residual wins. A neuro-fuzzy model starts at the
-    constant fit of its law and is kept only if its hold-out RMSE is 20 % below the law's; its
-    plant prior is relaxed only for a further 20 %. An adaptive model starts at the constant fit,
-    too; `fit_adaptive` has its further settings.
+    simulated windows of growing length then refine them and the plant. Windows that would lose what
+    shorter ones found are skipped, with a warning. Nonlinear laws are also started from their grid
+    of initial values and from their nested law; the lowest residual wins. A neuro-fuzzy model
+    starts at the constant fit of its law and is kept only if its hold-out RMSE is 20 % below the
+    law's; its plant prior is relaxed only for a further 20 %. An adaptive model starts at the
+    constant fit, too; `fit_adaptive` has its further settings.
 
     Args:
         model: the model to fit; changed in place.
