@@ -97,11 +97,12 @@ def fit(
     """Estimate a friction model from recordings.
 
     Equation error gives constant coefficients; output error over windows of growing length then
-    refines them and the plant. Laws with several minima are also started from the simpler law that
-    they contain (`Law.nested_law`); the lowest residual wins. A neuro-fuzzy model starts at the
-    constant fit of its law and is kept only if its hold-out RMSE is 20 % below the law's; its
-    plant prior is relaxed only for a further 20 %. An adaptive model starts at the constant fit,
-    too; `fit_adaptive` has its further settings.
+    refines them and the plant. Windows that would lose what shorter ones found are skipped, with a
+    warning. Laws with several minima are also started from their grid of initial values and from
+    the simpler law that they contain (`Law.nested_law`); the lowest residual wins. A neuro-fuzzy
+    model starts at the constant fit of its law and is kept only if its hold-out RMSE is 20 % below
+    the law's; its plant prior is relaxed only for a further 20 %. An adaptive model starts at the
+    constant fit, too; `fit_adaptive` has its further settings.
 
     Args:
         model: the model to fit; changed in place.
