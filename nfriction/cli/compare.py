@@ -50,7 +50,8 @@ def add_comparison_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/compare"), help="folder to write")
     parser.add_argument("--initial-states", type=names.file, metavar="FILE",
                         help="table with columns id, q0_1, qd0_1, ... of the recordings' initial "
-                        "states (default: estimated from each recording)")  # fmt: skip
+                        "states (default: estimated from the first 0.2 s of each, which are "
+                        "then not scored)")  # fmt: skip
     parser.add_argument("--select", action="store_true",
                         help="also choose a model on the training recordings alone, by "
                         "cross-validation over blocks of time")  # fmt: skip
@@ -163,7 +164,7 @@ def _initial_states(
     plant: Plant,
     recordings: Sequence[Recording],
 ) -> InitialStates | None:
-    """States of these recordings; warns of those that start from their smoothed motion."""
+    """States of these recordings; warns of those that have none."""
     from nfriction.recording import read_initial_states
 
     path = arguments.initial_states
