@@ -174,9 +174,10 @@ class Simulator:
         scored = slice(self.lead if state is None else 0, None)
         state = starts.state if state is None else state
         q, diverged_at = self.simulate(state, samples)
-        squares = np.zeros((self.draws, self.plant.joints))
-        # One draw after another, as a long recording takes much memory.
-        for k, off in enumerate(starts.deviations):
+        squares = np.full((self.draws, self.plant.joints), np.inf)
+        # Where the run itself diverged there is no limit. One draw after another, as a long
+        # recording takes much memory.
+        for k, off in enumerate(starts.deviations if np.isinf(diverged_at).all() else ()):
             drawn, _ = self.simulate(state + off, samples)
             apart = self._as_read(drawn, measured) - q
             squares[k] = np.mean(apart[:, scored] ** 2, axis=(0, 1))
@@ -253,6 +254,10 @@ def estimate_starts(
     nudge = noise[:, None, :] / np.stack([np.ones(len(y)), time[:, -1]], 1)[..., None]
     nudge = nudge.reshape(kinematic.shape)
     state, run = kinematic, simulate(kinematic)
+    if not np.isfinite(run).all(axis=(1, 2)).any():
+        # Every simulation is lost within its lead-in, whatever its start.
+        root = np.linalg.cholesky(np.linalg.inv(prior))
+        return Starts(state, root, noise, np.zeros((draws, *state.shape)))
     for _ in range(MOST_STEPS):
         gradient, information = _linearised(simulate, state, nudge, y - run, weight)
         gradient += (prior @ (kinematic - state)[..., None])[..., 0]
