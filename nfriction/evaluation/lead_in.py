@@ -41,6 +41,8 @@ MOST_SUBSTEPS = 100
 # Starts drawn for the limit. The true start is one more like them, so that it errs by less than the
 # worst of them in 39 of 40 cases.
 DRAWS = 39
+# Samples of draws that are simulated together: a long recording of many takes much memory.
+DRAWN_SAMPLES = 2**20
 # Filters of a controller's velocity and acceleration [Hz].
 CUTOFF = 20.0
 # The time-stepping scheme is of first order: such steps keep its error below an encoder's [s].
@@ -175,12 +177,12 @@ class Simulator:
         state = starts.state if state is None else state
         q, diverged_at = self.simulate(state, samples)
         squares = np.full((self.draws, self.plant.joints), np.inf)
-        # Where the run itself diverged there is no limit. One draw after another, as a long
-        # recording takes much memory.
-        for k, off in enumerate(starts.deviations if np.isinf(diverged_at).all() else ()):
-            drawn, _ = self.simulate(state + off, samples)
-            apart = self._as_read(drawn, measured) - q
-            squares[k] = np.mean(apart[:, scored] ** 2, axis=(0, 1))
+        at_once = max(1, DRAWN_SAMPLES // samples.size)
+        # Where the run itself diverged there is no limit.
+        for k in range(0, self.draws if np.isinf(diverged_at).all() else 0, at_once):
+            drawn, _ = self.simulate(state + starts.deviations[k : k + at_once], samples)
+            apart = (self._as_read(drawn, measured) - q)[:, :, scored]
+            squares[k : k + at_once] = np.mean(apart**2, axis=(1, 2))
         return Runs(
             samples, q, (q - measured)[:, scored], squares + self._noise_beyond_rounding(starts),
             float((self.time[samples[:, 0]] + diverged_at).min()),
