@@ -164,8 +164,9 @@ def _corrected_positions(
             return replace(given, q=given.q @ torch.as_tensor(matrix.T),
                            qd=given.qd @ torch.as_tensor(matrix.T),
                            qdd=given.qdd @ torch.as_tensor(matrix.T))  # fmt: skip
-        q = convention.position_from_joint(given.q, first) @ matrix.T + offset
-        rates = (convention.rate_from_joint(x, first) @ matrix.T for x in (given.qd, given.qdd))
+        q = convention.position_from_joint(given.q.numpy(), first) @ matrix.T + offset
+        given_rates = given.qd.numpy(), given.qdd.numpy()
+        rates = (convention.rate_from_joint(x, first) @ matrix.T for x in given_rates)
         qd, qdd = (torch.as_tensor(reading.rate_to_joint(x, first)) for x in rates)
         return replace(
             given, q=torch.as_tensor(reading.position_to_joint(q, first)), qd=qd, qdd=qdd
