@@ -65,6 +65,11 @@ def verdict(comparison: Comparison) -> str:
         return "no verdict: there was no test recording; give some by --test"
     if best is None:
         return "no verdict: every free run over the test recordings diverged"
+    unfit = "".join(f"\nnot fit for use: {name}: {why}" for name, why in comparison.unfit().items())
+    return _best(comparison, best) + unfit
+
+
+def _best(comparison: Comparison, best: str) -> str:
     error = 1e3 * comparison.table()["all"][best]
     end = "; no model is better" if best == NO_FRICTION else ""
     found = (
