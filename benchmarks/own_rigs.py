@@ -13,7 +13,7 @@ from nfriction import FrictionModel, LinearAxis, PendulumChain, Plant, Recording
 from nfriction.fitting.fit import fit
 from nfriction.fitting.plant_parameters import adjusted_buffers, plant_parameters
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction.registry import model_by_name
+from nfriction.friction import model_by_name
 from nfriction.signals import quantise
 
 COUNTS, RATE, SECONDS = 4096, 500, 10.0

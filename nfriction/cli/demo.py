@@ -12,7 +12,7 @@ from nfriction.cli.inputs import count, seconds
 DURATION = 10.0
 
 EXAMPLE = """example:
-  nfriction demo --models NCFM,NFLFM --out runs/demo"""
+  nfriction demo --models viscous,neuro-fuzzy:load-coulomb --out runs/demo"""
 
 
 def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:

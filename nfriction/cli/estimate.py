@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from nfriction.recording import Recording
 
 FIT_EXAMPLE = """example:
-  nfriction fit run1.csv run2.csv --rig rig.json --model LFM --out lfm.json"""
+  nfriction fit run1.csv run2.csv --rig rig.json --model load-coulomb --out lfm.json"""
 COMPARE_EXAMPLE = """example:
   nfriction compare run1.csv run2.csv --test run3.csv --rig rig.json \\
-      --models NCFM,LFM,NFLFM --out runs/mine"""
+      --models viscous,load-coulomb,neuro-fuzzy:load-coulomb --out runs/mine"""
 
 
 def add_fit(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
@@ -34,8 +34,8 @@ def add_fit(commands: argparse._SubParsersAction[Parser], common: Parser) -> Non
     )  # fmt: skip
     parser.add_argument("recordings", nargs="+", type=inputs.file, metavar="RECORDING",
                         help=f"with columns time, q1, ... ({inputs.FORMATS})")  # fmt: skip
-    parser.add_argument("--model", type=inputs.model, default="NFLFM",
-                        help=f"one of {', '.join(inputs.MODELS)}")  # fmt: skip
+    parser.add_argument("--model", type=inputs.model, default="neuro-fuzzy:load-coulomb",
+                        help=inputs.MODELS)  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path("model.json"), help="model file to write")
     inputs.add_fit_options(parser)
     parser.set_defaults(run=run_fit)
@@ -61,7 +61,7 @@ def add_comparison_options(parser: argparse.ArgumentParser) -> None:
     """Options of `compare` and `demo`."""
     add = parser.add_argument
     add("--models", type=inputs.models, default=inputs.DEFAULT_MODELS,
-        help=f"of {', '.join(inputs.MODELS)}")  # fmt: skip
+        help=f"with commas between them: {inputs.MODELS}")  # fmt: skip
     add("--out", type=Path, default=Path("runs/compare"), help="folder to write")
     add("--initial-states", type=inputs.file, metavar="FILE",
         help="table with columns id, q0_1, qd0_1, ... of the recordings' initial states (default: "
@@ -162,8 +162,12 @@ def _print(
     comparison: Comparison, selection: Selection | None, plant: Plant, arguments: argparse.Namespace
 ) -> None:
     from nfriction.cli import tables
+    from nfriction.friction import plain_name
 
-    print(f"\n{tables.error_tables(comparison)}\n")
+    print(f"\n{tables.error_tables(comparison)}")
+    # Tables show abbreviations, which a reader of plain names has not met.
+    names = (*comparison.fits, *comparison.failed)
+    print(f"models: {', '.join(f'{name}: {plain_name(name)}' for name in names)}\n")
     for name, fit in comparison.fits.items():
         print(tables.fit_lines(name, fit))
     for name, why in comparison.failed.items():

@@ -258,8 +258,9 @@ def compare(
 
     Args:
         plant: the mechanism as given.
-        models: names of models, the simplest first: constant laws start from its plant terms,
-            an adaptive or neuro-fuzzy model from the constant fit of its law.
+        models: names of models such as `"coulomb-viscous"` or `"CVFM"`, the simplest first:
+            constant laws start from its plant terms, an adaptive or neuro-fuzzy model from the
+            constant fit of its law.
         train: recordings to fit, or one.
         test: recordings to judge by, or one; never seen by a fit.
         initial_states: q0 and qd0 by recording name, in the recording's convention; free runs of
