@@ -208,7 +208,7 @@ def _log(path: Path | None) -> Iterator[logging.Logger]:
 def _initial_states(
     arguments: argparse.Namespace, plant: Plant, recordings: Sequence[Recording]
 ) -> InitialStates | None:
-    """States of these recordings; warns of those that start from their smoothed motion."""
+    """States of these recordings; warns of those that have none."""
     from nfriction.recording import read_initial_states
 
     path = arguments.initial_states

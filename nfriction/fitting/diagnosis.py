@@ -164,8 +164,9 @@ def _corrected_positions(
             return replace(given, q=given.q @ torch.as_tensor(matrix.T),
                            qd=given.qd @ torch.as_tensor(matrix.T),
                            qdd=given.qdd @ torch.as_tensor(matrix.T))  # fmt: skip
-        q = convention.position_from_joint(given.q, first) @ matrix.T + offset
-        rates = (convention.rate_from_joint(x, first) @ matrix.T for x in (given.qd, given.qdd))
+        q = convention.position_from_joint(given.q.numpy(), first) @ matrix.T + offset
+        given_rates = given.qd.numpy(), given.qdd.numpy()
+        rates = (convention.rate_from_joint(x, first) @ matrix.T for x in given_rates)
         qd, qdd = (torch.as_tensor(reading.rate_to_joint(x, first)) for x in rates)
         return replace(
             given, q=torch.as_tensor(reading.position_to_joint(q, first)), qd=qd, qdd=qdd
@@ -298,7 +299,10 @@ def _delay(
     around = np.clip((best - grid[1] + grid[0], best + grid[1] - grid[0]), grid[0], grid[-1])
     found = minimize_scalar(unexplained, bounds=around, method="bounded", options={"xatol": 1e-4})
     words = ("torques", "positions") if found.x > 0 else ("positions", "torques")
-    lag = f"{words[0]} are recorded {1e3 * abs(found.x):.1f} ms later than {words[1]}"
+    lag = (
+        f"{words[0]} are recorded {1e3 * abs(found.x):.1f} ms later than {words[1]} "
+        f"(`recording.advance_torque({found.x:.4f})`)"
+    )
     return lag, float(found.fun)
 
 

@@ -47,12 +47,14 @@ class FitRecord:
     """End of a fit, from `FitResult.to_dict`; entries that an older version lacks are empty.
 
     Attributes:
+        usability: "good", "doubtful" or "do not use", and why.
         intervals: 95 % interval by parameter, infinity for an open end.
         plant: adjusted terms of the plant by name.
     """
 
     status: str = "unknown"
     converged: bool = False
+    usability: tuple[str, ...] = ()
     residual: float = math.nan
     residual_unit: str = ""
     at_bounds: tuple[str, ...] = ()

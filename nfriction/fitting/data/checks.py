@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from nfriction.fitting.data.inputs import is_undriven_pendulum, largest_torques
 from nfriction.fitting.data.windows import begins_at_rest
-from nfriction.fitting.diagnosis import likely_mistakes, mistake_warning
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.plant import PendulumChain, Plant
 from nfriction.recording import Recording
@@ -54,10 +53,7 @@ def data_warnings(
     """Warnings about recordings as written and in joint coordinates, a sentence each."""
     still = _still_joints(plant, given, joint, options.min_counts)
     heavy = _implausible_masses(plant) if is_undriven_pendulum(plant, joint) else ()
-    convention = given[0].resolve_convention(plant)
-    stated, mistakes = likely_mistakes(plant, joint, motions, convention, options)
-    named = mistake_warning(stated, mistakes)
-    return (*named, *_spikes(given, options), *still, *heavy)
+    return (*_spikes(given, options), *still, *heavy)
 
 
 def require_motion(plant: Plant, joint: Sequence[Recording]) -> None:

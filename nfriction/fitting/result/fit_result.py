@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -36,6 +36,10 @@ BLURRED = (
     'of the plant; `method="output_error"` gives a better answer, and intervals that cover both.'
 )
 
+Usability = Literal["good", "doubtful", "do not use"]
+# Residuals above so many times the quantisation noise are mostly the model's error. A well-fitted
+# law on a real bench has up to ten times.
+DOUBTFUL_RATIO = 20.0
 # A lower bound no larger exists only for the logarithm of a positive coefficient, in SI.
 NOTHING = 1e-9
 
@@ -69,6 +73,9 @@ class FitResult:
             equation-error fit.
         continuity: of the fitted windows, see `fit`.
         data_warnings: warnings about the data; inherited by fits warm-started from this one.
+        mistakes: likely mistakes in recordings or rig, see `fitting.diagnosis`; inherited, too.
+        quantisation: noise of the encoder's count [rad; m]; None where the count is unknown, and
+            after an equation-error fit.
         stages: length of the windows of each stage that was kept [s], and its residual in
             `residual_unit`; of constant coefficients.
         skipped_horizons: lengths of windows that the constant law could not follow [s].
@@ -91,6 +98,8 @@ class FitResult:
     uncertainty: CoefficientUncertainty | None = None
     continuity: Continuity = "none"
     data_warnings: tuple[str, ...] = ()
+    mistakes: tuple[str, ...] = ()
+    quantisation: float | None = None
     stages: tuple[tuple[float, float], ...] = ()
     skipped_horizons: tuple[float, ...] = ()
 
@@ -99,11 +108,32 @@ class FitResult:
         usable = [w for w in windows if w < min(self.skipped_horizons, default=math.inf)]
         return usable[-1] if usable else windows[0]
 
-    def with_warnings(self, data_warnings: Sequence[str]) -> "FitResult":
+    def with_warnings(
+        self, data_warnings: Sequence[str], mistakes: Sequence[str] = ()
+    ) -> "FitResult":
         """The same with these warnings about the data first, each once."""
         every = tuple(dict.fromkeys((*data_warnings, *self.data_warnings)))
         others = (w for w in self.warnings if w not in every)
-        return replace(self, data_warnings=every, warnings=(*every, *others))
+        named = tuple(dict.fromkeys((*mistakes, *self.mistakes)))
+        return replace(self, data_warnings=every, warnings=(*every, *others), mistakes=named)
+
+    @property
+    def usability(self) -> tuple[Usability, str]:
+        """Fitness for simulation and control, and the reason in a clause."""
+        times = self.residual / self.quantisation if self.quantisation else 0.0
+        far = f"the residual is {times:.0f} times the encoder's quantisation noise"
+        if self.mistakes:
+            return "do not use", f"a mistake in the data is likely: {self.mistakes[0]}"
+        if not self.converged and times > DOUBTFUL_RATIO:
+            return "do not use", f"the search did not converge, and {far}"
+        reasons = []
+        if not self.converged:
+            reasons.append("the search did not converge")
+        if times > DOUBTFUL_RATIO:
+            reasons.append(far)
+        if self.unidentifiable:
+            reasons.append(f"the data do not determine {len(self.unidentifiable)} parameters")
+        return ("doubtful", "; ".join(reasons)) if reasons else ("good", "")
 
     @property
     def residual_unit(self) -> str:
@@ -118,6 +148,7 @@ class FitResult:
         return {
             "status": self.status,
             "converged": self.converged,
+            "usability": list(self.usability),
             "residual": self.residual,
             "residual_unit": self.residual_unit,
             "at_bounds": list(self.at_bounds),
@@ -223,6 +254,7 @@ def result_from_shooting(
         intervals=intervals,
         unidentifiable=unidentifiable,
         encoder_offsets=tuple(map(tuple, offsets.tolist())),
+        quantisation=encoder_count and encoder_count / math.sqrt(12),
         warnings=warnings_of(
             converged=result.converged, at_bounds=at_bounds, unidentifiable=unidentifiable,
             at_zero=at_zero, options=problem.options,
