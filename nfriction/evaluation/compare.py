@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -15,6 +15,9 @@ from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import kalman_smoother
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 NO_FRICTION = "no friction"
 LIMIT = "limit of these data"
@@ -209,6 +212,12 @@ class Comparison:
     def _parameters(self, name: str) -> int:
         found = self.fits.get(name)
         return sum(p.numel() for p in found.model.parameters()) if found else 0
+
+    def plot(self) -> "Figure":
+        """Position error over the length of the simulation, by model; see `plots.horizon_curve`."""
+        from nfriction import plots  # matplotlib is slow to import
+
+        return plots.horizon_curve(self)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON: coefficients, scores, how each fit ended, and which model is best."""
