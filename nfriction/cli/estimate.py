@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import math
 import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from nfriction.cli import inputs
 from nfriction.cli.console import Parser, Progress, UsageError, check_writable, warn
+from nfriction.friction import plain_name
 
 if TYPE_CHECKING:
     from nfriction.evaluation.compare import Comparison, InitialStates
@@ -162,7 +164,6 @@ def _print(
     comparison: Comparison, selection: Selection | None, plant: Plant, arguments: argparse.Namespace
 ) -> None:
     from nfriction.cli import tables
-    from nfriction.friction import plain_name
 
     print(f"\n{tables.error_tables(comparison)}")
     # Tables show abbreviations, which a reader of plain names has not met.
@@ -183,6 +184,32 @@ def _print(
         print(f"its model file: {arguments.out / 'models' / f'{comparison.best()}.json'}")
     what = "results and models" if arguments.no_figures else "results, models and figures"
     print(f"\n{what} are in {arguments.out}")
+    if conclusion := _conclusion(comparison):
+        model = arguments.out / "models" / f"{comparison.best()}.json"
+        print(f"\n{conclusion}")
+        print(f"all figures on a page: {shlex.join(['nfriction', 'report', str(arguments.out)])}")
+        export = ["nfriction", "export", str(model), "--format", "c", "--out", "controller"]
+        print(f"this model as C code:  {shlex.join(export)}")
+
+
+def _conclusion(comparison: Comparison) -> str:
+    """The gain by the best model in a sentence; empty where none is better, or it is unusable."""
+    from nfriction.evaluation.compare import NO_FRICTION
+
+    best = comparison.best() or NO_FRICTION
+    if best == NO_FRICTION or comparison.fits[best].usability[0] == "do not use":
+        return ""
+    error, unit = comparison.table()["all"], comparison.unit
+    without, learnt = float(error[NO_FRICTION]), float(error[best])
+    # Without friction a mechanism may turn over: thousands of milliradians are hard to imagine.
+    shown = [f"{x:.3g} {unit}" if x >= 1 else f"{1e3 * x:.3g} m{unit}" for x in (without, learnt)]
+    end = f"with the friction learnt ({plain_name(best)}) they miss it by {shown[1]}"
+    if not math.isfinite(without):
+        return f"Without friction, simulations of the test recordings diverge;\n{end}."
+    return (
+        f"Without friction, simulations of the test recordings miss the measured motion by "
+        f"{shown[0]};\n{end}, {100 * (1 - learnt / without):.3g} % less."
+    )
 
 
 @contextmanager

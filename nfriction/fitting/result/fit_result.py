@@ -226,7 +226,7 @@ class FitResult:
         """
         # By name, because plots is a layer above this one.
         plots, schedule = resolve_name("nfriction.plots"), self.model.schedule
-        labels = {"joint_names": self.plant.joint_names, "unit": self.plant.unit}
+        labels: dict[str, Any] = {"joint_names": self.plant.joint_names, "unit": self.plant.unit}
         figure: Figure
         if not schedule.follows_motion:
             figure = plots.coefficient_intervals({type(self.model).__name__: self})
