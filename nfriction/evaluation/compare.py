@@ -27,6 +27,8 @@ SCHEMA = 3
 first no number, and `held_out` where it now says `test`."""
 # Models whose errors agree to three digits are tied.
 TIE = 1e-3
+# So many times the error of a simpler model cannot be the luck of a few test recordings.
+FAR_WORSE = 2.0
 InitialStates = Mapping[str, tuple[np.ndarray, np.ndarray]]
 Part = Literal["train", "test"]
 PART_NAMES: dict[Part, str] = {"test": "test recordings", "train": "training recordings"}
@@ -209,6 +211,29 @@ class Comparison:
         near = () if limit is None else rmse.index[rmse <= rmse.min() + limit]
         return tuple(sorted({best, *near}, key=lambda name: (self._parameters(name), rmse[name])))
 
+    def unfit(self) -> dict[str, str]:
+        """Models not to be used, with the reason: a simpler one predicts the test far better.
+
+        A model that is worse than no friction, or at least twice as bad as one with fewer
+        parameters by more than the limit of these data, extrapolates wrongly from its training.
+        """
+        if not self.test:
+            return {}
+        rmse, limit = self.table()["all"], self.limit() or 0.0
+        found = {}
+        for name, error in rmse.items():
+            simpler = rmse[[self._parameters(n) < self._parameters(str(name)) for n in rmse.index]]
+            least = simpler.min() if len(simpler) else np.inf
+            # Where the simpler model diverges too, neither is known to be better.
+            if np.isfinite(least) and error >= FAR_WORSE * least and error > least + limit:
+                found[str(name)] = (
+                    f"{simpler.idxmin()} with fewer parameters has {1e3 * least:.3g} m{self.unit}, "
+                    + (f"it {1e3 * error:.3g}" if np.isfinite(error) else "it diverges")
+                )
+            elif NO_FRICTION in rmse and error > rmse[NO_FRICTION] + limit:
+                found[str(name)] = "no friction predicts better"
+        return found
+
     def _parameters(self, name: str) -> int:
         found = self.fits.get(name)
         return sum(p.numel() for p in found.model.parameters()) if found else 0
@@ -243,6 +268,7 @@ class Comparison:
             "models": models,
             **({"failed": dict(self.failed)} if self.failed else {}),
             "best": judged,
+            **({"unfit": unfit} if (unfit := self.unfit()) else {}),
             "units": self.unit,
             "joints": list(self.joint_names),
         }

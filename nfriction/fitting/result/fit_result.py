@@ -20,13 +20,14 @@ from nfriction.fitting.result.identifiability import (
     exceeds_drive_torque,
     model_error_warning,
     null_directions,
+    observed_count,
     standard_deviations,
     warnings_of,
     weakly_identified,
 )
 from nfriction.fitting.result.uncertainty import CoefficientUncertainty
 from nfriction.fitting.shooting.autocorrelation import bandwidth, effective_noise, hac_sd
-from nfriction.fitting.shooting.problem import ShootingProblem, observed_count
+from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.variables import model_at
 from nfriction.friction import model_names, plain_name
 from nfriction.friction.models import FrictionModel
@@ -308,7 +309,9 @@ def result_from_shooting(
         tuple(names[i] for i in mask.nonzero().flatten().tolist())
         for mask in (hit, hit & result.at_lower[:count] & least)
     )
-    encoder_count = plant.position_quantum or observed_count(problem)
+    encoder_count = plant.position_quantum or observed_count(
+        problem.windows.q @ problem.measurement.T
+    )
     residuals = problem.errors(x)
     residual = float(residuals.square().mean().sqrt())
     intervals, unidentifiable, root = _identifiability(problem, result, names, residuals, motions)

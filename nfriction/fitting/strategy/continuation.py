@@ -11,8 +11,9 @@ from torch import Tensor
 from nfriction.fitting.data.inputs import integration_substeps
 from nfriction.fitting.data.windows import Windows, cut_windows
 from nfriction.fitting.options import FitOptions
+from nfriction.fitting.result.identifiability import observed_count
 from nfriction.fitting.shooting.autocorrelation import effective_noise
-from nfriction.fitting.shooting.problem import ShootingProblem, observed_count
+from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.shooting.variables import Parts, model_at
 from nfriction.fitting.strategy.extrapolation_prior import ExtrapolationPrior
@@ -63,8 +64,10 @@ class HorizonResult:
     @property
     def explained(self) -> bool:
         """True if the rounding of the encoder explains the residuals."""
-        quantum = self.problem.jacobian.plant.position_quantum or observed_count(self.problem)
-        limit = self.problem.options.explained_ratio * (quantum or 0.0) / 12**0.5
+        problem = self.problem
+        seen = observed_count(problem.windows.q @ problem.measurement.T)
+        quantum = problem.jacobian.plant.position_quantum or seen
+        limit = problem.options.explained_ratio * (quantum or 0.0) / 12**0.5
         return self.rms <= limit
 
     def lost_motion(self, before: "HorizonResult", options: FitOptions) -> bool:
