@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from nfriction.friction.registry import model_by_name
 from numpy.typing import NDArray
 
 from nfriction import FrictionModel, LinearAxis, PendulumChain, Plant, Recording, rollout
 from nfriction.fitting.fit import fit
 from nfriction.fitting.plant_parameters import adjusted_buffers, plant_parameters
 from nfriction.fitting.result.fit_result import FitResult
+from nfriction.friction import model_by_name
 from nfriction.signals import quantise
 
 COUNTS, RATE, SECONDS = 4096, 500, 10.0

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -15,6 +15,9 @@ from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import kalman_smoother
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 NO_FRICTION = "no friction"
 LIMIT = "limit of these data"
@@ -235,6 +238,12 @@ class Comparison:
         found = self.fits.get(name)
         return sum(p.numel() for p in found.model.parameters()) if found else 0
 
+    def plot(self) -> "Figure":
+        """Position error over the length of the simulation, by model; see `plots.horizon_curve`."""
+        from nfriction import plots  # matplotlib is slow to import
+
+        return plots.horizon_curve(self)
+
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON: coefficients, scores, how each fit ended, and which model is best."""
         models: dict[str, Any] = {}
@@ -284,8 +293,9 @@ def compare(
 
     Args:
         plant: the mechanism as given.
-        models: names of models, the simplest first: constant laws start from its plant terms,
-            an adaptive or neuro-fuzzy model from the constant fit of its law.
+        models: names of models such as `"coulomb-viscous"` or `"CVFM"`, the simplest first:
+            constant laws start from its plant terms, an adaptive or neuro-fuzzy model from the
+            constant fit of its law.
         train: recordings to fit, or one.
         test: recordings to judge by, or one; never seen by a fit.
         initial_states: q0 and qd0 by recording name, in the recording's convention; free runs of

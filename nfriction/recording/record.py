@@ -8,6 +8,7 @@ import re
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -19,6 +20,7 @@ from nfriction.recording.validation import check, doubts, gaps, is_uniform, read
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 Unit = Literal["rad", "m"]
@@ -223,6 +225,12 @@ class Recording:
         if self.convention is not None:
             table.attrs["convention"] = str(self.convention)
         return table
+
+    def plot(self) -> Figure:
+        """Positions over time, a panel a joint; see `plots.motion`."""
+        # By name, because plots is a layer above this one.
+        figure: Figure = resolve_name("nfriction.plots:motion")(self)
+        return figure
 
     @classmethod
     def from_pandas(

@@ -68,7 +68,7 @@ def test_it_tells_in_a_few_lines_who_is_best(comparison):
 
 def test_one_name_and_one_recording_need_no_list():
     settings = {"horizons": (0.5,), "windows": (0.5,), "max_steps": 1}
-    one = compare(pendulum(), "NCFM", A, B, **settings)
+    one = compare(pendulum(), "viscous", A, B, **settings)
     many = compare(pendulum(), ["NCFM"], [A], [B], **settings)
     assert one.to_dict() == many.to_dict()
 

@@ -1,9 +1,11 @@
 """Result of a fit: model, plant, convergence, confidence intervals and warnings."""
 
+import html
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor
@@ -27,10 +29,15 @@ from nfriction.fitting.result.uncertainty import CoefficientUncertainty
 from nfriction.fitting.shooting.autocorrelation import bandwidth, effective_noise, hac_sd
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.variables import model_at
+from nfriction.friction import model_names, plain_name
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import LeastSquaresResult
 from nfriction.plant import Plant
 from nfriction.signals import Motion
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
 
 BLURRED = (
     "The torque comes from a smoothed motion, which blurs friction at low speed and knows no error "
@@ -164,6 +171,73 @@ class FitResult:
             **({} if self.continuity == "none" else {"continuity": self.continuity}),
             **(offsets if self.encoder_offsets else {}),
         }
+
+    def to_pandas(self) -> "pd.DataFrame":
+        """Table of coefficients and plant terms: value, low and high of 95 % intervals, note.
+
+        Coefficients are in SI and plant terms relative to the rig, as in `intervals`. Coefficients
+        that follow the motion are given where they apply, without intervals.
+        """
+        import pandas as pd  # slow to import
+
+        joints, schedule = self.plant.joint_names, self.model.schedule
+        rows: dict[str, tuple[float, float, float]] = {}
+        for label, values in schedule.coefficient_sets().items():
+            where = "" if label == "always" else f", {label.replace('_', ' ')}"
+            for joint, of_joint in zip(joints, values.tolist(), strict=True):
+                for name, value in zip(schedule.coefficient_names, of_joint, strict=True):
+                    rows[f"{name} of {joint}{where}"] = (value, math.nan, math.nan)
+        rows |= {i.name: (i.value, i.low, i.high) for i in self.intervals}
+        table = pd.DataFrame.from_dict(rows, orient="index", columns=["value", "low", "high"])
+        unknown = {name for direction in self.unidentifiable for name in direction.split(" with ")}
+        table["note"] = [
+            "not identifiable" if name in unknown else "at a bound" * (name in self.at_bounds)
+            for name in rows
+        ]
+        return table.rename_axis("parameter")
+
+    def _head(self) -> str:
+        """Model, usability, status and residual in a line."""
+        name, (verdict, reason) = type(self.model).__name__, self.usability
+        known = f" ({plain_name(name)})" if name in model_names() else ""
+        why = f" ({reason})" if reason else ""
+        unit = self.residual_unit
+        return (
+            f"{name}{known}: {verdict}{why}. {self.status.rstrip('.')}. Residual "
+            f"{1e3 * self.residual:.3g} m{unit} RMS over the training data."
+        )
+
+    def summary(self) -> str:
+        """Usability, status, coefficients with 95 % intervals, and warnings, as text."""
+        table = self.to_pandas().to_string(float_format=lambda x: f"{x:.4g}", na_rep="")
+        warned = [f"- {warning}" for warning in self.warnings]
+        return "\n".join([self._head(), *(line.rstrip() for line in table.splitlines()), *warned])
+
+    def _repr_html_(self) -> str:
+        """The summary for a notebook."""
+        table = self.to_pandas().to_html(float_format=lambda x: f"{x:.4g}", na_rep="")
+        warned = "".join(f"<li>{html.escape(warning)}</li>" for warning in self.warnings)
+        return f"<p>{html.escape(self._head())}</p>{table}<ul>{warned}</ul>"
+
+    def plot(self) -> "Figure":
+        """Coefficients with their intervals; maps over the motion where they are fuzzy.
+
+        Others that follow the motion are drawn over time along the first recording. A notebook
+        shows the figure, `figure.savefig(path)` writes it.
+        """
+        # By name, because plots is a layer above this one.
+        plots, schedule = resolve_name("nfriction.plots"), self.model.schedule
+        labels: dict[str, Any] = {"joint_names": self.plant.joint_names, "unit": self.plant.unit}
+        figure: Figure
+        if not schedule.follows_motion:
+            figure = plots.coefficient_intervals({type(self.model).__name__: self})
+        elif schedule.fuzzy_rules() is None:
+            models = {type(self.model).__name__: self.model}
+            figure = plots.coefficients_over_time(models, self.motions[0], **labels)
+        else:
+            labels |= {"motions": self.motions, "uncertainty": self.uncertainty}
+            figure = plots.coefficient_sections(self.model, **labels)
+        return figure
 
 
 def result_from_equation_error(
