@@ -15,6 +15,7 @@ from nfriction.friction import model_names
 from nfriction.friction.models import NCFM
 from nfriction.io.model_file import save
 from nfriction.papers import twin
+from nfriction.papers.twin import family
 from nfriction.plant import robot_file
 from nfriction.version import __version__
 
@@ -35,7 +36,8 @@ def test_names_are_those_of_the_library() -> None:
     assert rigs.names() == list(inputs.RIGS)
     assert inputs.models(inputs.DEFAULT_MODELS)
     assert (".json", ".toml", *robot_file.ENDINGS) == inputs.RIG_FILES
-    assert demo.DURATION == twin.QUICK_DURATION
+    assert (demo.DURATION, demo.TWIN_DURATION) == (twin.QUICK_DURATION, family.DURATION)
+    assert demo.TRUTHS == twin.TRUTHS
 
 
 @pytest.mark.parametrize("name", list(commands()))
