@@ -75,6 +75,7 @@ def run_twin(arguments: argparse.Namespace) -> int:
     """Simulate and write, then print how to compare models on it."""
     from nfriction.papers.twin import family
 
+    family.effects_of(arguments.truth)  # before a folder is made
     check_writable(arguments.out)
     simulated = family.build(
         arguments.truth,

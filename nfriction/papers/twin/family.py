@@ -6,10 +6,10 @@ The friction torque of a joint is, with the effects that its truth names and no 
     D = F (1 - a + a |R| / R_0) (1 + d s) (1 + r cos(k q + p)) (1 + b exp(-(u / v_s)^2))
     s = tanh(v / v_smooth),  w = exp(-h),  h' = P / C - h / T,  u' = (v - u) / T_u
 
-with the force |R| that the bearing carries over its value R_0 at rest, heat h from the power P that
-friction turns into heat, and the velocity u of a moment ago. Bristles of stiffness K = F / x replace
-w D s by K z with z' = v - |v| K z / (w D) (Dahl). All of it is passive: D, B and w are positive and
-bristles return at most what was stored in them.
+with the force |R| that the bearing carries over its value R_0 at rest, heat h from the power P
+that friction turns into heat, and the velocity u of a moment ago. Bristles of stiffness K = F / x
+replace w D s by K z with z' = v - |v| K z / max(w D, F / 4) (Dahl). All of it is passive: D, B and
+w are positive, and bristles return at most what was stored in them.
 
 Mechanics, friction and integrator are this file's own. No law or input of the library may be built
 from these formulas: the family is there to judge by, and knows other classes than the library.
@@ -29,7 +29,7 @@ from tqdm import tqdm
 
 from nfriction.evaluation.compare import Comparison
 from nfriction.io.atomic import write_atomically
-from nfriction.papers.twin.dataset import RATE, Release, Twin, record, sample_count, write
+from nfriction.papers.twin.dataset import RATE, Encoder, Release, Twin, record, sample_count, write
 from nfriction.papers.twin.mechanics import Links, TrueMotion, Vector
 from nfriction.plant import rigs
 
@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 
 DURATION = 20.0  # of a release [s]
 HELD_OUT = 10  # releases to judge by
-COUNT = 2 * np.pi / 8192  # of an encoder [rad]
+COUNT = Encoder().quantum  # [rad]
 # Largest error [counts] that a release off by a count at every joint may grow to: beyond it a free
 # run would measure the error of its start rather than that of the friction model.
 PREDICTABLE = 16
@@ -74,7 +74,7 @@ PARAMETERS = {
     "thinning": Parameter("shear", 0.7, 1.3, 1.0, "m, exponent of Cross's law"),
     "capacity": Parameter("warming", 2.0, 5.0, np.inf, "C [J], heat that lowers friction e times"),
     "cooling": Parameter("warming", 5.0, 20.0, 1.0, "T [s], of cooling"),
-    "slip": Parameter("bristle", 0.02, 0.06, 0.0, "x [rad], bend at which bristles slip"),
+    "slip": Parameter("bristle", 0.03, 0.08, 0.0, "x [rad], bend at which bristles slip"),
     "ripple": Parameter("ripple", 0.2, 0.5, 0.0, "r, of the position"),
     "waves": Parameter("ripple", (1.0, 2.0, 3.0), (1.0, 2.0, 3.0), 1.0, "k, waves in a turn"),
     "phase": Parameter("ripple", 0.0, 2 * np.pi, 0.0, "p [rad]"),
@@ -147,13 +147,10 @@ def draw(truth: str, *, seed: int = 0, duration: float = DURATION, progress: boo
         if not chosen:
             growth[:2] = 0.0  # windows to train on are too short for their start to matter
         chosen += [(poses[k], found[k]) for k in np.flatnonzero(growth <= PREDICTABLE * COUNT)]
-    releases, truths = [], {}
-    for k, (pose, true) in enumerate(chosen[: 2 + HELD_OUT]):
-        release = Release(f"train_{k}", "train", pose)
-        if k > 1:
-            release = Release(f"test_{k - 2}", "test", pose)
-        releases.append(release)
-        truths[release.label] = true
+    del chosen[2 + HELD_OUT :]
+    releases = [Release(f"test_{k - 1}", "test", pose) for k, (pose, _) in enumerate(chosen)]
+    releases[:2] = [Release(f"train_{k + 1}", "train", chosen[k][0]) for k in range(2)]
+    truths = {r.label: found for r, (_, found) in zip(releases, chosen, strict=True)}
     return record(f"{truth}-{seed}", plant, releases, truths, seed)
 
 
@@ -169,9 +166,8 @@ def build(
     twin = draw(truth, seed=seed, duration=duration, progress=progress)
     write(twin, Path(out))
     command = f"nfriction twin --truth {truth} --seed {seed} --seconds {duration:g}"
-    write_atomically(
-        Path(out) / "README.md", _card(twin, command, parameters(truth, seed)).encode()
-    )
+    card = _card(twin, command, parameters(truth, seed))
+    write_atomically(Path(out) / "README.md", card.encode())
     return twin
 
 
@@ -230,22 +226,27 @@ class _Motion:
         dry *= 1.0 + of["rise"] * np.exp(-((lagging / of["film"]) ** 2))
         fluid = warm * of["viscous"] * v / (1.0 + np.abs(v / of["thin_from"]) ** of["thinning"])
 
-        def friction_under(level: Array) -> tuple[Array, Array]:
-            """Dry friction and the rate at which bristles bend."""
+        def drag_of(level: Array) -> tuple[Array, Array]:
+            """Torque of dry friction, and the rate at which bristles bend."""
             if not of["slip"].any():
                 return level * sign, np.zeros_like(v)
             torque = of["dry"] / of["slip"] * bend
-            return torque, v - np.abs(v) * torque / level
+            # Without the bound, bristles under no load would follow faster than the steps do.
+            return torque, v - np.abs(v) * torque / np.maximum(level, of["dry"] / 4)
 
-        drag, bending = friction_under(dry)
-        acceleration = _solve(between.real, force - _absolute(drag + fluid))
+        def accelerations(drag: Array) -> Array:
+            torque = _absolute(drag + fluid)
+            return np.linalg.solve(between.real.T, (force - torque).T[..., None])[..., 0].T
+
+        drag, bending = drag_of(dry)
+        acceleration = accelerations(drag)
         if of["share"].any():
             # The load depends on the acceleration, which depends on it so little (some hundredths)
             # that a third repetition would change friction by less than a thousandth.
             for _ in range(2):
                 load = self.reaction(along, rate, acceleration) / self.at_rest
-                drag, bending = friction_under(dry * (1.0 + of["share"] * (load - 1.0)))
-                acceleration = _solve(between.real, force - _absolute(drag + fluid))
+                drag, bending = drag_of(dry * (1.0 + of["share"] * (load - 1.0)))
+                acceleration = accelerations(drag)
         # Power into heat: all but the part that bends bristles.
         power = drag * (v - bending) + fluid * v
         warming = power / of["capacity"] - heat / of["cooling"]
@@ -305,20 +306,6 @@ def _joint(absolute: Array) -> Array:
 def _absolute(torque: Array) -> Array:
     """Generalised forces on absolute angles of joint torques, which act on two links each."""
     return np.concatenate([torque[:-1] - torque[1:], torque[-1:]])
-
-
-def _solve(matrix: Array, rhs: Array) -> Array:
-    """Solve (joint, joint, release) systems, positive definite, by elimination."""
-    # NumPy's own solver takes several times as long on matrices of three rows.
-    matrix, x = matrix.copy(), rhs.copy()
-    size = len(x)
-    for k in range(size - 1):
-        factor = matrix[k + 1 :, k] / matrix[k, k]
-        matrix[k + 1 :, k + 1 :] -= factor[:, None] * matrix[k, k + 1 :]
-        x[k + 1 :] -= factor * x[k]
-    for k in reversed(range(size)):
-        x[k] = (x[k] - (matrix[k, k + 1 :] * x[k + 1 :]).sum(axis=0)) / matrix[k, k]
-    return x
 
 
 def _card(twin: Twin, command: str, friction: Mapping[str, Array]) -> str:

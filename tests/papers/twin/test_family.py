@@ -42,7 +42,6 @@ def test_motion_obeys_the_plant(two_seconds: tuple[str, list[TrueMotion]]) -> No
     for motion in two_seconds[1]:
         q, qd, qdd = (torch.from_numpy(x) for x in (motion.q, motion.qd, motion.qdd))
         needed = rigs.tlrip().inverse_dynamics(q, qd, qdd)
-        # The load of the last but one repetition: friction errs by less than a thousandth.
         np.testing.assert_allclose(needed.numpy(), -motion.tau_f, atol=1e-10)
 
 
