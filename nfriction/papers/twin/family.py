@@ -3,8 +3,8 @@
 The friction torque of a joint is, with the effects that its truth names and no other,
 
     tau_f = w D s + w B v / (1 + |v / v_t|^m)
-    D = F (1 - a + a |R| / R_0) (1 + d s) (1 + r cos(k q + p)) (1 + b exp(-(u / v_s)^2))
-    s = tanh(v / v_smooth),  w = exp(-h),  h' = P / C - h / T,  u' = (v - u) / T_u
+    D = F (1 - a + a |R| / R_0) (1 + r cos(k q + p)) (1 + b exp(-(u / v_s)^2))
+    s = tanh(v / v_smooth),  w = (1 + d s) exp(-h),  h' = P / C - h / T,  u' = (v - u) / T_u
 
 with the force |R| that the bearing carries over its value R_0 at rest, heat h from the power P
 that friction turns into heat, and the velocity u of a moment ago. Bristles of stiffness K = F / x
@@ -220,11 +220,11 @@ class _Motion:
         force = self.moment * along.imag - (between.imag * (rate * rate)).sum(axis=1)
         q, v = _joint(angle), _joint(rate)
         sign = np.tanh(v / V_SMOOTH)
-        warm = np.exp(-heat)
-        dry = warm * of["dry"] * (1.0 + of["lean"] * sign)
+        scale = (1.0 + of["lean"] * sign) * np.exp(-heat)
+        dry = scale * of["dry"]
         dry *= 1.0 + of["ripple"] * np.cos(of["waves"] * q + of["phase"])
         dry *= 1.0 + of["rise"] * np.exp(-((lagging / of["film"]) ** 2))
-        fluid = warm * of["viscous"] * v / (1.0 + np.abs(v / of["thin_from"]) ** of["thinning"])
+        fluid = scale * of["viscous"] * v / (1.0 + np.abs(v / of["thin_from"]) ** of["thinning"])
 
         def drag_of(level: Array) -> tuple[Array, Array]:
             """Torque of dry friction, and the rate at which bristles bend."""
