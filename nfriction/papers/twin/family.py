@@ -7,9 +7,9 @@ The friction torque of a joint is, with the effects that its truth names and no 
     s = tanh(v / v_smooth),  w = (1 + d s) exp(-h),  h' = P / C - h / T,  u' = (v - u) / T_u
 
 with the force |R| that the bearing carries over its value R_0 at rest, heat h from the power P
-that friction turns into heat, and the velocity u of a moment ago. Bristles of stiffness K = F / x
-replace w D s by K z with z' = v - |v| K z / max(w D, F / 4) (Dahl). All of it is passive: D, B and
-w are positive, and bristles return at most what was stored in them.
+that friction turns into heat, and the velocity u of a moment ago, to first order v - T_u dv/dt.
+Bristles of stiffness K = F / x replace w D s by K z with z' = v - |v| K z / max(w D, F / 4) (Dahl).
+All of it is passive: D, B and w are positive, and bristles return at most what is stored in them.
 
 Mechanics, friction and integrator are this file's own. No law or input of the library may be built
 from these formulas: the family is there to judge by, and knows other classes than the library.
@@ -42,6 +42,8 @@ COUNT = Encoder().quantum  # [rad]
 # run would measure the error of its start rather than that of the friction model.
 PREDICTABLE = 16
 CANDIDATES = 20  # releases tried at a time
+# Streams of random numbers beyond those of the encoders, which number the recordings.
+OF_FRICTION, OF_RELEASES = 2**16, 2**16 + 1
 # Velocity over which the sign of dry friction changes, for the integrator's sake [rad/s].
 V_SMOOTH = 0.01
 
@@ -108,7 +110,7 @@ def parameters(truth: str, seed: int) -> dict[str, Array]:
     An effect has the same parameters in every truth of the same seed.
     """
     effects = effects_of(truth)
-    random = np.random.default_rng([seed, 2**16])
+    random = np.random.default_rng([seed, OF_FRICTION])
     drawn = {}
     for name, p in PARAMETERS.items():
         # Drawn even where it is not used, so that the next ones do not depend on the truth.
@@ -139,7 +141,7 @@ def draw(truth: str, *, seed: int = 0, duration: float = DURATION, progress: boo
     samples = sample_count(duration)
     plant = rigs.tlrip()
     motion = _Motion(Links.of(plant), friction)
-    random = np.random.default_rng([seed, 2**16 + 1])
+    random = np.random.default_rng([seed, OF_RELEASES])
     chosen: list[tuple[Vector, TrueMotion]] = []
     while len(chosen) < 2 + HELD_OUT:
         poses = [_pose(random, upright=k % 2 == 0) for k in range(CANDIDATES)]
