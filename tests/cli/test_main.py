@@ -14,6 +14,7 @@ from nfriction.cli import demo, inputs
 from nfriction.friction.models import NCFM
 from nfriction.io.model_file import save
 from nfriction.papers import twin
+from nfriction.papers.twin import family
 from nfriction.plant import robot_file
 from nfriction.version import __version__
 
@@ -33,7 +34,8 @@ def test_names_are_those_of_the_library() -> None:
     assert rigs.names() == list(inputs.RIGS)
     assert inputs.models(inputs.DEFAULT_MODELS) == ["NCFM", "LFM", "NLFM", "NFLFM"]
     assert (".json", ".toml", *robot_file.ENDINGS) == inputs.RIG_FILES
-    assert demo.DURATION == twin.QUICK_DURATION
+    assert (demo.DURATION, demo.TWIN_DURATION) == (twin.QUICK_DURATION, family.DURATION)
+    assert demo.TRUTHS == twin.TRUTHS
 
 
 @pytest.mark.parametrize("name", list(commands()))
