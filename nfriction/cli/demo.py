@@ -18,6 +18,8 @@ MODELS = "viscous,coulomb-viscous,neuro-fuzzy:coulomb-viscous"
 
 EXAMPLE = """example:
   nfriction demo --models viscous,neuro-fuzzy:load-coulomb --out runs/demo"""
+TWIN_EXAMPLE = """example:
+  nfriction twin --truth load+warming --seed 1 --out runs/twin"""
 
 
 def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
