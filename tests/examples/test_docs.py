@@ -102,6 +102,16 @@ def test_every_page_is_in_the_menu_and_every_figure_function_in_the_reference() 
 
 
 @pytest.mark.slow
+def test_the_demo_ends_as_the_readme_shows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["demo", "--out", "runs/demo", "--no-figures"]) == 0
+    end = "\n".join(capsys.readouterr().out.splitlines()[-4:])
+    assert f"```\n{end}\n```" in README.read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
 @pytest.mark.skipif(
     shutil.which("mkdocs", path=Path(sys.executable).parent) is None,
     reason="no mkdocs here; `pip install .[docs]` to run this",

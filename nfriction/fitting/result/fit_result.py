@@ -220,7 +220,7 @@ class FitResult:
         return f"<p>{html.escape(self._head())}</p>{table}<ul>{warned}</ul>"
 
     def plot(self) -> "Figure":
-        """Coefficients with their intervals; maps over the motion where they are fuzzy.
+        """Coefficients with their intervals; over the velocity where they are fuzzy.
 
         Others that follow the motion are drawn over time along the first recording. A notebook
         shows the figure, `figure.savefig(path)` writes it.
