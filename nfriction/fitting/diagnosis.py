@@ -137,6 +137,7 @@ def _collect(
     # Blocks are left out evenly where there are more samples than needed.
     stride = block * math.ceil(sum(map(len, recordings)) / options.diagnosis_samples)
     parts: list[tuple[Array, ...]] = []
+    # Ends of a recording are left out by the longest delay, so that every delay has the same data.
     for recording, motion in zip(recordings, motions, strict=True):
         time, margin = motion.time, options.edge + options.largest_delay
         inside = np.flatnonzero((time >= time[0] + margin) & (time <= time[-1] - margin))
@@ -188,6 +189,7 @@ def _corrected_positions(
         for degrees in turns if chain and j >= first else ():
             text = f"{name}'s position is {-degrees if degrees < 180 else 180} degrees off"
             yield text, recorded(eye, math.radians(degrees) * eye[j])
+    # On a driven rig the same as reversed torques, which are listed besides.
     yield "the signs of all positions are reversed", recorded(-eye)
     for unit, factor in (("degrees", math.pi / 180), (f"m{plant.unit}", 1e-3)):
         yield f"positions are in {unit}", recorded(factor * eye)
@@ -275,6 +277,7 @@ def _corrected_torques(
     for what, joints in groups:
         part = torch.zeros_like(given.tau)
         part[:, joints] = given.tau[:, joints]
+        # The gain is found beside the friction, as dry friction biases a ratio of torques.
         gain = _balance(plant, replace(given, tau=given.tau - part), part)[1]
         if abs(gain - 1) > options.gain_term[0]:
             # Three digits: 1000 and not 1e+03.
