@@ -10,6 +10,7 @@ import torch
 from nfriction import CVFM, NCFM, LinearAxis, PendulumChain, Plant, Recording, fit, rollout
 from nfriction.fitting.fit import prepare_task
 from nfriction.fitting.options import FitOptions
+from nfriction.signals import kalman_smoother
 
 COUNT = 2 * math.pi / 4096
 STEP, SAMPLES = 2e-3, 3001
@@ -143,12 +144,22 @@ def test_an_advanced_torque_is_in_line_again():
         Recording(late.time, q).advance_torque(0.01)
 
 
-def test_a_spike_is_named_with_its_time():
+@pytest.mark.parametrize("rounded", [True, False])
+def test_a_spike_is_named_with_its_time(rounded):
     plant, q, tau = measured("driven")
-    q = q.copy()
+    # Without visible counts, too.
+    q = q.copy() if rounded else kalman_smoother(STEP * np.arange(len(q)), q).q.copy()
     q[1000, 1] += 0.5
     (found,) = (w for w in warnings_of(plant, q, tau) if "one sample" in w)
-    assert "joint2 jumps for one sample at 2 s" in found
+    assert "joint2 jumps for one sample at 2 s;" in found
+
+
+def test_a_step_at_a_gap_is_no_spike():
+    plant, q, tau = measured("driven")
+    kept = np.r_[0:1000, 1600 : len(q)]
+    with pytest.warns(UserWarning, match="gaps"):
+        found = warnings_of(plant, q[kept], tau[kept], time=STEP * kept)
+    assert not any("one sample" in warning for warning in found)
 
 
 def test_a_fit_names_the_mistake_first():
