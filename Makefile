@@ -6,9 +6,12 @@ BIN := .venv/bin
 # As many tests at a time as this process has cores.
 WORKERS ?= $(shell nproc 2>/dev/null || echo auto)
 
-.PHONY: demo test lint clean
+.PHONY: demo reproduce test lint clean
 
 demo: .venv/installed
+	$(BIN)/nfriction demo --out runs/demo
+
+reproduce: .venv/installed
 	$(BIN)/nfriction reproduce --quick --out runs/papers
 
 test: .venv/installed

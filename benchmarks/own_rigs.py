@@ -13,7 +13,7 @@ from nfriction import FrictionModel, LinearAxis, PendulumChain, Plant, Recording
 from nfriction.fitting.fit import fit
 from nfriction.fitting.plant_parameters import adjusted_buffers, plant_parameters
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction.registry import model_by_name
+from nfriction.friction import model_by_name
 from nfriction.signals import quantise
 
 COUNTS, RATE, SECONDS = 4096, 500, 10.0
@@ -32,7 +32,12 @@ class Rig(NamedTuple):
     given: Plant
     law: str
     truth: tuple[tuple[float, ...], ...]
-    driven: bool
+    effort: tuple[float, ...] = ()
+
+    @property
+    def driven(self) -> bool:
+        """True if torques drive it, of this root mean square at each joint [N m]."""
+        return bool(self.effort)
 
 
 def own_rigs(seeds: int, rigs: int) -> None:
@@ -66,7 +71,7 @@ def cases(seeds: int, rigs: int) -> Iterator[Rig]:
     for seed in range(seeds):
         for name, plant in (("axis", axis), ("chain", wheel)):
             yield Rig(f"flywheel as {name} {seed}", plant, known(plant, seed, True), "Stribeck",
-                      (FLYWHEEL,), driven=True)  # fmt: skip
+                      (FLYWHEEL,), effort=(1.1,))  # fmt: skip
     for number in range(rigs):
         yield random_rig(number)
 
@@ -80,15 +85,17 @@ def random_rig(number: int) -> Rig:
     length = random.uniform(0.15, 0.4, links)
     plant = PendulumChain(
         mass.tolist(), length.tolist(), inertia=(mass * length**2 / 12).tolist(),
+        armature=((0.2 if driven else 0.0) * mass * length**2).tolist(),
         convention=("relative", "hanging"),
     )  # fmt: skip
-    law = str(random.choice(LAWS))
+    law = LAWS[number // 2 % len(LAWS)]
     weights = 9.81 * np.cumsum((mass * length)[::-1])[::-1]
-    # Friction of a geared drive is a tenth of the weight and more, that of a bearing a hundredth.
-    size = (0.15 if driven else 0.015) * weights
+    # Shares of the weight: of a drive with its gears, of a bearing.
+    size = (0.05 if driven else 0.015) * weights
     truth = tuple(random_friction(law, scale, random) for scale in size)
     name = f"{'driven' if driven else 'free'} {links} x {law} {number}"
-    return Rig(name, plant, known(plant, number, driven), law, truth, driven)
+    effort = tuple((0.15 * weights).tolist()) if driven else ()
+    return Rig(name, plant, known(plant, number, driven), law, truth, effort)
 
 
 def random_friction(law: str, scale: float, random: np.random.Generator) -> tuple[float, ...]:
@@ -162,14 +169,7 @@ def smooth_torque(rig: Rig, random: np.random.Generator) -> NDArray[np.float64]:
     joints, waves = rig.plant.joints, 6
     rates = 2 * math.pi * random.uniform(0.1, 1.5, (joints, waves))
     phases = random.uniform(0, 2 * math.pi, (joints, waves))
-    dry = (
-        np.array([max(row) for row in rig.truth])
-        if rig.law == "CFM"
-        else np.array([sum(row[:2]) for row in rig.truth])
-    )
-    if rig.law != "Stribeck":
-        dry = 2 * dry
-    return 2.2 * dry * np.sin(rates * t + phases).sum(-1) / math.sqrt(waves / 2)
+    return rig.effort * np.sin(rates * t + phases).sum(-1) / math.sqrt(waves / 2)
 
 
 def judged(rig: Rig, found: FitResult) -> Iterator[tuple[str, str]]:

@@ -95,8 +95,8 @@ def test_prose_uses_standard_terms(paths: list[Path]) -> None:
     )
 
 
-# A ratchet like the sizes in `test_architecture.py`: the aim is 4 %.
-LEAST_SHARE_OF_COMMENTS = 0.035
+# Comments that give reasons; the models that this code is held against have 4 to 8 %.
+LEAST_SHARE_OF_COMMENTS = 0.04
 
 
 def test_comments_give_reasons_on_enough_lines() -> None:

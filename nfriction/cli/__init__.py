@@ -26,7 +26,7 @@ from nfriction.version import __version__
 # They register the commands, in the order in which the help lists them.
 COMMANDS = (
     estimate.add_fit, estimate.add_compare, demo.add, inspect.add_report, inspect.add_info,
-    export.add, verify.add, reproduce.add,
+    export.add, verify.add, reproduce.add, demo.add_twin,
 )  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import math
 import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from nfriction.cli import inputs
 from nfriction.cli.console import Parser, Progress, UsageError, check_writable, warn
+from nfriction.friction import plain_name
 
 if TYPE_CHECKING:
     from nfriction.evaluation.compare import Comparison, InitialStates
@@ -20,10 +22,10 @@ if TYPE_CHECKING:
     from nfriction.recording import Recording
 
 FIT_EXAMPLE = """example:
-  nfriction fit run1.csv run2.csv --rig rig.json --model LFM --out lfm.json"""
+  nfriction fit run1.csv run2.csv --rig rig.json --model load-coulomb --out lfm.json"""
 COMPARE_EXAMPLE = """example:
   nfriction compare run1.csv run2.csv --test run3.csv --rig rig.json \\
-      --models NCFM,LFM,NFLFM --out runs/mine"""
+      --models viscous,load-coulomb,neuro-fuzzy:load-coulomb --out runs/mine"""
 
 
 def add_fit(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
@@ -34,8 +36,8 @@ def add_fit(commands: argparse._SubParsersAction[Parser], common: Parser) -> Non
     )  # fmt: skip
     parser.add_argument("recordings", nargs="+", type=inputs.file, metavar="RECORDING",
                         help=f"with columns time, q1, ... ({inputs.FORMATS})")  # fmt: skip
-    parser.add_argument("--model", type=inputs.model, default="NFLFM",
-                        help=f"one of {', '.join(inputs.MODELS)}")  # fmt: skip
+    parser.add_argument("--model", type=inputs.model, default="neuro-fuzzy:load-coulomb",
+                        help=inputs.MODELS)  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path("model.json"), help="model file to write")
     inputs.add_fit_options(parser)
     parser.set_defaults(run=run_fit)
@@ -61,7 +63,7 @@ def add_comparison_options(parser: argparse.ArgumentParser) -> None:
     """Options of `compare` and `demo`."""
     add = parser.add_argument
     add("--models", type=inputs.models, default=inputs.DEFAULT_MODELS,
-        help=f"of {', '.join(inputs.MODELS)}")  # fmt: skip
+        help=f"with commas between them: {inputs.MODELS}")  # fmt: skip
     add("--out", type=Path, default=Path("runs/compare"), help="folder to write")
     add("--initial-states", type=inputs.file, metavar="FILE",
         help="table with columns id, q0_1, qd0_1, ... of the recordings' initial states (default: "
@@ -163,7 +165,10 @@ def _print(
 ) -> None:
     from nfriction.cli import tables
 
-    print(f"\n{tables.error_tables(comparison)}\n")
+    print(f"\n{tables.error_tables(comparison)}")
+    # Tables show abbreviations, which a reader of plain names has not met.
+    names = (*comparison.fits, *comparison.failed)
+    print(f"models: {', '.join(f'{name}: {plain_name(name)}' for name in names)}\n")
     for name, fit in comparison.fits.items():
         print(tables.fit_lines(name, fit))
     for name, why in comparison.failed.items():
@@ -179,6 +184,32 @@ def _print(
         print(f"its model file: {arguments.out / 'models' / f'{comparison.best()}.json'}")
     what = "results and models" if arguments.no_figures else "results, models and figures"
     print(f"\n{what} are in {arguments.out}")
+    if conclusion := _conclusion(comparison):
+        model = arguments.out / "models" / f"{comparison.best()}.json"
+        print(f"\n{conclusion}")
+        print(f"all figures on a page: {shlex.join(['nfriction', 'report', str(arguments.out)])}")
+        export = ["nfriction", "export", str(model), "--format", "c", "--out", "controller"]
+        print(f"this model as C code:  {shlex.join(export)}")
+
+
+def _conclusion(comparison: Comparison) -> str:
+    """The gain by the best model in a sentence; empty where none is better, or it is unusable."""
+    from nfriction.evaluation.compare import NO_FRICTION
+
+    best = comparison.best() or NO_FRICTION
+    if best == NO_FRICTION or comparison.fits[best].usability[0] == "do not use":
+        return ""
+    error, unit = comparison.table()["all"], comparison.unit
+    without, learnt = float(error[NO_FRICTION]), float(error[best])
+    # Without friction a mechanism may turn over: thousands of milliradians are hard to imagine.
+    shown = [f"{x:.3g} {unit}" if x >= 1 else f"{1e3 * x:.3g} m{unit}" for x in (without, learnt)]
+    end = f"with the friction learnt ({plain_name(best)}) they miss it by {shown[1]}"
+    if not math.isfinite(without):
+        return f"Without friction, simulations of the test recordings diverge;\n{end}."
+    return (
+        f"Without friction, simulations of the test recordings miss the measured motion by "
+        f"{shown[0]};\n{end}, {100 * (1 - learnt / without):.3g} % less."
+    )
 
 
 @contextmanager
@@ -204,7 +235,7 @@ def _log(path: Path | None) -> Iterator[logging.Logger]:
 def _initial_states(
     arguments: argparse.Namespace, plant: Plant, recordings: Sequence[Recording]
 ) -> InitialStates | None:
-    """States of these recordings; warns of those that start from their smoothed motion."""
+    """States of these recordings; warns of those that have none."""
     from nfriction.recording import read_initial_states
 
     path = arguments.initial_states

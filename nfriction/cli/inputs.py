@@ -15,20 +15,20 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from nfriction.cli.console import UsageError, one_line, warn
 from nfriction.fitting.options import CHOICES
-from nfriction.friction import model_names
+from nfriction.friction import model_list, model_name
 
 if TYPE_CHECKING:
     from nfriction.plant import Plant
     from nfriction.recording import Recording
 
-MODELS = model_names()
 RIGS = (
     "tlrip", "rtip", "multiarm-single", "multiarm-double", "multiarm-triple",
     "dfki-A0", "dfki-C0", "dfki-C1", "emps", "xl330",
 )  # fmt: skip
+MODELS = model_list()
 FORMATS = "CSV, TSV, TXT, Parquet, NPZ, MAT, HDF5 or MDF4"
 RIG_FILES = (".json", ".toml", ".urdf", ".xml", ".mjcf")
-DEFAULT_MODELS = "NCFM,LFM,NLFM,NFLFM"
+DEFAULT_MODELS = "viscous,load-coulomb,arctan,neuro-fuzzy:load-coulomb"
 # Of `nfriction.fit`; where an option is not given, its own default.
 _FIT_OPTIONS = (
     "windows", "fit_plant", "drag", "eccentricity", "encoder_reference", "continuity", "max_steps",
@@ -36,20 +36,18 @@ _FIT_OPTIONS = (
 
 
 def model(text: str) -> str:
-    """The name of a friction model, for argparse."""
-    if text not in MODELS:
-        raise argparse.ArgumentTypeError(
-            f"no friction model is called {text!r}{_similar(text, MODELS)}; there are "
-            f"{', '.join(MODELS)}"
-        )
-    return text
+    """The name of a friction model, by either of its names, for argparse."""
+    try:
+        return model_name(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error).rstrip(".")) from None
 
 
 def models(text: str) -> list[str]:
     """Names of friction models with commas between them, for argparse."""
-    names = [model(name.strip()) for name in text.split(",") if name.strip()]
+    names = [model(name) for name in text.split(",") if name.strip()]
     if not names:
-        raise argparse.ArgumentTypeError(f"takes names of {', '.join(MODELS)}, got none")
+        raise argparse.ArgumentTypeError(f"takes names of models, got none; there are {MODELS}")
     return names
 
 

@@ -12,9 +12,9 @@ from nfriction.friction.models import FrictionModel
 LEGEND = (
     "free run: one simulation over the whole recording; windows: simulations restarted every 1, 2 "
     "or 5 s,\nover all joints; each starts from the state that its model estimates from the "
-    f"{LEAD_IN:g} s before, which are not\nscored, or from a given one; error reduction: of the "
-    "free run, against no friction, which is simulated\non the rig as given; limit of these data: "
-    "error that the uncertainty of the start alone may cause;\n=: within that of the least"
+    f"{LEAD_IN:g} s before, which are\nnot scored, or from a given one; error reduction: of the "
+    "free run, against no friction, simulated on\nthe rig as given; limit of these data: error "
+    "that the uncertainty of the start alone may cause;\n=: within that of the least"
 )
 
 
@@ -34,9 +34,11 @@ def error_tables(comparison: Comparison) -> str:
 
 
 def fit_lines(name: str, fit: FitResult) -> str:
-    """Status and warnings of a fit: bounds, unidentifiable directions, model error."""
+    """Usability, status and warnings of a fit."""
+    verdict, reason = fit.usability
     note = f"; at a bound: {', '.join(fit.at_bounds)}" if fit.at_bounds else ""
-    return "\n  - ".join([f"{name}: {fit.status.rstrip('.')}{note}", *fit.warnings])
+    head = f"{verdict} ({reason})" if reason else verdict
+    return "\n  - ".join([f"{name}: {head}. {fit.status.rstrip('.')}{note}", *fit.warnings])
 
 
 def interval_table(fit: FitResult) -> str:
@@ -63,6 +65,11 @@ def verdict(comparison: Comparison) -> str:
         return "no verdict: there was no test recording; give some by --test"
     if best is None:
         return "no verdict: every free run over the test recordings diverged"
+    unfit = "".join(f"\nnot fit for use: {name}: {why}" for name, why in comparison.unfit().items())
+    return _best(comparison, best) + unfit
+
+
+def _best(comparison: Comparison, best: str) -> str:
     error = 1e3 * comparison.table()["all"][best]
     end = "; no model is better" if best == NO_FRICTION else ""
     found = (

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -16,6 +16,9 @@ from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import kalman_smoother
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 NO_FRICTION = "no friction"
 LIMIT = "limit of these data"
 JUDGED_BY = "free-run RMSE over all joints and test recordings"
@@ -24,6 +27,8 @@ SCHEMA = 3
 first no number, and `held_out` where it now says `test`."""
 # Models whose errors agree to three digits are tied.
 TIE = 1e-3
+# So many times the error of a simpler model cannot be the luck of a few test recordings.
+FAR_WORSE = 2.0
 InitialStates = Mapping[str, tuple[np.ndarray, np.ndarray]]
 Part = Literal["train", "test"]
 PART_NAMES: dict[Part, str] = {"test": "test recordings", "train": "training recordings"}
@@ -206,9 +211,38 @@ class Comparison:
         near = () if limit is None else rmse.index[rmse <= rmse.min() + limit]
         return tuple(sorted({best, *near}, key=lambda name: (self._parameters(name), rmse[name])))
 
+    def unfit(self) -> dict[str, str]:
+        """Models not to be used, with the reason: a simpler one predicts the test far better.
+
+        A model that is worse than no friction, or at least twice as bad as one with fewer
+        parameters by more than the limit of these data, extrapolates wrongly from its training.
+        """
+        if not self.test:
+            return {}
+        rmse, limit = self.table()["all"], self.limit() or 0.0
+        found = {}
+        for name, error in rmse.items():
+            simpler = rmse[[self._parameters(n) < self._parameters(str(name)) for n in rmse.index]]
+            least = simpler.min() if len(simpler) else np.inf
+            # Where the simpler model diverges too, neither is known to be better.
+            if np.isfinite(least) and error >= FAR_WORSE * least and error > least + limit:
+                found[str(name)] = (
+                    f"{simpler.idxmin()} with fewer parameters has {1e3 * least:.3g} m{self.unit}, "
+                    + (f"it {1e3 * error:.3g}" if np.isfinite(error) else "it diverges")
+                )
+            elif NO_FRICTION in rmse and error > rmse[NO_FRICTION] + limit:
+                found[str(name)] = "no friction predicts better"
+        return found
+
     def _parameters(self, name: str) -> int:
         found = self.fits.get(name)
         return sum(p.numel() for p in found.model.parameters()) if found else 0
+
+    def plot(self) -> "Figure":
+        """Position error over the length of the simulation, by model; see `plots.horizon_curve`."""
+        from nfriction import plots  # matplotlib is slow to import
+
+        return plots.horizon_curve(self)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON: coefficients, scores, how each fit ended, and which model is best."""
@@ -234,6 +268,7 @@ class Comparison:
             "models": models,
             **({"failed": dict(self.failed)} if self.failed else {}),
             "best": judged,
+            **({"unfit": unfit} if (unfit := self.unfit()) else {}),
             "units": self.unit,
             "joints": list(self.joint_names),
         }
@@ -258,8 +293,9 @@ def compare(
 
     Args:
         plant: the mechanism as given.
-        models: names of models, the simplest first: constant laws start from its plant terms,
-            an adaptive or neuro-fuzzy model from the constant fit of its law.
+        models: names of models such as `"coulomb-viscous"` or `"CVFM"`, the simplest first:
+            constant laws start from its plant terms, an adaptive or neuro-fuzzy model from the
+            constant fit of its law.
         train: recordings to fit, or one.
         test: recordings to judge by, or one; never seen by a fit.
         initial_states: q0 and qd0 by recording name, in the recording's convention; free runs of

@@ -17,7 +17,7 @@ from nfriction.fitting.data.checks import looks_zeroed_per_recording
 from nfriction.fitting.data.inputs import apply_encoder_offsets
 from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction import model_by_name
+from nfriction.friction import model_by_name, model_name
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion, kalman_smoother
@@ -148,7 +148,7 @@ def select(
             "a choice needs models, recordings and at least 2 folds, got "
             f"{len(models)} models, {len(recordings)} recordings and {folds} folds."
         )
-    names = list(dict.fromkeys(models))
+    names = list(dict.fromkeys(map(model_name, models)))
     by_recording = [blocked_k_fold(plant, recording, folds) for recording in recordings]
     if fit_settings.get("encoder_reference", "auto") == "auto":
         # Blocks no longer show where their recording began.

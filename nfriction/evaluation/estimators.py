@@ -53,7 +53,8 @@ class FrictionEstimator(BaseEstimator):
 
     Args:
         plant: the mechanism.
-        model: name of a friction model, or one to start from, which stays unchanged.
+        model: name of a friction model such as `"stribeck"`, or one to start from, which stays
+            unchanged.
         horizon: length of the simulations by which `score` judges [s].
         fit_settings: keyword arguments of `nfriction.fit`, such as `drag=False`; each is a
             parameter of the estimator, for grids, too.

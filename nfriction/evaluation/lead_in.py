@@ -41,6 +41,8 @@ MOST_SUBSTEPS = 100
 # Starts drawn for the limit. The true start is one more like them, so that it errs by less than the
 # worst of them in 39 of 40 cases.
 DRAWS = 39
+# Samples of draws that are simulated together: a long recording of many takes much memory.
+DRAWN_SAMPLES = 2**20
 # Filters of a controller's velocity and acceleration [Hz].
 CUTOFF = 20.0
 # The time-stepping scheme is of first order: such steps keep its error below an encoder's [s].
@@ -48,6 +50,8 @@ STOP_STEP = 2e-4
 # Iterations of Gauss-Newton, and the change of the state, in standard deviations, that ends them.
 MOST_STEPS = 8
 SMALL = 0.05
+# Repetitions by which deviations that a lead-in contradicts are made smaller.
+DRAWN_CLOSER = 3
 # Shares of a Gauss-Newton step that are tried; none of it where no other is better.
 SHARES = np.array([1.0, 0.5, 0.2, 0.05, 0.0])
 
@@ -73,16 +77,13 @@ class Starts:
         state: position and velocity in the recording's coordinates, (window, 2 joint).
         root: of the states' covariance root @ root.T, (window, 2 joint, 2 joint).
         noise: standard deviation of a measured position, (window, joint).
+        deviations: random errors of the states, (draw, window, 2 joint); the same every time.
     """
 
     state: Array
     root: Array
     noise: Array
-
-    def deviations(self, count: int) -> Array:
-        """Random errors of the states, (count, window, 2 joint); the same every time."""
-        normal = np.random.default_rng(0).standard_normal((count, *self.state.shape))
-        return (self.root @ normal[..., None])[..., 0]
+    deviations: Array
 
 
 @dataclass(frozen=True)
@@ -170,17 +171,18 @@ class Simulator:
         measured = self.recording.q[samples]
         starts = estimate_starts(
             lambda states: self.simulate(states, lead_in)[0],
-            self.time[lead_in], measured[:, : self.lead], self.plant.position_quantum,
+            self.time[lead_in], measured[:, : self.lead], self.plant.position_quantum, self.draws,
         )  # fmt: skip
         scored = slice(self.lead if state is None else 0, None)
         state = starts.state if state is None else state
         q, diverged_at = self.simulate(state, samples)
-        squares = np.zeros((self.draws, self.plant.joints))
-        # One draw after another, as a long recording takes much memory.
-        for k, off in enumerate(starts.deviations(self.draws)):
-            drawn, _ = self.simulate(state + off, samples)
-            apart = self._as_read(drawn, measured) - q
-            squares[k] = np.mean(apart[:, scored] ** 2, axis=(0, 1))
+        squares = np.full((self.draws, self.plant.joints), np.inf)
+        at_once = max(1, DRAWN_SAMPLES // samples.size)
+        # Where the run itself diverged there is no limit.
+        for k in range(0, self.draws if np.isinf(diverged_at).all() else 0, at_once):
+            drawn, _ = self.simulate(state + starts.deviations[k : k + at_once], samples)
+            apart = (self._as_read(drawn, measured) - q)[:, :, scored]
+            squares[k : k + at_once] = np.mean(apart**2, axis=(1, 2))
         return Runs(
             samples, q, (q - measured)[:, scored], squares + self._noise_beyond_rounding(starts),
             float((self.time[samples[:, 0]] + diverged_at).min()),
@@ -224,7 +226,11 @@ class Simulator:
 
 
 def estimate_starts(
-    simulate: Callable[[Array], Array], time: Array, y: Array, quantum: float | None
+    simulate: Callable[[Array], Array],
+    time: Array,
+    y: Array,
+    quantum: float | None,
+    draws: int = 0,
 ) -> Starts:
     """States from which simulations follow the measured positions of lead-ins best.
 
@@ -237,6 +243,7 @@ def estimate_starts(
         time: of the samples [s], (window, sample).
         y: measured positions, (window, sample, joint).
         quantum: one count of the encoder; None where unknown.
+        draws: number of deviations.
     """
     count = y.shape[1]
     time = time - time[:, :1]
@@ -249,6 +256,10 @@ def estimate_starts(
     nudge = noise[:, None, :] / np.stack([np.ones(len(y)), time[:, -1]], 1)[..., None]
     nudge = nudge.reshape(kinematic.shape)
     state, run = kinematic, simulate(kinematic)
+    if not np.isfinite(run).all(axis=(1, 2)).any():
+        # Every simulation is lost within its lead-in, whatever its start.
+        root = np.linalg.cholesky(np.linalg.inv(prior))
+        return Starts(state, root, noise, np.zeros((draws, *state.shape)))
     for _ in range(MOST_STEPS):
         gradient, information = _linearised(simulate, state, nudge, y - run, weight)
         gradient += (prior @ (kinematic - state)[..., None])[..., 0]
@@ -264,10 +275,18 @@ def estimate_starts(
         if np.all(np.sum(gradient * step, axis=-1) < SMALL**2):
             break
     # A model that misses the lead-in knows its state less well than the encoder would allow.
-    misfit = np.mean(((y - run) / noise[:, None]) ** 2, axis=(1, 2))
-    root = np.linalg.cholesky(np.linalg.inv(information))
-    excess = np.sqrt(np.maximum(np.nan_to_num(misfit, nan=1.0), 1.0))
-    return Starts(state, root * excess[:, None, None], noise)
+    misfit = np.nan_to_num(np.mean(((y - run) / noise[:, None]) ** 2, axis=(1, 2)), nan=1.0)
+    excess = np.sqrt(np.maximum(misfit, 1.0))[:, None]
+    root = np.linalg.cholesky(np.linalg.inv(information)) * excess[..., None]
+    normal = np.random.default_rng(0).standard_normal((draws, *state.shape))
+    deviations = (root @ normal[..., None])[..., 0]
+    allowed = np.sum((excess * normal) ** 2, axis=-1)
+    for _ in range(DRAWN_CLOSER if draws else 0):
+        # Where friction holds a joint, its derivatives vanish, and the covariance is too large.
+        apart = simulate(state + deviations) - run
+        seen = np.einsum("swkj,wj->sw", np.nan_to_num(apart) ** 2, weight)
+        deviations *= np.sqrt(allowed / np.maximum(seen, allowed))[..., None]
+    return Starts(state, root, noise, deviations)
 
 
 def _linearised(

@@ -24,7 +24,7 @@ import torch
 
 from nfriction.fitting.fit import fit
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction import model_by_name
+from nfriction.friction import model_by_name, model_name
 from nfriction.friction.models import ConstantModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
@@ -87,7 +87,7 @@ def fit_models(
     if jobs == 1:
         step = progress.step
         fit_settings = {"callback": lambda stage, _: step(stage)} | fit_settings
-    names = list(dict.fromkeys(models))
+    names = list(dict.fromkeys(map(model_name, models)))
     results = {part: Fits({}, {}) for part in parts}
     errors: list[Exception] = []
     origin = warm_starts(names)

@@ -159,6 +159,7 @@ def fit_sessions(
         )
         for name in names
     )
+    # The first spreads are those of the coefficients, in the order of the parameter vector.
     mean = copy.deepcopy(model)
     count = mean.schedule.parameter_vector().numel()
     vector = torch.tensor([s.mean for s in spreads[:count]], dtype=torch.float64)
@@ -176,6 +177,7 @@ def _fit_session(
         found = fit(copy.deepcopy(model), plant, recordings, **settings)
     except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
         return str(error)
+    # Motions and residuals stay behind: a thousand of them would fill the memory.
     unknown = set(" with ".join(found.unidentifiable).split(" with "))
     return SessionFit(
         {i.name: i.value for i in found.intervals},

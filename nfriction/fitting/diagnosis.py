@@ -137,6 +137,7 @@ def _collect(
     # Blocks are left out evenly where there are more samples than needed.
     stride = block * math.ceil(sum(map(len, recordings)) / options.diagnosis_samples)
     parts: list[tuple[Array, ...]] = []
+    # Ends of a recording are left out by the longest delay, so that every delay has the same data.
     for recording, motion in zip(recordings, motions, strict=True):
         time, margin = motion.time, options.edge + options.largest_delay
         inside = np.flatnonzero((time >= time[0] + margin) & (time <= time[-1] - margin))
@@ -164,8 +165,9 @@ def _corrected_positions(
             return replace(given, q=given.q @ torch.as_tensor(matrix.T),
                            qd=given.qd @ torch.as_tensor(matrix.T),
                            qdd=given.qdd @ torch.as_tensor(matrix.T))  # fmt: skip
-        q = convention.position_from_joint(given.q, first) @ matrix.T + offset
-        rates = (convention.rate_from_joint(x, first) @ matrix.T for x in (given.qd, given.qdd))
+        q = convention.position_from_joint(given.q.numpy(), first) @ matrix.T + offset
+        given_rates = given.qd.numpy(), given.qdd.numpy()
+        rates = (convention.rate_from_joint(x, first) @ matrix.T for x in given_rates)
         qd, qdd = (torch.as_tensor(reading.rate_to_joint(x, first)) for x in rates)
         return replace(
             given, q=torch.as_tensor(reading.position_to_joint(q, first)), qd=qd, qdd=qdd
@@ -187,6 +189,7 @@ def _corrected_positions(
         for degrees in turns if chain and j >= first else ():
             text = f"{name}'s position is {-degrees if degrees < 180 else 180} degrees off"
             yield text, recorded(eye, math.radians(degrees) * eye[j])
+    # On a driven rig the same as reversed torques, which are listed besides.
     yield "the signs of all positions are reversed", recorded(-eye)
     for unit, factor in (("degrees", math.pi / 180), (f"m{plant.unit}", 1e-3)):
         yield f"positions are in {unit}", recorded(factor * eye)
@@ -274,6 +277,7 @@ def _corrected_torques(
     for what, joints in groups:
         part = torch.zeros_like(given.tau)
         part[:, joints] = given.tau[:, joints]
+        # The gain is found beside the friction, as dry friction biases a ratio of torques.
         gain = _balance(plant, replace(given, tau=given.tau - part), part)[1]
         if abs(gain - 1) > options.gain_term[0]:
             # Three digits: 1000 and not 1e+03.
@@ -298,7 +302,10 @@ def _delay(
     around = np.clip((best - grid[1] + grid[0], best + grid[1] - grid[0]), grid[0], grid[-1])
     found = minimize_scalar(unexplained, bounds=around, method="bounded", options={"xatol": 1e-4})
     words = ("torques", "positions") if found.x > 0 else ("positions", "torques")
-    lag = f"{words[0]} are recorded {1e3 * abs(found.x):.1f} ms later than {words[1]}"
+    lag = (
+        f"{words[0]} are recorded {1e3 * abs(found.x):.1f} ms later than {words[1]} "
+        f"(`recording.advance_torque({found.x:.4f})`)"
+    )
     return lag, float(found.fun)
 
 

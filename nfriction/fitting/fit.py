@@ -28,6 +28,7 @@ from nfriction.fitting.data.inputs import (
     measurement_matrix,
     smoothed_motions,
 )
+from nfriction.fitting.diagnosis import likely_mistakes, mistake_warning
 from nfriction.fitting.options import (
     Continuity,
     Eccentricity,
@@ -60,6 +61,7 @@ class FitTask:
         callback: called with a stage name after every step; True stops.
         per_recording: whether encoders were set to zero at the start of each recording.
         data_warnings: warnings about the recordings.
+        mistakes: likely mistakes in recordings or plant.
     """
 
     model: FrictionModel
@@ -72,6 +74,7 @@ class FitTask:
     callback: Callback | None = None
     per_recording: bool = False
     data_warnings: tuple[str, ...] = ()
+    mistakes: tuple[str, ...] = ()
 
 
 def fit(
@@ -94,12 +97,13 @@ def fit(
     """Estimate a friction model from recordings.
 
     Equation error gives constant coefficients; output error over windows of growing length then
-    refines them and the plant. Laws with several minima are also started from the simpler law that
-    they contain (`Law.nested_law`); the lowest residual wins. A neuro-fuzzy model starts at the
-    constant fit of its law and is kept only if its hold-out RMSE is 20 % below the law's; its
-    plant prior is relaxed only for a further 20 %. Evidence chooses the priors of its parameters,
-    its noise, and whether its sets move. An adaptive model starts at the constant fit,
-    too; `fit_adaptive` has its further settings.
+    refines them and the plant. Windows that would lose what shorter ones found are skipped, with a
+    warning. Laws with several minima are also started from their grid of initial values and from
+    the simpler law that they contain (`Law.nested_law`); the lowest residual wins. A neuro-fuzzy
+    model starts at the constant fit of its law and is kept only if its hold-out RMSE is 20 % below
+    the law's; its plant prior is relaxed only for a further 20 %. Evidence chooses the priors of
+    its parameters, its noise, and whether its sets move. An adaptive model starts at the constant
+    fit, too; `fit_adaptive` has its further settings.
 
     Args:
         model: the model to fit; changed in place.
@@ -151,7 +155,7 @@ def fit(
             'adaptive and neuro-fuzzy models need `method="output_error"`, simulated windows.'
         )
     strategy: Callable[[FitTask], FitResult] = pkgutil.resolve_name(model.schedule.fit_strategy)
-    return strategy(task).with_warnings(task.data_warnings)
+    return strategy(task).with_warnings(task.data_warnings, task.mistakes)
 
 
 def prepare_task(
@@ -174,8 +178,24 @@ def prepare_task(
         per_recording = looks_zeroed_per_recording(plant, given, options)
         found = (ZEROED_PER_RECORDING,) if per_recording else ()
     moved = smoothed_motions(joint, motions)
-    found += data_warnings(plant, given, joint, moved, options)
-    measurement = measurement_matrix(plant, given[0].resolve_convention(plant))
+    convention = given[0].resolve_convention(plant)
+    stated, mistakes = likely_mistakes(plant, joint, moved, convention, options)
+    found = (
+        *mistake_warning(stated, mistakes),
+        *found,
+        *data_warnings(plant, given, joint, moved, options),
+    )
+    measurement = measurement_matrix(plant, convention)
     return FitTask(
-        model, plant, joint, measurement, moved, options, start, callback, per_recording, found
+        model,
+        plant,
+        joint,
+        measurement,
+        moved,
+        options,
+        start,
+        callback,
+        per_recording,
+        found,
+        tuple(m.text for m in mistakes),
     )

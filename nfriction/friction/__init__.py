@@ -2,39 +2,101 @@
 
 import difflib
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from nfriction.friction.models import NamedModel
 
+
+class _Kind(NamedTuple):
+    prefix: str
+    """Before a law's plain name."""
+    letters: str
+    """Before its abbreviation."""
+    module: str
+
+
+# Laws by their plain names, with the abbreviations of the papers.
+_LAWS = {
+    "viscous": "NCFM",
+    "load-coulomb": "LFM",
+    "arctan": "NLFM",
+    "coulomb": "CFM",
+    "coulomb-viscous": "CVFM",
+    "stribeck": "Stribeck",
+}
 # Classes are resolved only when asked for: a command line then starts quickly, and the core does
 # not import the papers' own models.
-_MODULES = {
-    "nfriction.friction.models": ("NCFM", "LFM", "NLFM", "CFM", "CVFM", "Stribeck"),
-    "nfriction.papers.afem.adaptive": ("ANCFM", "ALFM", "ANLFM", "ACFM", "ACVFM"),
-    "nfriction.friction.neurofuzzy": (
-        *("NFNCFM", "NFLFM", "NFNLFM", "NFCFM", "NFCVFM", "NFStribeck"),
-    ),
+_KINDS = (
+    _Kind("", "", "nfriction.friction.models"),
+    _Kind("adaptive:", "A", "nfriction.papers.afem.adaptive"),
+    _Kind("neuro-fuzzy:", "NF", "nfriction.friction.neurofuzzy"),
+)
+# The one pair that has no class.
+_MISSING = ("adaptive:", "stribeck")
+_MODELS = {
+    kind.letters + short: (kind, law)
+    for kind in _KINDS
+    for law, short in _LAWS.items()
+    if (kind.prefix, law) != _MISSING
 }
-_HOMES = {name: module for module, names in _MODULES.items() for name in names}
+_BY_TEXT = {
+    text.lower(): name
+    for name, (kind, law) in _MODELS.items()
+    for text in (name, kind.prefix + law)
+}
 
 
 def model_names() -> tuple[str, ...]:
-    """Names of all models."""
-    return tuple(_HOMES)
+    """Names of all models, as tables and files show them; also those of their classes."""
+    return tuple(_MODELS)
+
+
+def plain_name(name: str) -> str:
+    """The plain name of a named model, such as `neuro-fuzzy:stribeck` of `NFStribeck`."""
+    kind, law = _MODELS[model_name(name)]
+    return kind.prefix + law
+
+
+def model_name(text: str) -> str:
+    """The name of the model that is meant by it or by its plain name, in any case of letters.
+
+    Raises:
+        ValueError: if no model has that name; the message lists the names.
+
+    Examples:
+        >>> model_name("neuro-fuzzy:stribeck"), model_name("lfm")
+        ('NFStribeck', 'LFM')
+    """
+    asked = str(text).strip().lower().replace("_", "-")
+    if asked not in _BY_TEXT:
+        near = difflib.get_close_matches(asked, _BY_TEXT, 1)
+        hint = f" (did you mean {_both_names(_BY_TEXT[near[0]])}?)" if near else ""
+        raise ValueError(f"no friction model is called {text!r}{hint}; there are {model_list()}.")
+    return _BY_TEXT[asked]
+
+
+def model_list() -> str:
+    """All models in a phrase: the laws by both names, and what may precede them."""
+    plain, *others = _KINDS
+    laws = ", ".join(_both_names(plain.letters + short) for short in _LAWS.values())
+    first = next(iter(_LAWS.values()))
+    before = " or ".join(f"{kind.prefix} ({kind.letters}{first}, ...)" for kind in others)
+    return f"{laws}; also with {before} before them, except {''.join(_MISSING)}"
+
+
+def _both_names(name: str) -> str:
+    """The plain name, and the abbreviation where it is another word."""
+    plain = plain_name(name)
+    return plain if plain == name.lower() else f"{plain} ({name})"
 
 
 def model_by_name(name: str) -> "type[NamedModel]":
-    """The named model's class.
+    """The class of the model of that name, see `model_name`.
 
     Raises:
         ValueError: if no model has that name; the message lists the names.
     """
-    if name not in _HOMES:
-        near = difflib.get_close_matches(str(name), _HOMES, 1)
-        hint = f"; did you mean {near[0]}?" if near else "."
-        raise ValueError(
-            f"no friction model is called {name!r}; there are {', '.join(_HOMES)}{hint}"
-        )
-    found: type[NamedModel] = resolve_name(f"{_HOMES[name]}:{name}")
-    return found
+    found = model_name(name)
+    kind: type[NamedModel] = resolve_name(f"{_MODELS[found][0].module}:{found}")
+    return kind

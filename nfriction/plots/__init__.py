@@ -11,6 +11,7 @@ from nfriction.plots.coefficients import (
 from nfriction.plots.comparison import (
     coefficient_intervals,
     horizon_curve,
+    motion,
     positions,
     rmse_bars,
     torque_over_velocity,
@@ -22,5 +23,5 @@ from nfriction.plots.style import for_dark_screen
 __all__ = [
     "coefficient_intervals", "coefficient_sections", "coefficient_surfaces",
     "coefficients_over_time", "controller_surface", "for_dark_screen", "horizon_curve",
-    "memberships", "positions", "rmse_bars", "save_all", "torque_over_velocity",
+    "memberships", "motion", "positions", "rmse_bars", "save_all", "torque_over_velocity",
 ]  # fmt: skip

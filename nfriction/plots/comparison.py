@@ -30,6 +30,43 @@ _POINTS = 3000  # of the scatter of torques, a joint
 _BINS = 24  # of its medians
 
 
+def motion(
+    recording: Recording,
+    scores: Mapping[str, Score] | None = None,
+    *,
+    joints: Sequence[int] | None = None,
+) -> Figure:
+    """Measured positions over time, a panel a joint, under simulated ones.
+
+    Args:
+        recording: the measured motion, in its own convention and unit.
+        scores: scores on this very recording by name, whose simulated positions are drawn.
+        joints: places of the joints to draw; all by default.
+
+    Raises:
+        ValueError: if a score belongs to another recording.
+    """
+    scores = scores or {}
+    _check_same_recording(recording, scores)
+    places = range(recording.joints) if joints is None else joints
+    figure, axes = style.panels(len(places), 1, style.PAGE, 0.4 + 1.7 * len(places), sharex=True)
+    looks = style.looks(scores)
+    for joint, ax in zip(places, axes[:, 0], strict=True):
+        measured = recording.q[:, joint]
+        ax.plot(recording.time, measured, **style.MEASURED)
+        for name, score in scores.items():
+            ax.plot(recording.time, score.simulated[:, joint], **looks[name].line)
+        # Simulations that leave the measured range would flatten it.
+        ax.set_ylim(style.padded(float(measured.min()), float(measured.max()), 0.25))
+        ax.set_ylabel(f"{recording.names[joint]} [{recording.unit}]")
+        ax.margins(x=0.01)
+    axes[-1, 0].set_xlabel("time [s]")
+    figure.align_ylabels(axes[:, 0])
+    handles = [Line2D([], [], **style.MEASURED), *(looks[name].handle for name in scores)]
+    style.legend(figure, handles, ["measured", *scores])
+    return figure
+
+
 def positions(recording: Recording, scores: Mapping[str, Score]) -> Figure:
     """Measured against simulated position, a pair of panels a joint: position, error below.
 
@@ -46,12 +83,7 @@ def positions(recording: Recording, scores: Mapping[str, Score]) -> Figure:
     """
     if not scores:
         raise ValueError("`scores` is empty; give at least one model's score on the recording.")
-    for name, score in scores.items():
-        if score.simulated.shape != recording.q.shape:
-            raise ValueError(
-                f"the score of {name!r} has simulated positions {score.simulated.shape}, the "
-                f"recording {recording.q.shape}; scores must be of this very recording."
-            )
+    _check_same_recording(recording, scores)
     joints = recording.joints
     figure, axes = style.panels(
         2 * joints, 1, style.PAGE, 0.4 + 1.7 * joints, sharex=True, height_ratios=[1, 1] * joints
@@ -294,6 +326,15 @@ def coefficient_intervals(fits: Mapping[str, FitResult]) -> Figure:
     if len(fits) > 1:
         style.legend(figure, [Line2D([], [], **looks[name]) for name in fits], list(fits))
     return figure
+
+
+def _check_same_recording(recording: Recording, scores: Mapping[str, Score]) -> None:
+    for name, score in scores.items():
+        if score.simulated.shape != recording.q.shape:
+            raise ValueError(
+                f"the score of {name!r} has simulated positions {score.simulated.shape}, the "
+                f"recording {recording.q.shape}; scores must be of this very recording."
+            )
 
 
 def _largest(error: np.ndarray) -> float:

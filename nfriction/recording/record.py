@@ -8,6 +8,7 @@ import re
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -19,6 +20,7 @@ from nfriction.recording.validation import check, doubts, gaps, is_uniform, read
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 Unit = Literal["rad", "m"]
@@ -181,6 +183,22 @@ class Recording:
         q = convention.position_to_joint(self.q, first_link)
         return self._replace(q=q, qd=qd, convention=AngleConvention())
 
+    def advance_torque(self, delay: float) -> Recording:
+        """The recording with its torque taken `delay` [s] earlier, negative for later.
+
+        For torques that reach the log later than the positions, by a bus or a filter. Samples for
+        which no torque is known are cut off; torques between samples are interpolated.
+
+        Raises:
+            ValueError: without torque, or if the delay leaves fewer than 8 samples.
+        """
+        if self.tau is None:
+            raise ValueError(f"{self.name or 'the recording'} has no torque to advance.")
+        at = self.time + delay
+        known = (at >= self.time[0]) & (at <= self.time[-1])
+        tau = np.stack([np.interp(at, self.time, column) for column in self.tau.T], 1)
+        return self._replace(tau=tau)[known]
+
     def digest(self) -> str:
         """SHA-256 of the content in hexadecimal: arrays, joint names, convention and unit."""
         convention = None if self.convention is None else str(self.convention)
@@ -207,6 +225,12 @@ class Recording:
         if self.convention is not None:
             table.attrs["convention"] = str(self.convention)
         return table
+
+    def plot(self) -> Figure:
+        """Positions over time, a panel a joint; see `plots.motion`."""
+        # By name, because plots is a layer above this one.
+        figure: Figure = resolve_name("nfriction.plots:motion")(self)
+        return figure
 
     @classmethod
     def from_pandas(

@@ -7,7 +7,6 @@ values that it shows.
 import base64
 import hashlib
 import math
-import re
 import shlex
 from collections.abc import Iterator, Sequence
 from importlib import resources
@@ -178,11 +177,14 @@ def _fit(run: Run, name: str) -> dict[str, Any]:
     ]
     if intervals:
         tables.append(interval_table(name, intervals, bool(fit.plant)))
+    # Runs of older versions say only whether a search converged.
+    old = ("good" if fit.converged else "doubtful", "")
+    verdict, why = fit.usability if len(fit.usability) == 2 else old
     return {
         "name": name,
         "record": fit,
-        # The page shows convergence by a badge; the status would repeat it.
-        "reason": re.sub(r"^(not )?converged\W*", "", fit.status, flags=re.IGNORECASE),
+        "verdict": verdict,
+        "why": why,
         # Several fits of a chain may pass on the same warning.
         "warnings": list(dict.fromkeys(warnings)),
         "tables": tables,

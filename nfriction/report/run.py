@@ -47,12 +47,14 @@ class FitRecord:
     """End of a fit, from `FitResult.to_dict`; entries that an older version lacks are empty.
 
     Attributes:
+        usability: "good", "doubtful" or "do not use", and why.
         intervals: 95 % interval by parameter, infinity for an open end.
         plant: adjusted terms of the plant by name.
     """
 
     status: str = "unknown"
     converged: bool = False
+    usability: tuple[str, ...] = ()
     residual: float = math.nan
     residual_unit: str = ""
     at_bounds: tuple[str, ...] = ()
@@ -86,6 +88,7 @@ class Run:
         best: name of the best model, None where there was no test recording.
         indistinguishable: the best and all models tied with it, simplest first; of older versions
             none.
+        unfit: models not to be used, and why.
         recordings: digest by name of the `"train"` and `"test"` recordings.
         models: those whose files could be read, with the information in them.
         notes: a sentence on everything that could not be read.
@@ -100,6 +103,7 @@ class Run:
     best: str | None
     judged_by: str
     indistinguishable: tuple[str, ...]
+    unfit: dict[str, str]
     command: str
     recordings: dict[Part, dict[str, str]]
     models: dict[str, tuple[FrictionModel, ModelInfo]]
@@ -190,6 +194,7 @@ def _run(folder: Path, content: dict[str, Any]) -> Run:
         best=best.get("model"),
         judged_by=_read(str, best.get("by", ""), "`best`"),
         indistinguishable=_read(tuple[str, ...], best.get("indistinguishable", []), "`best`"),
+        unfit=_read(dict[str, str], content.get("unfit", {}), "`unfit`"),
         command=_read(str, content.get("command", ""), "`command`"),
         recordings={part: recordings.get(part, {}) for part in PART_NAMES},
         models=models,

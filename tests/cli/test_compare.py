@@ -86,8 +86,9 @@ def test_verdict_names_the_winner_and_its_file(
     bench: Path, compared: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = bench / "told"
-    assert compare(bench, out, "--no-figures", models="NCFM,LFM") == 0
+    assert compare(bench, out, "--no-figures", models="viscous,load-coulomb") == 0
     said = capsys.readouterr().out
+    assert "models: NCFM: viscous, LFM: load-coulomb\n" in said
     assert "best on test recordings: LFM" in said
     (file,) = re.findall(r"its model file: (.*)", said)
     assert Path(file).is_file()
@@ -99,7 +100,25 @@ def test_verdict_names_the_winner_and_its_file(
     # Four digits are printed.
     assert values == pytest.approx([coefficients["B"][0], coefficients["C"][0]], rel=1e-3)
     assert "windows of 5 s: none, b lasts 1.2 s" in said
-    assert said.splitlines()[-1] == f"results and models are in {out}"
+    assert f"\nresults and models are in {out}\n" in said
+
+
+def test_a_comparison_ends_with_the_gain_and_commands_for_what_comes_next(
+    bench: Path, compared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    assert compare(bench, tmp_path, "--no-figures", models="NCFM,LFM") == 0
+    *_, without, learnt, report, export = capsys.readouterr().out.splitlines()
+    free = {n: m["test"]["b"]["free_run"]["all"] for n, m in results(tmp_path)["models"].items()}
+    none, best = free["no friction"], free["LFM"]
+    assert without.endswith(f" miss the measured motion by {1e3 * none:.3g} mrad;")
+    assert "(load-coulomb)" in learnt
+    assert learnt.endswith(f" by {1e3 * best:.3g} mrad, {100 * (1 - best / none):.3g} % less.")
+    monkeypatch.chdir(tmp_path)
+    for line in (report, export):
+        assert cli.main(line.partition("nfriction ")[2].split()) == 0
+    assert (tmp_path / "report.html").is_file()
+    assert list((tmp_path / "controller").glob("*.c"))
 
 
 def test_without_test_recordings_there_is_no_verdict(

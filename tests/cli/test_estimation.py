@@ -141,7 +141,7 @@ def test_stamps_in_milliseconds_are_told(bench: Path, capsys, monkeypatch) -> No
     def ends(*_: object, **__: object) -> None:
         raise ValueError("enough")
 
-    monkeypatch.setattr("nfriction.fitting.fit", ends)
+    monkeypatch.setattr("nfriction.fitting.fit.fit", ends)
     out = str(bench / "w" / "m.json")
     assert cli.main(["fit", str(path), "--rig", str(bench / "bench.json"), "--out", out]) == 2
     first, _ = capsys.readouterr().err.splitlines()

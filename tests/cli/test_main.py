@@ -11,10 +11,10 @@ import pytest
 
 from nfriction import cli, rigs
 from nfriction.cli import demo, inputs
-from nfriction.friction import model_names
 from nfriction.friction.models import NCFM
 from nfriction.io.model_file import save
 from nfriction.papers import twin
+from nfriction.papers.twin import family
 from nfriction.plant import robot_file
 from nfriction.version import __version__
 
@@ -31,11 +31,11 @@ def example(parser: argparse.ArgumentParser) -> list[str]:
 
 
 def test_names_are_those_of_the_library() -> None:
-    assert list(model_names()) == list(inputs.MODELS)
     assert rigs.names() == list(inputs.RIGS)
-    assert inputs.models(inputs.DEFAULT_MODELS)
+    assert inputs.models(inputs.DEFAULT_MODELS) == ["NCFM", "LFM", "NLFM", "NFLFM"]
     assert (".json", ".toml", *robot_file.ENDINGS) == inputs.RIG_FILES
-    assert demo.DURATION == twin.QUICK_DURATION
+    assert (demo.DURATION, demo.TWIN_DURATION) == (twin.QUICK_DURATION, family.DURATION)
+    assert demo.TRUTHS == twin.TRUTHS
 
 
 @pytest.mark.parametrize("name", list(commands()))
@@ -109,9 +109,9 @@ def test_debug_shows_the_error_itself(bench: Path) -> None:
         (["--windows=-1"], "--windows: takes positive"),
         (["--windows", "1,nan"], "--windows: takes positive"),
         (["--max-steps", "-1"], "whole number"),
-        (["--models", ","], "NCFM, LFM"),
-        (["--models", "NCFM,FOO"], "NCFM, LFM"),
-        (["--models", "NCFM,stribek"], "did you mean Stribeck?"),
+        (["--models", ","], "viscous (NCFM)"),
+        (["--models", "NCFM,FOO"], "viscous (NCFM)"),
+        (["--models", "NCFM,stribek"], "did you mean stribeck?"),
         (["--rig", "nowhere"], "multiarm-triple"),
         (["--rig", "multiarm_triple"], "did you mean multiarm-triple?"),
         (["--rig", "absent.json"], "absent.json is not there"),
@@ -151,7 +151,7 @@ def test_export_info_and_demo_say_what_they_cannot(bench: Path, compared: Path, 
     assert "torchscript" in failing("export", model, "--format", "basic")
     assert "positive seconds" in failing("demo", "--seconds", "nan")
     assert "whole number" in failing("demo", "--seed", "-1")
-    assert "NCFM, LFM" in failing("demo", "--models", "FOO")
+    assert "viscous (NCFM)" in failing("demo", "--models", "FOO")
 
 
 @pytest.mark.skipif(os.name != "posix", reason="pipes end otherwise there")

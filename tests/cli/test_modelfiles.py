@@ -47,7 +47,7 @@ def test_a_fit_that_did_not_converge_is_not_told_to_be_exported(
     words = ["fit", str(bench / "a.csv.gz"), *rig, *QUICK, "--max-steps", "1"]
     assert cli.main(words) == 0
     said = capsys.readouterr().out
-    assert "LFM: Not converged" in said
+    assert "LFM: doubtful (the search did not converge). Not converged" in said
     assert f"wrote {tmp_path / 'm.json'}" in said
     assert "next:" not in said
 

@@ -68,7 +68,7 @@ def test_it_tells_in_a_few_lines_who_is_best(comparison):
 
 def test_one_name_and_one_recording_need_no_list():
     settings = {"horizons": (0.5,), "windows": (0.5,), "max_steps": 1}
-    one = compare(pendulum(), "NCFM", A, B, **settings)
+    one = compare(pendulum(), "viscous", A, B, **settings)
     many = compare(pendulum(), ["NCFM"], [A], [B], **settings)
     assert one.to_dict() == many.to_dict()
 
@@ -246,6 +246,21 @@ def test_models_within_the_limit_of_the_best_are_not_told_apart(comparison):
     assert all_alike.indistinguishable() == ("no friction", "NCFM", "LFM")
     assert scored(found, np.inf, **errors).limit() is None
     assert dataclasses.replace(found, test={}).indistinguishable() == ()
+
+
+def test_a_model_that_a_simpler_one_beats_by_far_is_not_fit_for_use(comparison):
+    found, _ = comparison
+    assert scored(found, no_friction=5.0, NCFM=1.0, LFM=1.9).unfit() == {}
+    runaway = scored(found, no_friction=5.0, NCFM=1.0, LFM=2.1)
+    assert set(runaway.unfit()) == {"LFM"}
+    assert "not fit for use: LFM: NCFM with fewer parameters has" in verdict(runaway)
+    assert runaway.to_dict()["unfit"] == runaway.unfit()
+    assert "it diverges" in scored(found, no_friction=5.0, NCFM=1.0, LFM=np.inf).unfit()["LFM"]
+    worse = scored(found, no_friction=1.0, NCFM=1.2, LFM=1.3).unfit()
+    assert worse == dict.fromkeys(("NCFM", "LFM"), "no friction predicts better")
+    # The data do not separate these.
+    assert scored(found, 10.0, no_friction=5.0, NCFM=1.0, LFM=3.0).unfit() == {}
+    assert dataclasses.replace(found, test={}).unfit() == {}
 
 
 def test_coefficients_that_follow_the_motion_say_what_they_hold_for():

@@ -110,5 +110,5 @@ def test_what_cannot_cross_to_other_processes_is_refused(data: Data) -> None:
     pytest.importorskip("joblib")
     with pytest.raises(ValueError, match="progress"):
         fit_models(pendulum(), ["LFM"], {"fit": data}, jobs=2, callback=lambda *_: None)
-    with pytest.raises(ValueError, match="there are NCFM"):
+    with pytest.raises(ValueError, match="there are viscous"):
         fit_models(pendulum(), ["XFM"], {"fit": data})

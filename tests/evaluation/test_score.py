@@ -220,7 +220,7 @@ def test_a_recording_without_room_for_a_lead_in_is_refused():
         score(plant(), MODEL, short)
 
 
-def test_divergence_is_infinite_and_null():
+def test_divergence_is_infinite_and_null(caplog):
     explode = Law("explode", (Coefficient("b", "N m s/rad", positive=False),),
                   lambda qd, load, c, v_smooth: c[..., 0] * qd)  # fmt: skip
     model = FrictionModel(explode, Constant(explode, 2, [-5.0]), 1.0)
@@ -228,6 +228,9 @@ def test_divergence_is_infinite_and_null():
     found = score(plant(), model, recording, horizons=(0.5,))
     assert found.free_run.all == np.inf
     assert 0 < found.diverged_at < 1.0
+    assert found.limit.free_run.all == found.limit.windows["0.5"].all == np.inf
+    # Once of the free run and of the windows, and not of every start that is tried.
+    assert caplog.text.count("diverged") < 10
     plain = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert plain["free_run"] == {"joints": [None, None], "all": None}
     assert plain["diverged_at"] == pytest.approx(found.diverged_at)

@@ -15,12 +15,13 @@ from nfriction import cli
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
+README = ROOT / "README.md"
 FILE = re.compile(r"\S+\.(csv|csv\.gz|json|xml|pt|c)$")
 
 
 def blocks(language: str) -> Iterator[tuple[str, str]]:
     """Page and text of every code block in a language."""
-    for page in PAGES:
+    for page in (README, *PAGES):
         text = page.read_text(encoding="utf-8")
         for block in re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
             yield page.name, block
@@ -33,6 +34,12 @@ def commands() -> list[tuple[str, str]]:
             if line.startswith("nfriction "):
                 found.append((page, line.split("#")[0].strip()))
     return found
+
+
+def test_links_of_the_readme_lead_somewhere_in_the_repository() -> None:
+    targets = re.findall(r"\]\(([^)#]+)", README.read_text(encoding="utf-8"))
+    assert len(targets) > 5
+    assert [t for t in targets if not t.startswith("http") and not (ROOT / t).exists()] == []
 
 
 def test_there_are_pages_and_commands() -> None:
@@ -92,6 +99,16 @@ def test_every_page_is_in_the_menu_and_every_figure_function_in_the_reference() 
 
     described = {name.rpartition(".")[2] for name in REFERENCES}
     assert set(plots.__all__) - described <= {"save_all"}
+
+
+@pytest.mark.slow
+def test_the_demo_ends_as_the_readme_shows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["demo", "--out", "runs/demo", "--no-figures"]) == 0
+    end = "\n".join(capsys.readouterr().out.splitlines()[-4:])
+    assert f"```\n{end}\n```" in README.read_text(encoding="utf-8")
 
 
 @pytest.mark.slow

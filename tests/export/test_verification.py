@@ -20,7 +20,8 @@ from nfriction.export import (
 )
 from nfriction.export.c_code.export import find_compiler
 from nfriction.export.contract import Contract, verify
-from nfriction.friction.models import LFM, NFNLFM
+from nfriction.friction.models import LFM
+from nfriction.friction.neurofuzzy import NFNLFM
 from tests.export.artefacts import INFO
 from tests.friction.samples import named_models, randomise
 

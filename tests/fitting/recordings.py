@@ -53,6 +53,21 @@ def driven_axis(axis: LinearAxis, model: FrictionModel, *, seconds: float = 3.0)
     return Recording(time, q, tau=tau.numpy(), unit="m", name="axis")
 
 
+def flywheel(seed: int, friction: FrictionModel) -> Recording:
+    """A driven axis of 0.13 kg: smooth random force with noise, 4096 counts a turn, 500 Hz."""
+    random = np.random.default_rng(seed)
+    time = np.arange(0.0, 10.0, 2e-3)[:, None]
+    rate, phase = random.uniform(0.6, 9.0, 6), random.uniform(0.0, 6.0, 6)
+    tau = 0.6 * np.sin(rate * time + phase).sum(1, keepdims=True)
+    zero = torch.zeros(1, dtype=F64)
+    out = rollout(
+        LinearAxis(0.13), friction, zero, zero, torch.as_tensor(tau[:-1]), sample_time=2e-3,
+        substeps=8, gradients=False,
+    )  # fmt: skip
+    read = tau + 0.01 * random.standard_normal(tau.shape)
+    return Recording(time[:, 0], quantise(out.q.numpy(), 4096), tau=read, unit="m", name=f"{seed}")
+
+
 def solve(
     problem: ShootingProblem, start: torch.Tensor, max_steps: int = 30, cost_tolerance: float = 1e-6
 ) -> LeastSquaresResult:

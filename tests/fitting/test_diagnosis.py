@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction import CVFM, LinearAxis, PendulumChain, Plant, Recording, fit, rollout
-from nfriction.fitting.data.checks import data_warnings
+from nfriction import CVFM, NCFM, LinearAxis, PendulumChain, Plant, Recording, fit, rollout
+from nfriction.fitting.fit import prepare_task
+from nfriction.fitting.options import FitOptions
 from nfriction.signals import kalman_smoother
 
 COUNT = 2 * math.pi / 4096
@@ -51,8 +52,7 @@ def warnings_of(plant: Plant, q: np.ndarray, tau: np.ndarray | None, **given) ->
     convention = None if plant.unit == "m" else given.get("convention", "relative,upright")
     time = given.get("time", STEP * np.arange(len(q)))
     recording = Recording(time, q, tau, convention=convention, unit=plant.unit)
-    joint = recording.joint_coordinates(plant)
-    return data_warnings(plant, [recording], [joint], [kalman_smoother(joint.time, joint.q)])
+    return prepare_task(CVFM(plant.joints), plant, recording, FitOptions()).data_warnings
 
 
 def later(values: np.ndarray, samples: int) -> np.ndarray:
@@ -133,12 +133,33 @@ def test_mistakes_in_conventions_and_time():
         assert "time is in ms" in warnings_of(plant, q, tau, time=2.0 * np.arange(len(q)))[0]
 
 
-def test_a_spike_is_named_with_its_time():
+def test_an_advanced_torque_is_in_line_again():
+    plant, q, tau = measured("motor")
+    late = Recording(STEP * np.arange(len(q)), q, later(tau, 10), convention="relative,upright")
+    aligned = late.advance_torque(10 * STEP)
+    np.testing.assert_allclose(aligned.tau, tau[: len(aligned)], atol=1e-12)
+    np.testing.assert_array_equal(aligned.q, q[: len(aligned)])
+    assert warnings_of(plant, aligned.q, aligned.tau) == ()
+    with pytest.raises(ValueError, match="no torque to advance"):
+        Recording(late.time, q).advance_torque(0.01)
+
+
+@pytest.mark.parametrize("rounded", [True, False])
+def test_a_spike_is_named_with_its_time(rounded):
     plant, q, tau = measured("driven")
-    q = q.copy()
+    # Without visible counts, too.
+    q = q.copy() if rounded else kalman_smoother(STEP * np.arange(len(q)), q).q.copy()
     q[1000, 1] += 0.5
     (found,) = (w for w in warnings_of(plant, q, tau) if "one sample" in w)
-    assert "joint2 jumps for one sample at 2 s" in found
+    assert "joint2 jumps for one sample at 2 s;" in found
+
+
+def test_a_step_at_a_gap_is_no_spike():
+    plant, q, tau = measured("driven")
+    kept = np.r_[0:1000, 1600 : len(q)]
+    with pytest.warns(UserWarning, match="gaps"):
+        found = warnings_of(plant, q[kept], tau[kept], time=STEP * kept)
+    assert not any("one sample" in warning for warning in found)
 
 
 def test_a_fit_names_the_mistake_first():
@@ -146,3 +167,16 @@ def test_a_fit_names_the_mistake_first():
     recording = Recording(STEP * np.arange(len(q)), -q, tau, convention="relative,upright")
     found = fit(CVFM(1), plant, recording, method="equation_error")
     assert "the sign of joint1's position is reversed" in found.warnings[0]
+    assert found.usability[0] == "do not use"
+    assert "the sign of joint1's position is reversed" in found.usability[1]
+
+
+def test_a_fit_says_whether_it_is_usable():
+    plant, q, tau = measured("motor")
+    recording = Recording(STEP * np.arange(len(q)), q, tau, convention="relative,upright")
+    settings = {"windows": (1.0,), "fit_plant": False}
+    assert fit(CVFM(1), plant, recording, **settings).usability == ("good", "")
+    # Viscous friction alone is far from dry friction.
+    verdict, reason = fit(NCFM(1), plant, recording, **settings).usability
+    assert verdict == "doubtful"
+    assert "times the encoder's quantisation noise" in reason

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from nfriction import CVFM, LFM, NFLFM, PendulumChain, Recording, fit
-from nfriction.fitting.data.checks import data_warnings
-from nfriction.signals import kalman_smoother
+from nfriction.fitting.fit import prepare_task
+from nfriction.fitting.options import FitOptions
 from tests.fitting.recordings import COUNTS, pendulum, swing
 
 COUNT = 2 * np.pi / COUNTS
@@ -13,9 +13,7 @@ MODEL = LFM(2, [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]], v_smooth=0.05)
 
 
 def said(plant: PendulumChain, *recordings: Recording) -> tuple[str, ...]:
-    joint = [r.joint_coordinates(plant) for r in recordings]
-    motions = [kalman_smoother(r.time, r.q) for r in joint]
-    return data_warnings(plant, recordings, joint, motions)
+    return prepare_task(LFM(plant.joints), plant, recordings, FitOptions()).data_warnings
 
 
 def as_plant_says(recording: Recording) -> Recording:

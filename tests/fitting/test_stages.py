@@ -1,16 +1,24 @@
-"""A stage tells its steps, ends where it creeps, and says so."""
+"""A stage tells its steps, ends where it creeps, and says so; none loses what was found."""
+
+import math
 
 import pytest
+import torch
 
-from nfriction import LFM
+from nfriction import LFM, LinearAxis, Stribeck, fit
 from nfriction.fitting.data.inputs import measurement_matrix
 from nfriction.fitting.data.windows import cut_windows
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.shooting.sensitivity import StepJacobian
-from nfriction.fitting.strategy.continuation import ShootingFitter, StallMonitor
+from nfriction.fitting.strategy.continuation import (
+    ShootingFitter,
+    StallMonitor,
+    log_ratio,
+    settle_states,
+)
 from nfriction.optim.least_squares import Step
 from nfriction.signals import kalman_smoother
-from tests.fitting.recordings import pendulum, swing
+from tests.fitting.recordings import F64, flywheel, pendulum, swing
 
 PATIENCE, SETTLED = DEFAULTS.patience, DEFAULTS.settled_move
 
@@ -89,3 +97,41 @@ def test_what_is_shared_has_settled_once_it_moves_no_more():
     assert not settles([x, far, x, far])
     assert not settles([x, near, far, near])
     assert not settles([x, near, x, near], damping=10.0)
+
+
+def test_long_windows_do_not_lose_the_friction_that_short_ones_found():
+    """Noise of the torque adds up over long windows, and leads their parameters astray."""
+    truth = [0.35, 0.15, 0.12, 0.3, 2.0]
+    recordings = [flywheel(seed, Stribeck(1, truth)) for seed in (3, 4)]
+    found = fit(Stribeck(1), LinearAxis(0.13), recordings)
+    assert found.converged, found.status
+    torch.testing.assert_close(
+        found.model.schedule.values[0], torch.tensor(truth, dtype=F64), rtol=0.04, atol=0
+    )
+    lengths = [length for length, _ in found.stages]
+    assert lengths == [0.5, 2.0, 5.0][: len(lengths)]
+    assert all(residual < 2e-3 for _, residual in found.stages)
+    assert found.to_dict()["stages"] == [list(stage) for stage in found.stages]
+    # What was skipped is named.
+    assert found.skipped_horizons == (0.5, 2.0, 5.0)[len(lengths) :]
+    for length in found.skipped_horizons:
+        assert any(f"Windows of {length:g} s were skipped" in w for w in found.warnings)
+
+
+def test_states_settle_while_the_parameters_stay():
+    _, problem = short_search()
+    start = problem.variables.start()
+    settled, stopped = settle_states(problem, start)
+    count = problem.variables.shared_count
+    assert not stopped
+    assert torch.equal(settled[:count], start[:count])
+    assert problem.cost(settled) < problem.cost(start)
+
+
+def test_a_ratio_of_errors_is_known_as_well_as_its_windows_agree():
+    old = torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=F64)
+    ratio, spread = log_ratio(4.0 * old, old)
+    assert ratio == pytest.approx(math.log(2.0))
+    assert spread == pytest.approx(0.0, abs=1e-12)
+    assert log_ratio(torch.tensor([9.0, 2.0, 3.0, 4.0]), old)[1] > 0.1
+    assert log_ratio(old[:1], old[:1]) == (0.0, math.inf)

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction import Recording
+from nfriction import LinearAxis, Recording, Stribeck, fit
 from nfriction.fitting.equation_error import TorqueFit, fit_torque, friction_torque, prior_sd
 from nfriction.fitting.options import DEFAULTS
 from nfriction.friction import model_by_name
 from nfriction.friction.laws import LINEAR, NONLINEAR, Coefficient, Law
 from nfriction.signals import Motion
-from tests.fitting.recordings import pendulum
+from tests.fitting.recordings import flywheel, pendulum
 
 V_SMOOTH = 0.05
 EDGE = DEFAULTS.edge
@@ -120,3 +120,28 @@ def test_a_law_that_gives_no_number_is_named_with_joint_and_velocity():
     law = Law("root", (Coefficient("R", "N m"),), root)
     with pytest.raises(ValueError, match=r"law 'root' gives nan where R is 1, at joint \d, vel"):
         fit_torque(law, plant, [recording], [motion], V_SMOOTH)
+
+
+def test_friction_that_falls_with_speed_shows_in_smoothed_torques():
+    """A smoother smears reversals, and with them all that is particular to low speed."""
+    truth = [0.35, 0.15, 0.12, 0.3, 2.0]
+    recordings = [flywheel(seed, Stribeck(1, truth)) for seed in (3, 4)]
+    found = fit(Stribeck(1), LinearAxis(0.13), recordings, method="equation_error")
+    values = found.model.schedule.values[0].tolist()
+    assert values[:3] == pytest.approx(truth[:3], rel=0.4)
+    assert values[0] + values[1] == pytest.approx(0.5, rel=0.15)
+    assert 0.15 < values[3] < 0.6
+    told = {i.name: i for i in found.intervals}
+    assert len(told) == 4
+    assert all(i.low < i.value < i.high for i in told.values())
+
+
+def test_a_regression_names_what_it_found_none_of():
+    plant = pendulum()
+    model = model_by_name("CVFM")(2, [[3e-3, 0.0], [5e-4, 1e-3]], v_smooth=V_SMOOTH)
+    recording, motion, _ = moved(model, plant)
+    law = model_by_name("CVFM")(2, v_smooth=V_SMOOTH)
+    found = fit(law, plant, recording, motions=[motion], method="equation_error")
+    assert found.at_bounds == ("F_v of joint1",)
+    assert any(w.startswith("At zero: F_v of joint1") for w in found.warnings)
+    assert any("smoothed motion" in w for w in found.warnings)

@@ -1,9 +1,11 @@
 """Friction models: law times schedule, one of a user's own included."""
 
+import re
+
 import pytest
 import torch
 
-from nfriction.friction import model_by_name, model_names
+from nfriction.friction import model_by_name, model_name, model_names, plain_name
 from nfriction.friction.coefficients import Constant, Schedule
 from nfriction.friction.laws import LINEAR, VISCOUS
 from nfriction.friction.models import LFM, NLFM, FrictionModel
@@ -178,13 +180,45 @@ def test_a_schedule_for_another_law_is_refused() -> None:
 
 def test_models_are_found_by_name() -> None:
     assert all(model_by_name(name).__name__ == name for name in model_names())
-    with pytest.raises(ValueError, match=r"'LFN'; there are NCFM, LFM, .*NFNLFM"):
-        model_by_name("LFN")
+    with pytest.raises(ValueError, match=r"'XYZ'; there are viscous \(NCFM\).*NFNCFM"):
+        model_by_name("XYZ")
 
 
-def test_a_mistyped_name_gets_the_nearest_one() -> None:
-    with pytest.raises(ValueError, match=r"did you mean Stribeck\?"):
-        model_by_name("stribek")
+@pytest.mark.parametrize(
+    ("asked", "meant"),
+    [
+        ("stribek", "stribeck"),
+        ("LFN", "load-coulomb (LFM)"),
+        ("coulomb-viscos", "coulomb-viscous (CVFM)"),
+        ("neurofuzzy:stribeck", "neuro-fuzzy:stribeck (NFStribeck)"),
+        ("adaptive:arctn", "adaptive:arctan (ANLFM)"),
+    ],
+)
+def test_a_mistyped_name_gets_the_nearest_one(asked: str, meant: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(f"did you mean {meant}?")):
+        model_by_name(asked)
+
+
+def test_plain_names_say_the_law_and_what_its_coefficients_follow() -> None:
+    plain = {name: plain_name(name) for name in model_names()}
+    assert len(set(plain.values())) == len(plain)
+    constant = {model_by_name(n).definition: p for n, p in plain.items() if ":" not in p}
+    for name, text in plain.items():
+        kind = model_by_name(text)
+        assert kind is model_by_name(name)
+        before, _, law = text.rpartition(":")
+        assert law == constant[kind.definition]
+        schedule = kind(1).schedule
+        assert type(schedule).__name__ == {
+            "": "Constant", "adaptive": "Adaptive", "neuro-fuzzy": "NeuroFuzzy"
+        }[before]  # fmt: skip
+
+
+def test_names_are_read_in_any_case_of_letters() -> None:
+    for name in model_names():
+        for text in (name, plain_name(name)):
+            forms = (text.upper(), text.lower(), text.title(), f" {text} ", text.replace("-", "_"))
+            assert {model_name(form) for form in forms} == {name}
 
 
 def test_arrays_and_lists_are_inputs_too() -> None:

@@ -57,7 +57,7 @@ def test_intervals_are_those_of_the_fit():
     (joint,) = plant.joint_names
     told = Interval(f"C_p of {joint}", value, 0.5 * value, 2 * value)
     figure = plots.coefficient_intervals({"known": replace(found, intervals=(told,)),
-                                          "unknown": found})  # fmt: skip
+                                          "unknown": replace(found, intervals=())})  # fmt: skip
     (ax,) = figure.axes
     (low, high), (edge, other) = (
         bars[0].get_segments()[0][:, 1] for _, _, bars in (c.lines for c in ax.containers)

@@ -118,6 +118,28 @@ def test_positions_show_the_measurement_the_simulations_and_their_difference(joi
     assert_tidy(figure)
 
 
+def test_a_motion_shows_the_joints_asked_for_within_the_measured_range():
+    recording = swing(3)
+    scores = {"no friction": score_of(recording, 1e3), "LFM": score_of(recording, 1e-3)}
+    figure = plots.motion(recording, scores, joints=[2, 0])
+    for ax, joint in zip(figure.axes, (2, 0), strict=True):
+        assert ax.get_ylabel() == f"joint{joint + 1} [rad]"
+        measured, *simulated = (line.get_ydata() for line in ax.lines)
+        np.testing.assert_array_equal(measured, recording.q[:, joint])
+        for shown, score in zip(simulated, scores.values(), strict=True):
+            np.testing.assert_array_equal(shown, score.simulated[:, joint])
+        assert max(np.abs(ax.get_ylim())) < 1
+    assert_tidy(figure)
+    assert_tidy(recording.plot())
+    with pytest.raises(ValueError, match="this very recording"):
+        plots.motion(swing(2), scores)
+
+
+def test_a_comparison_draws_its_errors_by_length():
+    figure = comparison_of(swing(1)).plot()
+    assert figure.axes[0].get_xlabel() == "length of simulation"
+
+
 def test_an_error_that_diverged_does_not_set_the_scale():
     recording = swing(1)
     scores = scores_of(recording) | {"LFM": score_of(recording, 1e9, lost=True)}

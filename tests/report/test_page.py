@@ -10,7 +10,7 @@ import pytest
 from nfriction import LFM, NFLFM, ModelInfo, save
 from nfriction.evaluation.tables import Table, error_table
 from nfriction.report import read_run, to_html
-from tests.report.runs import EVIL, JOINTS, write
+from tests.report.runs import EVIL, JOINTS, results, write
 
 
 class Page(HTMLParser):
@@ -104,7 +104,7 @@ def test_verdicts_warnings_and_rules_are_told(page):
     for said in (
         "LFM predicts the test recordings best: 100 mrad, where no friction leaves 2000.",
         f"it is statistically tied with {EVIL}; the simplest of them is {EVIL}.",
-        "Not converged.",
+        "Doubtful.",
         "Not identifiable: f_a with f_v.",
         "At a bound: f_b.",
         "IF velocity is slow AND acceleration is about zero THEN",
@@ -125,6 +125,24 @@ def test_a_rejected_network_has_no_rules_and_an_unnamed_rig_is_called_so(tmp_pat
     assert "Its network was rejected" in text
     assert "THEN" not in text
     assert "Rig: unnamed." in text
+
+
+def test_errors_within_the_limit_of_the_least_are_grey_and_the_limit_is_the_last_row(tmp_path):
+    """LFM has 100 mrad, NFLFM 200; in simulations of LFM the start alone may cause 150."""
+    content = results()
+    near = {"joints": [0.15, 0.01], "all": 0.15}
+    content["models"]["LFM"]["test"][EVIL]["limit"] = {"free_run": near, "windows": {}}
+    run = read_run(write(tmp_path, content))
+    table = error_table(run.comparison, "test")
+    assert table.limit[:4] == ("limit of these data", 150, 10, 150)
+    assert math.isnan(table.limit[4])
+    tied = {(r[0], k) for r in table.rows for k in range(len(r)) if table.is_tied(r, k)}
+    assert tied == {(model, k) for model in ("LFM", "NFLFM") for k in (1, 3)}
+    assert [line.split()[-1] for line in str(table).splitlines()[-2:]] == ["90", "n/a"]
+    html = to_html(run)
+    assert html.count('class="best tied"') == 2
+    assert html.count('class=" tied"') == 2
+    assert '<tfoot><tr><th scope="row">limit of these data</th><td>150</td>' in html
 
 
 def test_the_least_error_of_a_column_is_marked_and_a_diverged_one_never(tmp_path):

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from nfriction.fitting.data.inputs import is_undriven_pendulum, largest_torques
 from nfriction.fitting.data.windows import begins_at_rest
-from nfriction.fitting.diagnosis import likely_mistakes, mistake_warning
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.plant import PendulumChain, Plant
 from nfriction.recording import Recording
@@ -54,10 +53,7 @@ def data_warnings(
     """Warnings about recordings as written and in joint coordinates, a sentence each."""
     still = _still_joints(plant, given, joint, options.min_counts)
     heavy = _implausible_masses(plant) if is_undriven_pendulum(plant, joint) else ()
-    convention = given[0].resolve_convention(plant)
-    stated, mistakes = likely_mistakes(plant, joint, motions, convention, options)
-    named = mistake_warning(stated, mistakes)
-    return (*named, *_spikes(given, options), *still, *heavy)
+    return (*_spikes(given, options), *still, *heavy)
 
 
 def require_motion(plant: Plant, joint: Sequence[Recording]) -> None:
@@ -97,21 +93,20 @@ def _still_joints(
 
 
 def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[str]:
-    """Single samples far off the line between their neighbours."""
+    """Single samples far off both of their neighbours, to the same side."""
     for recording in recordings:
         q, time = recording.q, recording.time
-        off = q[1:-1] - (q[2:] + q[:-2]) / 2
-        # Beside a spike of height h its neighbours are off by -h/2 each.
-        pattern = (off[1:-1] - (off[2:] + off[:-2])) / 2
-        usual = np.maximum(np.quantile(np.abs(pattern), 0.99, axis=0), count_seen(q))
-        far = np.abs(pattern) > options.spike_ratio * usual
-        for name, column, size in zip(recording.names, far.T, np.abs(pattern).T, strict=True):
-            # Each is seen from its neighbours, too.
-            peaks = [
-                k for k in np.flatnonzero(column) if size[k] == size[max(0, k - 2) : k + 3].max()
-            ]
-            if peaks:
-                when = ", ".join(f"{time[k + 2]:.6g}" for k in peaks[:3])
+        before, after = q[1:-1] - q[:-2], q[1:-1] - q[2:]
+        near, other = np.sort(np.abs([before, after]), axis=0)
+        # Steps, as at a gap in time, and samples beside a spike are far off one neighbour alone.
+        height = np.where((before * after > 0) & (2 * near > other), near, 0.0)
+        curved = np.quantile(np.abs(before + after) / 2, 0.99, axis=0)
+        # A joint may show no count.
+        far = height > options.spike_ratio * np.fmax(curved, count_seen(q))
+        for name, column in zip(recording.names, far.T, strict=True):
+            peaks = np.flatnonzero(column) + 1
+            if len(peaks):
+                when = ", ".join(f"{time[k]:.6g}" for k in peaks[:3])
                 more = f" and {len(peaks) - 3} more" if len(peaks) > 3 else ""
                 yield (
                     f"{recording.name or 'A recording'}: {name} jumps for one sample at {when} s"

@@ -1,9 +1,11 @@
 """Result of a fit: model, plant, convergence, confidence intervals and warnings."""
 
+import html
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor
@@ -18,24 +20,34 @@ from nfriction.fitting.result.identifiability import (
     exceeds_drive_torque,
     model_error_warning,
     null_directions,
+    observed_count,
     standard_deviations,
     warnings_of,
     weakly_identified,
 )
 from nfriction.fitting.result.uncertainty import CoefficientUncertainty
 from nfriction.fitting.shooting.autocorrelation import bandwidth, effective_noise, hac_sd
-from nfriction.fitting.shooting.problem import ShootingProblem, observed_count
+from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.variables import model_at
+from nfriction.friction import model_names, plain_name
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import LeastSquaresResult
 from nfriction.plant import Plant
 from nfriction.signals import Motion
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
 
 BLURRED = (
     "The torque comes from a smoothed motion, which blurs friction at low speed and knows no error "
     'of the plant; `method="output_error"` gives a better answer, and intervals that cover both.'
 )
 
+Usability = Literal["good", "doubtful", "do not use"]
+# Residuals above so many times the quantisation noise are mostly the model's error. A well-fitted
+# law on a real bench has up to ten times.
+DOUBTFUL_RATIO = 20.0
 # A lower bound no larger exists only for the logarithm of a positive coefficient, in SI.
 NOTHING = 1e-9
 
@@ -69,6 +81,9 @@ class FitResult:
             equation-error fit.
         continuity: of the fitted windows, see `fit`.
         data_warnings: warnings about the data; inherited by fits warm-started from this one.
+        mistakes: likely mistakes in recordings or rig, see `fitting.diagnosis`; inherited, too.
+        quantisation: noise of the encoder's count [rad; m]; None where the count is unknown, and
+            after an equation-error fit.
         stages: length of the windows of each stage that was kept [s], and its residual in
             `residual_unit`; of constant coefficients.
         skipped_horizons: lengths of windows that the constant law could not follow [s].
@@ -93,6 +108,8 @@ class FitResult:
     uncertainty: CoefficientUncertainty | None = None
     continuity: Continuity = "none"
     data_warnings: tuple[str, ...] = ()
+    mistakes: tuple[str, ...] = ()
+    quantisation: float | None = None
     stages: tuple[tuple[float, float], ...] = ()
     skipped_horizons: tuple[float, ...] = ()
     effective_parameters: tuple[tuple[str, float, int], ...] = ()
@@ -102,11 +119,32 @@ class FitResult:
         usable = [w for w in windows if w < min(self.skipped_horizons, default=math.inf)]
         return usable[-1] if usable else windows[0]
 
-    def with_warnings(self, data_warnings: Sequence[str]) -> "FitResult":
+    def with_warnings(
+        self, data_warnings: Sequence[str], mistakes: Sequence[str] = ()
+    ) -> "FitResult":
         """The same with these warnings about the data first, each once."""
         every = tuple(dict.fromkeys((*data_warnings, *self.data_warnings)))
         others = (w for w in self.warnings if w not in every)
-        return replace(self, data_warnings=every, warnings=(*every, *others))
+        named = tuple(dict.fromkeys((*mistakes, *self.mistakes)))
+        return replace(self, data_warnings=every, warnings=(*every, *others), mistakes=named)
+
+    @property
+    def usability(self) -> tuple[Usability, str]:
+        """Fitness for simulation and control, and the reason in a clause."""
+        times = self.residual / self.quantisation if self.quantisation else 0.0
+        far = f"the residual is {times:.0f} times the encoder's quantisation noise"
+        if self.mistakes:
+            return "do not use", f"a mistake in the data is likely: {self.mistakes[0]}"
+        if not self.converged and times > DOUBTFUL_RATIO:
+            return "do not use", f"the search did not converge, and {far}"
+        reasons = []
+        if not self.converged:
+            reasons.append("the search did not converge")
+        if times > DOUBTFUL_RATIO:
+            reasons.append(far)
+        if self.unidentifiable:
+            reasons.append(f"the data do not determine {len(self.unidentifiable)} parameters")
+        return ("doubtful", "; ".join(reasons)) if reasons else ("good", "")
 
     @property
     def residual_unit(self) -> str:
@@ -122,6 +160,7 @@ class FitResult:
         return {
             "status": self.status,
             "converged": self.converged,
+            "usability": list(self.usability),
             "residual": self.residual,
             "residual_unit": self.residual_unit,
             "at_bounds": list(self.at_bounds),
@@ -137,6 +176,73 @@ class FitResult:
             **(offsets if self.encoder_offsets else {}),
             **({"effective_parameters": gamma} if gamma else {}),
         }
+
+    def to_pandas(self) -> "pd.DataFrame":
+        """Table of coefficients and plant terms: value, low and high of 95 % intervals, note.
+
+        Coefficients are in SI and plant terms relative to the rig, as in `intervals`. Coefficients
+        that follow the motion are given where they apply, without intervals.
+        """
+        import pandas as pd  # slow to import
+
+        joints, schedule = self.plant.joint_names, self.model.schedule
+        rows: dict[str, tuple[float, float, float]] = {}
+        for label, values in schedule.coefficient_sets().items():
+            where = "" if label == "always" else f", {label.replace('_', ' ')}"
+            for joint, of_joint in zip(joints, values.tolist(), strict=True):
+                for name, value in zip(schedule.coefficient_names, of_joint, strict=True):
+                    rows[f"{name} of {joint}{where}"] = (value, math.nan, math.nan)
+        rows |= {i.name: (i.value, i.low, i.high) for i in self.intervals}
+        table = pd.DataFrame.from_dict(rows, orient="index", columns=["value", "low", "high"])
+        unknown = {name for direction in self.unidentifiable for name in direction.split(" with ")}
+        table["note"] = [
+            "not identifiable" if name in unknown else "at a bound" * (name in self.at_bounds)
+            for name in rows
+        ]
+        return table.rename_axis("parameter")
+
+    def _head(self) -> str:
+        """Model, usability, status and residual in a line."""
+        name, (verdict, reason) = type(self.model).__name__, self.usability
+        known = f" ({plain_name(name)})" if name in model_names() else ""
+        why = f" ({reason})" if reason else ""
+        unit = self.residual_unit
+        return (
+            f"{name}{known}: {verdict}{why}. {self.status.rstrip('.')}. Residual "
+            f"{1e3 * self.residual:.3g} m{unit} RMS over the training data."
+        )
+
+    def summary(self) -> str:
+        """Usability, status, coefficients with 95 % intervals, and warnings, as text."""
+        table = self.to_pandas().to_string(float_format=lambda x: f"{x:.4g}", na_rep="")
+        warned = [f"- {warning}" for warning in self.warnings]
+        return "\n".join([self._head(), *(line.rstrip() for line in table.splitlines()), *warned])
+
+    def _repr_html_(self) -> str:
+        """The summary for a notebook."""
+        table = self.to_pandas().to_html(float_format=lambda x: f"{x:.4g}", na_rep="")
+        warned = "".join(f"<li>{html.escape(warning)}</li>" for warning in self.warnings)
+        return f"<p>{html.escape(self._head())}</p>{table}<ul>{warned}</ul>"
+
+    def plot(self) -> "Figure":
+        """Coefficients with their intervals; over the velocity where they are fuzzy.
+
+        Others that follow the motion are drawn over time along the first recording. A notebook
+        shows the figure, `figure.savefig(path)` writes it.
+        """
+        # By name, because plots is a layer above this one.
+        plots, schedule = resolve_name("nfriction.plots"), self.model.schedule
+        labels: dict[str, Any] = {"joint_names": self.plant.joint_names, "unit": self.plant.unit}
+        figure: Figure
+        if not schedule.follows_motion:
+            figure = plots.coefficient_intervals({type(self.model).__name__: self})
+        elif schedule.fuzzy_rules() is None:
+            models = {type(self.model).__name__: self.model}
+            figure = plots.coefficients_over_time(models, self.motions[0], **labels)
+        else:
+            labels |= {"motions": self.motions, "uncertainty": self.uncertainty}
+            figure = plots.coefficient_sections(self.model, **labels)
+        return figure
 
 
 def result_from_equation_error(
@@ -208,7 +314,9 @@ def result_from_shooting(
         tuple(names[i] for i in mask.nonzero().flatten().tolist())
         for mask in (hit, hit & result.at_lower[:count] & least)
     )
-    encoder_count = plant.position_quantum or observed_count(problem)
+    encoder_count = plant.position_quantum or observed_count(
+        problem.windows.q @ problem.measurement.T
+    )
     residuals = problem.errors(x)
     residual = float(residuals.square().mean().sqrt())
     intervals, unidentifiable, root = _identifiability(problem, result, names, residuals, motions)
@@ -228,6 +336,7 @@ def result_from_shooting(
         intervals=intervals,
         unidentifiable=unidentifiable,
         encoder_offsets=tuple(map(tuple, offsets.tolist())),
+        quantisation=encoder_count and encoder_count / math.sqrt(12),
         warnings=warnings_of(
             converged=result.converged, at_bounds=at_bounds, unidentifiable=unidentifiable,
             at_zero=at_zero, options=problem.options,

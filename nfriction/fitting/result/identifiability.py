@@ -4,14 +4,17 @@ Linear least-squares theory around the minimum, with two corrections: residuals 
 so intervals use the effective sample size; parameters at a bound get no interval inside it.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.optim.least_squares import scaled_spectrum
+from nfriction.signals import count_seen
 
 # Two-sided 95 % of a normal distribution.
 NORMAL_95 = 1.959964
@@ -217,6 +220,12 @@ def model_error_warning(
         "quantisation noise, so the model is missing something (error is correlated over "
         f"~{(effective_sd / residual) ** 2:.0f} samples). The intervals do not cover this.",
     )
+
+
+def observed_count(recorded: Tensor) -> float | None:
+    """Largest of the encoder counts that positions (window, sample, joint) show; None if none."""
+    seen = float(np.fmax.reduce(count_seen(recorded.numpy())))
+    return None if math.isnan(seen) else seen
 
 
 def _in_words(direction: str) -> str:

@@ -16,12 +16,10 @@ References:
     H. G. Bock, in: Modelling of Chemical Reaction Systems, Springer (1981), 102-125.
 """
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -42,7 +40,7 @@ from nfriction.fitting.strategy.extrapolation_prior import ExtrapolationPrior
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Quadratic
 from nfriction.plant import Plant
-from nfriction.signals import Motion, count_seen
+from nfriction.signals import Motion
 from nfriction.simulation.protocols import RolloutInputs
 from nfriction.simulation.rollout import Rollout, integrate
 
@@ -238,10 +236,3 @@ class ShootingProblem:
         """Rows of the Jacobian, some samples at a time."""
         pieces = propagate(self.jacobian, run, self.substeps, self.stride)
         return scaled_rows(pieces, scale, self.measurement, self.variables.indices())
-
-
-def observed_count(problem: ShootingProblem) -> float | None:
-    """Largest of the encoder counts that the positions show; None where none does."""
-    recorded = problem.windows.q @ problem.measurement.T
-    seen = float(np.fmax.reduce(count_seen(recorded.numpy())))
-    return None if math.isnan(seen) else seen

@@ -11,8 +11,9 @@ from torch import Tensor
 from nfriction.fitting.data.inputs import integration_substeps
 from nfriction.fitting.data.windows import Windows, cut_windows
 from nfriction.fitting.options import FitOptions
+from nfriction.fitting.result.identifiability import observed_count
 from nfriction.fitting.shooting.autocorrelation import effective_noise
-from nfriction.fitting.shooting.problem import ShootingProblem, observed_count
+from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.shooting.variables import Parts, model_at
 from nfriction.fitting.strategy.extrapolation_prior import ExtrapolationPrior
@@ -63,8 +64,10 @@ class HorizonResult:
     @property
     def explained(self) -> bool:
         """True if the rounding of the encoder explains the residuals."""
-        quantum = self.problem.jacobian.plant.position_quantum or observed_count(self.problem)
-        limit = self.problem.options.explained_ratio * (quantum or 0.0) / 12**0.5
+        problem = self.problem
+        seen = observed_count(problem.windows.q @ problem.measurement.T)
+        quantum = problem.jacobian.plant.position_quantum or seen
+        limit = problem.options.explained_ratio * (quantum or 0.0) / 12**0.5
         return self.rms <= limit
 
     def lost_motion(self, before: "HorizonResult", options: FitOptions) -> bool:
@@ -306,13 +309,16 @@ def settle_states(problem: ShootingProblem, x: Tensor) -> tuple[Tensor, bool]:
 def loses(stages: Sequence[HorizonResult], found: HorizonResult) -> bool:
     """True if a stage's parameters lose what the stages before it had found.
 
-    Where the encoder's rounding explains the residuals of shorter windows, law and plant are right,
-    and a loss of likelihood there beyond that of other parameters within their uncertainty is
-    one: errors of the torque add up over a long window and lead its parameters astray. Elsewhere
-    law or plant are wrong, and short horizons may be traded for long ones. As the noise of each is
-    unknown, its log likelihood is that of the root mean square residual; parameters lose that are
-    worse at a shorter horizon by more than its noise, and gain less at their own.
+    Errors of a measured torque add up over a long window and lead its parameters astray; free
+    swings have none. Where the encoder's rounding explains the residuals of shorter windows, law
+    and plant are right, and a loss of likelihood there beyond that of other parameters within
+    their uncertainty is one. Elsewhere law or plant are wrong, and short horizons may be traded
+    for long ones. As the noise of each is unknown, its log likelihood is that of the root mean
+    square residual; parameters lose that are worse at a shorter horizon by more than its noise,
+    and gain less at their own.
     """
+    if not found.problem.windows.tau.any():
+        return False
     from scipy.special import chdtri  # slow to import
 
     before, chance = stages[-1], found.problem.options.loss_level

@@ -1,5 +1,6 @@
 """Twins: simulated recordings of the papers' rigs, whose own were never published."""
 
 from nfriction.papers.twin.dataset import QUICK_DURATION, Twin, build, make, names
+from nfriction.papers.twin.family import TRUTHS, draw, held_out
 
-__all__ = ["QUICK_DURATION", "Twin", "build", "make", "names"]
+__all__ = ["QUICK_DURATION", "TRUTHS", "Twin", "build", "draw", "held_out", "make", "names"]

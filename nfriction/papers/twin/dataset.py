@@ -218,24 +218,16 @@ def make(
     """
     specified = specification(name)
     duration = specified.duration if duration is None else duration
-    samples = round(duration * RATE)
-    if samples < MINIMUM_SAMPLES:
-        raise ValueError(
-            f"`duration` must be at least {MINIMUM_SAMPLES / RATE} s, got {duration}; "
-            f"{QUICK_DURATION:g} s is enough for a quick look."
-        )
+    samples = sample_count(duration)
     plant = specified.rig()
     # The twin's own mechanics take only the rig's numbers.
     links = Links.of(plant)
     convention = AngleConvention.of(plant)
-    random = np.random.default_rng([seed, 0])
-    # The same encoders in all recordings, as on a real rig.
-    encoders = [Encoder.drawn(random) for _ in plant.joint_names]
-    truth, recordings = {}, {}
+    truth = {}
     total = samples // RATE * len(specified.releases)
     with tqdm(total=total, desc=f"{name} twin", unit="s", disable=not progress) as bar:
-        for index, release in enumerate(specified.releases):
-            motion = simulate(
+        for release in specified.releases:
+            truth[release.label] = simulate(
                 links,
                 specified.friction,
                 tuple(convention.position_to_joint(np.array(release.q)).tolist()),
@@ -244,19 +236,45 @@ def make(
                 rate=RATE,
                 advance=bar.update,
             )
-            truth[release.label] = motion
-            # A stream for each release: a shorter twin is the beginning of a longer one.
-            random = np.random.default_rng([seed, index + 1])
-            late = JITTER * np.clip(random.standard_normal(samples), -3.0, 3.0)
-            # The release is the origin of time, and its state is given as exact.
-            late[0] = 0.0
-            recordings[release.label] = _record(motion, encoders, late, plant, release.label)
+    return record(name, plant, specified.releases, truth, seed)
+
+
+def sample_count(duration: float) -> int:
+    """Samples in a recording of `duration` [s]; refuses one that is too short."""
+    samples = round(duration * RATE)
+    if samples < MINIMUM_SAMPLES:
+        raise ValueError(
+            f"`duration` must be at least {MINIMUM_SAMPLES / RATE} s, got {duration}; "
+            f"{QUICK_DURATION:g} s is enough for a quick look."
+        )
+    return samples
+
+
+def record(
+    name: str,
+    plant: PendulumChain,
+    releases: Sequence[Release],
+    truth: dict[str, TrueMotion],
+    seed: int,
+) -> Twin:
+    """A twin of true motions, read by encoders and a clock whose errors the seed draws."""
+    random = np.random.default_rng([seed, 0])
+    # The same encoders in all recordings, as on a real rig.
+    encoders = [Encoder.drawn(random) for _ in plant.joint_names]
+    recordings = {}
+    for index, (label, motion) in enumerate(truth.items()):
+        # A stream for each release: a shorter twin is the beginning of a longer one.
+        random = np.random.default_rng([seed, index + 1])
+        late = JITTER * np.clip(random.standard_normal(len(motion.q)), -3.0, 3.0)
+        # The release is the origin of time, and its state is given as exact.
+        late[0] = 0.0
+        recordings[label] = _read(motion, encoders, late, plant, label)
     return Twin(
         name=name,
         plant=plant,
         recordings=recordings,
-        splits={release.label: release.split for release in specified.releases},
-        initial_states={r.label: (np.array(r.q), np.array(r.qd)) for r in specified.releases},
+        splits={release.label: release.split for release in releases},
+        initial_states={r.label: (np.array(r.q), np.array(r.qd)) for r in releases},
         truth=truth,
     )
 
@@ -278,9 +296,14 @@ def build(
         name, seed, duration, progress: as for `make`.
         out: the folder; made where it is missing, files of these names are replaced.
     """
-    folder = Path(out)
-    folder.mkdir(parents=True, exist_ok=True)
     twin = make(name, seed=seed, duration=duration, progress=progress)
+    write(twin, Path(out))
+    return twin
+
+
+def write(twin: Twin, folder: Path) -> None:
+    """Write a twin's recordings, their overview, its rig and its truth; see `build`."""
+    folder.mkdir(parents=True, exist_ok=True)
     for label, recording in twin.recordings.items():
         recording.write(folder / _file(label))
     rigs.write(twin.plant, folder / "rig.json")
@@ -293,7 +316,6 @@ def build(
     with atomic_write(folder / "truth.npz") as unfinished, unfinished.open("wb") as file:
         np.savez(file, **arrays)
     write_table(_overview(twin), folder / "recordings.csv")
-    return twin
 
 
 def main(name: str, argv: Sequence[str] | None = None) -> int:
@@ -313,7 +335,7 @@ def main(name: str, argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _record(
+def _read(
     motion: TrueMotion, encoders: list[Encoder], late: Array, plant: PendulumChain, label: str
 ) -> Recording:
     """A motion as the rig's computer logs it, on an even clock, each sample `late` [s]."""

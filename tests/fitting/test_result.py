@@ -1,0 +1,88 @@
+"""A result shows itself: as text, as a table, in a notebook, as a figure."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from nfriction import FrictionModel, LinearAxis
+from nfriction.fitting.fit import fit
+from nfriction.fitting.result.fit_result import FitResult
+from nfriction.friction import laws
+from nfriction.friction.coefficients import Constant
+from nfriction.friction.models import LFM, NCFM, Stribeck
+from nfriction.friction.neurofuzzy import NFLFM
+from nfriction.papers.afem.adaptive import ALFM
+from tests.fitting.recordings import driven_axis
+
+AXIS = LinearAxis(2.0)
+
+
+@pytest.fixture(scope="module")
+def found() -> FitResult:
+    recording = driven_axis(AXIS, LFM(1, [2.0, 1.5], v_smooth=0.01))
+    return fit(LFM(1, v_smooth=0.01), AXIS, recording, method="equation_error", fit_plant=False)
+
+
+def test_the_table_has_every_coefficient_with_its_interval(found: FitResult) -> None:
+    table = found.to_pandas()
+    joint = AXIS.joint_names[0]
+    assert list(table.index) == [f"B of {joint}", f"C of {joint}"]
+    for interval in found.intervals:
+        row = table.loc[interval.name]
+        assert tuple(row[["value", "low", "high"]]) == (
+            interval.value, interval.low, interval.high
+        )  # fmt: skip
+    assert not table["note"].any()
+
+
+def test_the_table_notes_what_is_at_a_bound_or_unknown(found: FitResult) -> None:
+    b, c = found.to_pandas().index
+    assert list(replace(found, at_bounds=(b,)).to_pandas()["note"]) == ["at a bound", ""]
+    unknown = replace(found, at_bounds=(b,), unidentifiable=(f"{b} with {c}",))
+    assert list(unknown.to_pandas()["note"]) == ["not identifiable"] * 2
+
+
+def test_coefficients_without_an_interval_have_their_value(found: FitResult) -> None:
+    table = replace(found, model=Stribeck(1), intervals=()).to_pandas()
+    assert table.index[-1].startswith("delta of ")
+    assert table["value"].iloc[-1] == 2.0
+    assert table["low"].isna().all()
+
+
+@pytest.mark.parametrize("kind", [NFLFM, ALFM])
+def test_coefficients_that_follow_the_motion_are_given_where_they_apply(
+    found: FitResult, kind: type
+) -> None:
+    result = replace(found, model=kind(1, [2.0, 1.5]), intervals=(), uncertainty=None)
+    table = result.to_pandas()
+    assert all(", " in name for name in table.index)
+    np.testing.assert_allclose(sorted(set(table["value"].round(6))), [1.5, 2.0])
+    assert result.plot().axes
+
+
+def test_a_summary_names_model_status_numbers_and_warnings(found: FitResult) -> None:
+    told = replace(found, warnings=("Too short: 1 < 2.",)).summary()
+    assert told.startswith("LFM (load-coulomb): good. Converged")
+    assert " mN RMS" in told
+    assert f"{found.intervals[0].value:.4g}" in told
+    assert told.endswith("- Too short: 1 < 2.")
+    assert all(line == line.rstrip() for line in told.splitlines())
+
+
+def test_a_notebook_shows_the_same_with_text_escaped(found: FitResult) -> None:
+    page = replace(found, warnings=("Too short: 1 < 2.",))._repr_html_()
+    assert "LFM (load-coulomb): good" in page
+    assert "<table" in page
+    assert "<li>Too short: 1 &lt; 2.</li>" in page
+
+
+def test_a_law_of_ones_own_has_a_summary_too(found: FitResult) -> None:
+    own = replace(laws.VISCOUS, name="grease")
+    told = replace(found, model=FrictionModel(own, Constant(own, 1)), intervals=()).summary()
+    assert told.startswith("FrictionModel: good")
+
+
+def test_constants_are_drawn_with_their_intervals(found: FitResult) -> None:
+    assert len(found.plot().axes) == 2
+    assert replace(found, model=NCFM(1, [2.0]), intervals=()).plot().axes
