@@ -309,6 +309,12 @@ class NeuroFuzzy(Schedule):
         sizes = torch.tensor([p.numel() for p in self.trained()])
         return torch.arange(len(sizes)).repeat_interleave(sizes)
 
+    def joint_of_weights(self) -> Tensor:
+        """The joint that each weight acts on, -1 of the sets' parameters, (parameter,)."""
+        joints = torch.arange(self.joints)
+        parts = [joints.repeat_interleave(p[0].numel()) for p in self.trained()]
+        return torch.cat([*parts[:2], *(torch.full_like(part, -1) for part in parts[2:])])
+
     def bounds(self) -> tuple[Tensor, Tensor]:
         vector = self.parameter_vector()
         # The network of a coefficient that is not fitted stays where it started.
@@ -338,6 +344,10 @@ class NeuroFuzzy(Schedule):
 
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
         return self.residual_sensitivities(self.reference, qd, qdd)
+
+    @torch.no_grad()
+    def motion_sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
+        return Sensitivity((), *self.slopes(qd, qdd, self(qd, qdd)))
 
     @torch.no_grad()
     def slopes(self, qd: Tensor, qdd: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,10 +1,15 @@
-"""Neuro-fuzzy coefficients: a network that corrects a constant law, kept if it passes hold-out."""
+"""Neuro-fuzzy coefficients: a network that corrects a constant law as far as blocks left out show.
+
+A network learns from all windows, with priors and noise by evidence. Then it learns anew without
+each of some blocks of consecutive windows; the errors there give the share of the correction that
+each joint takes, and decide whether it is worth having (`nfriction.fitting.strategy.holdout`).
+"""
 
 import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
@@ -12,6 +17,7 @@ from torch import Tensor
 
 from nfriction.fitting.data.checks import require_motion
 from nfriction.fitting.data.inputs import adjustable_terms, apply_encoder_offsets
+from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.equation_error import coefficient_scale
 from nfriction.fitting.fit import FitTask
 from nfriction.fitting.options import DEFAULTS, FitOptions
@@ -22,33 +28,34 @@ from nfriction.fitting.shooting.autocorrelation import (
     decimation,
     effective_noise,
 )
+from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.shooting.variables import model_at
-from nfriction.fitting.strategy.constant import (
-    constant_prior,
-    constant_start,
-    fits_eccentricity,
-    known_terms,
-    regression,
-)
+from nfriction.fitting.strategy.constant import constant_start, fits_eccentricity, known_terms
 from nfriction.fitting.strategy.continuation import (
     HorizonResult,
     ShootingFitter,
     loglik_tolerance,
-    weighted_cost,
+    settle_states,
 )
 from nfriction.fitting.strategy.extrapolation_prior import prior_on_unvisited_cells
-from nfriction.fitting.strategy.holdout import HoldoutScore, holdout_rmse, holdout_split
+from nfriction.fitting.strategy.holdout import (
+    Correction,
+    Judgement,
+    cut_for_folds,
+    judge,
+    training_blocks,
+)
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
-from nfriction.optim.evidence import GroupEvidence, group_evidence
+from nfriction.optim.evidence import GroupEvidence, group_evidence, maximise_group_evidence
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
-# Consequents and head weights, the first groups of a network.
-LINEAR_GROUPS = 2
-# Share of a prior's width that holds a parameter where it is: no search feels what remains.
-HELD = 1e-6
+# Steps between two updates of priors by evidence, which needs no minimum, only to be near one.
+STEPS_PER_UPDATE = 2
+# Steps of a search that starts at the minimum over all windows and leaves out some.
+STEPS_WITHOUT_BLOCK = 4
 # Log ratio of evidences below which a hypothesis gains nothing worth mentioning (H. Jeffreys,
 # Theory of Probability, 3rd ed. 1961, appendix B).
 WORTH_MENTIONING = 0.5 * math.log(10.0)
@@ -59,40 +66,52 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     """Fit a neuro-fuzzy model from the constant fit of its law, see `fit`."""
     require_motion(task.plant, task.recordings)
     options, start = task.options, constant_start(task)
-    law_prior = constant_prior(start.model, regression(task, start.model, task.plant), options)
     recordings, motions = apply_encoder_offsets(
         start.encoder_offsets, task.plant, task.recordings, task.motions
     )
     network = initialise_from_constant(task.model, start, recordings, motions, options)
-    schedule = cast("NeuroFuzzy", network.schedule)
     terms = adjustable_terms(
         task.plant, recordings, options, eccentric=fits_eccentricity(options, start),
         per_recording=bool(start.encoder_offsets),
     )  # fmt: skip
-    plant_sd = torch.tensor([t.prior_sd for t in terms], dtype=torch.float64)
-    free = ShootingFitter(
+    fitter = ShootingFitter(
         StepJacobian(task.plant, network, terms), network, recordings, task.measurement, options,
-        task.callback, plant_prior=(known_terms(start, terms), plant_sd),
+        task.callback,
         # From smoothed states at full length a search creeps along constraints.
         defect_sd=None if options.continuity == "none" else options.penalty_sd,
-        extrapolation=prior_on_unvisited_cells(schedule, motions, options),
+        extrapolation=prior_on_unvisited_cells(network_of(network), motions, options),
     )  # fmt: skip
-    law = replace(free, friction=start.model, friction_prior=law_prior, extrapolation=None)
-    validation = _Validation(law, start, motions, start.longest_usable_horizon(options.windows))
-    best = validation.best_trial(_with_narrowed_priors(free, start))
-    if best is None:
+    length = start.longest_usable_horizon(options.windows)
+    windows = cut_for_folds(recordings, motions, length, options.folds)
+    training = _Training(fitter, start, windows)
+    trained = training.learn()
+    judged = None if trained is None else training.judge(trained)
+    if trained is None or judged is None:
         found = _constant_kept(task, network, start, INTERRUPTED, converged=False)
-    elif best.score.score > 1:
-        found = _constant_kept(task, network, start, str(best.score))
+    elif not judged.kept:
+        found = _constant_kept(task, network, start, judged.rejection())
     else:
-        end = validation.fit_all(best)
-        found = result_from_shooting(task.model, end.problem, end.result, motions)
-        found = replace(found, effective_parameters=effective_parameters(end))
+        end = shrunk(trained.end, judged.shares, training.plant)
+        own = copy.deepcopy(end.problem.friction)
+        found = result_from_shooting(own, end.problem, end.result, motions)
+        task.model.load_state_dict(own.state_dict())
+        found = replace(
+            found,
+            model=task.model.requires_grad_(False),
+            status=f"{found.status} {judged.statement(task.plant.joint_names)}",
+            effective_parameters=effective_parameters(trained),
+            uncertainty=found.uncertainty and replace(found.uncertainty, law=start.uncertainty),
+        )
     found = replace(
         found, motions=task.motions, encoder_offsets=start.encoder_offsets,
         continuity=options.continuity, skipped_horizons=start.skipped_horizons,
     )  # fmt: skip
     return found.with_warnings(start.data_warnings)
+
+
+def network_of(model: FrictionModel) -> NeuroFuzzy:
+    """The neuro-fuzzy coefficients of a model that has such."""
+    return cast("NeuroFuzzy", model.schedule)
 
 
 def input_range(
@@ -136,201 +155,277 @@ def revert_to_constant(
     schedule.silence()
 
 
-def network_evidence(end: HorizonResult) -> GroupEvidence:
-    """Evidence for the prior of each group of a network's parameters, relative to the present one.
+@dataclass(frozen=True, eq=False)
+class NetworkPrior:
+    """Prior of a network's parameters and of the plant's terms.
 
-    Of the marginal Gauss-Newton model: window states are integrated out, the plant's terms and the
-    prior on unvisited motion are known priors beside those of the groups.
+    Attributes:
+        mean, sd: of the parameters, (parameter,).
+        near: standard deviation of each plant term around that of the constant law, beside its
+            own prior, (term,).
     """
-    problem, x = end.problem, end.result.x
-    variables = problem.variables
-    schedule = cast("NeuroFuzzy", model_at(problem.friction, end.parts.friction).schedule)
+
+    mean: Tensor
+    sd: Tensor
+    near: Tensor
+
+    def plant_sd(self, own: Tensor) -> Tensor:
+        """Standard deviation of the plant's terms by both priors; `own` is that as given."""
+        return (self.near**-2 + own**-2).rsqrt()
+
+    def updated(self, precision: Tensor, groups: Tensor) -> "NetworkPrior":
+        """With new precisions of the groups relative to the present ones; the last is `near`'s."""
+        factor = precision.rsqrt()
+        near = self.near * factor[-1] if len(self.near) else self.near
+        return NetworkPrior(self.mean, self.sd * factor[groups], near)
+
+
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """A network at the end of a search with its priors."""
+
+    prior: NetworkPrior
+    end: HorizonResult
+
+    @property
+    def finite(self) -> bool:
+        """False where the motion diverges."""
+        return bool(torch.isfinite(self.end.result.hessian).all())
+
+    @property
+    def group_names(self) -> tuple[str, ...]:
+        """Names of the groups of parameters: the network's, and `"plant"` where it is fitted."""
+        names = network_of(self.end.problem.friction).group_names()
+        return (*names, "plant") if len(self.prior.near) else names
+
+    def log_evidence(self) -> float:
+        """Log evidence, comparable at one noise; -inf where it is not finite."""
+        if not self.finite:
+            return -math.inf
+        return network_evidence(self).occam - float(self.end.result.cost)
+
+
+class LocalModel(NamedTuple):
+    """Marginal Gauss-Newton model of a search's end, in units of the present prior.
+
+    Window states are integrated out. See `nfriction.optim.evidence.group_evidence`.
+    """
+
+    data: Tensor
+    known: Tensor
+    slope: Tensor
+    offset: Tensor
+    groups: Tensor
+
+
+def local_model(trained: Trained) -> LocalModel:
+    """Model for the evidence of groups, each of precision 1.
+
+    The plant's own prior and that on unvisited motion are known priors beside those of the groups.
+    """
+    end, near = trained.end, trained.prior.near
+    problem, variables = end.problem, end.problem.variables
+    schedule = network_of(model_at(problem.friction, end.parts.friction))
     shared, count = variables.shared_count, variables.friction_count
     precision, mean = variables.prior()
-    data = information(end.result.hessian, precision, shared).data
-    known = torch.diag(precision[:shared])
-    known[:count, :count] = 0.0
+    hessian, gradient = end.result.hessian, end.result.gradient
+    data = information(hessian, precision, shared).data
+    states = torch.linalg.solve_ex(hessian[shared:, shared:], gradient[shared:])[0]
+    slope = gradient[:shared] - hessian[:shared, shared:] @ states
+    known = torch.zeros_like(data)
     if problem.extrapolation is not None:
         known[:count, :count] = problem.extrapolation.normal_equations(schedule)[1]
-        data = data - known.where(torch.arange(shared)[:, None].lt(count), 0.0)
-    groups = torch.full((shared,), -1)
-    groups[:count] = schedule.groups()
-    # In units of the present prior, in which every precision is one.
-    sd = precision[:shared].rsqrt()
-    data, known = (sd[:, None] * part * sd for part in (data, known))
+        data = data - known
+    known.diagonal()[count:] += precision[count:shared] - near**-2
+    unit = torch.cat([precision[:count].rsqrt(), near])
+    data, known = (unit[:, None] * part * unit for part in (data, known))
+    own = schedule.groups()
+    groups = torch.cat([own, torch.full_like(near, int(own[-1]) + 1, dtype=own.dtype)])
     lower, upper = (bound[:shared] for bound in variables.bounds())
     fitted = (lower < upper).nonzero().flatten()
     values, vectors = torch.linalg.eigh(data[fitted][:, fitted])
     # Less than none is the rounding of states that grow by orders of magnitude.
     data = (vectors * values.clamp_min(0.0)) @ vectors.T
-    offset = ((x - mean)[:shared] / sd)[fitted]
-    ones = torch.ones(len(schedule.group_names()), dtype=torch.float64)
-    return group_evidence(data, known[fitted][:, fitted], offset, groups[fitted], ones)
+    offset = (end.result.x - mean)[:shared] / unit
+    # Of errors and known priors: without that of the groups.
+    slope = unit * slope - offset
+    return LocalModel(data, known[fitted][:, fitted], slope[fitted], offset[fitted], groups[fitted])
 
 
-def log_evidence(end: HorizonResult) -> float:
-    """Log evidence of a search's end, comparable at one noise; -inf where it is not finite."""
-    if not torch.isfinite(end.result.hessian).all():
-        return -math.inf
-    return network_evidence(end).occam - float(end.result.cost)
+def network_evidence(trained: Trained) -> GroupEvidence:
+    """Evidence for the prior of each group of parameters, relative to the present one."""
+    data, known, _, offset, groups = local_model(trained)
+    ones = torch.ones(len(trained.group_names), dtype=torch.float64)
+    return group_evidence(data, known, offset, groups, ones)
 
 
-def effective_parameters(end: HorizonResult) -> tuple[tuple[str, float, int], ...]:
+def effective_parameters(trained: Trained) -> tuple[tuple[str, float, int], ...]:
     """Name of each group of a network, how many parameters the data determine, and its size."""
-    schedule = cast("NeuroFuzzy", end.problem.friction.schedule)
-    if not torch.isfinite(end.result.hessian).all():
+    if not trained.finite:
         return ()
-    gamma = network_evidence(end).gamma.tolist()
-    sizes = schedule.groups().bincount().tolist()
-    return tuple(zip(schedule.group_names(), gamma, sizes, strict=True))
+    own = network_of(trained.end.problem.friction).groups().bincount().tolist()
+    sizes = [*own, len(trained.prior.near)]
+    gamma = network_evidence(trained).gamma.tolist()
+    return tuple(zip(trained.group_names, gamma, sizes, strict=False))
 
 
-def _with_narrowed_priors(free: ShootingFitter, start: FitResult) -> tuple[ShootingFitter, ...]:
-    """Fitters with ever wider priors of the plant: the posterior sd of the constant fit first.
+class _Training:
+    """Searches for a network that corrects a constant fit, on given windows."""
 
-    Within the recorded motion plant and network can compensate each other; outside, where the
-    network fades, such a plant is wrong.
-    """
-    assert free.plant_prior is not None
-    mean, sd = free.plant_prior
-    posterior = {i.name: i.sd for i in start.intervals}
-    narrow = sd.new_tensor([posterior.get(t.name, math.inf) for t in free.jacobian.terms])
-    narrow = torch.minimum(sd, narrow)
-    near = replace(free, plant_prior=(mean, narrow))
-    return (near,) if torch.equal(narrow, sd) else (near, free)
-
-
-@dataclass(frozen=True)
-class _Trial:
-    """A network trained on some windows, its score on the others, and its priors."""
-
-    score: HoldoutScore
-    fitter: ShootingFitter
-    end: HorizonResult
-
-
-class _Validation:
-    """Networks judged against a constant law on hold-out windows of one length [s]."""
-
-    def __init__(
-        self, law: ShootingFitter, start: FitResult, motions: tuple[Motion, ...], length: float
-    ) -> None:
-        assert law.plant_prior is not None
-        self.law, self.motions, self.length, self.options = law, motions, length, law.options
-        self.plant = law.plant_prior[0]
-        self.train, self.test = holdout_split(law.recordings, motions, length, self.options.folds)
-        # The noise against which the priors weigh is the residual of the constant law at the same
-        # horizon; its cost scales the tolerance.
+    def __init__(self, fitter: ShootingFitter, start: FitResult, windows: Windows) -> None:
+        self.fitter, self.windows, self.options = fitter, windows, fitter.options
+        # The noise against which priors weigh at first is the law's residual at the same horizon.
         self.noise = effective_noise(start.residuals)
         self.stride = decimation(start.residuals, self.options)
-        cost = weighted_cost(start.residuals, self.noise)
-        self.tolerance = loglik_tolerance(cost, self.options)
+        terms = fitter.jacobian.terms
+        self.plant = known_terms(start, terms)
+        self.plant_sd = self.plant.new_tensor([t.prior_sd for t in terms])
+        posterior = {i.name: i.sd for i in start.intervals}
+        near = self.plant.new_tensor([posterior.get(t.name, math.inf) for t in terms])
+        # Within the recorded motion plant and network can compensate each other; outside, where
+        # the network fades, such a plant is wrong. So it begins near the law's.
+        self.near = torch.minimum(self.plant_sd, near)
 
-    def best_trial(self, fitters: Sequence[ShootingFitter]) -> _Trial | None:
-        """The best of all priors; wider plant priors must earn their place. None if stopped."""
-        values = self.law.friction.schedule.parameter_vector()
-        same = self._search(self.law, values, "constant law, hold-out")
-        of_same = self._error(same)
-        if of_same is None:
-            return None
-        of_all = holdout_rmse(self.test, same.problem, values, self.plant)
-        if of_all is None:
-            return None
-        best: _Trial | None = None
-        for fitter in fitters:
-            trial = self._trial(fitter, of_same, of_all)
-            if trial is None:
-                return None
-            limit = math.inf if best is None else self.options.max_ratio_same * best.score.score
-            if best is None or trial.score.score < limit:
-                best = trial
-        return best
+    def learn(self) -> Trained | None:
+        """A network that starts silent, its sets moved if the evidence favours that.
 
-    def fit_all(self, trial: _Trial) -> HorizonResult:
-        """The network of a trial, fitted to all windows."""
-        windows = trial.fitter.cut(self.motions, self.length)
-        problem = trial.fitter.problem(
-            windows, trial.end.problem.noise_sd, trial.end.parts.friction, stride=self.stride
-        )
-        start = problem.variables.start(trial.end.parts.plant)
-        return trial.fitter.search(problem, start, self.tolerance, f"{self.length:g} s windows")
-
-    def _trial(self, fitter: ShootingFitter, of_same: float, of_all: float) -> _Trial | None:
-        """A network that starts silent, its sets moved if the evidence favours that."""
-        schedule = cast("NeuroFuzzy", fitter.friction.schedule)
+        None if it was stopped, half trained.
+        """
+        model = copy.deepcopy(self.fitter.friction)
+        schedule = network_of(model)
+        learn_sets, schedule.learn_sets = schedule.learn_sets, False
+        prior = NetworkPrior(*schedule.prior(), self.near)
+        problem = self._problem(model, prior, self.noise)
+        held = self._adapt(prior, problem, problem.variables.start(self.plant))
+        if held is None or not learn_sets:
+            return held
+        # At the same noise, or the evidence would compare different errors.
+        parts, noise = held.end.parts, held.end.problem.noise_sd
+        model = model_at(held.end.problem.friction, parts.friction)
+        schedule = network_of(model)
+        schedule.learn_sets = True
         mean, sd = schedule.prior()
-        linear = schedule.groups() < LINEAR_GROUPS
-        held = replace(fitter, friction_prior=(mean, torch.where(linear, sd, HELD * sd)))
-        fitter, end = self._learn(held, self._search(held, mean, "network, hold-out"))
-        if schedule.learn_sets and not end.stopped:
-            assert fitter.friction_prior is not None
-            learnt = torch.where(linear, fitter.friction_prior[1], sd)
-            moved = replace(fitter, friction_prior=(mean, learnt))
-            # At the same noise, or the evidence would compare different errors.
-            noise = end.problem.noise_sd
-            moved, other = self._learn(moved, self._go_on(moved, end, noise), noise)
-            if other.stopped:
-                return None
-            if log_evidence(other) > log_evidence(end) + WORTH_MENTIONING:
-                fitter, end = self._learn(moved, other)
-        error = self._error(end)
-        if error is None:
+        sd[: len(parts.friction)] = held.prior.sd
+        problem = self._problem(model, NetworkPrior(mean, sd, held.prior.near), noise)
+        x = torch.cat([schedule.parameter_vector(), held.end.result.x[len(parts.friction) :]])
+        moved = self._adapt(NetworkPrior(mean, sd, held.prior.near), problem, x, same_noise=True)
+        if moved is None:
             return None
-        ratios = [error / law if math.isfinite(error) else math.inf for law in (of_same, of_all)]
-        return _Trial(HoldoutScore(ratios[0], ratios[1], self.options), fitter, end)
+        if not moved.log_evidence() > held.log_evidence() + WORTH_MENTIONING:
+            return held
+        return self._adapt(moved.prior, moved.end.problem, moved.end.result.x)
 
-    def _learn(
-        self, fitter: ShootingFitter, end: HorizonResult, noise: float | None = None
-    ) -> tuple[ShootingFitter, HorizonResult]:
-        """Priors of a network's groups by evidence, and its noise if none is given."""
+    def judge(self, trained: Trained) -> Judgement | None:
+        """Share of a network that every joint takes by blocks left out; None if stopped."""
+        problem, parts = trained.end.problem, trained.end.parts
+        # From a minimum over all windows, that over most of them is a few steps away.
+        brief = replace(self.options, max_steps=STEPS_WITHOUT_BLOCK)
+        fitter = replace(self._fitter(problem.friction, trained.prior), options=brief)
+        joint = network_of(problem.friction).joint_of_weights()
+        left_out = []
+        for seen in training_blocks(len(self.windows), self.options.folds):
+            most = replace(problem, windows=self.windows.subset(seen))
+            x = torch.cat([parts.friction, parts.plant, parts.states[seen].flatten()])
+            tolerance = loglik_tolerance(float(most.cost(x)), self.options)
+            end = fitter.search(most, x, tolerance, "network, block left out")
+            if end.stopped:
+                return None
+            rest = replace(problem, windows=self.windows.subset(~seen))
+            found = end.parts
+            left_out.append(
+                Correction(
+                    rest, found.friction, found.plant, self.plant, parts.states[~seen], joint
+                )
+            )
+        return judge(left_out)
+
+    def _adapt(
+        self, prior: NetworkPrior, problem: ShootingProblem, x: Tensor, *, same_noise: bool = False
+    ) -> Trained | None:
+        """Search with the prior of each group by evidence, and the noise unless it is to stay."""
+        # A minimum first: near the start, sets that have not moved yet would seem useless.
+        found = self._search(prior, problem, x)
         for _ in range(self.options.evidence_updates):
-            if end.stopped or not torch.isfinite(end.result.hessian).all():
+            if found.end.stopped:
+                return None
+            if not found.finite:
                 break
-            found = network_evidence(end)
-            left = self._noise_of(end, float(found.gamma.sum())) if noise is None else noise
-            gain = max(float(found.slope.abs().max()), self._noise_gain(end, left))
-            if gain <= self.options.loglik_tolerance:
+            evidence, gain = maximise_group_evidence(
+                *local_model(found), self.options.loglik_tolerance
+            )
+            noise = found.end.problem.noise_sd
+            left = noise if same_noise else self._noise_of(found, float(evidence.gamma.sum()))
+            if max(gain, self._noise_gain(found, left)) <= self.options.loglik_tolerance:
                 break
-            assert fitter.friction_prior is not None
-            mean, sd = fitter.friction_prior
-            groups = cast("NeuroFuzzy", fitter.friction.schedule).groups()
-            fitter = replace(fitter, friction_prior=(mean, sd * found.precision.rsqrt()[groups]))
-            end = self._go_on(fitter, end, left)
-        return fitter, end
+            model = found.end.problem.friction
+            prior = found.prior.updated(evidence.precision, network_of(model).groups())
+            problem = self._problem(model, prior, left)
+            other = self._search(prior, problem, found.end.result.x, STEPS_PER_UPDATE)
+            # Where the quadratic model reaches too far, its precisions are no better.
+            if left == noise and not other.log_evidence() > found.log_evidence():
+                break
+            found = other
+        found = self._search(found.prior, found.end.problem, found.end.result.x)
+        return None if found.end.stopped else found
 
-    def _go_on(self, fitter: ShootingFitter, end: HorizonResult, noise: float) -> HorizonResult:
-        """Search of the training windows from another search's end."""
-        problem = fitter.problem(self.train, noise, end.parts.friction, stride=self.stride)
-        return fitter.search(problem, end.result.x, self.tolerance, "network, hold-out")
+    def _fitter(self, model: FrictionModel, prior: NetworkPrior) -> ShootingFitter:
+        return replace(
+            self.fitter,
+            friction=model,
+            friction_prior=(prior.mean, prior.sd),
+            plant_prior=(self.plant, prior.plant_sd(self.plant_sd)),
+        )
 
-    def _noise_of(self, end: HorizonResult, gamma: float) -> float:
+    def _problem(self, model: FrictionModel, prior: NetworkPrior, noise: float) -> ShootingProblem:
+        vector = model.schedule.parameter_vector()
+        fitter = self._fitter(model, prior)
+        return fitter.problem(self.windows, noise, vector, stride=self.stride)
+
+    def _search(
+        self, prior: NetworkPrior, problem: ShootingProblem, x: Tensor, steps: int | None = None
+    ) -> Trained:
+        fitter = self._fitter(problem.friction, prior)
+        if steps is not None:
+            fitter = replace(fitter, options=replace(self.options, max_steps=steps))
+        # Far from a minimum it is the start's cost, at the noise that the problem has.
+        tolerance = loglik_tolerance(float(problem.cost(x)), self.options)
+        return Trained(prior, fitter.search(problem, x, tolerance, "network"))
+
+    def _noise_of(self, found: Trained, gamma: float) -> float:
         """Noise of what a network leaves: MacKay's, of as many residuals as are independent."""
+        end = found.end
         residuals = end.residuals
         # Of white residuals a fit counts no more than every `stride`-th.
         lasting = max(correlation_time(residuals), float(self.stride))
         independent = residuals.numel() / lasting
-        explained = gamma + len(self.train) * end.problem.variables.state_count
+        explained = gamma + len(self.windows) * end.problem.variables.state_count
         left = max(independent - explained, 1.0)
         noise = end.rms * math.sqrt(lasting * independent / left)
         # A network contains its law, so it cannot leave more.
         return min(max(noise, self.options.min_noise), self.noise)
 
-    def _noise_gain(self, end: HorizonResult, noise: float) -> float:
+    def _noise_gain(self, found: Trained, noise: float) -> float:
         """Gain in log likelihood by another noise, to first order."""
-        before = end.problem.noise_sd
-        return abs((noise / before) ** 2 - 1.0) * float(end.result.cost)
+        before = found.end.problem.noise_sd
+        return abs((noise / before) ** 2 - 1.0) * float(found.end.result.cost)
 
-    def _search(self, fitter: ShootingFitter, friction: Tensor, name: str) -> HorizonResult:
-        """Search of the training windows."""
-        problem = fitter.problem(self.train, self.noise, friction, stride=self.stride)
-        start = problem.variables.start(self.plant)
-        return fitter.search(problem, start, self.tolerance, name)
 
-    def _error(self, end: HorizonResult) -> float | None:
-        """Hold-out RMSE of a search; None if it was stopped, half trained and unjudged."""
-        if end.stopped:
-            return None
-        return holdout_rmse(self.test, end.problem, end.parts.friction, end.parts.plant)
+def shrunk(end: HorizonResult, shares: Tensor, plant: Tensor) -> HorizonResult:
+    """A search's end with shares (joint,) of its correction, from a law's plant terms on."""
+    if bool((shares == 1).all()):
+        return end
+    problem, parts = end.problem, end.parts
+    joint = network_of(problem.friction).joint_of_weights()
+    whole = Correction(problem, parts.friction, parts.plant, plant, parts.states, joint)
+    taken = whole.shared_at(shares)
+    x, _ = settle_states(problem, torch.cat([taken, end.result.x[len(taken) :]]))
+    local = problem.linearise(x)
+    lower, upper = problem.variables.bounds()
+    result = replace(
+        end.result, x=x, cost=float(local.cost), gradient=local.gradient, hessian=local.hessian,
+        at_lower=x <= lower, at_upper=x >= upper,
+    )  # fmt: skip
+    return replace(end, result=result)
 
 
 def _constant_kept(

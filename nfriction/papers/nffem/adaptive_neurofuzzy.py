@@ -156,9 +156,7 @@ class AdaptiveNeuroFuzzy(Schedule):
 
     def joint_of_parameters(self) -> Tensor:
         """The joint whose coefficients each entry of the parameter vector moves, (parameter,)."""
-        joints = torch.arange(self.joints)
-        trained = self.deviation.trained()
-        return torch.cat([joints.repeat_interleave(p[0].numel()) for p in trained])
+        return self.deviation.joint_of_weights()
 
     def bounds(self) -> tuple[Tensor, Tensor]:
         return self.deviation.bounds()
