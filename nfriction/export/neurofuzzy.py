@@ -28,6 +28,7 @@ def tables(schedule: NeuroFuzzy) -> dict[str, Tensor]:
         set, input), with sets of no membership where one input has fewer; `planes` (joint,
         3 coefficient set, set), columns by set of velocity, then of acceleration; `unit_slope` and
         `unit_shift` (joint, unit, input and coefficient); `weights` (joint, unit, coefficient);
+        `lean` (joint, coefficient), of the direction;
         `reference`, `roundness` (joint, coefficient); `positive` (coefficient,).
     """
     anfis, head = schedule.network.anfis, schedule.network.head
@@ -72,6 +73,7 @@ def tables(schedule: NeuroFuzzy) -> dict[str, Tensor]:
         "unit_slope": scale / unit_widths,
         "unit_shift": (seen - head.centres) / unit_widths,
         "weights": (head.output_weight * half.unsqueeze(2)).mT,
+        "lean": half * schedule.leans(),
         "roundness": (schedule.scale * schedule.roundness).square(),
         "positive": schedule.positive,
     }
@@ -134,16 +136,19 @@ class SingleSample(nn.Module):
     unit_shift: Tensor
     unit_sums: Tensor
     weights: Tensor
+    lean: Tensor
     roundness: Tensor
     positive: Tensor
 
     along_motion: Final[bool]
     all_positive: Final[bool]
+    leans: Final[bool]
 
     def __init__(self, schedule: NeuroFuzzy) -> None:
         super().__init__()
         self.along_motion = schedule.along_motion
         self.all_positive = bool(schedule.positive.all())
+        self.leans = bool(schedule.leans().any())
         sets = max(schedule.terms)
         self.joints, self.rules = schedule.joints, sets * sets
         self.outputs = schedule.network.outputs
@@ -154,8 +159,11 @@ class SingleSample(nn.Module):
             self.register_buffer(name, value.contiguous())
 
     def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        direction = qd
+        if self.along_motion or self.leans:
+            direction = torch.tanh(qd * self.rate)
         if self.along_motion:
-            qdd = qdd * torch.tanh(qd * self.rate)
+            qdd = qdd * direction
         # They pass over NaN, which products of matrices would carry from joint to joint.
         given = torch.addcmul(self.shift, torch.cat([qd.abs(), qdd]), self.gain)
         x = torch.fmin(torch.fmax(given, -self.one), self.one)
@@ -167,7 +175,10 @@ class SingleSample(nn.Module):
         y = torch.bmm(rules.view(self.joints, self.outputs, self.rules), shares).view(-1)
         d = torch.addmv(self.unit_shift, self.unit_slope, torch.cat([x, y]))
         u = torch.addmv(y, self.weights, torch.mv(self.unit_sums, d * d).exp())
-        u = torch.addcmul(self.reference, weight.unsqueeze(1), u.view(self.joints, self.outputs))
+        u = u.view(self.joints, self.outputs)
+        if self.leans:
+            u = torch.addcmul(u, self.lean, direction.unsqueeze(1))
+        u = torch.addcmul(self.reference, weight.unsqueeze(1), u)
         rounded = u + torch.sqrt(torch.addcmul(self.roundness, u, u))
         if not self.all_positive:
             rounded = torch.where(self.positive, rounded, 2.0 * u)
@@ -207,6 +218,7 @@ def _matrices(given: dict[str, Tensor], sets: int) -> dict[str, Tensor]:
         "unit_shift": given["unit_shift"].flatten(),
         "unit_sums": -torch.kron(by_joint, joined),
         "weights": torch.block_diag(*given["weights"].mT),
+        "lean": given["lean"],
         "roundness": given["roundness"],
         "positive": given["positive"],
     }

@@ -57,8 +57,9 @@ class NeuroFuzzy(Schedule):
     """Coefficients from an ANFIS layer with a radial basis head.
 
     Inputs are |velocity| and acceleration, scaled to their trained range and clamped to it. The
-    network's output is the deviation from a constant reference, in units of a scale; it starts at
-    zero, so an untrained model *is* the constant law, and a prior around zero pulls toward it.
+    network's output, and a lean that changes its sign with the direction of motion, are the
+    deviation from a constant reference, in units of a scale; it starts at zero, so an untrained
+    model *is* the constant law, and a prior around zero pulls toward it.
     Beyond the trained range the deviation tapers off to the constant law.
 
     Args:
@@ -76,6 +77,9 @@ class NeuroFuzzy(Schedule):
 
     Attributes:
         learn_sets: whether a fit moves the sets and the head's units besides what they weigh.
+        learn_lean: whether a fit finds how much the coefficients differ by direction.
+        lean: half that difference of positive coefficients, in units of their scale (joint,
+            coefficient).
 
     References:
         TLRIP paper, neuro-fuzzy friction estimation (5 x 5 sets, 25 rules, 10 radial basis units).
@@ -91,6 +95,7 @@ class NeuroFuzzy(Schedule):
     fit_strategy = "nfriction.fitting.strategy.neurofuzzy:fit_neurofuzzy"
     handles_range = True
     learn_sets: bool = True
+    learn_lean: bool = True
 
     reference: Tensor
     scale: Tensor
@@ -127,6 +132,7 @@ class NeuroFuzzy(Schedule):
         self.prior_sd = positive_number("prior_sd", prior_sd)
         self.network = AnfisRBF(joints, 2, terms, k, units=head_units, interpretable=interpretable)
         self.network.init_grid(0.0, 1.0)
+        self.lean = nn.Parameter(torch.zeros(joints, k, dtype=torch.float64))
         for name in ("reference", "scale"):
             self.register_buffer(name, torch.ones(joints, k, dtype=torch.float64))
         for name in ("velocity_range", "acceleration_lower", "acceleration_upper"):
@@ -140,7 +146,7 @@ class NeuroFuzzy(Schedule):
         # Of |velocity|, so that friction is odd in the velocity without any training.
         velocity = qd / self.velocity_range
         if self.along_motion:
-            qdd = qdd * torch.tanh(velocity / self.turn)
+            qdd = qdd * self.direction(qd)
         span = self.acceleration_upper - self.acceleration_lower
         return torch.stack([velocity.abs(), (qdd - self.acceleration_lower) / span], -1)
 
@@ -150,7 +156,16 @@ class NeuroFuzzy(Schedule):
     def residual_coefficients(self, reference: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
         """Coefficients where the network's output is added to a reference in its own units."""
         x, weight = self._clamped_inputs(qd, qdd)
-        return self.to_coefficients(reference + weight * self.network(x))
+        leaning = self.leans() * self.direction(qd).unsqueeze(-1)
+        return self.to_coefficients(reference + weight * (self.network(x) + leaning))
+
+    def leans(self) -> Tensor:
+        """The lean of positive coefficients: an offset that turned with the motion would drive."""
+        return self.lean * self.positive
+
+    def direction(self, qd: Tensor) -> Tensor:
+        """Smooth sign of the velocity."""
+        return torch.tanh(qd / self.velocity_range / self.turn)
 
     def _clamped_inputs(self, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor]:
         """Inputs of the network, and the weight of its output (*batch, joint, 1)."""
@@ -242,7 +257,7 @@ class NeuroFuzzy(Schedule):
         qd = qd.clamp(-self.velocity_range, self.velocity_range)
         sign = torch.ones_like(qd)
         if self.along_motion:
-            sign = torch.tanh(qd / self.velocity_range / self.turn)
+            sign = self.direction(qd)
         held = (sign * qdd).clamp(self.acceleration_lower, self.acceleration_upper)
         # At rest the network's input is zero for every acceleration.
         return qd, torch.where(sign == 0, qdd, held / sign)
@@ -250,21 +265,27 @@ class NeuroFuzzy(Schedule):
     def trained(self) -> tuple[nn.Parameter, ...]:
         """The parameters that a trajectory fit varies, each (joint, ...).
 
-        First those that enter the coefficients almost linearly, (joint, coefficient, ...): the
-        rules' planes and the weights of the head. The head's bias stays zero: it would double the
-        rules' constants, and halve the prior on them. Then the sets' parameters, and the centres
-        and widths of the head's units.
+        First the `weights`. Then the sets' parameters, and the centres and widths of the head's
+        units.
         """
-        anfis, head = self.network.anfis, self.network.head
-        linear = anfis.consequents, head.output_weight
         if not self.learn_sets:
-            return linear
-        return (*linear, *anfis.partition.parameters(), head.centres, head.log_widths)
+            return self.weights()
+        partition, head = self.network.anfis.partition, self.network.head
+        return (*self.weights(), *partition.parameters(), head.centres, head.log_widths)
+
+    def weights(self) -> tuple[nn.Parameter, ...]:
+        """Parameters that enter the coefficients almost linearly, (joint, coefficient, ...).
+
+        The rules' planes, the weights of the head and the lean. The head's bias stays zero: it
+        would double the rules' constants, and halve the prior on them.
+        """
+        both = self.network.anfis.consequents, self.network.head.output_weight
+        return (*both, self.lean) if self.learn_lean else both
 
     @torch.no_grad()
     def silence(self) -> None:
         """Set the network's output to zero, so that coefficients are the reference."""
-        for p in self.trained()[:2]:
+        for p in (*self.weights(), self.lean):
             p.zero_()
 
     def parameter_vector(self) -> Tensor:
@@ -277,7 +298,7 @@ class NeuroFuzzy(Schedule):
             p.copy_(part.reshape(p.shape))
 
     def parameter_names(self, joint_names: Sequence[str]) -> list[str]:
-        rules, weights = (p[0, 0].numel() for p in self.trained()[:2])
+        rules, weights = (p[0, 0].numel() for p in self.weights()[:2])
         columns = ("velocity slope", "acceleration slope", "constant")
         planes = [
             f"{columns[k % len(columns)]} of rule {k // len(columns) + 1}" for k in range(rules)
@@ -285,12 +306,13 @@ class NeuroFuzzy(Schedule):
         head = [f"head weight {k + 1}" for k in range(weights)]
         names = [
             f"{name} of {joint}: {part}"
-            for parts in (planes, head)
+            for parts in (planes, head, ["lean"])[: len(self.weights())]
             for joint in joint_names
             for name in self.coefficient_names
             for part in parts
         ]
-        for group, p in zip(self.group_names()[2:], self.trained()[2:], strict=True):
+        count = len(self.weights())
+        for group, p in zip(self.group_names()[count:], self.trained()[count:], strict=True):
             parts = [f"{group} {k + 1}" for k in range(p[0].numel())]
             names += [f"network of {joint}: {part}" for joint in joint_names for part in parts]
         return names
@@ -301,7 +323,8 @@ class NeuroFuzzy(Schedule):
             f"set {name.removeprefix('log_')}"
             for name, _ in self.network.anfis.partition.named_parameters()
         )
-        names = ("consequents", "head weights", *sets, "head centres", "head widths")
+        lean = ("direction",) if self.learn_lean else ()
+        names = ("consequents", "head weights", *lean, *sets, "head centres", "head widths")
         return names[: len(self.trained())]
 
     def groups(self) -> Tensor:
@@ -313,15 +336,18 @@ class NeuroFuzzy(Schedule):
         """The joint that each weight acts on, -1 of the sets' parameters, (parameter,)."""
         joints = torch.arange(self.joints)
         parts = [joints.repeat_interleave(p[0].numel()) for p in self.trained()]
-        return torch.cat([*parts[:2], *(torch.full_like(part, -1) for part in parts[2:])])
+        count = len(self.weights())
+        return torch.cat([*parts[:count], *(torch.full_like(part, -1) for part in parts[count:])])
 
     def bounds(self) -> tuple[Tensor, Tensor]:
         vector = self.parameter_vector()
         # The network of a coefficient that is not fitted stays where it started.
         mask = torch.tensor(self.fitted_mask, device=vector.device)[:, None]
         fitted = torch.ones_like(vector, dtype=torch.bool)
+        masks = [mask, mask, mask & self.positive[:, None]]
         linear = [
-            mask.expand(self.joints, -1, p[0, 0].numel()).reshape(-1) for p in self.trained()[:2]
+            own.expand(self.joints, -1, p[0, 0].numel()).reshape(-1)
+            for own, p in zip(masks, self.weights(), strict=False)
         ]
         fitted[: sum(len(part) for part in linear)] = torch.cat(linear)
         free = torch.full_like(vector, torch.inf)
@@ -331,7 +357,7 @@ class NeuroFuzzy(Schedule):
         """Mean and standard deviation: zero for the network's output, its sets where they are."""
         partition, head = self.network.anfis.partition, self.network.head
         mean, units = self.parameter_vector(), {}
-        mean[: sum(p.numel() for p in self.trained()[:2])] = 0.0
+        mean[: sum(p.numel() for p in self.weights())] = 0.0
         # Centres in units of widths, spacings as logits, all others relative as they are.
         units[head.centres] = head.log_widths.detach().exp()
         if isinstance(partition, FreePartition):
@@ -353,14 +379,16 @@ class NeuroFuzzy(Schedule):
     def slopes(self, qd: Tensor, qdd: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """Derivatives of the coefficients by the joint's own velocity and acceleration.
 
-        With x the scaled inputs, u the reference plus w n, n the network's outputs at x clamped, w
-        their weight, v = qd / v_max and t = tanh(v / turn) (1 where acceleration is signed):
+        With x the scaled inputs, u the reference plus w n, n the network's outputs at x clamped
+        plus the lean l times t, w their weight, v = qd / v_max and t = tanh(v / turn), of which a
+        signed acceleration takes no notice:
 
             du/dx   = w dn/dx within the range, n dw/dx beyond it,
-            dc/dqd  = dc/du (du/dx_1 sgn(v) / v_max + du/dx_2 qdd dt/dqd / span),
+            dc/dqd  = dc/du (du/dx_1 sgn(v) / v_max + (du/dx_2 qdd / span + w l) dt/dqd),
             dc/dqdd = dc/du du/dx_2 t / span.
         """
-        by_x = self._slopes_over_range(self.scaled(qd, qdd))
+        scaled, turned = self.scaled(qd, qdd), self.direction(qd)
+        by_x = self._slopes_over_range(scaled, self.leans() * turned[..., None])
         # The slope of s = smooth_relu(u) with roundness r is s^2 / (s^2 + r^2).
         s = coefficients / self.scale
         rounded = s * s / (s * s + self.roundness**2)
@@ -368,14 +396,16 @@ class NeuroFuzzy(Schedule):
         velocity, span = self.velocity_range, self.acceleration_upper - self.acceleration_lower
         by_speed, by_acceleration = (by_x * by_u[..., None]).unbind(-1)
         by_acceleration = by_acceleration / span[:, None]
+        turning = ((1.0 - turned * turned) / (velocity * self.turn))[..., None]
+        weight = taper(scaled - scaled.clamp(0.0, 1.0), self.reach)[..., None]
         by_qd = by_speed * (qd.sign() / velocity)[..., None]
+        by_qd = by_qd + by_u * weight * self.leans() * turning
         if not self.along_motion:
             return by_qd, by_acceleration
-        turned = torch.tanh(qd / velocity / self.turn)
-        turning = qdd * (1.0 - turned * turned) / (velocity * self.turn)
-        return by_qd + by_acceleration * turning[..., None], by_acceleration * turned[..., None]
+        by_qd = by_qd + by_acceleration * qdd[..., None] * turning
+        return by_qd, by_acceleration * turned[..., None]
 
-    def _slopes_over_range(self, scaled: Tensor) -> Tensor:
+    def _slopes_over_range(self, scaled: Tensor, leaning: Tensor) -> Tensor:
         """Derivatives of the weighted network by its scaled inputs, (*batch, joint, output, 2)."""
         x = scaled.clamp(0.0, 1.0)
         beyond = scaled - x
@@ -384,7 +414,7 @@ class NeuroFuzzy(Schedule):
         weight = taper(beyond, self.reach)[..., None] * (beyond == 0.0)
         slope = taper_slope(beyond, self.reach)
         by_x = by_x.reshape(*x.shape[:-1], -1, 2) * weight[..., None, :]
-        return by_x + self.network(x)[..., None] * slope[..., None, :]
+        return by_x + (self.network(x) + leaning)[..., None] * slope[..., None, :]
 
     @torch.no_grad()
     def residual_sensitivities(self, reference: Tensor, qd: Tensor, qdd: Tensor) -> Sensitivity:
@@ -395,7 +425,9 @@ class NeuroFuzzy(Schedule):
         both = torch.cat([x, y], -1)
         with torch.enable_grad():
             # The map to coefficients is elementwise, so the sum's gradient is its slope.
-            u = (reference + weight * (y + head(both))).detach().requires_grad_()
+            turned = self.direction(qd)[..., None]
+            leaning = self.leans() * turned
+            u = (reference + weight * (y + head(both) + leaning)).detach().requires_grad_()
             coefficients = self.to_coefficients(u)
             (by_u,) = torch.autograd.grad(coefficients.sum(), u)
         by_u = by_u * weight
@@ -404,9 +436,10 @@ class NeuroFuzzy(Schedule):
         by_y = head.input_jacobian(both)[:, :, x.shape[-1] :].permute(3, 0, 1, 2)
         by_rules, by_head = by_u[..., None] * (own + by_y), by_u[..., None] * own
         by_qd, by_qdd = self.slopes(qd, qdd, coefficients)
+        lean = ((by_head * self.positive, turned),) if self.learn_lean else ()
         if not self.learn_sets:
             factors = ((by_rules, anfis.regressors(x)), (by_head, head.activations(both)))
-            return Sensitivity(factors, by_qd, by_qdd)
+            return Sensitivity((*factors, *lean), by_qd, by_qdd)
         columns, units = anfis.jacobian_columns(x), head.jacobian_columns(both)
         shared, one = anfis.consequents[0, 0].numel(), torch.ones_like(x[..., :1])
         by_set = columns[:, shared:].unflatten(1, (y.shape[-1], -1)).permute(3, 0, 1, 2)
@@ -418,6 +451,7 @@ class NeuroFuzzy(Schedule):
             (
                 (by_rules, columns[:, :shared].movedim(-1, 0)),
                 (by_head, units[:, : head.units].movedim(-1, 0)),
+                *lean,
                 *(
                     (by_rules @ (by_set @ rows), one)
                     for rows in anfis.partition.jacobian().values()

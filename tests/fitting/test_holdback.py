@@ -13,13 +13,16 @@ from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.continuation import ShootingFitter
 from nfriction.fitting.strategy.holdout import (
-    Correction,
     Judgement,
     cut_for_folds,
     judge,
     training_blocks,
 )
-from nfriction.fitting.strategy.neurofuzzy import initialise_from_constant, revert_to_constant
+from nfriction.fitting.strategy.neurofuzzy import (
+    correction,
+    initialise_from_constant,
+    revert_to_constant,
+)
 from nfriction.recording import Recording
 from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import F64, pendulum, swing
@@ -54,13 +57,12 @@ def corrections(constant, vectors, reference=None):
     search, motions = refinement(constant), constant[1].motions
     if reference is not None:
         search.friction.schedule.set_reference(reference)
-    schedule = search.friction.schedule
     windows = cut_for_folds(search.recordings, motions, 0.5, FOLDS)
     found = []
     for seen, vector in zip(training_blocks(len(windows), FOLDS), vectors, strict=True):
         problem = search.problem(windows.subset(~seen), 1e-3, vector)
-        states = problem.variables.split(problem.variables.start()).states
-        found.append(Correction(problem, vector, NONE, NONE, states, schedule.joint_of_weights()))
+        parts = problem.variables.split(problem.variables.start(friction=vector))
+        found.append(correction(problem, parts, NONE))
     return found
 
 

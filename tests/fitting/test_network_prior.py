@@ -1,5 +1,7 @@
 """How far a network may deviate from its constant law: evidence, and windows held back."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -152,6 +154,25 @@ def test_evidence_says_how_near_a_plant_stays():
     # However far evidence would let it go, it stays within what is known of the plant as given.
     assert (wider.plant_sd(own) < own).all()
     assert (prior.plant_sd(own) < wider.plant_sd(own)).all()
+
+
+def test_evidence_finds_that_friction_depends_on_the_direction():
+    truth = NFNCFM(1, [2e-3], terms=(2, 1), head_units=1)
+    truth.schedule.set_range(SPEED, [-80.0, 80.0])
+    with torch.no_grad():
+        truth.schedule.lean.fill_(0.2)
+    q0 = torch.tensor([np.pi + 2.0], dtype=torch.float64)
+    run = rollout(ARM, truth.requires_grad_(False), q0, 0 * q0, sample_time=2e-3, steps=3000)
+    q = COUNT * np.round(run.q.numpy() / COUNT)
+    recording = Recording(2e-3 * np.arange(len(q)), q, convention="relative,upright")
+    model = NFNCFM(1, terms=(2, 1), head_units=1)
+    model.schedule.learn_sets = False
+    found = fit(model, ARM, recording, windows=(0.5,), fit_plant=False, drag=False)
+    assert float(model.schedule.lean) == pytest.approx(0.2, rel=0.05)
+    (gamma,) = (value for name, value, _ in found.effective_parameters if name == "direction")
+    assert gamma > 0.9
+    (told,) = re.findall(r"and ([0-9.]+) % better than without the direction", found.status)
+    assert float(told) > 50
 
 
 @pytest.mark.parametrize("place", range(3))

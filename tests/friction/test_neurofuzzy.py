@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.func import functional_call, jacrev
 
 from nfriction.friction.coefficients import Constant
-from nfriction.friction.laws import LINEAR, NONLINEAR, STRIBECK, VISCOUS
+from nfriction.friction.laws import COULOMB, LINEAR, NONLINEAR, STRIBECK, VISCOUS
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import LEAST_RATIO, LOGIT_SD, NeuroFuzzy
 from tests.friction.samples import LAWS, QUADRATIC, motion, normal, randomise
@@ -53,7 +53,11 @@ def test_a_signed_coefficient_of_zero_starts_at_zero() -> None:
 @settings(max_examples=20)
 @given(seed=st.integers(0, 1000), spread=st.floats(0.01, 100.0))
 def test_coefficients_are_positive_whatever_the_parameters(law, seed: int, spread: float):
-    schedule = trained(law, 2, spread, seed)
+    schedule = trained(law, 2, 0.5, seed)
+    with torch.no_grad():
+        # Widths of e^100 would mean nothing.
+        for weight in schedule.weights():
+            weight.mul_(2.0 * spread)
     values = schedule(*motion(50, 2, seed=seed)[:2])
     assert torch.isfinite(values).all()
     assert (values[..., schedule.positive] >= 0).all()
@@ -83,6 +87,8 @@ def silence_offset(schedule: NeuroFuzzy) -> None:
 def test_turning_the_other_way_only_turns_the_torque(law) -> None:
     schedule = trained(law)
     silence_offset(schedule)
+    with torch.no_grad():
+        schedule.lean.zero_()
     model = FrictionModel(law, schedule)
     qd, qdd, load = motion(100, 2)
     assert torch.equal(model(-qd, -qdd, load), -model(qd, qdd, load))
@@ -90,6 +96,8 @@ def test_turning_the_other_way_only_turns_the_torque(law) -> None:
 
 def test_with_signed_acceleration_the_directions_differ() -> None:
     schedule = trained(acceleration="signed")
+    with torch.no_grad():
+        schedule.lean.zero_()
     qd, qdd, _ = motion(100, 2)
     assert not torch.allclose(schedule(-qd, -qdd), schedule(qd, qdd), rtol=1e-3)
     torch.testing.assert_close(schedule(-qd, qdd), schedule(qd, qdd), rtol=0, atol=0)
@@ -203,8 +211,8 @@ def test_a_coefficient_that_is_not_fitted_stays_constant() -> None:
     schedule = NeuroFuzzy(STRIBECK, 2)
     lower, upper = schedule.bounds()
     fixed = lower == upper
-    # One output of five, of every rule's plane and of every unit, at both joints.
-    assert int(fixed.sum()) == 2 * (25 * 3 + 10)
+    # One output of five, of every rule's plane, of every unit and of the lean, at both joints.
+    assert int(fixed.sum()) == 2 * (25 * 3 + 10 + 1)
     assert torch.isinf(lower[~fixed]).all()
     assert torch.isinf(upper[~fixed]).all()
     schedule.set_parameter_vector(normal(len(lower)).clamp(lower, upper))
@@ -368,3 +376,16 @@ def test_silence_leaves_the_constant_law_and_the_sets(interpretable: bool) -> No
     torch.testing.assert_close(schedule(*motion(5, 2)[:2]), expected, rtol=1e-14, atol=0)
     for before, after in zip(sets, schedule.network.anfis.sets(), strict=True):
         assert torch.equal(before, after)
+
+
+def test_coefficients_lean_with_the_direction_and_fade_with_the_rest() -> None:
+    schedule = NeuroFuzzy(COULOMB, 2, [[0.2], [0.1]])
+    schedule.set_range(3.0, [-10.0, 10.0])
+    with torch.no_grad():
+        schedule.lean.copy_(torch.tensor([[0.3], [0.0]]))
+    qd = torch.tensor([[2.0, 2.0], [-2.0, -2.0], [30.0, 30.0]], dtype=torch.float64)
+    found = schedule(qd, 0 * qd)[..., 0]
+    expected = torch.tensor([[0.26, 0.1], [0.14, 0.1], [0.2, 0.1]], dtype=torch.float64)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=0)
+    schedule.silence()
+    torch.testing.assert_close(schedule(qd, 0 * qd)[0], schedule(qd, 0 * qd)[1])

@@ -66,6 +66,7 @@ class Correction:
         states: of the windows' starts, near their best, (window, 2 joint).
         joint: the joint that each weight of the network acts on, -1 of parameters of its sets,
             which do nothing without weights, (parameter,).
+        direction: weights of the direction of motion, bool (parameter,).
     """
 
     problem: ShootingProblem
@@ -74,6 +75,7 @@ class Correction:
     law_plant: Tensor
     states: Tensor
     joint: Tensor
+    direction: Tensor
 
     @property
     def joints(self) -> int:
@@ -131,12 +133,14 @@ class Judgement:
         ratio: of the root mean square errors with to without, as a logarithm.
         spread: its standard deviation.
         windows: number of windows left out.
+        direction: ratio of the errors with to without the direction as an input, as a logarithm.
     """
 
     shares: Tensor
     ratio: float
     spread: float
     windows: int
+    direction: float = 0.0
     options: FitOptions = DEFAULTS
 
     @property
@@ -157,7 +161,8 @@ class Judgement:
         )
         return (
             f"By blocks left out each joint takes a share of the network's correction: {parts}; "
-            f"errors there are {_change(self.ratio)} than the constant law's."
+            f"errors there are {_change(self.ratio)} than the constant law's, and "
+            f"{_change(self.direction)} than without the direction of motion as an input."
         )
 
     def rejection(self) -> str:
@@ -188,16 +193,18 @@ def judge(corrections: Sequence[Correction]) -> Judgement | None:
         slope, curvature = slope + first, curvature + second
     options = corrections[0].problem.options
     if not (slope.isfinite().all() and curvature.isfinite().all()):
-        return Judgement(none, math.inf, math.inf, 0, options)
+        return Judgement(none, math.inf, math.inf, 0, options=options)
     solve = partial(solve_free, blocks=None)
     free = torch.ones(joints, dtype=torch.bool)
     shares = 1.0 + bounded_qp.minimise(curvature, slope, -full, none, free, solve)
+    blind = [replace(c, friction=c.friction.where(~c.direction, 0.0)) for c in corrections]
     squares = []
-    for at in (shares, none):
-        states = [correction.settled(at) for correction in corrections]
+    for trial, at in ((corrections, shares), (corrections, none), (blind, shares)):
+        states = [correction.settled(at) for correction in trial]
         if any(x is None for x in states):
             return None
-        pairs = zip(corrections, states, strict=True)
+        pairs = zip(trial, states, strict=True)
         squares.append(torch.cat([c.squares(x) for c, x in pairs if x is not None]))
-    ratio, spread = log_ratio(*squares)
-    return Judgement(shares, ratio, spread, len(squares[0]), options)
+    ratio, spread = log_ratio(*squares[:2])
+    by_direction, _ = log_ratio(squares[0], squares[2])
+    return Judgement(shares, ratio, spread, len(squares[0]), by_direction, options)

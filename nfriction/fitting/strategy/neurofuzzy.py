@@ -17,7 +17,7 @@ from torch import Tensor
 
 from nfriction.fitting.data.checks import require_motion
 from nfriction.fitting.data.inputs import adjustable_terms, apply_encoder_offsets
-from nfriction.fitting.data.windows import Windows
+from nfriction.fitting.data.windows import Windows, cut_windows
 from nfriction.fitting.equation_error import coefficient_scale
 from nfriction.fitting.fit import FitTask
 from nfriction.fitting.options import DEFAULTS, FitOptions
@@ -30,7 +30,7 @@ from nfriction.fitting.shooting.autocorrelation import (
 )
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
-from nfriction.fitting.shooting.variables import model_at
+from nfriction.fitting.shooting.variables import Parts, model_at
 from nfriction.fitting.strategy.constant import constant_start, fits_eccentricity, known_terms
 from nfriction.fitting.strategy.continuation import (
     HorizonResult,
@@ -82,10 +82,12 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
         extrapolation=prior_on_unvisited_cells(network_of(network), motions, options),
     )  # fmt: skip
     length = start.longest_usable_horizon(options.windows)
-    windows = cut_for_folds(recordings, motions, length, options.folds)
-    training = _Training(fitter, start, windows)
+    training = _Training(fitter, start, cut_windows(recordings, motions, length))
     trained = training.learn()
-    judged = None if trained is None else training.judge(trained)
+    judged = None
+    if trained is not None:
+        shorter = cut_for_folds(recordings, motions, length, options.folds)
+        judged = training.judge(trained, shorter)
     if trained is None or judged is None:
         found = _constant_kept(task, network, start, INTERRUPTED, converged=False)
     elif not judged.kept:
@@ -315,28 +317,33 @@ class _Training:
             return held
         return self._adapt(moved.prior, moved.end.problem, moved.end.result.x)
 
-    def judge(self, trained: Trained) -> Judgement | None:
-        """Share of a network that every joint takes by blocks left out; None if stopped."""
-        problem, parts = trained.end.problem, trained.end.parts
+    def judge(self, trained: Trained, windows: Windows) -> Judgement | None:
+        """Share of a network that every joint takes by blocks of windows left out; None if stopped.
+
+        The windows may be shorter than those that it learnt from, so that there are enough.
+        """
+        problem = replace(trained.end.problem, windows=windows)
+        parts = trained.end.parts
+        x, stopped = settle_states(
+            problem, problem.variables.start(parts.plant, friction=parts.friction)
+        )
+        if stopped:
+            return None
+        parts = problem.variables.split(x)
         # From a minimum over all windows, that over most of them is a few steps away.
         brief = replace(self.options, max_steps=STEPS_WITHOUT_BLOCK)
         fitter = replace(self._fitter(problem.friction, trained.prior), options=brief)
-        joint = network_of(problem.friction).joint_of_weights()
         left_out = []
-        for seen in training_blocks(len(self.windows), self.options.folds):
-            most = replace(problem, windows=self.windows.subset(seen))
+        for seen in training_blocks(len(windows), self.options.folds):
+            most = replace(problem, windows=windows.subset(seen))
             x = torch.cat([parts.friction, parts.plant, parts.states[seen].flatten()])
             tolerance = loglik_tolerance(float(most.cost(x)), self.options)
             end = fitter.search(most, x, tolerance, "network, block left out")
             if end.stopped:
                 return None
-            rest = replace(problem, windows=self.windows.subset(~seen))
-            found = end.parts
-            left_out.append(
-                Correction(
-                    rest, found.friction, found.plant, self.plant, parts.states[~seen], joint
-                )
-            )
+            rest = replace(problem, windows=windows.subset(~seen))
+            ended = end.parts._replace(states=parts.states[~seen])
+            left_out.append(correction(rest, ended, self.plant))
         return judge(left_out)
 
     def _adapt(
@@ -410,14 +417,23 @@ class _Training:
         return abs((noise / before) ** 2 - 1.0) * float(found.end.result.cost)
 
 
+def correction(problem: ShootingProblem, parts: Parts, law_plant: Tensor) -> Correction:
+    """The deviation of a network's parameters from its law, on a problem's windows."""
+    schedule = network_of(problem.friction)
+    names = schedule.group_names()
+    leaning = names.index("direction") if "direction" in names else -1
+    return Correction(
+        problem, parts.friction, parts.plant, law_plant, parts.states,
+        schedule.joint_of_weights(), schedule.groups() == leaning,
+    )  # fmt: skip
+
+
 def shrunk(end: HorizonResult, shares: Tensor, plant: Tensor) -> HorizonResult:
     """A search's end with shares (joint,) of its correction, from a law's plant terms on."""
     if bool((shares == 1).all()):
         return end
     problem, parts = end.problem, end.parts
-    joint = network_of(problem.friction).joint_of_weights()
-    whole = Correction(problem, parts.friction, parts.plant, plant, parts.states, joint)
-    taken = whole.shared_at(shares)
+    taken = correction(problem, parts, plant).shared_at(shares)
     x, _ = settle_states(problem, torch.cat([taken, end.result.x[len(taken) :]]))
     local = problem.linearise(x)
     lower, upper = problem.variables.bounds()

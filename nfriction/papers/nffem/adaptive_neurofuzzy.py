@@ -64,6 +64,8 @@ class AdaptiveNeuroFuzzy(Schedule):
         self.deviation = NeuroFuzzy(law, joints, self.adaptive.values.mean(1), **network)
         # Shares of a correction are shares of its parameters, so they have to enter linearly.
         self.deviation.learn_sets = False
+        # The papers' networks see velocity and acceleration alone.
+        self.deviation.learn_lean = False
 
     @torch.no_grad()
     def set_adaptive(self, adaptive: Adaptive, scale: Tensor | None = None) -> None:
