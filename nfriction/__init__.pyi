@@ -1,4 +1,5 @@
 # Each public name once; `nfriction/__init__.py` imports it lazily from the module given here.
+from . import datasets as datasets
 from . import export as export
 from . import plots as plots
 from .evaluation.compare import Comparison as Comparison

@@ -218,8 +218,8 @@ def second_torque(workspace: Workspace) -> Figure:
 
 
 def _experiment_motion(workspace: Workspace) -> Motion:
-    parts = workspace.bench("tlrip").parts()
-    return next(m for _, r, m in parts if r.name == EXPERIMENT)
+    (motion,) = workspace.bench(EXPERIMENT).motions
+    return motion
 
 
 def experiment(workspace: Workspace) -> Figure:
