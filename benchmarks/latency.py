@@ -29,7 +29,7 @@ from nfriction.export import c
 from nfriction.export.c_code.export import find_compiler
 from nfriction.export.controller import controller_of
 from nfriction.export.test_vectors import draw
-from nfriction.io.model_info import ModelInfo
+from nfriction.io.model_file import ModelInfo
 
 JOINTS = (1, 4)
 ROWS = 1000  # different samples, taken in turn

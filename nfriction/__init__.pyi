@@ -1,4 +1,5 @@
 # Each public name once; `nfriction/__init__.py` imports it lazily from the module given here.
+from . import datasets as datasets
 from . import export as export
 from . import plots as plots
 from .evaluation.compare import Comparison as Comparison
@@ -25,11 +26,11 @@ from .friction.neurofuzzy import NFLFM as NFLFM
 from .friction.neurofuzzy import NFNCFM as NFNCFM
 from .friction.neurofuzzy import NFNLFM as NFNLFM
 from .friction.neurofuzzy import NFStribeck as NFStribeck
+from .io.model_file import ModelInfo as ModelInfo
 from .io.model_file import load as load
 from .io.model_file import load_info as load_info
 from .io.model_file import load_plant as load_plant
 from .io.model_file import save as save
-from .io.model_info import ModelInfo as ModelInfo
 from .papers.afem.adaptive import ACFM as ACFM
 from .papers.afem.adaptive import ACVFM as ACVFM
 from .papers.afem.adaptive import ALFM as ALFM

@@ -10,7 +10,7 @@ from nfriction.cli.inputs import seconds
 
 if TYPE_CHECKING:
     from nfriction.friction.models import FrictionModel
-    from nfriction.io.model_info import ModelInfo
+    from nfriction.io.model_file import ModelInfo
 
 EXAMPLE = """example:
   nfriction export model.json --format torchscript,c --out artefacts"""

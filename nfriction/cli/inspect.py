@@ -11,7 +11,7 @@ from nfriction.friction import model_names, plain_name
 
 if TYPE_CHECKING:
     from nfriction.friction.models import FrictionModel
-    from nfriction.io.model_info import ModelInfo
+    from nfriction.io.model_file import ModelInfo
 
 INFO_EXAMPLE = """example:
   nfriction info runs/mine/models/LFM.json"""

@@ -16,12 +16,11 @@ from nfriction.codegen.batch import (
     rows_of,
     to_array,
 )
-from nfriction.codegen.derivative import with_jacobian
 from nfriction.codegen.errors import SelfCheckFailed
 from nfriction.codegen.graph import FunctionalModule, Method, Program
-from nfriction.codegen.hoist import hoist
 from nfriction.codegen.llvm import jit
 from nfriction.codegen.llvm.emit import write_function
+from nfriction.codegen.transform import hoist, with_jacobian
 
 _CHECK_TOLERANCE = 1e-10
 

@@ -17,11 +17,11 @@ from nfriction.codegen.batch import (
     series,
     to_array,
 )
-from nfriction.codegen.derivative import with_jacobian
 from nfriction.codegen.errors import SelfCheckFailed
 from nfriction.codegen.graph import FunctionalModule, Program
 from nfriction.codegen.llvm import jit
 from nfriction.codegen.rollout_program import LAYOUT, ForcedSystem, RolloutDriver, arrange
+from nfriction.codegen.transform import with_jacobian
 
 # Of accelerations over steps of 0.1 ms: velocities of 10 rad/s round to 2e-15, rates to 2e-11.
 _CHECK_TOLERANCE = 1e-9

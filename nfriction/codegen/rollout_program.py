@@ -8,10 +8,10 @@ from torch import Tensor, nn
 
 from nfriction.codegen.batch import Driver, Layout
 from nfriction.codegen.graph import Port, Program
-from nfriction.codegen.hoist import hoist
 from nfriction.codegen.llvm.emit import write_function
 from nfriction.codegen.llvm.ir import real
 from nfriction.codegen.scalar import Graph, Node
+from nfriction.codegen.transform import hoist
 
 LAYOUT = Layout(
     series=("q0", "qd0", "tau", "step", "drive_qd", "drive_qdd", "memory"),

@@ -24,8 +24,8 @@ from nfriction.export.controller import Controller, controller_of, run_in_order
 from nfriction.export.neurofuzzy import with_single_sample
 from nfriction.export.torch_archive import METADATA, check_script, check_source, contents, repacked
 from nfriction.friction.models import FrictionModel
-from nfriction.io.atomic import atomic_write
-from nfriction.io.model_info import ModelInfo
+from nfriction.io.files import atomic_write
+from nfriction.io.model_file import ModelInfo
 
 # All that an archive of ours holds.
 _OURS = re.compile(

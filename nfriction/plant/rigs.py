@@ -28,8 +28,7 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from nfriction.io import strict_json
-from nfriction.io.atomic import write_atomically
+from nfriction.io.files import parse_json, write_atomically
 from nfriction.plant import robot_file
 from nfriction.plant.base import LinearAxis, Plant
 from nfriction.plant.chain import Arm, PendulumChain
@@ -356,7 +355,7 @@ def _are_numbers(value: Any, depth: int = 0) -> bool:
 
 def _parse(text: str, suffix: str) -> Any:
     if suffix == ".json":
-        return strict_json.parse(text)
+        return parse_json(text)
     if suffix != ".toml":
         raise ValueError(f"a rig file ends in .json or .toml, .urdf or .xml, not {suffix!r}.")
     if sys.version_info < (3, 11):

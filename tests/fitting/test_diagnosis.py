@@ -144,8 +144,19 @@ def test_mistakes_in_conventions_and_time():
         "angles are measured from upright, not from hanging"
         in warnings_of(plant, q, tau, convention="relative,hanging")[0]
     )
+    for name in ("free", "driven"):
+        plant, q, tau = measured(name)
+        misread = np.cumsum(q - [math.pi, 0], axis=1)
+        first = warnings_of(plant, misread, tau, convention="relative,hanging")[0]
+        assert "angles are absolute, not relative" in first
     with pytest.warns(UserWarning, match="milliseconds"):
         assert "time is in ms" in warnings_of(plant, q, tau, time=2.0 * np.arange(len(q)))[0]
+
+
+def test_exchanged_columns_are_named():
+    plant, q, tau = measured("driven")
+    swapped = (np.ascontiguousarray(x[:, ::-1]) for x in (q, tau))
+    assert "the columns of joint1 and joint2 are exchanged" in warnings_of(plant, *swapped)[0]
 
 
 def test_an_advanced_torque_is_in_line_again():
