@@ -39,8 +39,10 @@ from .papers.afem.adaptive import ANLFM as ANLFM
 from .papers.afem.fit_adaptive import fit_adaptive as fit_adaptive
 from .papers.afem.fit_by_search import fit_by_search as fit_by_search
 from .plant import LinearAxis as LinearAxis
+from .plant import Motor as Motor
 from .plant import PendulumChain as PendulumChain
 from .plant import Plant as Plant
+from .plant import Rotor as Rotor
 from .plant import rigs as rigs
 from .recording import Recording as Recording
 from .recording.angles import AngleConvention as AngleConvention
