@@ -168,6 +168,11 @@ def prepare_task(
 ) -> FitTask:
     """Check and convert the arguments of a fit; see `fit`."""
     given = as_recording_list(model, plant, recordings)
+    if model.law.memory:
+        raise ValueError(
+            f"the law {model.law.name!r} has an internal state, which fits do not follow yet; fit "
+            "a law without memory, such as Stribeck."
+        )
     joint = in_joint_coordinates(plant, model, given)
     if options.eccentricity == "on" and not isinstance(plant, PendulumChain):
         raise ValueError(f"{plant.name or 'the axis'} has no encoders that turn with its joints.")

@@ -25,6 +25,13 @@ _LAWS = {
     "coulomb-viscous": "CVFM",
     "stribeck": "Stribeck",
 }
+# Laws with memory, which have no other kinds yet.
+_MEMORY = {
+    "dahl": "Dahl",
+    "lugre": "LuGre",
+    "elasto-plastic": "ElastoPlastic",
+    "maxwell-slip": "MaxwellSlip",
+}
 # Classes are resolved only when asked for: a command line then starts quickly, and the core does
 # not import the papers' own models.
 _KINDS = (
@@ -40,21 +47,26 @@ _MODELS = {
     for law, short in _LAWS.items()
     if (kind.prefix, law) != _MISSING
 }
+_KIND_OF_MEMORY = _Kind("", "", "nfriction.friction.memory")
+_ALL = _MODELS | {name: (_KIND_OF_MEMORY, law) for law, name in _MEMORY.items()}
 _BY_TEXT = {
-    text.lower(): name
-    for name, (kind, law) in _MODELS.items()
-    for text in (name, kind.prefix + law)
+    text.lower(): name for name, (kind, law) in _ALL.items() for text in (name, kind.prefix + law)
 }
 
 
 def model_names() -> tuple[str, ...]:
-    """Names of all models, as tables and files show them; also those of their classes."""
+    """Names of the models without memory, as tables and files show them, and of their classes."""
     return tuple(_MODELS)
+
+
+def memory_names() -> tuple[str, ...]:
+    """Names of the models of laws with memory."""
+    return tuple(_MEMORY.values())
 
 
 def plain_name(name: str) -> str:
     """The plain name of a named model, such as `neuro-fuzzy:stribeck` of `NFStribeck`."""
-    kind, law = _MODELS[model_name(name)]
+    kind, law = _ALL[model_name(name)]
     return kind.prefix + law
 
 
@@ -82,7 +94,10 @@ def model_list() -> str:
     laws = ", ".join(_both_names(plain.letters + short) for short in _LAWS.values())
     first = next(iter(_LAWS.values()))
     before = " or ".join(f"{kind.prefix} ({kind.letters}{first}, ...)" for kind in others)
-    return f"{laws}; also with {before} before them, except {''.join(_MISSING)}"
+    return (
+        f"{laws}; also with {before} before them, except {''.join(_MISSING)}; "
+        f"with memory {', '.join(_MEMORY)}"
+    )
 
 
 def _both_names(name: str) -> str:
@@ -98,5 +113,5 @@ def model_by_name(name: str) -> "type[NamedModel]":
         ValueError: if no model has that name; the message lists the names.
     """
     found = model_name(name)
-    kind: type[NamedModel] = resolve_name(f"{_MODELS[found][0].module}:{found}")
+    kind: type[NamedModel] = resolve_name(f"{_ALL[found][0].module}:{found}")
     return kind
