@@ -97,14 +97,24 @@ class TorqueFits:
         Raises:
             ValueError: if it was not fitted.
         """
+        return join([found.model for found in self.fits[self._known(name)]])
+
+    def _known(self, name: str) -> str:
+        """The name under which a model was fitted."""
         known = model_name(name)
         if known not in self.fits:
             raise ValueError(f"{name!r} was not fitted; there are {', '.join(self.fits)}.")
-        return join([found.model for found in self.fits[known]])
+        return known
+
+    def _names(self, model: str | None) -> list[str]:
+        """The model of each joint: a given one, or those chosen."""
+        if model is None:
+            return list(self.chosen.values())
+        return [self._known(model)] * len(self.table.joints)
 
     def info(self, name: str) -> ModelInfo:
         """Entries of the model file of a model of all joints."""
-        found = self.fits[model_name(name)]
+        found = self.fits[self._known(name)]
         joints = self.table.joints
         steps = [joint.step for joint in joints if joint.time is not None]
         ranges = {
@@ -141,8 +151,7 @@ class TorqueFits:
         """
         given = as_table(table, unit=self.table.unit)
         _check_joints(self.table.joint_names, given)
-        names = [self.chosen[joint] if model is None else model_name(model) for joint in
-                 self.table.joint_names]  # fmt: skip
+        names = self._names(model)
         return [
             predict(self.fits[name][k].model, joint).numpy()
             for k, (name, joint) in enumerate(zip(names, given.joints, strict=True))
@@ -152,13 +161,8 @@ class TorqueFits:
         """Errors of `predict` by joint: model, rmse [N m; N], nrmse [-]."""
         given = as_table(table, unit=self.table.unit)
         torques = self.predict(given, model)
-        names = [self.chosen[j] if model is None else model_name(model) for j in self.chosen]
-        return scores_frame(
-            [
-                score_joint(joint, torque, name)
-                for joint, torque, name in zip(given.joints, torques, names, strict=True)
-            ]
-        )
+        pairs = zip(given.joints, torques, self._names(model), strict=True)
+        return scores_frame([score_joint(*pair) for pair in pairs])
 
     def to_frame(self) -> pd.DataFrame:
         """NRMSE on blocks left out by joint and model."""
@@ -176,8 +180,8 @@ class TorqueFits:
         import pandas as pd  # slow to import
 
         rows = []
-        for k, joint in enumerate(self.table.joint_names):
-            own = self.chosen[joint] if name is None else model_name(name)
+        pairs = zip(self.table.joint_names, self._names(name), strict=True)
+        for k, (joint, own) in enumerate(pairs):
             found = self.fits[own][k]
             unknown = {n for d in found.unidentifiable for n in d.split(" with ")}
             values = found.model.schedule.coefficient_sets()
@@ -330,7 +334,9 @@ def _fit(
     found = fit_joint(name, joint, v_smooth, options)
     if shares[best]:
         found = fit_network(found, joint, shares[best], options)
+    # A network that was dropped has no parameters beyond its law's.
     count = int((found.model.schedule.parameter_vector() != 0).sum())
+    count += len(found.model.law.coefficients) * (form != "constant")
     return found, Candidate(name, tuple(errors[best].tolist()), count, found.converged)
 
 
