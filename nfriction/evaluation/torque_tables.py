@@ -28,9 +28,8 @@ from nfriction.fitting.torque_table import (
 )
 from nfriction.friction import model_by_name, model_name, plain_name
 from nfriction.friction.models import FrictionModel
-from nfriction.io import strict_json
-from nfriction.io.model_file import load, load_info
-from nfriction.io.model_info import ModelInfo
+from nfriction.io.files import parse_json
+from nfriction.io.model_file import ModelInfo, load, load_info
 from nfriction.recording import Unit
 from nfriction.recording.torque_table import JointTorque, TorqueTable, as_table, blocks
 
@@ -221,9 +220,9 @@ class TorqueFits:
         return f"<p>{head}</p>{''.join(tables)}"
 
     def plot(self) -> Figure:
-        """Friction torque over velocity with its 95 % band; see `plots.torque_table`."""
+        """Friction torque over velocity with its 95 % band; see `plots.friction_table`."""
         # By name, because plots is a layer above this one.
-        figure: Figure = resolve_name("nfriction.plots:torque_table")(self)
+        figure: Figure = resolve_name("nfriction.plots:friction_table")(self)
         return figure
 
     def to_dict(self) -> dict[str, Any]:
@@ -375,7 +374,7 @@ def read_models(path: str | Path) -> list[SavedModel]:
         return _saved(path)
     index = path / RESULTS
     try:
-        content = strict_json.parse(index.read_text(encoding="utf-8"))
+        content = parse_json(index.read_text(encoding="utf-8"))
         chosen = {str(joint): model_name(of["model"]) for joint, of in content["chosen"].items()}
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise ValueError(
