@@ -206,9 +206,10 @@ def _conclusion(comparison: Comparison) -> str:
     end = f"with the friction learnt ({plain_name(best)}) they miss it by {shown[1]}"
     if not math.isfinite(without):
         return f"Without friction, simulations of the test recordings diverge;\n{end}."
+    less = 100 * (1 - learnt / without)
     return (
         f"Without friction, simulations of the test recordings miss the measured motion by "
-        f"{shown[0]};\n{end}, {100 * (1 - learnt / without):.3g} % less."
+        f"{shown[0]};\n{end}, {less:.{3 if less < 99.95 else 4}g} % less."  # never quite all
     )
 
 

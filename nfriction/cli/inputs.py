@@ -134,8 +134,9 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
         "absolute,hanging (default: of the file or the rig)")  # fmt: skip
     add("--degrees", action="store_true", help="the files are in degrees")
     add("--columns", type=columns, metavar="OURS=THEIRS,...",
-        help="the files' names of time, q1, ..., tau1, ... where they differ, e.g. "
-        "time=t,q1=enc_1,q2=enc_2")  # fmt: skip
+        help="the files' names of time, q1, ..., tau1, ... (of a motor: motor1, current1) where "
+        "they differ, each perhaps with its unit, e.g. time=t:ms,q1=enc_1:deg,q2=enc_2:counts/8192"
+        )  # fmt: skip
     add("--windows", type=_windows, metavar="SECONDS",
         help="lengths of the shooting windows, in the order of their use [s] (default: 0.5,2,5)"
         )  # fmt: skip
@@ -170,7 +171,7 @@ def read_rig(name: str) -> Plant:
     """The rig that `--rig` names."""
     from nfriction.plant import rigs
 
-    return rigs.by_name(name) if name in RIGS else rigs.read(name)
+    return rigs.of(name)
 
 
 def read_recordings(
@@ -187,7 +188,7 @@ def read_recordings(
             warnings.simplefilter("always")
             recording = Recording.read(
                 path, columns=arguments.columns, degrees=arguments.degrees,
-                convention=arguments.angles, unit=unit,
+                convention=arguments.angles, unit=unit, plant=plant,
             )  # fmt: skip
         if recording.joints != plant.joints:
             raise UsageError(f"{path} has {recording.joints} joints, the rig has {plant.joints}.")

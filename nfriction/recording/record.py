@@ -242,37 +242,46 @@ class Recording:
         convention: ConventionLike | None = None,
         unit: Unit | None = None,
         name: str = "",
+        plant: Mechanism | None = None,
     ) -> Recording:
         """Recording from a table with columns time, q1 …, and perhaps qd1 … and tau1 ….
 
         Of several joints those without a torque are undriven: theirs is zero where another has
-        one. Velocity is taken where every joint has it; other columns are ignored.
+        one. Velocity is taken where every joint has it; other columns are ignored. In place of q1
+        and tau1 the table may have motor1, the angle of the joint's motor [rad], and current1 [A],
+        which the plant's `Motor` converts.
 
         Args:
             table: a row per sample.
             columns: the table's name for ours where they differ, perhaps with its unit after a
                 colon, {"time": "t:ms", "q1": "enc_1:deg"}. Units: s, ms, us, ns; rad, mrad, deg,
                 rev, counts/8192 (any number a revolution), m, mm; these per second, rpm; N m,
-                mN m, N, mN.
+                mN m, N, mN; A, mA.
             degrees: positions and velocities without a unit are in degrees.
             convention: of the angles, such as "absolute,hanging" or ("absolute", "hanging"), an
                 `AngleConvention`, or a plant; else `table.attrs["convention"]`, else None: that
                 of the plant in whose fit or score the recording is used.
-            unit: of position; else `table.attrs["unit"]`, else rad.
+            unit: of position; else `table.attrs["unit"]`, else the plant's, else rad.
             name: of the recording.
+            plant: the mechanism, for its motors.
         Warns:
             RecordingWarning: velocity or torque of some joints only, columns that look like torque
                 and are not read; and as `Recording`.
         """
         attributes = table.attrs
         convention = attributes.get("convention") if convention is None else convention
-        arrays, slides, remarks = formats.table_arrays(table, columns, degrees=degrees)
+        arrays, slides, remarks = formats.table_arrays(
+            table,
+            columns,
+            degrees=degrees,
+            motor_factors=None if plant is None else plant.motor_factors,
+        )
         found: Unit | None = None if slides is None else "m" if slides else "rad"
         written = attributes.get("unit")
         # The file's own word for what `degrees` states.
         if degrees and written == "deg":
             written = None
-        unit = unit or written or found or "rad"
+        unit = unit or written or found or ("m" if plant and plant.unit == "m" else "rad")
         if found and found != unit:
             raise ValueError(
                 f"`unit` is {unit!r}, but the columns are in {found!r}; drop one of the two."
@@ -305,6 +314,7 @@ class Recording:
         convention: ConventionLike | None = None,
         unit: Unit | None = None,
         name: str | None = None,
+        plant: Mechanism | None = None,
     ) -> Recording:
         """Recording from a file: CSV, TSV, TXT, Parquet, NPZ, MATLAB, HDF5 or MDF4.
 
@@ -322,7 +332,7 @@ class Recording:
 
         Args:
             path: of the file.
-            columns, degrees, convention, unit, name: as for `from_pandas`.
+            columns, degrees, convention, unit, name, plant: as for `from_pandas`.
         Warns:
             RecordingWarning: a decimal sign that is guessed; and as `from_pandas`.
         Raises:
@@ -342,6 +352,7 @@ class Recording:
                 convention=convention,
                 unit=unit,
                 name=formats.stem(path) if name is None else name,
+                plant=plant,
             )
         except ValueError as error:
             reason = str(error)

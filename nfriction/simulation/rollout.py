@@ -189,4 +189,5 @@ def _as_rollout(inputs: RolloutInputs, states: tuple[Tensor, ...]) -> Rollout:
         states = tuple(x.masked_fill(lost[..., None], torch.nan) for x in states)
         count = int(lost.any(-1).sum())
         logger.warning("%d rollout(s) diverged, first at %.4g s", count, diverged_at.min())
-    return Rollout(time, *states, diverged_at)
+    q, qd, qdd = states
+    return Rollout(time, q, qd, qdd, diverged_at)

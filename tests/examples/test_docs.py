@@ -2,6 +2,7 @@
 
 import importlib
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -51,7 +52,7 @@ def test_there_are_pages_and_commands() -> None:
 def test_commands_parse(
     page: str, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = line.split()[1:]
+    words = shlex.split(line)[1:]
     if words == ["--help"]:
         return
     monkeypatch.chdir(tmp_path)

@@ -129,9 +129,14 @@ def largest_torques(joint: Sequence[Recording]) -> NDArray[np.float64]:
 
 
 def is_undriven_pendulum(plant: Plant, joint: Sequence[Recording]) -> bool:
-    """True for a chain on a fixed pivot without any torque."""
+    """True for a chain on a fixed pivot that gravity moves, without any torque."""
     fixed = isinstance(plant, PendulumChain) and not plant.first_link
-    return fixed and not largest_torques(joint).any()
+    return fixed and weighs(plant) and not largest_torques(joint).any()
+
+
+def weighs(plant: Plant) -> bool:
+    """True for a chain whose pose matters to gravity, unlike a balanced rotor's."""
+    return isinstance(plant, PendulumChain) and bool(plant.gravity_moment.any())
 
 
 def adjustable_terms(
