@@ -220,9 +220,9 @@ class TorqueFits:
         return f"<p>{head}</p>{''.join(tables)}"
 
     def plot(self) -> Figure:
-        """Friction torque over velocity with its 95 % band; see `plots.friction_table`."""
+        """Friction torque over velocity with its 95 % band; see `plots.friction_curves`."""
         # By name, because plots is a layer above this one.
-        figure: Figure = resolve_name("nfriction.plots:friction_table")(self)
+        figure: Figure = resolve_name("nfriction.plots:friction_curves")(self)
         return figure
 
     def to_dict(self) -> dict[str, Any]:

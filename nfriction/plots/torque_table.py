@@ -24,7 +24,7 @@ _POINTS = 3000  # rows that are drawn, a joint
 _BINS = 24  # of medians
 
 
-def friction_table(fits: "TorqueFits") -> Figure:
+def friction_curves(fits: "TorqueFits") -> Figure:
     """Friction torque over velocity, a panel a joint: rows, medians of bins, and the laws.
 
     Lines are the laws at the median load and without acceleration; of laws with memory, where the

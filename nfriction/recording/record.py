@@ -5,11 +5,12 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import reprlib
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, Union
 
 import numpy as np
 from numpy.typing import NDArray
@@ -360,6 +361,48 @@ class Recording:
             reason = reason if len(reason) <= 2000 else f"{reason[:1997]}..."
             raise ValueError(f"'{path}': {reason}") from error
 
+    @classmethod
+    def of(
+        cls, given: RecordingLike, *, plant: Mechanism | None = None, name: str = ""
+    ) -> Recording:
+        """A recording as it is, or read from a file or a table with columns time, q1, ….
+
+        Args:
+            given: a recording, a path, or a table.
+            plant: see `from_pandas`.
+            name: of a recording from a table.
+        Raises:
+            TypeError: for anything else; arrays are given by `Recording(time, q)`.
+        """
+        if isinstance(given, Recording):
+            return given
+        if isinstance(given, str | os.PathLike):
+            return cls.read(given, plant=plant)
+        # A table has columns and attributes; pandas is slow to import only to ask.
+        if not (hasattr(given, "columns") and hasattr(given, "attrs")):
+            raise TypeError(
+                "a recording is a Recording, the path of a file, or a table with columns time, q1, "
+                f"…, got {type(given).__name__} {reprlib.repr(given)}; `Recording(time, q)` makes "
+                "one of arrays."
+            )
+        return cls.from_pandas(given, plant=plant, name=name)
+
+    @classmethod
+    def many(
+        cls,
+        given: RecordingLike | Iterable[RecordingLike],
+        *,
+        plant: Mechanism | None = None,
+        name: str = "table",
+    ) -> list[Recording]:
+        """Recordings of one or several of what `of` takes; tables are called `name` 1, 2, …."""
+        # A path iterates over its letters, a table over its columns.
+        single = isinstance(given, Recording | str | os.PathLike) or hasattr(given, "columns")
+        listed: Iterable[Any] = [given]
+        if not single and isinstance(given, Iterable):
+            listed = given
+        return [cls.of(one, plant=plant, name=f"{name} {k}") for k, one in enumerate(listed, 1)]
+
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write to .csv, .csv.gz, .parquet or .npz atomically; `read` gives it back."""
         formats.write_table(self.to_pandas(), path)
@@ -368,6 +411,10 @@ class Recording:
         # Of many recordings the reader must know which one.
         label = f"recording '{self.name}': " if self.name else ""
         warnings.warn(f"{label}{finding}; {remedy}.", RecordingWarning, stacklevel=stacklevel)
+
+
+# Not with `|`, because pandas is slow to import.
+RecordingLike: TypeAlias = Union[Recording, str, "os.PathLike[str]", "pd.DataFrame"]
 
 
 def read_initial_states(
