@@ -178,16 +178,16 @@ def _simulate(
 def _as_rollout(inputs: RolloutInputs, states: tuple[Tensor, ...]) -> Rollout:
     """The motion with its time, NaN from where it diverged."""
     time = torch.nn.functional.pad(inputs.step, (1, 0)).cumsum_(-1)
-    diverged_at = time.new_full(states[0].shape[:-2], torch.inf)
+    q, qd, qdd = states
+    diverged_at = time.new_full(q.shape[:-2], torch.inf)
     # What is lost stays NaN, so that the last sample shows whether anything is.
-    if states[1][..., -1, :].isnan().any():
-        lost = states[1].isnan().any(-1)
+    if qd[..., -1, :].isnan().any():
+        lost = qd.isnan().any(-1)
         first = lost.to(torch.int64).argmax(-1, keepdim=True)
         at = torch.gather(time.expand(lost.shape), -1, first).squeeze(-1)
         diverged_at = torch.where(lost.any(-1), at, torch.inf)
         # Masked, since gradients of NaN would spoil those of other motions.
-        states = tuple(x.masked_fill(lost[..., None], torch.nan) for x in states)
+        q, qd, qdd = (x.masked_fill(lost[..., None], torch.nan) for x in states)
         count = int(lost.any(-1).sum())
         logger.warning("%d rollout(s) diverged, first at %.4g s", count, diverged_at.min())
-    q, qd, qdd = states
     return Rollout(time, q, qd, qdd, diverged_at)
