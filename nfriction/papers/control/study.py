@@ -158,7 +158,8 @@ def compensation_of(model: FrictionModel) -> Compensation:
         compiled = compile_function(torque, (example,) * 3)
         return lambda *given: np.reshape(compiled(*map(_rows, given)), given[0].shape)
 
-    schedule, memory = model.schedule, []
+    schedule = model.schedule
+    memory: list[Array] = []
     start = schedule.initial_state(example, example)
 
     def step(qd: Tensor, qdd: Tensor, load: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
