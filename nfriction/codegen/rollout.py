@@ -42,6 +42,8 @@ class RolloutSignals:
             are held anew at each of these steps.
         memory: memory of the coefficients after the first sample, (candidate, joint, state_size),
             one row is for all; by default that of this sample alone.
+        law_state: of a friction law with memory at the start, (candidate, joint, state), one row is
+            for all; by default zero.
     """
 
     steps: int
@@ -50,6 +52,7 @@ class RolloutSignals:
     drive: tuple[Any, Any] | None = None
     substeps: int = 1
     memory: Any = None
+    law_state: Any = None
 
 
 class Trajectories(NamedTuple):
@@ -64,6 +67,7 @@ class Trajectories(NamedTuple):
             it never was, shape (candidate,).
         jacobian: derivatives of (q, qd, qdd) after each step by what was asked for, shape
             (candidate, sample, 3 joint, direction); None where nothing was.
+        law_state: of a friction law with memory, (candidate, sample + 1, joint, state); else None.
     """
 
     q: Any
@@ -71,6 +75,7 @@ class Trajectories(NamedTuple):
     qdd: Any
     diverged_at: Any
     jacobian: Any = None
+    law_state: Any = None
 
 
 def compile_rollout(
@@ -136,7 +141,8 @@ class CompiledRollout:
         if jacobian:
             given = {name: f"p{i}" for i, name in enumerate(self.parameter_names)}
             wanted = [name if name in examples else given[name] for name in jacobian]
-            step = Program(traced.graph, traced.inputs, traced.outputs[:3])
+            last = 4 if system.law_size else 3
+            step = Program(traced.graph, traced.inputs, traced.outputs[:last])
             slopes = with_jacobian(step, wanted).outputs[-1]
         self._jacobian = slopes.shape if slopes else None
         self._traced, self._slopes = traced, slopes
@@ -146,7 +152,7 @@ class CompiledRollout:
 
     @cached_property
     def _kernel(self) -> Kernel:
-        program = arrange(self._traced, self._slopes)
+        program = arrange(self._traced, self._slopes, self._system.law_size)
         return Kernel(lambda width: RolloutDriver(program, width), LAYOUT)
 
     def source(self, width: int = 0) -> str:
@@ -166,6 +172,8 @@ class CompiledRollout:
             held = self._system.friction.coefficients(*seen)
             if self._system.remembers:
                 found["memory"] = self._system.friction.initial_state(*seen)
+        if self._system.law_size:
+            found["law"] = torch.zeros(n, self._system.law_size, dtype=torch.float64)
         step = torch.full((1,), 1e-3, dtype=torch.float64)
         return {**found, "step": step, "held": held}
 
@@ -214,6 +222,10 @@ class CompiledRollout:
         if memory is not None:
             size = getattr(self._system.friction, "state_size", 0)
             given["memory"] = rows_of("memory", memory, (n, size))
+        size = self._system.law_size
+        if size:
+            law = np.zeros((1, n, size)) if inputs.law_state is None else inputs.law_state
+            given["law"] = rows_of("law_state", law, (n, size))
         p, rows = parameter_rows(self._module, parameters or {})
         count = common_rows(rows | {name: one.rows for name, one in given.items()})
         outputs: dict[str, np.ndarray] = {
@@ -222,13 +234,18 @@ class CompiledRollout:
         outputs["diverged"] = np.empty(count, dtype=np.int64)
         if self._jacobian:
             outputs["jacobian_out"] = np.empty((count, steps, *self._jacobian))
+        if size:
+            outputs["law_out"] = np.empty((count, steps + 1, n, size))
         settings = {"samples": steps, "substeps": substeps, "driven": drive is not None,
                     "remembered": memory is not None}  # fmt: skip
         self._kernel(count, p, given, outputs, settings, threads)
-        results: list[Any] = list(outputs.values())
+        results: dict[str, Any] = dict(outputs)
         if isinstance(q0, Tensor):
-            results = [torch.from_numpy(x) for x in results]
-        return Trajectories(*results)
+            results = {name: torch.from_numpy(x) for name, x in results.items()}
+        q, qd, qdd, diverged = (results[name] for name in LAYOUT.outputs[:4])
+        return Trajectories(
+            q, qd, qdd, diverged, results.get("jacobian_out"), results.get("law_out")
+        )
 
     def check(self) -> None:
         """Compare two steps from random states with the same steps in eager torch.
@@ -262,11 +279,13 @@ class CompiledRollout:
         q, qd, tau = (x.to(self._module.device) for x in (q, qd, tau))
         plant, friction = self._system.plant, self._system.friction
         qdd, memory = plant.forward_dynamics(q, qd, tau), None
+        size = self._system.law_size
+        law = (q.new_zeros(self.joints, size),) if size else ()
         for k in range(steps):
             if not self._system.remembers:
                 held = friction.coefficients(qd, qdd)
             else:
                 memory = friction.advance(qd, qdd, memory) if k else friction.initial_state(qd, qdd)
                 held = friction.coefficients_from(qd, qdd, memory)
-            q, qd, qdd = self._system.step(plant, friction, q, qd, tau, held, dt)
+            q, qd, qdd, *law = self._system.step(plant, friction, q, qd, tau, held, dt, *law)
         return qd

@@ -95,7 +95,7 @@ def describe(model: FrictionModel, info: ModelInfo) -> dict[str, Any]:
         "law": model.law.name,
         "joints": model.joints,
         "v_smooth": model.v_smooth,
-        "options": model.schedule.options(),
+        "options": model.options(),
         "coefficients": [
             {"name": c.name, "unit": _unit(c.unit, info.unit), "positive": c.positive}
             for c in model.law.coefficients
