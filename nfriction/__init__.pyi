@@ -11,6 +11,8 @@ from .evaluation.score import Score as Score
 from .evaluation.score import score as score
 from .evaluation.sessions import SessionsResult as SessionsResult
 from .evaluation.sessions import fit_sessions as fit_sessions
+from .evaluation.torque_tables import TorqueFits as TorqueFits
+from .evaluation.torque_tables import fit_torque as fit_torque
 from .fitting.fit import fit as fit
 from .fitting.result.fit_result import FitResult as FitResult
 from .friction.models import CFM as CFM
@@ -46,6 +48,7 @@ from .plant import Rotor as Rotor
 from .plant import rigs as rigs
 from .recording import Recording as Recording
 from .recording.angles import AngleConvention as AngleConvention
+from .recording.torque_table import TorqueTable as TorqueTable
 from .simulation.rollout import Rollout as Rollout
 from .simulation.rollout import rollout as rollout
 from .version import __version__ as __version__

@@ -173,5 +173,5 @@ def _driver(program: Program, layout: Layout, width: int) -> Driver:
         rooms = (f"room.{name}" for name in (*layout.series, *layout.outputs))
         driver.call("nf_row", "own_p", "room.once", *rooms)
         for name in layout.outputs:
-            driver.scatter(name, name, sizes[name], "0", "1")
+            driver.scatter(name, sizes[name])
     return driver

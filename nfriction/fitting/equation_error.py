@@ -81,7 +81,7 @@ def _inside(time: NDArray[np.float64], edge: float) -> NDArray[np.bool_]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Balance:
+class TorqueBalance:
     """The torque balance of one recording: friction as its smoothed motion shows it.
 
     A smoother sees an acceleration, and with it the jumps of dry friction, through a low-pass
@@ -126,13 +126,15 @@ class _Balance:
         return torch.cat(parts)
 
 
-def _balance(plant: Plant, recording: Recording, motion: Motion, options: FitOptions) -> _Balance:
+def _balance(
+    plant: Plant, recording: Recording, motion: Motion, options: FitOptions
+) -> TorqueBalance:
     q, qd, qdd = (torch.as_tensor(x) for x in (motion.q, motion.qd, motion.qdd))
     tau = torch.zeros_like(q) if recording.tau is None else torch.tensor(recording.tau)
     kept = torch.as_tensor(_inside(motion.time, options.edge))[:, None].expand_as(q)
     step = float(np.median(np.diff(motion.time)))
     rate = _smoother_rate(motion)
-    found = _Balance(qd, plant.load(q, qd), tau, kept, rate, step, recording.segments)
+    found = TorqueBalance(qd, plant.load(q, qd), tau, kept, rate, step, recording.segments)
     if rate is not None and motion.std is not None:
         # A torque is held until the next sample, so it acts half a sample late.
         held = 0.5 * (tau + torch.cat([tau[:1], tau[:-1]]))
@@ -156,7 +158,7 @@ def _smoother_rate(motion: Motion) -> Tensor | None:
     return rate if bool((torch.isfinite(rate) & (rate > 0)).all()) else None
 
 
-def fit_torque(
+def fit_equation_error(
     law: Law,
     plant: Plant,
     recordings: Sequence[Recording],
@@ -182,10 +184,26 @@ def fit_torque(
             f"{names}: too few samples, {count} are left {options.edge:g} s away from the ends "
             f"for {len(law.coefficients)} coefficients a joint; record for longer."
         )
-    torque, kept = (torch.cat([getattr(p, name) for p in parts]) for name in ("torque", "kept"))
+    kept = torch.cat([p.kept for p in parts])
     # A joint that hardly ever moved has to do with what there is.
     inside = torch.cat([torch.as_tensor(_inside(m.time, options.edge)) for m in motions])
     kept = torch.where(kept.sum(0) > len(law.coefficients), kept, inside[:, None])
+    parts = [
+        replace(part, kept=rows)
+        for part, rows in zip(parts, kept.split([len(p.qd) for p in parts]), strict=True)
+    ]
+    return regress(law, parts, v_smooth, options)
+
+
+def regress(
+    law: Law, parts: Sequence[TorqueBalance], v_smooth: float, options: FitOptions = DEFAULTS
+) -> TorqueFit:
+    """Least squares of the kept samples of torque balances; see `fit_equation_error`.
+
+    Raises:
+        ValueError: if the law's torque is not finite along the motion.
+    """
+    torque, kept = (torch.cat([getattr(p, name) for p in parts]) for name in ("torque", "kept"))
     nonlinear = {i: c.initial_grid for i, c in enumerate(law.coefficients) if not c.linear}
     candidates = []
     for values in itertools.product(*nonlinear.values()):
@@ -222,7 +240,7 @@ class _Regression:
     """Residuals of torque balances as a function of all coefficients of a law."""
 
     law: Law
-    parts: Sequence[_Balance]
+    parts: Sequence[TorqueBalance]
     torque: Tensor
     kept: Tensor
     v_smooth: float
@@ -232,7 +250,7 @@ class _Regression:
         rows = []
         for part in self.parts:
 
-            def torque(values: Tensor, part: _Balance = part) -> Tensor:
+            def torque(values: Tensor, part: TorqueBalance = part) -> Tensor:
                 return self.law.torque(part.qd, part.load, values, self.v_smooth)
 
             units = torch.eye(coefficients.shape[1], dtype=coefficients.dtype)

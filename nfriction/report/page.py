@@ -166,6 +166,8 @@ _CAPTIONS = {
     "horizons_train": "Position error over the length of the simulation, training recordings",
     "positions_test_": "Measured and simulated position with the error below, test: ",
     "positions_train_": "Measured and simulated position with the error below, training: ",
+    "friction": "Friction torque over velocity: rows, their medians with quartiles in bins of "
+    "velocity, the laws, and the 95 % band of the law chosen",
     "over_time_": "Coefficients along the first training recording, models of the law: ",
     "coefficients_": "Coefficients over velocity and acceleration (hatched: no data; faded: "
     "uncertain; lines enclose 50 % and 90 % of the samples) of ",
@@ -198,21 +200,16 @@ def to_html(run: Run) -> str:
     Everything from the folder is escaped, and the page's own policy lets only its own script and
     style run.
     """
-    style, script = (
-        (_TEMPLATES / name).read_text(encoding="utf-8") for name in ("page.css", "page.js")
-    )
     comparison = run.comparison
     error = {}
     if run.best is not None:
         error = (1e3 * comparison.table(part=comparison.parts[0])["all"]).to_dict()
     info = next((info for _, info in run.models.values()), None)
-    page: str = _JINJA.get_template("page.html.j2").render(
+    return document(
+        "page.html.j2",
+        f"Friction models: {run.folder.resolve().name}",
         run=run,
-        title=f"Friction models: {run.folder.resolve().name}",
-        style=Markup(style),
-        script=Markup(script),
-        policy=_policy(style, script),
-        version=__version__,
+        run_id=run.id,
         no_friction=NO_FRICTION,
         error=error,
         info=info,
@@ -223,11 +220,26 @@ def to_html(run: Run) -> str:
             "data": _data_table(run),
             "ranges": info and _range_table(info, comparison.joint_names, comparison.unit),
         },
-        figures=_pictures(run.figures),
+        figures=pictures(run.figures),
         fit_articles=[_fit(run, name) for name in run.fits],
         fuzzy_models=list(_fuzzy_models(run)),
         commands=_commands(run),
         cards=_cards(run),
+    )
+
+
+def document(template: str, title: str, **values: Any) -> str:
+    """A page from a template of this folder, with its style, script and policy."""
+    style, script = (
+        (_TEMPLATES / name).read_text(encoding="utf-8") for name in ("page.css", "page.js")
+    )
+    page: str = _JINJA.get_template(template).render(
+        {"run_id": ""} | values,
+        title=title,
+        style=Markup(style),
+        script=Markup(script),
+        policy=_policy(style, script),
+        version=__version__,
     )
     return page.lstrip() + "\n"
 
@@ -245,7 +257,7 @@ def write_report(folder: str | Path, path: str | Path) -> Run:
     return run
 
 
-def _pictures(figures: Sequence[Figure]) -> list[dict[str, Any]]:
+def pictures(figures: Sequence[Figure]) -> list[dict[str, Any]]:
     """Figures in the order of the page as URLs, each with its twin for a dark screen if any."""
     by_name, found = {figure.name: figure for figure in figures}, []
     for figure in figures:

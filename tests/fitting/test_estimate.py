@@ -24,7 +24,7 @@ from nfriction import (
     rigs,
     rollout,
 )
-from nfriction.fitting.equation_error import fit_torque
+from nfriction.fitting.equation_error import fit_equation_error
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.fitting.strategy.continuation import HorizonResult
@@ -455,13 +455,13 @@ def misled(monkeypatch):
 
     def by_torque(law, plant, *rest):
         asked.append(plant)
-        found = fit_torque(law, plant, *rest)
+        found = fit_equation_error(law, plant, *rest)
         if len(asked) > 1:
             return found
         poor = torch.tensor(POOR, dtype=F64)[:, : found.coefficients.shape[1]]
         return replace(found, coefficients=poor)
 
-    monkeypatch.setattr("nfriction.fitting.strategy.constant.fit_torque", by_torque)
+    monkeypatch.setattr("nfriction.fitting.strategy.constant.fit_equation_error", by_torque)
     return asked
 
 
@@ -514,13 +514,13 @@ def test_a_search_in_vain_from_the_simpler_law_leaves_the_model_as_it_was(monkey
     simpler = []
 
     def by_torque(law, plant, *rest):
-        found = fit_torque(law, plant, *rest)
+        found = fit_equation_error(law, plant, *rest)
         if not simpler:
             simpler.extend([1] if law.nested_law is None else [])
             return found
         return replace(found, coefficients=torch.tensor(POOR, dtype=F64))
 
-    monkeypatch.setattr("nfriction.fitting.strategy.constant.fit_torque", by_torque)
+    monkeypatch.setattr("nfriction.fitting.strategy.constant.fit_equation_error", by_torque)
     found = fit(Stribeck(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
     assert simpler
     monkeypatch.setattr(
@@ -537,12 +537,12 @@ def test_a_law_leaves_no_more_over_than_the_simpler_one_in_it(law, monkeypatch):
     """However badly torques mislead it."""
 
     def by_torque(law, plant, *rest):
-        found = fit_torque(law, plant, *rest)
+        found = fit_equation_error(law, plant, *rest)
         if law.nested_law is None:
             return found
         return replace(found, coefficients=0 * found.coefficients + 10.0)
 
-    monkeypatch.setattr("nfriction.fitting.strategy.constant.fit_torque", by_torque)
+    monkeypatch.setattr("nfriction.fitting.strategy.constant.fit_equation_error", by_torque)
     recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH), seconds=2.0)
     simpler, found = (
         fit(of(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5, 1.0), max_steps=8)
