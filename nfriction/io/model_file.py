@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nfriction.friction import model_by_name, model_names
+from nfriction.friction import memory_names, model_by_name, model_names
 from nfriction.friction.models import FrictionModel
 from nfriction.io import strict_json
 from nfriction.io.atomic import write_atomically
@@ -211,9 +211,10 @@ def _info(content: Mapping[str, Any]) -> ModelInfo:
 
 def _named_model(content: Mapping[str, Any]) -> FrictionModel:
     name = content["model"]
-    if name not in model_names():
+    known = (*model_names(), *memory_names())
+    if name not in known:
         raise ValueError(
-            f"{_short(name)} is none of the named models ({', '.join(model_names())}); create "
+            f"{_short(name)} is none of the named models ({', '.join(known)}); create "
             "the model yourself and pass it as `into`."
         )
     make = model_by_name(name)
@@ -240,9 +241,11 @@ def _check_same_model(content: Mapping[str, Any], model: FrictionModel) -> None:
 def _check_torque(model: FrictionModel, state: Mapping[str, Tensor]) -> None:
     """Refuse finite parameters whose exponentials overflow."""
     qd, qdd, load = torch.tensor([[0.0, 0.5], [0.0, 0.0], [1.0, 1.0]], dtype=torch.float64)
-    inputs = tuple(x[:, None].expand(-1, model.joints) for x in (qd, qdd, load))
+    qd, qdd, load = (x[:, None].expand(-1, model.joints) for x in (qd, qdd, load))
+    own = {name.removeprefix("schedule."): value for name, value in state.items()}
     with torch.no_grad():
-        torque = torch.func.functional_call(model, dict(state), inputs)
+        coefficients = torch.func.functional_call(model.schedule, own, (qd, qdd))
+        torque = model.law.torque(qd, load, coefficients, model.v_smooth)
     if not torque.isfinite().all():
         raise ValueError("with its parameters the model gives no finite torque.")
 
