@@ -37,7 +37,7 @@ def add_fit(commands: argparse._SubParsersAction[Parser], common: Parser) -> Non
     parser.add_argument("recordings", nargs="+", type=inputs.file, metavar="RECORDING",
                         help=f"with columns time, q1, ... ({inputs.FORMATS})")  # fmt: skip
     parser.add_argument("--model", type=inputs.model, default="neuro-fuzzy:load-coulomb",
-                        help=inputs.MODELS)  # fmt: skip
+                        help=f"{inputs.MODELS}; or my.py:LAW, a law of your own")  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path("model.json"), help="model file to write")
     inputs.add_fit_options(parser)
     parser.set_defaults(run=run_fit)
@@ -63,7 +63,8 @@ def add_comparison_options(parser: argparse.ArgumentParser) -> None:
     """Options of `compare` and `demo`."""
     add = parser.add_argument
     add("--models", type=inputs.models, default=inputs.DEFAULT_MODELS,
-        help=f"with commas between them: {inputs.MODELS}")  # fmt: skip
+        help=f"with commas between them: {inputs.MODELS}; or my.py:LAW, a law of your own"
+        )  # fmt: skip
     add("--out", type=Path, default=Path("runs/compare"), help="folder to write")
     add("--initial-states", type=inputs.file, metavar="FILE",
         help="table with columns id, q0_1, qd0_1, ... of the recordings' initial states (default: "
@@ -141,6 +142,7 @@ def compare_and_report(
     selection = None
     with exclusive(arguments.out), _log(arguments.log_file) as logger, Progress(logger) as progress:
         settings = settings | {"progress": progress, "jobs": arguments.jobs}
+        progress.expect(1)
         logger.info(arguments.command_line)
         if arguments.select:
             selection = select(plant, arguments.models, train, **settings)
@@ -206,9 +208,10 @@ def _conclusion(comparison: Comparison) -> str:
     end = f"with the friction learnt ({plain_name(best)}) they miss it by {shown[1]}"
     if not math.isfinite(without):
         return f"Without friction, simulations of the test recordings diverge;\n{end}."
+    less = 100 * (1 - learnt / without)
     return (
         f"Without friction, simulations of the test recordings miss the measured motion by "
-        f"{shown[0]};\n{end}, {100 * (1 - learnt / without):.3g} % less."
+        f"{shown[0]};\n{end}, {less:.{3 if less < 99.95 else 4}g} % less."  # never quite all
     )
 
 

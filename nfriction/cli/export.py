@@ -10,7 +10,7 @@ from nfriction.cli.inputs import seconds
 
 if TYPE_CHECKING:
     from nfriction.friction.models import FrictionModel
-    from nfriction.io.model_info import ModelInfo
+    from nfriction.io.model_file import ModelInfo
 
 EXAMPLE = """example:
   nfriction export model.json --format torchscript,c --out artefacts"""
@@ -57,6 +57,7 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
     group.add_argument("--columns", type=inputs.columns, metavar="OURS=THEIRS,...",
                        help="the recordings' names of time, q1, ..., tau1, ... where they differ, "
                        "e.g. time=t,q1=enc_1,q2=enc_2")  # fmt: skip
+    inputs.add_law_option(parser)
     parser.set_defaults(run=run)
 
 

@@ -21,9 +21,8 @@ from nfriction.evaluation.cross_validation import Selection
 from nfriction.evaluation.score import Score
 from nfriction.export import ExportError, torchscript
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.io.atomic import write_atomically
-from nfriction.io.model_file import save
-from nfriction.io.model_info import ModelInfo, parameter_hash
+from nfriction.io.files import write_atomically
+from nfriction.io.model_file import ModelInfo, parameter_hash, save
 from nfriction.recording import Recording
 
 logger = logging.getLogger(__name__)

@@ -262,7 +262,8 @@ def _corrected_terms(
         x = _amount(plant, {"armature": unit}, given)
         if x > options.ratio_term[0] * float(own["armature"][j]):
             armature = own["armature"] + x * unit
-            text = f"{name} has a rotor inertia (`armature`) of {float(armature[j]):.3g} kg m^2"
+            seen = f"of {float(armature[j]):.3g} kg m^2 seen at the joint"
+            text = f"{name} has a rotor inertia {seen} (`armature`, or that of its `motor`)"
             yield text, plant.replace(armature=armature)
 
 

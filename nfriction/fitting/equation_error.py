@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -48,7 +48,8 @@ class TorqueFit:
             torque is not linear, (start, joint, coefficient).
         information: of the data about each joint's coefficients, (joint, coefficient,
             coefficient), with residuals inflated for autocorrelation.
-        outliers: samples that a robust loss counts less than half.
+        weight: of each sample under a robust loss, (sample, joint).
+        outliers: samples that it counts less than half.
     """
 
     coefficients: Tensor
@@ -56,6 +57,7 @@ class TorqueFit:
     torque: Tensor
     starts: Tensor = field(default_factory=lambda: torch.zeros(0, 0, 0, dtype=torch.float64))
     information: Tensor = field(default_factory=lambda: torch.zeros(0, 0, 0, dtype=torch.float64))
+    weight: Tensor = field(default_factory=lambda: torch.zeros(0, 0, dtype=torch.float64))
     outliers: tuple[Outliers, ...] = ()
 
 
@@ -96,7 +98,7 @@ def _inside(time: NDArray[np.float64], edge: float) -> NDArray[np.bool_]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Balance:
+class TorqueBalance:
     """The torque balance of one recording: friction as its smoothed motion shows it.
 
     A smoother sees an acceleration, and with it the jumps of dry friction, through a low-pass
@@ -141,13 +143,15 @@ class _Balance:
         return torch.cat(parts)
 
 
-def _balance(plant: Plant, recording: Recording, motion: Motion, options: FitOptions) -> _Balance:
+def _balance(
+    plant: Plant, recording: Recording, motion: Motion, options: FitOptions
+) -> TorqueBalance:
     q, qd, qdd = (torch.as_tensor(x) for x in (motion.q, motion.qd, motion.qdd))
     tau = torch.zeros_like(q) if recording.tau is None else torch.tensor(recording.tau)
     kept = torch.as_tensor(_inside(motion.time, options.edge))[:, None].expand_as(q)
     step = float(np.median(np.diff(motion.time)))
     rate = _smoother_rate(motion)
-    found = _Balance(qd, plant.load(q, qd), tau, kept, rate, step, recording.segments)
+    found = TorqueBalance(qd, plant.load(q, qd), tau, kept, rate, step, recording.segments)
     if rate is not None and motion.std is not None:
         # A torque is held until the next sample, so it acts half a sample late.
         held = 0.5 * (tau + torch.cat([tau[:1], tau[:-1]]))
@@ -171,7 +175,7 @@ def _smoother_rate(motion: Motion) -> Tensor | None:
     return rate if bool((torch.isfinite(rate) & (rate > 0)).all()) else None
 
 
-def fit_torque(
+def fit_equation_error(
     law: Law,
     plant: Plant,
     recordings: Sequence[Recording],
@@ -198,10 +202,29 @@ def fit_torque(
             f"{names}: too few samples, {count} are left {options.edge:g} s away from the ends "
             f"for {len(law.coefficients)} coefficients a joint; record for longer."
         )
-    torque, kept = (torch.cat([getattr(p, name) for p in parts]) for name in ("torque", "kept"))
+    kept = torch.cat([p.kept for p in parts])
     # A joint that hardly ever moved has to do with what there is.
     inside = torch.cat([torch.as_tensor(_inside(m.time, options.edge)) for m in motions])
     kept = torch.where(kept.sum(0) > len(law.coefficients), kept, inside[:, None])
+    parts = [
+        replace(part, kept=rows)
+        for part, rows in zip(parts, kept.split([len(p.qd) for p in parts]), strict=True)
+    ]
+    found = regress(law, parts, v_smooth, options)
+    weights = zip(recordings, found.weight.split([len(r) for r in recordings]), strict=True)
+    named = (outlier for r, weight in weights for outlier in named_outliers(r, weight.numpy()))
+    return replace(found, outliers=tuple(named))
+
+
+def regress(
+    law: Law, parts: Sequence[TorqueBalance], v_smooth: float, options: FitOptions = DEFAULTS
+) -> TorqueFit:
+    """Least squares of the kept samples of torque balances; see `fit_equation_error`.
+
+    Raises:
+        ValueError: if the law's torque is not finite along the motion.
+    """
+    torque, kept = (torch.cat([getattr(p, name) for p in parts]) for name in ("torque", "kept"))
     regression = _Regression(law, parts, torque, kept, kept.to(torque), v_smooth, options)
     coefficients, starts = regression.solve()
     if options.loss != "linear":
@@ -221,7 +244,7 @@ def fit_torque(
             slopes[:, j].T @ slopes[:, j] / _effective_variance(error[kept[:, j], j])
             for j in range(len(many))
         ]),
-        tuple(regression.outliers(recordings)),
+        weight=torch.where(kept, regression.root.square(), 1.0),
     )  # fmt: skip
 
 
@@ -238,7 +261,7 @@ class _Regression:
     """
 
     law: Law
-    parts: Sequence[_Balance]
+    parts: Sequence[TorqueBalance]
     torque: Tensor
     kept: Tensor
     root: Tensor
@@ -272,20 +295,12 @@ class _Regression:
             root[rows, j] = loss_weight(found, scale, loss)[:, 0].sqrt()
         return replace(self, root=root)
 
-    def outliers(self, recordings: Sequence[Recording]) -> Iterator[Outliers]:
-        """Samples with little weight, in the recordings of these balances."""
-        weight = torch.where(self.kept, self.root.square(), 1.0)
-        for recording, part in zip(
-            recordings, weight.split([len(r) for r in recordings]), strict=True
-        ):
-            yield from named_outliers(recording, part.numpy())
-
     def linearised(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """Slopes (sample, joint, coefficient) and residuals (sample, joint); 0 if left out."""
         rows = []
         for part in self.parts:
 
-            def torque(values: Tensor, part: _Balance = part) -> Tensor:
+            def torque(values: Tensor, part: TorqueBalance = part) -> Tensor:
                 return self.law.torque(part.qd, part.load, values, self.v_smooth)
 
             units = torch.eye(coefficients.shape[1], dtype=coefficients.dtype)

@@ -14,6 +14,7 @@ order. The next step is `nfriction.fitting.shooting.problem`, the cost of the se
 import pkgutil
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from torch import Tensor
 
@@ -24,6 +25,7 @@ from nfriction.fitting.data.checks import (
 )
 from nfriction.fitting.data.inputs import (
     advanced_torques,
+    as_model,
     as_recording_list,
     in_joint_coordinates,
     largest_torques,
@@ -42,8 +44,8 @@ from nfriction.fitting.options import (
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Step
-from nfriction.plant import PendulumChain, Plant
-from nfriction.recording import Recording
+from nfriction.plant import PendulumChain, Plant, rigs
+from nfriction.recording import Recording, RecordingLike
 from nfriction.signals import Motion
 
 Callback = Callable[[str, Step], bool | None]
@@ -83,9 +85,9 @@ class FitTask:
 
 
 def fit(
-    model: FrictionModel,
-    plant: Plant,
-    recordings: Recording | Iterable[Recording],
+    model: FrictionModel | str,
+    plant: Plant | str | Path,
+    recordings: RecordingLike | Iterable[RecordingLike],
     *,
     method: Method = "output_error",
     windows: Sequence[float] = FitOptions.windows,
@@ -112,9 +114,10 @@ def fit(
     constant fit, too; `fit_adaptive` has its further settings.
 
     Args:
-        model: the model to fit; changed in place.
-        plant: the mechanism as given.
-        recordings: one or several, all in one convention; by default in the plant's.
+        model: the model to fit, changed in place; or the name of one, such as "coulomb-viscous".
+        plant: the mechanism as given, its name, or the path of a rig file.
+        recordings: one or several, paths of files, or tables with columns time, q1, …; all in one
+            convention, by default the plant's.
         method: `"equation_error"` stops after the regression (constant coefficients only).
         windows: lengths of the shooting windows [s], in the order in which they are used.
         fit_plant: adjust ratios of inertia and gravity terms, lengths and offsets, within bounds.
@@ -160,27 +163,35 @@ def fit(
         eccentricity, encoder_reference, continuity, max_steps, loss, fit_delay,
     )  # fmt: skip
     task = prepare_task(model, plant, recordings, options, start, motions, callback)
-    if not model.schedule.fit_strategy:
-        raise ValueError(f"cannot fit coefficients of type {type(model.schedule).__name__}.")
-    if method == "equation_error" and model.schedule.follows_motion:
+    schedule = task.model.schedule
+    if not schedule.fit_strategy:
+        raise ValueError(f"cannot fit coefficients of type {type(schedule).__name__}.")
+    if method == "equation_error" and schedule.follows_motion:
         raise ValueError(
             'adaptive and neuro-fuzzy models need `method="output_error"`, simulated windows.'
         )
-    strategy: Callable[[FitTask], FitResult] = pkgutil.resolve_name(model.schedule.fit_strategy)
+    strategy: Callable[[FitTask], FitResult] = pkgutil.resolve_name(schedule.fit_strategy)
     return strategy(task).with_warnings(task.data_warnings, task.mistakes)
 
 
 def prepare_task(
-    model: FrictionModel,
-    plant: Plant,
-    recordings: Recording | Iterable[Recording],
+    model: FrictionModel | str,
+    plant: Plant | str | Path,
+    recordings: RecordingLike | Iterable[RecordingLike],
     options: FitOptions,
     start: FitResult | None = None,
     motions: Sequence[Motion] | None = None,
     callback: Callback | None = None,
 ) -> FitTask:
     """Check and convert the arguments of a fit; see `fit`."""
-    given = as_recording_list(model, plant, recordings)
+    plant = rigs.of(plant)
+    model = as_model(model, plant.joints)
+    given = as_recording_list(recordings, plant)
+    if model.law.memory:
+        raise ValueError(
+            f"the law {model.law.name!r} has an internal state, which fits do not follow yet; fit "
+            "a law without memory, such as Stribeck."
+        )
     joint = in_joint_coordinates(plant, model, given)
     if options.eccentricity == "on" and not isinstance(plant, PendulumChain):
         raise ValueError(f"{plant.name or 'the axis'} has no encoders that turn with its joints.")

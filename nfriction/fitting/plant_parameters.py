@@ -124,8 +124,12 @@ def _chain_terms(
     def coupled(*pairs: tuple[int, int]) -> dict[str, Tensor]:
         return _at(buffers, "inertia_coupling", *pairs, *((j, i) for i, j in pairs))
 
+    weight = bool(buffers["gravity_moment"].any())
     for i in range(links):
-        yield from _ratio(buffers, f"inertia {i + 1}{i + 1}", coupled((i, i)), options.ratio_term)
+        # Without torque and gravity, the inertia is the scale of the friction.
+        if driven or weight:
+            name = f"inertia {i + 1}{i + 1}"
+            yield from _ratio(buffers, name, coupled((i, i)), options.ratio_term)
     # The off-diagonal inertia a_ij = L_i b_j shares the first moment b_j with gravity, so both
     # scale together.
     for j in range(0 if driven else 1, links):
@@ -136,7 +140,7 @@ def _chain_terms(
         yield from _ratio(buffers, f"length {i + 1}", carried, options.length_term)
     joints = buffers["angle_offset"].shape[-1]
     bound, sd = options.angle_term
-    for j in range(joints - links, joints):
+    for j in range(joints - links, joints) if weight else ():
         unit = _at(buffers, "angle_offset", j)
         yield PlantParameter(f"angle offset {j + 1} [rad]", unit, -bound, bound, sd)
 

@@ -59,6 +59,7 @@ class FrictionModel(nn.Module):
         self.v_smooth = positive_number("v_smooth", v_smooth, "rad/s")
         self.joints = schedule.joints
         self.state_size = schedule.state_size
+        self.law_state_size = law.state_size
         # TorchScript compiles a function held as an attribute; it would refuse the Law itself.
         self.law_torque = law.torque
 
@@ -75,7 +76,7 @@ class FrictionModel(nn.Module):
             raise ValueError(
                 f"`qd` must be (*batch, joint) with {self.joints} joints, got last axis {width}."
             )
-        return self.law_torque(qd, load, self.schedule(qd, qdd), self.v_smooth)
+        return self.torque(qd, load, self.schedule(qd, qdd))
 
     # A simulation takes the torque in two steps: coefficients at a sample, which it then holds, and
     # the torque of these at every stage of an integration step.
@@ -97,7 +98,16 @@ class FrictionModel(nn.Module):
         return self.schedule.coefficients_from(qd, qdd, state)
 
     def torque(self, qd: Tensor, load: Tensor, coefficients: Tensor) -> Tensor:
-        """Friction torque for given coefficients."""
+        """Friction torque for given coefficients.
+
+        Raises:
+            ValueError: of a law with memory, whose torque depends on the motion before.
+        """
+        if self.law_state_size:
+            raise ValueError(
+                "the friction law has an internal state, so there is no torque of a velocity "
+                "alone: advance `law.memory` over the samples, or simulate with `rollout`."
+            )
         return self.law_torque(qd, load, coefficients, self.v_smooth)
 
     def zero_velocity_damping(self) -> Tensor:

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from nfriction.codegen.rollout_program import SPEED_LIMIT
 from nfriction.simulation.protocols import (
     Friction,
     Plant,
@@ -126,6 +127,10 @@ def simulate_eager(
             )
         states.append((q, qd, qdd))
     shape = states[-1][0].shape
-    return tuple(
+    q, qd, qdd = (
         torch.stack([x.expand(shape) for x in one], -2) for one in zip(*states, strict=True)
     )
+    # NaN from where a motion is lost to the end, as compiled code writes it.
+    fine = (torch.isfinite(q) & (qd.abs() < SPEED_LIMIT)).all(-1, keepdim=True)
+    lost = ~fine.cumprod(-2).bool()
+    return tuple(x.masked_fill(lost, torch.nan) for x in (q, qd, qdd))

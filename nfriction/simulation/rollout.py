@@ -13,7 +13,6 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from nfriction.codegen.rollout_program import SPEED_LIMIT
 from nfriction.simulation.adjoint import adjoint_rollout, own_tensors
 from nfriction.simulation.compiled import Backend, System, integrate_compiled, wants_compiled
 from nfriction.simulation.protocols import Friction, NoFriction, Plant, RolloutInputs
@@ -179,26 +178,16 @@ def _simulate(
 def _as_rollout(inputs: RolloutInputs, states: tuple[Tensor, ...]) -> Rollout:
     """The motion with its time, NaN from where it diverged."""
     time = torch.nn.functional.pad(inputs.step, (1, 0)).cumsum_(-1)
-    q, qd, qdd = states
-    diverged_at = _divergence(time, q, qd)
-    if torch.isfinite(diverged_at).any():
-        lost = (time >= diverged_at[..., None])[..., None]
-        q, qd, qdd = (x.masked_fill(lost, torch.nan) for x in states)
-    return Rollout(time, q, qd, qdd, diverged_at)
-
-
-@torch.no_grad()
-def _divergence(time: Tensor, q: Tensor, qd: Tensor) -> Tensor:
-    """Time of the first sample that is not finite or beyond any speed, infinity where none."""
-    # Positions are finite while velocities are; a NaN fails every comparison.
-    low, high = map(float, qd.aminmax() if qd.numel() else (0.0, 0.0))
-    if -SPEED_LIMIT < low <= high < SPEED_LIMIT:
-        return time.new_full(q.shape[:-2], torch.inf)
-    lost = ~(torch.isfinite(q) & (qd.abs() < SPEED_LIMIT)).all(-1)
-    first = lost.to(torch.int64).argmax(-1, keepdim=True)
-    at = torch.gather(time.expand(lost.shape), -1, first).squeeze(-1)
-    diverged_at = torch.where(lost.any(-1), at, torch.inf)
-    count = int(lost.any(-1).sum())
-    if count:
+    diverged_at = time.new_full(states[0].shape[:-2], torch.inf)
+    # What is lost stays NaN, so that the last sample shows whether anything is.
+    if states[1][..., -1, :].isnan().any():
+        lost = states[1].isnan().any(-1)
+        first = lost.to(torch.int64).argmax(-1, keepdim=True)
+        at = torch.gather(time.expand(lost.shape), -1, first).squeeze(-1)
+        diverged_at = torch.where(lost.any(-1), at, torch.inf)
+        # Masked, since gradients of NaN would spoil those of other motions.
+        states = tuple(x.masked_fill(lost[..., None], torch.nan) for x in states)
+        count = int(lost.any(-1).sum())
         logger.warning("%d rollout(s) diverged, first at %.4g s", count, diverged_at.min())
-    return diverged_at
+    q, qd, qdd = states
+    return Rollout(time, q, qd, qdd, diverged_at)

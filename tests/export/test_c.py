@@ -22,7 +22,7 @@ from nfriction.friction import model_by_name, model_names
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.models import FrictionModel
-from nfriction.io.model_info import ModelInfo
+from nfriction.io.model_file import ModelInfo
 from tests.export.artefacts import Rising
 from tests.friction.samples import randomise
 

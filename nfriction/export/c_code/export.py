@@ -26,8 +26,8 @@ from nfriction.export.contract import (
 )
 from nfriction.export.controller import controller_of
 from nfriction.friction.models import FrictionModel
-from nfriction.io.atomic import write_atomically
-from nfriction.io.model_info import ModelInfo
+from nfriction.io.files import write_atomically
+from nfriction.io.model_file import ModelInfo
 
 # How much more a controller may err that rounds motions between filter and model.
 ROUNDED = 5.0

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.data.inputs import adjustable_terms, advanced_torques
-from nfriction.fitting.equation_error import TorqueFit, fit_torque, prior_sd
+from nfriction.fitting.equation_error import TorqueFit, fit_equation_error, prior_sd
 from nfriction.fitting.fit import FitTask
 from nfriction.fitting.options import Continuity, FitOptions
 from nfriction.fitting.plant_parameters import TORQUE_DELAY, PlantParameter
@@ -90,7 +90,9 @@ def fit_constant(task: FitTask) -> FitResult:
 def regression(task: FitTask, model: FrictionModel, plant: Plant) -> TorqueFit:
     """Constant coefficients that torques imply on a plant."""
     recordings = advanced_torques(task.recordings, task.delay)
-    return fit_torque(model.law, plant, recordings, task.motions, model.v_smooth, task.options)
+    return fit_equation_error(
+        model.law, plant, recordings, task.motions, model.v_smooth, task.options
+    )
 
 
 def _fitter(

@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 from tqdm import tqdm
 
 from nfriction.evaluation.score import RMSE, Score
-from nfriction.io.atomic import atomic_write
+from nfriction.io.files import atomic_write
 from nfriction.io.model_file import load
 from nfriction.papers.controller.mamdani import paper_controller
 from nfriction.papers.controller.rules import Variable
@@ -218,8 +218,8 @@ def second_torque(workspace: Workspace) -> Figure:
 
 
 def _experiment_motion(workspace: Workspace) -> Motion:
-    parts = workspace.bench("tlrip").parts()
-    return next(m for _, r, m in parts if r.name == EXPERIMENT)
+    (motion,) = workspace.bench(EXPERIMENT).motions
+    return motion
 
 
 def experiment(workspace: Workspace) -> Figure:
