@@ -12,12 +12,7 @@ from torch import Tensor
 
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.result.identifiability import NORMAL_95
-from nfriction.fitting.robust_loss import (
-    Outliers,
-    loss_weight,
-    named_outliers,
-    robust_scale,
-)
+from nfriction.fitting.robust_loss import Outliers, RobustLoss, named_outliers
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Law
@@ -289,10 +284,10 @@ class _Regression:
         error = replace(self, root=self.kept.to(self.root)).linearised(coefficients)[1]
         root = torch.zeros_like(error)
         for j, (rows, of_joint) in enumerate(zip(self.kept.T, error.T, strict=True)):
-            found, loss = of_joint[rows, None], self.options.loss
-            least = ROUNDING * float(self.torque[rows, j].abs().max())
-            scale = robust_scale(found, loss, max(least, self.options.min_noise))
-            root[rows, j] = loss_weight(found, scale, loss)[:, 0].sqrt()
+            found, least = of_joint[rows, None], ROUNDING * float(self.torque[rows, j].abs().max())
+            least = max(least, self.options.min_noise)
+            loss = RobustLoss.of_errors(self.options.loss, found, least)
+            root[rows, j] = loss.weight(found)[:, 0].sqrt()
         return replace(self, root=root)
 
     def linearised(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:

@@ -138,12 +138,14 @@ class ShootingFitter:
         `tolerance` is the relative decrease of the cost that counts as none, `name` the stage's for
         the callback. A robust loss without a scale gets that of the errors in the end.
         """
-        if self.options.loss == "linear" or problem.loss_scale is not None:
+        if self.options.loss == problem.loss.name:
             return self._minimise(problem, start, tolerance, name)
         found = self._minimise(problem.rescaled(start), start, tolerance, name)
         for _ in range(self.options.most_scales - 1):
             again = found.problem.rescaled(found.result.x)
-            if found.stopped or again.has_scale_of(found.problem):
+            if found.stopped or again.loss.is_near(
+                found.problem.loss, self.options.scale_tolerance
+            ):
                 break
             found = self._minimise(again, found.result.x, tolerance, name)
         return found
