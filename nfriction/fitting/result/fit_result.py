@@ -330,8 +330,8 @@ def result_from_shooting(
     encoder_count = plant.position_quantum or observed_count(
         problem.windows.q @ problem.measurement.T
     )
-    residuals, weights = problem.errors(x), problem.weights(x)
-    counted = problem.counted_errors(x)
+    residuals = problem.errors(x)
+    weights, counted = problem.loss.weight(residuals), problem.loss.counted(residuals)
     residual = float(counted.square().mean().sqrt())
     outliers = tuple(outliers_of(problem, weights))
     intervals, unidentifiable, root = _identifiability(
@@ -370,7 +370,7 @@ def result_from_shooting(
 
 def outliers_of(problem: ShootingProblem, weights: Tensor) -> Iterator[Outliers]:
     """Samples that a robust loss counts less than half, by recording."""
-    if problem.loss_scale is None:
+    if problem.loss.name == "linear":
         return
     windows = problem.windows
     for place, recording in enumerate(windows.recordings):
