@@ -27,7 +27,6 @@ from nfriction.fitting.result.identifiability import information
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.strategy.continuation import log_ratio, settle_states, student_quantile
 from nfriction.optim import bounded_qp
-from nfriction.optim.linear_algebra import solve_free
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
@@ -104,7 +103,7 @@ class Correction:
     def squares(self, x: Tensor) -> Tensor:
         """Squared error of each window, (window,)."""
         least = self.problem.options.min_noise
-        found = self.problem.errors(x).square().clamp_min(least**2).sum((1, 2))
+        found = self.problem.counted_errors(x).square().clamp_min(least**2).sum((1, 2))
         return found.nan_to_num(math.inf, math.inf)
 
     def quadratic(self, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -194,7 +193,7 @@ def judge(corrections: Sequence[Correction]) -> Judgement | None:
     options = corrections[0].problem.options
     if not (slope.isfinite().all() and curvature.isfinite().all()):
         return Judgement(none, math.inf, math.inf, 0, options=options)
-    solve = partial(solve_free, blocks=None)
+    solve = partial(bounded_qp.solve_free, blocks=None)
     free = torch.ones(joints, dtype=torch.bool)
     shares = 1.0 + bounded_qp.minimise(curvature, slope, -full, none, free, solve)
     blind = [replace(c, friction=c.friction.where(~c.direction, 0.0)) for c in corrections]
