@@ -239,7 +239,9 @@ class _Dictionary:
         speeds = np.abs(joint.qd).max() * np.array(VELOCITIES)
         ratio = joint.qd[:, None] / speeds
         scaled = [np.tanh(ratio), z[:, :1] * np.exp(-(ratio**2)), z]
-        rest = np.exp(-np.cumsum(np.abs(path_of(joint))) / fading)
+        # A rest adds to the friction that holds the joint, and so has the elements' sign.
+        held = float(np.sign(z[0].sum())) or float(np.sign(joint.tau[0]))
+        rest = held * np.exp(-np.cumsum(np.abs(path_of(joint))) / fading)
         plain = np.stack([np.ones_like(load), joint.qd, np.abs(joint.qd), rest], 1)
         whole = np.concatenate([plain, *(load[:, None] * x for x in scaled)], 1)
         assert joint.time is not None
@@ -343,12 +345,19 @@ def _weights(gram: Array, right: Array, shape: _Shape) -> Array:
     scale[scale <= 0] = 1.0
     a = gram / scale[:, None] / scale + shape.ridge * np.eye(len(right))
     if not shape.positive:
-        return np.linalg.solve(a, right / scale) / scale
+        weights: Array = np.linalg.solve(a, right / scale) / scale
+        place = REST - (not shape.asymmetric)
+        if shape.rested and weights[place] < 0:
+            rest = np.arange(len(right)) == place
+            weights[rest] = 0.0
+            weights[~rest] = np.linalg.solve(a[~rest][:, ~rest], (right / scale)[~rest])
+            weights[~rest] /= scale[~rest]
+        return weights
     from scipy.optimize import nnls  # slow to import
 
     root = np.linalg.cholesky(a).T
-    # Offset, asymmetry and excess may have either sign: their columns once more, reversed.
-    free = [0, *range(2, 2 + shape.asymmetric + shape.rested)]
+    # Offset and asymmetry may have either sign: their columns once more, reversed.
+    free = [0, 2] if shape.asymmetric else [0]
     target = np.linalg.solve(root.T, right / scale)
     both, _ = nnls(np.c_[root, -root[:, free]], target, maxiter=50 * len(right))
     solution = both[: len(right)]
