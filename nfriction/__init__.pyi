@@ -1,4 +1,5 @@
 # Each public name once; `nfriction/__init__.py` imports it lazily from the module given here.
+from . import datasets as datasets
 from . import export as export
 from . import plots as plots
 from .evaluation.compare import Comparison as Comparison
@@ -27,11 +28,11 @@ from .friction.neurofuzzy import NFLFM as NFLFM
 from .friction.neurofuzzy import NFNCFM as NFNCFM
 from .friction.neurofuzzy import NFNLFM as NFNLFM
 from .friction.neurofuzzy import NFStribeck as NFStribeck
+from .io.model_file import ModelInfo as ModelInfo
 from .io.model_file import load as load
 from .io.model_file import load_info as load_info
 from .io.model_file import load_plant as load_plant
 from .io.model_file import save as save
-from .io.model_info import ModelInfo as ModelInfo
 from .papers.afem.adaptive import ACFM as ACFM
 from .papers.afem.adaptive import ACVFM as ACVFM
 from .papers.afem.adaptive import ALFM as ALFM
@@ -40,8 +41,10 @@ from .papers.afem.adaptive import ANLFM as ANLFM
 from .papers.afem.fit_adaptive import fit_adaptive as fit_adaptive
 from .papers.afem.fit_by_search import fit_by_search as fit_by_search
 from .plant import LinearAxis as LinearAxis
+from .plant import Motor as Motor
 from .plant import PendulumChain as PendulumChain
 from .plant import Plant as Plant
+from .plant import Rotor as Rotor
 from .plant import rigs as rigs
 from .recording import Recording as Recording
 from .recording.angles import AngleConvention as AngleConvention

@@ -30,9 +30,8 @@ from nfriction.fitting.torque_table import (
 )
 from nfriction.friction import model_by_name, model_name, plain_name
 from nfriction.friction.models import FrictionModel
-from nfriction.io import strict_json
-from nfriction.io.model_file import load, load_info
-from nfriction.io.model_info import ModelInfo
+from nfriction.io.files import parse_json
+from nfriction.io.model_file import ModelInfo, load, load_info
 from nfriction.recording import Unit
 from nfriction.recording.torque_table import JointTorque, TorqueTable, as_table, blocks
 
@@ -48,6 +47,9 @@ LAWS = ("viscous", "coulomb", "coulomb-viscous", "arctan", "stribeck")
 WITH_TIME = ("slip",)
 WITH_LOAD = ("load-coulomb",)
 WITH_BOTH = ("load-slip",)
+# Standard deviations of a network's prior over its own, of which blocks left out choose. No network
+# first: it is kept only where it lowers the error.
+PRIOR_SHARES = (0.0, 1.0, 1 / 3)
 
 
 class TorqueScore(NamedTuple):
@@ -353,8 +355,7 @@ def _fit(
             "its law, or its neuro-fuzzy model."
         )
     require_load(name, joint)
-    # No network first: it is kept only where it lowers the error.
-    shares = (0.0, *options.prior_shares) if form == "neurofuzzy" else (0.0,)
+    shares = PRIOR_SHARES if form == "neurofuzzy" else (0.0,)
     errors = np.zeros((len(shares), folds))
     for k, test in enumerate(blocks(joint, folds)):
         rest = joint.rows(np.setdiff1d(np.arange(len(joint)), test))
@@ -415,7 +416,7 @@ def read_models(path: str | Path) -> list[SavedModel]:
         return _saved(path)
     index = path / RESULTS
     try:
-        content = strict_json.parse(index.read_text(encoding="utf-8"))
+        content = parse_json(index.read_text(encoding="utf-8"))
         chosen = {str(joint): model_name(of["model"]) for joint, of in content["chosen"].items()}
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise ValueError(

@@ -9,7 +9,7 @@ from nfriction.evaluation.results import REPORT, RESULTS, TABLE, exclusive
 from nfriction.evaluation.tables import Table, Value
 from nfriction.evaluation.torque_tables import TorqueFits
 from nfriction.friction import plain_name
-from nfriction.io.atomic import write_atomically
+from nfriction.io.files import write_atomically
 from nfriction.io.model_file import save
 from nfriction.plots.saving import DPI
 from nfriction.plots.style import DARK_GROUND, for_dark_screen
