@@ -212,8 +212,10 @@ def with_fitted_offsets(found: FitResult, blocks: Sequence[TimeBlock]) -> list[T
 def block_errors(found: FitResult, blocks: Sequence[TimeBlock], horizon: float) -> list[float]:
     """Root mean square position error of simulations of `horizon` seconds over each block."""
     return [
-        score(found.plant, found.model, block.recording, horizons=(horizon,), limit=False)
-        .windows[f"{horizon:g}"].all
+        score(
+            found.plant, found.model, found.aligned(block.recording), horizons=(horizon,),
+            limit=False,
+        ).windows[f"{horizon:g}"].all
         for block in with_fitted_offsets(found, blocks)
     ]  # fmt: skip
 
@@ -245,8 +247,7 @@ def choose(candidates: Sequence[Candidate], unit: str = "rad") -> tuple[str, str
     """
 
     def error(candidate: Candidate) -> str:
-        value = candidate.error
-        return f"{1e3 * value:.3g} m{unit}" if value < 1 else f"{value:.4g} {unit}"
+        return f"{1e3 * candidate.error:.3g} m{unit}"
 
     best = min(candidates, key=lambda c: c.error)
     if not math.isfinite(best.error):
