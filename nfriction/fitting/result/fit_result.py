@@ -149,7 +149,8 @@ class FitResult:
         if times > DOUBTFUL_RATIO:
             reasons.append(far)
         if self.unidentifiable:
-            reasons.append(f"the data do not determine {len(self.unidentifiable)} parameters")
+            count = len(self.unidentifiable)
+            reasons.append(f"the data do not determine {count} parameter{'s' * (count > 1)}")
         return ("doubtful", "; ".join(reasons)) if reasons else ("good", "")
 
     @property
