@@ -37,6 +37,7 @@ DEFAULT_MODELS = "viscous,load-coulomb,arctan,neuro-fuzzy:load-coulomb"
 # Of `nfriction.fit`; where an option is not given, its own default.
 _FIT_OPTIONS = (
     "windows", "fit_plant", "drag", "eccentricity", "encoder_reference", "continuity", "max_steps",
+    "loss", "fit_delay",
 )  # fmt: skip
 
 
@@ -203,6 +204,11 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
         )  # fmt: skip
     add("--max-steps", type=count, default=30, metavar="N",
         help="limit of search steps at each window length (default: 30)")  # fmt: skip
+    add("--loss", choices=CHOICES["loss"], default="linear",
+        help="loss of an error: linear for least squares; the others count spikes of a sensor less "
+        "and name them (default: linear)")  # fmt: skip
+    add("--fit-delay", action="store_true",
+        help="estimate by how much torques are recorded later than positions")  # fmt: skip
 
 
 def fit_settings(arguments: argparse.Namespace) -> dict[str, Any]:

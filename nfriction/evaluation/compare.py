@@ -340,7 +340,8 @@ def compare(
             if recordings:
                 scores[part][name] = [
                     score(
-                        found.plant if found else plant, found.model if found else None, recording,
+                        found.plant if found else plant, found.model if found else None,
+                        found.aligned(recording) if found else recording,
                         initial_state=states.get(recording.name), horizons=horizons,
                     )
                     for recording in recordings

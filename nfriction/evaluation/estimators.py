@@ -191,7 +191,8 @@ class FrictionEstimator(BaseEstimator):
             sample, NaN from where the simulation diverged: `Recording.to_pandas` of the
             recording has the same columns.
         """
-        (given,) = _recordings(recording, self.plant_)
+        (read,) = _recordings(recording, self.plant_)
+        given = self._fitted.aligned(read)
         run = score(self.plant_, self.model_, given, horizons=(), limit=False)
         table = given.to_pandas()[["time", *(f"q{k + 1}" for k in range(given.joints))]]
         table.iloc[:, 1:] = run.simulated
@@ -211,7 +212,8 @@ class FrictionEstimator(BaseEstimator):
         errors = []
         for recording in _recordings(X, self.plant_):
             horizon = min(self.horizon, longest_window(recording))
-            found = score(self.plant_, self.model_, recording, horizons=(horizon,), limit=False)
+            aligned = self._fitted.aligned(recording)
+            found = score(self.plant_, self.model_, aligned, horizons=(horizon,), limit=False)
             errors.append(found.windows[f"{horizon:g}"].all)
         return -math.sqrt(sum(e * e for e in errors) / len(errors))
 

@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -12,6 +12,12 @@ from torch import Tensor
 
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.result.identifiability import NORMAL_95
+from nfriction.fitting.robust_loss import (
+    Outliers,
+    loss_weight,
+    named_outliers,
+    robust_scale,
+)
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Law
@@ -21,6 +27,13 @@ from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
+
+# A robust loss is minimised by least squares with weights from the residuals before, so many times
+# or until no coefficient moves by more than this share of the largest.
+REWEIGHTINGS = 30
+SETTLED = 1e-4
+# Scatter of a torque that is rounding, over the torque.
+ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -35,6 +48,7 @@ class TorqueFit:
             torque is not linear, (start, joint, coefficient).
         information: of the data about each joint's coefficients, (joint, coefficient,
             coefficient), with residuals inflated for autocorrelation.
+        outliers: samples that a robust loss counts less than half.
     """
 
     coefficients: Tensor
@@ -42,6 +56,7 @@ class TorqueFit:
     torque: Tensor
     starts: Tensor = field(default_factory=lambda: torch.zeros(0, 0, 0, dtype=torch.float64))
     information: Tensor = field(default_factory=lambda: torch.zeros(0, 0, 0, dtype=torch.float64))
+    outliers: tuple[Outliers, ...] = ()
 
 
 def friction_torque(
@@ -170,7 +185,8 @@ def fit_equation_error(
 
     Linear least squares within bounds where the torque is linear in the coefficients, for every
     combination of the law's initial values of the others, which are then refined. Samples whose
-    direction of motion is uncertain are left out. Recordings and motions are in joint coordinates.
+    direction of motion is uncertain are left out. A robust loss weighs the squares. Recordings and
+    motions are in joint coordinates.
 
     Raises:
         ValueError: if there are too few samples, or the law's torque is not finite along the
@@ -192,30 +208,32 @@ def fit_equation_error(
         replace(part, kept=rows)
         for part, rows in zip(parts, kept.split([len(p.qd) for p in parts]), strict=True)
     ]
-    return regress(law, parts, v_smooth, options)
+    return regress(law, parts, v_smooth, options, recordings)
 
 
 def regress(
-    law: Law, parts: Sequence[TorqueBalance], v_smooth: float, options: FitOptions = DEFAULTS
+    law: Law,
+    parts: Sequence[TorqueBalance],
+    v_smooth: float,
+    options: FitOptions = DEFAULTS,
+    recordings: Sequence[Recording] = (),
 ) -> TorqueFit:
     """Least squares of the kept samples of torque balances; see `fit_equation_error`.
+
+    Samples that a robust loss weighs little are named by the `recordings` of the parts, if given.
 
     Raises:
         ValueError: if the law's torque is not finite along the motion.
     """
     torque, kept = (torch.cat([getattr(p, name) for p in parts]) for name in ("torque", "kept"))
-    nonlinear = {i: c.initial_grid for i, c in enumerate(law.coefficients) if not c.linear}
-    candidates = []
-    for values in itertools.product(*nonlinear.values()):
-        fixed = dict(zip(nonlinear, values, strict=True))
-        design = torch.cat([p.smoothed(_design(law, p.qd, p.load, v_smooth, fixed)) for p in parts])
-        candidates.append(_linear_fit(law, design, torque, kept, fixed, options.ridge))
-    starts, residuals = (torch.stack(x) for x in zip(*candidates, strict=True))
-    best = residuals.argmin(0)
-    coefficients = starts[best, torch.arange(len(best))]
-    regression = _Regression(law, parts, torque, kept, v_smooth)
-    if any(c.fitted for c in law.coefficients if not c.linear):
-        coefficients = regression.refined(coefficients)
+    regression = _Regression(law, parts, torque, kept, kept.to(torque), v_smooth, options)
+    coefficients, starts = regression.solve()
+    if options.loss != "linear":
+        for _ in range(REWEIGHTINGS):
+            before, regression = coefficients, regression.reweighted(coefficients)
+            coefficients, starts = regression.solve()
+            if (coefficients - before).abs().max() <= SETTLED * coefficients.abs().max():
+                break
     slopes, error = regression.linearised(coefficients)
     many = kept.sum(0)
     return TorqueFit(
@@ -227,6 +245,7 @@ def regress(
             slopes[:, j].T @ slopes[:, j] / _effective_variance(error[kept[:, j], j])
             for j in range(len(many))
         ]),
+        tuple(regression.outliers(recordings)) if recordings else (),
     )  # fmt: skip
 
 
@@ -237,13 +256,53 @@ def _effective_variance(error: Tensor) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Regression:
-    """Residuals of torque balances as a function of all coefficients of a law."""
+    """Residuals of torque balances as a function of all coefficients of a law.
+
+    `root` is the square root of each sample's weight, 0 where it is not `kept`, (sample, joint).
+    """
 
     law: Law
     parts: Sequence[TorqueBalance]
     torque: Tensor
     kept: Tensor
+    root: Tensor
     v_smooth: float
+    options: FitOptions
+
+    def solve(self) -> tuple[Tensor, Tensor]:
+        """The best coefficients, and those at each combination of initial values."""
+        law, candidates = self.law, []
+        nonlinear = {i: c.initial_grid for i, c in enumerate(law.coefficients) if not c.linear}
+        for values in itertools.product(*nonlinear.values()):
+            fixed = dict(zip(nonlinear, values, strict=True))
+            columns = [_design(law, p.qd, p.load, self.v_smooth, fixed) for p in self.parts]
+            design = torch.cat([p.smoothed(c) for p, c in zip(self.parts, columns, strict=True)])
+            candidates.append(self._linear_fit(design, fixed))
+        starts, residuals = (torch.stack(x) for x in zip(*candidates, strict=True))
+        best = residuals.argmin(0)
+        coefficients = starts[best, torch.arange(len(best))]
+        if any(c.fitted for c in law.coefficients if not c.linear):
+            coefficients = self.refined(coefficients)
+        return coefficients, starts
+
+    def reweighted(self, coefficients: Tensor) -> "_Regression":
+        """The same with the weights of the robust loss at the residuals of these coefficients."""
+        error = replace(self, root=self.kept.to(self.root)).linearised(coefficients)[1]
+        root = torch.zeros_like(error)
+        for j, (rows, of_joint) in enumerate(zip(self.kept.T, error.T, strict=True)):
+            found, loss = of_joint[rows, None], self.options.loss
+            least = ROUNDING * float(self.torque[rows, j].abs().max())
+            scale = robust_scale(found, loss, max(least, self.options.min_noise))
+            root[rows, j] = loss_weight(found, scale, loss)[:, 0].sqrt()
+        return replace(self, root=root)
+
+    def outliers(self, recordings: Sequence[Recording]) -> Iterator[Outliers]:
+        """Samples with little weight, in the recordings of these balances."""
+        weight = torch.where(self.kept, self.root.square(), 1.0)
+        for recording, part in zip(
+            recordings, weight.split([len(r) for r in recordings]), strict=True
+        ):
+            yield from named_outliers(recording, part.numpy())
 
     def linearised(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """Slopes (sample, joint, coefficient) and residuals (sample, joint); 0 if left out."""
@@ -260,8 +319,8 @@ class _Regression:
             ]
             values = torch.stack([pairs[0][0], *(pair[1] for pair in pairs)], -1)
             rows.append(part.smoothed(values))
-        found = torch.where(self.kept[..., None], torch.cat(rows), 0.0)
-        return found[..., 1:], found[..., 0] - torch.where(self.kept, self.torque, 0.0)
+        found = self.root[..., None] * torch.where(self.kept[..., None], torch.cat(rows), 0.0)
+        return found[..., 1:], found[..., 0] - self.root * torch.where(self.kept, self.torque, 0.0)
 
     def refined(self, coefficients: Tensor) -> Tensor:
         """The coefficients at the minimum next to these, within the bounds of a fit."""
@@ -276,6 +335,32 @@ class _Regression:
         solver = LevenbergMarquardt(cost_tolerance=1e-12)
         found = solver.minimise(model, coefficients.reshape(-1), lower=lower, upper=upper)
         return found.x.reshape(coefficients.shape)
+
+    def _linear_fit(self, design: Tensor, fixed: dict[int, float]) -> tuple[Tensor, Tensor]:
+        """Coefficients (joint, coefficient) and residual (joint,), the nonlinear ones given."""
+        from scipy.optimize import lsq_linear  # slow to import
+
+        law, joints = self.law, self.torque.shape[1]
+        linear = [i for i, c in enumerate(law.coefficients) if c.linear]
+        lower = [0.0 if law.coefficients[i].positive else -np.inf for i in linear]
+        coefficients = torch.zeros(joints, len(law.coefficients), dtype=self.torque.dtype)
+        for k, value in fixed.items():
+            coefficients[:, k] = value
+        residual = torch.zeros(joints, dtype=self.torque.dtype)
+        for joint in range(joints):
+            rows = self.kept[:, joint]
+            root = self.root[rows, joint]
+            a = (root[:, None] * design[rows, joint]).numpy()
+            y = (root * self.torque[rows, joint]).numpy()
+            # Columns of unit length, as coefficients differ by orders of magnitude.
+            scale = np.linalg.norm(a, axis=0)
+            scale[scale == 0] = 1.0
+            system = np.concatenate([a / scale, self.options.ridge * np.eye(len(linear))])
+            target = np.concatenate([y, np.zeros(len(linear))])
+            solution = lsq_linear(system, target, bounds=(lower, np.inf), tol=1e-12).x / scale
+            coefficients[joint, linear] = torch.as_tensor(solution)
+            residual[joint] = float(np.sqrt(np.mean((a @ solution - y) ** 2)))
+        return coefficients, residual
 
 
 def _design(law: Law, qd: Tensor, load: Tensor, v_smooth: float, fixed: dict[int, float]) -> Tensor:
@@ -297,38 +382,6 @@ def _design(law: Law, qd: Tensor, load: Tensor, v_smooth: float, fixed: dict[int
             "must be a finite number."
         )
     return design
-
-
-def _linear_fit(
-    law: Law,
-    design: Tensor,
-    torque: Tensor,
-    kept: Tensor,
-    fixed: dict[int, float],
-    ridge: float,
-) -> tuple[Tensor, Tensor]:
-    """Coefficients (joint, coefficient) and residual (joint,), the nonlinear ones given."""
-    from scipy.optimize import lsq_linear  # slow to import
-
-    linear = [i for i, c in enumerate(law.coefficients) if c.linear]
-    lower = [0.0 if law.coefficients[i].positive else -np.inf for i in linear]
-    joints = torque.shape[1]
-    coefficients = torch.zeros(joints, len(law.coefficients), dtype=torque.dtype)
-    for k, value in fixed.items():
-        coefficients[:, k] = value
-    residual = torch.zeros(joints, dtype=torque.dtype)
-    for joint in range(joints):
-        rows = kept[:, joint]
-        a, y = design[rows, joint].numpy(), torque[rows, joint].numpy()
-        # Columns of unit length, as coefficients differ by orders of magnitude.
-        scale = np.linalg.norm(a, axis=0)
-        scale[scale == 0] = 1.0
-        system = np.concatenate([a / scale, ridge * np.eye(len(linear))])
-        target = np.concatenate([y, np.zeros(len(linear))])
-        solution = lsq_linear(system, target, bounds=(lower, np.inf), tol=1e-12).x / scale
-        coefficients[joint, linear] = torch.as_tensor(solution)
-        residual[joint] = float(np.sqrt(np.mean((a @ solution - y) ** 2)))
-    return coefficients, residual
 
 
 def coefficient_scale(

@@ -24,18 +24,21 @@ from nfriction.fitting.data.checks import (
     looks_zeroed_per_recording,
 )
 from nfriction.fitting.data.inputs import (
+    advanced_torques,
     as_model,
     as_recording_list,
     in_joint_coordinates,
+    largest_torques,
     measurement_matrix,
     smoothed_motions,
 )
-from nfriction.fitting.diagnosis import likely_mistakes, mistake_warning
+from nfriction.fitting.diagnosis import balanced_delay, likely_mistakes, mistake_warning
 from nfriction.fitting.options import (
     Continuity,
     Eccentricity,
     EncoderReference,
     FitOptions,
+    Loss,
     Method,
 )
 from nfriction.fitting.result.fit_result import FitResult
@@ -62,6 +65,7 @@ class FitTask:
         start: an earlier fit to start from.
         callback: called with a stage name after every step; True stops.
         per_recording: whether encoders were set to zero at the start of each recording.
+        delay: of the torque after the positions by the balance of torques [s]; 0 unless fitted.
         data_warnings: warnings about the recordings.
         mistakes: likely mistakes in recordings or plant.
     """
@@ -75,6 +79,7 @@ class FitTask:
     start: FitResult | None = None
     callback: Callback | None = None
     per_recording: bool = False
+    delay: float = 0.0
     data_warnings: tuple[str, ...] = ()
     mistakes: tuple[str, ...] = ()
 
@@ -94,6 +99,8 @@ def fit(
     start: FitResult | None = None,
     motions: Sequence[Motion] | None = None,
     max_steps: int = 30,
+    loss: Loss = "linear",
+    fit_delay: bool = False,
     callback: Callback | None = None,
 ) -> FitResult:
     """Estimate a friction model from recordings.
@@ -135,6 +142,12 @@ def fit(
             for the plant's terms.
         motions: smoothed motions in joint coordinates, to save smoothing again.
         max_steps: limit of steps at each window length.
+        loss: `"linear"` for least squares, or a robust loss by SciPy's names, `"soft_l1"`,
+            `"huber"` or `"cauchy"`, for logs with spikes: errors beyond about the normal scatter
+            count less, and `FitResult.outliers` names the samples. Its scale comes from the
+            median error of each joint.
+        fit_delay: also estimate by how much torques are recorded later than positions, one delay
+            for all (`FitResult.torque_delay`, with an interval), as a bus or a filter causes it.
         callback: called with a stage name after every step; True stops.
 
     Returns:
@@ -147,7 +160,7 @@ def fit(
     """
     options = FitOptions(
         method, windows, fit_plant, drag,
-        eccentricity, encoder_reference, continuity, max_steps,
+        eccentricity, encoder_reference, continuity, max_steps, loss, fit_delay,
     )  # fmt: skip
     task = prepare_task(model, plant, recordings, options, start, motions, callback)
     schedule = task.model.schedule
@@ -189,7 +202,13 @@ def prepare_task(
         found = (ZEROED_PER_RECORDING,) if per_recording else ()
     moved = smoothed_motions(joint, motions)
     convention = given[0].resolve_convention(plant)
-    stated, mistakes = likely_mistakes(plant, joint, moved, convention, options)
+    delay = 0.0
+    if options.fit_delay:
+        if not largest_torques(joint).any():
+            raise ValueError("`fit_delay=True` needs recordings with torques, got none.")
+        delay, _ = balanced_delay(plant, joint, moved, options)
+    advanced = advanced_torques(joint, delay)
+    stated, mistakes = likely_mistakes(plant, advanced, moved, convention, options)
     found = (
         *mistake_warning(stated, mistakes),
         *found,
@@ -206,6 +225,7 @@ def prepare_task(
         start,
         callback,
         per_recording,
+        delay,
         found,
         tuple(m.text for m in mistakes),
     )

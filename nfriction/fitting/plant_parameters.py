@@ -13,6 +13,8 @@ from torch import Tensor, nn
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.plant import Plant
 
+TORQUE_DELAY = "torque delay [s]"
+
 
 @dataclass(frozen=True)
 class PlantParameter:
@@ -21,7 +23,7 @@ class PlantParameter:
     Attributes:
         name: as in reports.
         change: of the plant's buffers per unit, each in the shape of its buffer; of a ratio, 1 at
-            the entries that it scales.
+            the entries that it scales. Empty for the delay of the torque.
         lower, upper: bounds.
         prior_sd: standard deviation of the prior around 0.
         ratio: whether it scales its entries, rather than adding to them.
@@ -100,6 +102,17 @@ def plant_parameters(
                 name = f"encoder {part} {j + 1} [rad]"
                 found.append(PlantParameter(name, unit, -bound, bound, sd))
     return found
+
+
+def torque_delay_term(options: FitOptions = DEFAULTS) -> PlantParameter:
+    """Time by which torques are recorded later than positions."""
+    most = options.largest_delay
+    return PlantParameter(TORQUE_DELAY, {}, -most, most, options.delay_sd)
+
+
+def delay_index(terms: Sequence[PlantParameter]) -> int | None:
+    """Place of the torque's delay among the terms; None where it is not fitted."""
+    return next((i for i, term in enumerate(terms) if term.name == TORQUE_DELAY), None)
 
 
 def _chain_terms(

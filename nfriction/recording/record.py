@@ -197,8 +197,13 @@ class Recording:
             raise ValueError(f"{self.name or 'the recording'} has no torque to advance.")
         at = self.time + delay
         known = (at >= self.time[0]) & (at <= self.time[-1])
-        tau = np.stack([np.interp(at, self.time, column) for column in self.tau.T], 1)
-        return self._replace(tau=tau)[known]
+        return self._replace(tau=self.torque_at(at))[known]
+
+    def torque_at(self, time: Array) -> Array:
+        """Torque between samples by interpolation, held beyond the ends, (time, joint)."""
+        if self.tau is None:
+            return np.zeros((len(time), self.joints))
+        return np.stack([np.interp(time, self.time, column) for column in self.tau.T], 1)
 
     def digest(self) -> str:
         """SHA-256 of the content in hexadecimal: arrays, joint names, convention and unit."""

@@ -23,6 +23,7 @@ from nfriction.export.controller import (
 )
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
+from nfriction.plant import Plant
 
 # An exponential that compilers vectorise: that of `math.h` is a call for every number, this one a
 # loop over an array without branches or tables.
@@ -46,9 +47,15 @@ _NOWHERE = 1e3
 
 
 def source_of(
-    controller: Controller, description: Mapping[str, Any], dialect: ControllerC, name: str
+    controller: Controller,
+    description: Mapping[str, Any],
+    dialect: ControllerC,
+    name: str,
+    plant: Plant | None = None,
 ) -> tuple[str, str]:
     """Texts of a controller's `.c` and `.h`; the description is for the header's comment.
+
+    With a plant, and a law that reads the load, they have a function of the plant's load.
 
     Raises:
         ExportError: if the law or schedule uses an operation that has no C form, or a number of
@@ -62,6 +69,7 @@ def source_of(
         "state_size": controller.memory_size,
         "filter_size": FILTER_STATE if controller.filters else 0,
         "filter": controller,
+        "load": plant is not None and _reads_load(controller.model),
         "bits": description["status_bits"],
         # Names and units are foreign text.
         "about": description,
@@ -69,6 +77,7 @@ def source_of(
     }
     try:
         with torch.no_grad():
+            words["load_of"] = _load(plant, dialect) if plant and words["load"] else ""
             body = dialect.text("controller.c", **words, **_words(controller, dialect))
     except (UnsupportedOperation, ValueError) as error:
         raise ExportError(f"the model has no C form: {error}") from error
@@ -315,6 +324,25 @@ def _same_by_joint(one: Program, every: Program, joints: int) -> bool:
 
 def _depends(node: Node, name: str) -> bool:
     return any(n.op == "input" and n.value[0] == name for n in reachable([node]))
+
+
+def _reads_load(model: FrictionModel) -> bool:
+    given = {"qd": _example(1), "load": _example(1), "c": _example(1, len(model.law.names))}
+    (torque,) = trace(lambda qd, load, c: model.torque(qd, load, c), given).outputs[0].nodes
+    return _depends(torque, "load")
+
+
+def _load(plant: Plant, dialect: ControllerC) -> str:
+    """Statements that compute the load of each joint of a plant."""
+    program = trace(plant.load, {"q": _example(plant.joints), "qd": _example(plant.joints)})
+    bound = {
+        node.number: f"{port.name}[{i}]"
+        for port in program.inputs
+        for i, node in enumerate(port.nodes)
+    }
+    targets = [f"load[{j}]" for j in range(plant.joints)]
+    lines = _assignments(targets, program.outputs[0].nodes, bound, dialect)
+    return _braces([*lines, "(void)q;", "(void)qd;"], "")
 
 
 def _schedule(controller: Controller, dialect: ControllerC) -> str:

@@ -12,7 +12,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nfriction.fitting.options import DEFAULTS, FitOptions
-from nfriction.fitting.plant_parameters import PlantParameter, plant_parameters
+from nfriction.fitting.plant_parameters import (
+    PlantParameter,
+    plant_parameters,
+    torque_delay_term,
+)
 from nfriction.friction import model_by_name
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import PendulumChain, Plant
@@ -152,10 +156,12 @@ def adjustable_terms(
 ) -> list[PlantParameter]:
     """Terms of the plant that a fit adjusts; `drag=None` includes drag for undriven pendulums.
 
-    If encoders have an offset `per_recording`, the plant's would only be the mean of these.
+    If encoders have an offset `per_recording`, the plant's would only be the mean of these. The
+    torque's delay comes last.
     """
+    delay = [torque_delay_term(options)] if options.fit_delay else []
     if not options.fit_plant:
-        return []
+        return delay
     largest = largest_torques(joint)
     # Over spans that are long against a step of the encoder.
     spans = [max(1, len(r) // 200) for r in joint]
@@ -169,7 +175,14 @@ def adjustable_terms(
         drag=is_undriven_pendulum(plant, joint) if options.drag is None else options.drag,
         eccentricity=eccentric, options=options,
     )  # fmt: skip
-    return [t for t in terms if not (per_recording and "angle_offset" in t.change)]
+    return [t for t in terms if not (per_recording and "angle_offset" in t.change)] + delay
+
+
+def advanced_torques(recordings: Sequence[Recording], delay: float) -> list[Recording]:
+    """Recordings of equal length with the torque recorded `delay` [s] later; held at the ends."""
+    if not delay:
+        return list(recordings)
+    return [r if r.tau is None else r._replace(tau=r.torque_at(r.time + delay)) for r in recordings]
 
 
 def apply_encoder_offsets(

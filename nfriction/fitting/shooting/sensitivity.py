@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from nfriction import codegen
-from nfriction.fitting.plant_parameters import PlantParameter, adjusted_plant
+from nfriction.fitting.plant_parameters import PlantParameter, adjusted_plant, delay_index
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.parameters import Sensitivity
 from nfriction.plant import Plant
@@ -49,9 +49,11 @@ class StepJacobian:
     ) -> None:
         self.plant, self.friction, self.terms = plant, friction, tuple(terms)
         self._compiled: codegen.CompiledFunction | None = None
+        self.delay_index = delay_index(self.terms)
         joints, k = plant.joints, len(friction.law.coefficients)
+        torques = joints if self.delay_index is None else 2 * joints
         generator = torch.Generator().manual_seed(0)
-        shapes = ((joints,), (joints,), (joints, k), (joints,), (1,), (len(terms),))
+        shapes = ((joints,), (joints,), (joints, k), (torques,), (1,), (len(terms),))
         example = [
             scale * torch.rand(shape, generator=generator, dtype=torch.float64)
             for shape, scale in zip(shapes, (1.0, 1.0, 1e-2, 1.0, 1e-3, 1e-2), strict=True)
@@ -66,7 +68,8 @@ class StepJacobian:
     ) -> Tensor:
         """Derivatives of (q, qd, qdd) after a step, (sample, 3 joint, direction).
 
-        Directions: q, qd, held coefficients (joint-major), plant terms.
+        Directions: q, qd, held coefficients (joint-major), plant terms. Where the torque's delay is
+        one of the terms, `tau` is the torque at no delay, then its slope over the delay.
         """
         if self._compiled is not None:
             given = (q, qd, held, tau, step, vector[None])
@@ -84,7 +87,8 @@ class StepJacobian:
         """
 
         def acceleration(q: Tensor, qd: Tensor, vector: Tensor, tau: Tensor) -> Tensor:
-            return adjusted_plant(self.plant, self.terms, vector).forward_dynamics(q, qd, tau)
+            plant = adjusted_plant(self.plant, self.terms, vector)
+            return plant.forward_dynamics(q, qd, self._torque(tau, vector))
 
         slope = torch.func.vmap(torch.func.jacfwd(acceleration, (0, 1, 2)), (0, 0, None, 0))
         return torch.cat(slope(q, qd, vector, tau), -1)
@@ -94,15 +98,24 @@ class StepJacobian:
     ) -> Tensor:
         """State after one step, (*batch, 3 joint)."""
         plant = adjusted_plant(self.plant, self.terms, vector)
-        return torch.cat(rk4_step(plant, self.friction, q, qd, tau, held, step), -1)
+        torque = self._torque(tau, vector)
+        return torch.cat(rk4_step(plant, self.friction, q, qd, torque, held, step), -1)
+
+    def _torque(self, tau: Tensor, vector: Tensor) -> Tensor:
+        k = self.delay_index
+        if k is None:
+            return tau
+        at_none, slope = tau.chunk(2, -1)
+        return at_none + vector[..., k : k + 1] * slope
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """Simulated windows with their friction model and plant terms.
 
-    `motion` is (window, step + 1, joint), `tau` (window, step, joint), `step` (window, step). The
-    `memory` of the coefficients (window, step, joint, state_size) is held constant in derivatives.
+    `motion` is (window, step + 1, joint), `tau` (window, step, any) as `StepJacobian` takes it,
+    `step` (window, step). The `memory` of the coefficients (window, step, joint, state_size) is
+    held constant in derivatives.
     """
 
     friction: FrictionModel

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.fitting.data.inputs import adjustable_terms
+from nfriction.fitting.data.inputs import adjustable_terms, advanced_torques
 from nfriction.fitting.equation_error import TorqueFit, fit_equation_error, prior_sd
 from nfriction.fitting.fit import FitTask
 from nfriction.fitting.options import Continuity, FitOptions
-from nfriction.fitting.plant_parameters import PlantParameter
+from nfriction.fitting.plant_parameters import TORQUE_DELAY, PlantParameter
 from nfriction.fitting.result.fit_result import (
     FitResult,
     result_from_equation_error,
@@ -57,7 +57,7 @@ def fit_constant(task: FitTask) -> FitResult:
     eccentric = fits_eccentricity(options, start)
     fitter = _fitter(task, model, torque, eccentric)
     friction = torque.coefficients.reshape(-1)
-    plant = known_terms(start, fitter.jacobian.terms)
+    plant = known_terms(start, fitter.jacobian.terms, task.delay)
     linear = all(c.linear or not c.fitted for c in model.law.coefficients)
     search = horizon_continuation(
         fitter, friction, plant, task.motions, None if linear else equation_error
@@ -89,8 +89,9 @@ def fit_constant(task: FitTask) -> FitResult:
 
 def regression(task: FitTask, model: FrictionModel, plant: Plant) -> TorqueFit:
     """Constant coefficients that torques imply on a plant."""
+    recordings = advanced_torques(task.recordings, task.delay)
     return fit_equation_error(
-        model.law, plant, task.recordings, task.motions, model.v_smooth, task.options
+        model.law, plant, recordings, task.motions, model.v_smooth, task.options
     )
 
 
@@ -119,9 +120,13 @@ def constant_prior(
     return torch.zeros_like(sd), sd
 
 
-def known_terms(start: FitResult | None, terms: Sequence[PlantParameter]) -> Tensor:
-    """Plant terms of an earlier fit by name, 0 where it has none, (term,)."""
-    known = {name: value for name, value, _ in start.plant_terms} if start else {}
+def known_terms(
+    start: FitResult | None, terms: Sequence[PlantParameter], delay: float = 0.0
+) -> Tensor:
+    """Plant terms of an earlier fit by name, 0 where it has none but for the delay, (term,)."""
+    known = {TORQUE_DELAY: delay}
+    if start is not None:
+        known |= {name: value for name, value, _ in start.plant_terms}
     return torch.tensor([known.get(t.name, 0.0) for t in terms], dtype=torch.float64)
 
 

@@ -38,8 +38,8 @@ class HorizonResult:
 
     @cached_property
     def residuals(self) -> Tensor:
-        """Position errors [rad; m], (window, step + 1, joint)."""
-        return self.problem.errors(self.result.x)
+        """Position errors as the loss counts them [rad; m], (window, step + 1, joint)."""
+        return self.problem.counted_errors(self.result.x)
 
     @property
     def rms(self) -> float:
@@ -136,8 +136,21 @@ class ShootingFitter:
         """Minimise a problem of this fitter.
 
         `tolerance` is the relative decrease of the cost that counts as none, `name` the stage's for
-        the callback.
+        the callback. A robust loss without a scale gets that of the errors in the end.
         """
+        if self.options.loss == "linear" or problem.loss_scale is not None:
+            return self._minimise(problem, start, tolerance, name)
+        found = self._minimise(problem.rescaled(start), start, tolerance, name)
+        for _ in range(self.options.most_scales - 1):
+            again = found.problem.rescaled(found.result.x)
+            if found.stopped or again.has_scale_of(found.problem):
+                break
+            found = self._minimise(again, found.result.x, tolerance, name)
+        return found
+
+    def _minimise(
+        self, problem: ShootingProblem, start: Tensor, tolerance: float, name: str
+    ) -> HorizonResult:
         solver = LevenbergMarquardt(
             max_steps=self.options.max_steps,
             gradient_tolerance=self.options.gradient_tolerance,
@@ -345,7 +358,7 @@ def _squares(at: HorizonResult, of: HorizonResult) -> Tensor:
         return of.residuals.square().sum((1, 2))
     count = at.problem.variables.shared_count
     x, _ = settle_states(at.problem, torch.cat([of.result.x[:count], at.result.x[count:]]))
-    return at.problem.errors(x).square().sum((1, 2))
+    return at.problem.counted_errors(x).square().sum((1, 2))
 
 
 def log_ratio(new: Tensor, old: Tensor) -> tuple[float, float]:

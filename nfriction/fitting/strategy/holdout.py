@@ -85,5 +85,5 @@ def holdout_rmse(
     x, stopped = settle_states(judged, judged.variables.start(plant, friction=friction))
     if stopped:
         return None
-    error = float(judged.errors(x).square().mean().sqrt())
+    error = float(judged.counted_errors(x).square().mean().sqrt())
     return max(error, problem.options.min_noise) if math.isfinite(error) else math.inf

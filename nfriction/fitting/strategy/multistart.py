@@ -74,8 +74,9 @@ def best_of_starts(
     noise = max(min(size for size in sizes if math.isfinite(size)), options.min_noise)
     implied = equation_error(own.problem.plant_at(nested.parts.plant))[0]
     embedded = embed_nested(law, nested.parts.friction.reshape(len(implied), -1), implied)
-    best, lowest = own, _misfit(own, noise) if same else math.inf
-    limit = _misfit(nested, noise)
+    scale = own.problem.loss_scale
+    best, lowest = own, _misfit(own, noise, scale) if same else math.inf
+    limit = _misfit(nested, noise, scale)
     tolerance = loglik_tolerance(min(lowest, limit), options)
     for coefficients in (implied, embedded):
         if coefficients is embedded and lowest <= limit:
@@ -84,7 +85,7 @@ def best_of_starts(
         start = problem.variables.start(nested.parts.plant, nested.parts.offsets)
         name = f"from the {nested.problem.friction.law.name} law"
         found = fitter.search(problem, start, tolerance, name)
-        misfit = _misfit(found, noise)
+        misfit = _misfit(found, noise, scale)
         surer = found.result.converged and not best.result.converged
         if misfit < lowest * (1 - tolerance) or (surer and misfit < lowest * (1 + tolerance)):
             best, lowest = found, misfit
@@ -114,8 +115,12 @@ def _windows_from(found: HorizonResult) -> Windows:
     return replace(windows, q0=q0, qd0=qd0)
 
 
-def _misfit(found: HorizonResult, noise: float) -> float:
-    """Half the sum of squares of residuals and defects; infinite where the motion diverged."""
-    defects = 0.5 * float(found.problem.defects(found.result.x).square().sum())
-    misfit = weighted_cost(found.residuals, noise) + defects
+def _misfit(found: HorizonResult, noise: float, loss_scale: Tensor | None) -> float:
+    """Half the sum of squares of residuals and defects; infinite where the motion diverged.
+
+    Residuals count by a robust loss of the same scale in all that are compared.
+    """
+    problem, x = replace(found.problem, loss_scale=loss_scale), found.result.x
+    defects = 0.5 * float(problem.defects(x).square().sum())
+    misfit = weighted_cost(problem.counted_errors(x), noise) + defects
     return misfit if math.isfinite(misfit) else math.inf

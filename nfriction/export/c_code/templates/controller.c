@@ -48,6 +48,12 @@ void nf_init(nf_state *state, const nf_real qd[NF_JOINTS], const nf_real qdd[NF_
 }
 
 {% endif %}
+{% if load %}
+void nf_load(
+    const nf_real q[NF_JOINTS], const nf_real qd[NF_JOINTS], nf_real load[NF_JOINTS])
+{{ load_of }}
+
+{% endif %}
 void nf_step(
 {% if state_size %}
     nf_state *state,
