@@ -532,7 +532,7 @@ def test_a_search_in_vain_from_the_simpler_law_leaves_the_model_as_it_was(monkey
     assert found.residual == alone.residual
 
 
-@pytest.mark.parametrize("law", [Stribeck, NLFM])
+@pytest.mark.parametrize("law", [Stribeck, pytest.param(NLFM, marks=pytest.mark.slow)])
 def test_a_law_leaves_no_more_over_than_the_simpler_one_in_it(law, monkeypatch):
     """However badly torques mislead it."""
 
