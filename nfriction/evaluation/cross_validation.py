@@ -247,8 +247,7 @@ def choose(candidates: Sequence[Candidate], unit: str = "rad") -> tuple[str, str
     """
 
     def error(candidate: Candidate) -> str:
-        value = candidate.error
-        return f"{1e3 * value:.3g} m{unit}" if value < 1 else f"{value:.4g} {unit}"
+        return f"{1e3 * candidate.error:.3g} m{unit}"
 
     best = min(candidates, key=lambda c: c.error)
     if not math.isfinite(best.error):

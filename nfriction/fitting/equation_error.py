@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -12,12 +12,7 @@ from torch import Tensor
 
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.result.identifiability import NORMAL_95
-from nfriction.fitting.robust_loss import (
-    Outliers,
-    loss_weight,
-    named_outliers,
-    robust_scale,
-)
+from nfriction.fitting.robust_loss import Outliers, RobustLoss, named_outliers
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Law
@@ -48,7 +43,8 @@ class TorqueFit:
             torque is not linear, (start, joint, coefficient).
         information: of the data about each joint's coefficients, (joint, coefficient,
             coefficient), with residuals inflated for autocorrelation.
-        outliers: samples that a robust loss counts less than half.
+        weight: of each sample under a robust loss, (sample, joint).
+        outliers: samples that it counts less than half.
     """
 
     coefficients: Tensor
@@ -56,6 +52,7 @@ class TorqueFit:
     torque: Tensor
     starts: Tensor = field(default_factory=lambda: torch.zeros(0, 0, 0, dtype=torch.float64))
     information: Tensor = field(default_factory=lambda: torch.zeros(0, 0, 0, dtype=torch.float64))
+    weight: Tensor = field(default_factory=lambda: torch.zeros(0, 0, dtype=torch.float64))
     outliers: tuple[Outliers, ...] = ()
 
 
@@ -208,19 +205,16 @@ def fit_equation_error(
         replace(part, kept=rows)
         for part, rows in zip(parts, kept.split([len(p.qd) for p in parts]), strict=True)
     ]
-    return regress(law, parts, v_smooth, options, recordings)
+    found = regress(law, parts, v_smooth, options)
+    weights = zip(recordings, found.weight.split([len(r) for r in recordings]), strict=True)
+    named = (outlier for r, weight in weights for outlier in named_outliers(r, weight.numpy()))
+    return replace(found, outliers=tuple(named))
 
 
 def regress(
-    law: Law,
-    parts: Sequence[TorqueBalance],
-    v_smooth: float,
-    options: FitOptions = DEFAULTS,
-    recordings: Sequence[Recording] = (),
+    law: Law, parts: Sequence[TorqueBalance], v_smooth: float, options: FitOptions = DEFAULTS
 ) -> TorqueFit:
     """Least squares of the kept samples of torque balances; see `fit_equation_error`.
-
-    Samples that a robust loss weighs little are named by the `recordings` of the parts, if given.
 
     Raises:
         ValueError: if the law's torque is not finite along the motion.
@@ -245,7 +239,7 @@ def regress(
             slopes[:, j].T @ slopes[:, j] / _effective_variance(error[kept[:, j], j])
             for j in range(len(many))
         ]),
-        tuple(regression.outliers(recordings)) if recordings else (),
+        weight=torch.where(kept, regression.root.square(), 1.0),
     )  # fmt: skip
 
 
@@ -290,19 +284,11 @@ class _Regression:
         error = replace(self, root=self.kept.to(self.root)).linearised(coefficients)[1]
         root = torch.zeros_like(error)
         for j, (rows, of_joint) in enumerate(zip(self.kept.T, error.T, strict=True)):
-            found, loss = of_joint[rows, None], self.options.loss
-            least = ROUNDING * float(self.torque[rows, j].abs().max())
-            scale = robust_scale(found, loss, max(least, self.options.min_noise))
-            root[rows, j] = loss_weight(found, scale, loss)[:, 0].sqrt()
+            found, least = of_joint[rows, None], ROUNDING * float(self.torque[rows, j].abs().max())
+            least = max(least, self.options.min_noise)
+            loss = RobustLoss.of_errors(self.options.loss, found, least)
+            root[rows, j] = loss.weight(found)[:, 0].sqrt()
         return replace(self, root=root)
-
-    def outliers(self, recordings: Sequence[Recording]) -> Iterator[Outliers]:
-        """Samples with little weight, in the recordings of these balances."""
-        weight = torch.where(self.kept, self.root.square(), 1.0)
-        for recording, part in zip(
-            recordings, weight.split([len(r) for r in recordings]), strict=True
-        ):
-            yield from named_outliers(recording, part.numpy())
 
     def linearised(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """Slopes (sample, joint, coefficient) and residuals (sample, joint); 0 if left out."""

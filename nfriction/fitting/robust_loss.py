@@ -10,6 +10,7 @@ References:
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ from nfriction.recording import Recording
 
 # Scales over the standard deviation of normal noise at which an estimate needs 5 % more samples
 # than least squares do; without outliers little is lost.
-EFFICIENT = {"soft_l1": 1.287, "huber": 1.345, "cauchy": 2.385}
+EFFICIENT: dict[Loss, float] = {"soft_l1": 1.287, "huber": 1.345, "cauchy": 2.385}
 # Median of the absolute value of a standard normal variable.
 MEDIAN = 0.6745
 # Below such a weight a sample is named.
@@ -45,30 +46,50 @@ class Outliers(NamedTuple):
         return f"{self.recording or 'a recording'}, {self.joint} at {span} s"
 
 
-def robust_scale(errors: Tensor, loss: Loss, least: float) -> Tensor:
-    """Scale of a loss for errors (sample, joint), from their median; at least `least`, (joint,)."""
-    sd = errors.abs().median(0).values / MEDIAN
-    return EFFICIENT[loss] * sd.clamp_min(least)
+@dataclass(frozen=True, eq=False)
+class RobustLoss:
+    """A loss by name, and the error from which on it counts less than the square, (joint,)."""
+
+    name: Loss
+    scale: Tensor
+
+    @classmethod
+    def of_errors(cls, name: Loss, errors: Tensor, least: float) -> "RobustLoss":
+        """The loss with the scale of errors (sample, joint), from their median.
+
+        Their standard deviation counts as `least` or more.
+        """
+        sd = errors.abs().median(0).values / MEDIAN
+        return cls(name, EFFICIENT[name] * sd.clamp_min(least))
+
+    def is_near(self, other: "RobustLoss", tolerance: float) -> bool:
+        """True where the scales differ by no more than this share."""
+        return bool((self.scale / other.scale - 1).abs().max() <= tolerance)
+
+    def weight(self, errors: Tensor) -> Tensor:
+        """rho'(z): weight of each error (..., joint), 1 where it is small."""
+        if self.name == "linear":
+            return torch.ones_like(errors)
+        z = (errors / self.scale).square()
+        if self.name == "soft_l1":
+            return (1 + z).rsqrt()
+        return z.clamp_min(1.0).rsqrt() if self.name == "huber" else 1 / (1 + z)
+
+    def counted(self, errors: Tensor) -> Tensor:
+        """Errors (..., joint) whose squares are the loss: scale sqrt(rho(z)), with their sign."""
+        if self.name == "linear":
+            return errors
+        z = (errors / self.scale).square()
+        if self.name == "soft_l1":
+            rho = 2 * z / (1 + (1 + z).sqrt())
+        elif self.name == "huber":
+            rho = torch.where(z <= 1, z, 2 * z.sqrt() - 1)
+        else:
+            rho = torch.log1p(z)
+        return torch.sign(errors) * self.scale * rho.sqrt()
 
 
-def loss_weight(errors: Tensor, scale: Tensor, loss: Loss) -> Tensor:
-    """rho'(z): weight of each error, 1 where it is small."""
-    z = (errors / scale).square()
-    if loss == "soft_l1":
-        return (1 + z).rsqrt()
-    return z.clamp_min(1.0).rsqrt() if loss == "huber" else 1 / (1 + z)
-
-
-def counted_error(errors: Tensor, scale: Tensor, loss: Loss) -> Tensor:
-    """Errors whose squares are the loss: scale sqrt(rho(z)), with the sign of the error."""
-    z = (errors / scale).square()
-    if loss == "soft_l1":
-        rho = 2 * z / (1 + (1 + z).sqrt())
-    elif loss == "huber":
-        rho = torch.where(z <= 1, z, 2 * z.sqrt() - 1)
-    else:
-        rho = torch.log1p(z)
-    return torch.sign(errors) * scale * rho.sqrt()
+SQUARES = RobustLoss("linear", torch.ones(()))
 
 
 def named_outliers(recording: Recording, weight: np.ndarray) -> Iterator[Outliers]:

@@ -42,7 +42,7 @@ class Feedback(Protocol):
 
 @dataclass(frozen=True)
 class Electronics:
-    """What lies between a controller and its machine.
+    """Encoders, drives and delay between a controller and its machine.
 
     Attributes:
         sample_time: between two calls of the controller [s].

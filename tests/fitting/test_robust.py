@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from nfriction import CVFM, LinearAxis, Recording, fit
 from nfriction.fitting.data.windows import cut_windows
 from nfriction.fitting.options import FitOptions
-from nfriction.fitting.robust_loss import EFFICIENT, counted_error, loss_weight, robust_scale
+from nfriction.fitting.robust_loss import EFFICIENT, SQUARES, RobustLoss
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.signals import kalman_smoother
@@ -25,26 +25,26 @@ SPIKES = [300, 301, 650, 1111]
 @pytest.mark.parametrize("loss", LOSSES)
 def test_losses_are_those_of_scipy(loss):
     errors = torch.tensor([-40.0, -2.0, -0.3, 0.0, 0.7, 1.5, 1e4], dtype=F64)
-    scale = torch.tensor(1.3, dtype=F64)
+    ours = RobustLoss(loss, torch.tensor(1.3, dtype=F64))
     theirs = [
         least_squares(lambda x, e=e: e + x, [0.0], loss=loss, f_scale=1.3, max_nfev=1)
         for e in errors.tolist()
     ]
-    counted = counted_error(errors, scale, loss)
+    counted = ours.counted(errors)
     costs = torch.tensor([found.cost for found in theirs], dtype=F64)
     torch.testing.assert_close(0.5 * counted.square(), costs, rtol=1e-9, atol=1e-30)
     slopes = torch.tensor([found.grad[0] for found in theirs], dtype=F64)
-    torch.testing.assert_close(loss_weight(errors, scale, loss) * errors, slopes)
+    torch.testing.assert_close(ours.weight(errors) * errors, slopes)
     assert torch.equal(counted.sign(), errors.sign())
 
 
 @pytest.mark.parametrize("loss", LOSSES)
 def test_a_loss_needs_five_percent_more_samples_of_normal_noise(loss):
     """Asymptotic efficiency of an M-estimate: E[psi']^2 / E[psi^2]."""
-    scale = torch.tensor(EFFICIENT[loss], dtype=F64)
+    ours = RobustLoss(loss, torch.tensor(EFFICIENT[loss], dtype=F64))
 
     def influence(x):
-        return float(loss_weight(torch.tensor(x, dtype=F64), scale, loss) * x)
+        return float(ours.weight(torch.tensor(x, dtype=F64)) * x)
 
     def density(x):
         return np.exp(-0.5 * x * x) / np.sqrt(2 * np.pi)
@@ -60,12 +60,11 @@ def test_the_scale_is_that_of_normal_noise_whatever_the_spikes():
     noise = torch.randn(20_000, 2, generator=torch.Generator().manual_seed(0), dtype=F64)
     noise[:, 1] *= 3
     noise[:100] = 1e3
-    scale = robust_scale(noise, "huber", 0.0) / EFFICIENT["huber"]
+    scale = RobustLoss.of_errors("huber", noise, 0.0).scale / EFFICIENT["huber"]
     torch.testing.assert_close(scale, torch.tensor([1.0, 3.0], dtype=F64), rtol=0.03, atol=0)
     # Errors of a joint at rest are zero; its scale is the encoder's rounding.
-    assert robust_scale(torch.zeros(9, 1, dtype=F64), "huber", 0.5).tolist() == [
-        0.5 * EFFICIENT["huber"]
-    ]
+    still = RobustLoss.of_errors("huber", torch.zeros(9, 1, dtype=F64), 0.5)
+    assert still.scale.tolist() == [0.5 * EFFICIENT["huber"]]
 
 
 @pytest.mark.parametrize("loss", LOSSES)
@@ -86,7 +85,7 @@ def test_gradient_is_that_of_the_cost(loss):
         slope = (problem.cost(x + step) - problem.cost(x - step)) / 2e-6
         assert float(local.gradient[k]) == pytest.approx(float(slope), rel=1e-4, abs=1e-3)
     # All that sums squares of these errors sums the loss.
-    squares = replace(problem, loss_scale=None)
+    squares = replace(problem, loss=SQUARES)
     assert problem.counted_errors(x).square().sum() < squares.counted_errors(x).square().sum()
 
 

@@ -92,6 +92,8 @@ class FitResult:
             `residual_unit`; of constant coefficients.
         skipped_horizons: lengths of windows that the constant law could not follow [s].
         outliers: stretches of samples that a robust loss counts less than half.
+        effective_parameters: of a network: name of each group of its parameters, how many of them
+            the data determine (MacKay's gamma), and how many there are.
     """
 
     model: FrictionModel
@@ -116,6 +118,7 @@ class FitResult:
     stages: tuple[tuple[float, float], ...] = ()
     skipped_horizons: tuple[float, ...] = ()
     outliers: tuple[Outliers, ...] = ()
+    effective_parameters: tuple[tuple[str, float, int], ...] = ()
 
     def longest_usable_horizon(self, windows: Sequence[float]) -> float:
         """The last of growing window lengths that the constant law could follow [s]."""
@@ -169,6 +172,7 @@ class FitResult:
     def to_dict(self) -> dict[str, Any]:
         """Summary for JSON."""
         offsets = {"encoder_offsets": [list(row) for row in self.encoder_offsets]}
+        gamma = {name: value for name, value, _ in self.effective_parameters}
         return {
             "status": self.status,
             "converged": self.converged,
@@ -187,6 +191,7 @@ class FitResult:
             **({} if self.continuity == "none" else {"continuity": self.continuity}),
             **(offsets if self.encoder_offsets else {}),
             **({"outliers": [o._asdict() for o in self.outliers]} if self.outliers else {}),
+            **({"effective_parameters": gamma} if gamma else {}),
         }
 
     def to_pandas(self) -> "pd.DataFrame":
@@ -330,8 +335,8 @@ def result_from_shooting(
     encoder_count = plant.position_quantum or observed_count(
         problem.windows.q @ problem.measurement.T
     )
-    residuals, weights = problem.errors(x), problem.weights(x)
-    counted = problem.counted_errors(x)
+    residuals = problem.errors(x)
+    weights, counted = problem.loss.weight(residuals), problem.loss.counted(residuals)
     residual = float(counted.square().mean().sqrt())
     outliers = tuple(outliers_of(problem, weights))
     intervals, unidentifiable, root = _identifiability(
@@ -370,7 +375,7 @@ def result_from_shooting(
 
 def outliers_of(problem: ShootingProblem, weights: Tensor) -> Iterator[Outliers]:
     """Samples that a robust loss counts less than half, by recording."""
-    if problem.loss_scale is None:
+    if problem.loss.name == "linear":
         return
     windows = problem.windows
     for place, recording in enumerate(windows.recordings):

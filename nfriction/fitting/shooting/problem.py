@@ -33,7 +33,7 @@ from nfriction.fitting.result.identifiability import (
     observed_count,
     standard_deviations,
 )
-from nfriction.fitting.robust_loss import counted_error, loss_weight, robust_scale
+from nfriction.fitting.robust_loss import SQUARES, RobustLoss
 from nfriction.fitting.shooting.marginalization import Kept, marginalize_states, score_covariance
 from nfriction.fitting.shooting.normal_equations import (
     Rows,
@@ -72,9 +72,8 @@ class ShootingProblem:
         extrapolation: prior of a neuro-fuzzy schedule where there are no data.
         memory: hidden state of the coefficients (see `Schedule`) at the start of each window,
             (window, joint, state_size); None of a schedule without. It advances with every step.
-        loss_scale: error from which on the robust loss of `options` counts less than the square,
-            (joint,) [rad; m]; None for squares. See `rescaled`.
-        options: priors of the initial states, and the loss.
+        loss: of the errors.
+        options: priors of the initial states.
     """
 
     jacobian: StepJacobian
@@ -90,7 +89,7 @@ class ShootingProblem:
     defect_sd: tuple[float, float] | None = None
     extrapolation: ExtrapolationPrior | None = None
     memory: Tensor | None = None
-    loss_scale: Tensor | None = None
+    loss: RobustLoss = SQUARES
     options: FitOptions = DEFAULTS
 
     @cached_property
@@ -108,24 +107,45 @@ class ShootingProblem:
     def linearise(self, x: Tensor) -> Quadratic:
         """Cost, gradient and Gauss-Newton Hessian at `x` from one simulation."""
         run, indices = self._simulate(x, with_memory=True), self.variables.indices()
-        pieces = propagate(self.jacobian, run, self.substeps, self.stride)
-        errors = self._deviation(x, run)
-        scale = self._scale * self._weight(errors).sqrt()
-        rows, errors = scaled_rows(pieces, scale, self.measurement, indices), errors * scale
-        gradient, hessian, ends = normal_equations(rows, errors, indices, len(x))
-        if self.pairs:
-            defects = self._defects(x, run)
-            add_defects(gradient, hessian, defects, ends, self.pairs, indices, self._defect_sd)
+        gradient, hessian = self._normal_equations(x, run, indices, len(x))
         if self.extrapolation is not None:
             slope, curvature = self.extrapolation.normal_equations(run.friction.schedule)
             gradient[: len(slope)] += slope
             hessian[: len(slope), : len(slope)] += curvature
+        return self._quadratic(x, run, gradient, hessian, self.variables.shared_count)
+
+    def linearise_states(self, x: Tensor) -> Quadratic:
+        """The same by the states and offsets of windows alone, far cheaper for many parameters."""
+        run, count = self._simulate(x, with_memory=True), self.variables.shared_count
+        indices = self.variables.indices() - count
+        gradient, hessian = self._normal_equations(x, run, indices, len(x) - count)
+        return self._quadratic(x, run, gradient, hessian, 0)
+
+    def _normal_equations(
+        self, x: Tensor, run: Trajectory, indices: Tensor, size: int
+    ) -> tuple[Tensor, Tensor]:
+        """Gradient and Hessian of errors and defects by the last `size` variables."""
+        shared = size == len(x)
+        pieces = propagate(self.jacobian, run, self.substeps, self.stride, shared=shared)
+        errors = self._deviation(x, run)
+        scale = self._scale * self.loss.weight(errors).sqrt()
+        rows, errors = scaled_rows(pieces, scale, self.measurement, indices), errors * scale
+        gradient, hessian, ends = normal_equations(rows, errors, indices, size)
+        if self.pairs:
+            defects = self._defects(x, run)
+            add_defects(gradient, hessian, defects, ends, self.pairs, indices, self._defect_sd)
+        return gradient, hessian
+
+    def _quadratic(
+        self, x: Tensor, run: Trajectory, gradient: Tensor, hessian: Tensor, shared: int
+    ) -> Quadratic:
+        """With the priors, of which the first `shared` are those of all windows' variables."""
         precision, mean = self.variables.prior()
-        gradient += precision * (x - mean)
-        hessian.diagonal().add_(precision)
+        gradient += (precision * (x - mean))[len(x) - len(gradient) :]
+        hessian.diagonal().add_(precision[len(x) - len(gradient) :])
         # Defects and encoder offsets couple the states of different windows.
         alone = not self.pairs and not self.variables.offset_count
-        blocks = (self.variables.shared_count, self.variables.state_count) if alone else None
+        blocks = (shared, self.variables.state_count) if alone else None
         return Quadratic(self._cost(x, run), gradient, hessian, blocks)
 
     def errors(self, x: Tensor) -> Tensor:
@@ -134,25 +154,14 @@ class ShootingProblem:
 
     def counted_errors(self, x: Tensor) -> Tensor:
         """Errors whose squares are what the loss counts; `errors` where it is the square."""
-        return self._counted(self.errors(x))
-
-    def weights(self, x: Tensor) -> Tensor:
-        """Weight of every sample under the loss, 1 of squares, (window, step + 1, joint)."""
-        return self._weight(self.errors(x))
+        return self.loss.counted(self.errors(x))
 
     def rescaled(self, x: Tensor) -> "ShootingProblem":
-        """The problem with the scale of its robust loss from the errors at `x`."""
+        """The problem with the robust loss of `options`, its scale from the errors at `x`."""
         errors = self.errors(x)[self.windows.weight > 0]
         count = observed_count(self.windows.q @ self.measurement.T) or 0.0
         least = max(count / 12**0.5, self.options.min_noise)
-        return replace(self, loss_scale=robust_scale(errors, self.options.loss, least))
-
-    def has_scale_of(self, other: "ShootingProblem") -> bool:
-        """True if the robust losses of two problems have the same scale but for a tolerance."""
-        if self.loss_scale is None or other.loss_scale is None:
-            return self.loss_scale is other.loss_scale
-        change = (self.loss_scale / other.loss_scale - 1).abs().max()
-        return bool(change <= self.options.scale_tolerance)
+        return replace(self, loss=RobustLoss.of_errors(self.options.loss, errors, least))
 
     def residuals(self, x: Tensor) -> Tensor:
         """Errors of the counted samples over the noise, (window, step + 1, joint)."""
@@ -201,7 +210,7 @@ class ShootingProblem:
         of_states, of_offsets = variables.split(precision)[2:]
         kept = Kept(variables.indices(), variables.state_count, len(x))
         joined = (self.pairs, self._defect_sd) if self.pairs else ((), None)
-        scale = self._scale * self._weight(self._deviation(x, run)).sqrt()
+        scale = self._scale * self.loss.weight(self._deviation(x, run)).sqrt()
         data, response = marginalize_states(self._rows(run, scale), kept, of_states, *joined)
         rows = self._rows(run, self._scale * sd / self.noise_sd)
         score = score_covariance(rows, kept, response, of_states)
@@ -260,16 +269,6 @@ class ShootingProblem:
         q = run.motion.q[:, :: self.substeps] - self.variables.window_offsets(x)[:, None]
         return (q - self.windows.q) @ self.measurement.T
 
-    def _counted(self, errors: Tensor) -> Tensor:
-        if self.loss_scale is None:
-            return errors
-        return counted_error(errors, self.loss_scale, self.options.loss)
-
-    def _weight(self, errors: Tensor) -> Tensor:
-        if self.loss_scale is None:
-            return torch.ones_like(errors)
-        return loss_weight(errors, self.loss_scale, self.options.loss)
-
     def _defects(self, x: Tensor, run: Trajectory) -> Tensor:
         before, after = ([pair[k] for pair in self.pairs] for k in (0, 1))
         q = run.motion.q[before, -1] - self.variables.window_offsets(x)[before]
@@ -277,7 +276,7 @@ class ShootingProblem:
         return (end - self.variables.split(x).states[after]) / self._defect_sd
 
     def _cost(self, x: Tensor, run: Trajectory) -> Tensor:
-        squares = [self._counted(self._deviation(x, run)) * self._scale, self._defects(x, run)]
+        squares = [self.loss.counted(self._deviation(x, run)) * self._scale, self._defects(x, run)]
         if self.extrapolation is not None:
             squares.append(self.extrapolation.residuals(run.friction.schedule))
         misfit = torch.stack([row.square().sum() for row in squares]).sum()
