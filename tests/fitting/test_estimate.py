@@ -503,7 +503,7 @@ def test_a_law_that_torques_mislead_starts_anew_on_the_plant_that_it_found(
     better = "nfriction.fitting.strategy.continuation.restart_from_equation_error"
     monkeypatch.setattr(better, lambda fitter, found, *rest: found)
     monkeypatch.setattr(
-        "nfriction.fitting.strategy.multistart.best_of_starts", lambda fitter, own, *rest: own
+        "nfriction.fitting.strategy.constant.best_of_starts", lambda fitter, own, *rest: own
     )
     assert fitted().residual > 1.02 * found.residual
 
@@ -524,7 +524,7 @@ def test_a_search_in_vain_from_the_simpler_law_leaves_the_model_as_it_was(monkey
     found = fit(Stribeck(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
     assert simpler
     monkeypatch.setattr(
-        "nfriction.fitting.strategy.multistart.best_of_starts", lambda fitter, own, *rest: own
+        "nfriction.fitting.strategy.constant.best_of_starts", lambda fitter, own, *rest: own
     )
     simpler.clear()
     alone = fit(Stribeck(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
@@ -532,7 +532,7 @@ def test_a_search_in_vain_from_the_simpler_law_leaves_the_model_as_it_was(monkey
     assert found.residual == alone.residual
 
 
-@pytest.mark.parametrize("law", [Stribeck, NLFM])
+@pytest.mark.parametrize("law", [Stribeck, pytest.param(NLFM, marks=pytest.mark.slow)])
 def test_a_law_leaves_no_more_over_than_the_simpler_one_in_it(law, monkeypatch):
     """However badly torques mislead it."""
 

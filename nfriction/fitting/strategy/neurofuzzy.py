@@ -15,8 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.fitting.data.checks import require_motion
-from nfriction.fitting.data.inputs import adjustable_terms, apply_encoder_offsets
+from nfriction.fitting.data.inputs import adjustable_terms, apply_encoder_offsets, require_motion
 from nfriction.fitting.data.windows import Windows, cut_windows
 from nfriction.fitting.equation_error import coefficient_scale
 from nfriction.fitting.fit import FitTask
