@@ -72,6 +72,8 @@ def add_comparison_options(parser: argparse.ArgumentParser) -> None:
     add("--select", action="store_true", help="also choose a model on the training recordings "
         "alone, by cross-validation over blocks of time")  # fmt: skip
     add("--no-figures", action="store_true", help="draw no figures")
+    add("--also", choices=("svg", "pdf"), action="append", default=[], metavar="FORMAT",
+        help="write figures as svg or pdf, too, for a paper; can be given twice")  # fmt: skip
     add("--jobs", type=inputs.jobs, default=1, metavar="N",
         help="fits at the same time, each in a process of its own; -1 for one to each core (needs "
         "joblib; the results are the same)")  # fmt: skip
@@ -154,6 +156,7 @@ def compare_and_report(
         write_results(
             comparison, train, test, arguments.out, selection=selection,
             command=arguments.command_line, figures=not arguments.no_figures,
+            formats=arguments.also,
         )  # fmt: skip
         if page is not None:
             write_report(arguments.out, page)  # else the earlier run's page would be missed

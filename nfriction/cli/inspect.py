@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from nfriction.cli import inputs
 from nfriction.cli.console import Parser, UsageError, warn
-from nfriction.friction import model_names, plain_name
+from nfriction.friction import memory_names, model_names, plain_name
 
 if TYPE_CHECKING:
     from nfriction.friction.models import FrictionModel
@@ -74,7 +74,7 @@ def run_info(arguments: argparse.Namespace) -> int:
 
 def _facts(model: "FrictionModel", info: "ModelInfo") -> Iterator[tuple[str, str]]:
     name = type(model).__name__
-    known = name in model_names()
+    known = name in (*model_names(), *memory_names())
     yield "model", f"{name}, {plain_name(name) if known else f'law {model.law.name}'}"
     yield "joints", ", ".join(info.joint_names) or str(model.joints)
     if info.rig is not None:

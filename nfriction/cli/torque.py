@@ -19,7 +19,6 @@ FIT_EXAMPLE = """example:
   nfriction fit-torque table.csv --models viscous,coulomb-viscous,stribeck --out runs/joint"""
 SCORE_EXAMPLE = """example:
   nfriction score-torque runs/joint other_table.csv"""
-LAWS = "viscous,coulomb,coulomb-viscous,load-coulomb,arctan,stribeck"
 COLUMNS = "columns qd and tau, perhaps time, q, qdd, load, temperature and joint; or qd1, tau1, ..."
 
 
@@ -34,10 +33,11 @@ def add_fit(commands: argparse._SubParsersAction[Parser], common: Parser) -> Non
     )  # fmt: skip
     add = parser.add_argument
     add("table", type=inputs.file, metavar="TABLE", help=f"{COLUMNS} ({inputs.FORMATS})")
-    add("--models", type=inputs.models, default=LAWS,
-        help=f"with commas between them: {inputs.MODELS}")  # fmt: skip
+    add("--models", type=inputs.models,
+        help=f"with commas between them: {inputs.MODELS} (default: all constant laws that the "
+        "columns allow)")  # fmt: skip
     add("--out", type=Path, default=Path("runs/torque"), help="folder to write")
-    add("--folds", type=inputs.count, default=5, metavar="N",
+    add("--folds", type=inputs.count, default=10, metavar="N",
         help="blocks that are left out in turn")  # fmt: skip
     add("--no-figures", action="store_true", help="draw no figure")
     _add_reading(parser)

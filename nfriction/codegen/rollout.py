@@ -41,6 +41,8 @@ class RolloutSignals:
             are held anew at each of these steps.
         memory: memory of the coefficients after the first sample, (candidate, joint, state_size),
             one row is for all; by default that of this sample alone.
+        law_state: of a friction law with memory at the start, (candidate, joint, state), one row is
+            for all; by default zero.
     """
 
     steps: int
@@ -49,6 +51,7 @@ class RolloutSignals:
     drive: tuple[Any, Any] | None = None
     substeps: int = 1
     memory: Any = None
+    law_state: Any = None
 
 
 class Trajectories(NamedTuple):
@@ -61,12 +64,14 @@ class Trajectories(NamedTuple):
             at the start that without friction; same shape.
         diverged_at: number of the sample at which the state was not finite or too fast, -1 where
             it never was, shape (candidate,).
+        law_state: of a friction law with memory, (candidate, sample + 1, joint, state); else None.
     """
 
     q: Any
     qd: Any
     qdd: Any
     diverged_at: Any
+    law_state: Any = None
 
 
 def compile_rollout(plant: Any, friction: Any, step: Callable[..., Any]) -> "CompiledRollout":
@@ -125,7 +130,7 @@ class CompiledRollout:
 
     @cached_property
     def _kernel(self) -> Kernel:
-        program = arrange(self._traced)
+        program = arrange(self._traced, self._system.law_size)
         return Kernel(lambda width: RolloutDriver(program, width), LAYOUT)
 
     def source(self, width: int = 0) -> str:
@@ -145,6 +150,8 @@ class CompiledRollout:
             held = self._system.friction.coefficients(*seen)
             if self._system.remembers:
                 found["memory"] = self._system.friction.initial_state(*seen)
+        if self._system.law_size:
+            found["law"] = torch.zeros(n, self._system.law_size, dtype=torch.float64)
         step = torch.full((1,), 1e-3, dtype=torch.float64)
         return {**found, "step": step, "held": held}
 
@@ -191,19 +198,26 @@ class CompiledRollout:
         if memory is not None:
             size = getattr(self._system.friction, "state_size", 0)
             given["memory"] = rows_of("memory", memory, (n, size))
+        size = self._system.law_size
+        if size:
+            law = np.zeros((1, n, size)) if inputs.law_state is None else inputs.law_state
+            given["law"] = rows_of("law_state", law, (n, size))
         p, rows = parameter_rows(self._module, parameters or {})
         count = common_rows(rows | {name: one.rows for name, one in given.items()})
         outputs: dict[str, np.ndarray] = {
             name: np.empty((count, steps + 1, n)) for name in LAYOUT.outputs[:3]
         }
         outputs["diverged"] = np.empty(count, dtype=np.int64)
+        if size:
+            outputs["law_out"] = np.empty((count, steps + 1, n, size))
         settings = {"samples": steps, "substeps": substeps, "driven": drive is not None,
                     "remembered": memory is not None}  # fmt: skip
         self._kernel(count, p, given, outputs, settings, threads)
-        results: list[Any] = list(outputs.values())
+        results: dict[str, Any] = dict(outputs)
         if isinstance(q0, Tensor):
-            results = [torch.from_numpy(x) for x in results]
-        return Trajectories(*results)
+            results = {name: torch.from_numpy(x) for name, x in results.items()}
+        q, qd, qdd, diverged = (results[name] for name in LAYOUT.outputs[:4])
+        return Trajectories(q, qd, qdd, diverged, results.get("law_out"))
 
     def check(self) -> None:
         """Compare two steps from random states with the same steps in eager torch.
@@ -237,11 +251,13 @@ class CompiledRollout:
         q, qd, tau = (x.to(self._module.device) for x in (q, qd, tau))
         plant, friction = self._system.plant, self._system.friction
         qdd, memory = plant.forward_dynamics(q, qd, tau), None
+        size = self._system.law_size
+        law = (q.new_zeros(self.joints, size),) if size else ()
         for k in range(steps):
             if not self._system.remembers:
                 held = friction.coefficients(qd, qdd)
             else:
                 memory = friction.advance(qd, qdd, memory) if k else friction.initial_state(qd, qdd)
                 held = friction.coefficients_from(qd, qdd, memory)
-            q, qd, qdd = self._system.step(plant, friction, q, qd, tau, held, dt)
+            q, qd, qdd, *law = self._system.step(plant, friction, q, qd, tau, held, dt, *law)
         return qd

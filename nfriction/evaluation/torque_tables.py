@@ -14,12 +14,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from nfriction.evaluation.cross_validation import Candidate, choose
+from nfriction.evaluation.cross_validation import TOLERANCE, Candidate
 from nfriction.evaluation.results import RESULTS
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.torque_table import (
+    LEAD_IN,
     JointFit,
     fit_joint,
+    fit_memory,
     fit_network,
     join,
     predict,
@@ -39,8 +41,15 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-FOLDS = 5
-LAWS = ("viscous", "coulomb", "coulomb-viscous", "load-coulomb", "arctan", "stribeck")
+FOLDS = 10
+# Laws that are fitted by default: to any table, and to those with columns time, load or both.
+LAWS = ("viscous", "coulomb", "coulomb-viscous", "arctan", "stribeck")
+WITH_TIME = ("slip",)
+WITH_LOAD = ("load-coulomb",)
+WITH_BOTH = ("load-slip",)
+# Standard deviations of a network's prior over its own, of which blocks left out choose. No network
+# first: it is kept only where it lowers the error.
+PRIOR_SHARES = (0.0, 1.0, 1 / 3)
 
 
 class TorqueScore(NamedTuple):
@@ -143,12 +152,13 @@ class TorqueFits:
 
         Args:
             table: a `TorqueTable`, a path or a DataFrame, with the joints of the training table.
+                Without torque, laws with memory begin without deflection.
             model: by either of its names; by default the one chosen at each joint.
 
         Raises:
             ValueError: if its joints are others, or it lacks a load that a model needs.
         """
-        given = as_table(table, unit=self.table.unit)
+        given = as_table(table, unit=self.table.unit, torque=False)
         _check_joints(self.table.joint_names, given)
         names = self._names(model)
         return [
@@ -247,7 +257,7 @@ class TorqueFits:
 
 def fit_torque(
     table: Any,
-    models: str | Sequence[str] = LAWS,
+    models: str | Sequence[str] | None = None,
     *,
     folds: int = FOLDS,
     options: FitOptions = DEFAULTS,
@@ -259,12 +269,14 @@ def fit_torque(
     For constant-velocity tests, and for the residual torque of any inverse dynamics. Constant
     coefficients come from least squares within bounds, a network from a search under its prior,
     which is kept where it lowers the error on blocks left out. Models are compared on these blocks,
-    contiguous in time; rows without time are dealt to the blocks by their velocity.
+    contiguous in time; rows without time are dealt to the blocks by their velocity. Laws with
+    memory follow rows in order of time; the first 0.2 s of a table show how they were deflected
+    before, and are not scored.
 
     Args:
         table: a `TorqueTable`, or a path or DataFrame that makes one.
-        models: names, with commas between them or in a list; a model that needs a load is left
-            out where the table has none.
+        models: names, with commas between them or in a list; by default all constant laws that
+            the table's columns allow.
         folds: blocks that are left out in turn, at least 2.
         options: tuning constants.
         progress: called with each stage.
@@ -275,7 +287,7 @@ def fit_torque(
             that could be fitted; the message names the remedy.
     """
     given = as_table(table, **reading)
-    names = [models] if isinstance(models, str) else list(models)
+    names = [models] if isinstance(models, str) else list(models or _laws_for(given))
     names = [name for text in names for name in text.split(",")]
     names = list(dict.fromkeys(map(model_name, names)))
     if folds < 2:
@@ -297,29 +309,53 @@ def fit_torque(
             errors[joint].append(candidate)
     if not fits:
         raise ValueError(" ".join(failed.values()))
-    unit = "rad" if given.unit == "rad" else "m"
-    choices = {joint: choose(of, _torque_unit(unit)) for joint, of in errors.items()}
+    choices = {joint: _choose(of) for joint, of in errors.items()}
     return TorqueFits(given, fits, {j: tuple(of) for j, of in errors.items()}, choices, failed)
 
 
-def _torque_unit(unit: str) -> str:
-    return "N m" if unit == "rad" else "N"
+def _laws_for(table: TorqueTable) -> tuple[str, ...]:
+    """Constant laws that the columns of a table allow."""
+    time = all(joint.time is not None for joint in table.joints)
+    load = all(joint.load is not None for joint in table.joints)
+    found = (LAWS, WITH_TIME * time, WITH_LOAD * load, WITH_BOTH * (time and load))
+    return tuple(name for names in found for name in names)
+
+
+def _choose(candidates: Sequence[Candidate]) -> tuple[str, str]:
+    """The model with the fewest parameters whose error is within a tolerance of the least.
+
+    The scatter over blocks of one run is no measure here: the blocks at rest are unlike the others.
+    """
+    least = min(candidates, key=lambda c: c.error)
+    near = [c for c in candidates if c.error <= (1 + TOLERANCE) * least.error]
+    chosen = min(near, key=lambda c: (c.parameters, c.error))
+    if chosen is not least:
+        return chosen.name, (
+            f"within {100 * TOLERANCE:g} % of the least, of {plain_name(least.name)}, with fewer "
+            "parameters"
+        )
+    others = sorted(c.error for c in candidates if c is not least)
+    if not others:
+        return least.name, "the only model"
+    return least.name, f"the next has {100 * (others[0] / least.error - 1):.0f} % more"
 
 
 def _fit(
     name: str, joint: JointTorque, v_smooth: float, folds: int, options: FitOptions
 ) -> tuple[JointFit, Candidate]:
     """A model fitted to all rows of a joint, and its errors on blocks left out."""
-    make = model_by_name(name)
-    form = make(1).schedule.form
+    model = model_by_name(name)(1)
+    form = model.schedule.form
+    if model.law.memory is not None:
+        fit, left_out = fit_memory(name, joint, blocks(joint, folds), v_smooth)
+        return fit, Candidate(name, left_out, len(fit.intervals), True)
     if form not in ("constant", "neurofuzzy"):
         raise ValueError(
             f"{plain_name(name)} is not fitted to tables, which have no acceleration classes; use "
             "its law, or its neuro-fuzzy model."
         )
     require_load(name, joint)
-    # No network first: it is kept only where it lowers the error.
-    shares = (0.0, *options.prior_shares) if form == "neurofuzzy" else (0.0,)
+    shares = PRIOR_SHARES if form == "neurofuzzy" else (0.0,)
     errors = np.zeros((len(shares), folds))
     for k, test in enumerate(blocks(joint, folds)):
         rest = joint.rows(np.setdiff1d(np.arange(len(joint)), test))
@@ -340,9 +376,15 @@ def _fit(
 
 
 def score_joint(joint: JointTorque, torque: Array, model: str) -> TorqueScore:
-    """Error of a torque predicted at the rows of a joint."""
-    rmse = float(np.sqrt(np.mean((torque - joint.tau) ** 2)))
-    return TorqueScore(joint.name, model, rmse, rmse / (float(joint.tau.std()) or math.nan))
+    """Error of a torque predicted at the rows of a joint.
+
+    The lead-in of a law with memory is not scored, because its torque was read.
+    """
+    rows = slice(None)
+    if joint.time is not None and model_by_name(model).definition.memory is not None:
+        rows = slice(int(np.searchsorted(joint.time, joint.time[0] + LEAD_IN)), None)
+    rmse = float(np.sqrt(np.mean((torque - joint.tau)[rows] ** 2)))
+    return TorqueScore(joint.name, model, rmse, rmse / (float(joint.tau[rows].std()) or math.nan))
 
 
 def scores_frame(scores: Sequence[TorqueScore]) -> pd.DataFrame:

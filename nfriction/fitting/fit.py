@@ -18,17 +18,15 @@ from pathlib import Path
 
 from torch import Tensor
 
-from nfriction.fitting.data.checks import (
-    ZEROED_PER_RECORDING,
-    data_warnings,
-    looks_zeroed_per_recording,
-)
 from nfriction.fitting.data.inputs import (
+    ZEROED_PER_RECORDING,
     advanced_torques,
     as_model,
     as_recording_list,
+    data_warnings,
     in_joint_coordinates,
     largest_torques,
+    looks_zeroed_per_recording,
     measurement_matrix,
     smoothed_motions,
 )
@@ -109,9 +107,11 @@ def fit(
     refines them and the plant. Windows that would lose what shorter ones found are skipped, with a
     warning. Laws with several minima are also started from their grid of initial values and from
     the simpler law that they contain (`Law.nested_law`); the lowest residual wins. A neuro-fuzzy
-    model starts at the constant fit of its law and is kept only if its hold-out RMSE is 20 % below
-    the law's; its plant prior is relaxed only for a further 20 %. An adaptive model starts at the
-    constant fit, too; `fit_adaptive` has its further settings.
+    model starts at the constant fit of its law; evidence chooses the priors of its parameters, how
+    near the plant stays to the law's, the noise, and whether its sets move. Each joint takes the
+    share of its correction that blocks left out of the training support, and none if the gain there
+    may be chance. An adaptive model starts at the constant fit, too; `fit_adaptive` has its further
+    settings.
 
     Args:
         model: the model to fit, changed in place; or the name of one, such as "coulomb-viscous".

@@ -7,9 +7,19 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from nfriction.fitting.bristles import BristleFit, fit_bristles
 from nfriction.fitting.equation_error import TorqueBalance, regress
+from nfriction.fitting.hysteresis import (
+    LEAD_IN,
+    PATHS,
+    SlipFit,
+    fit_slip,
+    path_of,
+    range_of,
+)
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.result.identifiability import (
     Information,
@@ -19,7 +29,8 @@ from nfriction.fitting.result.identifiability import (
     null_directions,
 )
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
-from nfriction.friction import model_by_name
+from nfriction.friction import model_by_name, plain_name
+from nfriction.friction.laws import Memory
 from nfriction.friction.models import V_SMOOTH, FrictionModel
 from nfriction.optim.least_squares import Quadratic
 from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
@@ -27,6 +38,8 @@ from nfriction.recording.torque_table import JointTorque, TorqueTable
 
 # The sign of the velocity turns within this share of the largest velocity, or within `V_SMOOTH`.
 TURN_SHARE = 0.01
+# Share of the torques by which starts differ that another start than the fit's has to explain.
+START_SHARE = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,11 +166,122 @@ def fit_network(
     )  # fmt: skip
 
 
-def predict(model: FrictionModel, joint: JointTorque) -> Tensor:
-    """Friction torque of a model of one joint at the rows of a table, (row,) [N m; N]."""
+def fit_memory(
+    name: str, joint: JointTorque, blocks: Sequence[NDArray[np.intp]], v_smooth: float
+) -> tuple[JointFit, tuple[float, ...]]:
+    """Coefficients of a named model with memory, and its errors on blocks left out [N m; N].
+
+    Raises:
+        ValueError: if the rows have no time, or the law needs a load that the table lacks.
+    """
+    model = model_by_name(name)(1, v_smooth=v_smooth)
+    if joint.time is None:
+        raise ValueError(
+            f"{plain_name(name)} remembers the motion before, and {joint.name} has no column time; "
+            "add one, or leave the model out."
+        )
+    require_load(name, joint)
+    unknown: tuple[str, ...] = ()
+    found: SlipFit | BristleFit
+    if "sigma_0" in model.law.names:
+        found = fit_bristles(model.law, joint, blocks)
+        if not found.presliding:
+            # A stiff joint explains the rows as well: they hold no presliding.
+            unknown = (f"sigma_0 of {joint.name}",)
+    elif "f_o" in model.law.names:
+        found = fit_slip(joint, blocks, loaded=joint.load is not None and reads_load(model))
+    else:
+        raise ValueError(f"{plain_name(name)} is not fitted to tables; use slip.")
+    schedule = model.schedule
+    schedule.set_parameter_vector(torch.tensor(found.coefficients))
+    error = torch.tensor(found.torque - joint.tau)
+    noise = max(effective_noise(error[None, :, None]), 1e-12 * float(np.abs(joint.tau).max()))
+    design = torch.tensor(found.design) / noise
+    known = Information(design.T @ design, torch.zeros(len(found.fitted)).double())
+    own = covariance_root(known)
+    root = torch.zeros(len(found.coefficients), own.shape[1]).double()
+    kept = list(found.fitted)
+    root[kept] = own
+    names = schedule.parameter_names([joint.name])
+    fitted = [names[k] for k in kept]
+    lower, upper = (bound[kept] for bound in schedule.bounds())
+    values = schedule.parameter_vector()[kept]
+    intervals = confidence_intervals(fitted, values, own.norm(dim=1), lower, upper)
+    residual = float(error.square().mean().sqrt())
+    fit = JointFit(
+        model.requires_grad_(False), intervals, (*unknown, *null_directions(fitted, known)), root,
+        residual,
+    )  # fmt: skip
+    return fit, found.errors
+
+
+def predict(model: FrictionModel, joint: JointTorque, lead_in: float = LEAD_IN) -> Tensor:
+    """Friction torque of a model of one joint at the rows of a table, (row,) [N m; N].
+
+    Args:
+        model: of one joint.
+        joint: rows; in order of time for a law with memory.
+        lead_in: time from the first row [s] whose torque shows a law with memory how far it was
+            deflected before; 0 begins without deflection.
+    """
     require_load(type(model).__name__, joint, model)
+    if model.law.memory is not None:
+        return _remembered(model, model.law.memory, joint, lead_in)
     with torch.no_grad():
-        return model(*_columns(joint)[:3])[:, 0]
+        torque: Tensor = model(*_columns(joint)[:3])[:, 0]
+        return torque
+
+
+@torch.no_grad()
+def _remembered(model: FrictionModel, memory: Memory, joint: JointTorque, lead_in: float) -> Tensor:
+    """Torque of a law with memory along rows in order of time."""
+    if joint.time is None:
+        raise ValueError(f"a law with memory needs the time of the rows of {joint.name}.")
+    qd, qdd, load, tau = _columns(joint)
+    coefficients = model.coefficients(qd[:1], qdd[:1]).reshape(1, -1)
+    step = np.diff(joint.time, prepend=joint.time[0] - joint.step)
+    moved = torch.tensor(path_of(joint) / step)[:, None]
+    steps = torch.tensor(step)[:, None]
+
+    def along(state: Tensor, rows: range) -> Tensor:
+        """States after rows, (row, *state)."""
+        found = []
+        for k in rows:
+            state = memory.advance(
+                state, moved[k].expand(state.shape[:-1]), load[k], coefficients, steps[k]
+            )
+            found.append(state)
+        return torch.stack(found)
+
+    still = torch.zeros(1, 1, memory.size).double()
+    # A table to predict may have no torque, which then shows nothing.
+    seen = lead_in if bool(tau.isfinite().all()) else 0.0
+    first = slice(int(np.searchsorted(joint.time, joint.time[0] + seen)))
+    if first.stop:
+        names, reach = model.law.names, max(range_of(joint), 1e-12)
+        own = float(coefficients[0, names.index("p_0")]) if "p_0" in names else 0.0
+        way = torch.tensor([own, 0.0, *(sign * reach * x for x in PATHS for sign in (1, -1))])
+        starts = memory.advance(
+            still.expand(len(way), 1, -1), way.sign()[:, None], load[0], coefficients,
+            way.abs()[:, None],
+        )  # fmt: skip
+        states = along(starts, range(first.stop))[..., 0, :]
+        speed, force = (x[first].expand(states.shape[:-1]) for x in (qd, load))
+        torque = memory.torque(states, speed, force, coefficients[0])
+        rmse = (tau[first] - torque).square().mean(0).sqrt()
+        best = int(rmse.argmin())
+        # Noise at rest must not choose a start that later rows of the fit would contradict.
+        spread = torque.mean(0).max() - torque.mean(0).min()
+        best = best if rmse[best] + START_SHARE * spread < rmse[0] else 0
+        still = starts[best][None]
+        fading = float(coefficients[0, names.index("d_r")]) if "d_r" in names else 0.0
+        if fading > 1e-6 * reach:
+            # Friction that the elements do not show is the excess of a long rest.
+            left = torch.exp(-(moved[first].abs() * steps[first]).cumsum(0) / fading)[:, 0]
+            error = (tau[first] - torque)[:, best]
+            still[..., -1] = left @ error / left.square().sum()
+    states = along(still, range(len(joint)))[:, 0]
+    return memory.torque(states, qd, load, coefficients)[:, 0]
 
 
 def torque_and_slopes(
@@ -171,7 +295,8 @@ def torque_and_slopes(
     with torch.enable_grad():
         # A law is elementwise, so the sum's gradient is each row's own.
         coefficients.requires_grad_()
-        torque = model.torque(qd, load, coefficients)
+        # The steady torque of a law with memory.
+        torque = model.law.torque(qd, load, coefficients, model.v_smooth)
         (by_coefficient,) = torch.autograd.grad(torque.sum(), coefficients)
     slopes = torch.einsum("sk,skp->sp", by_coefficient[:, 0], by_parameter)
     return torque.detach()[:, 0], slopes
@@ -189,17 +314,19 @@ def join(models: Sequence[FrictionModel]) -> FrictionModel:
 
 def require_load(name: str, joint: JointTorque, model: FrictionModel | None = None) -> None:
     """Raise ValueError where the law of a model reads a load that the table lacks."""
-    model = model or model_by_name(name)(1)
-    if joint.load is not None:
-        return
-    qd, zero = torch.ones(2, 1).double(), torch.zeros(2, 1).double()
-    load = torch.tensor([[0.0], [1.0]]).double()
-    torque = model.torque(qd, load, model.coefficients(qd, zero).detach())
-    if not torch.equal(torque[0], torque[1]):
+    if joint.load is None and reads_load(model or model_by_name(name)(1)):
         raise ValueError(
             f"{name} takes the load, and {joint.name} has no column load; add one, or leave the "
             "model out."
         )
+
+
+def reads_load(model: FrictionModel) -> bool:
+    """True where the steady torque of a model of one joint depends on the load."""
+    qd, load = torch.ones(2, 1).double(), torch.tensor([[0.0], [1.0]]).double()
+    units = torch.ones(2, 1, len(model.law.names)).double()
+    torque = model.law.torque(qd, load, units, model.v_smooth)
+    return not torch.equal(torque[0], torque[1])
 
 
 def _columns(joint: JointTorque) -> tuple[Tensor, Tensor, Tensor, Tensor]:

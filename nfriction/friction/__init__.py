@@ -35,6 +35,8 @@ _MEMORY = {
     "elasto-plastic": "ElastoPlastic",
     "maxwell-slip": "MaxwellSlip",
 }
+# Slip elements beside terms of the velocity, for tables of torque.
+_HYSTERESIS = {"slip": "Slip", "load-slip": "LoadSlip"}
 # Classes are resolved only when asked for: a command line then starts quickly, and the core does
 # not import the papers' own models.
 _KINDS = (
@@ -51,7 +53,12 @@ _MODELS = {
     if (kind.prefix, law) != _MISSING
 }
 _KIND_OF_MEMORY = _Kind("", "", "nfriction.friction.memory")
-_ALL = _MODELS | {name: (_KIND_OF_MEMORY, law) for law, name in _MEMORY.items()}
+_KIND_OF_HYSTERESIS = _Kind("", "", "nfriction.friction.hysteresis")
+_ALL = (
+    _MODELS
+    | {name: (_KIND_OF_MEMORY, law) for law, name in _MEMORY.items()}
+    | {name: (_KIND_OF_HYSTERESIS, law) for law, name in _HYSTERESIS.items()}
+)
 _BY_TEXT = {
     text.lower(): name for name, (kind, law) in _ALL.items() for text in (name, kind.prefix + law)
 }
@@ -95,7 +102,7 @@ def model_names() -> tuple[str, ...]:
 
 def memory_names() -> tuple[str, ...]:
     """Names of the models of laws with memory."""
-    return tuple(_MEMORY.values())
+    return (*_MEMORY.values(), *_HYSTERESIS.values())
 
 
 def plain_name(name: str) -> str:
@@ -130,7 +137,7 @@ def model_list() -> str:
     before = " or ".join(f"{kind.prefix} ({kind.letters}{first}, ...)" for kind in others)
     return (
         f"{laws}; also with {before} before them, except {''.join(_MISSING)}; "
-        f"with memory {', '.join(_MEMORY)}"
+        f"with memory {', '.join((*_MEMORY, *_HYSTERESIS))}"
     )
 
 

@@ -39,22 +39,26 @@ References:
     (generalised Maxwell-slip).
 """
 
+from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from nfriction.friction.laws import Coefficient, Law, Memory, smooth_sign
-from nfriction.friction.models import ConstantModel
+from nfriction.friction.models import V_SMOOTH, ConstantModel
 
 # Keeps 0/0 away where a coefficient is zero, and below what a decay over a sample can resolve.
 TINY = 1e-12
+SMALL = 1e-3
 
 
 def growth(x: Tensor) -> Tensor:
     """Share `(1 - exp(-x)) / x` of a held input that a decaying state keeps, 1 at x = 0."""
-    safe = x.clamp(min=TINY)
-    return -torch.expm1(-safe) / safe
+    # The quotient cancels at small x, where four terms of its series are exact to rounding.
+    series = 1.0 - x * (1 / 2 - x * (1 / 6 - x / 24))
+    return torch.where(x < SMALL, series, (1.0 - torch.exp(-x)) / x.clamp(min=SMALL))
 
 
 def steady_friction(qd: Tensor, f_c: Tensor, f_d: Tensor, v_s: Tensor) -> Tensor:
@@ -157,7 +161,8 @@ def advance_elasto_plastic(
     moved, path = y + stretch, path - stretch
     plastic = settled - elastic
     x = (settled + plastic) * path / (plastic * settled)
-    kept, lost = torch.exp(-x), -torch.expm1(-x)
+    kept = torch.exp(-x)
+    lost = x * growth(x)
     # Sums of positive terms alone, which do not cancel; against the motion y is not used.
     y = moved.clamp(min=TINY * settled)
     slid = (settled * y + plastic * (y * kept + settled * lost)) / (
@@ -310,6 +315,26 @@ class ElastoPlastic(ConstantModel):
 
 
 class MaxwellSlip(ConstantModel):
-    """Generalised Maxwell-slip law of five elements in parallel; see `maxwell_slip`."""
+    """Generalised Maxwell-slip law of elements in parallel, see `maxwell_slip`.
+
+    Args:
+        joints, initial, v_smooth: see `NamedModel`.
+        elements: their number.
+    """
 
     definition = maxwell_slip(5)
+
+    def __init__(
+        self,
+        joints: int,
+        initial: Tensor | Sequence | None = None,
+        *,
+        elements: int = 5,
+        v_smooth: float = V_SMOOTH,
+    ) -> None:
+        # A law of this object's own, in place of the class's.
+        self.definition = maxwell_slip(elements)
+        super().__init__(joints, initial, v_smooth=v_smooth)
+
+    def options(self) -> dict[str, Any]:
+        return {"elements": self.law.state_size}

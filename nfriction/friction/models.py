@@ -114,8 +114,11 @@ class FrictionModel(nn.Module):
         """Slope of the torque over velocity at rest under unit load [N m s/rad], (joint,).
 
         It decides whether an explicit integrator is stable near standstill. The largest, where
-        several sets of coefficients are possible at rest.
+        several sets of coefficients are possible at rest. Zero of a law with memory, for which
+        steps are implicit and stable at any slope.
         """
+        if self.law_state_size:
+            return self.schedule.positive.new_zeros(self.joints, dtype=torch.float64)
         # A caller may have switched gradients off, even for good (`torch.inference_mode`).
         with torch.inference_mode(False), torch.enable_grad():
             held = self.schedule.rest_coefficients().detach().clone()
@@ -125,6 +128,10 @@ class FrictionModel(nn.Module):
             # A law is elementwise, so the sum's gradient is each joint's slope.
             slope = torch.autograd.grad(self.torque(qd, load, held).sum(), qd)[0]
         return slope.reshape(-1, self.joints).amax(0)
+
+    def options(self) -> dict[str, Any]:
+        """Constructor arguments beyond joints, initial values and `v_smooth`, as plain JSON."""
+        return self.schedule.options()
 
     def extra_repr(self) -> str:
         return f"law={self.law.name}, joints={self.joints}, v_smooth={self.v_smooth:g}"

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nfriction.friction import model_by_name, model_names
+from nfriction.friction import memory_names, model_by_name, model_names
 from nfriction.friction.models import FrictionModel
 from nfriction.io.files import numbers, parse_json, write_atomically
 from nfriction.plant import Plant
@@ -106,7 +106,7 @@ def describe(model: FrictionModel, info: ModelInfo) -> dict[str, Any]:
         "law": model.law.name,
         "joints": model.joints,
         "v_smooth": model.v_smooth,
-        "options": model.schedule.options(),
+        "options": model.options(),
         "coefficients": [
             {"name": c.name, "unit": _unit(c.unit, info.unit), "positive": c.positive}
             for c in model.law.coefficients
@@ -308,10 +308,10 @@ def _info(content: Mapping[str, Any]) -> ModelInfo:
 
 
 def _named_model(content: Mapping[str, Any]) -> FrictionModel:
-    name = content["model"]
-    if name not in model_names():
+    name, names = content["model"], (*model_names(), *memory_names())
+    if name not in names:
         raise ValueError(
-            f"{_short(name)} is none of the named models ({', '.join(model_names())}); create "
+            f"{_short(name)} is none of the named models ({', '.join(names)}); create "
             "the model yourself and pass it as `into`."
         )
     make = model_by_name(name)
@@ -325,7 +325,7 @@ def _check_same_model(content: Mapping[str, Any], model: FrictionModel) -> None:
         "coefficients": (names, list(model.law.names)),
         "joints": (content["joints"], model.joints),
         "v_smooth": (content["v_smooth"], model.v_smooth),
-        "options": (content["options"], model.schedule.options()),
+        "options": (content["options"], model.options()),
     }
     # By key, so that the message names the first difference; as JSON, where true is not 1.
     for key, (ours, theirs) in pairs.items():
@@ -340,9 +340,20 @@ def _check_torque(model: FrictionModel, state: Mapping[str, Tensor]) -> None:
     qd, qdd, load = torch.tensor([[0.0, 0.5], [0.0, 0.0], [1.0, 1.0]], dtype=torch.float64)
     inputs = tuple(x[:, None].expand(-1, model.joints) for x in (qd, qdd, load))
     with torch.no_grad():
-        torque = torch.func.functional_call(model, dict(state), inputs)
+        if model.law.memory is None:
+            torque = torch.func.functional_call(model, dict(state), inputs)
+        else:
+            c = torch.func.functional_call(model.schedule, _of_schedule(state), inputs[:2])
+            start = model.law.initial_state(inputs[0])
+            after = model.law.memory.advance(start, inputs[0], inputs[2], c, 1e-3)
+            torque = model.law.memory.torque(after, inputs[0], inputs[2], c)
     if not torque.isfinite().all():
         raise ValueError("with its parameters the model gives no finite torque.")
+
+
+def _of_schedule(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The schedule's part of a model's state."""
+    return {name.removeprefix("schedule."): value for name, value in state.items()}
 
 
 def _parameter(name: str, given: Any, expected: Tensor) -> Tensor:
@@ -384,7 +395,7 @@ def _check_sizes(content: Mapping[str, Any], size: int) -> None:
     joints, options = content["joints"], content["options"]
     terms = options.get("terms", [])
     terms = terms if isinstance(terms, list) else [terms]
-    sizes = [joints, options.get("head_units", 1), *terms]
+    sizes = [joints, options.get("head_units", 1), options.get("elements", 1), *terms]
     sound = all(isinstance(n, int) and not isinstance(n, bool) and n > 0 for n in sizes)
     # Each rule and each unit has at least one number in the file.
     if not sound or joints > MOST_JOINTS or joints * max(sizes[1], math.prod(terms)) > size:

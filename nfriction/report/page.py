@@ -28,6 +28,7 @@ from nfriction.evaluation.tables import (
     interval_table,
     selection_table,
 )
+from nfriction.friction import model_names, plain_name
 from nfriction.friction.models import FrictionModel
 from nfriction.io.files import write_atomically
 from nfriction.io.model_file import ModelInfo
@@ -154,19 +155,19 @@ def _in_order(centres: Sequence[float], names: Sequence[str]) -> list[str]:
 
 # A figure's twin for a dark screen.
 _DARK = ".dark"
-# In the order of the page: errors first, then motions, then the insides of the models.
+# In the order of the page: friction and errors first, then motions, then the models' insides.
 _CAPTIONS = {
+    "torque_over_velocity": "Friction torque over velocity: the models' laws with their 95 % bands "
+    "over the torque that the recorded motion implies, averaged over 30 ms",
     "rmse_test": "Position error by model and joint, test recordings",
     "horizons_test": "Position error over the length of the simulation, test recordings; the band "
-    "is the effect of one encoder count in the initial state",
+    "is the limit of these data, the effect of the uncertainty of the start",
     "rmse_train": "Position error by model and joint, training recordings",
     "horizons_train": "Position error over the length of the simulation, training recordings",
     "positions_test_": "Measured and simulated position with the error below, test: ",
     "positions_train_": "Measured and simulated position with the error below, training: ",
     "friction": "Friction torque over velocity: rows, their medians with quartiles in bins of "
     "velocity, the laws, and the 95 % band of the law chosen",
-    "torque_over_velocity": "Friction torque over velocity: the models' laws over the torque that "
-    "the recorded motion implies",
     "over_time_": "Coefficients along the first training recording, models of the law: ",
     "coefficients_": "Coefficients over velocity and acceleration (hatched: no data; faded: "
     "uncertain; lines enclose 50 % and 90 % of the samples) of ",
@@ -183,7 +184,10 @@ _JINJA = jinja2.Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-_JINJA.filters["four"] = lambda value: f"{value:.4g}"
+_JINJA.filters["four"] = lambda value: f"{value:.0f}" if 1e3 <= value < 1e7 else f"{value:.4g}"
+_JINJA.filters["plain"] = lambda name: (
+    f" ({plain_name(name)})" if name in model_names() and plain_name(name) != name.lower() else ""
+)
 # JavaScript reads Infinity where Python writes inf.
 _JINJA.filters["sortable"] = lambda value: (
     "Infinity" if math.isnan(value) else str(value).replace("inf", "Infinity")
@@ -220,6 +224,7 @@ def to_html(run: Run) -> str:
         fit_articles=[_fit(run, name) for name in run.fits],
         fuzzy_models=list(_fuzzy_models(run)),
         commands=_commands(run),
+        cards=_cards(run),
     )
 
 
@@ -320,6 +325,35 @@ def _fit(run: Run, name: str) -> dict[str, Any]:
         "warnings": list(dict.fromkeys(warnings)),
         "tables": tables,
     }
+
+
+def _cards(run: Run) -> list[dict[str, Any]]:
+    """The best model's coefficients of each joint, in words, with their 95 % intervals."""
+    best = run.best
+    if best is None or best not in run.fits:
+        return []
+    sets, units = run.coefficients.get(best, {}), _units(run, best)
+    show = Table("", (), ()).text
+    cards = []
+    for j, joint in enumerate(run.comparison.joint_names):
+        lines = []
+        for name in next(iter(sets.values()), {}):
+            values = [of[name][j] for of in sets.values() if name in of]
+            unit = f" {units[name]}" if name in units else ""
+            low, high = run.fits[best].intervals.get(f"{name} of {joint}", (math.nan, math.nan))
+            note = ""
+            if len(values) > 1:
+                value = f"{show(min(values))} to {show(max(values))}{unit}"
+                note = "follows the motion"
+            else:
+                value = f"{show(values[0])}{unit}"
+                if math.isfinite(low) and math.isfinite(high):
+                    note = f"{show(low)} to {show(high)}"
+                elif not math.isnan(low):
+                    note = "not identifiable"
+            lines.append({"name": name, "value": value, "note": note})
+        cards.append({"joint": joint, "lines": lines})
+    return cards
 
 
 def _units(run: Run, model: str) -> dict[str, str]:

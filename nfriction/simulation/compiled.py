@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from nfriction import codegen
+from nfriction.simulation.memory_step import memory_of
 from nfriction.simulation.protocols import RolloutInputs, StepFunction
 from nfriction.simulation.rk4 import rk4_step
 
@@ -79,7 +80,7 @@ def integrate_compiled(
     parameters: Mapping[str, Tensor] | None = None,
     step_function: StepFunction = rk4_step,
 ) -> tuple[Tensor, ...] | None:
-    """States at every sample: q, qd, qdd, each (*batch, steps + 1, joint).
+    """States at every sample: q, qd, qdd, each (*batch, steps + 1, joint), and that of the law.
 
     Args:
         system, inputs: what moves, and how.
@@ -99,6 +100,7 @@ def integrate_compiled(
     if compiled is None:
         return None
     q, qd, measured, memory = inputs.q0, inputs.qd0, inputs.measured, inputs.hidden_state
+    law = inputs.law_state
     batch, joints = q.shape[:-1], q.shape[-1]
 
     def rows(x: Tensor, trailing: int) -> Tensor:
@@ -124,11 +126,13 @@ def integrate_compiled(
             drive=drive,
             substeps=inputs.substeps,
             memory=None if memory is None else rows(memory, 2).reshape(-1, *memory.shape[-2:]),
+            law_state=None if law is None else rows(law, 2).reshape(-1, *law.shape[-2:]),
         ),
         values,
         threads,
     )
-    return tuple(x.reshape(*batch, *x.shape[1:]) for x in (found.q, found.qd, found.qdd))
+    given = [found.q, found.qd, found.qdd] + [found.law_state] * (law is not None)
+    return tuple(x.reshape(*batch, *x.shape[1:]) for x in given)
 
 
 def _compiled(
@@ -210,7 +214,11 @@ def _check_compilable(plant: Any, friction: Any) -> None:
         device = next((t.device for t in (*plant.parameters(), *plant.buffers())), None)
         rest = torch.zeros(plant.joints, dtype=torch.float64, device=device)
         held = friction.coefficients(rest, rest)
-        tau_f = friction.torque(rest, plant.load(rest, rest), held)
+        law, load = memory_of(friction), plant.load(rest, rest)
+        if law is None:
+            tau_f = friction.torque(rest, load, held)
+        else:
+            tau_f = law.torque(rest.new_zeros(plant.joints, law.size), rest, load, held)
         if plant.forward_dynamics(rest, rest, tau_f).shape != rest.shape:
             raise codegen.CodegenError(
                 "a plant or friction model with a batch of its own cannot be compiled"

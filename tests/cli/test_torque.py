@@ -58,10 +58,3 @@ def test_errors_are_one_line_with_the_remedy(
     words = ["--columns", "qd=speed", "--folds", "1"]
     assert main(["fit-torque", str(csv), *words]) == 2
     assert "--folds must be at least 2" in capsys.readouterr().err
-
-
-def test_laws_of_the_command_are_those_of_the_function() -> None:
-    from nfriction.cli import torque
-    from nfriction.evaluation.torque_tables import LAWS
-
-    assert ",".join(LAWS) == torque.LAWS

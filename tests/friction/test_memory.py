@@ -14,9 +14,8 @@ from nfriction.fitting.fit import fit
 from nfriction.friction import memory_names, model_by_name, model_name, plain_name
 from nfriction.friction.laws import Law, Memory
 from nfriction.friction.memory import DAHL, ELASTO_PLASTIC, LUGRE, TINY, LuGre, maxwell_slip
-from nfriction.plant.rigs import multiarm_single, tlrip
+from nfriction.plant.rigs import multiarm_single
 from nfriction.recording import Recording
-from nfriction.simulation.rollout import rollout
 
 LAWS = (DAHL, LUGRE, ELASTO_PLASTIC, maxwell_slip(1), maxwell_slip(4))
 every_law = pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
@@ -248,5 +247,3 @@ def test_what_has_no_state_yet_refuses_such_a_law() -> None:
     recording = Recording(np.arange(100) * 0.01, np.zeros((100, 1)))
     with pytest.raises(ValueError, match="internal state, which fits do not follow yet"):
         fit(model, multiarm_single(), recording)
-    with pytest.raises(ValueError, match="has an internal state"):
-        rollout(tlrip(), LuGre(3), torch.zeros(3), torch.zeros(3), steps=3)

@@ -8,7 +8,7 @@ neuro-fuzzy models are fitted alike.
 """
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -48,20 +48,17 @@ class StepJacobian:
         self, plant: Plant, friction: FrictionModel, terms: Sequence[PlantParameter]
     ) -> None:
         self.plant, self.friction, self.terms = plant, friction, tuple(terms)
-        self._compiled: codegen.CompiledFunction | None = None
         self.delay_index = delay_index(self.terms)
         joints, k = plant.joints, len(friction.law.coefficients)
         torques = joints if self.delay_index is None else 2 * joints
         generator = torch.Generator().manual_seed(0)
         shapes = ((joints,), (joints,), (joints, k), (torques,), (1,), (len(terms),))
-        example = [
+        q, qd, held, tau, step, vector = (
             scale * torch.rand(shape, generator=generator, dtype=torch.float64)
             for shape, scale in zip(shapes, (1.0, 1.0, 1e-2, 1.0, 1e-3, 1e-2), strict=True)
-        ]
-        try:
-            self._compiled = codegen.compile_function(self._step, example, jacobian=(0, 1, 2, 5))
-        except codegen.CodegenError as error:
-            logger.warning("fits run slowly, as steps are linearised in eager torch: %s", error)
+        )
+        self._by_step = _jacobian(self._step, [q, qd, held, tau, step, vector], (0, 1, 2, 5))
+        self._by_start = _jacobian(self._start, [q, qd, tau, vector], (0, 1, 3))
 
     def __call__(
         self, q: Tensor, qd: Tensor, held: Tensor, tau: Tensor, step: Tensor, vector: Tensor
@@ -71,27 +68,18 @@ class StepJacobian:
         Directions: q, qd, held coefficients (joint-major), plant terms. Where the torque's delay is
         one of the terms, `tau` is the torque at no delay, then its slope over the delay.
         """
-        if self._compiled is not None:
-            given = (q, qd, held, tau, step, vector[None])
-            return torch.from_numpy(self._compiled(*given)[-1])
-        slopes = torch.func.jacfwd(self._step, (0, 1, 2, 5))
-        found = torch.func.vmap(slopes, (0, 0, 0, 0, 0, None), chunk_size=CHUNK)(
-            q, qd, held, tau, step, vector
-        )
-        return torch.cat([slope.flatten(2) for slope in found], -1)
+        return self._by_step(q, qd, held, tau, step, vector)
 
     def initial_acceleration(self, q: Tensor, qd: Tensor, tau: Tensor, vector: Tensor) -> Tensor:
         """Derivatives of the first acceleration, which has no friction, by q, qd and plant terms.
 
         `q`, `qd` and `tau` are (window, joint); the result is (window, joint, direction).
         """
+        return self._by_start(q, qd, tau, vector)
 
-        def acceleration(q: Tensor, qd: Tensor, vector: Tensor, tau: Tensor) -> Tensor:
-            plant = adjusted_plant(self.plant, self.terms, vector)
-            return plant.forward_dynamics(q, qd, self._torque(tau, vector))
-
-        slope = torch.func.vmap(torch.func.jacfwd(acceleration, (0, 1, 2)), (0, 0, None, 0))
-        return torch.cat(slope(q, qd, vector, tau), -1)
+    def _start(self, q: Tensor, qd: Tensor, tau: Tensor, vector: Tensor) -> Tensor:
+        plant = adjusted_plant(self.plant, self.terms, vector)
+        return plant.forward_dynamics(q, qd, self._torque(tau, vector))
 
     def _step(
         self, q: Tensor, qd: Tensor, held: Tensor, tau: Tensor, step: Tensor, vector: Tensor
@@ -107,6 +95,20 @@ class StepJacobian:
             return tau
         at_none, slope = tau.chunk(2, -1)
         return at_none + vector[..., k : k + 1] * slope
+
+
+def _jacobian(
+    function: Callable[..., Tensor], example: Sequence[Tensor], by: tuple[int, ...]
+) -> Callable[..., Tensor]:
+    """The Jacobian of a function by some inputs, over batches of all of them but the last."""
+    try:
+        compiled = codegen.compile_function(function, example, jacobian=by)
+    except codegen.CodegenError as error:
+        logger.warning("fits run slowly, as steps are linearised in eager torch: %s", error)
+        axes = (*[0] * (len(example) - 1), None)
+        slopes = torch.func.vmap(torch.func.jacfwd(function, by), axes, chunk_size=CHUNK)
+        return lambda *given: torch.cat([slope.flatten(2) for slope in slopes(*given)], -1)
+    return lambda *given: torch.from_numpy(compiled(*given[:-1], given[-1][None])[-1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +129,7 @@ class Trajectory:
 
 
 def propagate(
-    jacobian: StepJacobian, run: Trajectory, substeps: int, stride: int
+    jacobian: StepJacobian, run: Trajectory, substeps: int, stride: int, *, shared: bool = True
 ) -> Iterator[tuple[slice, Tensor]]:
     """Derivatives of the positions at every `stride`-th sample, some samples at a time.
 
@@ -136,6 +138,7 @@ def propagate(
         run: the windows' motion.
         substeps: steps per sample.
         stride: samples per counted one.
+        shared: also by the parameters; False leaves their columns out.
 
     Yields:
         Samples, and (window, sample, joint, column) by the friction parameters, the plant terms and
@@ -144,15 +147,16 @@ def propagate(
     """
     windows, steps = run.step.shape
     joints, plant_count = run.motion.q.shape[-1], len(run.plant_vector)
-    friction_count = run.friction.schedule.parameter_vector().numel()
-    shared = friction_count + plant_count
-    carried = torch.zeros(windows, 3 * joints, shared + 2 * joints, dtype=torch.float64)
-    carried[:, : 2 * joints, shared:] = torch.eye(2 * joints, dtype=torch.float64)
-    carried[:, 2 * joints :, shared:], carried[:, 2 * joints :, friction_count:shared] = (
-        jacobian.initial_acceleration(
-            run.motion.q[:, 0], run.motion.qd[:, 0], run.tau[:, 0], run.plant_vector
-        ).tensor_split([2 * joints], -1)
-    )
+    friction_count = run.friction.schedule.parameter_vector().numel() if shared else 0
+    count = friction_count + plant_count if shared else 0
+    carried = torch.zeros(windows, 3 * joints, count + 2 * joints, dtype=torch.float64)
+    carried[:, : 2 * joints, count:] = torch.eye(2 * joints, dtype=torch.float64)
+    by_start, by_plant = jacobian.initial_acceleration(
+        run.motion.q[:, 0], run.motion.qd[:, 0], run.tau[:, 0], run.plant_vector
+    ).tensor_split([2 * joints], -1)
+    carried[:, 2 * joints :, count:] = by_start
+    if shared:
+        carried[:, 2 * joints :, friction_count:count] = by_plant
     block = stride * substeps
     many, whole = block * max(1, PIECE // (windows * block)), steps // block * block
     sample = 0
@@ -164,11 +168,11 @@ def propagate(
             for x in (run.motion.q, run.motion.qd, run.motion.qdd, run.tau, run.step[..., None])
         )
         memory = None if run.memory is None else _by_block(run.memory[:, first:last], length)
-        held, slope = _coefficients(run.friction, qd, qdd, memory)
+        held, slope = _coefficients(run.friction, qd, qdd, memory, shared=shared)
         derivative = jacobian(q, qd, held, tau, step, run.plant_vector)
         by_state, by_shared = (
             part.unflatten(0, (-1, windows))
-            for part in _compose(slope, derivative, length, plant_count)
+            for part in _compose(slope, derivative, length, plant_count, shared=shared)
         )
         rows, carried = _carry(by_state, by_shared, carried, joints)
         end = sample + stride * rows.shape[1]
@@ -183,11 +187,13 @@ def _by_block(x: Tensor, length: int) -> Tensor:
 
 
 def _coefficients(
-    friction: FrictionModel, qd: Tensor, qdd: Tensor, memory: Tensor | None
+    friction: FrictionModel, qd: Tensor, qdd: Tensor, memory: Tensor | None, *, shared: bool
 ) -> tuple[Tensor, Sensitivity]:
     """Coefficients held over each step, (sample, joint, coefficient), and their derivatives."""
     schedule = friction.schedule
-    if memory is None:
+    if memory is None and not shared:
+        held, slope = schedule(qd, qdd), schedule.motion_sensitivities(qd, qdd)
+    elif memory is None:
         held, slope = schedule(qd, qdd), schedule.sensitivities(qd, qdd)
     else:
         held = schedule.coefficients_from(qd, qdd, memory)
@@ -196,11 +202,12 @@ def _coefficients(
 
 
 def _compose(
-    slope: Sensitivity, derivative: Tensor, block: int, plant_count: int
+    slope: Sensitivity, derivative: Tensor, block: int, plant_count: int, *, shared: bool
 ) -> tuple[Tensor, Tensor]:
     """Close the loop from the state through the coefficients, and chain the steps of blocks.
 
-    The results are derivatives of the ends of blocks by the state before, and by what is shared.
+    The results are derivatives of the ends of blocks by the state before, and by what is shared,
+    without columns unless it is asked for.
     """
     samples, joints, k = slope.qd.shape
     by_q, by_qd, by_held, by_plant = derivative.split(
@@ -224,6 +231,8 @@ def _compose(
         rows.append(after @ held[:, s])
         total = total + after @ plant[:, s]
         after = after @ state[:, s]
+    if not shared:
+        return after, after.new_zeros(*after.shape[:-1], 0)
     by_coefficient = torch.stack(rows[::-1], 1).unflatten(-1, (joints, k)).transpose(1, 2)
     return after, torch.cat([slope.contract(by_coefficient), total], -1)
 

@@ -32,6 +32,7 @@ from nfriction.papers.afem.adaptive import CLASSES, Adaptive
 from nfriction.papers.afem.classes import class_intervals
 from nfriction.papers.afem.fit_adaptive import fit_adaptive
 from nfriction.papers.afem.fit_by_search import SearchMethod, SearchOptions, fit_by_search
+from nfriction.papers.control import study
 from nfriction.papers.nffem.refine_adaptive import refine_adaptive
 from nfriction.papers.nffem.train_network import TrainingOptions
 from nfriction.papers.reproduction.procedure import papers_neuro_fuzzy
@@ -43,6 +44,7 @@ from nfriction.papers.reproduction.workspace import (
     Workspace,
     smoothed,
 )
+from nfriction.plant import rigs
 from nfriction.recording import Recording
 from nfriction.signals import causal_motion
 from nfriction.simulation.rk4 import required_substeps
@@ -96,7 +98,7 @@ def stages() -> dict[str, Stage]:
             Stage(f"rtip-{law}", ("twin-rtip",), partial(second_paper, law=law)),
         ]
     constant = partial(fitted, fit=fit_constant, name="Stribeck")
-    found.append(Stage("Stribeck", ("twin-tlrip",), constant))
+    found += [Stage("Stribeck", ("twin-tlrip",), constant), Stage("control", (), controlled)]
     return {stage.name: stage for stage in found}
 
 
@@ -308,6 +310,23 @@ def papers_way(workspace: Workspace, law: str) -> dict[str, Any]:
     info = replace(load_info(workspace.model(f"A{law}")), fit=ended)
     save(model, workspace.model(name), info)
     return {"fit": ended} | _judged(workspace, name, bench, model, info)
+
+
+def controlled(workspace: Workspace) -> dict[str, Any]:
+    """Result of the control study: the papers' future work."""
+    settings = workspace.settings
+    plant = rigs.rtip("free")
+    recordings = study.driven_recordings(
+        plant, study.true_friction(plant), count=1, seconds=12.0, seed=settings.seed
+    )
+    models = {n: study.fitted_model(plant, recordings, n) for n in settings.control_models}
+    for name, model in models.items():
+        save(model, workspace.model(f"control-{name}"))
+    tables, motions = study.run_study(
+        models, seconds=settings.control_seconds, settled=0.375 * settings.control_seconds
+    )
+    workspace.write_arrays("control", motions)
+    return {"tables": tables}
 
 
 def _finish(workspace: Workspace, stage: str, bench: Bench, found: FitResult) -> dict[str, Any]:
