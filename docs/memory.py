@@ -4,6 +4,7 @@ python docs/memory.py
 """
 
 import math
+from itertools import pairwise
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -38,7 +39,7 @@ def presliding() -> tuple[Tensor, Tensor]:
     """Displacement and force of a Maxwell-slip contact with an inner loop."""
     law, c = maxwell_slip(4), torch.tensor(SLIP, dtype=F64)
     turns = [0.0, 4e-3, -4e-3, 1e-3, -1e-3, 4e-3]
-    path = torch.cat([torch.linspace(a, b, 400, dtype=F64) for a, b in zip(turns, turns[1:])])
+    path = torch.cat([torch.linspace(a, b, 400, dtype=F64) for a, b in pairwise(turns)])
     one = torch.ones(1, dtype=F64)
     state, forces = law.initial_state(one), []
     for qd in path.diff()[:, None]:
@@ -90,17 +91,16 @@ def main() -> None:
     axes[0, 0].set(xlabel="displacement [mm]", ylabel="friction [N]", title="Maxwell-slip: loops")
     rates = [1.0, 2.0, 5.0, 10.0, 20.0, 50.0]
     peaks = [breakaway(rate) for rate in rates]
-    print("breakaway [N]:", ", ".join(f"{r:g} N/s {p:.2f}" for r, p in zip(rates, peaks)))
+    print(
+        "breakaway [N]:", ", ".join(f"{r:g} N/s {p:.2f}" for r, p in zip(rates, peaks, strict=True))
+    )
     axes[0, 1].plot(rates, peaks, "o-")
     axes[0, 1].set(xlabel="rate of the force [N/s]", ylabel="breakaway [N]", title="LuGre: rate")
     for frequency in (1.0, 10.0, 25.0):
         velocity, force = lag(frequency)
         half = len(velocity) // 2
-        middle = (
-            (velocity[:half] - 1.5e-3).abs().argmin(),
-            (velocity[half:] - 1.5e-3).abs().argmin(),
-        )
-        width = float(force[:half][middle[0]] - force[half:][middle[1]])
+        up, down = ((v - 1.5e-3).abs().argmin() for v in (velocity[:half], velocity[half:]))
+        width = float(force[up] - force[half + down])
         print(f"lag at {frequency:g} Hz: {width:.3f} N wider on the way up at 1.5 mm/s")
         axes[1, 0].plot(1e3 * velocity, force, label=f"{frequency:g} Hz")
     axes[1, 0].set(xlabel="velocity [mm/s]", ylabel="friction [N]", title="LuGre: lag")

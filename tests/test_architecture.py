@@ -32,8 +32,9 @@ ALLOWED: dict[str, set[str]] = {
     },
     "export": {"version", "io", "io.model", "plant", "friction", "codegen", "signals"},
 }
-# The papers' own methods are a wing: the command line and the papers' scripts use them, no other.
-MAY_USE_PAPERS = {"papers", "cli"}
+# The papers' own methods are a wing: the command line, the loader of simulated data sets and the
+# papers' scripts use them, no other.
+MAY_USE_PAPERS = {"papers", "cli", "datasets"}
 # Only command lines talk to a person: the program's, and the one that scripts share.
 MAY_PRINT = ("cli/", "papers/twin/dataset.py")
 # TorchScript is deprecated upstream; it has one home. Asking whether one is being scripted is no

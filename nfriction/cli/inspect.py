@@ -11,7 +11,7 @@ from nfriction.friction import memory_names, model_names, plain_name
 
 if TYPE_CHECKING:
     from nfriction.friction.models import FrictionModel
-    from nfriction.io.model_info import ModelInfo
+    from nfriction.io.model_file import ModelInfo
 
 INFO_EXAMPLE = """example:
   nfriction info runs/mine/models/LFM.json"""
@@ -29,6 +29,7 @@ def add_report(commands: "argparse._SubParsersAction[Parser]", common: Parser) -
     parser.add_argument("folder", type=Path, metavar="RUN", help="folder of compare or demo")
     parser.add_argument("--out", type=Path, metavar="FILE",
                         help="file to write (default: report.html in the folder)")  # fmt: skip
+    inputs.add_law_option(parser)
     parser.set_defaults(run=run_report)
 
 
@@ -40,6 +41,7 @@ def add_info(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> 
         "the fit, rig.",
     )  # fmt: skip
     parser.add_argument("model", type=inputs.file, metavar="MODEL", help="model file")
+    inputs.add_law_option(parser)
     parser.set_defaults(run=run_info)
 
 

@@ -7,15 +7,15 @@ from typing import Any
 from torch import Tensor, nn
 
 from nfriction.codegen.batch import Driver, Layout
-from nfriction.codegen.graph import Port, Program
-from nfriction.codegen.hoist import hoist
+from nfriction.codegen.graph import Program
 from nfriction.codegen.llvm.emit import write_function
 from nfriction.codegen.llvm.ir import real
 from nfriction.codegen.scalar import Graph, Node
+from nfriction.codegen.transform import hoist
 
 LAYOUT = Layout(
     series=("q0", "qd0", "tau", "step", "drive_qd", "drive_qdd", "memory", "law"),
-    outputs=("q_out", "qd_out", "qdd_out", "diverged", "jacobian_out", "law_out"),
+    outputs=("q_out", "qd_out", "qdd_out", "diverged", "law_out"),
     settings=("samples", "substeps", "driven", "remembered"),
 )
 # A joint faster than this [rad/s or m/s] has left any mechanism's range: it has diverged.
@@ -77,7 +77,6 @@ class RolloutProgram:
         within: whether that state is finite and no joint too fast.
         begin: memory of the coefficients after the first sample; empty where they have none.
         advance: memory after a sample, from that before.
-        jacobian: derivatives of `step`; empty where they are not wanted.
         places: array and index of the input nodes.
     """
 
@@ -89,16 +88,14 @@ class RolloutProgram:
     within: Node
     begin: tuple[Node, ...]
     advance: tuple[Node, ...]
-    jacobian: tuple[Node, ...]
     places: dict[int, tuple[str, int]]
 
 
-def arrange(program: Program, jacobian: Port | None, law_size: int = 0) -> RolloutProgram:
+def arrange(program: Program, law_size: int = 0) -> RolloutProgram:
     """Arrange what was traced of a `ForcedSystem`.
 
     Args:
         program: with the outputs of its `forward`.
-        jacobian: derivatives of the state after a step, where they are wanted.
         law_size: size of the internal state of the friction law.
     """
     graph, outputs = program.graph, [port.nodes for port in program.outputs]
@@ -107,10 +104,9 @@ def arrange(program: Program, jacobian: Port | None, law_size: int = 0) -> Rollo
     begin, advance = remembered or ((), ())
     joints = len(q)
     within = _within(graph, q, qd)
-    slopes = jacobian.nodes if jacobian else ()
-    groups = [start, held, (*q, *qd, *qdd, *law), (within,), begin, advance, slopes]
+    groups = [start, held, (*q, *qd, *qdd, *law), (within,), begin, advance]
     groups, once = hoist(graph, groups)
-    start, held, step, (within,), begin, advance, slopes = groups
+    start, held, step, (within,), begin, advance = groups
     at = {"q": ("state", 0), "qd": ("state", joints), "seen_qdd": ("seen", joints),
           "seen_qd": ("seen", 0), "law": ("state", 3 * joints)}  # fmt: skip
     places: dict[int, tuple[str, int]] = {}
@@ -120,9 +116,7 @@ def arrange(program: Program, jacobian: Port | None, law_size: int = 0) -> Rollo
         array, offset = at.get(port.name, (port.name, 0)) if own else ("p", parameters)
         places |= {node.number: (array, offset + i) for i, node in enumerate(port.nodes)}
         parameters += 0 if own else len(port.nodes)
-    return RolloutProgram(
-        joints, tuple(once), start, held, step, within, begin, advance, slopes, places
-    )
+    return RolloutProgram(joints, tuple(once), start, held, step, within, begin, advance, places)
 
 
 def _within(graph: Graph, q: Sequence[Node], qd: Sequence[Node]) -> Node:
@@ -146,7 +140,7 @@ class RolloutDriver(Driver):
         n = program.joints
         sizes = {"state": len(program.step), "seen": 2 * n, "tau": n, "step": 1,
                  "held": len(program.held), "memory": len(program.advance), "within": 1,
-                 "jacobian": len(program.jacobian), "alive": 1}  # fmt: skip
+                 "alive": 1}  # fmt: skip
         super().__init__(LAYOUT, width, sizes, len(program.once))
         self.program = program
         self._functions()
@@ -169,7 +163,7 @@ class RolloutDriver(Driver):
         function("nf_held", ["seen", "memory"], {"held": parts.held})
         function("nf_begin", ["seen"], {"memory": parts.begin}, seldom=True)
         function("nf_advance", ["seen", "memory"], {"memory": parts.advance})
-        after = {"state": parts.step, "within": (parts.within,), "jacobian": parts.jacobian}
+        after = {"state": parts.step, "within": (parts.within,)}
         function("nf_step", ["state", "tau", "step", "held"], after)
 
     def _candidates(self) -> None:
@@ -214,7 +208,7 @@ class RolloutDriver(Driver):
         with body.loop("0", value["substeps"]):
             if not self.program.advance:
                 self.call("nf_held", "own_p", "room.once", "sees", "room.memory", "room.held")
-            rooms = ("state", "tau", "step", "held", "within", "jacobian")
+            rooms = ("state", "tau", "step", "held", "within")
             self.call("nf_step", "own_p", "room.once", *(f"room.{name}" for name in rooms))
             fine = body.load(value["room.within"], 0, real(self.width))
             one = body.constant(1.0, self.width)
@@ -224,9 +218,6 @@ class RolloutDriver(Driver):
                 lost = body.let(f"icmp ne i{self.width} {every}, 0")
             with body.when(lost):
                 self._stop(k, alive)
-        if self.program.jacobian:
-            size = len(self.program.jacobian)
-            self.scatter("jacobian", "jacobian_out", size, k, value["samples"])
 
     def _remember(self, k: str) -> None:
         body, size = self.body, len(self.program.advance)

@@ -79,7 +79,6 @@ def integrate_compiled(
     threads: int,
     parameters: Mapping[str, Tensor] | None = None,
     step_function: StepFunction = rk4_step,
-    jacobian: tuple[str, ...] = (),
 ) -> tuple[Tensor, ...] | None:
     """States at every sample: q, qd, qdd, each (*batch, steps + 1, joint), and that of the law.
 
@@ -90,9 +89,6 @@ def integrate_compiled(
         parameters: values of the friction model's parameters by name that differ from its own,
             each (*batch, *the parameter's shape).
         step_function: what is repeated, with the arguments of `rk4_step`.
-        jacobian: return the derivatives of (q, qd, qdd) after each step as well, shape
-            (*batch, steps, 3 joint, direction), by these: "q", "qd", "held" (the coefficients,
-            joint-major), and names of parameters and buffers ("plant.…", "friction.…").
 
     Returns:
         None where `backend="auto"` finds no way to compile, so that eager torch has to do it.
@@ -100,7 +96,7 @@ def integrate_compiled(
     Raises:
         CodegenError: if compiled code is asked for and cannot be made.
     """
-    compiled = _compiled(system, backend, step_function, jacobian)
+    compiled = _compiled(system, backend, step_function)
     if compiled is None:
         return None
     q, qd, measured, memory = inputs.q0, inputs.qd0, inputs.measured, inputs.hidden_state
@@ -136,15 +132,13 @@ def integrate_compiled(
         threads,
     )
     given = [found.q, found.qd, found.qdd] + [found.law_state] * (law is not None)
-    states = tuple(x.reshape(*batch, *x.shape[1:]) for x in given)
-    return (*states, found.jacobian.unflatten(0, batch)) if jacobian else states
+    return tuple(x.reshape(*batch, *x.shape[1:]) for x in given)
 
 
 def _compiled(
     system: System,
     backend: Backend,
     step_function: StepFunction = rk4_step,
-    jacobian: tuple[str, ...] = (),
 ) -> "codegen.CompiledRollout | None":
     """The compiled rollout of this system, from the cache where it is there."""
     plant, friction = system.plant, system.friction
@@ -162,10 +156,10 @@ def _compiled(
             "compiled rollouts are traced anew in every call, because they may read "
             f"{system.fingerprint}"
         )
-        found = _attempt(plant, friction, step_function, jacobian)
+        found = _attempt(plant, friction, step_function)
     else:
-        key = system.fingerprint.key, step_function, jacobian
-        found = _known.get(key) or _attempt(plant, friction, step_function, jacobian)
+        key = system.fingerprint.key, step_function
+        found = _known.get(key) or _attempt(plant, friction, step_function)
         _keep(_known, key, found)
     if isinstance(found, codegen.CodegenError):
         if backend != "auto":
@@ -175,12 +169,12 @@ def _compiled(
 
 
 def _attempt(
-    plant: Any, friction: Any, step_function: StepFunction, jacobian: tuple[str, ...]
+    plant: Any, friction: Any, step_function: StepFunction
 ) -> "codegen.CompiledRollout | codegen.CodegenError":
     """A compiled rollout, or the reason why there is none."""
     try:
         _check_compilable(plant, friction)
-        traced = codegen.trace_rollout(plant, friction, step_function, jacobian=jacobian)
+        traced = codegen.trace_rollout(plant, friction, step_function)
         found = _compiled_graphs.get(traced.digest)
         if found is None:
             traced.check()

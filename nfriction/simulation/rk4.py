@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from nfriction.codegen.rollout_program import SPEED_LIMIT
 from nfriction.simulation.protocols import (
     Friction,
     Plant,
@@ -130,7 +131,13 @@ def simulate_eager(
             )
         states.append((q, qd, qdd, *internal))
     shape = states[-1][0].shape
-    return tuple(
-        torch.stack([x.expand(*shape, *x.shape[q.ndim :]) for x in one], q.ndim - 1)
+    dims = len(shape)
+    q, qd, qdd, *internal = (
+        torch.stack([x.expand(*shape, *x.shape[dims:]) for x in one], dims - 1)
         for one in zip(*states, strict=True)
     )
+    # NaN from where a motion is lost to the end, as compiled code writes it.
+    fine = (torch.isfinite(q) & (qd.abs() < SPEED_LIMIT)).all(-1, keepdim=True)
+    lost = ~fine.cumprod(-2).bool()
+    internal = [x.masked_fill(lost[..., None], torch.nan) for x in internal]
+    return (*(x.masked_fill(lost, torch.nan) for x in (q, qd, qdd)), *internal)

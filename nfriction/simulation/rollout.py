@@ -13,7 +13,6 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from nfriction.codegen.rollout_program import SPEED_LIMIT
 from nfriction.simulation.adjoint import adjoint_rollout, own_tensors
 from nfriction.simulation.compiled import Backend, System, integrate_compiled, wants_compiled
 from nfriction.simulation.memory_step import memory_of, memory_step
@@ -156,7 +155,7 @@ def rollout(
         able = backend in ("auto", "torch") and inputs.tau.shape[-2] <= GRADIENT_STEPS
         given = (inputs.q0, inputs.qd0, inputs.tau, *own_tensors(plant, model))
         gradients = able and torch.is_grad_enabled() and any(x.requires_grad for x in given)
-    states = _simulate(system, inputs, gradients, backend, threads, progress)
+    states = simulate(system, inputs, gradients, backend, threads, progress)
     return _as_rollout(inputs, states)
 
 
@@ -164,10 +163,10 @@ def integrate(plant: Plant, friction: Friction | None, inputs: RolloutInputs) ->
     """`rollout` without checks and gradients, for searches whose trials may well be unstable."""
     model = NoFriction(plant.joints) if friction is None else friction
     inputs = with_law_state(inputs, model, inputs.law_state)
-    return _as_rollout(inputs, _simulate(System.of(plant, model), inputs))
+    return _as_rollout(inputs, simulate(System.of(plant, model), inputs))
 
 
-def _simulate(
+def simulate(
     system: System,
     inputs: RolloutInputs,
     gradients: bool = False,
@@ -182,7 +181,7 @@ def _simulate(
     # With gradients the motion itself may still be compiled: the adjoint sweep adds them.
     if gradients and backend == "auto":
         states = adjoint_rollout(
-            lambda: _simulate(system, inputs, threads=threads, progress=progress),
+            lambda: simulate(system, inputs, threads=threads, progress=progress),
             system.plant, system.friction, inputs,
         )  # fmt: skip
     elif compiled:
@@ -197,26 +196,16 @@ def _as_rollout(inputs: RolloutInputs, states: tuple[Tensor, ...]) -> Rollout:
     """The motion with its time, NaN from where it diverged."""
     time = torch.nn.functional.pad(inputs.step, (1, 0)).cumsum_(-1)
     q, qd, qdd, *law = states
-    diverged_at = _divergence(time, q, qd)
-    if torch.isfinite(diverged_at).any():
-        lost = (time >= diverged_at[..., None])[..., None]
-        q, qd, qdd = (x.masked_fill(lost, torch.nan) for x in states[:3])
-        law = [x.masked_fill(lost[..., None], torch.nan) for x in law]
-    return Rollout(time, q, qd, qdd, diverged_at, *law)
-
-
-@torch.no_grad()
-def _divergence(time: Tensor, q: Tensor, qd: Tensor) -> Tensor:
-    """Time of the first sample that is not finite or beyond any speed, infinity where none."""
-    # Positions are finite while velocities are; a NaN fails every comparison.
-    low, high = map(float, qd.aminmax() if qd.numel() else (0.0, 0.0))
-    if -SPEED_LIMIT < low <= high < SPEED_LIMIT:
-        return time.new_full(q.shape[:-2], torch.inf)
-    lost = ~(torch.isfinite(q) & (qd.abs() < SPEED_LIMIT)).all(-1)
-    first = lost.to(torch.int64).argmax(-1, keepdim=True)
-    at = torch.gather(time.expand(lost.shape), -1, first).squeeze(-1)
-    diverged_at = torch.where(lost.any(-1), at, torch.inf)
-    count = int(lost.any(-1).sum())
-    if count:
+    diverged_at = time.new_full(q.shape[:-2], torch.inf)
+    # What is lost stays NaN, so that the last sample shows whether anything is.
+    if qd[..., -1, :].isnan().any():
+        lost = qd.isnan().any(-1)
+        first = lost.to(torch.int64).argmax(-1, keepdim=True)
+        at = torch.gather(time.expand(lost.shape), -1, first).squeeze(-1)
+        diverged_at = torch.where(lost.any(-1), at, torch.inf)
+        # Masked, since gradients of NaN would spoil those of other motions.
+        q, qd, qdd = (x.masked_fill(lost[..., None], torch.nan) for x in (q, qd, qdd))
+        law = [x.masked_fill(lost[..., None, None], torch.nan) for x in law]
+        count = int(lost.any(-1).sum())
         logger.warning("%d rollout(s) diverged, first at %.4g s", count, diverged_at.min())
-    return diverged_at
+    return Rollout(time, q, qd, qdd, diverged_at, *law)

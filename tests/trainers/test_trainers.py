@@ -11,8 +11,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import torch
 
-from nfriction import load
+from nfriction import ANCFM, load, save
 from nfriction.friction import model_names
 from nfriction.io.model_file import load_info
 
@@ -45,7 +46,9 @@ def train(*words: object) -> None:
 
 
 def test_there_is_a_script_for_each_kind_of_model() -> None:
-    assert SCRIPTS == ["train_adaptive.py", "train_constant.py", "train_neurofuzzy.py"]
+    assert [
+        f"train_{kind}.py" for kind in ("adaptive", "constant", "neurofuzzy", "supervised")
+    ] == SCRIPTS
 
 
 @pytest.mark.slow
@@ -87,6 +90,29 @@ def test_checkpoints_of_other_options_are_refused(tmp_path: Path) -> None:
 def test_recordings_need_a_rig(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="--rig"):
         train("train_adaptive.py", "run.csv", "--out", tmp_path)
+
+
+@pytest.mark.parametrize(("adaptive", "made"), [(None, "NFLFM"), (ANCFM(3, [0.02]), "NFNCFM")])
+def test_networks_are_trained_on_the_supervised_set(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    adaptive: ANCFM | None,
+    made: str,
+) -> None:
+    monkeypatch.setenv("NFRICTION_CACHE", str(tmp_path / "cache"))
+    words = ["--seconds", "3", "--units", "3", "--max-steps", "2", "--out", str(tmp_path)]
+    if adaptive is not None:
+        words += ["--adaptive", str(save(adaptive, tmp_path / "adaptive.json"))]
+    train("train_supervised.py", *words)
+    assert "3000 samples a joint, 3 units" in capsys.readouterr().out
+    model = load(tmp_path / f"{made}.json")
+    # The network follows the controllers: it is not the constant that it started from.
+    speeds = torch.tensor([[0.1] * 3, [3.0] * 3], dtype=torch.float64)
+    spread = model.schedule(speeds, torch.zeros_like(speeds)).diff(dim=0).abs()
+    assert adaptive is not None or (spread > 0).all()
+    for name in (f"{made}.pt", f"{made}-loss.png", f"{made}-outputs.png"):
+        assert (tmp_path / name).stat().st_size > 0
 
 
 @pytest.mark.slow

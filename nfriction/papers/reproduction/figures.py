@@ -15,8 +15,9 @@ from matplotlib.ticker import MaxNLocator
 from tqdm import tqdm
 
 from nfriction.evaluation.score import RMSE, Score
-from nfriction.io.atomic import atomic_write
+from nfriction.io.files import atomic_write
 from nfriction.io.model_file import load
+from nfriction.papers.control.drawing import balance_figure, swing_up_animation
 from nfriction.papers.controller.mamdani import paper_controller
 from nfriction.papers.controller.rules import Variable
 from nfriction.papers.reproduction import tables
@@ -69,7 +70,9 @@ def draw_all(workspace: Workspace, *, progress: bool = False) -> list[Path]:
             figure.savefig(temporary, dpi=DPI, format="png")
         figure.clear()
         written.append(path)
-    return written
+    lifted = workspace.arrays("control")["swing-up"]
+    gif = swing_up_animation(lifted, workspace.folder / "figures" / "control_swing_up.gif")
+    return [*written, gif]
 
 
 def figures(workspace: Workspace) -> dict[str, Callable[[], Figure]]:
@@ -94,6 +97,7 @@ def figures(workspace: Workspace) -> dict[str, Callable[[], Figure]]:
         "second_fig_3_free_arm": second_swing,
         **seconds,
         "second_fig_8_torque": partial(second_torque, workspace),
+        "control_balance": lambda: balance_figure(workspace.arrays("control")),
         "experiment_classes": partial(experiment, workspace),
         **{
             f"positions_joint_{joint + 2}": partial(model_groups, workspace, joint)
@@ -218,8 +222,8 @@ def second_torque(workspace: Workspace) -> Figure:
 
 
 def _experiment_motion(workspace: Workspace) -> Motion:
-    parts = workspace.bench("tlrip").parts()
-    return next(m for _, r, m in parts if r.name == EXPERIMENT)
+    (motion,) = workspace.bench(EXPERIMENT).motions
+    return motion
 
 
 def experiment(workspace: Workspace) -> Figure:

@@ -8,18 +8,19 @@ from torch import Tensor
 
 from nfriction.friction import model_by_name, model_names
 from nfriction.friction.laws import Law
-from nfriction.friction.models import FrictionModel
+from nfriction.friction.models import V_SMOOTH, FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzyModel
 from nfriction.fuzzy import FuzzySet, RBFNetwork, sets_from_ranges
 from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.controller.mamdani import MamdaniController, paper_controller
 from nfriction.papers.controller.rules import Rule, RuleBase, Variable
+from nfriction.papers.controller.samples import ControllerSamples, sampled
 from nfriction.papers.nffem.rbf_coefficients import RBFCoefficients
 from nfriction.papers.nffem.train_network import (
     DEFAULTS,
     NetworkFit,
     TrainingOptions,
-    train_on_controller,
+    train_network,
 )
 from nfriction.signals import Motion
 
@@ -40,22 +41,23 @@ def papers_neuro_fuzzy(
     """The neuro-fuzzy model of an adaptive one, by the papers' procedure.
 
     The coefficients by class span the outputs of a fuzzy controller with the papers' rules, the
-    motion its inputs; the controller's outputs at `samples` evenly drawn inputs a joint then teach
-    a radial basis network by Bayesian regularisation.
+    motion its inputs; the controller's outputs along the measured motion then teach a radial basis
+    network a joint by Bayesian regularisation.
 
     Args:
         adaptive: fitted, with coefficients for each class of acceleration.
         motions: of the recordings behind it, in joint coordinates.
-        samples: a joint.
+        samples: most a joint, evenly thinned from the motions.
         units: of the network.
-        options: of its training, see `train_on_controller`.
+        options: of its training, see `train_network`.
 
     Returns:
         A model of the same law with the network for its schedule, without gradients; and the fit
         of each joint's network.
 
     Raises:
-        ValueError: if the model is not adaptive, or its law has no neuro-fuzzy model.
+        ValueError: if the model is not adaptive, its law has no neuro-fuzzy model, or `samples` is
+            not positive.
 
     References:
         TLRIP paper, neuro-fuzzy friction estimation (NFFEM).
@@ -64,19 +66,63 @@ def papers_neuro_fuzzy(
         raise ValueError(
             f"the papers' procedure starts from an adaptive model, got {type(adaptive).__name__}."
         )
-    law, joints = adaptive.law, adaptive.joints
-    controllers = controllers_from_classes(
-        law,
-        adaptive.schedule.values,
-        np.concatenate([m.qd for m in motions]),
-        np.concatenate([m.qdd for m in motions]),
+    if samples < 1:
+        raise ValueError(f"`samples` must be at least 1, got {samples}.")
+    # One after the other: the times matter to nobody here.
+    time, q, qd, qdd = (
+        np.concatenate([getattr(m, key) for m in motions]) for key in ("time", "q", "qd", "qdd")
     )
+    controllers = controllers_from_classes(adaptive.law, adaptive.schedule.values, qd, qdd)
+    # Rounded up, so that the limit holds.
+    measured = sampled(
+        controllers,
+        Motion(time, q, qd, qdd),
+        joint_names=[f"joint {k + 1}" for k in range(adaptive.joints)],
+        every=-(-len(qd) // samples),
+    )
+    return train_on_samples(
+        adaptive.law, controllers, measured, units=units, options=options,
+        v_smooth=adaptive.v_smooth,
+    )  # fmt: skip
+
+
+def train_on_samples(
+    law: Law,
+    controllers: Sequence[MamdaniController],
+    samples: ControllerSamples,
+    *,
+    units: int = 10,
+    options: TrainingOptions = DEFAULTS,
+    v_smooth: float = V_SMOOTH,
+) -> tuple[NeuroFuzzyModel, list[NetworkFit]]:
+    """A model whose coefficients are radial basis networks trained on controllers' samples.
+
+    Args:
+        law: of the coefficients that the controllers give.
+        controllers: whose universes the model keeps to, one for each joint.
+        samples: along a measured motion.
+        units: of each network; the paper takes 10.
+        options: of the training, see `train_network`.
+        v_smooth: of the model's sign [rad/s].
+
+    Returns:
+        The model, without gradients, and the fit of each joint's network.
+
+    Raises:
+        ValueError: if the law has no neuro-fuzzy model.
+
+    References:
+        TLRIP paper, neuro-fuzzy friction estimation (2-10-2 networks, 40,000 samples a joint).
+    """
+    joints = len(controllers)
     network = RBFNetwork(joints, 2, units, len(law.names))
-    fits = train_on_controller(network, controllers, samples=samples, options=options)
+    # Units at samples, each where it explains most of what the others leave.
+    network.init_ols(samples.x, samples.y, width=0.5)
+    fits = train_network(network, samples.x, samples.y, options)
     model = _neuro_fuzzy_class(law)(
         joints,
-        adaptive.schedule.values.mean(1),
-        v_smooth=adaptive.v_smooth,
+        samples.y.mean(0),
+        v_smooth=v_smooth,
         head_units=units,
         acceleration="signed",
         network="rbf",

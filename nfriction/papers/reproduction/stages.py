@@ -26,13 +26,13 @@ from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction import model_by_name
 from nfriction.friction.models import FrictionModel
-from nfriction.io.model_file import load, load_info, save
-from nfriction.io.model_info import ModelInfo
+from nfriction.io.model_file import ModelInfo, load, load_info, save
 from nfriction.papers import twin
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
 from nfriction.papers.afem.classes import class_intervals
 from nfriction.papers.afem.fit_adaptive import fit_adaptive
 from nfriction.papers.afem.fit_by_search import SearchMethod, SearchOptions, fit_by_search
+from nfriction.papers.control import study
 from nfriction.papers.nffem.refine_adaptive import refine_adaptive
 from nfriction.papers.nffem.train_network import TrainingOptions
 from nfriction.papers.reproduction.procedure import papers_neuro_fuzzy
@@ -44,6 +44,7 @@ from nfriction.papers.reproduction.workspace import (
     Workspace,
     smoothed,
 )
+from nfriction.plant import rigs
 from nfriction.recording import Recording
 from nfriction.signals import causal_motion
 from nfriction.simulation.rk4 import required_substeps
@@ -60,8 +61,8 @@ PAPERS_WAY = tuple(f"{name}-papers" for name in NEURO_FUZZY)
 SECOND_PAPER = tuple(f"rtip-{law}" for law in LAWS)
 SEARCH: dict[str, SearchMethod] = {"NCFM": "sqp", "LFM": "pattern", "NLFM": "pattern"}
 """The second paper's method for each model."""
-EXPERIMENT = "train_hanging"
-"""The TLRIP paper's friction experiment, of which its Table 6 gives the classes."""
+EXPERIMENT = "experiment"
+"""Twin of the TLRIP paper's friction experiment, of which its Table 6 gives the classes."""
 COUNTS = 8192
 """Counts a revolution of the papers' encoders, four edges to each of 2048 lines."""
 
@@ -87,13 +88,17 @@ def stages() -> dict[str, Stage]:
     for law in reversed(LAWS):
         found += [
             Stage(law, ("twin-tlrip",), partial(fitted, fit=fit_constant, name=law)),
-            Stage(f"A{law}", (law,), partial(fitted, fit=fit_by_class, name=f"A{law}")),
+            Stage(
+                f"A{law}",
+                (law, f"twin-{EXPERIMENT}"),
+                partial(fitted, fit=fit_by_class, name=f"A{law}"),
+            ),
             Stage(f"NF{law}", (f"A{law}",), partial(fitted, fit=fit_network, name=f"NF{law}")),
             Stage(f"NF{law}-papers", (f"A{law}",), partial(papers_way, law=law)),
             Stage(f"rtip-{law}", ("twin-rtip",), partial(second_paper, law=law)),
         ]
     constant = partial(fitted, fit=fit_constant, name="Stribeck")
-    found.append(Stage("Stribeck", ("twin-tlrip",), constant))
+    found += [Stage("Stribeck", ("twin-tlrip",), constant), Stage("control", (), controlled)]
     return {stage.name: stage for stage in found}
 
 
@@ -195,7 +200,7 @@ def run_stage(workspace: Workspace, name: str) -> None:
 def make_twin(workspace: Workspace, name: str) -> dict[str, Any]:
     """Simulate a twin's recordings, and smooth them once for all fits."""
     settings = workspace.settings
-    duration = {"tlrip": settings.tlrip_seconds, "rtip": settings.rtip_seconds}[name]
+    duration = settings.rtip_seconds if name == "rtip" else settings.tlrip_seconds
     made = twin.build(name, workspace.folder / "twin" / name, seed=settings.seed, duration=duration)
     motions = smoothed(made.plant, list(made.recordings.values()))
     arrays: dict[str, Array] = {}
@@ -307,6 +312,23 @@ def papers_way(workspace: Workspace, law: str) -> dict[str, Any]:
     return {"fit": ended} | _judged(workspace, name, bench, model, info)
 
 
+def controlled(workspace: Workspace) -> dict[str, Any]:
+    """Result of the control study: the papers' future work."""
+    settings = workspace.settings
+    plant = rigs.rtip("free")
+    recordings = study.driven_recordings(
+        plant, study.true_friction(plant), count=1, seconds=12.0, seed=settings.seed
+    )
+    models = {n: study.fitted_model(plant, recordings, n) for n in settings.control_models}
+    for name, model in models.items():
+        save(model, workspace.model(f"control-{name}"))
+    tables, motions = study.run_study(
+        models, seconds=settings.control_seconds, settled=0.375 * settings.control_seconds
+    )
+    workspace.write_arrays("control", motions)
+    return {"tables": tables}
+
+
 def _finish(workspace: Workspace, stage: str, bench: Bench, found: FitResult) -> dict[str, Any]:
     info = model_info(found, bench.train)
     return {"fit": found.to_dict()} | _judged(workspace, stage, bench, found.model, info)
@@ -325,15 +347,19 @@ def _judged(
             logger.warning("%s was not exported: %s", stage, " ".join(str(error).split()))
     scores, simulated = judge(bench, model)
     workspace.write_arrays(stage, simulated)
-    return {"scores": scores, "coefficients": coefficient_summary(model)} | _classes(bench, model)
+    return {
+        "scores": scores,
+        "coefficients": coefficient_summary(model),
+        **_classes(workspace, model),
+    }
 
 
-def _classes(bench: Bench, model: FrictionModel) -> dict[str, Any]:
+def _classes(workspace: Workspace, model: FrictionModel) -> dict[str, Any]:
     """Coefficients of an adaptive model by class, joint and name; its classes in the experiment."""
     schedule = model.schedule
     if not isinstance(schedule, Adaptive):
         return {}
-    motion = next(m for _, r, m in bench.parts() if r.name == EXPERIMENT)
+    (motion,) = workspace.bench(EXPERIMENT).motions
     labels = schedule.classes(torch.tensor(motion.qd), torch.tensor(motion.qdd)).T.numpy()
     return {
         "classes": {

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from nfriction.io.atomic import write_atomically
+from nfriction.io.files import write_atomically
 from nfriction.papers.reproduction.stages import (
     ADAPTIVE,
     CONSTANT,
@@ -199,6 +199,17 @@ def second_table_4(workspace: Workspace, split: str = "test") -> pd.DataFrame:
     return _beside(ours, _table(SECOND_TABLE_4))
 
 
+def control_table(workspace: Workspace, task: str) -> pd.DataFrame:
+    """Performance of the balanced rig with the friction compensation of each model.
+
+    References:
+        TLRIP paper, future work: control with the friction models.
+    """
+    rows = workspace.found("control")["tables"][task]
+    table = pd.DataFrame.from_dict(rows, orient="index", dtype=float).fillna(np.inf)
+    return pd.concat({"ours": table}, axis=1)
+
+
 def _table(rows: Mapping[str, Any]) -> pd.DataFrame:
     return pd.DataFrame.from_dict(dict(rows), orient="index", columns=list(JOINTS))
 
@@ -304,6 +315,12 @@ def all_tables(workspace: Workspace) -> dict[str, tuple[str, pd.DataFrame]]:
         f"second paper, Table IV: {error} {settings.rtip_seconds:g} s",
         second_table_4(workspace),
     )
+    for task, arm in (("still", "stays still"), ("follow", "follows a slow sine")):
+        found[f"control_{task}"] = (
+            f"future work, control: three links balanced upright while the arm {arm}, by the "
+            "model whose friction torque is compensated (inf: the links fell)",
+            control_table(workspace, task),
+        )
     return found
 
 

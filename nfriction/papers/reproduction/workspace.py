@@ -16,9 +16,10 @@ from tqdm import tqdm
 from nfriction.evaluation.results import model_info
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.identifiability import Interval
-from nfriction.io.atomic import atomic_write, write_atomically
+from nfriction.io.files import atomic_write, write_atomically
 from nfriction.io.model_file import load, load_plant, save
 from nfriction.papers.afem.fit_by_search import SearchState
+from nfriction.papers.control import study
 from nfriction.papers.twin.dataset import Split
 from nfriction.plant import Plant, rigs
 from nfriction.recording import Recording, read_initial_states
@@ -44,6 +45,8 @@ class Settings:
         controller_samples: a joint, on which the papers' network learns.
         search_horizon: length of the windows that a search simulates [s].
         search_evaluations: most simulations of a search on the position error.
+        control_models: fitted to the driven rig, for friction compensation.
+        control_seconds: length of each balanced motion [s].
         fit_plant: adjust inertia and gravity terms, too.
         torchscript: export every model.
         origin: of the recordings, and further options, of a run on other data than the twins.
@@ -61,13 +64,16 @@ class Settings:
     controller_samples: int = 40_000
     search_horizon: float = 5.0
     search_evaluations: int = 1500
+    control_models: tuple[str, ...] = study.MODELS
+    control_seconds: float = 16.0
     fit_plant: bool = False
     torchscript: bool = True
     origin: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON."""
-        return asdict(self) | {"windows": list(self.windows), "terms": list(self.terms)}
+        # JSON knows no tuples: what is read back would differ.
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
 
     def digest(self) -> str:
         """Marks a result as made with these settings by this version."""
@@ -88,6 +94,8 @@ QUICK = Settings(
     head_units=5,
     controller_samples=2000,
     search_evaluations=200,
+    control_models=("NCFM", "LFM", "NLFM"),
+    control_seconds=4.0,
 )
 """A look at everything within a minute or two; the figures are then not the papers'."""
 

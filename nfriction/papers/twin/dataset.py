@@ -9,7 +9,7 @@ import argparse
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Literal
 
@@ -18,11 +18,11 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from nfriction.io.atomic import atomic_write
+from nfriction.io.files import atomic_write
 from nfriction.io.formats import write_table
 from nfriction.papers.twin.mechanics import HiddenFriction, Links, TrueMotion, Vector, simulate
 from nfriction.plant import PendulumChain, rigs
-from nfriction.recording import MINIMUM_SAMPLES, Recording
+from nfriction.recording import MINIMUM_SAMPLES, Recording, read_initial_states
 from nfriction.recording.angles import AngleConvention
 
 Array = NDArray[np.float64]
@@ -31,6 +31,8 @@ Split = Literal["train", "test"]
 RATE = 1000  # samples a second
 JITTER = 5e-6  # standard deviation of the moment of sampling [s]
 QUICK_DURATION = 10.0  # of recordings for a quick look [s]
+# Released exactly upright, a pendulum never falls; a hand leaves it about this far off [deg].
+RELEASE_ERROR = 0.1
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,10 @@ _RTIP = Specification(
     ),
 )
 
-SPECIFICATIONS = {"tlrip": _TLRIP, "rtip": _RTIP}
+# The TLRIP paper's friction experiment from (180°, 0, 0), counted from hanging: released upright.
+_EXPERIMENT = replace(_TLRIP, releases=(Release("experiment", "train", (RELEASE_ERROR, 0.0, 0.0)),))
+
+SPECIFICATIONS = {"tlrip": _TLRIP, "rtip": _RTIP, "experiment": _EXPERIMENT}
 
 
 def names() -> list[str]:
@@ -207,7 +212,7 @@ def make(
     """Simulate a twin's recordings in memory.
 
     Args:
-        name: "tlrip" or "rtip".
+        name: "tlrip", "rtip" or "experiment".
         seed: of the encoders' errors and the clock's jitter; the motion itself is deterministic.
         duration: of each recording [s]; by default the experiment's own. A shorter twin is the
             beginning of a longer one.
@@ -310,12 +315,39 @@ def write(twin: Twin, folder: Path) -> None:
     arrays = {
         f"{label}_{key}": getattr(motion, key)
         for label, motion in twin.truth.items()
-        for key in ("q", "qd", "tau_f")
+        for key in ("q", "qd", "qdd", "tau_f")
     }
     # Not compressed: the last bits of floats do not shrink, and trying takes longest of all.
     with atomic_write(folder / "truth.npz") as unfinished, unfinished.open("wb") as file:
         np.savez(file, **arrays)
     write_table(_overview(twin), folder / "recordings.csv")
+
+
+def read(name: str, folder: Path) -> Twin:
+    """A twin from the folder that `build` wrote it to.
+
+    Raises:
+        OSError: if a file is missing.
+    """
+    plant = rigs.read(folder / "rig.json")
+    assert isinstance(plant, PendulumChain)  # `write` takes no other
+    overview = pd.read_csv(folder / "recordings.csv", dtype={"id": str, "file": str})
+    with np.load(folder / "truth.npz", allow_pickle=False) as kept:
+        truth = {
+            label: TrueMotion(*(kept[f"{label}_{f.name}"] for f in fields(TrueMotion)))
+            for label in overview["id"]
+        }
+    return Twin(
+        name=name,
+        plant=plant,
+        recordings={
+            label: Recording.read(folder / file, convention=plant.convention, name=label)
+            for label, file in zip(overview["id"], overview["file"], strict=True)
+        },
+        splits=dict(zip(overview["id"], overview["split"], strict=True)),
+        initial_states=dict(read_initial_states(folder / "recordings.csv")),
+        truth=truth,
+    )
 
 
 def main(name: str, argv: Sequence[str] | None = None) -> int:

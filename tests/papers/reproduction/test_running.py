@@ -22,6 +22,8 @@ TINY = Settings(
     controller_samples=200,
     search_horizon=0.5,
     search_evaluations=40,
+    control_models=("NCFM",),
+    control_seconds=0.5,
     torchscript=False,
 )
 

@@ -40,6 +40,7 @@ def workspace(folder: Path, errors: Mapping[str, float | None]) -> Workspace:
                 "coefficients": {k: [1.0, 2.0, 3.0] for k in names},
                 "classes": {"low": {"B": [1.0, 2.0, 3.0]}, "high": {"B": [4.0, 5.0, 6.0]}},
                 "intervals": [[["high", 0.0, 7.5], ["low", 7.5, 40.0]]] * 3,
+                "tables": {task: {"none": {"power [W]": None}} for task in ("still", "follow")},
                 "fit": {"status": "ended", "converged": name != "ALFM"},
             },
         )

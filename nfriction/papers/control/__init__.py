@@ -1,0 +1,1 @@
+"""Control of the papers' rig: their future work."""

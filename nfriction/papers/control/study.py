@@ -1,0 +1,346 @@
+"""Balance of the papers' rig on its driven arm with friction compensation by each class of model.
+
+The rig is the RTIP twin's with its arm free and ball bearings at all links: with the twin's bushing
+at the last one, linear feedback on encoder counts loses the links. The arm, the only joint with a
+motor, has friction of its own. The true friction belongs to no class that is fitted. Models are
+fitted to driven recordings of the hanging rig, then compensate friction while the links are
+balanced upright. A single link is also swung up; swinging up all three is not attempted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from nfriction.codegen import compile_function
+from nfriction.fitting.fit import fit
+from nfriction.fitting.options import FitOptions
+from nfriction.friction import model_by_name
+from nfriction.friction.coefficients import Constant
+from nfriction.friction.laws import Coefficient, Law, smooth_sign
+from nfriction.friction.models import FrictionModel
+from nfriction.papers.afem.adaptive import Adaptive
+from nfriction.papers.afem.fit_adaptive import fit_adaptive
+from nfriction.papers.control.feedback import (
+    Balance,
+    Compensation,
+    SwingUp,
+    kalman_gain,
+    linearise,
+    lqr,
+)
+from nfriction.papers.twin.dataset import SPECIFICATIONS, Encoder
+from nfriction.plant import PendulumChain, rigs
+from nfriction.plant.chain import Arm
+from nfriction.recording import Recording
+from nfriction.recording.angles import AngleConvention
+from nfriction.simulation.closed_loop import ControlledMotion, Electronics, control
+from nfriction.simulation.rollout import rollout
+
+Array = NDArray[np.float64]
+
+MODELS = ("NCFM", "LFM", "NLFM", "Stribeck", "ALFM", "NFLFM")
+"""One or more of each class: constant, adaptive, neuro-fuzzy."""
+NONE, TRUTH, SHARED = "none", "true friction", "LFM"
+THINNED = 10  # one sample of this many is kept for figures
+SHARES = (0.5, 0.8, 1.2)
+"""Shares of the friction torque compensated, beside all of it."""
+# The arm's motor and slip ring: dry friction (independent of load, and by it), Stribeck's rise and
+# velocity, asymmetry, viscous friction and the velocity from which it thins. A choice of ours.
+ARM = (0.12, 0.03, 0.4, 0.2, 0.06, 0.05, 4.0)
+ELECTRONICS = Electronics(counts=4 * Encoder().lines, delay=1, torque_limit=20.0, torque_bits=16)
+STATE_WEIGHT = (100.0, 100.0, 100.0, 100.0, 10.0, 1.0, 1.0, 1.0)
+TORQUE_NOISE = 1.0  # unknown torques for the Kalman filter [N m]
+AMPLITUDE, FREQUENCY = 0.3, 0.1  # of the arm's reference [rad, Hz]
+SAMPLE_TIME = ELECTRONICS.sample_time
+WINDOWS = (0.5,)  # of fits that simulate [s]
+TILT = 0.5  # of the first link at the start [deg]
+
+
+def _hidden_torque(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
+    seal, bearing, rise, v_s, asymmetry, viscous, v_t = coefficients.unbind(-1)
+    sign = smooth_sign(qd, v_smooth)
+    dry = (1.0 + rise * torch.exp(-(qd / v_s).square())) * (seal + bearing * load)
+    grease = viscous * qd * (1.0 + (qd / v_t).square()) ** -0.15
+    return dry * (1.0 + asymmetry * sign) * sign + grease
+
+
+_HIDDEN = Law(
+    "hidden",
+    tuple(
+        Coefficient(name, unit, positive=False)
+        for name, unit in (
+            ("seal", "N m"), ("bearing", "N m"), ("rise", "1"), ("v_s", "rad/s"),
+            ("asymmetry", "1"), ("viscous", "N m s/rad"), ("v_t", "rad/s"),
+        )
+    ),
+    _hidden_torque,
+)  # fmt: skip
+
+
+def true_friction(plant: PendulumChain) -> FrictionModel:
+    """The friction of the simulated rig; the twin's own, with the papers' load for the bearing's.
+
+    The force that a bearing carries, which the twin takes, is no input of a friction model here.
+    """
+    twin = replace(
+        SPECIFICATIONS["rtip"].friction, seal=(8e-4,) * 3, bearing_arm=(5e-5,) * 3,
+        viscous=(1e-2,) * 3,
+    )  # fmt: skip
+    mass = torch.as_tensor(plant.to_dict()["mass"])
+    weight = plant.to_dict()["gravity"] * mass.flip(0).cumsum(0).flip(0)
+    links = [
+        (twin.seal[k], twin.bearing_arm[k] * float(weight[k]), twin.stribeck_rise[k],
+         twin.stribeck_velocity[k], twin.asymmetry[k], twin.viscous[k], twin.shear_velocity[k])
+        for k in range(plant.joints - 1)
+    ]  # fmt: skip
+    values = torch.tensor([ARM, *links], dtype=torch.float64)
+    model = FrictionModel(_HIDDEN, Constant(_HIDDEN, plant.joints, values))
+    return model.requires_grad_(False)
+
+
+def driven_recordings(
+    plant: PendulumChain, friction: FrictionModel, *, count: int, seconds: float, seed: int = 0
+) -> list[Recording]:
+    """Recordings of the hanging rig with a random multisine of torque at the arm."""
+    random = np.random.default_rng(seed)
+    steps = round(seconds * 1000)
+    time = np.arange(steps + 1) / 1000
+    found = []
+    for k in range(count):
+        frequency = np.geomspace(0.2, 2.0, 6)
+        phase = random.uniform(0, 2 * np.pi, len(frequency))
+        tau = np.zeros((steps + 1, plant.joints))
+        tau[:, 0] = 0.9 * np.sin(2 * np.pi * frequency * time[:, None] + phase).sum(1)
+        hanging = torch.zeros(plant.joints, dtype=torch.float64)
+        hanging[1] = math.pi
+        run = rollout(plant, friction, hanging, torch.zeros_like(hanging), torch.tensor(tau[:-1]),
+                      sample_time=1e-3)  # fmt: skip
+        found.append(
+            Recording(
+                time=time, q=ELECTRONICS.read(run.q.numpy()), tau=tau,
+                names=plant.joint_names, convention=AngleConvention.of("relative,upright"),
+                name=f"driven_{k + 1}",
+            )
+        )  # fmt: skip
+    return found
+
+
+def fitted_model(
+    plant: PendulumChain, recordings: Sequence[Recording], name: str, max_steps: int = 3
+) -> FrictionModel:
+    """A model fitted to driven recordings: constants by equation error, others on windows."""
+    model = model_by_name(name)(plant.joints)
+    if not model.schedule.follows_motion:
+        fit(model, plant, recordings, method="equation_error", fit_plant=False)
+    elif isinstance(model.schedule, Adaptive):
+        options = FitOptions(windows=WINDOWS, max_steps=max_steps, fit_plant=False)
+        fit_adaptive(model, plant, recordings, options=options)
+    else:
+        fit(model, plant, recordings, windows=WINDOWS, max_steps=max_steps, fit_plant=False)
+    return model
+
+
+def compensation_of(model: FrictionModel) -> Compensation:
+    """Friction torque of a model, sample by sample, compiled; classes advance with the samples."""
+    example = torch.zeros(model.joints, dtype=torch.float64)
+    if not model.state_size:
+
+        def torque(qd: Tensor, qdd: Tensor, load: Tensor) -> Tensor:
+            return model.torque(qd, load, model.coefficients(qd, qdd))
+
+        compiled = compile_function(torque, (example,) * 3)
+        return lambda *given: np.reshape(compiled(*map(_rows, given)), given[0].shape)
+
+    schedule = model.schedule
+    memory: list[Array] = []
+    start = schedule.initial_state(example, example)
+
+    def step(qd: Tensor, qdd: Tensor, load: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        following = schedule.advance(qd, qdd, state)
+        return model.torque(qd, load, schedule.coefficients_from(qd, qdd, following)), following
+
+    advance = compile_function(step, (example, example, example, start))
+
+    def stateful(qd: Array, qdd: Array, load: Array) -> Array:
+        given = [_rows(x) for x in (qd, qdd, load)]
+        if not memory:
+            first = [torch.as_tensor(x) for x in given[:2]]
+            memory.append(schedule.initial_state(*first).detach().numpy())
+        tau_f, memory[0] = advance(*given, memory[0])
+        return np.asarray(tau_f).reshape(qd.shape)
+
+    return stateful
+
+
+def _rows(x: Array) -> Array:
+    return np.ascontiguousarray(x).reshape(-1, x.shape[-1])
+
+
+def side_by_side(compensations: Sequence[Compensation | None]) -> Compensation:
+    """Compensations of the rows of a batch, one each along the first axis; None for none."""
+
+    def torque(qd: Array, qdd: Array, load: Array) -> Array:
+        rows = [
+            np.zeros_like(row[0]) if each is None else each(*row)
+            for each, *row in zip(compensations, qd, qdd, load, strict=True)
+        ]
+        return np.stack(rows)
+
+    return torque
+
+
+def reference(time: float) -> tuple[float, float]:
+    """Angle and rate of the arm that the balance follows: slow, so that friction matters most."""
+    w = 2.0 * math.pi * FREQUENCY
+    return AMPLITUDE * math.sin(w * time), AMPLITUDE * w * math.cos(w * time)
+
+
+def still(_: float) -> tuple[float, float]:
+    """Reference of an arm that is to stay where it is."""
+    return 0.0, 0.0
+
+
+def balanced(
+    plant: PendulumChain,
+    friction: FrictionModel,
+    compensations: Mapping[str, Compensation | None],
+    *,
+    seconds: float,
+    follow: bool,
+    shares: Mapping[str, float] | None = None,
+) -> dict[str, ControlledMotion]:
+    """Motions of the rig balanced upright, one for each compensation, side by side.
+
+    Args:
+        plant, friction: the rig and its true friction.
+        compensations: by name; None for none.
+        seconds: length of the motion.
+        follow: let the arm follow `reference`, or keep it still.
+        shares: of the friction torque that is compensated, by name; by default all of it.
+    """
+    shares = shares or {}
+    linear = linearise(plant, torch.zeros(plant.joints, dtype=torch.float64), SAMPLE_TIME)
+    gain = lqr(linear, np.array(STATE_WEIGHT), 1.0)
+    noise = 2.0 * math.pi / (ELECTRONICS.counts or math.inf) / math.sqrt(12.0)
+    controller = Balance(
+        plant, linear, gain, kalman_gain(linear, TORQUE_NOISE, noise),
+        reference if follow else still, side_by_side(list(compensations.values())),
+        np.array([shares.get(name, 1.0) for name in compensations]),
+    )  # fmt: skip
+    tilted = torch.zeros(len(compensations), plant.joints, dtype=torch.float64)
+    tilted[:, 1] = math.radians(TILT)
+    run = control(plant, friction, controller, tilted, torch.zeros_like(tilted),
+                  steps=round(seconds / SAMPLE_TIME), electronics=ELECTRONICS)  # fmt: skip
+    return {
+        name: ControlledMotion(
+            run.time, run.q[k], run.qd[k], run.qdd[k], run.diverged_at[k],
+            tau=run.tau[k], measured=run.measured[k],
+        )
+        for k, name in enumerate(compensations)
+    }  # fmt: skip
+
+
+def performance(run: ControlledMotion, *, follow: bool, settled: float) -> dict[str, float]:
+    """Figures of a balanced motion after it has settled.
+
+    Args:
+        run: of `balanced`.
+        follow: its arm follows `reference`.
+        settled: from here on [s].
+
+    Returns:
+        Tracking error of the arm and its largest excursion from the reference, largest angle of a
+        link from upright, mean power of the motor and root mean square of its torque; infinite
+        where the links fell.
+    """
+    late = run.time >= settled
+    asked = np.array([reference(t)[0] if follow else 0.0 for t in run.time[late].tolist()])
+    error = run.q[late, 0].numpy() - asked
+    links = run.q[late, 1:].cumsum(-1).abs().numpy()
+    torque, rate = run.tau[late[1:], 0].numpy(), run.qd[1:][late[1:], 0].numpy()
+    found = {
+        "tracking error [mrad]": 1e3 * float(np.sqrt(np.mean(error**2))),
+        "limit cycle [mrad]": 1e3 * float(np.ptp(error)),
+        "largest tilt [mrad]": 1e3 * float(links.max()),
+        "power [W]": float(np.mean(np.abs(torque * rate))),
+        "torque [N m]": float(np.sqrt(np.mean(torque**2))),
+    }
+    fallen = not math.isfinite(found["largest tilt [mrad]"]) or links.max() > 0.5 * math.pi
+    return dict.fromkeys(found, math.inf) if fallen else found
+
+
+def run_study(
+    models: Mapping[str, FrictionModel], *, seconds: float, settled: float
+) -> tuple[dict[str, dict[str, dict[str, float | None]]], dict[str, Array]]:
+    """Balance, tracking and swing-up with the friction compensation of each model.
+
+    Args:
+        models: fitted to the rig of `true_friction`, by name; of the first law with load also
+            shares of the torque are tried.
+        seconds, settled: length of each motion, and from where on it counts [s].
+
+    Returns:
+        `performance` by task ("still", "follow") and compensation, None for infinity; and thinned
+        motions for figures.
+    """
+    plant = rigs.rtip("free")
+    friction = true_friction(plant)
+    rows: dict[str, tuple[FrictionModel | None, float]] = {NONE: (None, 0.0)}
+    rows |= {name: (model, 1.0) for name, model in models.items()}
+    rows |= {f"{SHARED}, {g:g} of it": (models[SHARED], g) for g in SHARES if SHARED in models}
+    rows[TRUTH] = (friction, 1.0)
+    found: dict[str, dict[str, dict[str, float | None]]] = {}
+    kept: dict[str, Array] = {}
+    for task, follow in (("still", False), ("follow", True)):
+        runs = balanced(
+            plant, friction,
+            # Made anew: an adaptive model's remembers the motion before.
+            {n: model and compensation_of(model) for n, (model, _) in rows.items()},
+            seconds=seconds, follow=follow, shares={n: share for n, (_, share) in rows.items()},
+        )  # fmt: skip
+        found[task] = {
+            name: {
+                key: value if math.isfinite(value) else None
+                for key, value in performance(run, follow=follow, settled=settled).items()
+            }
+            for name, run in runs.items()
+        }
+        kept |= {f"{task}, {name}": run.q[::THINNED].numpy() for name, run in runs.items()}
+    _, lifted, success = swung_up(None)
+    found["swing-up"] = {NONE: {"caught": float(success)}}
+    return found, kept | {"swing-up": lifted.q[::THINNED].numpy()}
+
+
+def single_link() -> PendulumChain:
+    """The rig with its first link alone, which an energy swing-up can lift."""
+    whole = rigs.rtip("free").to_dict()
+    first = {key: whole[key][:1] for key in ("mass", "length", "com", "inertia")}
+    return PendulumChain(
+        **first, arm=Arm(**whole["arm"]), gravity=whole["gravity"], name="rtip_single",
+        joint_names=whole["joint_names"][:2], convention=("relative", "upright"),
+    )  # fmt: skip
+
+
+def swung_up(
+    compensation: Compensation | None = None, *, seconds: float = 12.0
+) -> tuple[PendulumChain, ControlledMotion, bool]:
+    """Swing-up of a single link from hanging, and balance: the rig, its motion, and success."""
+    plant = single_link()
+    friction = true_friction(plant)
+    linear = linearise(plant, torch.zeros(2, dtype=torch.float64), SAMPLE_TIME)
+    weight = np.array([10.0, 100.0, 1.0, 1.0])
+    noise = 2.0 * math.pi / (ELECTRONICS.counts or math.inf) / math.sqrt(12.0)
+    balance = Balance(plant, linear, lqr(linear, weight, 1.0),
+                      kalman_gain(linear, TORQUE_NOISE, noise), still, compensation)  # fmt: skip
+    hanging = torch.tensor([0.0, math.pi], dtype=torch.float64)
+    run = control(plant, friction, SwingUp(balance), hanging, torch.zeros_like(hanging),
+                  steps=round(seconds / SAMPLE_TIME), electronics=ELECTRONICS)  # fmt: skip
+    late = run.q[run.time >= seconds - 1.0, 1].numpy()
+    return plant, run, bool(np.abs(np.angle(np.exp(1j * late))).max() < 0.1)

@@ -1,0 +1,162 @@
+"""Samples of fuzzy controllers along a measured motion, on which the papers train their network."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from nfriction.io.files import parse_json, write_atomically
+from nfriction.io.formats import write_table
+from nfriction.papers.controller.mamdani import MamdaniController, paper_controller
+from nfriction.papers.twin.dataset import Encoder, make
+from nfriction.signals import Motion, causal_motion
+
+INPUTS = ("speed", "acceleration")
+DIGITS = 9
+"""Of the numbers in the files: the last bits of a float differ between machines."""
+CHECKSUMS = "checksums.json"
+
+
+@dataclass(frozen=True, eq=False)
+class ControllerSamples:
+    """Inputs and outputs of a fuzzy controller for every joint.
+
+    Attributes:
+        joint_names: in the order of the arrays.
+        output_names: of the coefficients.
+        time: [s], shape (sample,).
+        x: |velocity| [rad/s] and acceleration [rad/s^2], shape (sample, joint, 2).
+        y: coefficients in SI, shape (sample, joint, output).
+    """
+
+    joint_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    time: NDArray[np.float64]
+    x: Tensor
+    y: Tensor
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def to_pandas(self, joint: int) -> pd.DataFrame:
+        """Table of one joint (counted from 0): time, speed, acceleration and the outputs."""
+        columns = torch.cat([self.x[:, joint], self.y[:, joint]], -1).numpy()
+        table = pd.DataFrame(columns, columns=[*INPUTS, *self.output_names])
+        table.insert(0, "time", self.time)
+        return table
+
+
+def sampled(
+    controllers: Sequence[MamdaniController],
+    motion: Motion,
+    *,
+    joint_names: Sequence[str],
+    every: int = 1,
+) -> ControllerSamples:
+    """Outputs of a controller for each joint along a motion.
+
+    Args:
+        controllers: of |velocity| and acceleration, one for each joint.
+        motion: velocity and acceleration as a controller has them, (sample, joint).
+        joint_names: one for each joint.
+        every: take one sample of this many.
+
+    Raises:
+        ValueError: if there is not one controller with the same outputs for each joint.
+    """
+    qd, qdd = torch.as_tensor(motion.qd[::every]), torch.as_tensor(motion.qdd[::every])
+    names = {tuple(v.name for v in c.rule_base.outputs) for c in controllers}
+    if len(controllers) != qd.shape[1] or len(names) != 1 or len(joint_names) != qd.shape[1]:
+        raise ValueError(
+            f"a motion of {qd.shape[1]} joints needs as many controllers and joint names, all "
+            f"controllers with the same outputs; got {len(controllers)} with {sorted(names)} and "
+            f"{len(joint_names)} names."
+        )
+    x = torch.stack([qd.abs(), qdd], -1)
+    y = torch.stack([c(x[:, j, 0], x[:, j, 1]) for j, c in enumerate(controllers)], 1)
+    return ControllerSamples(tuple(joint_names), names.pop(), motion.time[::every].copy(), x, y)
+
+
+def make_samples(*, seed: int = 0, duration: float | None = None) -> ControllerSamples:
+    """The papers' controllers along the measured friction experiment of the TLRIP twin.
+
+    40 s at 1 kHz make 40,000 samples a joint. Velocity and acceleration come from the encoders by
+    the causal filters of a real-time controller.
+
+    Args:
+        seed: of the encoders' errors.
+        duration: of the experiment [s]; by default 40.
+
+    References:
+        TLRIP paper, Tables 4 and 5, and the training of the 2-10-2 networks.
+    """
+    made = make("experiment", seed=seed, duration=duration)
+    (recording,) = made.recordings.values()
+    joint = recording.joint_coordinates(made.plant)
+    motion = causal_motion(joint.time, joint.q, 4 * Encoder().lines)
+    controllers = [paper_controller(number) for number in (2, 3, 4)]
+    return sampled(controllers, motion, joint_names=made.plant.joint_names)
+
+
+def build_samples(
+    out: str | os.PathLike[str], *, seed: int = 0, duration: float | None = None
+) -> ControllerSamples:
+    """Write `<joint>.csv.gz` for every joint and `checksums.json`; see `make_samples`.
+
+    Returns:
+        The samples as they are in the files, with nine digits.
+    """
+    folder, made = Path(out), make_samples(seed=seed, duration=duration)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / CHECKSUMS).unlink(missing_ok=True)  # of an earlier build
+    for joint, name in enumerate(made.joint_names):
+        table = made.to_pandas(joint).map(lambda value: float(f"{value:.{DIGITS}g}"))
+        write_table(table, folder / f"{name}.csv.gz")
+    # Last: a folder without it is not complete.
+    found = read_samples(folder, made.joint_names)
+    write_atomically(folder / CHECKSUMS, json.dumps(checksums(found), indent=1).encode())
+    return found
+
+
+def read_samples(
+    folder: str | os.PathLike[str], joint_names: Sequence[str] = ("joint2", "joint3", "joint4")
+) -> ControllerSamples:
+    """Samples from the folder that `build_samples` wrote them to.
+
+    Raises:
+        OSError: if a file is missing.
+        ValueError: if a file differs from its checksum.
+    """
+    folder = Path(folder)
+    tables = [pd.read_csv(folder / f"{name}.csv.gz") for name in joint_names]
+    outputs = tuple(tables[0].columns[1 + len(INPUTS) :])
+    x, y = (
+        torch.tensor(np.stack([table[list(names)].to_numpy() for table in tables], 1))
+        for names in (INPUTS, outputs)
+    )
+    time = tables[0]["time"].to_numpy(dtype=np.float64)
+    found = ControllerSamples(tuple(joint_names), outputs, time, x, y)
+    path = folder / CHECKSUMS
+    if path.exists() and parse_json(path.read_bytes()) != checksums(found):
+        raise ValueError(f"{folder}: files differ from {CHECKSUMS}; build them again.")
+    return found
+
+
+def checksums(samples: ControllerSamples) -> dict[str, str]:
+    """SHA-256 by joint of its numbers, rounded as in the files."""
+    found = {}
+    for joint, name in enumerate(samples.joint_names):
+        rows = samples.to_pandas(joint).to_numpy()
+        text = "\n".join(" ".join(f"{value:.{DIGITS}g}" for value in row) for row in rows)
+        found[name] = hashlib.sha256(text.encode()).hexdigest()
+    return found

@@ -1,0 +1,131 @@
+"""Control of the rig: gains, balance, swing-up, and exported C in the loop."""
+
+import ctypes
+import math
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from nfriction import LFM, NFLFM, export, rigs
+from nfriction.friction.models import FrictionModel
+from nfriction.papers.control import study
+from nfriction.papers.control.feedback import Compensation, kalman_gain, linearise, lqr
+from nfriction.simulation.rollout import rollout
+
+PLANT = rigs.rtip("free")
+UPRIGHT = torch.zeros(4, dtype=torch.float64)
+LINEAR = linearise(PLANT, UPRIGHT, 1e-3)
+
+
+def test_the_linear_plant_moves_as_the_plant_near_the_top() -> None:
+    start = 1e-6 * torch.tensor([1.0, -2.0, 3.0, -1.0], dtype=torch.float64)
+    tau = 1e-6 * torch.tensor([[1.0, 0.5, -1.0, 2.0]], dtype=torch.float64)
+    run = rollout(PLANT, None, start, 2 * start, tau)
+    state = np.concatenate([start, 2 * start])
+    after = LINEAR.a @ state + LINEAR.b @ tau[0].numpy()
+    # RK4 and the exponential differ by (h lambda)^5, the plant and its linear part by squares.
+    np.testing.assert_allclose(after, np.concatenate([run.q[-1], run.qd[-1]]), atol=1e-14)
+
+
+def test_the_upright_rig_is_unstable_and_its_loops_are_not() -> None:
+    gain = lqr(LINEAR, np.array(study.STATE_WEIGHT), 1.0)
+    observer = kalman_gain(LINEAR, 1.0, 2e-4)
+    joints = np.hstack([np.eye(4), np.zeros((4, 4))])
+    assert np.abs(np.linalg.eigvals(LINEAR.a)).max() > 1.003
+    assert np.abs(np.linalg.eigvals(LINEAR.a - np.outer(LINEAR.b[:, 0], gain))).max() < 1.0
+    kept = np.eye(8) - observer @ joints
+    assert np.abs(np.linalg.eigvals(kept @ LINEAR.a)).max() < 1.0
+
+
+def test_a_pose_that_is_no_equilibrium_is_refused() -> None:
+    with pytest.raises(ValueError, match="not in equilibrium"):
+        linearise(PLANT, UPRIGHT + 0.1, 1e-3)
+
+
+def test_true_friction_is_passive() -> None:
+    friction = study.true_friction(PLANT)
+    qd = torch.linspace(-6, 6, 241, dtype=torch.float64)[:, None].expand(-1, 4)
+    load = torch.rand_like(qd)
+    assert (qd * friction.torque(qd, load, friction.coefficients(qd, qd)) >= 0).all()
+
+
+def test_three_links_stay_upright() -> None:
+    runs = study.balanced(
+        PLANT, study.true_friction(PLANT), {study.NONE: None}, seconds=3.0, follow=False
+    )
+    found = study.performance(runs[study.NONE], follow=False, settled=1.0)
+    assert found["largest tilt [mrad]"] < 100
+
+
+@pytest.mark.slow
+def test_compensation_helps_the_arm_to_follow() -> None:
+    friction = study.true_friction(PLANT)
+    runs = study.balanced(
+        PLANT, friction,
+        {study.NONE: None, study.TRUTH: study.compensation_of(friction)},
+        seconds=18.0, follow=True,
+    )  # fmt: skip
+    found = {n: study.performance(run, follow=True, settled=8.0) for n, run in runs.items()}
+    key = "tracking error [mrad]"
+    assert found[study.TRUTH][key] < 0.9 * found[study.NONE][key]
+
+
+def test_a_fallen_rig_has_no_tracking_error() -> None:
+    friction = study.true_friction(PLANT)
+    runs = study.balanced(PLANT, friction, {study.NONE: None}, seconds=0.5, follow=False)
+    run = runs[study.NONE]
+    run.q[-1, 1] = 2.0
+    assert set(study.performance(run, follow=False, settled=0.1).values()) == {math.inf}
+
+
+@pytest.mark.slow
+def test_a_single_link_swings_up_and_stays() -> None:
+    plant, run, success = study.swung_up(seconds=8.0)
+    assert success
+    assert plant.joints == 2
+    assert run.tau.abs().max() <= study.ELECTRONICS.torque_limit
+
+
+def compiled(model: FrictionModel, folder: Path) -> Compensation:
+    """The friction torque of a model by its exported C."""
+    export.c(model, folder)
+    library = folder / "friction.so"
+    subprocess.run(
+        ["cc", "-O2", "-shared", "-fPIC", "-ffp-contract=off", str(folder / "nfriction.c"),
+         "-o", str(library), "-lm"], check=True,
+    )  # fmt: skip
+    step = ctypes.CDLL(str(library)).nfriction_step
+    number = ctypes.POINTER(ctypes.c_double)
+
+    def torque(qd: np.ndarray, qdd: np.ndarray, load: np.ndarray) -> np.ndarray:
+        rows = []
+        for row in zip(qd.reshape(-1, 4), qdd.reshape(-1, 4), load.reshape(-1, 4), strict=True):
+            given = [np.ascontiguousarray(x, dtype=np.float64) for x in row]
+            out, coefficients = np.zeros(4), np.zeros(4 * len(model.law.names))
+            status = (ctypes.c_int * 4)()
+            step(*(x.ctypes.data_as(number) for x in (*given, out, coefficients)), status)
+            rows.append(out)
+        return np.stack(rows).reshape(qd.shape)
+
+    return torque
+
+
+@pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
+@pytest.mark.parametrize("kind", [LFM, NFLFM])
+def test_exported_c_in_the_loop_gives_the_same_motion(kind: type, tmp_path: Path) -> None:
+    model = kind(4, [0.05, 0.17]).requires_grad_(False)
+    friction = study.true_friction(PLANT)
+    runs = study.balanced(
+        PLANT, friction,
+        {"torch": study.compensation_of(model), "C": compiled(model, tmp_path)},
+        seconds=1.0, follow=True,
+    )  # fmt: skip
+    # Torques pass a converter of 16 bits, which removes what the last bits of exp differ by.
+    assert torch.equal(runs["torch"].tau, runs["C"].tau)
+    assert torch.equal(runs["torch"].q, runs["C"].q)
+    plain = study.balanced(PLANT, friction, {"none": None}, seconds=1.0, follow=True)
+    assert not torch.equal(plain["none"].q, runs["C"].q)

@@ -1,0 +1,82 @@
+"""The supervised data set, and the loader of all simulated ones."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from nfriction import datasets
+from nfriction.papers import twin
+from nfriction.papers.controller.mamdani import paper_controller
+from nfriction.papers.controller.samples import ControllerSamples, checksums, sampled
+from nfriction.signals import Motion
+
+CARDS = Path(__file__).resolve().parents[3] / "datasets"
+
+
+def controller_samples(**options: object) -> ControllerSamples:
+    found = datasets.load("tlrip_controller", **options)  # type: ignore[arg-type]
+    assert isinstance(found, ControllerSamples)
+    return found
+
+
+def test_targets_are_what_the_controllers_say_of_the_measured_motion(tmp_path: Path) -> None:
+    samples = controller_samples(duration=1.0, cache=tmp_path)
+    assert samples.x.shape == samples.y.shape == (1000, 3, 2)
+    assert samples.output_names == ("B", "C")
+    assert (samples.x[..., 0] >= 0).all()
+    for joint, number in enumerate((2, 3, 4)):
+        said = paper_controller(number)(samples.x[:, joint, 0], samples.x[:, joint, 1])
+        # The files have nine digits.
+        torch.testing.assert_close(said, samples.y[:, joint], rtol=1e-7, atol=0.0)
+
+
+def test_what_was_built_is_read_later_and_a_change_is_noticed(tmp_path: Path) -> None:
+    first = controller_samples(duration=0.2, cache=tmp_path)
+    (folder,) = (p for p in tmp_path.iterdir() if p.is_dir())
+    assert checksums(controller_samples(duration=0.2, cache=tmp_path)) == checksums(first)
+    table = first.to_pandas(1)
+    table.loc[3, "B"] *= 1.5
+    table.to_csv(folder / "joint3.csv.gz", index=False)
+    with pytest.raises(ValueError, match="differ from checksums"):
+        controller_samples(duration=0.2, cache=tmp_path)
+
+
+@pytest.mark.parametrize("name", [n for n in datasets.names() if n.endswith("_twin")])
+def test_a_loaded_twin_is_the_one_that_was_made(name: str, tmp_path: Path) -> None:
+    made = twin.make(name.removesuffix("_twin"), duration=0.2, seed=3)
+    for _ in ("built", "read"):
+        found = datasets.load(name, seed=3, duration=0.2, cache=tmp_path)
+        assert isinstance(found, twin.Twin)
+        assert found.splits == made.splits
+        assert found.plant.to_dict() == made.plant.to_dict()
+        for label, recording in made.recordings.items():
+            assert found.recordings[label].digest() == recording.digest()
+            np.testing.assert_array_equal(found.truth[label].qdd, made.truth[label].qdd)
+            np.testing.assert_array_equal(found.initial_states[label], made.initial_states[label])
+    assert len([p for p in tmp_path.iterdir() if p.is_dir()]) == 1
+
+
+def test_bad_names_are_refused_before_anything_is_written(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="tlrip_controller"):
+        datasets.load("cartpole", cache=tmp_path)
+    with pytest.raises(ValueError, match="load"):
+        datasets.load("twin_family", truth="../../x", cache=tmp_path)
+    with pytest.raises(ValueError, match="duration"):
+        datasets.load("rtip_twin", duration=0.001, cache=tmp_path)
+    assert not [p for p in tmp_path.iterdir() if p.is_dir()]
+
+
+def test_a_motion_needs_a_controller_for_each_joint() -> None:
+    still = Motion(np.arange(3.0), *(np.zeros((3, 2)) for _ in range(3)))
+    with pytest.raises(ValueError, match="2 joints"):
+        sampled([paper_controller(2)], still, joint_names=("a", "b"))
+
+
+@pytest.mark.slow
+def test_the_full_set_is_that_of_its_card(tmp_path: Path) -> None:
+    card = (CARDS / "tlrip_controller" / "README.md").read_text(encoding="utf-8")
+    samples = controller_samples(cache=tmp_path)
+    assert len(samples) == 40_000
+    assert all(checksum in card for checksum in checksums(samples).values())

@@ -1,0 +1,167 @@
+"""Train the first paper's networks on the outputs of fuzzy controllers along a measured motion.
+
+    python trainers/train_supervised.py
+    python trainers/train_supervised.py --adaptive runs/papers/models/ANLFM.json --units 12
+
+The data set is `tlrip_controller`: 40,000 samples a joint of velocity, acceleration and the outputs
+of the papers' own controllers, coefficients B and C of the linear law. `--adaptive` takes
+controllers that the coefficients by class of an adaptive model span instead, of any law, along the
+same motion. Writes the model with its TorchScript, a figure of the error by step and one of what
+the networks learnt. A run takes about a minute and starts again after an interruption.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import common
+import torch
+from matplotlib.figure import Figure
+
+from nfriction import datasets, load
+from nfriction.export import torchscript
+from nfriction.friction import model_names
+from nfriction.friction.laws import LINEAR, Law
+from nfriction.io.model_file import ModelInfo, save
+from nfriction.optim.evidence import EvidenceState
+from nfriction.papers.afem.adaptive import Adaptive
+from nfriction.papers.controller.mamdani import MamdaniController, paper_controller
+from nfriction.papers.controller.samples import ControllerSamples, sampled
+from nfriction.papers.nffem.train_network import TrainingOptions
+from nfriction.papers.reproduction.procedure import controllers_from_classes, train_on_samples
+from nfriction.plots import style
+from nfriction.signals import Motion
+
+MODELS = tuple(name for name in model_names() if name.startswith("NF"))
+SHOWN_SECONDS = 12.0  # of the motion: later it has almost died out
+
+
+def train(argv: Sequence[str] | None) -> str:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--adaptive", type=Path, metavar="MODEL",
+                        help="adaptive model file whose classes span the controllers")  # fmt: skip
+    parser.add_argument("--units", type=int, default=10, help="of each network")
+    parser.add_argument("--max-steps", type=int, default=100, help="of Bayesian regularisation")
+    parser.add_argument("--starts", type=int, default=1, help="the best by evidence is taken")
+    parser.add_argument("--seconds", type=float, help="of the motion; by default its 40 s")
+    parser.add_argument("--seed", type=int, default=0, help="of encoders and starts")
+    parser.add_argument("--out", type=Path, default=Path("runs/supervised"), help="folder to write")
+    given = parser.parse_args(argv)
+    law, controllers, samples = _data(given)
+    losses: list[list[float]] = []
+
+    def keep(state: EvidenceState) -> None:
+        # The training of each joint counts its steps from 1.
+        if state.step == 1:
+            losses.append([])
+        # The noise is relative to half the range of an output.
+        losses[-1].append(50.0 * (0.5 / state.beta) ** 0.5)
+
+    options = TrainingOptions(
+        max_steps=given.max_steps, seed=given.seed, starts=given.starts, callback=keep
+    )
+    model, fits = train_on_samples(law, controllers, samples, units=given.units, options=options)
+    ended = [f"{n}: {f.evidence.message}" for n, f in zip(samples.joint_names, fits, strict=True)]
+    converged = all(f.evidence.converged for f in fits)
+    fastest, (braking, driving) = samples.x[..., 0].amax(0), samples.x[..., 1].aminmax(dim=0)
+    info = ModelInfo(
+        joint_names=samples.joint_names,
+        input_ranges={"qd": torch.stack([-fastest, fastest], -1).tolist(),
+                      "qdd": torch.stack([braking, driving], -1).tolist()},
+        fit={"status": " ".join(ended), "converged": converged},
+    )  # fmt: skip
+    path = save(model, given.out / f"{type(model).__name__}.json", info)
+    torchscript(model, path.with_suffix(".pt"), info)
+    learnt = model.schedule(samples.x[..., 0], samples.x[..., 1])
+    span = samples.y.amax(0) - samples.y.amin(0)
+    error = (learnt - samples.y).square().mean(0).sqrt() / span
+    for name, figure in (
+        ("loss", _loss(losses, samples.joint_names)),
+        ("outputs", _outputs(samples, learnt)),
+    ):
+        figure.savefig(given.out / f"{path.stem}-{name}.png", dpi=150)
+    lines = [
+        f"{path.stem}: {len(samples)} samples a joint, {given.units} units",
+        *ended,
+        *(
+            f"{joint}: error of the network [% of the output's range] "
+            + ", ".join(
+                f"{n} {100 * e:.2f}" for n, e in zip(samples.output_names, row, strict=True)
+            )
+            for joint, row in zip(samples.joint_names, error.tolist(), strict=True)
+        ),
+        f"wrote {path}, its TorchScript and figures of loss and outputs",
+    ]
+    return "\n".join(lines)
+
+
+def _data(
+    given: argparse.Namespace,
+) -> tuple[Law, list[MamdaniController], ControllerSamples]:
+    """The law, its controllers and their samples."""
+    samples = datasets.load("tlrip_controller", seed=given.seed, duration=given.seconds)
+    assert isinstance(samples, ControllerSamples)
+    if given.adaptive is None:
+        return LINEAR, [paper_controller(joint) for joint in (2, 3, 4)], samples
+    adaptive = load(given.adaptive)
+    if not isinstance(adaptive.schedule, Adaptive) or adaptive.joints != len(samples.joint_names):
+        raise ValueError(
+            f"--adaptive needs an adaptive model of {len(samples.joint_names)} joints, "
+            f"{given.adaptive} holds {type(adaptive).__name__} with {adaptive.joints}."
+        )
+    speed, acceleration = samples.x.unbind(-1)
+    motion = Motion(samples.time, *(x.numpy() for x in (speed, speed, acceleration)))
+    controllers = controllers_from_classes(
+        adaptive.law, adaptive.schedule.values, motion.qd, motion.qdd
+    )
+    again = sampled(controllers, motion, joint_names=samples.joint_names)
+    return adaptive.law, controllers, again
+
+
+def _loss(losses: Sequence[Sequence[float]], joints: Sequence[str]) -> Figure:
+    """Estimated error of the outputs over the steps of the training, a line a joint."""
+    figure, axes = style.panels(1, 1, style.PAGE, 2.4)
+    looks, ax = style.looks(joints), axes[0, 0]
+    for joint, values in zip(joints, losses, strict=False):
+        ax.plot(range(1, len(values) + 1), values, **looks[joint].line)
+    ax.set_yscale("log")
+    ax.set_xlabel("step of Bayesian regularisation")
+    ax.set_ylabel("error [% of the range]")
+    style.legend(figure, [looks[joint].handle for joint in joints], list(joints))
+    return figure
+
+
+def _outputs(samples: ControllerSamples, learnt: torch.Tensor) -> Figure:
+    """Outputs of controller and network along the motion, a column a joint."""
+    shown = samples.time <= SHOWN_SECONDS
+    count = len(samples.output_names)
+    figure, axes = style.panels(
+        count, len(samples.joint_names), style.PAGE, 0.6 + 1.3 * count, sharex=True
+    )
+    for row, name in zip(range(count), samples.output_names, strict=True):
+        for column, joint in enumerate(samples.joint_names):
+            ax = axes[row, column]
+            (given,) = ax.plot(samples.time[shown], samples.y[shown, column, row], **style.MEASURED)
+            (found,) = ax.plot(
+                samples.time[shown], learnt[shown, column, row], color=style.COLOURS[0],
+                linewidth=0.9,
+            )  # fmt: skip
+            if row == 0:
+                style.title(ax, joint)
+        axes[row, 0].set_ylabel(f"{name} [SI]")
+    for ax in axes[-1]:
+        ax.set_xlabel("time [s]")
+    style.legend(figure, [given, found], ["controller", "network"])
+    return figure
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    print(common.run(train, argv))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
