@@ -4,6 +4,13 @@
 
 #include "nf.h"
 
+#if NF_STATE_SIZE
+static nf_state state;
+#define STEP(...) nf_step(&state, __VA_ARGS__)
+#else
+#define STEP(...) nf_step(__VA_ARGS__)
+#endif
+
 static double now(void)
 {
     struct timespec t;
@@ -21,7 +28,7 @@ double batch(long calls, long rows, const nf_real *qd, const nf_real *qdd, const
     long call;
     for (call = 0; call < calls; ++call) {
         const long at = call % rows * NF_JOINTS;
-        nf_step(qd + at, qdd + at, load + at, tau, coefficients, status);
+        STEP(qd + at, qdd + at, load + at, tau, coefficients, status);
         *total += (double)tau[0];
     }
     return (now() - begin) / (double)calls;
@@ -38,7 +45,7 @@ double latency(long calls, long rows, const nf_real *qd, const nf_real *qdd, con
     for (call = 0; call < calls; ++call) {
         const long at = call % rows * NF_JOINTS;
         begin = now();
-        nf_step(qd + at, qdd + at, load + at, tau, coefficients, status);
+        STEP(qd + at, qdd + at, load + at, tau, coefficients, status);
         ns[call] = now() - begin;
         total += (double)tau[0];
     }

@@ -3,10 +3,11 @@
     python benchmarks/latency.py [--calls 200000]
 
 The controller is an NFLFM (5 x 5 rules and 10 radial units a joint) with random parameters, in all
-targets the same. Every call is timed on its own. For C what two readings of the clock cost (their
-median, measured beside it) is taken off; the last column is the mean of many calls in a row, which
-needs no such correction. Rows of C name the compiler's options. TorchScript in C++ needs cmake,
-ONNX Runtime its package; what is not here is left out.
+targets the same, and in one of them a LuGre model, whose law has memory. Every call is timed on its
+own. For C what two readings of the clock cost (their median, measured beside it) is taken off; the
+last column is the mean of many calls in a row, which needs no such correction. Rows of C name the
+compiler's options. TorchScript in C++ needs cmake, ONNX Runtime its package; what is not here is
+left out.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import ctypes
 import subprocess
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import latency_torch
@@ -28,6 +29,7 @@ from nfriction.export import c
 from nfriction.export.c_code.export import find_compiler
 from nfriction.export.controller import controller_of
 from nfriction.export.test_vectors import draw
+from nfriction.friction.memory import LuGre
 from nfriction.io.model_file import ModelInfo
 
 JOINTS = (1, 4)
@@ -105,6 +107,16 @@ def c_timer(dtype: str, *options: str) -> Timer:
     return run
 
 
+def with_memory(timer: Timer) -> Timer:
+    """A timer of a LuGre model in place of the given one."""
+
+    def run(given: Case) -> Times:
+        model = LuGre(given.model.joints, [1.0, 0.5, 0.05, 1e4, 10.0, 0.4])
+        return timer(replace(given, model=model, folder=given.folder / "lugre"))
+
+    return run
+
+
 def alone(timer: Callable[[Case], np.ndarray]) -> Timer:
     """A timer of single calls, each so long that the clock does not count."""
     return lambda given: Times(timer(given))
@@ -120,6 +132,7 @@ TARGETS: list[tuple[str, Timer, tuple[float | None, float | None]]] = [
     ("C, float, -O2", c_timer("float32", "-O2"), (None, None)),
     ("C, float, -O3", c_timer("float32", "-O3"), (0.25, 1.0)),
     ("C, float, native", c_timer("float32", *NATIVE), (0.25, 1.0)),
+    ("LuGre, C, double, -O2", with_memory(c_timer("float64", "-O2")), (0.25, 1.0)),
     ("TorchScript in C++", alone(latency_torch.torchscript_cpp), (None, None)),
     ("TorchScript in Python", alone(latency_torch.torchscript_python), (None, None)),
     ("ONNX Runtime, double", alone(latency_torch.onnx_runtime), (None, None)),

@@ -22,8 +22,9 @@ from cases import DT, STEPS
 from limit import hand_written
 from timing import Contestant, verdict
 
-from nfriction import FrictionModel, PendulumChain, rollout
+from nfriction import CVFM, FrictionModel, PendulumChain, Stribeck, rollout
 from nfriction.codegen import RolloutSignals, compile_rollout
+from nfriction.friction.memory import LuGre, MaxwellSlip
 from nfriction.simulation.rk4 import rk4_step
 
 BATCH_STEPS = 2_000
@@ -115,6 +116,28 @@ def batched(count: int, rounds: int) -> dict[str, float]:
     return timing.compare(title, [own, *present(makers)], rounds)
 
 
+def with_memory(rounds: int) -> dict[str, float]:
+    """A law with memory beside the memoryless one to which it settles at a constant velocity."""
+    plant = cases.rig()
+    q0, qd0 = cases.release()
+    # In sliding the same; smooth enough at rest that RK4 needs no steps within a sample.
+    models = {
+        "Stribeck": Stribeck(3, [2e-3, 1e-3, 2e-3, 0.05, 2.0], v_smooth=0.1),
+        "LuGre": LuGre(3, [2e-3, 1e-3, 0.05, 50.0, 0.05, 2e-3]),
+        "Maxwell-slip": MaxwellSlip(3),
+        "Coulomb-viscous": CVFM(3, [2e-3, 2e-3], v_smooth=0.1),
+    }
+    contestants = [
+        Contestant(
+            name, ours(plant, model, q0, qd0, steps=STEPS, backend="compiled"), tolerance=np.inf
+        )
+        for name, model in models.items()
+    ]
+    return timing.compare(
+        f"{STEPS:,} steps of {DT * 1e3:g} ms, three links, laws with memory", contestants, rounds
+    )
+
+
 def same_mechanism() -> None:
     """MuJoCo without frictionloss must give our motion: then its model is our rig."""
     plant, friction = cases.rig(), cases.constant()
@@ -144,6 +167,7 @@ def main(argv: list[str] | None = None) -> int:
         plain = single(cases.constant(), "constant coefficients", options.rounds, folder)
         fuzzy = single(cases.neurofuzzy(), "neuro-fuzzy, held", options.rounds, folder)
     batch = batched(options.candidates, options.rounds)
+    memory = with_memory(options.rounds)
     print("\nTargets")
 
     def ratio(times: dict[str, float], top: str, base: str, target: float, most: bool) -> None:
@@ -162,6 +186,8 @@ def main(argv: list[str] | None = None) -> int:
         ratio(times, "diffrax", "ours, compiled", limits[1], False)
     ratio(plain, "MuJoCo", "ours, compiled", 30.0, False)
     ratio(fuzzy, "ours, torch", "ours, compiled", 300.0, False)
+    print("  laws with memory")
+    ratio(memory, "LuGre", "Stribeck", 1.5, True)
     print("  candidates")
     ratio(batch, "MuJoCo", "ours, compiled", 30.0, False)
     return 0

@@ -179,6 +179,7 @@ def contract_of(
     """
     if dtype not in TOLERANCE:
         raise ValueError(f'`dtype` must be "float64" or "float32", got {dtype!r}.')
+    info = info or ModelInfo()
     inputs = trials(controller)
     if dtype == "float32":
         # As the target will be given them: at the edges of the range a rounding decides the status.
@@ -186,7 +187,9 @@ def contract_of(
     outputs = controller.run(*inputs)
     beyond = "of clamped inputs" if controller.clamps else "as the model has them there"
     description = {
-        **describe(model, info or ModelInfo()),
+        **describe(model, info),
+        # Of a law with memory its state is given out, too.
+        "coefficients": describe(controller.model, info)["coefficients"],
         "format": FORMAT,
         "schema": SCHEMA,
         "dtype": dtype,

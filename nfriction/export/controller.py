@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from nfriction.friction.models import FrictionModel
+from nfriction.friction.sampled import sampled
 from nfriction.io.files import numbers
 from nfriction.io.model_file import ModelInfo
 from nfriction.signals import SecondOrderLowPass
@@ -50,9 +51,17 @@ def controller_of(
         cutoff_hz: cut-off of that filter [Hz].
 
     Raises:
-        ValueError: if a range or the limit is malformed, or a filter lacks its sample time.
+        ValueError: if a range or the limit is malformed, or a filter or a law with memory lacks
+            its sample time.
     """
     info = info or ModelInfo()
+    if model.law.memory is not None:
+        if info.sample_time is None:
+            raise ValueError(
+                f"the law {model.law.name!r} has memory, which a controller advances by "
+                "`ModelInfo.sample_time` [s], got None."
+            )
+        model = sampled(model, info.sample_time)
     if not with_filter:
         return Controller(model, info, torque_limit)
     if info.sample_time is None:

@@ -242,7 +242,7 @@ _RULES: dict[str, Rule] = {
     **{
         aten: _plain(op)
         for aten, op in {
-            "abs": "Abs", "exp": "Exp", "neg": "Neg", "tanh": "Tanh", "log": "Log",
+            "abs": "Abs", "exp": "Exp", "neg": "Neg", "sign": "Sign", "tanh": "Tanh", "log": "Log",
             "sqrt": "Sqrt", "sin": "Sin", "sigmoid": "Sigmoid", "reciprocal": "Reciprocal",
             "bitwise_not": "Not", "logical_not": "Not", "mul": "Mul", "div": "Div",
             "maximum": "Max", "minimum": "Min", "pow": "Pow", "bitwise_or": "Or",

@@ -41,7 +41,7 @@ References:
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -49,21 +49,24 @@ from torch import Tensor
 from nfriction.friction.laws import Coefficient, Law, Memory, smooth_sign
 from nfriction.friction.models import V_SMOOTH, ConstantModel
 
-# Keeps 0/0 away where a coefficient is zero, and below what a decay over a sample can resolve.
-TINY = 1e-12
-SMALL = 1e-3
+# TorchScript has no arithmetic on unions: it compiles these functions for tensors.
+if TYPE_CHECKING:
+    Duration = float | Tensor
+else:
+    Duration = Tensor
+# 1e-12 keeps 0/0 away where a coefficient is zero; written out, as TorchScript takes no global.
 
 
 def growth(x: Tensor) -> Tensor:
     """Share `(1 - exp(-x)) / x` of a held input that a decaying state keeps, 1 at x = 0."""
     # The quotient cancels at small x, where four terms of its series are exact to rounding.
     series = 1.0 - x * (1 / 2 - x * (1 / 6 - x / 24))
-    return torch.where(x < SMALL, series, (1.0 - torch.exp(-x)) / x.clamp(min=SMALL))
+    return torch.where(x < 1e-3, series, (1.0 - torch.exp(-x)) / x.clamp(min=1e-3))
 
 
 def steady_friction(qd: Tensor, f_c: Tensor, f_d: Tensor, v_s: Tensor) -> Tensor:
     """Stribeck curve `g(v) = F_c + F_d exp(-(v/v_s)^2)` without sign and viscous part [N m]."""
-    return (f_c + f_d * torch.exp(-(qd / v_s).square())).clamp(min=TINY)
+    return (f_c + f_d * torch.exp(-(qd / v_s).square())).clamp(min=1e-12)
 
 
 def bristle_torque(
@@ -81,7 +84,7 @@ def bristle_torque(
     """
     stiffness, damping, viscous = coefficients.unbind(-1)
     # The energy that damping may give back at most equals what slipping dissipates.
-    most = 2.0 * steady / (qd.abs() * slipping.abs().clamp(min=1.0)).clamp(min=TINY)
+    most = 2.0 * steady / (qd.abs() * slipping.abs().clamp(min=1.0)).clamp(min=1e-12)
     return stiffness * z + torch.minimum(damping, most) * (1.0 - slipping) * qd + viscous * qd
 
 
@@ -89,11 +92,11 @@ def bristle_torque(
 
 
 def advance_dahl(
-    state: Tensor, qd: Tensor, load: Tensor, coefficients: Tensor, time_step: float | Tensor
+    state: Tensor, qd: Tensor, load: Tensor, coefficients: Tensor, time_step: Duration
 ) -> Tensor:
     """Deflection after a sample; exponential in the displacement."""
     f_c, _, stiffness = coefficients.unbind(-1)
-    return _relaxed(state, qd, f_c.clamp(min=TINY), stiffness, time_step)
+    return _relaxed(state, qd, f_c.clamp(min=1e-12), stiffness, time_step)
 
 
 def dahl_torque(state: Tensor, qd: Tensor, load: Tensor, coefficients: Tensor) -> Tensor:
@@ -112,7 +115,7 @@ def steady_dahl(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float)
 
 
 def advance_lugre(
-    state: Tensor, qd: Tensor, load: Tensor, coefficients: Tensor, time_step: float | Tensor
+    state: Tensor, qd: Tensor, load: Tensor, coefficients: Tensor, time_step: Duration
 ) -> Tensor:
     """Deflection after a sample; exponential in the displacement."""
     f_c, f_d, v_s, stiffness = coefficients[..., :4].unbind(-1)
@@ -135,7 +138,7 @@ def steady_lugre(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float
 
 
 def _relaxed(
-    state: Tensor, qd: Tensor, steady: Tensor, stiffness: Tensor, time_step: float | Tensor
+    state: Tensor, qd: Tensor, steady: Tensor, stiffness: Tensor, time_step: Duration
 ) -> Tensor:
     """Solution of dz/dt = qd - stiffness |qd| z / steady after a time step, (..., 1)."""
     path = qd * time_step
@@ -149,7 +152,7 @@ def _relaxed(
 
 
 def advance_elasto_plastic(
-    state: Tensor, qd: Tensor, load: Tensor, coefficients: Tensor, time_step: float | Tensor
+    state: Tensor, qd: Tensor, load: Tensor, coefficients: Tensor, time_step: Duration
 ) -> Tensor:
     """Deflection after a sample: elastic up to z_b, from there on logistic in the displacement."""
     elastic, settled = _elastic_range(qd, coefficients)
@@ -164,7 +167,7 @@ def advance_elasto_plastic(
     kept = torch.exp(-x)
     lost = x * growth(x)
     # Sums of positive terms alone, which do not cancel; against the motion y is not used.
-    y = moved.clamp(min=TINY * settled)
+    y = moved.clamp(min=1e-12 * settled)
     slid = (settled * y + plastic * (y * kept + settled * lost)) / (
         y * lost + plastic + settled * kept
     )
@@ -188,7 +191,7 @@ def _elastic_range(qd: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
     f_c, f_d, v_s, stiffness = coefficients[..., :4].unbind(-1)
     # Beyond 1 the bristle would never slip.
     share = coefficients.select(-1, 6).clamp(max=0.99)
-    stiffness = stiffness.clamp(min=TINY)
+    stiffness = stiffness.clamp(min=1e-12)
     settled = steady_friction(qd, f_c, f_d, v_s) / stiffness
     return share * f_c / stiffness, settled
 
@@ -198,7 +201,7 @@ def _elastic_range(qd: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def advance_slip(
-    state: Tensor, qd: Tensor, load: Tensor, coefficients: Tensor, time_step: float | Tensor
+    state: Tensor, qd: Tensor, load: Tensor, coefficients: Tensor, time_step: Duration
 ) -> Tensor:
     """Deflections after a sample: moved along, and clipped where elements slip."""
     count = state.shape[-1]

@@ -13,7 +13,7 @@ from torch import Tensor
 from nfriction.fitting.fit import fit
 from nfriction.friction import memory_names, model_by_name, model_name, plain_name
 from nfriction.friction.laws import Law, Memory
-from nfriction.friction.memory import DAHL, ELASTO_PLASTIC, LUGRE, TINY, LuGre, maxwell_slip
+from nfriction.friction.memory import DAHL, ELASTO_PLASTIC, LUGRE, LuGre, maxwell_slip
 from nfriction.plant.rigs import multiarm_single
 from nfriction.recording import Recording
 
@@ -200,7 +200,7 @@ def test_a_stiff_contact_is_stable_at_a_millisecond(law: Law) -> None:
 
 @every_law
 def test_zero_coefficients_give_finite_torques(law: Law) -> None:
-    c = torch.full((1, len(law.names)), TINY, dtype=torch.float64)
+    c = torch.full((1, len(law.names)), 1e-12, dtype=torch.float64)
     for qd in (-1.0, 0.0, 1e-9, 5.0):
         v, one = torch.full((1,), qd, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
         state = memory(law).advance(law.initial_state(v), v, one, c, 1e-3)

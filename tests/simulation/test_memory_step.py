@@ -216,6 +216,43 @@ def test_the_stick_slip_cycle_has_the_period_of_the_published_equations() -> Non
     assert period(*stick_slip(5e-3)) == pytest.approx(published, rel=0.02)
 
 
+def breakaway(rate: float) -> float:
+    """Largest friction under a force on a mass of 1 kg that grows by so many N/s."""
+    count = round(2000.0 / min(rate, 2.0))
+    step = 2.0 / rate / count
+    push = (torch.arange(count, dtype=F64)[:, None] + 0.5) * step * rate
+    start, law = torch.zeros(1, dtype=F64), LUGRE.memory
+    model = LuGre(1, CLASSIC).requires_grad_(False)
+    run = rollout(LinearAxis(1.0), model, start, start, push, sample_time=step)
+    assert law is not None
+    assert run.law_state is not None
+    c = torch.tensor(CLASSIC, dtype=F64)
+    return float(law.torque(run.law_state, run.qd, torch.ones_like(run.qd), c).max())
+
+
+def test_a_fast_load_breaks_a_contact_away_sooner() -> None:
+    # Fig. 3 of Canudas de Wit et al.: from nearly F_s = 1.5 N down to nearly F_c = 1 N.
+    slow, medium, fast = (breakaway(rate) for rate in (1.0, 10.0, 50.0))
+    assert 1.35 < slow < 1.5
+    assert 1.15 < medium < 1.3
+    assert 0.99 < fast < 1.1
+
+
+def test_friction_lags_behind_a_changing_velocity() -> None:
+    # Higher while the velocity rises than while it falls, as Hess and Soom measured.
+    law, c, dt = LUGRE.memory, torch.tensor(CLASSIC, dtype=F64), 1e-4
+    assert law is not None
+    t = torch.arange(4000, dtype=F64) * dt
+    v = (1.5e-3 * (1.0 - 0.9 * torch.cos(2.0 * math.pi * 10.0 * t)))[:, None]
+    one, state, found = torch.ones(1, dtype=F64), LUGRE.initial_state(v[0]), []
+    for qd in v:
+        state = law.advance(state, qd, one, c, dt)
+        found.append(law.torque(state, qd, one, c))
+    up, down = torch.stack(found[-1000:-500]), torch.stack(found[-500:]).flip(0)
+    assert float((up - down)[50:450].min()) > 0.0
+    assert float((up - down).max()) > 0.05
+
+
 def test_a_recording_is_scored_with_the_law_it_was_made_with() -> None:
     model = models()["lugre"]
     run = rollout(CHAIN, model, Q0, REST, sample_time=2e-3, steps=2500)

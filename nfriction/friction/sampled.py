@@ -1,0 +1,119 @@
+"""A law with memory at a fixed sample rate, as controllers compute it.
+
+A controller sees the motion at its samples and takes the velocity as held until the next one. The
+law's internal state is then a hidden state of the coefficients, and all that handles such states
+(exports with their init, reset and step, and what they promise for NaN) handles the law.
+"""
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from nfriction.friction.coefficients import Constant, Schedule
+from nfriction.friction.laws import Coefficient, Law
+from nfriction.friction.models import FrictionModel
+from nfriction.friction.parameters import Sensitivity, positive_number
+
+
+def sampled(model: FrictionModel, sample_time: float) -> FrictionModel:
+    """The model of a law with memory as one without, whose coefficients have a hidden state.
+
+    Its coefficients are those of the law and, behind them, its internal state after the sample. The
+    hidden state before a first sample is that of a joint at rest, nothing deflected.
+
+    Args:
+        model: of a law with memory and constant coefficients.
+        sample_time: time between samples [s].
+
+    Raises:
+        ValueError: if the coefficients follow the motion, if the state depends on the load, which
+            a schedule does not see, or if the sample time is not positive.
+    """
+    step = positive_number("sample_time", sample_time, "s")
+    law = model.law
+    if law.memory is None or not isinstance(model.schedule, Constant):
+        raise ValueError(
+            f"only a law with memory and constant coefficients can be sampled, got {law.name!r} "
+            f"with {type(model.schedule).__name__}."
+        )
+    _refuse_load(model, step)
+    states = tuple(Coefficient(f"state_{k + 1}", "-", False) for k in range(law.state_size))
+    flat = Law(law.name, (*law.coefficients, *states), _Torque(law.memory.torque, law.state_size))
+    return FrictionModel(flat, _Sampled(model, flat, step), model.v_smooth)
+
+
+def _refuse_load(model: FrictionModel, step: float) -> None:
+    law, c = model.law, model.schedule.rest_coefficients().detach()
+    qd = torch.linspace(-1.0, 1.0, 7, dtype=c.dtype)[:, None].expand(-1, model.joints)
+    start = law.initial_state(qd)
+    assert law.memory is not None
+    loaded, unloaded = (law.memory.advance(start, qd, x, c, step) for x in (qd + 2.0, qd * 0.0))
+    if not torch.equal(loaded, unloaded):
+        raise ValueError(
+            f"the state of law {law.name!r} depends on the load, which coefficients cannot follow; "
+            "let its torque alone depend on it."
+        )
+
+
+class _Torque(nn.Module):
+    """Torque of the law, its state the last of the coefficients."""
+
+    def __init__(self, torque: Callable[..., Tensor], size: int) -> None:
+        super().__init__()
+        self.torque = torque
+        self.size = size
+
+    def forward(self, qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
+        count = coefficients.size(-1) - self.size
+        state = coefficients[..., count:]
+        return self.torque(state, qd, load, coefficients[..., :count])
+
+
+class _Sampled(Schedule):
+    """Constant coefficients, and the state of the law that has them."""
+
+    handles_range = True
+    step: Tensor
+    rest: Tensor
+
+    def __init__(self, model: FrictionModel, flat: Law, sample_time: float) -> None:
+        super().__init__(flat, model.joints)
+        assert model.law.memory is not None
+        self.state_size = model.law.state_size
+        self.sample_time = sample_time
+        self.constant = model.schedule
+        self.law_advance = model.law.memory.advance
+        step = torch.tensor(sample_time, dtype=torch.float64)
+        self.register_buffer("step", step, persistent=False)
+        self.register_buffer("rest", step.new_zeros(self.state_size), persistent=False)
+
+    def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        first = self.advance(qd, qdd, self.initial_state(qd, qdd))
+        return self.coefficients_from(qd, qdd, first)
+
+    def initial_state(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        return qd.unsqueeze(-1) * self.rest
+
+    def advance(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
+        load = 0.0 * qd  # has no part in it
+        return self.law_advance(state, qd, load, self.constant(qd, qdd), self.step)
+
+    def coefficients_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
+        c = self.constant(qd, qdd)
+        return torch.cat([c + 0.0 * state[..., :1], state], -1)
+
+    def parameter_vector(self) -> Tensor:
+        return self.constant.parameter_vector()
+
+    def set_parameter_vector(self, vector: Tensor) -> None:
+        self.constant.set_parameter_vector(vector)
+
+    def parameter_names(self, joint_names: Sequence[str]) -> list[str]:
+        return self.constant.parameter_names(joint_names)
+
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        return self.constant.bounds()
+
+    def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
+        raise NotImplementedError("a sampled law is for controllers; fit the law itself.")
