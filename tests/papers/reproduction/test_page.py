@@ -39,8 +39,8 @@ def test_the_page_is_self_contained_and_in_the_papers_order(tmp_path) -> None:
 
 def test_the_conclusion_follows_the_errors(tmp_path) -> None:
     errors = {"NCFM": 4.0, "LFM": 4.0, "NLFM": 4.0, "rtip-NLFM": 0.5}
-    errors |= {name: 3.0 for name in tables.ADAPTIVE} | {name: 2.0 for name in tables.NEURO_FUZZY}
-    errors |= {name: 3.5 for name in tables.PAPERS_WAY}
+    errors |= dict.fromkeys(tables.ADAPTIVE, 3.0) | dict.fromkeys(tables.NEURO_FUZZY, 2.0)
+    errors |= dict.fromkeys(tables.PAPERS_WAY, 3.5)
     lines = tables.conclusion(workspace(tmp_path, errors)).splitlines()
     assert len(lines) == 6
     held = [line.split(":")[0] for line in lines[1:5]]
