@@ -25,8 +25,8 @@ def add(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
     )  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path("runs/papers"), help="folder to write")
     parser.add_argument("--quick", action="store_true",
-                        help="recordings of 10 s and shorter searches: about a minute instead of "
-                        "several minutes on two cores")  # fmt: skip
+                        help="recordings of 10 s and shorter searches: a few minutes on two "
+                        "cores")  # fmt: skip
     parser.add_argument("--seed", type=count, default=0,
                         help="of the encoders' errors and of the searches")  # fmt: skip
     parser.add_argument("--jobs", type=count, default=2, help="models trained at a time")
