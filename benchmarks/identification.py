@@ -3,6 +3,7 @@
     python benchmarks/identification.py recovery [--seconds 10 20 40] [--seeds 1] [--peer mujoco]
     python benchmarks/identification.py real DATA [--only triple ...] [--models NCFM LFM NFLFM]
                                                  [--blocks N] [--peer scipy]
+                                                 [--loss huber] [--fit-delay]
     python benchmarks/identification.py intervals DATA [--only triple ...] [--models CFM]
                                                       [--seconds 5]
     python benchmarks/identification.py own-rigs [--seeds 10] [--rigs 10]
@@ -22,7 +23,8 @@ first state; with `--blocks N` each recording is cut in N, and one block of ever
 out at a time, and simulated with the zeros that the others of its recording showed where encoders
 were zeroed anew. With `--peer scipy` every constant law is also fitted by single shooting, as the
 baselines on the recordings' cards were, which shows how hard these recordings are beside those that
-are kept apart. DATA holds a folder to each set, with a `recordings.csv` of initial states.
+are kept apart. A model that is twice as bad as one named before it is marked as not fit for use.
+DATA holds a folder to each set, with a `recordings.csv` of initial states.
 
 `intervals` fits pieces of recordings, each alone, and prints how often the difference of what two
 of them say lies within its 95 % interval.
@@ -45,6 +47,8 @@ from own_rigs import own_rigs
 from pieces import intervals
 from recovery import RELEASES, recovery
 
+from nfriction.fitting.options import CHOICES
+
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
@@ -60,6 +64,8 @@ def main() -> int:
     given.add_argument("--models", nargs="+", default=["NCFM", "LFM", "NFLFM"])
     given.add_argument("--blocks", type=int, default=1)
     given.add_argument("--peer", choices=["scipy"])
+    given.add_argument("--loss", default="linear", choices=CHOICES["loss"])
+    given.add_argument("--fit-delay", action="store_true")
     apart = commands.add_parser("intervals", help="intervals held against pieces of recordings")
     apart.add_argument("data", type=Path)
     apart.add_argument("--only", nargs="+", default=list(SETS), choices=list(SETS))
@@ -78,7 +84,10 @@ def main() -> int:
         own_rigs(arguments.seeds, arguments.rigs)
     else:
         peer = arguments.peer is not None
-        real(arguments.data, arguments.only, arguments.models, arguments.blocks, peer)
+        real(
+            arguments.data, arguments.only, arguments.models, arguments.blocks, peer,
+            loss=arguments.loss, fit_delay=arguments.fit_delay,
+        )  # fmt: skip
     return 0
 
 

@@ -57,20 +57,6 @@ def torchscript_cpp(case: Any) -> np.ndarray:
     return 1e3 * np.loadtxt(times)
 
 
-def multiplications(count: int, calls: int = 5000) -> np.ndarray:
-    """That many multiplications of four numbers, one after the other, in TorchScript: a yardstick.
-
-    So small a tensor costs its call: what an artefact of as many operations cannot fall below.
-    """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        source = "def chain(x):\n" + count * "    x = x * 1.0001\n" + "    return x\n"
-        chain = torch.jit.CompilationUnit(source).chain
-    rows = [(torch.ones(4, dtype=torch.float64),)]
-    with torch.inference_mode(), torch.jit.optimized_execution(False):
-        return _timed(lambda row: chain(*row), rows, calls)
-
-
 def onnx_runtime(case: Any, dtype: str = "float64") -> np.ndarray:
     """The ONNX artefact in ONNX Runtime, which is an extra."""
     runtime = importlib.import_module("onnxruntime")

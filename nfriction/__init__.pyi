@@ -11,6 +11,8 @@ from .evaluation.score import Score as Score
 from .evaluation.score import score as score
 from .evaluation.sessions import SessionsResult as SessionsResult
 from .evaluation.sessions import fit_sessions as fit_sessions
+from .evaluation.torque_tables import TorqueFits as TorqueFits
+from .evaluation.torque_tables import fit_torque as fit_torque
 from .fitting.fit import fit as fit
 from .fitting.result.fit_result import FitResult as FitResult
 from .friction.models import CFM as CFM
@@ -26,11 +28,11 @@ from .friction.neurofuzzy import NFLFM as NFLFM
 from .friction.neurofuzzy import NFNCFM as NFNCFM
 from .friction.neurofuzzy import NFNLFM as NFNLFM
 from .friction.neurofuzzy import NFStribeck as NFStribeck
+from .io.model_file import ModelInfo as ModelInfo
 from .io.model_file import load as load
 from .io.model_file import load_info as load_info
 from .io.model_file import load_plant as load_plant
 from .io.model_file import save as save
-from .io.model_info import ModelInfo as ModelInfo
 from .papers.afem.adaptive import ACFM as ACFM
 from .papers.afem.adaptive import ACVFM as ACVFM
 from .papers.afem.adaptive import ALFM as ALFM
@@ -39,11 +41,14 @@ from .papers.afem.adaptive import ANLFM as ANLFM
 from .papers.afem.fit_adaptive import fit_adaptive as fit_adaptive
 from .papers.afem.fit_by_search import fit_by_search as fit_by_search
 from .plant import LinearAxis as LinearAxis
+from .plant import Motor as Motor
 from .plant import PendulumChain as PendulumChain
 from .plant import Plant as Plant
+from .plant import Rotor as Rotor
 from .plant import rigs as rigs
 from .recording import Recording as Recording
 from .recording.angles import AngleConvention as AngleConvention
+from .recording.torque_table import TorqueTable as TorqueTable
 from .simulation.rollout import Rollout as Rollout
 from .simulation.rollout import rollout as rollout
 from .version import __version__ as __version__

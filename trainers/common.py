@@ -16,8 +16,7 @@ from nfriction.evaluation.score import score
 from nfriction.export import torchscript
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction.models import FrictionModel
-from nfriction.io.model_file import save
-from nfriction.io.model_info import ModelInfo
+from nfriction.io.model_file import ModelInfo, save
 from nfriction.papers import twin
 from nfriction.papers.reproduction.workspace import Bench, Settings, Workspace, smoothed
 from nfriction.plant import Plant, rigs

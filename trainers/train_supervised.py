@@ -23,8 +23,7 @@ from nfriction import datasets, load
 from nfriction.export import torchscript
 from nfriction.friction import model_names
 from nfriction.friction.laws import LINEAR, Law
-from nfriction.io.model_file import save
-from nfriction.io.model_info import ModelInfo
+from nfriction.io.model_file import ModelInfo, save
 from nfriction.optim.evidence import EvidenceState
 from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.controller.mamdani import MamdaniController, paper_controller

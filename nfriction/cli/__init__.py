@@ -12,7 +12,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 
-from nfriction.cli import demo, estimate, export, inspect, reproduce, verify
+from nfriction.cli import demo, estimate, export, inspect, reproduce, torque, verify
 from nfriction.cli.console import (
     Parser,
     UsageError,
@@ -25,8 +25,8 @@ from nfriction.version import __version__
 
 # They register the commands, in the order in which the help lists them.
 COMMANDS = (
-    estimate.add_fit, estimate.add_compare, demo.add, inspect.add_report, inspect.add_info,
-    export.add, verify.add, reproduce.add, demo.add_twin,
+    estimate.add_fit, estimate.add_compare, torque.add_fit, torque.add_score, demo.add,
+    inspect.add_report, inspect.add_info, export.add, verify.add, reproduce.add, demo.add_twin,
 )  # fmt: skip
 
 

@@ -9,6 +9,7 @@ import sys
 import tempfile
 import textwrap
 import threading
+import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -62,6 +63,10 @@ _OPTIONS = (
     (re.compile(r'columns=\{"(\w+)": "([^"]+)"\}'), r'--columns "\1=\2"'),
     (re.compile(r"`degrees=True`"), "--degrees"),
     (re.compile(r"`columns`"), "--columns"),
+    (
+        re.compile("create the model yourself and pass it as `into`"),
+        "name its law, --law my.py:LAW",
+    ),
 )
 
 
@@ -129,15 +134,24 @@ def interruptible() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
+# Between two lines about the progress in a file [s].
+_QUIET = 10.0
+
+
 class Progress:
-    """One bar for a whole run: stages, which are also logged, and steps taken."""
+    """The stages of a whole run, which are also logged, with the time taken and left.
+
+    On a terminal a bar; otherwise, as in a job's log, a line every ten seconds at most.
+    """
 
     def __init__(self, logger: logging.Logger | None = None) -> None:
         # Slow to import, and not needed for `--help`.
         from tqdm import tqdm
 
         self._what, self._logger = "start", logger
-        self._bar = tqdm(unit=" steps", disable=not sys.stderr.isatty(), leave=False)
+        self._begun = self._shown = time.monotonic()
+        self._ended = self._expected = self._steps = 0
+        self._bar = tqdm(disable=not sys.stderr.isatty(), leave=False, bar_format="{desc} {bar:20}")
 
     def __enter__(self) -> "Progress":
         return self
@@ -153,14 +167,45 @@ class Progress:
         self._check()
         if self._logger is not None:
             self._logger.info(what)
-        self._what = what
-        self._bar.set_description_str(what)
+        self._what, self._steps = what, 0
+        self._show(what)
+
+    def expect(self, stages: int) -> None:
+        """So many further stages are to come."""
+        self._expected += stages
+        self._bar.total = self._expected
+
+    def done(self) -> None:
+        """A stage has ended."""
+        self._ended += 1
+        self._bar.update()
 
     def step(self, stage: str) -> None:
         """Count a step of a solver."""
         self._check()
-        self._bar.set_description_str(f"{self._what}, {stage}")
-        self._bar.update()
+        self._steps += 1
+        self._show(f"{self._what}, {stage}, step {self._steps}")
+
+    def _show(self, what: str) -> None:
+        now = time.monotonic()
+        line = f"{self._count()}{what} ({self._times(now - self._begun)})"
+        if not self._bar.disable:
+            self._bar.set_description_str(line)
+        elif now - self._shown >= _QUIET:
+            self._shown = now
+            print(f"nfriction: {line}", file=sys.stderr, flush=True)
+
+    def _count(self) -> str:
+        return f"{self._ended + 1} of {self._expected}: " if self._expected else ""
+
+    def _times(self, passed: float) -> str:
+        """Time passed, and time left by the mean of the stages that have ended."""
+        text = f"{passed:.0f} s"
+        if 0 < self._ended < self._expected:
+            left = passed / self._ended * (self._expected - self._ended)
+            rest = f"{left:.0f} s" if left < 120 else f"{left / 60:.0f} min"
+            text += f", about {rest} left"
+        return text
 
     def _check(self) -> None:
         if _interrupted.is_set():

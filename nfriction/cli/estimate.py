@@ -37,7 +37,7 @@ def add_fit(commands: argparse._SubParsersAction[Parser], common: Parser) -> Non
     parser.add_argument("recordings", nargs="+", type=inputs.file, metavar="RECORDING",
                         help=f"with columns time, q1, ... ({inputs.FORMATS})")  # fmt: skip
     parser.add_argument("--model", type=inputs.model, default="neuro-fuzzy:load-coulomb",
-                        help=inputs.MODELS)  # fmt: skip
+                        help=f"{inputs.MODELS}; or my.py:LAW, a law of your own")  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path("model.json"), help="model file to write")
     inputs.add_fit_options(parser)
     parser.set_defaults(run=run_fit)
@@ -63,7 +63,8 @@ def add_comparison_options(parser: argparse.ArgumentParser) -> None:
     """Options of `compare` and `demo`."""
     add = parser.add_argument
     add("--models", type=inputs.models, default=inputs.DEFAULT_MODELS,
-        help=f"with commas between them: {inputs.MODELS}")  # fmt: skip
+        help=f"with commas between them: {inputs.MODELS}; or my.py:LAW, a law of your own"
+        )  # fmt: skip
     add("--out", type=Path, default=Path("runs/compare"), help="folder to write")
     add("--initial-states", type=inputs.file, metavar="FILE",
         help="table with columns id, q0_1, qd0_1, ... of the recordings' initial states (default: "
@@ -71,6 +72,8 @@ def add_comparison_options(parser: argparse.ArgumentParser) -> None:
     add("--select", action="store_true", help="also choose a model on the training recordings "
         "alone, by cross-validation over blocks of time")  # fmt: skip
     add("--no-figures", action="store_true", help="draw no figures")
+    add("--also", choices=("svg", "pdf"), action="append", default=[], metavar="FORMAT",
+        help="write figures as svg or pdf, too, for a paper; can be given twice")  # fmt: skip
     add("--jobs", type=inputs.jobs, default=1, metavar="N",
         help="fits at the same time, each in a process of its own; -1 for one to each core (needs "
         "joblib; the results are the same)")  # fmt: skip
@@ -141,6 +144,7 @@ def compare_and_report(
     selection = None
     with exclusive(arguments.out), _log(arguments.log_file) as logger, Progress(logger) as progress:
         settings = settings | {"progress": progress, "jobs": arguments.jobs}
+        progress.expect(1)
         logger.info(arguments.command_line)
         if arguments.select:
             selection = select(plant, arguments.models, train, **settings)
@@ -152,6 +156,7 @@ def compare_and_report(
         write_results(
             comparison, train, test, arguments.out, selection=selection,
             command=arguments.command_line, figures=not arguments.no_figures,
+            formats=arguments.also,
         )  # fmt: skip
         if page is not None:
             write_report(arguments.out, page)  # else the earlier run's page would be missed
@@ -206,9 +211,10 @@ def _conclusion(comparison: Comparison) -> str:
     end = f"with the friction learnt ({plain_name(best)}) they miss it by {shown[1]}"
     if not math.isfinite(without):
         return f"Without friction, simulations of the test recordings diverge;\n{end}."
+    less = 100 * (1 - learnt / without)
     return (
         f"Without friction, simulations of the test recordings miss the measured motion by "
-        f"{shown[0]};\n{end}, {100 * (1 - learnt / without):.3g} % less."
+        f"{shown[0]};\n{end}, {less:.{3 if less < 99.95 else 4}g} % less."  # never quite all
     )
 
 

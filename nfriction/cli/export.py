@@ -10,7 +10,7 @@ from nfriction.cli.inputs import seconds
 
 if TYPE_CHECKING:
     from nfriction.friction.models import FrictionModel
-    from nfriction.io.model_info import ModelInfo
+    from nfriction.io.model_file import ModelInfo
 
 EXAMPLE = """example:
   nfriction export model.json --format torchscript,c --out artefacts"""
@@ -34,6 +34,9 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
     parser.add_argument("--format", type=_targets, default="torchscript", metavar="FORMATS",
                         help=f"with commas between them: {', '.join(TARGETS)}")  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path(), help="folder to write to")
+    parser.add_argument("--name", type=_identifier, metavar="NAME",
+                        help="of the files, and in C prefix of all functions (default: that of "
+                        "the model file)")  # fmt: skip
     parser.add_argument("--dtype", choices=("float64", "float32"), default="float64",
                         help=f"precision of {' and '.join(IN_SINGLE)}")  # fmt: skip
     parser.add_argument("--torque-limit", type=_numbers, metavar="LIMIT,...",
@@ -57,6 +60,7 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
     group.add_argument("--columns", type=inputs.columns, metavar="OURS=THEIRS,...",
                        help="the recordings' names of time, q1, ..., tau1, ... where they differ, "
                        "e.g. time=t,q1=enc_1,q2=enc_2")  # fmt: skip
+    inputs.add_law_option(parser)
     parser.set_defaults(run=run)
 
 
@@ -96,7 +100,7 @@ def _write_controller(
     }
     if target in IN_SINGLE:
         options["dtype"] = arguments.dtype
-    stem = arguments.model.stem
+    stem = arguments.name or arguments.model.stem
     if target == "c":
         name = "".join(x if x.isascii() and x.isalnum() else "_" for x in stem)[:24]
         name = name if is_identifier(name) else f"nf_{name}"
@@ -162,6 +166,17 @@ def _targets(text: str) -> list[str]:
     if not targets:
         raise argparse.ArgumentTypeError(f"takes some of {', '.join(TARGETS)}, got none")
     return targets
+
+
+def _identifier(text: str) -> str:
+    """A name that C takes, for argparse."""
+    from nfriction.export.c_code.dialect import is_identifier
+
+    if not is_identifier(text):
+        raise argparse.ArgumentTypeError(
+            f"must be letters, digits and _ with a letter first and no word of C, got {text!r}"
+        )
+    return text
 
 
 def _numbers(text: str) -> list[float]:

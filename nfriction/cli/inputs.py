@@ -7,7 +7,10 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import importlib.machinery
 import math
+import re
+import types
 import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -26,19 +29,27 @@ RIGS = (
     "dfki-A0", "dfki-C0", "dfki-C1", "emps", "xl330",
 )  # fmt: skip
 MODELS = model_list()
-FORMATS = "CSV, TSV, TXT, Parquet, NPZ, MAT, HDF5 or MDF4"
+FORMATS = (
+    "CSV, TSV or TXT, Parquet, NumPy .npz, MATLAB .mat, HDF5 .h5, or MDF4 .mf4 as of ASAM loggers"
+)
 RIG_FILES = (".json", ".toml", ".urdf", ".xml", ".mjcf")
 DEFAULT_MODELS = "viscous,load-coulomb,arctan,neuro-fuzzy:load-coulomb"
 # Of `nfriction.fit`; where an option is not given, its own default.
 _FIT_OPTIONS = (
     "windows", "fit_plant", "drag", "eccentricity", "encoder_reference", "continuity", "max_steps",
+    "loss", "fit_delay",
 )  # fmt: skip
 
 
+# `my.py:LAW`, alone or behind the kind of its coefficients.
+_OWN_LAW = re.compile(r"(?P<kind>neuro-fuzzy:|adaptive:|)(?P<file>.+\.py):(?P<law>\w+)")
+
+
 def model(text: str) -> str:
-    """The name of a friction model, by either of its names, for argparse."""
+    """The name of a friction model, by either of its names, or FILE.py:LAW, for argparse."""
+    own = _OWN_LAW.fullmatch(text.strip())
     try:
-        return model_name(text)
+        return model_name(text if own is None else own["kind"] + law(f"{own['file']}:{own['law']}"))
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error).rstrip(".")) from None
 
@@ -49,6 +60,36 @@ def models(text: str) -> list[str]:
     if not names:
         raise argparse.ArgumentTypeError(f"takes names of models, got none; there are {MODELS}")
     return names
+
+
+def law(text: str) -> str:
+    """The name of a law of one's own, FILE.py:LAW, known from now on, for argparse."""
+    own = _OWN_LAW.fullmatch(text.strip())
+    if own is None or own["kind"]:
+        raise argparse.ArgumentTypeError(f"takes a law as my.py:LAW, got {text!r}")
+    from nfriction.friction import add_law
+    from nfriction.friction.laws import Law
+
+    path = file(own["file"])
+    loader = importlib.machinery.SourceFileLoader(path.stem, str(path))
+    module = types.ModuleType(path.stem)
+    module.__file__ = str(path)
+    try:
+        loader.exec_module(module)
+    except (SyntaxError, ImportError, NameError, TypeError, ValueError, LookupError) as error:
+        raise argparse.ArgumentTypeError(
+            f"{path} cannot be run: {type(error).__name__}: {error}"
+        ) from error
+    found = getattr(module, own["law"], None)
+    if not isinstance(found, Law):
+        laws = ", ".join(k for k, v in vars(module).items() if isinstance(v, Law))
+        raise argparse.ArgumentTypeError(
+            f"{path} has no law {own['law']}; its laws: {laws or 'none'}"
+        )
+    try:
+        return add_law(found)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error).rstrip(".")) from None
 
 
 def rig(text: str) -> str:
@@ -123,6 +164,12 @@ def _windows(text: str) -> tuple[float, ...]:
         ) from None
 
 
+def add_law_option(parser: argparse.ArgumentParser) -> None:
+    """The option of commands that read a model file."""
+    parser.add_argument("--law", type=law, action="append", metavar="FILE.py:LAW",
+                        help="law of your own that the model file needs")  # fmt: skip
+
+
 def add_fit_options(parser: argparse.ArgumentParser) -> None:
     """Options of `fit` and `compare`."""
     add = parser.add_argument
@@ -134,8 +181,9 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
         "absolute,hanging (default: of the file or the rig)")  # fmt: skip
     add("--degrees", action="store_true", help="the files are in degrees")
     add("--columns", type=columns, metavar="OURS=THEIRS,...",
-        help="the files' names of time, q1, ..., tau1, ... where they differ, e.g. "
-        "time=t,q1=enc_1,q2=enc_2")  # fmt: skip
+        help="the files' names of time, q1, ..., tau1, ... (of a motor: motor1, current1) where "
+        "they differ, each perhaps with its unit, e.g. time=t:ms,q1=enc_1:deg,q2=enc_2:counts/8192"
+        )  # fmt: skip
     add("--windows", type=_windows, metavar="SECONDS",
         help="lengths of the shooting windows, in the order of their use [s] (default: 0.5,2,5)"
         )  # fmt: skip
@@ -156,6 +204,11 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
         )  # fmt: skip
     add("--max-steps", type=count, default=30, metavar="N",
         help="limit of search steps at each window length (default: 30)")  # fmt: skip
+    add("--loss", choices=CHOICES["loss"], default="linear",
+        help="loss of an error: linear for least squares; the others count spikes of a sensor less "
+        "and name them (default: linear)")  # fmt: skip
+    add("--fit-delay", action="store_true",
+        help="estimate by how much torques are recorded later than positions")  # fmt: skip
 
 
 def fit_settings(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -170,7 +223,7 @@ def read_rig(name: str) -> Plant:
     """The rig that `--rig` names."""
     from nfriction.plant import rigs
 
-    return rigs.by_name(name) if name in RIGS else rigs.read(name)
+    return rigs.of(name)
 
 
 def read_recordings(
@@ -187,7 +240,7 @@ def read_recordings(
             warnings.simplefilter("always")
             recording = Recording.read(
                 path, columns=arguments.columns, degrees=arguments.degrees,
-                convention=arguments.angles, unit=unit,
+                convention=arguments.angles, unit=unit, plant=plant,
             )  # fmt: skip
         if recording.joints != plant.joints:
             raise UsageError(f"{path} has {recording.joints} joints, the rig has {plant.joints}.")

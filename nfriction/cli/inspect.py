@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 from nfriction.cli import inputs
 from nfriction.cli.console import Parser, UsageError, warn
-from nfriction.friction import model_names, plain_name
+from nfriction.friction import memory_names, model_names, plain_name
 
 if TYPE_CHECKING:
     from nfriction.friction.models import FrictionModel
-    from nfriction.io.model_info import ModelInfo
+    from nfriction.io.model_file import ModelInfo
 
 INFO_EXAMPLE = """example:
   nfriction info runs/mine/models/LFM.json"""
@@ -29,6 +29,7 @@ def add_report(commands: "argparse._SubParsersAction[Parser]", common: Parser) -
     parser.add_argument("folder", type=Path, metavar="RUN", help="folder of compare or demo")
     parser.add_argument("--out", type=Path, metavar="FILE",
                         help="file to write (default: report.html in the folder)")  # fmt: skip
+    inputs.add_law_option(parser)
     parser.set_defaults(run=run_report)
 
 
@@ -40,6 +41,7 @@ def add_info(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> 
         "the fit, rig.",
     )  # fmt: skip
     parser.add_argument("model", type=inputs.file, metavar="MODEL", help="model file")
+    inputs.add_law_option(parser)
     parser.set_defaults(run=run_info)
 
 
@@ -72,7 +74,7 @@ def run_info(arguments: argparse.Namespace) -> int:
 
 def _facts(model: "FrictionModel", info: "ModelInfo") -> Iterator[tuple[str, str]]:
     name = type(model).__name__
-    known = name in model_names()
+    known = name in (*model_names(), *memory_names())
     yield "model", f"{name}, {plain_name(name) if known else f'law {model.law.name}'}"
     yield "joints", ", ".join(info.joint_names) or str(model.joints)
     if info.rig is not None:

@@ -22,6 +22,7 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
     parser.add_argument("model", type=inputs.file, metavar="MODEL", help="model file")
     parser.add_argument("--points", type=inputs.count, default=5000, metavar="N",
                         help="points to draw, to 10 %% beyond the range")  # fmt: skip
+    inputs.add_law_option(parser)
     parser.set_defaults(run=run)
 
 

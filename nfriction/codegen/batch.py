@@ -239,12 +239,11 @@ class Driver:
                 index = body.let(f"mul i64 {i}, {self.value[f'{name}_element']}")
                 body.store(body.load(source, index), target, self._place(i, lane))
 
-    def scatter(self, name: str, output: str, count: int, index: str, blocks: str) -> None:
-        """Write an array of the room to block `index` of the `blocks` that each row has."""
+    def scatter(self, name: str, count: int) -> None:
+        """Write an array of the room to each row's place in the output of its name."""
         body = self.body
         with self.each() as (row, lane):
-            block = body.let(f"add i64 {body.let(f'mul i64 {row}, {blocks}')}, {index}")
-            target = body.at(self.value[output], body.let(f"mul i64 {block}, {count}"))
+            target = body.at(self.value[name], body.let(f"mul i64 {row}, {count}"))
             with body.loop("0", str(count)) as i:
                 value = body.load(self.value[f"room.{name}"], self._place(i, lane))
                 body.store(value, target, i)

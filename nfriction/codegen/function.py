@@ -16,12 +16,11 @@ from nfriction.codegen.batch import (
     rows_of,
     to_array,
 )
-from nfriction.codegen.derivative import with_jacobian
 from nfriction.codegen.errors import SelfCheckFailed
 from nfriction.codegen.graph import FunctionalModule, Method, Program
-from nfriction.codegen.hoist import hoist
 from nfriction.codegen.llvm import jit
 from nfriction.codegen.llvm.emit import write_function
+from nfriction.codegen.transform import hoist, with_jacobian
 
 _CHECK_TOLERANCE = 1e-10
 
@@ -174,5 +173,5 @@ def _driver(program: Program, layout: Layout, width: int) -> Driver:
         rooms = (f"room.{name}" for name in (*layout.series, *layout.outputs))
         driver.call("nf_row", "own_p", "room.once", *rooms)
         for name in layout.outputs:
-            driver.scatter(name, name, sizes[name], "0", "1")
+            driver.scatter(name, sizes[name])
     return driver

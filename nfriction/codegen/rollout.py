@@ -1,6 +1,6 @@
 """Compile the rollout of a plant with friction, and run many at once."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -17,9 +17,8 @@ from nfriction.codegen.batch import (
     series,
     to_array,
 )
-from nfriction.codegen.derivative import with_jacobian
 from nfriction.codegen.errors import SelfCheckFailed
-from nfriction.codegen.graph import FunctionalModule, Program
+from nfriction.codegen.graph import FunctionalModule
 from nfriction.codegen.llvm import jit
 from nfriction.codegen.rollout_program import LAYOUT, ForcedSystem, RolloutDriver, arrange
 
@@ -42,6 +41,8 @@ class RolloutSignals:
             are held anew at each of these steps.
         memory: memory of the coefficients after the first sample, (candidate, joint, state_size),
             one row is for all; by default that of this sample alone.
+        law_state: of a friction law with memory at the start, (candidate, joint, state), one row is
+            for all; by default zero.
     """
 
     steps: int
@@ -50,6 +51,7 @@ class RolloutSignals:
     drive: tuple[Any, Any] | None = None
     substeps: int = 1
     memory: Any = None
+    law_state: Any = None
 
 
 class Trajectories(NamedTuple):
@@ -62,20 +64,17 @@ class Trajectories(NamedTuple):
             at the start that without friction; same shape.
         diverged_at: number of the sample at which the state was not finite or too fast, -1 where
             it never was, shape (candidate,).
-        jacobian: derivatives of (q, qd, qdd) after each step by what was asked for, shape
-            (candidate, sample, 3 joint, direction); None where nothing was.
+        law_state: of a friction law with memory, (candidate, sample + 1, joint, state); else None.
     """
 
     q: Any
     qd: Any
     qdd: Any
     diverged_at: Any
-    jacobian: Any = None
+    law_state: Any = None
 
 
-def compile_rollout(
-    plant: Any, friction: Any, step: Callable[..., Any], *, jacobian: Sequence[str] = ()
-) -> "CompiledRollout":
+def compile_rollout(plant: Any, friction: Any, step: Callable[..., Any]) -> "CompiledRollout":
     """Compile rollouts of a plant with friction from their torch definition.
 
     Parameters and floating-point buffers stay inputs: they are read at every call, so a fit may
@@ -88,22 +87,18 @@ def compile_rollout(
             also has `state_size` > 0, `initial_state`, `advance` and `coefficients_from`.
         step: `(plant, friction, q, qd, tau, coefficients, step) -> (q, qd, qdd)`, which is
             repeated; for instance `nfriction.simulation.rk4.rk4_step`.
-        jacobian: with each step its derivatives by these are computed: "q", "qd", "held" (the
-            coefficients, joint-major) and names of parameters or buffers ("plant.…").
 
     Raises:
         NoBackend: llvmlite cannot be loaded.
         UnsupportedOperation: the modules use an operation that has no scalar form here.
         SelfCheckFailed: a compiled step is not the eager one.
     """
-    compiled = trace_rollout(plant, friction, step, jacobian=jacobian)
+    compiled = trace_rollout(plant, friction, step)
     compiled.check()
     return compiled
 
 
-def trace_rollout(
-    plant: Any, friction: Any, step: Callable[..., Any], *, jacobian: Sequence[str] = ()
-) -> "CompiledRollout":
+def trace_rollout(plant: Any, friction: Any, step: Callable[..., Any]) -> "CompiledRollout":
     """The same, neither compiled nor checked before its first call.
 
     Raises:
@@ -113,7 +108,7 @@ def trace_rollout(
     for name, module in (("plant", plant), ("friction", friction)):
         if not isinstance(module, nn.Module):
             raise TypeError(f"`{name}` must be a torch module, got {type(module).__name__}.")
-    return CompiledRollout(ForcedSystem(plant, friction, step), tuple(jacobian))
+    return CompiledRollout(ForcedSystem(plant, friction, step))
 
 
 class CompiledRollout:
@@ -125,28 +120,17 @@ class CompiledRollout:
             same digest computes the same, given the same parameters.
     """
 
-    def __init__(self, system: ForcedSystem, jacobian: tuple[str, ...]) -> None:
+    def __init__(self, system: ForcedSystem) -> None:
         self._system = system
         self.joints = int(system.plant.joints)
         self._module = FunctionalModule(system)
         self.parameter_names = tuple(self._module.shapes)
-        examples = self._examples()
-        traced = self._module.trace(examples)
-        slopes = None
-        if jacobian:
-            given = {name: f"p{i}" for i, name in enumerate(self.parameter_names)}
-            wanted = [name if name in examples else given[name] for name in jacobian]
-            step = Program(traced.graph, traced.inputs, traced.outputs[:3])
-            slopes = with_jacobian(step, wanted).outputs[-1]
-        self._jacobian = slopes.shape if slopes else None
-        self._traced, self._slopes = traced, slopes
-        outputs = (*traced.outputs, slopes) if slopes else traced.outputs
-        whole = Program(traced.graph, traced.inputs, outputs)
-        self.digest = f"{self._module.shapes} {whole.digest()}"
+        self._traced = self._module.trace(self._examples())
+        self.digest = f"{self._module.shapes} {self._traced.digest()}"
 
     @cached_property
     def _kernel(self) -> Kernel:
-        program = arrange(self._traced, self._slopes)
+        program = arrange(self._traced, self._system.law_size)
         return Kernel(lambda width: RolloutDriver(program, width), LAYOUT)
 
     def source(self, width: int = 0) -> str:
@@ -166,6 +150,8 @@ class CompiledRollout:
             held = self._system.friction.coefficients(*seen)
             if self._system.remembers:
                 found["memory"] = self._system.friction.initial_state(*seen)
+        if self._system.law_size:
+            found["law"] = torch.zeros(n, self._system.law_size, dtype=torch.float64)
         step = torch.full((1,), 1e-3, dtype=torch.float64)
         return {**found, "step": step, "held": held}
 
@@ -198,8 +184,6 @@ class CompiledRollout:
                 "`steps` must be 0 or more, `substeps` and `threads` 1 or more, got "
                 f"{steps}, {substeps} and {threads}."
             )
-        if self._jacobian and substeps > 1:
-            raise ValueError("a rollout with derivatives of each step has one step a sample.")
         n = self.joints
         step = inputs.time_step if substeps == 1 else to_array(inputs.time_step) / substeps
         given = {
@@ -214,21 +198,26 @@ class CompiledRollout:
         if memory is not None:
             size = getattr(self._system.friction, "state_size", 0)
             given["memory"] = rows_of("memory", memory, (n, size))
+        size = self._system.law_size
+        if size:
+            law = np.zeros((1, n, size)) if inputs.law_state is None else inputs.law_state
+            given["law"] = rows_of("law_state", law, (n, size))
         p, rows = parameter_rows(self._module, parameters or {})
         count = common_rows(rows | {name: one.rows for name, one in given.items()})
         outputs: dict[str, np.ndarray] = {
             name: np.empty((count, steps + 1, n)) for name in LAYOUT.outputs[:3]
         }
         outputs["diverged"] = np.empty(count, dtype=np.int64)
-        if self._jacobian:
-            outputs["jacobian_out"] = np.empty((count, steps, *self._jacobian))
+        if size:
+            outputs["law_out"] = np.empty((count, steps + 1, n, size))
         settings = {"samples": steps, "substeps": substeps, "driven": drive is not None,
                     "remembered": memory is not None}  # fmt: skip
         self._kernel(count, p, given, outputs, settings, threads)
-        results: list[Any] = list(outputs.values())
+        results: dict[str, Any] = dict(outputs)
         if isinstance(q0, Tensor):
-            results = [torch.from_numpy(x) for x in results]
-        return Trajectories(*results)
+            results = {name: torch.from_numpy(x) for name, x in results.items()}
+        q, qd, qdd, diverged = (results[name] for name in LAYOUT.outputs[:4])
+        return Trajectories(q, qd, qdd, diverged, results.get("law_out"))
 
     def check(self) -> None:
         """Compare two steps from random states with the same steps in eager torch.
@@ -262,11 +251,13 @@ class CompiledRollout:
         q, qd, tau = (x.to(self._module.device) for x in (q, qd, tau))
         plant, friction = self._system.plant, self._system.friction
         qdd, memory = plant.forward_dynamics(q, qd, tau), None
+        size = self._system.law_size
+        law = (q.new_zeros(self.joints, size),) if size else ()
         for k in range(steps):
             if not self._system.remembers:
                 held = friction.coefficients(qd, qdd)
             else:
                 memory = friction.advance(qd, qdd, memory) if k else friction.initial_state(qd, qdd)
                 held = friction.coefficients_from(qd, qdd, memory)
-            q, qd, qdd = self._system.step(plant, friction, q, qd, tau, held, dt)
+            q, qd, qdd, *law = self._system.step(plant, friction, q, qd, tau, held, dt, *law)
         return qd

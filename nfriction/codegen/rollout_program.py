@@ -7,21 +7,21 @@ from typing import Any
 from torch import Tensor, nn
 
 from nfriction.codegen.batch import Driver, Layout
-from nfriction.codegen.graph import Port, Program
-from nfriction.codegen.hoist import hoist
+from nfriction.codegen.graph import Program
 from nfriction.codegen.llvm.emit import write_function
 from nfriction.codegen.llvm.ir import real
 from nfriction.codegen.scalar import Graph, Node
+from nfriction.codegen.transform import hoist
 
 LAYOUT = Layout(
-    series=("q0", "qd0", "tau", "step", "drive_qd", "drive_qdd", "memory"),
-    outputs=("q_out", "qd_out", "qdd_out", "diverged", "jacobian_out"),
+    series=("q0", "qd0", "tau", "step", "drive_qd", "drive_qdd", "memory", "law"),
+    outputs=("q_out", "qd_out", "qdd_out", "diverged", "law_out"),
     settings=("samples", "substeps", "driven", "remembered"),
 )
 # A joint faster than this [rad/s or m/s] has left any mechanism's range: it has diverged.
 SPEED_LIMIT = 1e6
 # Of `ForcedSystem`; all other inputs of its trace are parameters.
-INPUTS = ("q", "qd", "tau", "step", "held", "seen_qd", "seen_qdd", "memory")
+INPUTS = ("q", "qd", "tau", "step", "held", "seen_qd", "seen_qdd", "memory", "law")
 
 
 class ForcedSystem(nn.Module):
@@ -30,7 +30,8 @@ class ForcedSystem(nn.Module):
     Args:
         plant: the mechanism.
         friction: the friction model.
-        step: `(plant, friction, q, qd, tau, coefficients, step) -> (q, qd, qdd)`.
+        step: `(plant, friction, q, qd, tau, coefficients, step) -> (q, qd, qdd)`; of a friction law
+            with memory its state is a last argument, and the state afterwards a last result.
     """
 
     def __init__(self, plant: Any, friction: Any, step: Callable[..., Any]) -> None:
@@ -39,6 +40,7 @@ class ForcedSystem(nn.Module):
         self.friction = friction
         self.step = step
         self.remembers = int(getattr(friction, "state_size", 0)) > 0
+        self.law_size = int(getattr(friction, "law_state_size", 0))
 
     def forward(
         self,
@@ -50,8 +52,10 @@ class ForcedSystem(nn.Module):
         seen_qd: Tensor,
         seen_qdd: Tensor,
         memory: Tensor | None = None,
+        law: Tensor | None = None,
     ) -> tuple[Tensor, ...]:
-        after = self.step(self.plant, self.friction, q, qd, tau, held, step)
+        own = () if law is None else (law,)
+        after = self.step(self.plant, self.friction, q, qd, tau, held, step, *own)
         start = self.plant.forward_dynamics(q, qd, tau)
         if memory is None:
             return *after, start, self.friction.coefficients(seen_qd, seen_qdd)
@@ -69,11 +73,10 @@ class RolloutProgram:
         once: values computed once a rollout.
         start: acceleration without friction, which is the one known at the start.
         held: coefficients of a motion, and of a memory where they have one.
-        step: q, qd and qdd after a step with these.
+        step: q, qd and qdd after a step with these, and the state of a law with memory.
         within: whether that state is finite and no joint too fast.
         begin: memory of the coefficients after the first sample; empty where they have none.
         advance: memory after a sample, from that before.
-        jacobian: derivatives of `step`; empty where they are not wanted.
         places: array and index of the input nodes.
     """
 
@@ -85,28 +88,27 @@ class RolloutProgram:
     within: Node
     begin: tuple[Node, ...]
     advance: tuple[Node, ...]
-    jacobian: tuple[Node, ...]
     places: dict[int, tuple[str, int]]
 
 
-def arrange(program: Program, jacobian: Port | None) -> RolloutProgram:
+def arrange(program: Program, law_size: int = 0) -> RolloutProgram:
     """Arrange what was traced of a `ForcedSystem`.
 
     Args:
         program: with the outputs of its `forward`.
-        jacobian: derivatives of the first three of them, where they are wanted.
+        law_size: size of the internal state of the friction law.
     """
     graph, outputs = program.graph, [port.nodes for port in program.outputs]
+    law = outputs.pop(3) if law_size else ()
     q, qd, qdd, start, held, *remembered = outputs
     begin, advance = remembered or ((), ())
     joints = len(q)
     within = _within(graph, q, qd)
-    slopes = jacobian.nodes if jacobian else ()
-    groups = [start, held, (*q, *qd, *qdd), (within,), begin, advance, slopes]
+    groups = [start, held, (*q, *qd, *qdd, *law), (within,), begin, advance]
     groups, once = hoist(graph, groups)
-    start, held, step, (within,), begin, advance, slopes = groups
+    start, held, step, (within,), begin, advance = groups
     at = {"q": ("state", 0), "qd": ("state", joints), "seen_qdd": ("seen", joints),
-          "seen_qd": ("seen", 0)}  # fmt: skip
+          "seen_qd": ("seen", 0), "law": ("state", 3 * joints)}  # fmt: skip
     places: dict[int, tuple[str, int]] = {}
     parameters = 0
     for port in program.inputs:
@@ -114,9 +116,7 @@ def arrange(program: Program, jacobian: Port | None) -> RolloutProgram:
         array, offset = at.get(port.name, (port.name, 0)) if own else ("p", parameters)
         places |= {node.number: (array, offset + i) for i, node in enumerate(port.nodes)}
         parameters += 0 if own else len(port.nodes)
-    return RolloutProgram(
-        joints, tuple(once), start, held, step, within, begin, advance, slopes, places
-    )
+    return RolloutProgram(joints, tuple(once), start, held, step, within, begin, advance, places)
 
 
 def _within(graph: Graph, q: Sequence[Node], qd: Sequence[Node]) -> Node:
@@ -138,9 +138,9 @@ class RolloutDriver(Driver):
 
     def __init__(self, program: RolloutProgram, width: int) -> None:
         n = program.joints
-        sizes = {"state": 3 * n, "seen": 2 * n, "tau": n, "step": 1, "held": len(program.held),
-                 "memory": len(program.advance), "within": 1,
-                 "jacobian": len(program.jacobian), "alive": 1}  # fmt: skip
+        sizes = {"state": len(program.step), "seen": 2 * n, "tau": n, "step": 1,
+                 "held": len(program.held), "memory": len(program.advance), "within": 1,
+                 "alive": 1}  # fmt: skip
         super().__init__(LAYOUT, width, sizes, len(program.once))
         self.program = program
         self._functions()
@@ -163,7 +163,7 @@ class RolloutDriver(Driver):
         function("nf_held", ["seen", "memory"], {"held": parts.held})
         function("nf_begin", ["seen"], {"memory": parts.begin}, seldom=True)
         function("nf_advance", ["seen", "memory"], {"memory": parts.advance})
-        after = {"state": parts.step, "within": (parts.within,), "jacobian": parts.jacobian}
+        after = {"state": parts.step, "within": (parts.within,)}
         function("nf_step", ["state", "tau", "step", "held"], after)
 
     def _candidates(self) -> None:
@@ -173,6 +173,9 @@ class RolloutDriver(Driver):
         self.gather("q0", n, value["room.state"])
         self.gather("qd0", n, self.element("state", n))
         self.gather("tau", n, value["room.tau"])
+        self.law = len(self.program.step) - 3 * n
+        if self.law:
+            self.gather("law", self.law, self.element("state", 3 * n))
         value["rate"] = self.element("state", 2 * n)
         self.call("nf_start", "own_p", "room.once", "room.state", "room.tau", "rate")
         with self.each() as (candidate, _):
@@ -205,7 +208,7 @@ class RolloutDriver(Driver):
         with body.loop("0", value["substeps"]):
             if not self.program.advance:
                 self.call("nf_held", "own_p", "room.once", "sees", "room.memory", "room.held")
-            rooms = ("state", "tau", "step", "held", "within", "jacobian")
+            rooms = ("state", "tau", "step", "held", "within")
             self.call("nf_step", "own_p", "room.once", *(f"room.{name}" for name in rooms))
             fine = body.load(value["room.within"], 0, real(self.width))
             one = body.constant(1.0, self.width)
@@ -215,9 +218,6 @@ class RolloutDriver(Driver):
                 lost = body.let(f"icmp ne i{self.width} {every}, 0")
             with body.when(lost):
                 self._stop(k, alive)
-        if self.program.jacobian:
-            size = len(self.program.jacobian)
-            self.scatter("jacobian", "jacobian_out", size, k, value["samples"])
 
     def _remember(self, k: str) -> None:
         body, size = self.body, len(self.program.advance)
@@ -239,7 +239,7 @@ class RolloutDriver(Driver):
         with self.each() as (candidate, lane):
             lost = body.let(f"fcmp une double {body.load(self.value['room.within'], lane)}, 1.0")
             with body.when(lost):
-                for i in range(3 * self.program.joints):
+                for i in range(len(self.program.step)):
                     body.store("0.0", self.element("state", i), lane)
                 place = body.at(self.value["diverged"], candidate, "i64")
                 fresh = body.let(f"icmp slt i64 {body.let(f'load i64, ptr {place}')}, 0")
@@ -254,13 +254,16 @@ class RolloutDriver(Driver):
         records = body.let(f"add i64 {self.value['samples']}, 1")
         with self.each() as (candidate, lane):
             place = body.let(f"add i64 {body.let(f'mul i64 {candidate}, {records}')}, {sample}")
-            to = body.let(f"mul i64 {place}, {n}")
             diverged = body.load(self.value["diverged"], candidate, "i64")
             fine = body.let(f"icmp slt i64 {diverged}, 0")
             nan = body.constant(float("nan"))
-            for part, name in enumerate(("q_out", "qd_out", "qdd_out")):
-                target = body.at(self.value[name], to)
-                for joint in range(n):
-                    state = body.load(self.element("state", part * n + joint), lane)
+            parts = [("q_out", n), ("qd_out", n), ("qdd_out", n)]
+            parts += [("law_out", self.law)] * bool(self.law)
+            element = 0
+            for name, size in parts:
+                target = body.at(self.value[name], body.let(f"mul i64 {place}, {size}"))
+                for i in range(size):
+                    state = body.load(self.element("state", element), lane)
                     shown = body.let(f"select i1 {fine}, double {state}, double {nan}")
-                    body.store(shown, target, joint)
+                    body.store(shown, target, i)
+                    element += 1

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -11,9 +12,10 @@ from nfriction.evaluation.parallel import Data, Progress, fit_models
 from nfriction.evaluation.score import HORIZONS, RMSE, Score, score
 from nfriction.fitting.data.inputs import warn_of_undriven
 from nfriction.fitting.result.fit_result import FitResult
+from nfriction.friction import model_name
 from nfriction.friction.models import FrictionModel
-from nfriction.plant import Plant
-from nfriction.recording import Recording
+from nfriction.plant import Plant, rigs
+from nfriction.recording import Recording, RecordingLike
 from nfriction.signals import kalman_smoother
 
 if TYPE_CHECKING:
@@ -275,10 +277,10 @@ class Comparison:
 
 
 def compare(
-    plant: Plant,
+    plant: Plant | str | Path,
     models: str | Sequence[str],
-    train: Recording | Sequence[Recording],
-    test: Recording | Sequence[Recording] = (),
+    train: RecordingLike | Sequence[RecordingLike],
+    test: RecordingLike | Sequence[RecordingLike] = (),
     *,
     initial_states: InitialStates | None = None,
     horizons: Sequence[float] = HORIZONS,
@@ -292,11 +294,11 @@ def compare(
     model is scored on the plant that was fitted with it.
 
     Args:
-        plant: the mechanism as given.
+        plant: the mechanism as given, its name, or the path of a rig file.
         models: names of models such as `"coulomb-viscous"` or `"CVFM"`, the simplest first:
             constant laws start from its plant terms, an adaptive or neuro-fuzzy model from the
             constant fit of its law.
-        train: recordings to fit, or one.
+        train: recordings to fit, or one; also paths of files and tables, see `Recording.of`.
         test: recordings to judge by, or one; never seen by a fit.
         initial_states: q0 and qd0 by recording name, in the recording's convention; free runs of
             other recordings start from a lead-in, see `score`.
@@ -314,15 +316,16 @@ def compare(
             could not, `failed` has the reasons.
     """
     models = [models] if isinstance(models, str) else models
-    train, test = (
-        [given] if isinstance(given, Recording) else list(given) for given in (train, test)
-    )
+    plant = rigs.of(plant)
+    train = Recording.many(train, plant=plant, name="train")
+    test = Recording.many(test, plant=plant, name="test")
     if not models or not train:
         raise ValueError("at least one model and one training recording are needed.")
     check_recordings(train, test)
     warn_of_undriven([*train, *test])
     progress = progress or Progress()
     joint = [recording.joint_coordinates(plant) for recording in train]
+    progress.expect(1 + len(set(map(model_name, models))))  # scores, besides fits
     # Smoothed once for all fits.
     data = Data(train, [kalman_smoother(r.time, r.q) for r in joint])
     fits, failed = fit_models(
@@ -337,11 +340,13 @@ def compare(
             if recordings:
                 scores[part][name] = [
                     score(
-                        found.plant if found else plant, found.model if found else None, recording,
+                        found.plant if found else plant, found.model if found else None,
+                        found.aligned(recording) if found else recording,
                         initial_state=states.get(recording.name), horizons=horizons,
                     )
                     for recording in recordings
                 ]  # fmt: skip
+        progress.done()
     return Comparison(
         fits, **scores, unit=plant.unit, joint_names=tuple(plant.joint_names),
         horizons_asked=tuple(horizons), failed=failed,

@@ -212,8 +212,10 @@ def with_fitted_offsets(found: FitResult, blocks: Sequence[TimeBlock]) -> list[T
 def block_errors(found: FitResult, blocks: Sequence[TimeBlock], horizon: float) -> list[float]:
     """Root mean square position error of simulations of `horizon` seconds over each block."""
     return [
-        score(found.plant, found.model, block.recording, horizons=(horizon,), limit=False)
-        .windows[f"{horizon:g}"].all
+        score(
+            found.plant, found.model, found.aligned(block.recording), horizons=(horizon,),
+            limit=False,
+        ).windows[f"{horizon:g}"].all
         for block in with_fitted_offsets(found, blocks)
     ]  # fmt: skip
 

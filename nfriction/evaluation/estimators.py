@@ -3,7 +3,9 @@
 import copy
 import inspect
 import math
+import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,10 +17,9 @@ from nfriction.evaluation.lead_in import longest_window
 from nfriction.evaluation.score import score
 from nfriction.fitting.fit import fit
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction import model_by_name
 from nfriction.friction.models import FrictionModel
-from nfriction.plant import Plant
-from nfriction.recording import Recording, Unit
+from nfriction.plant import Plant, rigs
+from nfriction.recording import Recording, RecordingLike
 from nfriction.signals import kalman_smoother
 
 try:
@@ -36,8 +37,8 @@ except ImportError:
 
 
 Array = NDArray[np.float64]
-# One recording, or its table with columns time, q1, ... as `Recording.from_pandas` takes it.
-Sample = Recording | pd.DataFrame
+# One recording, its file or its table, see `Recording.of`.
+Sample = RecordingLike
 # Settings of `fit` that are no matter of one call.
 SETTINGS = {
     name: parameter
@@ -52,7 +53,7 @@ class FrictionEstimator(BaseEstimator):
     A sample is a whole recording, so `X` is a list and cross-validation leaves out recordings.
 
     Args:
-        plant: the mechanism.
+        plant: the mechanism, its name, or the path of a rig file.
         model: name of a friction model such as `"stribeck"`, or one to start from, which stays
             unchanged.
         horizon: length of the simulations by which `score` judges [s].
@@ -75,7 +76,7 @@ class FrictionEstimator(BaseEstimator):
 
     def __init__(
         self,
-        plant: Plant | None = None,
+        plant: Plant | str | Path | None = None,
         model: str | FrictionModel = "LFM",
         *,
         horizon: float = 5.0,
@@ -97,7 +98,8 @@ class FrictionEstimator(BaseEstimator):
         """Estimate from recordings.
 
         Args:
-            X: recordings, or tables with columns time, q1, ... (see `Recording.from_pandas`).
+            X: recordings, paths of files, or tables with columns time, q1, ... (see
+                `Recording.of`).
             y: ignored; positions to be predicted are in the recordings.
 
         Returns:
@@ -108,12 +110,11 @@ class FrictionEstimator(BaseEstimator):
         """
         if self.plant is None:
             raise ValueError("`plant` is missing; give the mechanism, as of rigs.read('rig.json').")
-        if isinstance(self.model, str):
-            model: FrictionModel = model_by_name(self.model)(self.plant.joints)
-        else:
-            model = copy.deepcopy(self.model)
+        plant = rigs.of(self.plant)
+        # The model given is a parameter, which stays as it is.
+        model = self.model if isinstance(self.model, str) else copy.deepcopy(self.model)
         settings = {name: getattr(self, name) for name in SETTINGS}
-        self.fit_ = fit(model, self.plant, _recordings(X, self.plant), **settings)
+        self.fit_ = fit(model, plant, _recordings(X, plant), **settings)
         return self
 
     @property
@@ -162,7 +163,7 @@ class FrictionEstimator(BaseEstimator):
         """
         model, plant = self._fitted.model, self._fitted.plant
         with torch.no_grad():
-            if isinstance(X, Recording | pd.DataFrame):
+            if isinstance(X, Recording | pd.DataFrame | str | os.PathLike):
                 (recording,) = _recordings(X, plant)
                 joint = recording.joint_coordinates(plant)
                 motion = kalman_smoother(joint.time, joint.q)
@@ -190,7 +191,8 @@ class FrictionEstimator(BaseEstimator):
             sample, NaN from where the simulation diverged: `Recording.to_pandas` of the
             recording has the same columns.
         """
-        (given,) = _recordings(recording, self.plant_)
+        (read,) = _recordings(recording, self.plant_)
+        given = self._fitted.aligned(read)
         run = score(self.plant_, self.model_, given, horizons=(), limit=False)
         table = given.to_pandas()[["time", *(f"q{k + 1}" for k in range(given.joints))]]
         table.iloc[:, 1:] = run.simulated
@@ -210,7 +212,8 @@ class FrictionEstimator(BaseEstimator):
         errors = []
         for recording in _recordings(X, self.plant_):
             horizon = min(self.horizon, longest_window(recording))
-            found = score(self.plant_, self.model_, recording, horizons=(horizon,), limit=False)
+            aligned = self._fitted.aligned(recording)
+            found = score(self.plant_, self.model_, aligned, horizons=(horizon,), limit=False)
             errors.append(found.windows[f"{horizon:g}"].all)
         return -math.sqrt(sum(e * e for e in errors) / len(errors))
 
@@ -240,21 +243,8 @@ _own = list(inspect.signature(FrictionEstimator.__init__).parameters.values())[:
 FrictionEstimator.__init__.__signature__ = inspect.Signature([*_own, *SETTINGS.values()])  # type: ignore[attr-defined]
 
 
-def _recordings(X: object, plant: Plant) -> list[Recording]:
+def _recordings(X: Sample | Sequence[Sample], plant: Plant) -> list[Recording]:
     """Recordings of any accepted form; a table without a unit is in the plant's."""
-    many = [X] if isinstance(X, Recording | pd.DataFrame) else X
-    if not isinstance(many, Sequence | np.ndarray) or not len(many):
+    if not (found := Recording.many(X, plant=plant)):
         raise ValueError(f"recordings are needed, one or a list of them, got {X!r}.")
-    found = []
-    for k, given in enumerate(many):
-        if isinstance(given, pd.DataFrame):
-            known: Unit = "m" if plant.unit == "m" else "rad"
-            unit = None if "unit" in given.attrs else known
-            given = Recording.from_pandas(given, unit=unit, name=f"table {k + 1}")
-        if not isinstance(given, Recording):
-            raise ValueError(
-                f"a sample is a Recording, or a table with columns time, q1, ..., got "
-                f"{type(given).__name__}; `Recording(time, q)` makes one of arrays."
-            )
-        found.append(given)
     return found

@@ -25,7 +25,7 @@ import torch
 from nfriction.fitting.fit import fit
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction import model_by_name, model_name
-from nfriction.friction.models import ConstantModel
+from nfriction.friction.models import ConstantModel, FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
@@ -41,8 +41,14 @@ _PACKAGE = logging.getLogger("nfriction")
 class Progress:
     """Receives what is being done; this one ignores it."""
 
+    def expect(self, stages: int) -> None:
+        """So many further stages are to come."""
+
     def stage(self, what: str) -> None:
-        """Begin a stage."""
+        """Begin a stage, or several at the same time."""
+
+    def done(self) -> None:
+        """A stage has ended."""
 
     def step(self, stage: str) -> None:
         """Count a step of a search that runs in this process."""
@@ -91,11 +97,15 @@ def fit_models(
     results = {part: Fits({}, {}) for part in parts}
     errors: list[Exception] = []
     origin = warm_starts(names)
+    progress.expect(len(parts) * len(names))
     for level in dependency_levels(origin):
         labels = {f"{part} {name}": (part, name) for part in parts for name in level}
         tasks = {
-            label: (name, plant, parts[part], results[part].found.get(origin[name] or ""),
-                    fit_settings)
+            # An instance, as a process elsewhere may not know a law of one's own.
+            label: (
+                model_by_name(name)(plant.joints), plant, parts[part],
+                results[part].found.get(origin[name] or ""), fit_settings,
+            )
             for label, (part, name) in labels.items()
         }  # fmt: skip
         for label, (result, seconds) in as_completed(_fit, tasks, jobs=jobs, progress=progress):
@@ -147,11 +157,14 @@ def dependency_levels(origin: Mapping[str, str | None]) -> Iterator[list[str]]:
 
 
 def _fit(
-    name: str, plant: Plant, data: Data, start: FitResult | None, settings: dict[str, Any]
+    model: FrictionModel,
+    plant: Plant,
+    data: Data,
+    start: FitResult | None,
+    settings: dict[str, Any],
 ) -> tuple[FitResult | Exception, float]:
     """A fit or its error, and the time it took [s]."""
     begun = time.perf_counter()
-    model = model_by_name(name)(plant.joints)
     result: FitResult | Exception
     try:
         result = fit(model, plant, data.recordings, motions=data.motions, start=start, **settings)
@@ -198,7 +211,9 @@ def as_completed(
     if jobs == 1 or len(calls) < 2:
         for call in calls:
             progress.stage(call[0])
-            yield _run(*call)[:2]
+            label, value, _ = _run(*call)
+            progress.done()
+            yield label, value
         return
     from joblib import Parallel, delayed
 
@@ -209,6 +224,7 @@ def as_completed(
         results = pool(delayed(_run)(*call) for call in calls)
     for finished, (label, value, log) in enumerate(results, 1):
         log.replay(shown)
+        progress.done()
         progress.stage(f"{label} done, {len(calls) - finished} of {len(calls)} left")
         yield label, value
 

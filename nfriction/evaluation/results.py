@@ -21,16 +21,15 @@ from nfriction.evaluation.cross_validation import Selection
 from nfriction.evaluation.score import Score
 from nfriction.export import ExportError, torchscript
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.io.atomic import write_atomically
-from nfriction.io.model_file import save
-from nfriction.io.model_info import ModelInfo, parameter_hash
+from nfriction.io.files import write_atomically
+from nfriction.io.model_file import ModelInfo, parameter_hash, save
 from nfriction.recording import Recording
 
 logger = logging.getLogger(__name__)
 
 RESULTS, TABLE, REPORT = "results.json", "table.csv", "report.html"
 # Files that a run may have written and a later one removes: in its own folders, no way out of them.
-OURS = re.compile(r"table\.csv|models/[\w-]+\.(json|pt)|figures/\w[\w.-]*\.png")
+OURS = re.compile(r"table\.csv|models/[\w-]+\.(json|pt)|figures/\w[\w.-]*\.(png|svg|pdf)")
 REPORT_MARK = b'<meta name="generator" content="nfriction'
 """Near the top of every report; a `report.html` without it is the user's own."""
 # In the folder while it is written: the lock, files that are not complete, files that are.
@@ -116,6 +115,7 @@ def write_results(
     selection: Selection | None = None,
     command: str = "",
     figures: bool = True,
+    formats: Sequence[str] = (),
 ) -> list[Path]:
     """Write `table.csv`, `results.json`, the models with their TorchScript, and figures.
 
@@ -130,6 +130,7 @@ def write_results(
         selection: the choice on the training recordings alone, if there is one.
         command: reproduces the results.
         figures: draw them.
+        formats: of figures besides PNG, see `plots.save_all`.
 
     Raises:
         OSError: another process is writing a run into the folder, or it cannot be written.
@@ -162,7 +163,9 @@ def write_results(
             if figures:
                 from nfriction import plots  # matplotlib takes half a second that others save
 
-                drawn = plots.save_all(comparison, [*train, *test], unfinished, run=run)
+                drawn = plots.save_all(
+                    comparison, [*train, *test], unfinished, run=run, formats=formats
+                )
                 (folder / "figures").mkdir(exist_ok=True)
                 # Listed before they are there, so that a later run knows them in any case.
                 written += [f"figures/{path.name}" for path in drawn]

@@ -171,10 +171,8 @@ def _fit_session(
     model: FrictionModel, plant: Plant, session: Session, settings: dict[str, Any]
 ) -> SessionFit | str:
     """Estimates of a session, or the reason why there are none."""
-    many = [session] if isinstance(session, (Recording, str, os.PathLike)) else session
     try:
-        recordings = [r if isinstance(r, Recording) else Recording.read(r) for r in many]
-        found = fit(copy.deepcopy(model), plant, recordings, **settings)
+        found = fit(copy.deepcopy(model), plant, session, **settings)
     except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
         return str(error)
     # Motions and residuals stay behind: a thousand of them would fill the memory.

@@ -8,7 +8,7 @@ from itertools import zip_longest
 from nfriction.evaluation.compare import LIMIT, NO_FRICTION, PART_NAMES, Comparison, Part
 from nfriction.evaluation.cross_validation import Selection
 from nfriction.friction.models import FrictionModel
-from nfriction.io.model_info import ModelInfo, describe
+from nfriction.io.model_file import ModelInfo, describe
 
 Value = str | float
 Sets = Mapping[str, Mapping[str, Sequence[float]]]

@@ -18,9 +18,8 @@ from torch import Tensor
 from nfriction.export.controller import NOT_FINITE, OUTSIDE, SATURATED, Controller
 from nfriction.export.test_vectors import draw_motion, trials
 from nfriction.friction.models import FrictionModel
-from nfriction.io import strict_json
-from nfriction.io.atomic import atomic_write
-from nfriction.io.model_info import ModelInfo, describe
+from nfriction.io.files import atomic_write, numbers, parse_json
+from nfriction.io.model_file import ModelInfo, describe
 
 
 class ExportError(RuntimeError):
@@ -135,7 +134,7 @@ class Contract:
             ContractError: if it is not of this form.
         """
         try:
-            content = strict_json.parse(text)
+            content = parse_json(text)
         except (ValueError, RecursionError) as error:
             raise ContractError(f"the metadata are no JSON, or cut short ({error}).") from error
         if not isinstance(content, dict) or content.get("format") != FORMAT:
@@ -147,7 +146,7 @@ class Contract:
             )
         try:
             vectors = content.pop("vectors")
-            tolerance = strict_json.numbers("tolerance", content.pop("tolerance"))
+            tolerance = numbers("tolerance", content.pop("tolerance"))
             inputs, outputs, scales = (
                 {str(name): _tensor(name, x) for name, x in side.items()}
                 for side in (vectors["inputs"], vectors["outputs"], content.pop("scales"))
@@ -336,7 +335,7 @@ def _tensor(name: str, given: Any) -> Tensor:
 
     if not isinstance(given, list) or len(given) > MOST_VECTORS:
         raise ValueError(f"`{name}` is no list, or too long")
-    values = strict_json.numbers(name, given, words=("nan", "inf", "-inf"))
+    values = numbers(name, given, words=("nan", "inf", "-inf"))
     return torch.tensor(values, dtype=torch.float64)
 
 

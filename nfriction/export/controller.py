@@ -20,8 +20,8 @@ import torch
 from torch import Tensor, nn
 
 from nfriction.friction.models import FrictionModel
-from nfriction.io.model_info import ModelInfo
-from nfriction.io.strict_json import numbers
+from nfriction.io.files import numbers
+from nfriction.io.model_file import ModelInfo
 from nfriction.signals import SecondOrderLowPass
 
 # Bits of the status.

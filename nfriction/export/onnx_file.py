@@ -28,7 +28,7 @@ from nfriction.export.controller import controller_of, for_single_precision
 from nfriction.export.pt2_file import exported, run_from_nan, silent
 from nfriction.export.torch_archive import METADATA
 from nfriction.friction.models import FrictionModel
-from nfriction.io.model_info import ModelInfo
+from nfriction.io.model_file import ModelInfo
 
 # Old enough for runtimes in the field; nothing newer is needed.
 OPSET, IR_VERSION = 18, 8

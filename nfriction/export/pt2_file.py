@@ -24,8 +24,8 @@ from nfriction.export.controller import Controller, controller_of, run_in_order
 from nfriction.export.test_vectors import draw
 from nfriction.export.torch_archive import METADATA, check_program, contents, repacked
 from nfriction.friction.models import FrictionModel
-from nfriction.io import strict_json
-from nfriction.io.model_info import ModelInfo
+from nfriction.io.files import parse_json
+from nfriction.io.model_file import ModelInfo
 
 # All that an archive of ours holds.
 _OURS = re.compile(
@@ -118,10 +118,10 @@ def open_pt2(path: str | Path) -> tuple[Contract, Runner]:
 def _refuse_foreign_objects(path: str | Path, files: Mapping[str, bytes]) -> None:
     """Refuse an archive that holds more than tensors and JSON: torch would unpickle it."""
     try:
-        check_program(strict_json.parse(files["models/model.json"]))
+        check_program(parse_json(files["models/model.json"]))
         for name, content in files.items():
             if name.endswith("_config.json"):
-                config = strict_json.parse(content)["config"]
+                config = parse_json(content)["config"]
                 if any(entry["use_pickle"] for entry in config.values()):
                     raise ExportError("it holds pickled objects, which are refused.")
             if name.endswith(".pt") and content:

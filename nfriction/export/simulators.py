@@ -16,8 +16,8 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from nfriction.friction.models import FrictionModel
-from nfriction.io.atomic import write_atomically
-from nfriction.io.model_info import ModelInfo
+from nfriction.io.files import write_atomically
+from nfriction.io.model_file import ModelInfo
 from nfriction.plant.robot_file import parse_xml
 from nfriction.signals import Motion
 

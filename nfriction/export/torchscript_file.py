@@ -21,11 +21,10 @@ from nfriction.export.contract import (
     verify,
 )
 from nfriction.export.controller import Controller, controller_of, run_in_order
-from nfriction.export.neurofuzzy import with_single_sample
 from nfriction.export.torch_archive import METADATA, check_script, check_source, contents, repacked
 from nfriction.friction.models import FrictionModel
-from nfriction.io.atomic import atomic_write
-from nfriction.io.model_info import ModelInfo
+from nfriction.io.files import atomic_write
+from nfriction.io.model_file import ModelInfo
 
 # All that an archive of ours holds.
 _OURS = re.compile(
@@ -215,7 +214,7 @@ def _compile(controller: Controller) -> Any:
     kind = (
         _Filtering if controller.filters else _Remembering if controller.remembers else _Stateless
     )
-    module = kind(with_single_sample(controller)).eval()
+    module = kind(controller).eval()
     methods = [name for name in _methods(module) if name != "forward"]
     try:
         return torch.jit.freeze(torch.jit.script(module), preserved_attrs=methods)
@@ -228,20 +227,13 @@ def _methods(module: Any) -> list[str]:
     return [name for name in ("forward", "step", "initial_state") if hasattr(module, name)]
 
 
-ONE_BY_ONE = 100
-
-
 def _check(controller: Controller, loaded: Any, contract: Contract) -> None:
     """Refuse an artefact that is not the model."""
     inputs = sample_inputs(controller.model, 1000, seed=0)
     with torch.no_grad():
         expected, got = controller.torque(*inputs), loaded(*inputs)
-        # One sample at a time too, for which neuro-fuzzy models have a way of their own.
-        rows = list(zip(*(x[:ONE_BY_ONE] for x in inputs), strict=True))
-        single = torch.stack([loaded(*row) for row in rows])
-        difference = torch.cat([got - expected, single - expected[:ONE_BY_ONE]])
         scale = torch.maximum(expected.abs().amax(0), contract.scales["tau_f"]).clamp_min(1e-300)
-        error = float((difference.abs() / scale).max())
+        error = float(((got - expected).abs() / scale).max())
         if not error <= contract.tolerance:
             raise ExportError(
                 f"the TorchScript differs from its model by {error:.1e} of full scale."

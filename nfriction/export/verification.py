@@ -27,7 +27,7 @@ from nfriction.export.torch_archive import contract_of_archive
 from nfriction.export.torchscript_file import open_torchscript
 from nfriction.friction.models import FrictionModel
 from nfriction.io import sandbox
-from nfriction.io.model_info import ModelInfo
+from nfriction.io.model_file import ModelInfo
 
 # A controller with a state goes through its points one by one.
 MOST_SUCCESSIVE = 2000

@@ -120,7 +120,8 @@ def _tested(
     if given.tau.any():
         for text, data in _corrected_torques(plant, given, options):
             yield text, _unexplained(plant, data)
-        yield _delay(plant, recordings, motions, options)
+        delay, share = balanced_delay(plant, recordings, motions, options)
+        yield _delay_in_words(delay), share
     for text, rig in _corrected_terms(plant, given, options):
         yield text, _unexplained(rig, given)
 
@@ -143,11 +144,10 @@ def _collect(
         inside = np.flatnonzero((time >= time[0] + margin) & (time <= time[-1] - margin))
         starts = np.arange(0, max(0, len(inside) - block + 1), stride)
         chosen = inside[(starts[:, None] + np.arange(block)).ravel()]
-        tau = np.zeros_like(motion.q) if recording.tau is None else recording.tau
-        moved = [np.interp(time[chosen] + delay, time, column) for column in tau.T]
-        parts.append((motion.q[chosen], motion.qd[chosen], motion.qdd[chosen], np.stack(moved, 1)))
-    q, qd, qdd, torque = (torch.as_tensor(np.concatenate(x)) for x in zip(*parts, strict=True))
-    return _Data(q, qd, qdd, torque, block)
+        torque = recording.torque_at(time[chosen] + delay)
+        parts.append((motion.q[chosen], motion.qd[chosen], motion.qdd[chosen], torque))
+    q, qd, qdd, tau = (torch.as_tensor(np.concatenate(x)) for x in zip(*parts, strict=True))
+    return _Data(q, qd, qdd, tau, block)
 
 
 def _corrected_positions(
@@ -262,7 +262,8 @@ def _corrected_terms(
         x = _amount(plant, {"armature": unit}, given)
         if x > options.ratio_term[0] * float(own["armature"][j]):
             armature = own["armature"] + x * unit
-            text = f"{name} has a rotor inertia (`armature`) of {float(armature[j]):.3g} kg m^2"
+            seen = f"of {float(armature[j]):.3g} kg m^2 seen at the joint"
+            text = f"{name} has a rotor inertia {seen} (`armature`, or that of its `motor`)"
             yield text, plant.replace(armature=armature)
 
 
@@ -287,10 +288,16 @@ def _corrected_torques(
             yield f"{what} {cause}", replace(given, tau=given.tau + (gain - 1) * part)
 
 
-def _delay(
-    plant: Plant, recordings: Sequence[Recording], motions: Sequence[Motion], options: FitOptions
-) -> tuple[str, float]:
-    """The delay between torques and positions that explains most."""
+def balanced_delay(
+    plant: Plant,
+    recordings: Sequence[Recording],
+    motions: Sequence[Motion],
+    options: FitOptions = DEFAULTS,
+) -> tuple[float, float]:
+    """Delay of torques after positions that explains most [s], and what it leaves [-].
+
+    For the arguments and the share of unexplained torque see `likely_mistakes`.
+    """
     from scipy.optimize import minimize_scalar  # slow to import
 
     def unexplained(delay: float) -> float:
@@ -301,12 +308,15 @@ def _delay(
     best = grid[int(np.argmin([unexplained(delay) for delay in grid]))]
     around = np.clip((best - grid[1] + grid[0], best + grid[1] - grid[0]), grid[0], grid[-1])
     found = minimize_scalar(unexplained, bounds=around, method="bounded", options={"xatol": 1e-4})
-    words = ("torques", "positions") if found.x > 0 else ("positions", "torques")
-    lag = (
-        f"{words[0]} are recorded {1e3 * abs(found.x):.1f} ms later than {words[1]} "
-        f"(`recording.advance_torque({found.x:.4f})`)"
+    return float(found.x), float(found.fun)
+
+
+def _delay_in_words(delay: float) -> str:
+    words = ("torques", "positions") if delay > 0 else ("positions", "torques")
+    return (
+        f"{words[0]} are recorded {1e3 * abs(delay):.1f} ms later than {words[1]} "
+        f"(`fit_delay=True`, or `recording.advance_torque({delay:.4f})`)"
     )
-    return lag, float(found.fun)
 
 
 def _amount(plant: Plant, change: dict[str, Tensor], given: _Data) -> float:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.result.identifiability import NORMAL_95
+from nfriction.fitting.robust_loss import Outliers, RobustLoss, named_outliers
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Law
@@ -21,6 +22,13 @@ from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
+
+# A robust loss is minimised by least squares with weights from the residuals before, so many times
+# or until no coefficient moves by more than this share of the largest.
+REWEIGHTINGS = 30
+SETTLED = 1e-4
+# Scatter of a torque that is rounding, over the torque.
+ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -35,6 +43,8 @@ class TorqueFit:
             torque is not linear, (start, joint, coefficient).
         information: of the data about each joint's coefficients, (joint, coefficient,
             coefficient), with residuals inflated for autocorrelation.
+        weight: of each sample under a robust loss, (sample, joint).
+        outliers: samples that it counts less than half.
     """
 
     coefficients: Tensor
@@ -42,6 +52,8 @@ class TorqueFit:
     torque: Tensor
     starts: Tensor = field(default_factory=lambda: torch.zeros(0, 0, 0, dtype=torch.float64))
     information: Tensor = field(default_factory=lambda: torch.zeros(0, 0, 0, dtype=torch.float64))
+    weight: Tensor = field(default_factory=lambda: torch.zeros(0, 0, dtype=torch.float64))
+    outliers: tuple[Outliers, ...] = ()
 
 
 def friction_torque(
@@ -81,7 +93,7 @@ def _inside(time: NDArray[np.float64], edge: float) -> NDArray[np.bool_]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Balance:
+class TorqueBalance:
     """The torque balance of one recording: friction as its smoothed motion shows it.
 
     A smoother sees an acceleration, and with it the jumps of dry friction, through a low-pass
@@ -126,13 +138,15 @@ class _Balance:
         return torch.cat(parts)
 
 
-def _balance(plant: Plant, recording: Recording, motion: Motion, options: FitOptions) -> _Balance:
+def _balance(
+    plant: Plant, recording: Recording, motion: Motion, options: FitOptions
+) -> TorqueBalance:
     q, qd, qdd = (torch.as_tensor(x) for x in (motion.q, motion.qd, motion.qdd))
     tau = torch.zeros_like(q) if recording.tau is None else torch.tensor(recording.tau)
     kept = torch.as_tensor(_inside(motion.time, options.edge))[:, None].expand_as(q)
     step = float(np.median(np.diff(motion.time)))
     rate = _smoother_rate(motion)
-    found = _Balance(qd, plant.load(q, qd), tau, kept, rate, step, recording.segments)
+    found = TorqueBalance(qd, plant.load(q, qd), tau, kept, rate, step, recording.segments)
     if rate is not None and motion.std is not None:
         # A torque is held until the next sample, so it acts half a sample late.
         held = 0.5 * (tau + torch.cat([tau[:1], tau[:-1]]))
@@ -156,7 +170,7 @@ def _smoother_rate(motion: Motion) -> Tensor | None:
     return rate if bool((torch.isfinite(rate) & (rate > 0)).all()) else None
 
 
-def fit_torque(
+def fit_equation_error(
     law: Law,
     plant: Plant,
     recordings: Sequence[Recording],
@@ -168,7 +182,8 @@ def fit_torque(
 
     Linear least squares within bounds where the torque is linear in the coefficients, for every
     combination of the law's initial values of the others, which are then refined. Samples whose
-    direction of motion is uncertain are left out. Recordings and motions are in joint coordinates.
+    direction of motion is uncertain are left out. A robust loss weighs the squares. Recordings and
+    motions are in joint coordinates.
 
     Raises:
         ValueError: if there are too few samples, or the law's torque is not finite along the
@@ -182,22 +197,37 @@ def fit_torque(
             f"{names}: too few samples, {count} are left {options.edge:g} s away from the ends "
             f"for {len(law.coefficients)} coefficients a joint; record for longer."
         )
-    torque, kept = (torch.cat([getattr(p, name) for p in parts]) for name in ("torque", "kept"))
+    kept = torch.cat([p.kept for p in parts])
     # A joint that hardly ever moved has to do with what there is.
     inside = torch.cat([torch.as_tensor(_inside(m.time, options.edge)) for m in motions])
     kept = torch.where(kept.sum(0) > len(law.coefficients), kept, inside[:, None])
-    nonlinear = {i: c.initial_grid for i, c in enumerate(law.coefficients) if not c.linear}
-    candidates = []
-    for values in itertools.product(*nonlinear.values()):
-        fixed = dict(zip(nonlinear, values, strict=True))
-        design = torch.cat([p.smoothed(_design(law, p.qd, p.load, v_smooth, fixed)) for p in parts])
-        candidates.append(_linear_fit(law, design, torque, kept, fixed, options.ridge))
-    starts, residuals = (torch.stack(x) for x in zip(*candidates, strict=True))
-    best = residuals.argmin(0)
-    coefficients = starts[best, torch.arange(len(best))]
-    regression = _Regression(law, parts, torque, kept, v_smooth)
-    if any(c.fitted for c in law.coefficients if not c.linear):
-        coefficients = regression.refined(coefficients)
+    parts = [
+        replace(part, kept=rows)
+        for part, rows in zip(parts, kept.split([len(p.qd) for p in parts]), strict=True)
+    ]
+    found = regress(law, parts, v_smooth, options)
+    weights = zip(recordings, found.weight.split([len(r) for r in recordings]), strict=True)
+    named = (outlier for r, weight in weights for outlier in named_outliers(r, weight.numpy()))
+    return replace(found, outliers=tuple(named))
+
+
+def regress(
+    law: Law, parts: Sequence[TorqueBalance], v_smooth: float, options: FitOptions = DEFAULTS
+) -> TorqueFit:
+    """Least squares of the kept samples of torque balances; see `fit_equation_error`.
+
+    Raises:
+        ValueError: if the law's torque is not finite along the motion.
+    """
+    torque, kept = (torch.cat([getattr(p, name) for p in parts]) for name in ("torque", "kept"))
+    regression = _Regression(law, parts, torque, kept, kept.to(torque), v_smooth, options)
+    coefficients, starts = regression.solve()
+    if options.loss != "linear":
+        for _ in range(REWEIGHTINGS):
+            before, regression = coefficients, regression.reweighted(coefficients)
+            coefficients, starts = regression.solve()
+            if (coefficients - before).abs().max() <= SETTLED * coefficients.abs().max():
+                break
     slopes, error = regression.linearised(coefficients)
     many = kept.sum(0)
     return TorqueFit(
@@ -209,6 +239,7 @@ def fit_torque(
             slopes[:, j].T @ slopes[:, j] / _effective_variance(error[kept[:, j], j])
             for j in range(len(many))
         ]),
+        weight=torch.where(kept, regression.root.square(), 1.0),
     )  # fmt: skip
 
 
@@ -219,20 +250,52 @@ def _effective_variance(error: Tensor) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Regression:
-    """Residuals of torque balances as a function of all coefficients of a law."""
+    """Residuals of torque balances as a function of all coefficients of a law.
+
+    `root` is the square root of each sample's weight, 0 where it is not `kept`, (sample, joint).
+    """
 
     law: Law
-    parts: Sequence[_Balance]
+    parts: Sequence[TorqueBalance]
     torque: Tensor
     kept: Tensor
+    root: Tensor
     v_smooth: float
+    options: FitOptions
+
+    def solve(self) -> tuple[Tensor, Tensor]:
+        """The best coefficients, and those at each combination of initial values."""
+        law, candidates = self.law, []
+        nonlinear = {i: c.initial_grid for i, c in enumerate(law.coefficients) if not c.linear}
+        for values in itertools.product(*nonlinear.values()):
+            fixed = dict(zip(nonlinear, values, strict=True))
+            columns = [_design(law, p.qd, p.load, self.v_smooth, fixed) for p in self.parts]
+            design = torch.cat([p.smoothed(c) for p, c in zip(self.parts, columns, strict=True)])
+            candidates.append(self._linear_fit(design, fixed))
+        starts, residuals = (torch.stack(x) for x in zip(*candidates, strict=True))
+        best = residuals.argmin(0)
+        coefficients = starts[best, torch.arange(len(best))]
+        if any(c.fitted for c in law.coefficients if not c.linear):
+            coefficients = self.refined(coefficients)
+        return coefficients, starts
+
+    def reweighted(self, coefficients: Tensor) -> "_Regression":
+        """The same with the weights of the robust loss at the residuals of these coefficients."""
+        error = replace(self, root=self.kept.to(self.root)).linearised(coefficients)[1]
+        root = torch.zeros_like(error)
+        for j, (rows, of_joint) in enumerate(zip(self.kept.T, error.T, strict=True)):
+            found, least = of_joint[rows, None], ROUNDING * float(self.torque[rows, j].abs().max())
+            least = max(least, self.options.min_noise)
+            loss = RobustLoss.of_errors(self.options.loss, found, least)
+            root[rows, j] = loss.weight(found)[:, 0].sqrt()
+        return replace(self, root=root)
 
     def linearised(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """Slopes (sample, joint, coefficient) and residuals (sample, joint); 0 if left out."""
         rows = []
         for part in self.parts:
 
-            def torque(values: Tensor, part: _Balance = part) -> Tensor:
+            def torque(values: Tensor, part: TorqueBalance = part) -> Tensor:
                 return self.law.torque(part.qd, part.load, values, self.v_smooth)
 
             units = torch.eye(coefficients.shape[1], dtype=coefficients.dtype)
@@ -242,8 +305,8 @@ class _Regression:
             ]
             values = torch.stack([pairs[0][0], *(pair[1] for pair in pairs)], -1)
             rows.append(part.smoothed(values))
-        found = torch.where(self.kept[..., None], torch.cat(rows), 0.0)
-        return found[..., 1:], found[..., 0] - torch.where(self.kept, self.torque, 0.0)
+        found = self.root[..., None] * torch.where(self.kept[..., None], torch.cat(rows), 0.0)
+        return found[..., 1:], found[..., 0] - self.root * torch.where(self.kept, self.torque, 0.0)
 
     def refined(self, coefficients: Tensor) -> Tensor:
         """The coefficients at the minimum next to these, within the bounds of a fit."""
@@ -258,6 +321,32 @@ class _Regression:
         solver = LevenbergMarquardt(cost_tolerance=1e-12)
         found = solver.minimise(model, coefficients.reshape(-1), lower=lower, upper=upper)
         return found.x.reshape(coefficients.shape)
+
+    def _linear_fit(self, design: Tensor, fixed: dict[int, float]) -> tuple[Tensor, Tensor]:
+        """Coefficients (joint, coefficient) and residual (joint,), the nonlinear ones given."""
+        from scipy.optimize import lsq_linear  # slow to import
+
+        law, joints = self.law, self.torque.shape[1]
+        linear = [i for i, c in enumerate(law.coefficients) if c.linear]
+        lower = [0.0 if law.coefficients[i].positive else -np.inf for i in linear]
+        coefficients = torch.zeros(joints, len(law.coefficients), dtype=self.torque.dtype)
+        for k, value in fixed.items():
+            coefficients[:, k] = value
+        residual = torch.zeros(joints, dtype=self.torque.dtype)
+        for joint in range(joints):
+            rows = self.kept[:, joint]
+            root = self.root[rows, joint]
+            a = (root[:, None] * design[rows, joint]).numpy()
+            y = (root * self.torque[rows, joint]).numpy()
+            # Columns of unit length, as coefficients differ by orders of magnitude.
+            scale = np.linalg.norm(a, axis=0)
+            scale[scale == 0] = 1.0
+            system = np.concatenate([a / scale, self.options.ridge * np.eye(len(linear))])
+            target = np.concatenate([y, np.zeros(len(linear))])
+            solution = lsq_linear(system, target, bounds=(lower, np.inf), tol=1e-12).x / scale
+            coefficients[joint, linear] = torch.as_tensor(solution)
+            residual[joint] = float(np.sqrt(np.mean((a @ solution - y) ** 2)))
+        return coefficients, residual
 
 
 def _design(law: Law, qd: Tensor, load: Tensor, v_smooth: float, fixed: dict[int, float]) -> Tensor:
@@ -279,38 +368,6 @@ def _design(law: Law, qd: Tensor, load: Tensor, v_smooth: float, fixed: dict[int
             "must be a finite number."
         )
     return design
-
-
-def _linear_fit(
-    law: Law,
-    design: Tensor,
-    torque: Tensor,
-    kept: Tensor,
-    fixed: dict[int, float],
-    ridge: float,
-) -> tuple[Tensor, Tensor]:
-    """Coefficients (joint, coefficient) and residual (joint,), the nonlinear ones given."""
-    from scipy.optimize import lsq_linear  # slow to import
-
-    linear = [i for i, c in enumerate(law.coefficients) if c.linear]
-    lower = [0.0 if law.coefficients[i].positive else -np.inf for i in linear]
-    joints = torque.shape[1]
-    coefficients = torch.zeros(joints, len(law.coefficients), dtype=torque.dtype)
-    for k, value in fixed.items():
-        coefficients[:, k] = value
-    residual = torch.zeros(joints, dtype=torque.dtype)
-    for joint in range(joints):
-        rows = kept[:, joint]
-        a, y = design[rows, joint].numpy(), torque[rows, joint].numpy()
-        # Columns of unit length, as coefficients differ by orders of magnitude.
-        scale = np.linalg.norm(a, axis=0)
-        scale[scale == 0] = 1.0
-        system = np.concatenate([a / scale, ridge * np.eye(len(linear))])
-        target = np.concatenate([y, np.zeros(len(linear))])
-        solution = lsq_linear(system, target, bounds=(lower, np.inf), tol=1e-12).x / scale
-        coefficients[joint, linear] = torch.as_tensor(solution)
-        residual[joint] = float(np.sqrt(np.mean((a @ solution - y) ** 2)))
-    return coefficients, residual
 
 
 def coefficient_scale(

@@ -14,6 +14,7 @@ order. The next step is `nfriction.fitting.shooting.problem`, the cost of the se
 import pkgutil
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from torch import Tensor
 
@@ -23,24 +24,28 @@ from nfriction.fitting.data.checks import (
     looks_zeroed_per_recording,
 )
 from nfriction.fitting.data.inputs import (
+    advanced_torques,
+    as_model,
     as_recording_list,
     in_joint_coordinates,
+    largest_torques,
     measurement_matrix,
     smoothed_motions,
 )
-from nfriction.fitting.diagnosis import likely_mistakes, mistake_warning
+from nfriction.fitting.diagnosis import balanced_delay, likely_mistakes, mistake_warning
 from nfriction.fitting.options import (
     Continuity,
     Eccentricity,
     EncoderReference,
     FitOptions,
+    Loss,
     Method,
 )
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Step
-from nfriction.plant import PendulumChain, Plant
-from nfriction.recording import Recording
+from nfriction.plant import PendulumChain, Plant, rigs
+from nfriction.recording import Recording, RecordingLike
 from nfriction.signals import Motion
 
 Callback = Callable[[str, Step], bool | None]
@@ -60,6 +65,7 @@ class FitTask:
         start: an earlier fit to start from.
         callback: called with a stage name after every step; True stops.
         per_recording: whether encoders were set to zero at the start of each recording.
+        delay: of the torque after the positions by the balance of torques [s]; 0 unless fitted.
         data_warnings: warnings about the recordings.
         mistakes: likely mistakes in recordings or plant.
     """
@@ -73,14 +79,15 @@ class FitTask:
     start: FitResult | None = None
     callback: Callback | None = None
     per_recording: bool = False
+    delay: float = 0.0
     data_warnings: tuple[str, ...] = ()
     mistakes: tuple[str, ...] = ()
 
 
 def fit(
-    model: FrictionModel,
-    plant: Plant,
-    recordings: Recording | Iterable[Recording],
+    model: FrictionModel | str,
+    plant: Plant | str | Path,
+    recordings: RecordingLike | Iterable[RecordingLike],
     *,
     method: Method = "output_error",
     windows: Sequence[float] = FitOptions.windows,
@@ -92,6 +99,8 @@ def fit(
     start: FitResult | None = None,
     motions: Sequence[Motion] | None = None,
     max_steps: int = 30,
+    loss: Loss = "linear",
+    fit_delay: bool = False,
     callback: Callback | None = None,
 ) -> FitResult:
     """Estimate a friction model from recordings.
@@ -100,14 +109,17 @@ def fit(
     refines them and the plant. Windows that would lose what shorter ones found are skipped, with a
     warning. Laws with several minima are also started from their grid of initial values and from
     the simpler law that they contain (`Law.nested_law`); the lowest residual wins. A neuro-fuzzy
-    model starts at the constant fit of its law and is kept only if its hold-out RMSE is 20 % below
-    the law's; its plant prior is relaxed only for a further 20 %. An adaptive model starts at the
-    constant fit, too; `fit_adaptive` has its further settings.
+    model starts at the constant fit of its law; evidence chooses the priors of its parameters, how
+    near the plant stays to the law's, the noise, and whether its sets move. Each joint takes the
+    share of its correction that blocks left out of the training support, and none if the gain there
+    may be chance. An adaptive model starts at the constant fit, too; `fit_adaptive` has its further
+    settings.
 
     Args:
-        model: the model to fit; changed in place.
-        plant: the mechanism as given.
-        recordings: one or several, all in one convention; by default in the plant's.
+        model: the model to fit, changed in place; or the name of one, such as "coulomb-viscous".
+        plant: the mechanism as given, its name, or the path of a rig file.
+        recordings: one or several, paths of files, or tables with columns time, q1, …; all in one
+            convention, by default the plant's.
         method: `"equation_error"` stops after the regression (constant coefficients only).
         windows: lengths of the shooting windows [s], in the order in which they are used.
         fit_plant: adjust ratios of inertia and gravity terms, lengths and offsets, within bounds.
@@ -132,6 +144,12 @@ def fit(
             for the plant's terms.
         motions: smoothed motions in joint coordinates, to save smoothing again.
         max_steps: limit of steps at each window length.
+        loss: `"linear"` for least squares, or a robust loss by SciPy's names, `"soft_l1"`,
+            `"huber"` or `"cauchy"`, for logs with spikes: errors beyond about the normal scatter
+            count less, and `FitResult.outliers` names the samples. Its scale comes from the
+            median error of each joint.
+        fit_delay: also estimate by how much torques are recorded later than positions, one delay
+            for all (`FitResult.torque_delay`, with an interval), as a bus or a filter causes it.
         callback: called with a stage name after every step; True stops.
 
     Returns:
@@ -144,30 +162,38 @@ def fit(
     """
     options = FitOptions(
         method, windows, fit_plant, drag,
-        eccentricity, encoder_reference, continuity, max_steps,
+        eccentricity, encoder_reference, continuity, max_steps, loss, fit_delay,
     )  # fmt: skip
     task = prepare_task(model, plant, recordings, options, start, motions, callback)
-    if not model.schedule.fit_strategy:
-        raise ValueError(f"cannot fit coefficients of type {type(model.schedule).__name__}.")
-    if method == "equation_error" and model.schedule.follows_motion:
+    schedule = task.model.schedule
+    if not schedule.fit_strategy:
+        raise ValueError(f"cannot fit coefficients of type {type(schedule).__name__}.")
+    if method == "equation_error" and schedule.follows_motion:
         raise ValueError(
             'adaptive and neuro-fuzzy models need `method="output_error"`, simulated windows.'
         )
-    strategy: Callable[[FitTask], FitResult] = pkgutil.resolve_name(model.schedule.fit_strategy)
+    strategy: Callable[[FitTask], FitResult] = pkgutil.resolve_name(schedule.fit_strategy)
     return strategy(task).with_warnings(task.data_warnings, task.mistakes)
 
 
 def prepare_task(
-    model: FrictionModel,
-    plant: Plant,
-    recordings: Recording | Iterable[Recording],
+    model: FrictionModel | str,
+    plant: Plant | str | Path,
+    recordings: RecordingLike | Iterable[RecordingLike],
     options: FitOptions,
     start: FitResult | None = None,
     motions: Sequence[Motion] | None = None,
     callback: Callback | None = None,
 ) -> FitTask:
     """Check and convert the arguments of a fit; see `fit`."""
-    given = as_recording_list(model, plant, recordings)
+    plant = rigs.of(plant)
+    model = as_model(model, plant.joints)
+    given = as_recording_list(recordings, plant)
+    if model.law.memory:
+        raise ValueError(
+            f"the law {model.law.name!r} has an internal state, which fits do not follow yet; fit "
+            "a law without memory, such as Stribeck."
+        )
     joint = in_joint_coordinates(plant, model, given)
     if options.eccentricity == "on" and not isinstance(plant, PendulumChain):
         raise ValueError(f"{plant.name or 'the axis'} has no encoders that turn with its joints.")
@@ -178,7 +204,13 @@ def prepare_task(
         found = (ZEROED_PER_RECORDING,) if per_recording else ()
     moved = smoothed_motions(joint, motions)
     convention = given[0].resolve_convention(plant)
-    stated, mistakes = likely_mistakes(plant, joint, moved, convention, options)
+    delay = 0.0
+    if options.fit_delay:
+        if not largest_torques(joint).any():
+            raise ValueError("`fit_delay=True` needs recordings with torques, got none.")
+        delay, _ = balanced_delay(plant, joint, moved, options)
+    advanced = advanced_torques(joint, delay)
+    stated, mistakes = likely_mistakes(plant, advanced, moved, convention, options)
     found = (
         *mistake_warning(stated, mistakes),
         *found,
@@ -195,6 +227,7 @@ def prepare_task(
         start,
         callback,
         per_recording,
+        delay,
         found,
         tuple(m.text for m in mistakes),
     )

@@ -11,12 +11,15 @@ Eccentricity = Literal["off", "on", "auto"]
 EncoderReference = Literal["auto", "shared", "per_recording"]
 # Defects between shooting windows: free, penalised, or enforced.
 Continuity = Literal["none", "penalty", "constraint"]
+# Of SciPy's robust losses those that keep growing, so that a start far away still comes near.
+Loss = Literal["linear", "soft_l1", "huber", "cauchy"]
 
 CHOICES = {
     "method": get_args(Method),
     "eccentricity": get_args(Eccentricity),
     "encoder_reference": get_args(EncoderReference),
     "continuity": get_args(Continuity),
+    "loss": get_args(Loss),
 }
 
 
@@ -24,7 +27,7 @@ CHOICES = {
 class FitOptions:
     """Settings of a fit.
 
-    The fields up to `max_steps` are the user's, see `nfriction.fit`; the others are tuning
+    The fields up to `fit_delay` are the user's, see `nfriction.fit`; the others are tuning
     constants with their reasons. Lengths and speeds are in m for sliding joints. A `..._term` is
     the bound of a plant term and the standard deviation of its prior, both around the given plant.
 
@@ -41,6 +44,8 @@ class FitOptions:
     encoder_reference: EncoderReference = "auto"
     continuity: Continuity = "none"
     max_steps: int = 30
+    loss: Loss = "linear"
+    fit_delay: bool = False
 
     # --- Data.
     # Faster over its first sample, a recording does not begin at rest [rad/s]; an encoder that
@@ -94,6 +99,8 @@ class FitOptions:
     asymmetry_term: tuple[float, float] = (1.0, 0.1)
     # Drag of a slender bar is 0.5 rho c_d width, below 0.1 N s^2/m^3.
     drag_term: tuple[float, float] = (1.0, 0.05)
+    # Buses and filters delay a torque by some ms; the bound is `largest_delay` [s].
+    delay_sd: float = 0.02
     # How far the last link extends into the air is rarely measured: lower, upper, sd [link length].
     reach_term: tuple[float, float, float] = (-0.7, 1.0, 0.3)
 
@@ -117,6 +124,10 @@ class FitOptions:
     step_tolerance: float = 1e-8
     # Relative decrease that ends a search whose result is only a start for the next.
     loose_tolerance: float = 1e-4
+    # Searches with a robust loss: each takes its scale from the errors of the one before, and they
+    # end where it moves by less than this share.
+    most_scales: int = 5
+    scale_tolerance: float = 0.05
     # Decrease of the cost that ends the last search: a tenth in log likelihood.
     loglik_tolerance: float = 0.1
     # Dry friction puts kinks into the cost along which steps creep; so many in a row that gain no
@@ -141,14 +152,13 @@ class FitOptions:
     settling_tolerance: float = 1e-4
 
     # --- Hold-out of a network.
-    # Every so many-th window is held out, so that all sizes of the motion are represented.
-    folds: int = 3
-    # Maximum hold-out RMSE ratio to the law fitted on the same windows.
-    max_ratio_same: float = 0.8
-    # Maximum hold-out RMSE ratio to the law fitted on all windows, which it would replace.
-    max_ratio_all: float = 1.1
-    # Candidate priors, relative to the network's own.
-    prior_shares: tuple[float, ...] = (1.0, 1 / 3)
+    # Blocks of consecutive windows, each left out of a network's training once; windows of short
+    # recordings are shortened until there are as many.
+    folds: int = 5
+    # Chance that a network no better than its law on the blocks left out is kept.
+    gain_level: float = 0.05
+    # Updates of a network's prior and noise by evidence; each searches on from the last.
+    evidence_updates: int = 6
 
     # --- Extrapolation prior of a network.
     # Grid cells along velocity and acceleration, cells around a visited one that count as
@@ -206,6 +216,8 @@ class FitOptions:
                 raise ValueError(
                     '`encoder_reference="per_recording"` needs `method="output_error"`.'
                 )
+            if self.fit_delay:
+                raise ValueError('`fit_delay=True` needs `method="output_error"`.')
             if self.continuity != "none":
                 raise ValueError(f'`continuity="{self.continuity}"` needs `method="output_error"`.')
 

@@ -13,6 +13,8 @@ from torch import Tensor, nn
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.plant import Plant
 
+TORQUE_DELAY = "torque delay [s]"
+
 
 @dataclass(frozen=True)
 class PlantParameter:
@@ -21,7 +23,7 @@ class PlantParameter:
     Attributes:
         name: as in reports.
         change: of the plant's buffers per unit, each in the shape of its buffer; of a ratio, 1 at
-            the entries that it scales.
+            the entries that it scales. Empty for the delay of the torque.
         lower, upper: bounds.
         prior_sd: standard deviation of the prior around 0.
         ratio: whether it scales its entries, rather than adding to them.
@@ -102,6 +104,17 @@ def plant_parameters(
     return found
 
 
+def torque_delay_term(options: FitOptions = DEFAULTS) -> PlantParameter:
+    """Time by which torques are recorded later than positions."""
+    most = options.largest_delay
+    return PlantParameter(TORQUE_DELAY, {}, -most, most, options.delay_sd)
+
+
+def delay_index(terms: Sequence[PlantParameter]) -> int | None:
+    """Place of the torque's delay among the terms; None where it is not fitted."""
+    return next((i for i, term in enumerate(terms) if term.name == TORQUE_DELAY), None)
+
+
 def _chain_terms(
     buffers: Mapping[str, Tensor], driven: bool, options: FitOptions
 ) -> Iterator[PlantParameter]:
@@ -111,8 +124,12 @@ def _chain_terms(
     def coupled(*pairs: tuple[int, int]) -> dict[str, Tensor]:
         return _at(buffers, "inertia_coupling", *pairs, *((j, i) for i, j in pairs))
 
+    weight = bool(buffers["gravity_moment"].any())
     for i in range(links):
-        yield from _ratio(buffers, f"inertia {i + 1}{i + 1}", coupled((i, i)), options.ratio_term)
+        # Without torque and gravity, the inertia is the scale of the friction.
+        if driven or weight:
+            name = f"inertia {i + 1}{i + 1}"
+            yield from _ratio(buffers, name, coupled((i, i)), options.ratio_term)
     # The off-diagonal inertia a_ij = L_i b_j shares the first moment b_j with gravity, so both
     # scale together.
     for j in range(0 if driven else 1, links):
@@ -123,7 +140,7 @@ def _chain_terms(
         yield from _ratio(buffers, f"length {i + 1}", carried, options.length_term)
     joints = buffers["angle_offset"].shape[-1]
     bound, sd = options.angle_term
-    for j in range(joints - links, joints):
+    for j in range(joints - links, joints) if weight else ():
         unit = _at(buffers, "angle_offset", j)
         yield PlantParameter(f"angle offset {j + 1} [rad]", unit, -bound, bound, sd)
 

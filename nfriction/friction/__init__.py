@@ -5,6 +5,7 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
+    from nfriction.friction.laws import Law
     from nfriction.friction.models import NamedModel
 
 
@@ -14,6 +15,8 @@ class _Kind(NamedTuple):
     letters: str
     """Before its abbreviation."""
     module: str
+    base: str = ""
+    """Class there of which every model of the kind is one."""
 
 
 # Laws by their plain names, with the abbreviations of the papers.
@@ -25,12 +28,21 @@ _LAWS = {
     "coulomb-viscous": "CVFM",
     "stribeck": "Stribeck",
 }
+# Laws with memory, which have no other kinds yet.
+_MEMORY = {
+    "dahl": "Dahl",
+    "lugre": "LuGre",
+    "elasto-plastic": "ElastoPlastic",
+    "maxwell-slip": "MaxwellSlip",
+}
+# Slip elements beside terms of the velocity, for tables of torque.
+_HYSTERESIS = {"slip": "Slip", "load-slip": "LoadSlip"}
 # Classes are resolved only when asked for: a command line then starts quickly, and the core does
 # not import the papers' own models.
 _KINDS = (
-    _Kind("", "", "nfriction.friction.models"),
-    _Kind("adaptive:", "A", "nfriction.papers.afem.adaptive"),
-    _Kind("neuro-fuzzy:", "NF", "nfriction.friction.neurofuzzy"),
+    _Kind("", "", "nfriction.friction.models", "ConstantModel"),
+    _Kind("adaptive:", "A", "nfriction.papers.afem.adaptive", "AdaptiveModel"),
+    _Kind("neuro-fuzzy:", "NF", "nfriction.friction.neurofuzzy", "NeuroFuzzyModel"),
 )
 # The one pair that has no class.
 _MISSING = ("adaptive:", "stribeck")
@@ -40,21 +52,62 @@ _MODELS = {
     for law, short in _LAWS.items()
     if (kind.prefix, law) != _MISSING
 }
+_KIND_OF_MEMORY = _Kind("", "", "nfriction.friction.memory")
+_KIND_OF_HYSTERESIS = _Kind("", "", "nfriction.friction.hysteresis")
+_ALL = (
+    _MODELS
+    | {name: (_KIND_OF_MEMORY, law) for law, name in _MEMORY.items()}
+    | {name: (_KIND_OF_HYSTERESIS, law) for law, name in _HYSTERESIS.items()}
+)
 _BY_TEXT = {
-    text.lower(): name
-    for name, (kind, law) in _MODELS.items()
-    for text in (name, kind.prefix + law)
+    text.lower(): name for name, (kind, law) in _ALL.items() for text in (name, kind.prefix + law)
 }
+
+# Models of laws of one's own, see `add_law`.
+_OWN: "dict[str, type[NamedModel]]" = {}
+
+
+def add_law(law: "Law") -> str:
+    """Make a law of one's own known by its name, also with `neuro-fuzzy:` before it.
+
+    Commands, comparisons and model files then know its models as they know those of the library.
+
+    Returns:
+        The name of its constant model.
+
+    Raises:
+        ValueError: if the name is no identifier or that of another model.
+    """
+    name, plain = law.name, law.name.lower().replace("_", "-")
+    made = {kind.letters + name: kind for kind in _KINDS if kind.prefix != _MISSING[0]}
+    taken = [full for full in made if full.lower() in _BY_TEXT and full not in _OWN]
+    if taken or not name.isidentifier() or not name.isascii():
+        raise ValueError(
+            f"law {name!r} needs a name of letters, digits and _ that no other model has"
+            + (f"; {taken[0]} is one of the library." if taken else ".")
+        )
+    _LAWS[plain] = name
+    for full, kind in made.items():
+        base: type[NamedModel] = resolve_name(f"{kind.module}:{kind.base}")
+        _OWN[full] = type(full, (base,), {"definition": law, "__doc__": f"Law {name!r}."})
+        _MODELS[full] = _ALL[full] = kind, plain
+        _BY_TEXT[kind.letters.lower() + plain] = _BY_TEXT[kind.prefix + plain] = full
+    return name
 
 
 def model_names() -> tuple[str, ...]:
-    """Names of all models, as tables and files show them; also those of their classes."""
+    """Names of the models without memory, as tables and files show them, and of their classes."""
     return tuple(_MODELS)
+
+
+def memory_names() -> tuple[str, ...]:
+    """Names of the models of laws with memory."""
+    return (*_MEMORY.values(), *_HYSTERESIS.values())
 
 
 def plain_name(name: str) -> str:
     """The plain name of a named model, such as `neuro-fuzzy:stribeck` of `NFStribeck`."""
-    kind, law = _MODELS[model_name(name)]
+    kind, law = _ALL[model_name(name)]
     return kind.prefix + law
 
 
@@ -82,7 +135,10 @@ def model_list() -> str:
     laws = ", ".join(_both_names(plain.letters + short) for short in _LAWS.values())
     first = next(iter(_LAWS.values()))
     before = " or ".join(f"{kind.prefix} ({kind.letters}{first}, ...)" for kind in others)
-    return f"{laws}; also with {before} before them, except {''.join(_MISSING)}"
+    return (
+        f"{laws}; also with {before} before them, except {''.join(_MISSING)}; "
+        f"with memory {', '.join((*_MEMORY, *_HYSTERESIS))}"
+    )
 
 
 def _both_names(name: str) -> str:
@@ -98,5 +154,7 @@ def model_by_name(name: str) -> "type[NamedModel]":
         ValueError: if no model has that name; the message lists the names.
     """
     found = model_name(name)
-    kind: type[NamedModel] = resolve_name(f"{_MODELS[found][0].module}:{found}")
+    if found in _OWN:
+        return _OWN[found]
+    kind: type[NamedModel] = resolve_name(f"{_ALL[found][0].module}:{found}")
     return kind

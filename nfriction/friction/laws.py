@@ -30,6 +30,8 @@ import torch
 from torch import Tensor
 
 TorqueFunction = Callable[[Tensor, Tensor, Tensor, float], Tensor]
+StateTorqueFunction = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
+AdvanceFunction = Callable[[Tensor, Tensor, Tensor, Tensor, "float | Tensor"], Tensor]
 
 
 @dataclass(frozen=True)
@@ -78,17 +80,41 @@ class Coefficient:
 
 
 @dataclass(frozen=True)
+class Memory:
+    """Internal state of a law; `nfriction.friction.memory` has the contract and such laws.
+
+    Attributes:
+        size: numbers a joint.
+        advance: `(state, qd, load, coefficients, time_step) -> state` over a sample.
+        torque: `(state, qd, load, coefficients) -> tau_f` at the end of a sample.
+    """
+
+    size: int
+    advance: AdvanceFunction
+    torque: StateTorqueFunction
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.size, int) or self.size < 1:
+            raise ValueError(f"`size` must be a whole number of at least 1, got {self.size!r}.")
+        if not callable(self.advance) or not callable(self.torque):
+            raise TypeError("`advance` and `torque` of a memory must be functions.")
+
+
+@dataclass(frozen=True)
 class Law:
     """A friction law: its torque function and a description of its coefficients.
 
     Attributes:
         name: name of the law.
         coefficients: in the order of the coefficients' last axis.
-        torque: `(qd, load, coefficients, v_smooth) -> tau_f`, elementwise and scriptable.
+        torque: `(qd, load, coefficients, v_smooth) -> tau_f`, elementwise and scriptable; of a law
+            with memory the steady torque, approached at a constant velocity.
         nested_law: a simpler law that this one contains: the torque is the same where all
             coefficients but `nested_coefficients` are zero, or only shape such a term. A law with
             several minima is also fitted from where its nested law's fit ended.
         nested_coefficients: names, here, of the nested law's coefficients, in its order.
+        memory: internal state of a law whose torque depends on more than the present motion; None
+            of a law without.
 
     Raises:
         TypeError: if a coefficient, the torque or the nested law is something else.
@@ -106,6 +132,7 @@ class Law:
     torque: TorqueFunction
     nested_law: "Law | None" = None
     nested_coefficients: tuple[str, ...] = ()
+    memory: Memory | None = None
 
     def __post_init__(self) -> None:
         given = self.coefficients
@@ -141,6 +168,15 @@ class Law:
     def names(self) -> tuple[str, ...]:
         """Names of the coefficients, in order."""
         return tuple(c.name for c in self.coefficients)
+
+    @property
+    def state_size(self) -> int:
+        """Size of each joint's internal state; 0 of a law without memory."""
+        return self.memory.size if self.memory else 0
+
+    def initial_state(self, qd: Tensor) -> Tensor:
+        """Internal state before the first sample, none deflected, (*batch, joint, state)."""
+        return qd.new_zeros((*qd.shape, self.state_size))
 
 
 def smooth_sign(qd: Tensor, v_smooth: float) -> Tensor:

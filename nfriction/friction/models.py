@@ -59,6 +59,7 @@ class FrictionModel(nn.Module):
         self.v_smooth = positive_number("v_smooth", v_smooth, "rad/s")
         self.joints = schedule.joints
         self.state_size = schedule.state_size
+        self.law_state_size = law.state_size
         # TorchScript compiles a function held as an attribute; it would refuse the Law itself.
         self.law_torque = law.torque
 
@@ -75,7 +76,7 @@ class FrictionModel(nn.Module):
             raise ValueError(
                 f"`qd` must be (*batch, joint) with {self.joints} joints, got last axis {width}."
             )
-        return self.law_torque(qd, load, self.schedule(qd, qdd), self.v_smooth)
+        return self.torque(qd, load, self.schedule(qd, qdd))
 
     # A simulation takes the torque in two steps: coefficients at a sample, which it then holds, and
     # the torque of these at every stage of an integration step.
@@ -97,15 +98,27 @@ class FrictionModel(nn.Module):
         return self.schedule.coefficients_from(qd, qdd, state)
 
     def torque(self, qd: Tensor, load: Tensor, coefficients: Tensor) -> Tensor:
-        """Friction torque for given coefficients."""
+        """Friction torque for given coefficients.
+
+        Raises:
+            ValueError: of a law with memory, whose torque depends on the motion before.
+        """
+        if self.law_state_size:
+            raise ValueError(
+                "the friction law has an internal state, so there is no torque of a velocity "
+                "alone: advance `law.memory` over the samples, or simulate with `rollout`."
+            )
         return self.law_torque(qd, load, coefficients, self.v_smooth)
 
     def zero_velocity_damping(self) -> Tensor:
         """Slope of the torque over velocity at rest under unit load [N m s/rad], (joint,).
 
         It decides whether an explicit integrator is stable near standstill. The largest, where
-        several sets of coefficients are possible at rest.
+        several sets of coefficients are possible at rest. Zero of a law with memory, for which
+        steps are implicit and stable at any slope.
         """
+        if self.law_state_size:
+            return self.schedule.positive.new_zeros(self.joints, dtype=torch.float64)
         # A caller may have switched gradients off, even for good (`torch.inference_mode`).
         with torch.inference_mode(False), torch.enable_grad():
             held = self.schedule.rest_coefficients().detach().clone()
@@ -115,6 +128,10 @@ class FrictionModel(nn.Module):
             # A law is elementwise, so the sum's gradient is each joint's slope.
             slope = torch.autograd.grad(self.torque(qd, load, held).sum(), qd)[0]
         return slope.reshape(-1, self.joints).amax(0)
+
+    def options(self) -> dict[str, Any]:
+        """Constructor arguments beyond joints, initial values and `v_smooth`, as plain JSON."""
+        return self.schedule.options()
 
     def extra_repr(self) -> str:
         return f"law={self.law.name}, joints={self.joints}, v_smooth={self.v_smooth:g}"

@@ -1,28 +1,126 @@
 """Model files: one JSON file holds the parameters and what is needed to use them safely.
 
+`ModelInfo` is the description beside the parameters: form, units and origin.
+
 A file is checked for form, size and damage before a model is made of it; no code in it is run.
 """
 
 import hashlib
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from nfriction.friction import model_by_name, model_names
+from nfriction.friction import memory_names, model_by_name, model_names
 from nfriction.friction.models import FrictionModel
-from nfriction.io import strict_json
-from nfriction.io.atomic import write_atomically
-from nfriction.io.model_info import FORMAT, SCHEMA, ModelInfo, describe
-from nfriction.io.strict_json import numbers
+from nfriction.io.files import numbers, parse_json, write_atomically
 from nfriction.plant import Plant
 from nfriction.plant.rigs import from_dict
+from nfriction.version import __version__
+
+FORMAT, SCHEMA = "nfriction model", 1
+
+
+@dataclass(frozen=True)
+class ModelInfo:
+    """Facts about a model besides its parameters.
+
+    Attributes:
+        joint_names: in the order of the last axis; empty where joints have no names.
+        unit: of a joint's position, `"rad"` or `"m"`.
+        sample_time: of the recordings it was trained on [s]; None where they differ.
+        input_ranges: smallest and largest trained value of each input by joint,
+            `{"qd": [[low, high], ...], "qdd": ...}`.
+        training_data: digest of each recording, by name.
+        rig: the mechanism's parameters, as `Plant.to_dict` gives them.
+        fit: how the fit ended.
+
+    Raises:
+        ValueError: an entry is of another kind.
+    """
+
+    joint_names: Sequence[str] = ()
+    unit: str = "rad"
+    sample_time: float | None = None
+    input_ranges: Mapping[str, Any] = field(default_factory=dict)
+    training_data: Mapping[str, str] = field(default_factory=dict)
+    rig: Mapping[str, Any] | None = None
+    fit: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.unit not in ("rad", "m"):
+            raise ValueError(f'`unit` must be "rad" or "m", got {str(self.unit)[:80]!r}.')
+        step = self.sample_time
+        if step is not None and not 0 < numbers("sample_time", step) < math.inf:
+            raise ValueError(f"`sample_time` must be positive and finite [s], or None, got {step}.")
+        texts = [*self.joint_names, *self.training_data, *self.training_data.values()]
+        for text in texts:
+            if not isinstance(text, str):
+                raise ValueError(
+                    "`joint_names` must be texts, and `training_data` map names to digests, got "
+                    f"{str(text)[:80]!r}."
+                )
+        for name, given in self.input_ranges.items():
+            pairs = numbers(f"input_ranges[{name!r}]", given)
+            sound = isinstance(pairs, list) and all(isinstance(p, list) for p in pairs)
+            if not sound or not all(len(p) == 2 and p[0] <= p[1] for p in pairs):
+                raise ValueError(
+                    f"`input_ranges` of {name} must be [lowest, highest] for each joint, got "
+                    f"{str(given)[:80]}."
+                )
+
+
+def parameter_hash(state: Mapping[str, Tensor]) -> str:
+    """SHA-256 over names, shapes and values of a model's parameters and buffers."""
+    digest = hashlib.sha256()
+    # The order in which a module registers its buffers is no property of the model.
+    for name in sorted(state):
+        # In one type on the CPU, so that the device does not change the hash.
+        value = state[name].detach().to("cpu", torch.float64).contiguous()
+        digest.update(f"{name}{tuple(value.shape)}".encode())
+        digest.update(value.numpy().tobytes())
+    return digest.hexdigest()
+
+
+def describe(model: FrictionModel, info: ModelInfo) -> dict[str, Any]:
+    """Everything a model file holds except the parameters, as plain JSON.
+
+    Raises:
+        ValueError: not one name for each joint.
+    """
+    if info.joint_names and len(info.joint_names) != model.joints:
+        raise ValueError(
+            f"`joint_names` must name {model.joints} joints, got {list(info.joint_names)}."
+        )
+    return {
+        "format": FORMAT,
+        "schema": SCHEMA,
+        "version": __version__,
+        "model": type(model).__name__,
+        "law": model.law.name,
+        "joints": model.joints,
+        "v_smooth": model.v_smooth,
+        "options": model.options(),
+        "coefficients": [
+            {"name": c.name, "unit": _unit(c.unit, info.unit), "positive": c.positive}
+            for c in model.law.coefficients
+        ],
+        "units": {"qd": f"{info.unit}/s", "qdd": f"{info.unit}/s^2", "load": "-",
+                  "tau_f": _unit("N m", info.unit)},
+        "parameter_hash": parameter_hash(model.state_dict()),
+        **asdict(info),
+    }  # fmt: skip
+
+
+def _unit(revolute: str, position: str) -> str:
+    return revolute if position == "rad" else revolute.replace("N m", "N").replace("rad", "m")
+
 
 # A neuro-fuzzy model of ten joints takes less than a megabyte.
 LARGEST_FILE = 64 * 2**20
@@ -166,7 +264,7 @@ def read_model_file(path: str | Path) -> dict[str, Any]:
         if size > LARGEST_FILE:
             raise ValueError(f"{size} bytes are too many for a model file.")
         try:
-            content = strict_json.parse(path.read_text(encoding="utf-8"))
+            content = parse_json(path.read_text(encoding="utf-8"))
         except ValueError as error:
             raise ValueError(f"not a model file, or cut short ({error}).") from error
         if not isinstance(content, dict) or content.get("format") != FORMAT:
@@ -210,10 +308,10 @@ def _info(content: Mapping[str, Any]) -> ModelInfo:
 
 
 def _named_model(content: Mapping[str, Any]) -> FrictionModel:
-    name = content["model"]
-    if name not in model_names():
+    name, names = content["model"], (*model_names(), *memory_names())
+    if name not in names:
         raise ValueError(
-            f"{_short(name)} is none of the named models ({', '.join(model_names())}); create "
+            f"{_short(name)} is none of the named models ({', '.join(names)}); create "
             "the model yourself and pass it as `into`."
         )
     make = model_by_name(name)
@@ -227,7 +325,7 @@ def _check_same_model(content: Mapping[str, Any], model: FrictionModel) -> None:
         "coefficients": (names, list(model.law.names)),
         "joints": (content["joints"], model.joints),
         "v_smooth": (content["v_smooth"], model.v_smooth),
-        "options": (content["options"], model.schedule.options()),
+        "options": (content["options"], model.options()),
     }
     # By key, so that the message names the first difference; as JSON, where true is not 1.
     for key, (ours, theirs) in pairs.items():
@@ -242,9 +340,20 @@ def _check_torque(model: FrictionModel, state: Mapping[str, Tensor]) -> None:
     qd, qdd, load = torch.tensor([[0.0, 0.5], [0.0, 0.0], [1.0, 1.0]], dtype=torch.float64)
     inputs = tuple(x[:, None].expand(-1, model.joints) for x in (qd, qdd, load))
     with torch.no_grad():
-        torque = torch.func.functional_call(model, dict(state), inputs)
+        if model.law.memory is None:
+            torque = torch.func.functional_call(model, dict(state), inputs)
+        else:
+            c = torch.func.functional_call(model.schedule, _of_schedule(state), inputs[:2])
+            start = model.law.initial_state(inputs[0])
+            after = model.law.memory.advance(start, inputs[0], inputs[2], c, 1e-3)
+            torque = model.law.memory.torque(after, inputs[0], inputs[2], c)
     if not torque.isfinite().all():
         raise ValueError("with its parameters the model gives no finite torque.")
+
+
+def _of_schedule(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The schedule's part of a model's state."""
+    return {name.removeprefix("schedule."): value for name, value in state.items()}
 
 
 def _parameter(name: str, given: Any, expected: Tensor) -> Tensor:
@@ -286,7 +395,7 @@ def _check_sizes(content: Mapping[str, Any], size: int) -> None:
     joints, options = content["joints"], content["options"]
     terms = options.get("terms", [])
     terms = terms if isinstance(terms, list) else [terms]
-    sizes = [joints, options.get("head_units", 1), *terms]
+    sizes = [joints, options.get("head_units", 1), options.get("elements", 1), *terms]
     sound = all(isinstance(n, int) and not isinstance(n, bool) and n > 0 for n in sizes)
     # Each rule and each unit has at least one number in the file.
     if not sound or joints > MOST_JOINTS or joints * max(sizes[1], math.prod(terms)) > size:

@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from nfriction.optim import bounded_qp
+from nfriction.optim.bounded_qp import solve_free
 from nfriction.optim.least_squares import (
     LeastSquaresResult,
     Quadratic,
@@ -31,7 +32,6 @@ from nfriction.optim.least_squares import (
     Step,
     positive_diagonal,
 )
-from nfriction.optim.linear_algebra import solve_free
 
 Model = Callable[[Tensor], Quadratic]
 Cost = Callable[[Tensor], Tensor]

@@ -1,7 +1,8 @@
-"""Mechanisms without friction: pendulum chains, positioning axes, published rigs."""
+"""Mechanisms without friction: pendulum chains, motors, positioning axes, published rigs."""
 
 from nfriction.plant import rigs
-from nfriction.plant.base import LinearAxis, Plant
+from nfriction.plant.base import LinearAxis, Motor, Plant
 from nfriction.plant.chain import Arm, PendulumChain
+from nfriction.plant.rotor import Rotor
 
-__all__ = ["Arm", "LinearAxis", "PendulumChain", "Plant", "rigs"]
+__all__ = ["Arm", "LinearAxis", "Motor", "PendulumChain", "Plant", "Rotor", "rigs"]

@@ -13,6 +13,7 @@ import reprlib
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -24,6 +25,47 @@ if TYPE_CHECKING:
 
 ANGLES = ("relative", "absolute")
 ZEROS = ("upright", "hanging")
+
+
+@dataclass(frozen=True)
+class Motor:
+    """Motors that drive joints through gears: one number for all joints, or one for each.
+
+    Recordings may hold the motors' angles and currents instead of positions and torques of joints,
+    see `Recording.read`.
+
+    Args:
+        gear_ratio: turns of the motor per turn of its joint [-]; of an axis, its angle per way
+            [rad/m]. Negative where it turns the other way.
+        rotor_inertia: of the rotor about its own axis, before the gear [kg m^2].
+        torque_constant: torque of the motor per current, before the gear [N m/A]; None where no
+            current is read.
+
+    Raises:
+        ValueError: for a ratio or constant of zero, a negative inertia, or no numbers.
+    """
+
+    gear_ratio: float | Sequence[float] = 1.0
+    rotor_inertia: float | Sequence[float] = 0.0
+    torque_constant: float | Sequence[float] | None = None
+
+    def __post_init__(self) -> None:
+        for name, given in _known(asdict(self)).items():
+            many = given if isinstance(given, list | tuple) else [given]
+            found = vector(f"motor's {name}", many, None)
+            bad, rule = (found < 0, "negative") if name == "rotor_inertia" else (found == 0, "zero")
+            if bad.any():
+                raise ValueError(f"`motor's {name}` must not be {rule}, got {found.tolist()}.")
+
+    def each(self, name: str, joints: int) -> Tensor:
+        """A field of every joint, (joints,)."""
+        given = getattr(self, name)
+        many = given if isinstance(given, list | tuple) else [given] * joints
+        return vector(f"motor's {name}", many, joints)
+
+    def reflected_inertia(self, joints: int) -> Tensor:
+        """Inertia of each rotor seen at its joint, times the ratio squared, (joints,) [kg m^2]."""
+        return self.each("rotor_inertia", joints) * self.each("gear_ratio", joints) ** 2
 
 
 class Plant(nn.Module, ABC):
@@ -38,7 +80,8 @@ class Plant(nn.Module, ABC):
         unit: of a position, "rad" or "m".
         convention: of the angles in its recordings' columns, ("relative" | "absolute",
             "upright" | "hanging"). The methods here always take relative angles from upright.
-        position_quantum: smallest step of the position sensor [rad or m]; None where unknown.
+        position_quantum: smallest step of the position [rad or m]; None where unknown.
+        motor: what drives the joints, if known.
     """
 
     kind: ClassVar[str]  # in files
@@ -59,6 +102,7 @@ class Plant(nn.Module, ABC):
         unit: str,
         convention: Sequence[str] = ("relative", "upright"),
         position_quantum: float | None = None,
+        motor: Motor | None = None,
     ) -> None:
         super().__init__()
         names = _texts("joint_names", joint_names or [f"joint{i + 1}" for i in range(joints)])
@@ -80,6 +124,22 @@ class Plant(nn.Module, ABC):
         self.unit = unit
         self.convention = (angles, zero)
         self.position_quantum = position_quantum
+        if not isinstance(motor, Motor | None):
+            raise TypeError(f"`motor` must be a Motor(gear_ratio, ...) or None, got {motor!r}.")
+        self.motor = motor
+        _ = self.motor_factors  # fails here unless there is one number for each joint
+
+    @property
+    def motor_factors(self) -> dict[str, list[float]]:
+        """Position of each joint per motor angle, and its torque per motor current, as known."""
+        if self.motor is None:
+            return {}
+        ratio = self.motor.each("gear_ratio", self.joints)
+        found = {"motor": (1.0 / ratio).tolist()}
+        if self.motor.torque_constant is not None:
+            constant = self.motor.each("torque_constant", self.joints)
+            found["current"] = (constant * ratio).tolist()
+        return found
 
     def forward(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
         """Acceleration; the same as `forward_dynamics`, so that a plant can be exported."""
@@ -165,9 +225,10 @@ class Plant(nn.Module, ABC):
             "name": self.name,
             "joint_names": list(self.joint_names),
             "position_quantum": self.position_quantum,
+            "motor": None if self.motor is None else _known(asdict(self.motor)),
             **self._given,
         }
-        data = {key: value for key, value in data.items() if value is not None}
+        data = _known(data)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # shown when this plant was built
             fresh = dict(self.from_dict(data).named_buffers())
@@ -188,6 +249,9 @@ class Plant(nn.Module, ABC):
         """
         check_keys("rig", data, cls.required, (*cls.optional, "buffers", "kind"))
         given = {key: data[key] for key in (*cls.required, *cls.optional) if key in data}
+        if given.get("motor") is not None:
+            check_keys("motor", given["motor"], (), [f.name for f in fields(Motor)])
+            given["motor"] = Motor(**given["motor"])
         buffers = data.get("buffers", {})
         check_keys("buffers", buffers, (), buffers)
         values = {name: numbers(name, value) for name, value in buffers.items()}
@@ -201,14 +265,14 @@ class LinearAxis(Plant):
     """Equation of motion mass * qdd = tau + torque_offset - asymmetry |qd|, in m and N.
 
     Args:
-        mass: moved mass, the drive's inertia included [kg].
+        mass: moved mass [kg], the drive's inertia included unless `motor` has it.
         torque_offset: constant force added to tau [N].
-        name, joint_names, position_quantum: see `Plant`.
+        name, joint_names, position_quantum, motor: see `Plant`.
     """
 
     kind = "axis"
     required = ("mass",)
-    optional = ("torque_offset", "name", "joint_names", "position_quantum")
+    optional = ("torque_offset", "motor", "name", "joint_names", "position_quantum")
 
     mass: Tensor  # (1,) [kg]
     # Difference in viscous resistance between the two directions, (1,) [N s/m]; zero unless
@@ -223,12 +287,17 @@ class LinearAxis(Plant):
         name: str = "",
         joint_names: Sequence[str] | None = None,
         position_quantum: float | None = None,
+        motor: Motor | None = None,
     ) -> None:
         super().__init__(
-            1, joint_names=joint_names, name=name, unit="m", position_quantum=position_quantum
-        )
+            1, joint_names=joint_names, name=name, unit="m", position_quantum=position_quantum,
+            motor=motor,
+        )  # fmt: skip
         self.links = 1
-        self.register_buffer("mass", vector("mass", [mass], 1, positive=True))
+        moved = vector("mass", [mass], 1, positive=True)
+        if motor is not None:
+            moved = moved + motor.reflected_inertia(1)
+        self.register_buffer("mass", moved)
         self.register_buffer("torque_offset", vector("torque_offset", [torque_offset], 1))
         self.register_buffer("asymmetry", torch.zeros(1, dtype=torch.float64))
         self._given = {"mass": float(mass), "torque_offset": float(torque_offset)}
@@ -278,6 +347,10 @@ class LinearAxis(Plant):
     def extra_repr(self) -> str:
         offset = self.torque_offset.tolist()
         return f"{self.name or 'unnamed'}, mass={self.mass.tolist()} kg, offset={offset} N"
+
+
+def _known(data: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in data.items() if value is not None}
 
 
 def check_keys(

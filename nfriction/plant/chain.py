@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from nfriction.plant import dynamics
-from nfriction.plant.base import Plant, check_keys, number, numbers, vector
+from nfriction.plant.base import Motor, Plant, check_keys, number, numbers, vector
 from nfriction.plant.inertia import fastest_mode, inertia_tensors, require_positive_definite
 
 if TYPE_CHECKING:
@@ -69,7 +69,8 @@ class PendulumChain(Plant):
             z the joint axis. Without a free arm only Izz matters.
         gravity: [m/s^2].
         arm: the rotating arm; None where it is fixed.
-        armature: rotor inertia seen at each joint [kg m^2]; None for none.
+        armature: rotor inertia seen at each joint [kg m^2]; None for that of `motor`, if any.
+        motor: motors and gears of the joints; a rotor's inertia there is seen at its joint.
         convention: of the recordings' columns, see `Plant`.
         joint_names, name, position_quantum: see `Plant`.
 
@@ -84,9 +85,11 @@ class PendulumChain(Plant):
     """
 
     kind = "chain"
-    required = ("mass", "length")
-    optional = ("com", "inertia", "gravity", "arm", "armature", "convention", "joint_names",
-                "name", "position_quantum")  # fmt: skip
+    required: ClassVar[tuple[str, ...]] = ("mass", "length")
+    optional: ClassVar[tuple[str, ...]] = (
+        *("com", "inertia", "gravity", "arm", "armature", "motor"),
+        *("convention", "joint_names", "name", "position_quantum"),
+    )
 
     # Constants of the equations; those of a mechanism as given follow from its arguments.
     inertia_coupling: Tensor  # a_ij, (links, links) [kg m^2]; only the upper triangle is read
@@ -120,6 +123,7 @@ class PendulumChain(Plant):
         gravity: float = 9.81,
         arm: Arm | None = None,
         armature: Sequence[float] | Tensor | None = None,
+        motor: Motor | None = None,
         convention: Sequence[str] = ("relative", "upright"),
         joint_names: Sequence[str] | None = None,
         name: str = "",
@@ -139,13 +143,16 @@ class PendulumChain(Plant):
             unit="rad",
             convention=convention,
             position_quantum=position_quantum,
+            motor=motor,
         )
         self.links, self.first_link = links, first
         size = vector("length", length, links, positive=True)
         centre = size / 2 if com is None else vector("com", com, links)
         tensors = inertia_tensors(inertia, links)
-        rotor = m.new_zeros(self.joints)
+        rotor = (motor or Motor()).reflected_inertia(self.joints)
         if armature is not None:
+            if rotor.any():
+                raise ValueError("give `armature` or the motor's `rotor_inertia`, not both.")
             rotor = vector("armature", armature, self.joints)
         if (rotor < 0).any():
             raise ValueError(f"`armature` must not be negative, got {rotor.tolist()}.")
@@ -185,7 +192,7 @@ class PendulumChain(Plant):
             "inertia": inertia if inertia is None else numbers("inertia", inertia).tolist(),
             "gravity": gravity,
             "arm": asdict(arm) if arm else None,
-            "armature": rotor.tolist() if self.has_armature else None,
+            "armature": None if armature is None or not self.has_armature else rotor.tolist(),
         }
         aligned = self.mass_matrix(rotor.new_zeros(self.joints))
         require_positive_definite(self.inertia_coupling, aligned[first:, first:])

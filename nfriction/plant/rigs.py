@@ -1,17 +1,18 @@
 """Rigs: published mechanisms by name, and a user's own from files.
 
 A rig file (JSON or TOML) holds the constructor arguments of `PendulumChain` (kind "chain", the
-default) or `LinearAxis` (kind "axis"), in SI units:
+default), `Rotor` (kind "rotor") or `LinearAxis` (kind "axis"), in SI units:
 
     {"kind": "chain", "name": "bench", "mass": [0.26, 0.12], "length": [0.17, 0.23],
      "com": [0.16, 0.18], "inertia": [1e-4, 1.7e-4], "convention": ["absolute", "hanging"],
      "position_quantum": 1.571e-4}
+    {"kind": "rotor", "inertia": 0.02,
+     "motor": {"gear_ratio": 50, "rotor_inertia": 1.2e-5, "torque_constant": 0.03}}
 
-Only `mass` and, for a chain, `length` are required; angles of a chain without a `convention` are
-relative, from upright. A geared motor adds `armature`, its rotor's inertia times the gear ratio
-squared, per joint [kg m^2]. A balanced rotor is a chain of one link with `"com": [0]`. `buffers`
-may hold values in place of derived constants, such as `{"drag_quadratic": [0.01, 0.01]}`; a fitted
-plant is written so. Robot descriptions (URDF, MJCF) are read, too.
+Angles of a chain without a `convention` are relative, from upright. `motor` may be given for every
+kind, with one number for all joints or one for each (`Motor`). `buffers` may hold values in place
+of derived constants, such as `{"drag_quadratic": [0.01, 0.01]}`; a fitted plant is written so.
+Robot descriptions (URDF, MJCF) are read, too.
 """
 
 import difflib
@@ -27,11 +28,11 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from nfriction.io import strict_json
-from nfriction.io.atomic import write_atomically
+from nfriction.io.files import parse_json, write_atomically
 from nfriction.plant import robot_file
 from nfriction.plant.base import LinearAxis, Plant
 from nfriction.plant.chain import Arm, PendulumChain
+from nfriction.plant.rotor import Rotor
 
 _HANGING = ("relative", "hanging")
 _PAPER_QUANTUM = math.tau / 8192  # 2048 pulses per revolution, counted on all four edges
@@ -248,11 +249,28 @@ def by_name(name: str) -> Plant:
 
 
 _KINDS: dict[str, type[PendulumChain] | type[LinearAxis]] = {
-    plant.kind: plant for plant in (PendulumChain, LinearAxis)
+    plant.kind: plant for plant in (PendulumChain, Rotor, LinearAxis)
 }
 # Far beyond any rig; the memory of a chain's matrices grows with the square of its links.
 LARGEST_FILE, MOST_LINKS, LARGEST_NUMBER = 2**20, 100, 1e30
 _TEXTS = ("kind", "name", "convention", "joint_names")
+
+
+def of(rig: Plant | str | Path) -> Plant:
+    """A plant as it is, or the one that a name or a rig file gives.
+
+    Raises:
+        TypeError: for anything else.
+        ValueError, OSError, ImportError: as `by_name` and `read`.
+    """
+    if isinstance(rig, Plant):
+        return rig
+    if not isinstance(rig, str | Path):
+        raise TypeError(
+            "`plant` must be a mechanism such as a PendulumChain, the name of a rig or the path of "
+            f"a rig file, got {type(rig).__name__} {reprlib.repr(rig)}."
+        )
+    return read(rig) if Path(rig).suffix and rig not in _RIGS else by_name(str(rig))
 
 
 def from_dict(data: Mapping[str, Any]) -> Plant:
@@ -337,7 +355,7 @@ def _are_numbers(value: Any, depth: int = 0) -> bool:
 
 def _parse(text: str, suffix: str) -> Any:
     if suffix == ".json":
-        return strict_json.parse(text)
+        return parse_json(text)
     if suffix != ".toml":
         raise ValueError(f"a rig file ends in .json or .toml, .urdf or .xml, not {suffix!r}.")
     if sys.version_info < (3, 11):

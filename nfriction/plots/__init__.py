@@ -19,9 +19,11 @@ from nfriction.plots.comparison import (
 from nfriction.plots.fuzzy import controller_surface, memberships
 from nfriction.plots.saving import save_all
 from nfriction.plots.style import for_dark_screen
+from nfriction.plots.torque_table import friction_curves
 
 __all__ = [
     "coefficient_intervals", "coefficient_sections", "coefficient_surfaces",
-    "coefficients_over_time", "controller_surface", "for_dark_screen", "horizon_curve",
-    "memberships", "motion", "positions", "rmse_bars", "save_all", "torque_over_velocity",
+    "coefficients_over_time", "controller_surface", "for_dark_screen",
+    "friction_curves", "horizon_curve", "memberships", "motion", "positions", "rmse_bars",
+    "save_all", "torque_over_velocity",
 ]  # fmt: skip

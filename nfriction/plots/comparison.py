@@ -15,7 +15,10 @@ from numpy.typing import NDArray
 from nfriction.evaluation.compare import LIMIT, NO_FRICTION, Comparison, Part
 from nfriction.evaluation.score import Score
 from nfriction.fitting.equation_error import friction_torque
+from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.fit_result import FitResult
+from nfriction.fitting.result.identifiability import NORMAL_95
+from nfriction.fitting.result.uncertainty import CoefficientUncertainty
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.plots import style
@@ -27,7 +30,6 @@ Array = NDArray[np.float64]
 # Room that a bar and its number need side by side with others [in].
 _BAR = 0.13
 _POINTS = 3000  # of the scatter of torques, a joint
-_BINS = 24  # of its medians
 
 
 def motion(
@@ -100,7 +102,7 @@ def positions(recording: Recording, scores: Mapping[str, Score]) -> Figure:
         position.plot(recording.time, measured, **style.MEASURED)
         errors = {n: s.simulated[:, joint] - measured for n, s in scores.items()}
         shown = min(max(_largest(e) for n, e in errors.items() if n in whole), 0.5 * span) or span
-        factor, unit = style.scaled(recording.unit, shown)
+        factor, unit = 1e3, f"m{recording.unit}"  # as in every table
         for model, error in errors.items():
             position.plot(recording.time, scores[model].simulated[:, joint], **looks[model].line)
             if model != NO_FRICTION or len(scores) == 1:
@@ -229,24 +231,30 @@ def torque_over_velocity(
     models: Mapping[str, FrictionModel],
     recordings: Sequence[Recording],
     motions: Sequence[Motion] | None = None,
+    *,
+    uncertainty: Mapping[str, CoefficientUncertainty] | None = None,
 ) -> Figure:
     """Friction torque of each law over velocity, a panel a joint, over that of the motion.
 
-    Lines are at the load at rest and without acceleration; dots are `tau - M qdd - bias` along the
-    recordings, with their median in bins of equally many samples.
+    Lines are at the load at rest and without acceleration, with 95 % bands; dots are
+    `tau - M qdd - bias` along the recordings, averaged over 30 ms in which the joint turns one way.
 
     Args:
         plant: the mechanism, with its fitted terms where there are any.
         models: friction models by name.
         recordings: in any convention.
         motions: their smoothed motion in joint coordinates; computed where not given.
+        uncertainty: of the models' fits by name (`FitResult.uncertainty`), for the bands.
     """
     joint = [r.joint_coordinates(plant) for r in recordings]
     motions = motions or [kalman_smoother(r.time, r.q) for r in joint]
+    known = uncertainty or {}
     with torch.no_grad():
-        parts = [friction_torque(plant, r, m) for r, m in zip(joint, motions, strict=True)]
-        qd = torch.cat([p[0] for p in parts]).numpy()
-        torque = torch.cat([p[2] for p in parts]).numpy()
+        parts = [
+            _averaged(*friction_torque(plant, r, m)[::2], r.sample_time)
+            for r, m in zip(joint, motions, strict=True)
+        ]
+    qd, torque = (np.concatenate(x) for x in zip(*parts, strict=True))
     columns = min(plant.joints, 3) if plant.joints != 4 else 2
     figure, axes = style.panel_each(
         plant.joints, columns, style.PAGE if columns > 1 else style.COLUMN, 2.0
@@ -255,19 +263,23 @@ def torque_over_velocity(
     for k, ax in enumerate(axes):
         grid = _velocities(qd[:, k])
         lines = {name: _torque(model, grid, k) for name, model in models.items()}
-        bins = np.array_split(np.argsort(qd[:, k]), min(_BINS, len(qd)))
-        middle = [np.array([np.median(x[b, k]) for b in bins]) for x in (qd, torque)]
-        # The dots scatter far beyond any friction; the laws and most medians set the limits.
-        extremes = np.concatenate([*lines.values(), np.quantile(middle[1], [0.05, 0.95])])
+        seen = np.flatnonzero(np.isfinite(torque[:, k]))
+        # Dots may scatter far beyond any friction; the laws and most dots set the limits.
+        most = np.quantile(torque[seen, k], [0.05, 0.95]) if len(seen) else np.zeros(0)
+        extremes = np.concatenate([*lines.values(), most])
         factor, unit = style.scaled(style.sliding("N m", plant.unit), extremes)
-        some = np.linspace(0, len(qd) - 1, min(_POINTS, len(qd))).astype(int)
+        some = seen[np.linspace(0, len(seen) - 1, min(_POINTS, len(seen))).astype(int)]
         ax.plot(
-            qd[some, k], factor * torque[some, k], ".", color=style.FAINT, markersize=2.0,
-            alpha=0.35, markeredgewidth=0, rasterized=True,
+            qd[some, k], factor * torque[some, k], ".", color=style.FAINT, markersize=2.5,
+            alpha=0.5, markeredgewidth=0, rasterized=True,
         )  # fmt: skip
         for name, line in lines.items():
             ax.plot(grid, factor * line, **looks[name].line)
-        ax.plot(middle[0], factor * middle[1], "o", color=style.INK, markersize=2.2, zorder=3)
+            if name in known:
+                reach = NORMAL_95 * _torque_sd(known[name], models[name], grid, k)
+                low, high = (factor * (line + sign * reach) for sign in (-1, 1))
+                colour = looks[name].line["color"]
+                ax.fill_between(grid, low, high, color=colour, alpha=0.25, linewidth=0)
         ax.set_ylim(style.padded(factor * extremes.min(), factor * extremes.max(), 0.15))
         ax.margins(x=0.02)
         style.title(ax, plant.joint_names[k])
@@ -276,11 +288,23 @@ def torque_over_velocity(
             ax.set_xlabel(f"joint velocity [{plant.unit}/s]")
     handles = [
         Line2D([], [], linestyle="", marker=".", color=style.FAINT),
-        Line2D([], [], linestyle="", marker="o", color=style.INK, markersize=2.2),
         *(looks[name].handle for name in models),
     ]
-    style.legend(figure, handles, ["from the motion", "its median", *models])
+    band = ", with 95 % band"
+    labels = [f"{name}{band if name in known else ''}" for name in models]
+    style.legend(figure, handles, ["from the motion", *labels])
     return figure
+
+
+def _averaged(qd: torch.Tensor, torque: torch.Tensor, step: float) -> tuple[Array, Array]:
+    """Means over blocks of samples, NaN where a joint does not turn one way throughout."""
+    size = max(1, round(DEFAULTS.diagnosis_block / step))
+    size = min(size, max(1, len(qd)))
+    whole = len(qd) // size * size
+    speeds, torques = (x[:whole].reshape(-1, size, x.shape[-1]) for x in (qd, torque))
+    one_way = torch.sign(speeds).mean(1).abs() == 1
+    # Dry friction takes any value at rest.
+    return speeds.mean(1).numpy(), torch.where(one_way, torques.mean(1), torch.nan).numpy()
 
 
 def coefficient_intervals(fits: Mapping[str, FitResult]) -> Figure:
@@ -376,6 +400,12 @@ def _torque(model: FrictionModel, qd: Array, joint: int) -> Array:
     with torch.no_grad():
         torque = model(velocity, torch.zeros_like(velocity), torch.ones_like(velocity))
     return torque[:, joint].numpy()
+
+
+def _torque_sd(known: CoefficientUncertainty, model: FrictionModel, qd: Array, joint: int) -> Array:
+    """Standard deviation of one joint's torque over its velocity."""
+    velocity = torch.as_tensor(qd)[:, None].expand(-1, model.joints).contiguous()
+    return known.torque_sd(model, velocity)[:, joint].numpy()
 
 
 def _intervals(found: FitResult, name: str, k: int) -> Array:

@@ -27,7 +27,12 @@ RUN_KEY = "nfriction run"
 
 
 def save_all(
-    comparison: Comparison, recordings: Sequence[Recording], folder: str | Path, *, run: str = ""
+    comparison: Comparison,
+    recordings: Sequence[Recording],
+    folder: str | Path,
+    *,
+    run: str = "",
+    formats: Sequence[str] = (),
 ) -> list[Path]:
     """Write every figure of a comparison as PNG, and as `NAME.dark.png` for a dark screen.
 
@@ -40,7 +45,8 @@ def save_all(
         comparison: fits and scores.
         recordings: those compared, or some of them.
         folder: made where it does not exist; files of the same name are replaced.
-        run: id of the run, kept in each file.
+        run: id of the run, kept in each PNG file.
+        formats: further ones for papers, `"svg"` or `"pdf"`.
 
     Returns:
         The files written.
@@ -71,6 +77,9 @@ def save_all(
             path = folder / f"{stem}_{count}.png"
         kept = {RUN_KEY: run} if run else {}
         figure.savefig(path, dpi=DPI, metadata=kept)
+        for ending in formats:
+            figure.savefig(path.with_suffix(f".{ending}"))
+            written.append(path.with_suffix(f".{ending}"))
         shade = path.with_suffix(".dark.png")
         for_dark_screen(figure, ground=DARK_GROUND).savefig(shade, dpi=DPI, metadata=kept)
         figure.clear()
@@ -105,7 +114,13 @@ def _figures(
     models = {name: found.model for name, found in comparison.fits.items()}
     if given:
         motions = [trained[r.name] for r in given]
-        yield "torque_over_velocity", torque_over_velocity(last.plant, models, given, motions)
+        bands = {
+            name: found.uncertainty
+            for name, found in comparison.fits.items()
+            if found.uncertainty is not None
+        }
+        figure = torque_over_velocity(last.plant, models, given, motions, uncertainty=bands)
+        yield "torque_over_velocity", figure
     labels: dict[str, Any] = {"joint_names": comparison.joint_names, "unit": comparison.unit}
     for law in dict.fromkeys(model.law.name for model in models.values()):
         of_law = {name: model for name, model in models.items() if model.law.name == law}

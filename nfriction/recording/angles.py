@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Literal, Protocol, TypeAlias, get_args
 
@@ -33,6 +33,9 @@ class Mechanism(Protocol):
 
     @property
     def unit(self) -> str: ...
+
+    @property
+    def motor_factors(self) -> Mapping[str, Sequence[float]]: ...
 
 
 @dataclass(frozen=True)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import reprlib
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, Union
 
 import numpy as np
 from numpy.typing import NDArray
@@ -196,8 +197,13 @@ class Recording:
             raise ValueError(f"{self.name or 'the recording'} has no torque to advance.")
         at = self.time + delay
         known = (at >= self.time[0]) & (at <= self.time[-1])
-        tau = np.stack([np.interp(at, self.time, column) for column in self.tau.T], 1)
-        return self._replace(tau=tau)[known]
+        return self._replace(tau=self.torque_at(at))[known]
+
+    def torque_at(self, time: Array) -> Array:
+        """Torque between samples by interpolation, held beyond the ends, (time, joint)."""
+        if self.tau is None:
+            return np.zeros((len(time), self.joints))
+        return np.stack([np.interp(time, self.time, column) for column in self.tau.T], 1)
 
     def digest(self) -> str:
         """SHA-256 of the content in hexadecimal: arrays, joint names, convention and unit."""
@@ -242,37 +248,46 @@ class Recording:
         convention: ConventionLike | None = None,
         unit: Unit | None = None,
         name: str = "",
+        plant: Mechanism | None = None,
     ) -> Recording:
         """Recording from a table with columns time, q1 …, and perhaps qd1 … and tau1 ….
 
         Of several joints those without a torque are undriven: theirs is zero where another has
-        one. Velocity is taken where every joint has it; other columns are ignored.
+        one. Velocity is taken where every joint has it; other columns are ignored. In place of q1
+        and tau1 the table may have motor1, the angle of the joint's motor [rad], and current1 [A],
+        which the plant's `Motor` converts.
 
         Args:
             table: a row per sample.
             columns: the table's name for ours where they differ, perhaps with its unit after a
                 colon, {"time": "t:ms", "q1": "enc_1:deg"}. Units: s, ms, us, ns; rad, mrad, deg,
                 rev, counts/8192 (any number a revolution), m, mm; these per second, rpm; N m,
-                mN m, N, mN.
+                mN m, N, mN; A, mA.
             degrees: positions and velocities without a unit are in degrees.
             convention: of the angles, such as "absolute,hanging" or ("absolute", "hanging"), an
                 `AngleConvention`, or a plant; else `table.attrs["convention"]`, else None: that
                 of the plant in whose fit or score the recording is used.
-            unit: of position; else `table.attrs["unit"]`, else rad.
+            unit: of position; else `table.attrs["unit"]`, else the plant's, else rad.
             name: of the recording.
+            plant: the mechanism, for its motors.
         Warns:
             RecordingWarning: velocity or torque of some joints only, columns that look like torque
                 and are not read; and as `Recording`.
         """
         attributes = table.attrs
         convention = attributes.get("convention") if convention is None else convention
-        arrays, slides, remarks = formats.table_arrays(table, columns, degrees=degrees)
+        arrays, slides, remarks = formats.table_arrays(
+            table,
+            columns,
+            degrees=degrees,
+            motor_factors=None if plant is None else plant.motor_factors,
+        )
         found: Unit | None = None if slides is None else "m" if slides else "rad"
         written = attributes.get("unit")
         # The file's own word for what `degrees` states.
         if degrees and written == "deg":
             written = None
-        unit = unit or written or found or "rad"
+        unit = unit or written or found or ("m" if plant and plant.unit == "m" else "rad")
         if found and found != unit:
             raise ValueError(
                 f"`unit` is {unit!r}, but the columns are in {found!r}; drop one of the two."
@@ -305,6 +320,7 @@ class Recording:
         convention: ConventionLike | None = None,
         unit: Unit | None = None,
         name: str | None = None,
+        plant: Mechanism | None = None,
     ) -> Recording:
         """Recording from a file: CSV, TSV, TXT, Parquet, NPZ, MATLAB, HDF5 or MDF4.
 
@@ -322,7 +338,7 @@ class Recording:
 
         Args:
             path: of the file.
-            columns, degrees, convention, unit, name: as for `from_pandas`.
+            columns, degrees, convention, unit, name, plant: as for `from_pandas`.
         Warns:
             RecordingWarning: a decimal sign that is guessed; and as `from_pandas`.
         Raises:
@@ -342,12 +358,55 @@ class Recording:
                 convention=convention,
                 unit=unit,
                 name=formats.stem(path) if name is None else name,
+                plant=plant,
             )
         except ValueError as error:
             reason = str(error)
             # It may quote the file.
             reason = reason if len(reason) <= 2000 else f"{reason[:1997]}..."
             raise ValueError(f"'{path}': {reason}") from error
+
+    @classmethod
+    def of(
+        cls, given: RecordingLike, *, plant: Mechanism | None = None, name: str = ""
+    ) -> Recording:
+        """A recording as it is, or read from a file or a table with columns time, q1, ….
+
+        Args:
+            given: a recording, a path, or a table.
+            plant: see `from_pandas`.
+            name: of a recording from a table.
+        Raises:
+            TypeError: for anything else; arrays are given by `Recording(time, q)`.
+        """
+        if isinstance(given, Recording):
+            return given
+        if isinstance(given, str | os.PathLike):
+            return cls.read(given, plant=plant)
+        # A table has columns and attributes; pandas is slow to import only to ask.
+        if not (hasattr(given, "columns") and hasattr(given, "attrs")):
+            raise TypeError(
+                "a recording is a Recording, the path of a file, or a table with columns time, q1, "
+                f"…, got {type(given).__name__} {reprlib.repr(given)}; `Recording(time, q)` makes "
+                "one of arrays."
+            )
+        return cls.from_pandas(given, plant=plant, name=name)
+
+    @classmethod
+    def many(
+        cls,
+        given: RecordingLike | Iterable[RecordingLike],
+        *,
+        plant: Mechanism | None = None,
+        name: str = "table",
+    ) -> list[Recording]:
+        """Recordings of one or several of what `of` takes; tables are called `name` 1, 2, …."""
+        # A path iterates over its letters, a table over its columns.
+        single = isinstance(given, Recording | str | os.PathLike) or hasattr(given, "columns")
+        listed: Iterable[Any] = [given]
+        if not single and isinstance(given, Iterable):
+            listed = given
+        return [cls.of(one, plant=plant, name=f"{name} {k}") for k, one in enumerate(listed, 1)]
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write to .csv, .csv.gz, .parquet or .npz atomically; `read` gives it back."""
@@ -357,6 +416,10 @@ class Recording:
         # Of many recordings the reader must know which one.
         label = f"recording '{self.name}': " if self.name else ""
         warnings.warn(f"{label}{finding}; {remedy}.", RecordingWarning, stacklevel=stacklevel)
+
+
+# Not with `|`, because pandas is slow to import.
+RecordingLike: TypeAlias = Union[Recording, str, "os.PathLike[str]", "pd.DataFrame"]
 
 
 def read_initial_states(

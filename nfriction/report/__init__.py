@@ -1,7 +1,6 @@
 """A comparison's folder as one self-contained HTML page."""
 
-from nfriction.report.page import to_html, write_report
-from nfriction.report.rules import JointRules, Rule, Term, rules_in_words
+from nfriction.report.page import JointRules, Rule, Term, rules_in_words, to_html, write_report
 from nfriction.report.run import Run, RunError, read_run
 
 __all__ = [

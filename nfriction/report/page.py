@@ -1,4 +1,4 @@
-"""Draw a run as one self-contained HTML page.
+"""Draw a run as one self-contained HTML page, with the rules of neuro-fuzzy models in words.
 
 The wording and layout of the page are in `templates/page.html.j2`; here are the tables and other
 values that it shows.
@@ -9,6 +9,7 @@ import hashlib
 import math
 import shlex
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -27,25 +28,146 @@ from nfriction.evaluation.tables import (
     interval_table,
     selection_table,
 )
-from nfriction.io.atomic import write_atomically
-from nfriction.io.model_info import ModelInfo
-from nfriction.report.rules import rules_in_words
+from nfriction.friction import model_names, plain_name
+from nfriction.friction.models import FrictionModel
+from nfriction.io.files import write_atomically
+from nfriction.io.model_file import ModelInfo
 from nfriction.report.run import Figure, Run, read_run
 from nfriction.version import __version__
 
+_SPEEDS = {
+    1: ("any",),
+    2: ("slow", "fast"),
+    3: ("slow", "medium", "fast"),
+    4: ("very slow", "slow", "fast", "very fast"),
+    5: ("very slow", "slow", "medium", "fast", "very fast"),
+}
+_SIZES = ("", "strongly ", "very strongly ")
+
+
+@dataclass(frozen=True)
+class Term:
+    """A fuzzy set of one input: its name in words, middle and standard deviation in SI."""
+
+    name: str
+    centre: float
+    width: float
+
+
+@dataclass(frozen=True)
+class Rule:
+    """One rule: the names of its terms, and the coefficients in SI where these hold fully.
+
+    The values are those of the whole model, neighbouring rules and radial basis head included.
+    """
+
+    velocity: str
+    acceleration: str
+    values: tuple[float, ...]
+
+    def sentence(self, coefficients: Sequence[tuple[str, str]]) -> str:
+        """The rule in words; `coefficients` are names and units."""
+        then = " AND ".join(
+            f"{name} = {value:.4g} {unit}".rstrip()
+            for (name, unit), value in zip(coefficients, self.values, strict=True)
+        )
+        return f"{self.condition} THEN {then}"
+
+    @property
+    def condition(self) -> str:
+        """The rule's premise in words."""
+        return f"IF velocity is {self.velocity} AND acceleration is {self.acceleration}"
+
+
+@dataclass(frozen=True)
+class JointRules:
+    """Sets and rules of one joint; velocity's set by velocity's set, acceleration's faster."""
+
+    joint: str
+    velocity: tuple[Term, ...]
+    acceleration: tuple[Term, ...]
+    rules: tuple[Rule, ...]
+
+
+def rules_in_words(model: FrictionModel, joint_names: Sequence[str] = ()) -> list[JointRules]:
+    """The rules of a neuro-fuzzy model, joint by joint; none of a model without rules.
+
+    Sets are named by their order and by where zero lies. Acceleration counts along the motion
+    (braking, speeding up) unless the model takes it signed.
+
+    Args:
+        model: any friction model.
+        joint_names: default joint1, joint2, ...
+
+    Raises:
+        ValueError: if the names are not one a joint.
+    """
+    fuzzy = model.schedule.fuzzy_rules()
+    if fuzzy is None:
+        return []
+    names = list(joint_names) or [f"joint{k + 1}" for k in range(model.joints)]
+    if len(names) != model.joints:
+        raise ValueError(f"`joint_names` must be {model.joints} names, got {names}.")
+    described = []
+    for j, joint in enumerate(names):
+        (speeds, speed_widths), (accelerations, widths) = (
+            (c[j].tolist(), w[j].tolist()) for c, w in zip(fuzzy.centres, fuzzy.widths, strict=True)
+        )
+        names_v = _in_order(speeds, _speed_names(len(speeds)))
+        names_a = _acceleration_names(sorted(accelerations), fuzzy.along_motion)
+        v = tuple(map(Term, names_v, speeds, speed_widths))
+        a = tuple(map(Term, _in_order(accelerations, names_a), accelerations, widths))
+        # The order of the rule table: the acceleration varies faster.
+        pairs = [(x.name, y.name) for x in v for y in a]
+        values = fuzzy.coefficients[j].tolist()
+        rules = [Rule(*pair, tuple(of)) for pair, of in zip(pairs, values, strict=True)]
+        described.append(JointRules(joint, v, a, tuple(rules)))
+    return described
+
+
+def _speed_names(count: int) -> Sequence[str]:
+    # Language has no words for more than five.
+    return _SPEEDS.get(count) or [f"speed {k + 1}" for k in range(count)]
+
+
+def _acceleration_names(ordered: Sequence[float], along_motion: bool) -> list[str]:
+    below, above = ("braking", "speeding up") if along_motion else ("negative", "positive")
+    # The set nearest to zero: after training none need lie exactly there.
+    zero = min(range(len(ordered)), key=lambda k: abs(ordered[k]))
+    return [
+        *(_size(zero - k) + below for k in range(zero)),
+        "about zero",
+        *(_size(k - zero) + above for k in range(zero + 1, len(ordered))),
+    ]
+
+
+def _size(rank: int) -> str:
+    return _SIZES[rank - 1] if rank <= len(_SIZES) else f"{rank} times "
+
+
+def _in_order(centres: Sequence[float], names: Sequence[str]) -> list[str]:
+    """Names from the lowest centre to the highest, in the order of the centres."""
+    # Training may move sets past each other.
+    order = sorted(range(len(centres)), key=lambda k: centres[k])
+    named = dict(zip(order, names, strict=True))
+    return [named[k] for k in range(len(centres))]
+
+
 # A figure's twin for a dark screen.
 _DARK = ".dark"
-# In the order of the page: errors first, then motions, then the insides of the models.
+# In the order of the page: friction and errors first, then motions, then the models' insides.
 _CAPTIONS = {
+    "torque_over_velocity": "Friction torque over velocity: the models' laws with their 95 % bands "
+    "over the torque that the recorded motion implies, averaged over 30 ms",
     "rmse_test": "Position error by model and joint, test recordings",
     "horizons_test": "Position error over the length of the simulation, test recordings; the band "
-    "is the effect of one encoder count in the initial state",
+    "is the limit of these data, the effect of the uncertainty of the start",
     "rmse_train": "Position error by model and joint, training recordings",
     "horizons_train": "Position error over the length of the simulation, training recordings",
     "positions_test_": "Measured and simulated position with the error below, test: ",
     "positions_train_": "Measured and simulated position with the error below, training: ",
-    "torque_over_velocity": "Friction torque over velocity: the models' laws over the torque that "
-    "the recorded motion implies",
+    "friction": "Friction torque over velocity: rows, their medians with quartiles in bins of "
+    "velocity, the laws, and the 95 % band of the law chosen",
     "over_time_": "Coefficients along the first training recording, models of the law: ",
     "coefficients_": "Coefficients over velocity and acceleration (hatched: no data; faded: "
     "uncertain; lines enclose 50 % and 90 % of the samples) of ",
@@ -62,7 +184,10 @@ _JINJA = jinja2.Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-_JINJA.filters["four"] = lambda value: f"{value:.4g}"
+_JINJA.filters["four"] = lambda value: f"{value:.0f}" if 1e3 <= value < 1e7 else f"{value:.4g}"
+_JINJA.filters["plain"] = lambda name: (
+    f" ({plain_name(name)})" if name in model_names() and plain_name(name) != name.lower() else ""
+)
 # JavaScript reads Infinity where Python writes inf.
 _JINJA.filters["sortable"] = lambda value: (
     "Infinity" if math.isnan(value) else str(value).replace("inf", "Infinity")
@@ -75,21 +200,16 @@ def to_html(run: Run) -> str:
     Everything from the folder is escaped, and the page's own policy lets only its own script and
     style run.
     """
-    style, script = (
-        (_TEMPLATES / name).read_text(encoding="utf-8") for name in ("page.css", "page.js")
-    )
     comparison = run.comparison
     error = {}
     if run.best is not None:
         error = (1e3 * comparison.table(part=comparison.parts[0])["all"]).to_dict()
     info = next((info for _, info in run.models.values()), None)
-    page: str = _JINJA.get_template("page.html.j2").render(
+    return document(
+        "page.html.j2",
+        f"Friction models: {run.folder.resolve().name}",
         run=run,
-        title=f"Friction models: {run.folder.resolve().name}",
-        style=Markup(style),
-        script=Markup(script),
-        policy=_policy(style, script),
-        version=__version__,
+        run_id=run.id,
         no_friction=NO_FRICTION,
         error=error,
         info=info,
@@ -100,10 +220,26 @@ def to_html(run: Run) -> str:
             "data": _data_table(run),
             "ranges": info and _range_table(info, comparison.joint_names, comparison.unit),
         },
-        figures=_pictures(run.figures),
+        figures=pictures(run.figures),
         fit_articles=[_fit(run, name) for name in run.fits],
         fuzzy_models=list(_fuzzy_models(run)),
         commands=_commands(run),
+        cards=_cards(run),
+    )
+
+
+def document(template: str, title: str, **values: Any) -> str:
+    """A page from a template of this folder, with its style, script and policy."""
+    style, script = (
+        (_TEMPLATES / name).read_text(encoding="utf-8") for name in ("page.css", "page.js")
+    )
+    page: str = _JINJA.get_template(template).render(
+        {"run_id": ""} | values,
+        title=title,
+        style=Markup(style),
+        script=Markup(script),
+        policy=_policy(style, script),
+        version=__version__,
     )
     return page.lstrip() + "\n"
 
@@ -121,7 +257,7 @@ def write_report(folder: str | Path, path: str | Path) -> Run:
     return run
 
 
-def _pictures(figures: Sequence[Figure]) -> list[dict[str, Any]]:
+def pictures(figures: Sequence[Figure]) -> list[dict[str, Any]]:
     """Figures in the order of the page as URLs, each with its twin for a dark screen if any."""
     by_name, found = {figure.name: figure for figure in figures}, []
     for figure in figures:
@@ -189,6 +325,35 @@ def _fit(run: Run, name: str) -> dict[str, Any]:
         "warnings": list(dict.fromkeys(warnings)),
         "tables": tables,
     }
+
+
+def _cards(run: Run) -> list[dict[str, Any]]:
+    """The best model's coefficients of each joint, in words, with their 95 % intervals."""
+    best = run.best
+    if best is None or best not in run.fits:
+        return []
+    sets, units = run.coefficients.get(best, {}), _units(run, best)
+    show = Table("", (), ()).text
+    cards = []
+    for j, joint in enumerate(run.comparison.joint_names):
+        lines = []
+        for name in next(iter(sets.values()), {}):
+            values = [of[name][j] for of in sets.values() if name in of]
+            unit = f" {units[name]}" if name in units else ""
+            low, high = run.fits[best].intervals.get(f"{name} of {joint}", (math.nan, math.nan))
+            note = ""
+            if len(values) > 1:
+                value = f"{show(min(values))} to {show(max(values))}{unit}"
+                note = "follows the motion"
+            else:
+                value = f"{show(values[0])}{unit}"
+                if math.isfinite(low) and math.isfinite(high):
+                    note = f"{show(low)} to {show(high)}"
+                elif not math.isnan(low):
+                    note = "not identifiable"
+            lines.append({"name": name, "value": value, "note": note})
+        cards.append({"joint": joint, "lines": lines})
+    return cards
 
 
 def _units(run: Run, model: str) -> dict[str, str]:

@@ -17,9 +17,8 @@ from nfriction.evaluation.results import COMPLETE, exclusive
 from nfriction.evaluation.score import Score
 from nfriction.friction import model_names
 from nfriction.friction.models import FrictionModel
-from nfriction.io import strict_json
-from nfriction.io.model_file import ModelFileError, load, load_info
-from nfriction.io.model_info import ModelInfo
+from nfriction.io.files import parse_json
+from nfriction.io.model_file import ModelFileError, ModelInfo, load, load_info
 
 # Far above any run of ours; larger files are none of it.
 LARGEST_RESULTS, LARGEST_FIGURE, MOST_FIGURES = 64 * 2**20, 16 * 2**20, 100
@@ -136,7 +135,7 @@ def read_run(folder: str | Path) -> Run:
     if path.stat().st_size > LARGEST_RESULTS:
         raise RunError(f"{path}: is too large for results of a comparison.")
     try:
-        content = strict_json.parse(path.read_text(encoding="utf-8"))
+        content = parse_json(path.read_text(encoding="utf-8"))
         if isinstance(content, dict) and "schema" not in content:
             content = _renamed(content)
     except (ValueError, RecursionError) as error:

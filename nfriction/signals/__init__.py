@@ -14,8 +14,7 @@ from nfriction.signals.causal import (
     period_counting,
     quantise,
 )
-from nfriction.signals.kalman import kalman_smoother
-from nfriction.signals.motion import Motion
+from nfriction.signals.kalman import Motion, kalman_smoother
 
 __all__ = [
     "Motion",

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nfriction.signals.motion import Motion, check_motion
+from nfriction.signals.kalman import Motion, check_motion
 
 Array = NDArray[np.float64]
 

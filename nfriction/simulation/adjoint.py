@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
+from nfriction.simulation.memory_step import memory_of
 from nfriction.simulation.protocols import Friction, Plant, RolloutInputs, as_stateful
 from nfriction.simulation.rk4 import acceleration, runge_kutta
 
@@ -38,12 +39,12 @@ def adjoint_rollout(
         plant, friction, inputs: the rollout that it simulates.
 
     Returns:
-        None where a gradient would be incomplete: with a hidden state, a sample time or measured
-        motion that requires one, or modules that read tensors of others.
+        None where a gradient would be incomplete: with a hidden state, a law with memory, a sample
+        time or measured motion that requires one, or modules that read tensors of others.
     """
     system = _System(plant, friction, inputs, own_tensors(plant, friction))
     fixed = (inputs.step, *(inputs.measured or ()))
-    if as_stateful(friction) or any(x.requires_grad for x in fixed):
+    if as_stateful(friction) or memory_of(friction) or any(x.requires_grad for x in fixed):
         return None
     if not _is_closed(system):
         return None

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nfriction.codegen.rollout_program import SPEED_LIMIT
-from nfriction.simulation.compiled import System, integrate_compiled
+from nfriction.simulation.compiled import System
 from nfriction.simulation.protocols import (
     Friction,
     NoFriction,
@@ -21,9 +21,13 @@ from nfriction.simulation.protocols import (
     RolloutInputs,
     as_stateful,
 )
-from nfriction.simulation.rk4 import simulate_eager
-from nfriction.simulation.rollout import Rollout
-from nfriction.simulation.validate import outside_inference_mode, require_stability, validate_inputs
+from nfriction.simulation.rollout import Rollout, simulate
+from nfriction.simulation.validate import (
+    outside_inference_mode,
+    require_stability,
+    validate_inputs,
+    with_law_state,
+)
 
 Array = NDArray[np.float64]
 
@@ -38,7 +42,7 @@ class Feedback(Protocol):
 
 @dataclass(frozen=True)
 class Electronics:
-    """What lies between a controller and its machine.
+    """Encoders, drives and delay between a controller and its machine.
 
     Attributes:
         sample_time: between two calls of the controller [s].
@@ -90,7 +94,7 @@ class Electronics:
         return step * np.rint(held / step)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ControlledMotion(Rollout):
     """A motion under a controller.
 
@@ -137,12 +141,16 @@ def control(
     given = validate_inputs(
         plant, model, q0, qd0, None, electronics.sample_time, steps, electronics.substeps
     )
+    given = with_law_state(given, model, None)
     system = System.of(plant, model)
     require_stability(system, given)
     q, qd, step = given.q0, given.qd0, given.step[:1]
     qdd = plant.forward_dynamics(q, qd, torch.zeros_like(q))
     stateful = as_stateful(model)
     hidden: Tensor | None = None
+    law_states: list[Tensor] = []
+    if given.law_state is not None:
+        law_states.append(given.law_state)
     states, torques, readings = [(q, qd, qdd)], [], []
     waiting = [np.zeros(q.shape)] * electronics.delay
     diverged_at = torch.full(q.shape[:-1], torch.inf, dtype=q.dtype)
@@ -163,10 +171,10 @@ def control(
             else:
                 hidden = stateful.advance(qd, qdd, hidden)
         inputs = RolloutInputs(q, qd, tau.unsqueeze(-2), step, electronics.substeps, None, hidden)
-        found = integrate_compiled(system, inputs, "auto", 1) or simulate_eager(
-            plant, model, inputs
-        )
-        q, qd, qdd = (x[..., -1, :].clone() for x in found)
+        inputs = with_law_state(inputs, model, law_states[-1] if law_states else None)
+        found = simulate(system, inputs)
+        q, qd, qdd = (x[..., -1, :].clone() for x in found[:3])
+        law_states += [x[..., -1, :, :].clone() for x in found[3:]]
         states.append((q, qd, qdd))
         torques.append(tau)
         readings.append(torch.as_tensor(reading).clone())
@@ -182,4 +190,7 @@ def control(
         torch.stack(x, -2).masked_fill(gone, torch.nan) for x in zip(*states, strict=True)
     )
     applied, read = torch.stack(torques, -2), torch.stack(readings, -2)
-    return ControlledMotion(seconds, q, qd, qdd, diverged_at, applied, read)
+    law = None
+    if law_states:
+        law = torch.stack(law_states, -3).masked_fill(gone[..., None], torch.nan)
+    return ControlledMotion(seconds, q, qd, qdd, diverged_at, law, tau=applied, measured=read)

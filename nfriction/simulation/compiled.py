@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from nfriction import codegen
+from nfriction.simulation.memory_step import memory_of
 from nfriction.simulation.protocols import RolloutInputs, StepFunction
 from nfriction.simulation.rk4 import rk4_step
 
@@ -78,9 +79,8 @@ def integrate_compiled(
     threads: int,
     parameters: Mapping[str, Tensor] | None = None,
     step_function: StepFunction = rk4_step,
-    jacobian: tuple[str, ...] = (),
 ) -> tuple[Tensor, ...] | None:
-    """States at every sample: q, qd, qdd, each (*batch, steps + 1, joint).
+    """States at every sample: q, qd, qdd, each (*batch, steps + 1, joint), and that of the law.
 
     Args:
         system, inputs: what moves, and how.
@@ -89,9 +89,6 @@ def integrate_compiled(
         parameters: values of the friction model's parameters by name that differ from its own,
             each (*batch, *the parameter's shape).
         step_function: what is repeated, with the arguments of `rk4_step`.
-        jacobian: return the derivatives of (q, qd, qdd) after each step as well, shape
-            (*batch, steps, 3 joint, direction), by these: "q", "qd", "held" (the coefficients,
-            joint-major), and names of parameters and buffers ("plant.…", "friction.…").
 
     Returns:
         None where `backend="auto"` finds no way to compile, so that eager torch has to do it.
@@ -99,10 +96,11 @@ def integrate_compiled(
     Raises:
         CodegenError: if compiled code is asked for and cannot be made.
     """
-    compiled = _compiled(system, backend, step_function, jacobian)
+    compiled = _compiled(system, backend, step_function)
     if compiled is None:
         return None
     q, qd, measured, memory = inputs.q0, inputs.qd0, inputs.measured, inputs.hidden_state
+    law = inputs.law_state
     batch, joints = q.shape[:-1], q.shape[-1]
 
     def rows(x: Tensor, trailing: int) -> Tensor:
@@ -128,19 +126,19 @@ def integrate_compiled(
             drive=drive,
             substeps=inputs.substeps,
             memory=None if memory is None else rows(memory, 2).reshape(-1, *memory.shape[-2:]),
+            law_state=None if law is None else rows(law, 2).reshape(-1, *law.shape[-2:]),
         ),
         values,
         threads,
     )
-    states = tuple(x.reshape(*batch, *x.shape[1:]) for x in (found.q, found.qd, found.qdd))
-    return (*states, found.jacobian.unflatten(0, batch)) if jacobian else states
+    given = [found.q, found.qd, found.qdd] + [found.law_state] * (law is not None)
+    return tuple(x.reshape(*batch, *x.shape[1:]) for x in given)
 
 
 def _compiled(
     system: System,
     backend: Backend,
     step_function: StepFunction = rk4_step,
-    jacobian: tuple[str, ...] = (),
 ) -> "codegen.CompiledRollout | None":
     """The compiled rollout of this system, from the cache where it is there."""
     plant, friction = system.plant, system.friction
@@ -158,10 +156,10 @@ def _compiled(
             "compiled rollouts are traced anew in every call, because they may read "
             f"{system.fingerprint}"
         )
-        found = _attempt(plant, friction, step_function, jacobian)
+        found = _attempt(plant, friction, step_function)
     else:
-        key = system.fingerprint.key, step_function, jacobian
-        found = _known.get(key) or _attempt(plant, friction, step_function, jacobian)
+        key = system.fingerprint.key, step_function
+        found = _known.get(key) or _attempt(plant, friction, step_function)
         _keep(_known, key, found)
     if isinstance(found, codegen.CodegenError):
         if backend != "auto":
@@ -171,12 +169,12 @@ def _compiled(
 
 
 def _attempt(
-    plant: Any, friction: Any, step_function: StepFunction, jacobian: tuple[str, ...]
+    plant: Any, friction: Any, step_function: StepFunction
 ) -> "codegen.CompiledRollout | codegen.CodegenError":
     """A compiled rollout, or the reason why there is none."""
     try:
         _check_compilable(plant, friction)
-        traced = codegen.trace_rollout(plant, friction, step_function, jacobian=jacobian)
+        traced = codegen.trace_rollout(plant, friction, step_function)
         found = _compiled_graphs.get(traced.digest)
         if found is None:
             traced.check()
@@ -216,7 +214,11 @@ def _check_compilable(plant: Any, friction: Any) -> None:
         device = next((t.device for t in (*plant.parameters(), *plant.buffers())), None)
         rest = torch.zeros(plant.joints, dtype=torch.float64, device=device)
         held = friction.coefficients(rest, rest)
-        tau_f = friction.torque(rest, plant.load(rest, rest), held)
+        law, load = memory_of(friction), plant.load(rest, rest)
+        if law is None:
+            tau_f = friction.torque(rest, load, held)
+        else:
+            tau_f = law.torque(rest.new_zeros(plant.joints, law.size), rest, load, held)
         if plant.forward_dynamics(rest, rest, tau_f).shape != rest.shape:
             raise codegen.CodegenError(
                 "a plant or friction model with a batch of its own cannot be compiled"

@@ -56,7 +56,8 @@ class NoFriction(nn.Module):
 
 
 # One integration step, with the arguments and values of `nfriction.simulation.rk4.rk4_step`.
-StepFunction = Callable[..., tuple[Tensor, Tensor, Tensor]]
+# Of a law with memory, of `nfriction.simulation.memory_step.memory_step`.
+StepFunction = Callable[..., tuple[Tensor, ...]]
 
 
 def as_stateful(friction: Friction) -> StatefulFriction | None:
@@ -79,6 +80,8 @@ class RolloutInputs:
             ones, each (*batch, steps, joint) or without batch; None for the simulated ones.
         hidden_state: of the coefficients after the first sample, (*batch, joint, state_size);
             None for that of the first sample alone.
+        law_state: internal state of the friction law at the start, (*batch, joint, state); None of
+            a law without.
     """
 
     q0: Tensor
@@ -88,3 +91,4 @@ class RolloutInputs:
     substeps: int = 1
     measured: tuple[Tensor, Tensor] | None = None
     hidden_state: Tensor | None = None
+    law_state: Tensor | None = None

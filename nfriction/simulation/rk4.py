@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from nfriction.codegen.rollout_program import SPEED_LIMIT
 from nfriction.simulation.protocols import (
     Friction,
     Plant,
@@ -98,12 +99,16 @@ def simulate_eager(
     progress: bool = False,
     step_function: StepFunction = rk4_step,
 ) -> tuple[Tensor, ...]:
-    """States at every sample in eager torch: q, qd, qdd, each (*batch, steps + 1, joint)."""
+    """States at every sample in eager torch: q, qd, qdd, each (*batch, steps + 1, joint).
+
+    Of a law with memory also its state, (*batch, steps + 1, joint, state).
+    """
     q, qd, tau = inputs.q0, inputs.qd0, inputs.tau
     step = inputs.step / inputs.substeps
     # Nothing is known of friction before the first step, so that acceleration leaves it out.
     qdd = plant.forward_dynamics(q, qd, tau[..., 0, :])
-    states = [(q, qd, qdd)]
+    internal = [] if inputs.law_state is None else [inputs.law_state]
+    states = [(q, qd, qdd, *internal)]
     stateful, hidden = as_stateful(friction), inputs.hidden_state
     for k in tqdm(range(step.shape[-1]), disable=not progress, unit="step", leave=False):
         measured = None
@@ -121,11 +126,18 @@ def simulate_eager(
         for _ in range(inputs.substeps):
             if stateful is None:
                 held = friction.coefficients(*(measured or (qd, qdd)))
-            q, qd, qdd = step_function(
-                plant, friction, q, qd, tau[..., k, :], held, step[..., k, None]
+            q, qd, qdd, *internal = step_function(
+                plant, friction, q, qd, tau[..., k, :], held, step[..., k, None], *internal
             )
-        states.append((q, qd, qdd))
+        states.append((q, qd, qdd, *internal))
     shape = states[-1][0].shape
-    return tuple(
-        torch.stack([x.expand(shape) for x in one], -2) for one in zip(*states, strict=True)
+    dims = len(shape)
+    q, qd, qdd, *internal = (
+        torch.stack([x.expand(*shape, *x.shape[dims:]) for x in one], dims - 1)
+        for one in zip(*states, strict=True)
     )
+    # NaN from where a motion is lost to the end, as compiled code writes it.
+    fine = (torch.isfinite(q) & (qd.abs() < SPEED_LIMIT)).all(-1, keepdim=True)
+    lost = ~fine.cumprod(-2).bool()
+    internal = [x.masked_fill(lost[..., None], torch.nan) for x in internal]
+    return (*(x.masked_fill(lost, torch.nan) for x in (q, qd, qdd)), *internal)

@@ -13,11 +13,17 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from nfriction.codegen.rollout_program import SPEED_LIMIT
 from nfriction.simulation.adjoint import adjoint_rollout, own_tensors
 from nfriction.simulation.compiled import Backend, System, integrate_compiled, wants_compiled
-from nfriction.simulation.protocols import Friction, NoFriction, Plant, RolloutInputs
-from nfriction.simulation.rk4 import simulate_eager
+from nfriction.simulation.memory_step import memory_of, memory_step
+from nfriction.simulation.protocols import (
+    Friction,
+    NoFriction,
+    Plant,
+    RolloutInputs,
+    StepFunction,
+)
+from nfriction.simulation.rk4 import rk4_step, simulate_eager
 from nfriction.simulation.stiction import simulate_stiction
 from nfriction.simulation.validate import (
     outside_inference_mode,
@@ -26,6 +32,7 @@ from nfriction.simulation.validate import (
     validate_measured,
     warn_of_sample_time,
     with_hidden_state,
+    with_law_state,
 )
 
 logger = logging.getLogger(__name__)
@@ -47,6 +54,8 @@ class Rollout:
             friction) [rad/s^2], same shape; with `qd` it drives the coefficients.
         diverged_at: time [s] at which a motion of the batch stopped being finite, infinity where
             it never did, shape (*batch,).
+        law_state: internal state of a friction law with memory, (*batch, steps + 1, joint, state);
+            None of a law without.
     """
 
     time: Tensor
@@ -54,6 +63,7 @@ class Rollout:
     qd: Tensor
     qdd: Tensor
     diverged_at: Tensor
+    law_state: Tensor | None = None
 
     @property
     def diverged(self) -> Tensor:
@@ -76,6 +86,7 @@ def rollout(
     drive: Literal["simulated", "measured"] = "simulated",
     measured: tuple[Tensor, Tensor] | None = None,
     hidden_state: Tensor | None = None,
+    law_state: Tensor | None = None,
     gradients: bool | None = None,
     backend: Backend = "auto",
     threads: int = 1,
@@ -108,6 +119,8 @@ def rollout(
         hidden_state: of the coefficients after the first sample, (*batch, joint, state_size), to
             continue an earlier motion (see `Schedule.states`); by default that of the first
             sample alone.
+        law_state: internal state of a friction law with memory at the start, (*batch, joint,
+            state), to continue an earlier motion; by default nothing is deflected.
         gradients: make the motion differentiable; None does so where any input requires it, no
             compiled backend is named, and there are at most 10,000 steps.
         backend: `"torch"` steps in eager torch; `"compiled"` compiles the same definition
@@ -130,6 +143,7 @@ def rollout(
     inputs = validate_inputs(plant, model, q0, qd0, tau, sample_time, steps, substeps)
     inputs = replace(inputs, measured=validate_measured(drive, measured, inputs))
     inputs = with_hidden_state(inputs, model, hidden_state)
+    inputs = with_law_state(inputs, model, law_state)
     if scheme not in get_args(Scheme):
         raise ValueError(f"`scheme` must be one of {get_args(Scheme)}, got {scheme!r}.")
     if scheme == "time_stepping":
@@ -141,17 +155,18 @@ def rollout(
         able = backend in ("auto", "torch") and inputs.tau.shape[-2] <= GRADIENT_STEPS
         given = (inputs.q0, inputs.qd0, inputs.tau, *own_tensors(plant, model))
         gradients = able and torch.is_grad_enabled() and any(x.requires_grad for x in given)
-    states = _simulate(system, inputs, gradients, backend, threads, progress)
+    states = simulate(system, inputs, gradients, backend, threads, progress)
     return _as_rollout(inputs, states)
 
 
 def integrate(plant: Plant, friction: Friction | None, inputs: RolloutInputs) -> Rollout:
     """`rollout` without checks and gradients, for searches whose trials may well be unstable."""
     model = NoFriction(plant.joints) if friction is None else friction
-    return _as_rollout(inputs, _simulate(System.of(plant, model), inputs))
+    inputs = with_law_state(inputs, model, inputs.law_state)
+    return _as_rollout(inputs, simulate(System.of(plant, model), inputs))
 
 
-def _simulate(
+def simulate(
     system: System,
     inputs: RolloutInputs,
     gradients: bool = False,
@@ -161,44 +176,36 @@ def _simulate(
 ) -> tuple[Tensor, ...]:
     """States q, qd, qdd, each (*batch, steps + 1, joint), by the backend that can compute them."""
     compiled = wants_compiled(backend, inputs.q0, gradients)
+    step_function: StepFunction = rk4_step if memory_of(system.friction) is None else memory_step
     states = None
     # With gradients the motion itself may still be compiled: the adjoint sweep adds them.
     if gradients and backend == "auto":
         states = adjoint_rollout(
-            lambda: _simulate(system, inputs, threads=threads, progress=progress),
+            lambda: simulate(system, inputs, threads=threads, progress=progress),
             system.plant, system.friction, inputs,
         )  # fmt: skip
     elif compiled:
-        states = integrate_compiled(system, inputs, backend, threads)
+        states = integrate_compiled(system, inputs, backend, threads, step_function=step_function)
     if states is None:
         with torch.set_grad_enabled(gradients and torch.is_grad_enabled()):
-            states = simulate_eager(system.plant, system.friction, inputs, progress)
+            states = simulate_eager(system.plant, system.friction, inputs, progress, step_function)
     return states
 
 
 def _as_rollout(inputs: RolloutInputs, states: tuple[Tensor, ...]) -> Rollout:
     """The motion with its time, NaN from where it diverged."""
     time = torch.nn.functional.pad(inputs.step, (1, 0)).cumsum_(-1)
-    q, qd, qdd = states
-    diverged_at = _divergence(time, q, qd)
-    if torch.isfinite(diverged_at).any():
-        lost = (time >= diverged_at[..., None])[..., None]
-        q, qd, qdd = (x.masked_fill(lost, torch.nan) for x in states)
-    return Rollout(time, q, qd, qdd, diverged_at)
-
-
-@torch.no_grad()
-def _divergence(time: Tensor, q: Tensor, qd: Tensor) -> Tensor:
-    """Time of the first sample that is not finite or beyond any speed, infinity where none."""
-    # Positions are finite while velocities are; a NaN fails every comparison.
-    low, high = map(float, qd.aminmax() if qd.numel() else (0.0, 0.0))
-    if -SPEED_LIMIT < low <= high < SPEED_LIMIT:
-        return time.new_full(q.shape[:-2], torch.inf)
-    lost = ~(torch.isfinite(q) & (qd.abs() < SPEED_LIMIT)).all(-1)
-    first = lost.to(torch.int64).argmax(-1, keepdim=True)
-    at = torch.gather(time.expand(lost.shape), -1, first).squeeze(-1)
-    diverged_at = torch.where(lost.any(-1), at, torch.inf)
-    count = int(lost.any(-1).sum())
-    if count:
+    q, qd, qdd, *law = states
+    diverged_at = time.new_full(q.shape[:-2], torch.inf)
+    # What is lost stays NaN, so that the last sample shows whether anything is.
+    if qd[..., -1, :].isnan().any():
+        lost = qd.isnan().any(-1)
+        first = lost.to(torch.int64).argmax(-1, keepdim=True)
+        at = torch.gather(time.expand(lost.shape), -1, first).squeeze(-1)
+        diverged_at = torch.where(lost.any(-1), at, torch.inf)
+        # Masked, since gradients of NaN would spoil those of other motions.
+        q, qd, qdd = (x.masked_fill(lost[..., None], torch.nan) for x in (q, qd, qdd))
+        law = [x.masked_fill(lost[..., None, None], torch.nan) for x in law]
+        count = int(lost.any(-1).sum())
         logger.warning("%d rollout(s) diverged, first at %.4g s", count, diverged_at.min())
-    return diverged_at
+    return Rollout(time, q, qd, qdd, diverged_at, *law)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from nfriction.simulation.compiled import System, integrate_compiled
+from nfriction.simulation.memory_step import memory_of
 from nfriction.simulation.protocols import Friction, NoFriction, Plant, RolloutInputs, as_stateful
 from nfriction.simulation.rk4 import simulate_eager
 
@@ -90,6 +91,11 @@ def simulate_stiction(
         ValueError: for what this scheme does not have.
     """
     given = gradients or inputs.measured is not None or inputs.hidden_state is not None
+    if memory_of(friction) is not None:
+        raise ValueError(
+            "a friction law with memory holds a joint by itself, so `time_stepping` has no use for "
+            'it; use scheme="rk4".'
+        )
     if given or isinstance(friction, NoFriction) or as_stateful(friction) is not None:
         raise ValueError(
             '`scheme="time_stepping"` needs a friction model, and has no gradients, measured '

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from nfriction import codegen
 from nfriction.simulation.compiled import System
+from nfriction.simulation.memory_step import memory_of
 from nfriction.simulation.protocols import Friction, NoFriction, Plant, RolloutInputs
 from nfriction.simulation.rk4 import RK4_STABILITY, required_substeps
 
@@ -180,6 +181,30 @@ def with_hidden_state(
     shape = np.broadcast_shapes(inputs.q0.shape, given.shape[:-1])
     q0, qd0 = inputs.q0.expand(shape), inputs.qd0.expand(shape)
     return replace(inputs, q0=q0, qd0=qd0, hidden_state=given)
+
+
+def with_law_state(
+    inputs: RolloutInputs, friction: Friction, law_state: Tensor | None
+) -> RolloutInputs:
+    """The inputs with the state that a friction law with memory starts from."""
+    law, shape = memory_of(friction), tuple(inputs.q0.shape)
+    if law is None:
+        if law_state is not None:
+            raise ValueError(
+                "`law_state` is for a friction law with memory, such as LuGre; leave it out."
+            )
+        return inputs
+    if law_state is None:
+        return replace(inputs, law_state=inputs.q0.new_zeros(*shape, law.size))
+    given = as_tensor("law_state", law_state).to(inputs.q0)
+    if given.shape[-2:] != (shape[-1], law.size) or not all_finite(given):
+        raise ValueError(
+            f"`law_state` must be finite (*batch, {shape[-1]}, {law.size}), got "
+            f"{tuple(given.shape)}."
+        )
+    shape = np.broadcast_shapes(shape, given.shape[:-1])
+    q0, qd0 = inputs.q0.expand(shape), inputs.qd0.expand(shape)
+    return replace(inputs, q0=q0, qd0=qd0, law_state=given.expand(*shape, law.size))
 
 
 def require_stability(system: System, inputs: RolloutInputs) -> None:

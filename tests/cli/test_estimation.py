@@ -2,15 +2,16 @@
 
 import argparse
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from nfriction import cli, rigs
+from nfriction import cli, friction, rigs
 from nfriction.cli import inputs
+from nfriction.cli.console import Progress
 from nfriction.fitting.options import DEFAULTS
 from tests.cli.benches import compare, pendulum, results
 
@@ -190,3 +191,98 @@ def test_a_robot_description_is_as_good_as_a_rig_file(bench: Path, compared: Pat
         # The rig file knows the encoder's rounding besides, which weighs the samples of a lead-in.
         mine, other = (m[model]["test"]["b"]["free_run"]["all"] for m in (ours, theirs))
         assert mine == pytest.approx(other, rel=1e-4)
+
+
+OWN = """
+import torch
+from nfriction.friction.laws import Coefficient, Law
+
+def torque(qd, load, coefficients, v_smooth):
+    return coefficients[..., 0] * torch.tanh(qd / v_smooth) + coefficients[..., 1] * qd * qd.abs()
+
+STICKY = Law("sticky_joint", (Coefficient("K", "N m"), Coefficient("D", "N m s^2/rad^2")), torque)
+OTHER = 5
+TAKEN = Law("CVFM", (Coefficient("K", "N m"),), torque)
+"""
+
+
+@pytest.fixture
+def own_law(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file with a law of one's own, which no other test knows."""
+    for name in ("_LAWS", "_MODELS", "_ALL", "_BY_TEXT", "_OWN"):
+        monkeypatch.setattr(friction, name, dict(getattr(friction, name)))
+    path = tmp_path / "my.py"
+    path.write_text(OWN)
+    return path
+
+
+def test_a_law_of_ones_own_goes_all_the_way(
+    bench: Path, own_law: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    models = f"viscous,{own_law}:STICKY"
+    assert compare(bench, tmp_path / "out", models=models) == 0
+    assert set(results(tmp_path / "out")["models"]) == {"no friction", "NCFM", "sticky_joint"}
+    model = tmp_path / "out" / "models" / "sticky_joint.json"
+    words = ["--law", f"{own_law}:STICKY"]
+    assert cli.main(["info", str(model), *words]) == 0
+    out = ["--format", "c", "--out", str(tmp_path / "c")]
+    assert cli.main(["export", str(model), *out, *words]) == 0
+    assert (tmp_path / "c" / "sticky_joint.c").is_file()
+    assert "sticky_joint, sticky-joint" in capsys.readouterr().out
+    assert inputs.models(f"neuro-fuzzy:{own_law}:STICKY,sticky-joint") == [
+        "NFsticky_joint",
+        "sticky_joint",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("law", "said"),
+    [
+        ("my.py:STICKI", "has no law STICKI; its laws: STICKY"),
+        ("my.py:OTHER", "has no law OTHER"),
+        ("my.py:TAKEN", "CVFM is one of the library"),
+        ("absent.py:STICKY", "absent.py is not there"),
+        ("broken.py:STICKY", "broken.py cannot be run: NameError"),
+    ],
+)
+def test_a_law_that_cannot_be_used_is_named(
+    law: str, said: str, own_law: Path, failing: Callable[..., str]
+) -> None:
+    (own_law.parent / "broken.py").write_text("STICKY = lw\n")
+    words = ("a.csv", "--rig", "tlrip", "--model", own_law.parent / law)
+    (own_law.parent / "a.csv").touch()
+    assert said in failing("fit", own_law.parent / "a.csv", *words[1:])
+
+
+def test_a_model_file_of_an_unknown_law_says_how_to_name_it(
+    bench: Path, own_law: Path, tmp_path: Path, failing: Callable[..., str]
+) -> None:
+    assert compare(bench, tmp_path / "out", models=f"{own_law}:STICKY") == 0
+    for known in (friction._LAWS, friction._MODELS, friction._ALL, friction._OWN):
+        for name in [n for n in known if "sticky" in n]:
+            del known[name]
+    model = tmp_path / "out" / "models" / "sticky_joint.json"
+    assert "name its law, --law my.py:LAW" in failing("export", model, "--format", "c")
+
+
+def test_progress_counts_stages_and_estimates_the_time_left(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = [0.0]
+    monkeypatch.setattr("nfriction.cli.console.time.monotonic", lambda: clock[0])
+    with Progress() as progress:
+        progress.expect(4)
+        progress.stage("fit CVFM")
+        assert capsys.readouterr().err == ""  # a run of seconds needs no lines
+        clock[0] = 12.0
+        progress.step("2 s windows")
+        clock[0] = 15.0
+        progress.step("2 s windows")
+        progress.done()
+        progress.stage("fit NFCVFM")
+        clock[0] = 30.0
+        progress.step("0.5 s windows")
+    assert capsys.readouterr().err.splitlines() == [
+        "nfriction: 1 of 4: fit CVFM, 2 s windows, step 1 (12 s)",
+        "nfriction: 2 of 4: fit NFCVFM, 0.5 s windows, step 1 (30 s, about 90 s left)",
+    ]

@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from nfriction.codegen import UnsupportedOperation, compile_function
-from nfriction.codegen.derivative import _RULES, tangents, with_jacobian
 from nfriction.codegen.graph import trace
 from nfriction.codegen.scalar import Graph, evaluate, reachable
+from nfriction.codegen.transform import _RULES, tangents, with_jacobian
 
 RULES = {
     "add": lambda x, y: x + y,

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from nfriction.codegen.hoist import hoist
 from nfriction.codegen.scalar import Graph, UpdateRate, evaluate, reachable
+from nfriction.codegen.transform import hoist
 
 
 def example():

@@ -217,52 +217,6 @@ def test_inputs_are_read_where_they_are(coulomb):
     )
 
 
-@pytest.mark.parametrize("wanted", [("q", "qd", "held"), ("qd", "plant.gravity", "friction.log")])
-def test_derivatives_of_each_step_come_with_it(wanted):
-    plant, friction = Pendulum(2), NeuroFuzzy(2)
-    compiled = compile_rollout(plant, friction, jacobian=wanted)
-    q, qd = start(2, batch=5)
-    tau = torch.randn(20, 2, dtype=F64)
-    got = run(compiled, q, qd, steps=20, time_step=1e-3, tau=tau)
-    plain = run(compile_rollout(plant, friction), q, qd, steps=20, time_step=1e-3, tau=tau)
-    torch.testing.assert_close(got.q, plain.q, **TOLERANCE)
-    before = {name: getattr(got, name)[2, 7] for name in ("q", "qd")}
-    held = friction.coefficients(got.qd[2, 7], got.qdd[2, 7]).detach()
-
-    def after(**changed):
-        own = {"q": before["q"], "qd": before["qd"], "held": held} | changed
-        swapped = {n: own.pop(n) for n in list(own) if "." in n}
-
-        def step(module):
-            return torch.cat(rk4_step(module[0], module[1], own["q"], own["qd"], tau[7],
-                                      own["held"], 1e-3))  # fmt: skip
-
-        system = nn.ModuleDict({"plant": plant, "friction": friction})
-        with torch.nn.utils.parametrize.cached():
-            return torch.func.functional_call(
-                _Called(system, step), {f"system.{n}": v for n, v in swapped.items()}, ()
-            )
-
-    values = {**before, "held": held, "plant.gravity": plant.gravity,
-              "friction.log": friction.log.detach()}  # fmt: skip
-    columns = [
-        torch.func.jacfwd(lambda x, n=name: after(**{n: x}))(values[name]).reshape(6, -1)
-        for name in wanted
-    ]
-    torch.testing.assert_close(got.jacobian[2, 7], torch.cat(columns, -1), rtol=1e-9, atol=1e-12)
-    with pytest.raises(ValueError, match="one step a sample"):
-        run(compiled, q, qd, steps=20, time_step=1e-3, substeps=2)
-
-
-class _Called(nn.Module):
-    def __init__(self, system, function):
-        super().__init__()
-        self.system, self.function = system, function
-
-    def forward(self):
-        return self.function((self.system["plant"], self.system["friction"]))
-
-
 def test_numpy_in_numpy_out(coulomb):
     _, _, compiled = coulomb
     got = run(compiled, np.ones((2, 3)), np.zeros((1, 3)), steps=5, time_step=1e-3)

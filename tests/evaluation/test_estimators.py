@@ -156,9 +156,15 @@ def test_misuse_is_told(recordings: list[Recording]) -> None:
         FrictionEstimator().fit(recordings)
     with pytest.raises(ValueError, match="no friction model is called"):
         FrictionEstimator(pendulum(), "XFM").fit(recordings)
-    for wrong in (recordings[0].q, [recordings[0].q], [], "a.csv"):
-        with pytest.raises(ValueError, match=r"a sample is a Recording|recordings are needed"):
+    for wrong in (recordings[0].q, [recordings[0].q], 5):
+        with pytest.raises(TypeError, match="a recording is a Recording, the path"):
             FrictionEstimator(pendulum()).fit(wrong)
+    with pytest.raises(ValueError, match="recordings are needed"):
+        FrictionEstimator(pendulum()).fit([])
+    with pytest.raises(FileNotFoundError, match=r"a\.csv"):
+        FrictionEstimator(pendulum()).fit("a.csv")
+    with pytest.raises(ValueError, match="no rig 'penduluum'"):
+        FrictionEstimator("penduluum").fit(recordings)
 
 
 def test_without_scikit_learn_the_library_works_and_the_estimator_says_what_it_needs() -> None:

@@ -2,6 +2,7 @@
 
 import importlib
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import nfriction
-from nfriction import cli
+from nfriction import cli, friction
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
@@ -51,10 +52,13 @@ def test_there_are_pages_and_commands() -> None:
 def test_commands_parse(
     page: str, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = line.split()[1:]
+    words = shlex.split(line)[1:]
     if words == ["--help"]:
         return
     monkeypatch.chdir(tmp_path)
+    for name in ("_LAWS", "_MODELS", "_ALL", "_BY_TEXT", "_OWN"):
+        monkeypatch.setattr(friction, name, dict(getattr(friction, name)))
+    shutil.copy(ROOT / "examples" / "own_law.py", tmp_path)
     for word in filter(FILE.match, words):
         (tmp_path / word).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / word).touch()

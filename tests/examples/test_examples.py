@@ -18,6 +18,7 @@ SAID = {
     "fit_a_recording": "best: ",
     "fuzzy_rules": "in % of range",
     "many_fits_on_dask": "fitted on 2 workers",
+    "motor_bench": "true 0.12",
     "neuro_fuzzy": "THEN C_p = ",
     "own_law": "true 0.0004",
     "own_rig": "fitted B, C:",

@@ -6,7 +6,7 @@ from torch import Tensor
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import LINEAR, Law
 from nfriction.friction.models import FrictionModel
-from nfriction.io.model_info import ModelInfo
+from nfriction.io.model_file import ModelInfo
 from tests.friction.samples import randomise
 
 INFO = ModelInfo(

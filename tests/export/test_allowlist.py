@@ -204,7 +204,7 @@ def test_views_of_memory_beyond_a_tensor_are_refused() -> None:
 
 
 def test_a_script_without_an_end_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(verification, "STARTING", 8.0)
+    monkeypatch.setattr(verification, "STARTING", 4.0)
     monkeypatch.setattr(verification, "BY_SAMPLE", 0.0)
     with pytest.raises(ExportError, match="does not come to an end"):
         verify_artefact(scripted(Endless(), tmp_path / "bad.pt"), MODEL, INFO)

@@ -22,7 +22,8 @@ from nfriction.friction import model_by_name, model_names
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.models import FrictionModel
-from nfriction.io.model_info import ModelInfo
+from nfriction.io.model_file import ModelInfo
+from nfriction.plant import Rotor, rigs
 from tests.export.artefacts import Rising
 from tests.friction.samples import randomise
 
@@ -51,13 +52,13 @@ INFO = ModelInfo(
 )
 
 
-def random_model(name: str, joints: int = 3, seed: int = 0) -> FrictionModel:
+def random_model(name: str, joints: int = 3, seed: int = 0, **options: object) -> FrictionModel:
     """A named model, every parameter off its start."""
     random = torch.Generator().manual_seed(seed)
     kind = model_by_name(name)
     initial = INITIAL[kind(1).law.name]
     factors = 1.0 + 0.3 * torch.rand(joints, len(initial), generator=random, dtype=torch.float64)
-    model = kind(joints, factors * torch.tensor(initial, dtype=torch.float64))
+    model = kind(joints, factors * torch.tensor(initial, dtype=torch.float64), **options)
     with torch.no_grad():
         for p in model.parameters():
             p.add_(0.1 * torch.randn(p.shape, generator=random, dtype=p.dtype))
@@ -436,7 +437,7 @@ def test_one_input_may_have_fewer_sets_than_the_other(tmp_path, terms):
 
 
 def test_sets_so_narrow_that_all_underflow_export(tmp_path):
-    model = random_model("NFLFM")
+    model = random_model("NFLFM", interpretable=False)
     with torch.no_grad():
         model.schedule.network.anfis.partition.log_widths.sub_(2.7)
     c(model, tmp_path, INFO)
@@ -531,3 +532,42 @@ def test_passes_on_a_big_endian_powerpc(exported, name, dtype, flags):
         ["qemu-ppc", folder / "ppc"], capture_output=True, text=True, timeout=120
     )
     assert result.returncode == 0, result.stdout
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize(
+    "plant",
+    [rigs.multiarm_triple(), rigs.tlrip("free"), Rotor(0.02)],
+    ids=["chain", "arm", "rotor"],
+)
+def test_the_load_beside_a_law_that_reads_it_is_the_plants(plant, dtype, tmp_path):
+    joints = plant.joints
+    info = ModelInfo(rig=plant.to_dict(), joint_names=plant.joint_names)
+    model = random_model("LFM", joints)
+    c(model, tmp_path, info, dtype=dtype)
+    q, qd = torch.randn(2, 200, joints, generator=torch.Generator().manual_seed(1)).double()
+    rows = torch.cat([q, qd], -1).tolist()
+    numbers = ",\n".join(", ".join(map(repr, row)) for row in rows)
+    (tmp_path / "main.cpp").write_text(
+        '#include <cstdio>\n#include "nfriction.hpp"\n'
+        f"static const double rows[200][{2 * joints}] = {{{numbers}}};\n"
+        "int main() {\n    for (int k = 0; k < 200; ++k) {\n"
+        "        nfriction::Joints q{}, qd{};\n"
+        f"        for (unsigned j = 0; j < {joints}; ++j) {{\n"
+        "            q[j] = static_cast<nfriction::Real>(rows[k][j]);\n"
+        f"            qd[j] = static_cast<nfriction::Real>(rows[k][{joints} + j]);\n        }}\n"
+        "        for (double n : nfriction::Friction::load(q, qd))\n"
+        '            std::printf("%.17g ", n);\n    }\n    return 0;\n}\n'
+    )
+    build([*C89, "-c", "nfriction.c"], tmp_path)
+    build([*CXX, "-Wno-missing-braces", "main.cpp", "nfriction.o", "-o", "load"], tmp_path)
+    said = subprocess.run([tmp_path / "load"], capture_output=True, text=True, check=True).stdout
+    found = np.array([float(x) for x in said.split()]).reshape(-1, joints)
+    tolerance = 1e-14 if dtype == "float64" else 2e-6
+    expected = plant.load(q, qd).numpy()
+    np.testing.assert_allclose(found, expected, rtol=tolerance, atol=tolerance)
+    build([*CXX, f"-I{STUBS}", "-fsyntax-only", "-x", "c++", "nfriction.ino"], tmp_path)
+    build([*C89[:-1], "-Wno-conversion", "-Werror", f"-I{STUBS}", "-c", "nfriction_sfun.c",
+           "-o", "s.o"], tmp_path)  # fmt: skip
+    c(random_model("CVFM", joints), tmp_path / "even", info)
+    assert "HAS_LOAD 0" in (tmp_path / "even" / "nfriction.h").read_text()

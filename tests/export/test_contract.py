@@ -18,7 +18,7 @@ from nfriction.export.contract import (
 from nfriction.export.controller import NOT_FINITE, controller_of
 from nfriction.friction.laws import LINEAR
 from nfriction.friction.models import LFM, FrictionModel
-from nfriction.io.model_info import ModelInfo
+from nfriction.io.model_file import ModelInfo
 from tests.export.artefacts import INFO, Rising
 from tests.friction.samples import named_models
 

@@ -11,7 +11,7 @@ from nfriction.export.controller import NOT_FINITE, OUTSIDE, SATURATED, controll
 from nfriction.export.test_vectors import draw
 from nfriction.friction.models import LFM
 from nfriction.friction.neurofuzzy import NFLFM
-from nfriction.io.model_info import ModelInfo
+from nfriction.io.model_file import ModelInfo
 from nfriction.signals import SecondOrderLowPass
 from tests.export.artefacts import INFO, rising
 from tests.friction.samples import motion, named_models, randomise

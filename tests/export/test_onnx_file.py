@@ -20,7 +20,7 @@ from nfriction.export.torch_archive import METADATA
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.models import LFM, FrictionModel
-from nfriction.io.model_info import ModelInfo
+from nfriction.io.model_file import ModelInfo
 from tests.export.artefacts import INFO, rising
 from tests.friction.samples import named_models
 

@@ -11,7 +11,7 @@ import torch
 from nfriction.export import fit_damping_frictionloss, mjcf, urdf
 from nfriction.friction.models import LFM, NCFM, NLFM
 from nfriction.friction.neurofuzzy import NFLFM
-from nfriction.io.model_info import ModelInfo
+from nfriction.io.model_file import ModelInfo
 from nfriction.papers.afem.adaptive import ALFM
 from nfriction.signals import Motion
 from tests.friction.samples import randomise

@@ -20,7 +20,7 @@ from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law, TorqueFunction
 from nfriction.friction.models import LFM, FrictionModel
 from nfriction.friction.neurofuzzy import NFLFM, NeuroFuzzy
-from nfriction.io.model_info import ModelInfo, parameter_hash
+from nfriction.io.model_file import ModelInfo, parameter_hash
 from tests.export.artefacts import INFO, rising
 from tests.friction.samples import QUADRATIC, named_models, randomise
 

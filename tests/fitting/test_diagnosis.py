@@ -7,12 +7,24 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction import CVFM, NCFM, LinearAxis, PendulumChain, Plant, Recording, fit, rollout
+from nfriction import (
+    CVFM,
+    NCFM,
+    LinearAxis,
+    Motor,
+    PendulumChain,
+    Plant,
+    Recording,
+    Rotor,
+    fit,
+    rollout,
+)
 from nfriction.fitting.fit import prepare_task
 from nfriction.fitting.options import FitOptions
 from nfriction.signals import kalman_smoother
 
 COUNT = 2 * math.pi / 4096
+WHEEL = {"inertia": 0.02, "motor": Motor(50, rotor_inertia=1.2e-5)}
 STEP, SAMPLES = 2e-3, 3001
 DOUBLE = {"mass": [0.5, 0.3], "length": [0.3, 0.25], "com": [0.15, 0.12],
           "inertia": [3.75e-3, 1.56e-3]}  # fmt: skip
@@ -34,7 +46,8 @@ def torque(peaks: list[float], seed: int) -> np.ndarray:
 def measured(name: str) -> tuple[Plant, np.ndarray, np.ndarray | None]:
     """Rig, positions in joint coordinates as encoders round them, and torques."""
     plants = {"free": PendulumChain(**DOUBLE), "driven": PendulumChain(**DOUBLE),
-              "motor": PendulumChain(**MOTOR), "axis": LinearAxis(0.13)}  # fmt: skip
+              "motor": PendulumChain(**MOTOR), "axis": LinearAxis(0.13),
+              "wheel": Rotor(**WHEEL)}  # fmt: skip
     plant, joints = plants[name], 2 if name in ("free", "driven") else 1
     friction = {"free": [[0.02, 0.004], [0.008, 0.003]], "driven": [[0.1, 0.05], [0.02, 0.01]]}
     model = CVFM(joints, friction.get(name, [[0.3, 0.12]])).requires_grad_(False)
@@ -105,7 +118,8 @@ def test_mistakes_in_torques(name, change, finding):
 @pytest.mark.parametrize(
     ("name", "rig", "finding"),
     [
-        ("motor", {"armature": None}, "rotor inertia (`armature`) of 0.05"),
+        ("wheel", {"motor": Motor(50)}, "rotor inertia of 0.03"),
+        ("motor", {"armature": None}, "rotor inertia of 0.05"),
         ("motor", {"inertia": [0.0075 + 0.15**2]}, "inertias are about the joints"),
         ("motor", {"mass": [1e3], "inertia": [7.5]}, "masses are in g"),
         ("driven", {"length": [300, 250], "com": [150, 120]}, "lengths are in mm"),
@@ -115,7 +129,8 @@ def test_mistakes_in_torques(name, change, finding):
 )
 def test_mistakes_in_rigs(name, rig, finding):
     _, q, tau = measured(name)
-    plant = PendulumChain(**{**(MOTOR if name == "motor" else DOUBLE), **rig})
+    kind = Rotor if name == "wheel" else PendulumChain
+    plant = kind(**{**{"motor": MOTOR, "wheel": WHEEL}.get(name, DOUBLE), **rig})
     assert finding in warnings_of(plant, q, tau)[0]
 
 
@@ -129,8 +144,19 @@ def test_mistakes_in_conventions_and_time():
         "angles are measured from upright, not from hanging"
         in warnings_of(plant, q, tau, convention="relative,hanging")[0]
     )
+    for name in ("free", "driven"):
+        plant, q, tau = measured(name)
+        misread = np.cumsum(q - [math.pi, 0], axis=1)
+        first = warnings_of(plant, misread, tau, convention="relative,hanging")[0]
+        assert "angles are absolute, not relative" in first
     with pytest.warns(UserWarning, match="milliseconds"):
         assert "time is in ms" in warnings_of(plant, q, tau, time=2.0 * np.arange(len(q)))[0]
+
+
+def test_exchanged_columns_are_named():
+    plant, q, tau = measured("driven")
+    swapped = (np.ascontiguousarray(x[:, ::-1]) for x in (q, tau))
+    assert "the columns of joint1 and joint2 are exchanged" in warnings_of(plant, *swapped)[0]
 
 
 def test_an_advanced_torque_is_in_line_again():

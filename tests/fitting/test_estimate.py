@@ -21,9 +21,10 @@ from nfriction import (
     Recording,
     Stribeck,
     fit,
+    rigs,
     rollout,
 )
-from nfriction.fitting.equation_error import fit_torque
+from nfriction.fitting.equation_error import fit_equation_error
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.fitting.strategy.continuation import HorizonResult
@@ -201,8 +202,8 @@ def test_windows_that_are_left_out_are_told(monkeypatch):
     assert not any("were skipped" in told for told in alone.warnings)
     assert found.residual == pytest.approx(alone.residual, rel=0.2)
     # Whatever starts there says it, too.
-    for score in (2.0, 0.0):
-        monkeypatch.setattr("nfriction.fitting.strategy.holdout.HoldoutScore.score", score)
+    for kept in (False, True):
+        monkeypatch.setattr("nfriction.fitting.strategy.holdout.Judgement.kept", kept)
         network = NFLFM(2, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2)
         further = fit(network, pendulum(), recording, start=found, windows=(0.5,), max_steps=2)
         assert sum("were skipped" in told for told in further.warnings) == 1
@@ -415,18 +416,32 @@ def test_a_method_that_is_none_is_named():
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (lambda m, p, r: ("LFM", p, r), "`model` must be a friction model .*'LFM'"),
-        (lambda m, p, r: (m, "tlrip", r), "`plant` must be a PendulumChain .*'tlrip'"),
-        (lambda m, p, r: (m, r, p), "`plant` must be"),
-        (lambda m, p, r: (m, p, "run.csv"), "`recordings` must be one Recording .*'run.csv'"),
-        (lambda m, p, r: (m, p, r.q), "`recordings` must be"),
-        (lambda m, p, r: (m, p, r.to_pandas()), "`recordings` .*from_pandas.* got DataFrame"),
+        (lambda m, p, r: (LFM, p, r), "`model` must be a friction model .*LFM"),
+        (lambda m, p, r: (m, r, p), "`plant` must be a mechanism"),
+        (lambda m, p, r: (m, p, r.q), "a recording is a Recording, the path"),
+        (lambda m, p, r: (m, p, 5), "a recording is a Recording, the path"),
     ],
 )
 def test_what_is_something_else_is_told(arguments, told):
     recording = swing(pendulum(), LFM(2, v_smooth=0.05), seconds=0.2)
     with pytest.raises(TypeError, match=told):
         fit(*arguments(LFM(2), pendulum(), recording))
+
+
+def test_names_paths_and_tables_are_taken_as_what_they_name(tmp_path):
+    recording = swing(pendulum(), LFM(2, v_smooth=0.05), seconds=0.5)
+    recording.write(tmp_path / "run.csv")
+    rigs.write(pendulum(), tmp_path / "rig.json")
+    settings = {"windows": (0.2,), "max_steps": 2}
+    wanted = fit(CVFM(2), pendulum(), recording, **settings)
+    for given in (str(tmp_path / "run.csv"), [tmp_path / "run.csv"], recording.to_pandas()):
+        found = fit("coulomb-viscous", tmp_path / "rig.json", given, **settings)
+        assert type(found.model) is CVFM
+        assert found.residual == pytest.approx(wanted.residual, rel=1e-6)
+    with pytest.raises(ValueError, match=r"no friction model is called 'coulom'.*did you mean"):
+        fit("coulom", pendulum(), recording)
+    with pytest.raises(FileNotFoundError):
+        fit("coulomb", pendulum(), "absent.csv")
 
 
 FALLING = [[4e-4, 6e-3, 3e-4, 0.8, 2.0], [3e-4, 4e-3, 2e-4, 0.8, 2.0]]
@@ -440,13 +455,13 @@ def misled(monkeypatch):
 
     def by_torque(law, plant, *rest):
         asked.append(plant)
-        found = fit_torque(law, plant, *rest)
+        found = fit_equation_error(law, plant, *rest)
         if len(asked) > 1:
             return found
         poor = torch.tensor(POOR, dtype=F64)[:, : found.coefficients.shape[1]]
         return replace(found, coefficients=poor)
 
-    monkeypatch.setattr("nfriction.fitting.strategy.constant.fit_torque", by_torque)
+    monkeypatch.setattr("nfriction.fitting.strategy.constant.fit_equation_error", by_torque)
     return asked
 
 
@@ -499,13 +514,13 @@ def test_a_search_in_vain_from_the_simpler_law_leaves_the_model_as_it_was(monkey
     simpler = []
 
     def by_torque(law, plant, *rest):
-        found = fit_torque(law, plant, *rest)
+        found = fit_equation_error(law, plant, *rest)
         if not simpler:
             simpler.extend([1] if law.nested_law is None else [])
             return found
         return replace(found, coefficients=torch.tensor(POOR, dtype=F64))
 
-    monkeypatch.setattr("nfriction.fitting.strategy.constant.fit_torque", by_torque)
+    monkeypatch.setattr("nfriction.fitting.strategy.constant.fit_equation_error", by_torque)
     found = fit(Stribeck(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
     assert simpler
     monkeypatch.setattr(
@@ -522,12 +537,12 @@ def test_a_law_leaves_no_more_over_than_the_simpler_one_in_it(law, monkeypatch):
     """However badly torques mislead it."""
 
     def by_torque(law, plant, *rest):
-        found = fit_torque(law, plant, *rest)
+        found = fit_equation_error(law, plant, *rest)
         if law.nested_law is None:
             return found
         return replace(found, coefficients=0 * found.coefficients + 10.0)
 
-    monkeypatch.setattr("nfriction.fitting.strategy.constant.fit_torque", by_torque)
+    monkeypatch.setattr("nfriction.fitting.strategy.constant.fit_equation_error", by_torque)
     recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH), seconds=2.0)
     simpler, found = (
         fit(of(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5, 1.0), max_steps=8)

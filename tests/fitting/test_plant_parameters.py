@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nfriction import LinearAxis, PendulumChain, rigs
+from nfriction import LinearAxis, PendulumChain, Rotor, rigs
 from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.plant_parameters import adjusted_buffers, plant_parameters
 from tests.fitting.recordings import F64, pendulum
@@ -22,6 +22,14 @@ def test_free_swing_keeps_one_gravity_term_as_the_scale():
         "gravity 1", "torque gain 2", "gear loss 1", "gear loss 2", "torque offset 1 [N m]",
         "torque offset 2 [N m]",
     }  # fmt: skip
+
+
+def test_a_wheel_has_no_angle_to_be_off_and_coasting_keeps_its_inertia():
+    driven = {"inertia 11", "gear loss 1", "torque offset 1 [N m]"}
+    assert set(names(Rotor(0.02), driven=(0,), largest_torque=1.0)) == driven
+    assert names(Rotor(0.02), driven=()) == []
+    pendulum = {"gravity 1", "angle offset 1 [rad]"}
+    assert set(names(Rotor(0.05, 0.5, 0.3), driven=(0,), largest_torque=1.0)) == driven | pendulum
 
 
 def test_a_joint_that_nothing_drives_has_no_torque_to_be_off():

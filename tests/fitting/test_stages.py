@@ -1,6 +1,7 @@
 """A stage tells its steps, ends where it creeps, and says so; none loses what was found."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -14,6 +15,7 @@ from nfriction.fitting.strategy.continuation import (
     ShootingFitter,
     StallMonitor,
     log_ratio,
+    loses,
     settle_states,
 )
 from nfriction.optim.least_squares import Step
@@ -116,6 +118,21 @@ def test_long_windows_do_not_lose_the_friction_that_short_ones_found():
     assert found.skipped_horizons == (0.5, 2.0, 5.0)[len(lengths) :]
     for length in found.skipped_horizons:
         assert any(f"Windows of {length:g} s were skipped" in w for w in found.warnings)
+
+
+def test_a_free_swing_keeps_what_short_windows_found():
+    """Where rounding explains the short windows, the law is right, and no other is better."""
+    search, problem = short_search()
+    found = search.search(problem, problem.variables.start(), 1e-9, "")
+    assert found.explained
+    assert not problem.windows.tau.any()
+    assert not loses([found], found)
+
+    again = search.search(problem, problem.variables.start(), 1e-4, "")
+    assert not loses([found], again)
+    wrong = found.result.x.clone()
+    wrong[: problem.variables.friction_count] *= 1.3
+    assert loses([found], replace(found, result=replace(found.result, x=wrong)))
 
 
 def test_states_settle_while_the_parameters_stay():

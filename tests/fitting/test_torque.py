@@ -5,7 +5,12 @@ import pytest
 import torch
 
 from nfriction import LinearAxis, Recording, Stribeck, fit
-from nfriction.fitting.equation_error import TorqueFit, fit_torque, friction_torque, prior_sd
+from nfriction.fitting.equation_error import (
+    TorqueFit,
+    fit_equation_error,
+    friction_torque,
+    prior_sd,
+)
 from nfriction.fitting.options import DEFAULTS
 from nfriction.friction import model_by_name
 from nfriction.friction.laws import LINEAR, NONLINEAR, Coefficient, Law
@@ -41,7 +46,7 @@ def test_noiseless_torques_give_the_exact_coefficients(name):
     plant = pendulum()
     model = model_by_name(name)(2, TRUTH[name], v_smooth=V_SMOOTH)
     recording, motion, tau_f = moved(model, plant)
-    found = fit_torque(model.law, plant, [recording], [motion], V_SMOOTH)
+    found = fit_equation_error(model.law, plant, [recording], [motion], V_SMOOTH)
     truth = torch.tensor(TRUTH[name], dtype=torch.float64)
     torch.testing.assert_close(found.coefficients, truth, rtol=1e-6, atol=1e-10)
     assert float(found.residual.max()) < 1e-9 * float(found.torque.max())
@@ -72,17 +77,19 @@ def test_too_few_samples_are_refused():
     for count, enough in ((12, False), (ends + 2, False), (ends + 10, True)):
         part = Motion(*(x[:count] for x in (motion.time, motion.q, motion.qd, motion.qdd)))
         if enough:
-            fit_torque(law, plant, [recording[:count]], [part])
+            fit_equation_error(law, plant, [recording[:count]], [part])
             continue
         with pytest.raises(ValueError, match=r"too few samples.*2 coefficients.*for longer"):
-            fit_torque(law, plant, [recording[:count]], [part])
+            fit_equation_error(law, plant, [recording[:count]], [part])
 
 
 def test_recordings_are_weighed_together_by_their_samples():
     plant = pendulum()
     models = [model_by_name("NCFM")(2, [c], v_smooth=V_SMOOTH) for c in (1e-3, 3e-3)]
     parts = [moved(m, plant) for m in models]
-    both = fit_torque(models[0].law, plant, [p[0] for p in parts], [p[1] for p in parts], V_SMOOTH)
+    both = fit_equation_error(
+        models[0].law, plant, [p[0] for p in parts], [p[1] for p in parts], V_SMOOTH
+    )
     torch.testing.assert_close(both.coefficients, torch.full((2, 1), 2e-3, dtype=torch.float64))
 
 
@@ -93,9 +100,9 @@ def test_what_is_positive_by_physics_stays_so():
     backwards = Recording(recording.time, recording.q, tau=2 * np.asarray(
         plant.inverse_dynamics(*(torch.as_tensor(x) for x in (motion.q, motion.qd, motion.qdd)))
     ) - recording.tau)  # fmt: skip
-    found = fit_torque(LINEAR, plant, [backwards], [motion], V_SMOOTH)
+    found = fit_equation_error(LINEAR, plant, [backwards], [motion], V_SMOOTH)
     assert (found.coefficients >= 0).all()
-    signed = fit_torque(model.law, plant, [recording], [motion], V_SMOOTH)
+    signed = fit_equation_error(model.law, plant, [recording], [motion], V_SMOOTH)
     assert (signed.coefficients[:, 0] < 0).all()
 
 
@@ -119,7 +126,7 @@ def test_a_law_that_gives_no_number_is_named_with_joint_and_velocity():
     recording, motion, _ = moved(model_by_name("NCFM")(2, TRUTH["NCFM"]), plant)
     law = Law("root", (Coefficient("R", "N m"),), root)
     with pytest.raises(ValueError, match=r"law 'root' gives nan where R is 1, at joint \d, vel"):
-        fit_torque(law, plant, [recording], [motion], V_SMOOTH)
+        fit_equation_error(law, plant, [recording], [motion], V_SMOOTH)
 
 
 def test_friction_that_falls_with_speed_shows_in_smoothed_torques():

@@ -19,13 +19,15 @@ from nfriction.friction.models import LFM, NCFM, NLFM, FrictionModel
 from nfriction.friction.neurofuzzy import NFLFM, NFNLFM, NeuroFuzzy
 from nfriction.io.model_file import (
     ModelFileError,
+    ModelInfo,
+    describe,
     load,
     load_info,
     load_plant,
+    parameter_hash,
     read_model_file,
     save,
 )
-from nfriction.io.model_info import ModelInfo, describe, parameter_hash
 from tests.fitting.recordings import pendulum, swing
 from tests.friction.samples import QUADRATIC, motion, named_models, quadratic, randomise
 

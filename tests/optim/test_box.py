@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from nfriction.optim import bounded_qp as box
-from nfriction.optim.bounded_qp import minimise
-from nfriction.optim.linear_algebra import solve_semidefinite
+from nfriction.optim.bounded_qp import minimise, solve_semidefinite
 
 F64 = torch.float64
 

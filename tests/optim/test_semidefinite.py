@@ -3,9 +3,9 @@
 import pytest
 import torch
 
+from nfriction.optim.bounded_qp import solve_arrowhead, solve_semidefinite
 from nfriction.optim.least_squares import Quadratic
 from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
-from nfriction.optim.linear_algebra import solve_arrowhead, solve_semidefinite
 
 F64 = torch.float64
 SHARED, SIZE, COUNT = 3, 2, 50
@@ -44,7 +44,7 @@ def test_what_nothing_tells_stays_at_zero(lost):
 @pytest.mark.parametrize("bound", [float("inf"), 0.05])
 def test_a_search_goes_the_same_way_with_blocks_and_without(bound, monkeypatch):
     """Also where a shared unknown ends at a bound."""
-    monkeypatch.setattr("nfriction.optim.linear_algebra.MANY_BLOCKS", COUNT)
+    monkeypatch.setattr("nfriction.optim.bounded_qp.MANY_BLOCKS", COUNT)
     jacobian, r = bordered()
     upper = torch.full((jacobian.shape[1],), torch.inf, dtype=F64)
     upper[0] = bound

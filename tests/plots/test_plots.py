@@ -12,6 +12,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
@@ -19,8 +20,9 @@ from nfriction import plots
 from nfriction.evaluation.compare import NO_FRICTION, Comparison
 from nfriction.evaluation.score import RMSE, Limit, Score
 from nfriction.fitting.fit import fit
+from nfriction.fitting.result.uncertainty import CoefficientUncertainty
 from nfriction.friction import model_names
-from nfriction.friction.models import LFM, NCFM, NLFM
+from nfriction.friction.models import CVFM, LFM, NCFM, NLFM
 from nfriction.friction.neurofuzzy import NFLFM, NFNCFM, NFNLFM
 from nfriction.papers.controller.mamdani import paper_controller
 from nfriction.plant import LinearAxis, rigs
@@ -223,14 +225,31 @@ def test_torque_of_the_motion_lies_on_the_law_that_made_it():
     figure = plots.torque_over_velocity(plant, {"LFM": law}, [recording], [motion])
     (ax,) = figure.axes
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("joint velocity [m/s]", "friction force [N]")
-    dots, line, medians = ax.lines
+    dots, line = ax.lines
     velocity = torch.as_tensor(line.get_xdata())[:, None]
     expected = law(velocity, 0 * velocity, torch.ones_like(velocity)).detach()[:, 0]
     np.testing.assert_allclose(line.get_ydata(), expected, rtol=1e-12)
-    for shown in (dots, medians):
-        x, y = shown.get_data()
-        clear = np.abs(x) > 0.05  # away from the sign's passage, inside which a line has corners
-        np.testing.assert_allclose(y[clear], np.interp(x, *line.get_data())[clear], rtol=1e-3)
+    x, y = dots.get_data()
+    clear = np.abs(x) > 0.05  # away from the sign's passage, inside which a line has corners
+    np.testing.assert_allclose(y[clear], np.interp(x, *line.get_data())[clear], rtol=1e-3)
+    assert_tidy(figure)
+
+
+def test_the_band_around_a_law_holds_what_its_parameters_leave_open():
+    law = CVFM(1, [3.0, 5.0])
+    plant, recording, motion = axis_data(law)
+    # Deviations of 0.1 N and 0.2 N s/m, independent of each other.
+    known = CoefficientUncertainty(law.schedule, torch.diag(torch.tensor([0.1, 0.2]).double()))
+    figure = plots.torque_over_velocity(
+        plant, {"CVFM": law}, [recording], [motion], uncertainty={"CVFM": known}
+    )
+    (ax,) = figure.axes
+    (band,) = (c for c in ax.collections if isinstance(c, PolyCollection))
+    corners = band.get_paths()[0].vertices
+    at = corners[np.isclose(corners[:, 0], corners[:, 0].max()), 1]
+    v = float(corners[:, 0].max())
+    assert np.ptp(at) / 2 == pytest.approx(1.96 * np.hypot(0.1, 0.2 * v), rel=1e-3)
+    assert (at.min() + at.max()) / 2 == pytest.approx(3.0 + 5.0 * v, rel=1e-6)
     assert_tidy(figure)
 
 
@@ -360,6 +379,10 @@ def test_save_all_writes_every_figure_and_leaves_matplotlib_alone(tmp_path):
     assert {f.name for f in files} == {f"{n}{of}.png" for n in expected for of in ("", ".dark")}
     assert all(f.read_bytes().startswith(b"\x89PNG") for f in files)
     assert rc_params() == before
+    assert (tmp_path / "figures" / "rmse_test.png").is_file()
+    paper = plots.save_all(comparison, [], tmp_path / "paper", formats=("svg", "pdf"))
+    assert {f.suffix for f in paper} == {".png", ".svg", ".pdf"}
+    assert (tmp_path / "paper" / "rmse_test.pdf").read_bytes().startswith(b"%PDF")
     # A network whose coefficients are constants, as of one that was rejected, has nothing to show.
     rejected = replace(comparison, fits=fits | {"NFNCFM": replace(found, model=NFNCFM(1))})
     names = {f.name for f in plots.save_all(rejected, [recording], tmp_path / "fewer")}

@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 import torch
 
+from nfriction.plant import Motor, Rotor
 from nfriction.recording import Recording, RecordingWarning, read_initial_states
 from nfriction.recording.angles import AngleConvention
 
@@ -163,7 +164,7 @@ def test_a_column_that_looks_like_torque_is_not_left_out_without_a_word(
 def test_a_current_is_no_torque_and_not_left_out_without_a_word(name: str) -> None:
     table = swing(joints=1).to_pandas().filter(regex="time|q")
     table[name] = 1.0
-    said = "looks like motor current and is not read; .* multiply it by the torque constant"
+    said = "looks like motor current and is not read; .* give the rig a `motor` with its `torque_"
     with pytest.warns(RecordingWarning, match=said):
         assert Recording.from_pandas(table).tau is None
 
@@ -636,3 +637,51 @@ def test_initial_states_name_their_faults(tmp_path: Path) -> None:
     assert [list(part) for part in states["b"]] == [[7], [8]]
     for label, parts in read_initial_states(path, degrees=True).items():
         np.testing.assert_allclose(np.rad2deg(parts), states[label], rtol=4e-16)
+
+
+GEARED = Rotor(0.02, motor=Motor(gear_ratio=50, torque_constant=0.03))
+
+
+def motor_log(**columns: object) -> pd.DataFrame:
+    """A table of a motor's counts of 1000 a turn and its current."""
+    log = {"time": 0.01 * np.arange(20), "enc": 1000 * np.arange(20), "I": np.linspace(-1, 1, 20)}
+    return pd.DataFrame(log | columns)
+
+
+def test_angle_and_current_of_a_motor_become_those_of_its_joint() -> None:
+    columns = {"motor1": "enc:counts/1000", "current1": "I"}
+    recording = Recording.from_pandas(motor_log(), columns=columns, plant=GEARED)
+    np.testing.assert_allclose(recording.q[:, 0], 2 * np.pi / 50 * np.arange(20))
+    assert recording.tau is not None
+    np.testing.assert_allclose(recording.tau[:, 0], 50 * 0.03 * np.linspace(-1, 1, 20))
+    milli = Recording.from_pandas(
+        motor_log(I=1e3 * np.linspace(-1, 1, 20)),
+        columns=columns | {"current1": "I:mA"},
+        plant=GEARED,
+    )
+    np.testing.assert_allclose(milli.tau, recording.tau)
+
+
+def test_columns_of_joints_win_over_those_of_motors_unless_named() -> None:
+    table = motor_log(q1=0.1, tau1=2.0, motor1=5.0, current1=1.0)
+    recording = Recording.from_pandas(table, plant=GEARED)
+    assert recording.q[0, 0] == 0.1
+    assert recording.tau is not None
+    assert recording.tau[0, 0] == 2.0
+    named = Recording.from_pandas(table, columns={"motor1": "motor1:deg"}, plant=GEARED)
+    assert named.q[0, 0] == pytest.approx(np.deg2rad(5.0) / 50)
+    with pytest.raises(ValueError, match="names q1 and motor1, but one follows"):
+        Recording.from_pandas(table, columns={"q1": "q1", "motor1": "enc"}, plant=GEARED)
+
+
+def test_a_motor_unknown_to_the_rig_is_named() -> None:
+    with pytest.raises(ValueError, match=r"motor1 is of a motor.*`gear_ratio`.*plant=rig"):
+        Recording.from_pandas(motor_log(motor1=1.0))
+    table = motor_log(q1=0.1)
+    rig = Rotor(0.02, motor=Motor(50))
+    with pytest.raises(ValueError, match=r"current1 is of a motor.*`torque_constant`"):
+        Recording.from_pandas(table, columns={"current1": "I"}, plant=rig)
+    # A column that happens to be there is no reason to stop.
+    with pytest.warns(RecordingWarning, match="looks like motor current"):
+        found = Recording.from_pandas(table.rename(columns={"I": "current1"}), plant=rig)
+    assert found.tau is None

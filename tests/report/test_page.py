@@ -102,7 +102,10 @@ def test_what_a_reader_of_the_screen_needs(page):
 def test_verdicts_warnings_and_rules_are_told(page):
     text = " ".join("".join(page.text).split())
     for said in (
-        "LFM predicts the test recordings best: 100 mrad, where no friction leaves 2000.",
+        "LFM (load-coulomb) predicts the test recordings best: 100 mrad, where no friction leaves "
+        "2000.",
+        "Fit of LFM: good",
+        "0.002 N m s/rad",
         f"it is statistically tied with {EVIL}; the simplest of them is {EVIL}.",
         "Doubtful.",
         "Not identifiable: f_a with f_v.",

@@ -39,8 +39,7 @@ from nfriction.export.pt2_file import open_pt2
 from nfriction.export.torchscript_file import open_torchscript
 from nfriction.io.formats import matlab, mdf
 from nfriction.io.formats.signals import load_signals, save_signals
-from nfriction.io.model_file import ModelFileError, load, load_info, load_plant
-from nfriction.io.model_info import parameter_hash
+from nfriction.io.model_file import ModelFileError, load, load_info, load_plant, parameter_hash
 from nfriction.papers.controller.fis import load_fis
 from nfriction.papers.controller.mamdani import MamdaniController
 from nfriction.papers.controller.rules import format_rules, load_rules, parse_rules

@@ -15,7 +15,7 @@ import pytest
 
 from nfriction import LFM, ModelInfo, save
 from nfriction.export import torchscript
-from nfriction.io.atomic import atomic_write, write_atomically
+from nfriction.io.files import atomic_write, write_atomically
 from nfriction.papers.controller.mamdani import paper_controller
 from nfriction.papers.controller.rules import save_rules
 from nfriction.plant import rigs

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from nfriction import ALFM, rigs, rollout
+from nfriction.friction.memory import LuGre
 from nfriction.friction.models import LFM
 from nfriction.simulation.closed_loop import Electronics, control
 
@@ -28,6 +29,14 @@ def test_a_closed_loop_is_the_rollout_of_its_torques(kind: type) -> None:
     again = rollout(PLANT, friction(kind), START, 0 * START, found.tau)
     assert torch.equal(found.q, again.q)
     assert torch.equal(found.qd, again.qd)
+
+
+def test_friction_with_memory_keeps_its_state_from_sample_to_sample() -> None:
+    bristles = LuGre(3, [0.02, 0.01, 0.1, 50.0, 0.05, 0.01]).requires_grad_(False)
+    found = control(PLANT, bristles, spring, START, 0 * START, steps=300)
+    again = rollout(PLANT, bristles, START, 0 * START, found.tau)
+    assert torch.equal(found.q, again.q)
+    assert torch.equal(found.law_state, again.law_state)
 
 
 def test_a_batch_is_each_of_its_motions() -> None:

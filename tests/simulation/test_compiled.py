@@ -10,12 +10,10 @@ import pytest
 import torch
 
 from nfriction import LFM, NFLFM, PendulumChain, codegen, rollout
-from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import LINEAR, Law, linear
 from nfriction.friction.models import FrictionModel
 from nfriction.simulation import compiled
-from nfriction.simulation.protocols import RolloutInputs
 
 F64 = torch.float64
 CHAIN = PendulumChain([0.3, 0.2], [0.2, 0.15])
@@ -292,24 +290,3 @@ def test_a_batch_of_plants_runs(compilations):
     together = both(LFM(2, v_smooth=0.05), plant)
     assert together.shape == (2, 41, 2)
     torch.testing.assert_close(together[1], both(LFM(2, v_smooth=0.05)), rtol=0, atol=1e-12)
-
-
-def test_a_rollout_may_bring_the_derivatives_of_its_steps(compilations):
-    """One pass gives the motion, and the step maps that a fit chains."""
-    model = NFLFM(2, v_smooth=0.05, terms=(2, 2), head_units=2)
-    q0 = torch.stack([Q0, 0.9 * Q0, Q0 - 0.1]).expand(2, 3, 2)
-    given = (torch.zeros(1, 2, dtype=F64).expand(30, 2), torch.full((30,), 1e-3, dtype=F64))
-    q, qd, qdd, slopes = compiled.integrate_compiled(
-        compiled.System.of(CHAIN, model), RolloutInputs(q0, QD0.expand(2, 3, 2), *given),
-        "compiled", 1,
-        jacobian=("q", "qd", "held"),
-    )  # fmt: skip
-    plain = rollout(CHAIN, model, q0, QD0, steps=30, gradients=False)
-    torch.testing.assert_close(q, plain.q, rtol=0, atol=1e-12)
-    assert slopes.shape == (2, 3, 30, 6, 4 + 2 * 2)
-    jacobian = StepJacobian(CHAIN, model, [])
-    before = [x[..., :-1, :].reshape(-1, 2) for x in (q, qd, qdd)]
-    held = model.coefficients(*before[1:]).detach()
-    rest = torch.zeros(len(held), 2, dtype=F64), torch.full((len(held), 1), 1e-3, dtype=F64)
-    expected = jacobian(*before[:2], held, *rest, torch.zeros(0, dtype=F64))
-    torch.testing.assert_close(slopes.reshape(-1, 6, 8), expected, rtol=1e-11, atol=1e-13)

@@ -26,8 +26,9 @@ from nfriction.export.contract import (
 )
 from nfriction.export.controller import controller_of
 from nfriction.friction.models import FrictionModel
-from nfriction.io.atomic import write_atomically
-from nfriction.io.model_info import ModelInfo
+from nfriction.io.files import write_atomically
+from nfriction.io.model_file import ModelInfo
+from nfriction.plant.rigs import from_dict
 
 # How much more a controller may err that rounds motions between filter and model.
 ROUNDED = 5.0
@@ -55,7 +56,8 @@ def c(
     Args:
         model: a friction model.
         folder: where to write; made if missing. The same model gives the same bytes.
-        info: description of the model besides its parameters.
+        info: description of the model besides its parameters. With its rig, C of a law that reads
+            the load has a function `<name>_load(q, qd, load)` for it.
         dtype: "float64" or "float32", in which the controller computes.
         name: of the files, and prefix of all functions, types and macros: controllers of
             different names link into one program.
@@ -81,7 +83,8 @@ def c(
     )
     contract = contract_of(model, controller, info, dtype=dtype)
     dialect = ControllerC(REALS[dtype], name)
-    code, header = source_of(controller, contract.description, dialect, name)
+    plant = None if info is None or info.rig is None else from_dict(info.rig)
+    code, header = source_of(controller, contract.description, dialect, name, plant)
     words = _words(contract, name)
     files = {
         f"{name}.c": code,

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from nfriction.codegen.errors import UnsupportedOperation
 from nfriction.codegen.graph import Program, trace
@@ -20,8 +21,9 @@ from nfriction.export.controller import (
     Controller,
     for_single_precision,
 )
-from nfriction.export.neurofuzzy import tables
 from nfriction.friction.models import FrictionModel
+from nfriction.friction.neurofuzzy import NeuroFuzzy
+from nfriction.plant import Plant
 
 # An exponential that compilers vectorise: that of `math.h` is a call for every number, this one a
 # loop over an array without branches or tables.
@@ -40,11 +42,20 @@ _LN2: dict[Real, tuple[float, float]] = {
     "float": (0.693359375, -0.00021219444),
 }
 
+# Shift of a set that is there for its place alone: its membership is zero.
+_NOWHERE = 1e3
+
 
 def source_of(
-    controller: Controller, description: Mapping[str, Any], dialect: ControllerC, name: str
+    controller: Controller,
+    description: Mapping[str, Any],
+    dialect: ControllerC,
+    name: str,
+    plant: Plant | None = None,
 ) -> tuple[str, str]:
     """Texts of a controller's `.c` and `.h`; the description is for the header's comment.
+
+    With a plant, and a law that reads the load, they have a function of the plant's load.
 
     Raises:
         ExportError: if the law or schedule uses an operation that has no C form, or a number of
@@ -58,6 +69,7 @@ def source_of(
         "state_size": controller.memory_size,
         "filter_size": FILTER_STATE if controller.filters else 0,
         "filter": controller,
+        "load": plant is not None and _reads_load(controller.model),
         "bits": description["status_bits"],
         # Names and units are foreign text.
         "about": description,
@@ -65,6 +77,7 @@ def source_of(
     }
     try:
         with torch.no_grad():
+            words["load_of"] = _load(plant, dialect) if plant and words["load"] else ""
             body = dialect.text("controller.c", **words, **_words(controller, dialect))
     except (UnsupportedOperation, ValueError) as error:
         raise ExportError(f"the model has no C form: {error}") from error
@@ -89,7 +102,7 @@ def _words(controller: Controller, dialect: ControllerC) -> dict[str, Any]:
     values: dict[str, Any] = {"range": ranges, "torque_limit": controller.torque_limit}
     words: dict[str, Any] = {
         "form": form, "network": network,
-        "by_class": form.startswith("adaptive"), "along_motion": False,
+        "by_class": form.startswith("adaptive"), "along_motion": False, "leans": False,
         "bounded": bool((ranges.abs() < UNBOUNDED).any()), "clamped": controller.clamps,
         "limited": controller.limited, "law_comment": comment(model.law.name),
         # Calls of an own exponential for many joints at once cost flash on a microcontroller.
@@ -107,7 +120,7 @@ def _words(controller: Controller, dialect: ControllerC) -> dict[str, Any]:
         _add_classes(model.schedule, values, words, dialect)
     if network:
         _add_network(model.schedule, values, words, dialect)
-        if words["along_motion"]:
+        if words["along_motion"] or words["leans"]:
             signs.append(dialect.own("NF_RATE[j] * v[j]"))
     words["c"] = dialect.own("NF_CONSTANT") if form == "constant" else "c"
     words["law"] = _law(model, dialect, words["c"], signs if network else None)
@@ -146,7 +159,7 @@ def _add_network(
         "plane": made["planes"].view(joints, -1, sets, sets).permute(3, 2, 1, 0),
         "unit_slope": made["unit_slope"].permute(2, 1, 0),
         "unit_shift": made["unit_shift"].permute(2, 1, 0),
-        "unit_weight": made["weights"].permute(2, 1, 0),
+        "unit_weight": made["weights"].permute(2, 1, 0), "lean": made["lean"].mT,
         "reference": made["reference"].mT, "roundness": made["roundness"].mT,
     }  # fmt: skip
     if words["by_class"]:
@@ -160,12 +173,77 @@ def _add_network(
         runs.append((start, k + 1, positive))
     words |= {
         "sets": sets, "units": units, "seen": made["unit_slope"].shape[2],
-        "along_motion": network.along_motion, "signs_of_coefficients": runs,
+        "along_motion": network.along_motion, "leans": bool(network.leans().any()),
+        "signs_of_coefficients": runs,
         "per_reach": dialect.literal(0.5 / network.reach),
         "least_exponent": dialect.literal(network.network.head.least_exponent),
         "deep": _deepest(made["set_slope"].mT, made["set_shift"].mT) >= _DEEP,
         "spare": lambda count: _spare(count, dialect),
     }  # fmt: skip
+
+
+def tables(schedule: NeuroFuzzy) -> dict[str, Tensor]:
+    """Scales folded into slopes, shifts and weights.
+
+    Inputs are brought to [-1, 1] by `gain x + shift`; sets and units are those of such inputs, with
+    exponents -(slope x + shift)^2. The head's bias is part of the consequents, half the
+    coefficients' scale of all weights and of the reference; the units of the head see its inputs in
+    that scale.
+
+    Returns:
+        `rate` (joint,); `gain` and `shift` (joint, input); `set_slope` and `set_shift` (joint,
+        set, input), with sets of no membership where one input has fewer; `planes` (joint,
+        3 coefficient set, set), columns by set of velocity, then of acceleration; `unit_slope` and
+        `unit_shift` (joint, unit, input and coefficient); `weights` (joint, unit, coefficient);
+        `lean` (joint, coefficient), of the direction;
+        `reference`, `roundness` (joint, coefficient); `positive` (coefficient,).
+    """
+    anfis, head = schedule.network.anfis, schedule.network.head
+    joints, terms = schedule.joints, schedule.terms
+    sets = max(terms)
+    lower = torch.stack([torch.zeros_like(schedule.velocity_range), schedule.acceleration_lower], 1)
+    upper = torch.stack([schedule.velocity_range, schedule.acceleration_upper], 1)
+    half_range = 0.5 * (upper - lower)
+    half = 0.5 * schedule.scale
+    bias = head.output_bias
+
+    # The network's own inputs are (x + 1) / 2.
+    centres, widths = anfis.sets()
+    slope = 0.5 / (math.sqrt(2.0) * widths)
+    shift = (0.5 - centres) * 2.0 * slope
+    set_slope, set_shift = (
+        torch.stack(
+            [pad(part, (0, sets - part.shape[1]), value=fill) for part in x.split(terms, 1)], 2
+        )
+        for x, fill in ((slope, 0.0), (shift, _NOWHERE))
+    )
+
+    slopes = 0.5 * anfis.consequents[..., :2]
+    constants = anfis.consequents[..., 2] + slopes.sum(-1) + bias.unsqueeze(2)
+    columns = torch.cat([slopes, constants.unsqueeze(3)], 3) * half[:, :, None, None]
+    # (joint, coefficient, set of velocity, set of acceleration, column) to columns by acceleration.
+    planes = columns.unflatten(2, terms).permute(0, 4, 1, 2, 3)
+    planes = pad(planes, (0, sets - terms[1], 0, sets - terms[0])).reshape(joints, -1, sets)
+
+    unit_widths = math.sqrt(2.0) * torch.exp(head.log_widths)
+    middle = torch.full_like(lower, 0.5)
+    seen = torch.cat([middle, -bias], 1).unsqueeze(1)
+    scale = torch.cat([middle, 1.0 / half], 1).unsqueeze(1)
+    return {
+        "rate": 1.0 / (schedule.velocity_range * schedule.turn),
+        "gain": 1.0 / half_range,
+        "shift": -0.5 * (lower + upper) / half_range,
+        "reference": half * schedule.reference,
+        "set_slope": set_slope,
+        "set_shift": set_shift,
+        "planes": planes,
+        "unit_slope": scale / unit_widths,
+        "unit_shift": (seen - head.centres) / unit_widths,
+        "weights": (head.output_weight * half.unsqueeze(2)).mT,
+        "lean": half * schedule.leans(),
+        "roundness": (schedule.scale * schedule.roundness).square(),
+        "positive": schedule.positive,
+    }
 
 
 # Where some set is within this exponent of full membership, strengths are far from underflow.
@@ -249,6 +327,25 @@ def _same_by_joint(one: Program, every: Program, joints: int) -> bool:
 
 def _depends(node: Node, name: str) -> bool:
     return any(n.op == "input" and n.value[0] == name for n in reachable([node]))
+
+
+def _reads_load(model: FrictionModel) -> bool:
+    given = {"qd": _example(1), "load": _example(1), "c": _example(1, len(model.law.names))}
+    (torque,) = trace(lambda qd, load, c: model.torque(qd, load, c), given).outputs[0].nodes
+    return _depends(torque, "load")
+
+
+def _load(plant: Plant, dialect: ControllerC) -> str:
+    """Statements that compute the load of each joint of a plant."""
+    program = trace(plant.load, {"q": _example(plant.joints), "qd": _example(plant.joints)})
+    bound = {
+        node.number: f"{port.name}[{i}]"
+        for port in program.inputs
+        for i, node in enumerate(port.nodes)
+    }
+    targets = [f"load[{j}]" for j in range(plant.joints)]
+    lines = _assignments(targets, program.outputs[0].nodes, bound, dialect)
+    return _braces([*lines, "(void)q;", "(void)qd;"], "")
 
 
 def _schedule(controller: Controller, dialect: ControllerC) -> str:

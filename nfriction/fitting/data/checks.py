@@ -5,10 +5,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from nfriction.fitting.data.inputs import is_undriven_pendulum, largest_torques
+from nfriction.fitting.data.inputs import is_undriven_pendulum, largest_torques, weighs
 from nfriction.fitting.data.windows import begins_at_rest
 from nfriction.fitting.options import DEFAULTS, FitOptions
-from nfriction.plant import PendulumChain, Plant
+from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion, count_seen
 
@@ -33,7 +33,7 @@ def looks_zeroed_per_recording(
     rest, and all its encoders read zero each time, they were set to it.
     """
     return (
-        isinstance(plant, PendulumChain)
+        weighs(plant)
         and bool(largest_torques(recordings).any())
         and len(recordings) > 1
         and all(
@@ -117,7 +117,9 @@ def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[st
 def _implausible_masses(plant: Plant) -> Iterator[str]:
     """Warn of masses that look like g; a free swing shows only their ratios."""
     data = plant.to_dict()
-    for k, (mass, length) in enumerate(zip(data.get("mass", ()), data["length"], strict=True)):
+    if "length" not in data:
+        return  # a rotor: its size is not known
+    for k, (mass, length) in enumerate(zip(data["mass"], data["length"], strict=True)):
         if mass > LEAD * length**3:
             yield (
                 f"Link {k + 1} of {mass:g} kg and {length:g} m would be heavier than a cube of "

@@ -5,7 +5,6 @@ import textwrap
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,10 +12,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nfriction.fitting.options import DEFAULTS, FitOptions
-from nfriction.fitting.plant_parameters import PlantParameter, plant_parameters
+from nfriction.fitting.plant_parameters import (
+    PlantParameter,
+    plant_parameters,
+    torque_delay_term,
+)
+from nfriction.friction import model_by_name
 from nfriction.friction.models import FrictionModel
-from nfriction.plant import LinearAxis, PendulumChain, Plant
-from nfriction.recording import Recording
+from nfriction.plant import PendulumChain, Plant
+from nfriction.recording import Recording, RecordingLike
 from nfriction.recording.angles import AngleConvention
 from nfriction.signals import Motion, kalman_smoother
 from nfriction.simulation.rk4 import required_substeps
@@ -24,32 +28,35 @@ from nfriction.simulation.rk4 import required_substeps
 logger = logging.getLogger(__name__)
 
 
+def as_model(model: FrictionModel | str, joints: int) -> FrictionModel:
+    """A model as it is, or a new one by its name.
+
+    Raises:
+        TypeError: for anything else.
+        ValueError: if no model has that name.
+    """
+    if isinstance(model, str):
+        return model_by_name(model)(joints)
+    if not isinstance(model, FrictionModel):
+        raise TypeError(
+            "`model` must be a friction model such as LFM(joints=3), or the name of one, got "
+            f"{type(model).__name__} {textwrap.shorten(repr(model), 60)}."
+        )
+    return model
+
+
 def as_recording_list(
-    model: FrictionModel, plant: Plant, recordings: Recording | Iterable[Recording]
+    recordings: RecordingLike | Iterable[RecordingLike], plant: Plant
 ) -> list[Recording]:
     """The recordings of a fit as a list.
 
     Raises:
-        TypeError: if model, plant or recordings are something else.
+        TypeError: if one is something else than `Recording.of` takes.
         ValueError: if a recording is given twice.
     Warns:
         UserWarning: if only some recordings have torques.
     """
-    given: list[Any] = [recordings]
-    # A table iterates over its columns, a text over its letters.
-    single = isinstance(recordings, str) or hasattr(recordings, "columns")
-    if isinstance(recordings, Iterable) and not single:
-        given = list(recordings)
-    wanted: list[tuple[str, object, tuple[type, ...], str]] = [
-        ("model", model, (FrictionModel,), "a friction model such as LFM(joints=3)"),
-        ("plant", plant, (PendulumChain, LinearAxis), "a PendulumChain or LinearAxis"),
-        *(("recordings", r, (Recording,), "one Recording or a list of them, made by "
-           "`Recording.read(path)` or `Recording.from_pandas(table)`") for r in given),
-    ]  # fmt: skip
-    for name, value, kinds, what in wanted:
-        if not isinstance(value, kinds):
-            shown = textwrap.shorten(repr(value), 60)
-            raise TypeError(f"`{name}` must be {what}, got {type(value).__name__} {shown}.")
+    given = Recording.many(recordings, plant=plant)
     _refuse_repeated(given)
     warn_of_undriven(given)
     return given
@@ -129,9 +136,14 @@ def largest_torques(joint: Sequence[Recording]) -> NDArray[np.float64]:
 
 
 def is_undriven_pendulum(plant: Plant, joint: Sequence[Recording]) -> bool:
-    """True for a chain on a fixed pivot without any torque."""
+    """True for a chain on a fixed pivot that gravity moves, without any torque."""
     fixed = isinstance(plant, PendulumChain) and not plant.first_link
-    return fixed and not largest_torques(joint).any()
+    return fixed and weighs(plant) and not largest_torques(joint).any()
+
+
+def weighs(plant: Plant) -> bool:
+    """True for a chain whose pose matters to gravity, unlike a balanced rotor's."""
+    return isinstance(plant, PendulumChain) and bool(plant.gravity_moment.any())
 
 
 def adjustable_terms(
@@ -144,10 +156,12 @@ def adjustable_terms(
 ) -> list[PlantParameter]:
     """Terms of the plant that a fit adjusts; `drag=None` includes drag for undriven pendulums.
 
-    If encoders have an offset `per_recording`, the plant's would only be the mean of these.
+    If encoders have an offset `per_recording`, the plant's would only be the mean of these. The
+    torque's delay comes last.
     """
+    delay = [torque_delay_term(options)] if options.fit_delay else []
     if not options.fit_plant:
-        return []
+        return delay
     largest = largest_torques(joint)
     # Over spans that are long against a step of the encoder.
     spans = [max(1, len(r) // 200) for r in joint]
@@ -161,7 +175,14 @@ def adjustable_terms(
         drag=is_undriven_pendulum(plant, joint) if options.drag is None else options.drag,
         eccentricity=eccentric, options=options,
     )  # fmt: skip
-    return [t for t in terms if not (per_recording and "angle_offset" in t.change)]
+    return [t for t in terms if not (per_recording and "angle_offset" in t.change)] + delay
+
+
+def advanced_torques(recordings: Sequence[Recording], delay: float) -> list[Recording]:
+    """Recordings of equal length with the torque recorded `delay` [s] later; held at the ends."""
+    if not delay:
+        return list(recordings)
+    return [r if r.tau is None else r._replace(tau=r.torque_at(r.time + delay)) for r in recordings]
 
 
 def apply_encoder_offsets(

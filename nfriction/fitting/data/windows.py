@@ -24,6 +24,7 @@ class Windows:
         q0, qd0: smoothed initial state, (window, joint).
         spans: index of each window's recording, its first and its last sample.
         at_rest: windows whose initial state is known: the measured position, and no velocity.
+        recordings: that the windows are of, in joint coordinates.
     """
 
     q: Tensor
@@ -34,6 +35,7 @@ class Windows:
     qd0: Tensor
     spans: tuple[tuple[int, int, int], ...] = ()
     at_rest: tuple[int, ...] = ()
+    recordings: tuple[Recording, ...] = ()
 
     def __len__(self) -> int:
         return self.q.shape[0]
@@ -52,7 +54,26 @@ class Windows:
             weight=self.weight[index], q0=self.q0[index], qd0=self.qd0[index],
             spans=tuple(self.spans[i] for i in index if self.spans),
             at_rest=tuple(k for k, i in enumerate(index) if i in self.at_rest),
+            recordings=self.recordings,
         )  # fmt: skip
+
+    def torque_at(self, delay: float) -> tuple[Tensor, Tensor]:
+        """Torque that was recorded `delay` [s] later, and its slope over the delay.
+
+        Both are (window, step, joint), held over each step and at the ends of a recording.
+        """
+        tau, slope = torch.zeros_like(self.tau), torch.zeros_like(self.tau)
+        for w, (place, first, last) in enumerate(self.spans):
+            recording = self.recordings[place]
+            # A sample wide, as a line between samples has kinks at them.
+            half = 0.5 * recording.sample_time
+            at = recording.time[first:last] + delay
+            now, ahead, behind = (
+                torch.as_tensor(recording.torque_at(at + shift)) for shift in (0.0, half, -half)
+            )
+            tau[w, : last - first] = now
+            slope[w, : last - first] = (ahead - behind) / (2 * half)
+        return tau, slope
 
 
 def cut_windows(
@@ -102,7 +123,9 @@ def cut_windows(
             at_rest.append(w)
             start[0, w], start[1, w] = recording.q[0], 0.0
     q_, tau_, step_, weight_, q0, qd0 = map(torch.as_tensor, (q, tau, step, weight, *start))
-    return Windows(q_, tau_, step_, weight_, q0, qd0, tuple(spans), tuple(at_rest))
+    return Windows(
+        q_, tau_, step_, weight_, q0, qd0, tuple(spans), tuple(at_rest), tuple(recordings)
+    )
 
 
 def _cut(recording: Recording, length: float) -> Iterator[tuple[int, int]]:

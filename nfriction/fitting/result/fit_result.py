@@ -2,16 +2,18 @@
 
 import html
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from nfriction.fitting.equation_error import TorqueFit, peak_dynamics_torque
 from nfriction.fitting.options import Continuity
+from nfriction.fitting.plant_parameters import TORQUE_DELAY
 from nfriction.fitting.result.identifiability import (
     Information,
     Interval,
@@ -26,6 +28,7 @@ from nfriction.fitting.result.identifiability import (
     weakly_identified,
 )
 from nfriction.fitting.result.uncertainty import CoefficientUncertainty
+from nfriction.fitting.robust_loss import Outliers, named_outliers, outlier_warning
 from nfriction.fitting.shooting.autocorrelation import bandwidth, effective_noise, hac_sd
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.variables import model_at
@@ -33,6 +36,7 @@ from nfriction.friction import model_names, plain_name
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import LeastSquaresResult
 from nfriction.plant import Plant
+from nfriction.recording import Recording
 from nfriction.signals import Motion
 
 if TYPE_CHECKING:
@@ -64,7 +68,7 @@ class FitResult:
         status: `"Converged ..."` or `"Not converged: ..."` with the reason.
         converged: whether the search ended at a minimum.
         residual: root mean square residual in `residual_unit`: of the positions over the training
-            windows, or of the torque after an equation-error fit.
+            windows, or of the torque after an equation-error fit; as a robust loss counts them.
         at_bounds: names of parameters at a bound.
         steps: accepted steps of the last stage.
         motions: smoothed motion of each recording, in joint coordinates.
@@ -87,6 +91,9 @@ class FitResult:
         stages: length of the windows of each stage that was kept [s], and its residual in
             `residual_unit`; of constant coefficients.
         skipped_horizons: lengths of windows that the constant law could not follow [s].
+        outliers: stretches of samples that a robust loss counts less than half.
+        effective_parameters: of a network: name of each group of its parameters, how many of them
+            the data determine (MacKay's gamma), and how many there are.
     """
 
     model: FrictionModel
@@ -110,6 +117,8 @@ class FitResult:
     quantisation: float | None = None
     stages: tuple[tuple[float, float], ...] = ()
     skipped_horizons: tuple[float, ...] = ()
+    outliers: tuple[Outliers, ...] = ()
+    effective_parameters: tuple[tuple[str, float, int], ...] = ()
 
     def longest_usable_horizon(self, windows: Sequence[float]) -> float:
         """The last of growing window lengths that the constant law could follow [s]."""
@@ -144,6 +153,16 @@ class FitResult:
         return ("doubtful", "; ".join(reasons)) if reasons else ("good", "")
 
     @property
+    def torque_delay(self) -> float:
+        """Time by which torques are recorded later than positions [s]; 0 unless it was fitted."""
+        return next((value for name, value, _ in self.plant_terms if name == TORQUE_DELAY), 0.0)
+
+    def aligned(self, recording: Recording) -> Recording:
+        """A recording with its torque advanced by the fitted delay, as simulations need it."""
+        delay = self.torque_delay
+        return recording.advance_torque(delay) if delay and recording.tau is not None else recording
+
+    @property
     def residual_unit(self) -> str:
         """Unit of `residual`: of positions (rad, m), or of torques (N m, N)."""
         if self.residuals.numel():
@@ -153,6 +172,7 @@ class FitResult:
     def to_dict(self) -> dict[str, Any]:
         """Summary for JSON."""
         offsets = {"encoder_offsets": [list(row) for row in self.encoder_offsets]}
+        gamma = {name: value for name, value, _ in self.effective_parameters}
         return {
             "status": self.status,
             "converged": self.converged,
@@ -170,6 +190,8 @@ class FitResult:
             "warnings": list(self.warnings),
             **({} if self.continuity == "none" else {"continuity": self.continuity}),
             **(offsets if self.encoder_offsets else {}),
+            **({"outliers": [o._asdict() for o in self.outliers]} if self.outliers else {}),
+            **({"effective_parameters": gamma} if gamma else {}),
         }
 
     def to_pandas(self) -> "pd.DataFrame":
@@ -284,7 +306,8 @@ def result_from_equation_error(
         residuals=torch.zeros(0, dtype=torch.float64),
         intervals=confidence_intervals(fitted_names, values, sd, lower, upper),
         unidentifiable=unidentifiable,
-        warnings=(*found, BLURRED) if found else (),
+        warnings=(*((*found, BLURRED) if found else ()), *outlier_warning(torque.outliers)),
+        outliers=torque.outliers,
     )
 
 
@@ -313,8 +336,12 @@ def result_from_shooting(
         problem.windows.q @ problem.measurement.T
     )
     residuals = problem.errors(x)
-    residual = float(residuals.square().mean().sqrt())
-    intervals, unidentifiable, root = _identifiability(problem, result, names, residuals, motions)
+    weights, counted = problem.loss.weight(residuals), problem.loss.counted(residuals)
+    residual = float(counted.square().mean().sqrt())
+    outliers = tuple(outliers_of(problem, weights))
+    intervals, unidentifiable, root = _identifiability(
+        problem, result, names, residuals * weights, motions
+    )
     return FitResult(
         model=model.requires_grad_(False),
         plant=problem.plant_at(vector),
@@ -338,10 +365,26 @@ def result_from_shooting(
             largest_defect=float(problem.defects(x).abs().max()) if problem.pairs else 0.0,
         )
         + model_error_warning(
-            residual, effective_noise(residuals), encoder_count, plant.unit, problem.options
-        ),
+            residual, effective_noise(counted), encoder_count, plant.unit, problem.options
+        )
+        + outlier_warning(outliers),
+        outliers=outliers,
         uncertainty=None if root is None else CoefficientUncertainty(model.schedule, root),
     )  # fmt: skip
+
+
+def outliers_of(problem: ShootingProblem, weights: Tensor) -> Iterator[Outliers]:
+    """Samples that a robust loss counts less than half, by recording."""
+    if problem.loss.name == "linear":
+        return
+    windows = problem.windows
+    for place, recording in enumerate(windows.recordings):
+        weight = np.ones_like(recording.q)
+        for (of, first, last), row in zip(windows.spans, weights.numpy(), strict=True):
+            if of == place:
+                part = weight[first : last + 1]
+                np.minimum(part, row[: last - first + 1], out=part)
+        yield from named_outliers(recording, weight)
 
 
 def _identifiability(

@@ -4,7 +4,8 @@ A recording is cut into windows. Each is simulated from a state of its own, beca
 light mechanism forgets its start within seconds. The decision variables x are the friction
 parameters, the plant terms, each window's initial state and the encoders' offsets, and the cost is
 
-    J(x) = 1/2 sum |C (q_sim(t; x) - q(t))|^2 / noise_sd^2      over windows and samples
+    J(x) = 1/2 sum |C (q_sim(t; x) - q(t))|^2 / noise_sd^2      over windows and samples, or a
+                                                                robust loss of these errors
          + 1/2 sum |defect|^2 / defect_sd^2                     where windows meet, if asked for
          + 1/2 sum (x - mean)^2 / sd^2                          priors
 
@@ -26,7 +27,13 @@ from torch import Tensor
 from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.plant_parameters import adjusted_plant
-from nfriction.fitting.result.identifiability import Information, information, standard_deviations
+from nfriction.fitting.result.identifiability import (
+    Information,
+    information,
+    observed_count,
+    standard_deviations,
+)
+from nfriction.fitting.robust_loss import SQUARES, RobustLoss
 from nfriction.fitting.shooting.marginalization import Kept, marginalize_states, score_covariance
 from nfriction.fitting.shooting.normal_equations import (
     Rows,
@@ -65,6 +72,7 @@ class ShootingProblem:
         extrapolation: prior of a neuro-fuzzy schedule where there are no data.
         memory: hidden state of the coefficients (see `Schedule`) at the start of each window,
             (window, joint, state_size); None of a schedule without. It advances with every step.
+        loss: of the errors.
         options: priors of the initial states.
     """
 
@@ -81,6 +89,7 @@ class ShootingProblem:
     defect_sd: tuple[float, float] | None = None
     extrapolation: ExtrapolationPrior | None = None
     memory: Tensor | None = None
+    loss: RobustLoss = SQUARES
     options: FitOptions = DEFAULTS
 
     @cached_property
@@ -98,28 +107,61 @@ class ShootingProblem:
     def linearise(self, x: Tensor) -> Quadratic:
         """Cost, gradient and Gauss-Newton Hessian at `x` from one simulation."""
         run, indices = self._simulate(x, with_memory=True), self.variables.indices()
-        pieces = propagate(self.jacobian, run, self.substeps, self.stride)
-        rows = scaled_rows(pieces, self._scale, self.measurement, indices)
-        errors = self._deviation(x, run) * self._scale
-        gradient, hessian, ends = normal_equations(rows, errors, indices, len(x))
-        if self.pairs:
-            defects = self._defects(x, run)
-            add_defects(gradient, hessian, defects, ends, self.pairs, indices, self._defect_sd)
+        gradient, hessian = self._normal_equations(x, run, indices, len(x))
         if self.extrapolation is not None:
             slope, curvature = self.extrapolation.normal_equations(run.friction.schedule)
             gradient[: len(slope)] += slope
             hessian[: len(slope), : len(slope)] += curvature
+        return self._quadratic(x, run, gradient, hessian, self.variables.shared_count)
+
+    def linearise_states(self, x: Tensor) -> Quadratic:
+        """The same by the states and offsets of windows alone, far cheaper for many parameters."""
+        run, count = self._simulate(x, with_memory=True), self.variables.shared_count
+        indices = self.variables.indices() - count
+        gradient, hessian = self._normal_equations(x, run, indices, len(x) - count)
+        return self._quadratic(x, run, gradient, hessian, 0)
+
+    def _normal_equations(
+        self, x: Tensor, run: Trajectory, indices: Tensor, size: int
+    ) -> tuple[Tensor, Tensor]:
+        """Gradient and Hessian of errors and defects by the last `size` variables."""
+        shared = size == len(x)
+        pieces = propagate(self.jacobian, run, self.substeps, self.stride, shared=shared)
+        errors = self._deviation(x, run)
+        scale = self._scale * self.loss.weight(errors).sqrt()
+        rows, errors = scaled_rows(pieces, scale, self.measurement, indices), errors * scale
+        gradient, hessian, ends = normal_equations(rows, errors, indices, size)
+        if self.pairs:
+            defects = self._defects(x, run)
+            add_defects(gradient, hessian, defects, ends, self.pairs, indices, self._defect_sd)
+        return gradient, hessian
+
+    def _quadratic(
+        self, x: Tensor, run: Trajectory, gradient: Tensor, hessian: Tensor, shared: int
+    ) -> Quadratic:
+        """With the priors, of which the first `shared` are those of all windows' variables."""
         precision, mean = self.variables.prior()
-        gradient += precision * (x - mean)
-        hessian.diagonal().add_(precision)
+        gradient += (precision * (x - mean))[len(x) - len(gradient) :]
+        hessian.diagonal().add_(precision[len(x) - len(gradient) :])
         # Defects and encoder offsets couple the states of different windows.
         alone = not self.pairs and not self.variables.offset_count
-        blocks = (self.variables.shared_count, self.variables.state_count) if alone else None
+        blocks = (shared, self.variables.state_count) if alone else None
         return Quadratic(self._cost(x, run), gradient, hessian, blocks)
 
     def errors(self, x: Tensor) -> Tensor:
         """Position error at every sample [rad; m], (window, step + 1, joint)."""
         return self._deviation(x, self._simulate(x)) * self.windows.weight[..., None]
+
+    def counted_errors(self, x: Tensor) -> Tensor:
+        """Errors whose squares are what the loss counts; `errors` where it is the square."""
+        return self.loss.counted(self.errors(x))
+
+    def rescaled(self, x: Tensor) -> "ShootingProblem":
+        """The problem with the robust loss of `options`, its scale from the errors at `x`."""
+        errors = self.errors(x)[self.windows.weight > 0]
+        count = observed_count(self.windows.q @ self.measurement.T) or 0.0
+        least = max(count / 12**0.5, self.options.min_noise)
+        return replace(self, loss=RobustLoss.of_errors(self.options.loss, errors, least))
 
     def residuals(self, x: Tensor) -> Tensor:
         """Errors of the counted samples over the noise, (window, step + 1, joint)."""
@@ -159,7 +201,7 @@ class ShootingProblem:
         return standard_deviations(information(hessian, precision, self.variables.shared_count))
 
     def information(self, x: Tensor, sd: Tensor) -> Information:
-        """Information about the shared variables, given the sd of each error.
+        """Information about the shared variables, given the sd of each error times its weight.
 
         `sd` is inflated for autocorrelation, (window, step + 1, joint).
         """
@@ -168,7 +210,8 @@ class ShootingProblem:
         of_states, of_offsets = variables.split(precision)[2:]
         kept = Kept(variables.indices(), variables.state_count, len(x))
         joined = (self.pairs, self._defect_sd) if self.pairs else ((), None)
-        data, response = marginalize_states(self._rows(run, self._scale), kept, of_states, *joined)
+        scale = self._scale * self.loss.weight(self._deviation(x, run)).sqrt()
+        data, response = marginalize_states(self._rows(run, scale), kept, of_states, *joined)
         rows = self._rows(run, self._scale * sd / self.noise_sd)
         score = score_covariance(rows, kept, response, of_states)
         prior = torch.cat([precision[:shared], of_offsets.flatten()])
@@ -191,12 +234,20 @@ class ShootingProblem:
         friction, plant, states, _ = self.variables.split(x)
         model = model_at(self.friction, friction)
         q0, qd0 = states.chunk(2, -1)
-        tau = self.windows.tau.repeat_interleave(self.substeps, 1)
+        held, linearised = (t.repeat_interleave(self.substeps, 1) for t in self._torques(plant))
         step = self.windows.step.repeat_interleave(self.substeps, 1) / self.substeps
         offsets = self.variables.window_offsets(x)
-        motion = self._integrate(self.plant_at(plant), model, q0 + offsets, qd0, tau, step)
+        motion = self._integrate(self.plant_at(plant), model, q0 + offsets, qd0, held, step)
         memory = self._memory_along(model, motion) if with_memory else None
-        return Trajectory(model, plant, motion, tau, step, memory)
+        return Trajectory(model, plant, motion, linearised, step, memory)
+
+    def _torques(self, plant: Tensor) -> tuple[Tensor, Tensor]:
+        """Torque over each step, and as `StepJacobian` takes it."""
+        k = self.jacobian.delay_index
+        if k is None:
+            return self.windows.tau, self.windows.tau
+        tau, slope = self.windows.torque_at(float(plant[k]))
+        return tau, torch.cat([tau - plant[k] * slope, slope], -1)
 
     def _integrate(
         self, plant: Plant, model: FrictionModel, q0: Tensor, qd0: Tensor, tau: Tensor, step: Tensor
@@ -225,7 +276,7 @@ class ShootingProblem:
         return (end - self.variables.split(x).states[after]) / self._defect_sd
 
     def _cost(self, x: Tensor, run: Trajectory) -> Tensor:
-        squares = [self._deviation(x, run) * self._scale, self._defects(x, run)]
+        squares = [self.loss.counted(self._deviation(x, run)) * self._scale, self._defects(x, run)]
         if self.extrapolation is not None:
             squares.append(self.extrapolation.residuals(run.friction.schedule))
         misfit = torch.stack([row.square().sum() for row in squares]).sum()

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from nfriction import codegen
-from nfriction.fitting.plant_parameters import PlantParameter, adjusted_plant
+from nfriction.fitting.plant_parameters import PlantParameter, adjusted_plant, delay_index
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.parameters import Sensitivity
 from nfriction.plant import Plant
@@ -49,9 +49,11 @@ class StepJacobian:
     ) -> None:
         self.plant, self.friction, self.terms = plant, friction, tuple(terms)
         self._compiled: codegen.CompiledFunction | None = None
+        self.delay_index = delay_index(self.terms)
         joints, k = plant.joints, len(friction.law.coefficients)
+        torques = joints if self.delay_index is None else 2 * joints
         generator = torch.Generator().manual_seed(0)
-        shapes = ((joints,), (joints,), (joints, k), (joints,), (1,), (len(terms),))
+        shapes = ((joints,), (joints,), (joints, k), (torques,), (1,), (len(terms),))
         example = [
             scale * torch.rand(shape, generator=generator, dtype=torch.float64)
             for shape, scale in zip(shapes, (1.0, 1.0, 1e-2, 1.0, 1e-3, 1e-2), strict=True)
@@ -66,7 +68,8 @@ class StepJacobian:
     ) -> Tensor:
         """Derivatives of (q, qd, qdd) after a step, (sample, 3 joint, direction).
 
-        Directions: q, qd, held coefficients (joint-major), plant terms.
+        Directions: q, qd, held coefficients (joint-major), plant terms. Where the torque's delay is
+        one of the terms, `tau` is the torque at no delay, then its slope over the delay.
         """
         if self._compiled is not None:
             given = (q, qd, held, tau, step, vector[None])
@@ -84,7 +87,8 @@ class StepJacobian:
         """
 
         def acceleration(q: Tensor, qd: Tensor, vector: Tensor, tau: Tensor) -> Tensor:
-            return adjusted_plant(self.plant, self.terms, vector).forward_dynamics(q, qd, tau)
+            plant = adjusted_plant(self.plant, self.terms, vector)
+            return plant.forward_dynamics(q, qd, self._torque(tau, vector))
 
         slope = torch.func.vmap(torch.func.jacfwd(acceleration, (0, 1, 2)), (0, 0, None, 0))
         return torch.cat(slope(q, qd, vector, tau), -1)
@@ -94,15 +98,24 @@ class StepJacobian:
     ) -> Tensor:
         """State after one step, (*batch, 3 joint)."""
         plant = adjusted_plant(self.plant, self.terms, vector)
-        return torch.cat(rk4_step(plant, self.friction, q, qd, tau, held, step), -1)
+        torque = self._torque(tau, vector)
+        return torch.cat(rk4_step(plant, self.friction, q, qd, torque, held, step), -1)
+
+    def _torque(self, tau: Tensor, vector: Tensor) -> Tensor:
+        k = self.delay_index
+        if k is None:
+            return tau
+        at_none, slope = tau.chunk(2, -1)
+        return at_none + vector[..., k : k + 1] * slope
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """Simulated windows with their friction model and plant terms.
 
-    `motion` is (window, step + 1, joint), `tau` (window, step, joint), `step` (window, step). The
-    `memory` of the coefficients (window, step, joint, state_size) is held constant in derivatives.
+    `motion` is (window, step + 1, joint), `tau` (window, step, any) as `StepJacobian` takes it,
+    `step` (window, step). The `memory` of the coefficients (window, step, joint, state_size) is
+    held constant in derivatives.
     """
 
     friction: FrictionModel
@@ -114,7 +127,7 @@ class Trajectory:
 
 
 def propagate(
-    jacobian: StepJacobian, run: Trajectory, substeps: int, stride: int
+    jacobian: StepJacobian, run: Trajectory, substeps: int, stride: int, *, shared: bool = True
 ) -> Iterator[tuple[slice, Tensor]]:
     """Derivatives of the positions at every `stride`-th sample, some samples at a time.
 
@@ -123,6 +136,7 @@ def propagate(
         run: the windows' motion.
         substeps: steps per sample.
         stride: samples per counted one.
+        shared: also by the parameters; False leaves their columns out.
 
     Yields:
         Samples, and (window, sample, joint, column) by the friction parameters, the plant terms and
@@ -131,15 +145,16 @@ def propagate(
     """
     windows, steps = run.step.shape
     joints, plant_count = run.motion.q.shape[-1], len(run.plant_vector)
-    friction_count = run.friction.schedule.parameter_vector().numel()
-    shared = friction_count + plant_count
-    carried = torch.zeros(windows, 3 * joints, shared + 2 * joints, dtype=torch.float64)
-    carried[:, : 2 * joints, shared:] = torch.eye(2 * joints, dtype=torch.float64)
-    carried[:, 2 * joints :, shared:], carried[:, 2 * joints :, friction_count:shared] = (
-        jacobian.initial_acceleration(
-            run.motion.q[:, 0], run.motion.qd[:, 0], run.tau[:, 0], run.plant_vector
-        ).tensor_split([2 * joints], -1)
-    )
+    friction_count = run.friction.schedule.parameter_vector().numel() if shared else 0
+    count = friction_count + plant_count if shared else 0
+    carried = torch.zeros(windows, 3 * joints, count + 2 * joints, dtype=torch.float64)
+    carried[:, : 2 * joints, count:] = torch.eye(2 * joints, dtype=torch.float64)
+    by_start, by_plant = jacobian.initial_acceleration(
+        run.motion.q[:, 0], run.motion.qd[:, 0], run.tau[:, 0], run.plant_vector
+    ).tensor_split([2 * joints], -1)
+    carried[:, 2 * joints :, count:] = by_start
+    if shared:
+        carried[:, 2 * joints :, friction_count:count] = by_plant
     block = stride * substeps
     many, whole = block * max(1, PIECE // (windows * block)), steps // block * block
     sample = 0
@@ -151,11 +166,11 @@ def propagate(
             for x in (run.motion.q, run.motion.qd, run.motion.qdd, run.tau, run.step[..., None])
         )
         memory = None if run.memory is None else _by_block(run.memory[:, first:last], length)
-        held, slope = _coefficients(run.friction, qd, qdd, memory)
+        held, slope = _coefficients(run.friction, qd, qdd, memory, shared=shared)
         derivative = jacobian(q, qd, held, tau, step, run.plant_vector)
         by_state, by_shared = (
             part.unflatten(0, (-1, windows))
-            for part in _compose(slope, derivative, length, plant_count)
+            for part in _compose(slope, derivative, length, plant_count, shared=shared)
         )
         rows, carried = _carry(by_state, by_shared, carried, joints)
         end = sample + stride * rows.shape[1]
@@ -170,11 +185,13 @@ def _by_block(x: Tensor, length: int) -> Tensor:
 
 
 def _coefficients(
-    friction: FrictionModel, qd: Tensor, qdd: Tensor, memory: Tensor | None
+    friction: FrictionModel, qd: Tensor, qdd: Tensor, memory: Tensor | None, *, shared: bool
 ) -> tuple[Tensor, Sensitivity]:
     """Coefficients held over each step, (sample, joint, coefficient), and their derivatives."""
     schedule = friction.schedule
-    if memory is None:
+    if memory is None and not shared:
+        held, slope = schedule(qd, qdd), schedule.motion_sensitivities(qd, qdd)
+    elif memory is None:
         held, slope = schedule(qd, qdd), schedule.sensitivities(qd, qdd)
     else:
         held = schedule.coefficients_from(qd, qdd, memory)
@@ -183,11 +200,12 @@ def _coefficients(
 
 
 def _compose(
-    slope: Sensitivity, derivative: Tensor, block: int, plant_count: int
+    slope: Sensitivity, derivative: Tensor, block: int, plant_count: int, *, shared: bool
 ) -> tuple[Tensor, Tensor]:
     """Close the loop from the state through the coefficients, and chain the steps of blocks.
 
-    The results are derivatives of the ends of blocks by the state before, and by what is shared.
+    The results are derivatives of the ends of blocks by the state before, and by what is shared,
+    without columns unless it is asked for.
     """
     samples, joints, k = slope.qd.shape
     by_q, by_qd, by_held, by_plant = derivative.split(
@@ -211,6 +229,8 @@ def _compose(
         rows.append(after @ held[:, s])
         total = total + after @ plant[:, s]
         after = after @ state[:, s]
+    if not shared:
+        return after, after.new_zeros(*after.shape[:-1], 0)
     by_coefficient = torch.stack(rows[::-1], 1).unflatten(-1, (joints, k)).transpose(1, 2)
     return after, torch.cat([slope.contract(by_coefficient), total], -1)
 

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.fitting.data.inputs import adjustable_terms
-from nfriction.fitting.equation_error import TorqueFit, fit_torque, prior_sd
+from nfriction.fitting.data.inputs import adjustable_terms, advanced_torques
+from nfriction.fitting.equation_error import TorqueFit, fit_equation_error, prior_sd
 from nfriction.fitting.fit import FitTask
 from nfriction.fitting.options import Continuity, FitOptions
-from nfriction.fitting.plant_parameters import PlantParameter
+from nfriction.fitting.plant_parameters import TORQUE_DELAY, PlantParameter
 from nfriction.fitting.result.fit_result import (
     FitResult,
     result_from_equation_error,
@@ -20,14 +20,15 @@ from nfriction.fitting.result.fit_result import (
 )
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.continuation import (
+    HorizonResult,
     ShootingFitter,
     horizon_continuation,
     loglik_tolerance,
 )
-from nfriction.fitting.strategy.encoder_eccentricity import richer_by_evidence
 from nfriction.fitting.strategy.multistart import warm_start_from_nested
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.models import FrictionModel
+from nfriction.optim.least_squares import Quadratic
 from nfriction.plant import PendulumChain, Plant
 
 TOO_LONG = (
@@ -56,7 +57,7 @@ def fit_constant(task: FitTask) -> FitResult:
     eccentric = fits_eccentricity(options, start)
     fitter = _fitter(task, model, torque, eccentric)
     friction = torque.coefficients.reshape(-1)
-    plant = known_terms(start, fitter.jacobian.terms)
+    plant = known_terms(start, fitter.jacobian.terms, task.delay)
     linear = all(c.linear or not c.fitted for c in model.law.coefficients)
     search = horizon_continuation(
         fitter, friction, plant, task.motions, None if linear else equation_error
@@ -88,7 +89,10 @@ def fit_constant(task: FitTask) -> FitResult:
 
 def regression(task: FitTask, model: FrictionModel, plant: Plant) -> TorqueFit:
     """Constant coefficients that torques imply on a plant."""
-    return fit_torque(model.law, plant, task.recordings, task.motions, model.v_smooth, task.options)
+    recordings = advanced_torques(task.recordings, task.delay)
+    return fit_equation_error(
+        model.law, plant, recordings, task.motions, model.v_smooth, task.options
+    )
 
 
 def _fitter(
@@ -116,9 +120,13 @@ def constant_prior(
     return torch.zeros_like(sd), sd
 
 
-def known_terms(start: FitResult | None, terms: Sequence[PlantParameter]) -> Tensor:
-    """Plant terms of an earlier fit by name, 0 where it has none, (term,)."""
-    known = {name: value for name, value, _ in start.plant_terms} if start else {}
+def known_terms(
+    start: FitResult | None, terms: Sequence[PlantParameter], delay: float = 0.0
+) -> Tensor:
+    """Plant terms of an earlier fit by name, 0 where it has none but for the delay, (term,)."""
+    known = {TORQUE_DELAY: delay}
+    if start is not None:
+        known |= {name: value for name, value, _ in start.plant_terms}
     return torch.tensor([known.get(t.name, 0.0) for t in terms], dtype=torch.float64)
 
 
@@ -127,6 +135,57 @@ def fits_eccentricity(options: FitOptions, start: FitResult | None) -> bool:
     terms = start.plant_terms if start else ()
     found = any(name.startswith("encoder ") for name, _, _ in terms)
     return options.eccentricity == "on" or (options.eccentricity == "auto" and found)
+
+
+def richer_by_evidence(
+    base: HorizonResult, richer: ShootingFitter, tolerance: float
+) -> HorizonResult | None:
+    """The stage with encoder terms if the data ask for them, else None.
+
+    The two plants are compared by their evidence in Laplace's approximation: the decrease of the
+    cost less the Occam factor of the new terms, with residuals inflated for autocorrelation. A
+    first prediction of the decrease from derivatives alone may save the search. The terms of
+    `richer` are those of `base`, then the encoders'.
+
+    References:
+        D. J. C. MacKay, Neural Computation 4 (1992), 415-447.
+    """
+    extra = len(richer.jacobian.terms) - len(base.problem.jacobian.terms)
+    if not base.noise > 0 or extra < 1:
+        return None
+    problem = richer.problem(base.problem.windows, base.noise, base.parts.friction)
+    variables = problem.variables
+    shared, old = variables.shared_count, base.problem.variables.shared_count
+    zeros = torch.zeros(extra, dtype=torch.float64)
+    at_base = torch.cat([base.result.x[:old], zeros, base.result.x[old:]])
+    before = problem.linearise(at_base)
+    lower, upper = variables.bounds()
+    known = (at_base > lower) & (at_base < upper)
+    known[old:shared] = False
+    both = known.clone()
+    both[old:shared] = True
+    log_prior = 0.5 * float(variables.prior()[0][old:shared].log().sum())
+
+    def occam(after: Quadratic) -> float:
+        return log_prior - 0.5 * (_log_volume(after, both) - _log_volume(before, known))
+
+    if _newton_decrease(before, both) - _newton_decrease(before, known) + occam(before) <= 0:
+        return None
+    start = variables.start(torch.cat([base.parts.plant, zeros]), base.parts.offsets)
+    found = richer.search(problem, start, tolerance, "eccentric encoders")
+    end = found.result
+    gain = float(before.cost) - float(end.cost)
+    return found if gain + occam(Quadratic(end.cost, end.gradient, end.hessian)) > 0 else None
+
+
+def _newton_decrease(local: Quadratic, chosen: Tensor) -> float:
+    """Decrease of the cost that its quadratic model predicts when the chosen variables move."""
+    slope = local.gradient[chosen]
+    return 0.5 * float(slope @ torch.linalg.lstsq(local.hessian[chosen][:, chosen], slope).solution)
+
+
+def _log_volume(local: Quadratic, chosen: Tensor) -> float:
+    return float(torch.linalg.slogdet(local.hessian[chosen][:, chosen]).logabsdet)
 
 
 def is_constant_fit(

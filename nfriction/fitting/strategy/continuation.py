@@ -38,8 +38,8 @@ class HorizonResult:
 
     @cached_property
     def residuals(self) -> Tensor:
-        """Position errors [rad; m], (window, step + 1, joint)."""
-        return self.problem.errors(self.result.x)
+        """Position errors as the loss counts them [rad; m], (window, step + 1, joint)."""
+        return self.problem.counted_errors(self.result.x)
 
     @property
     def rms(self) -> float:
@@ -136,8 +136,23 @@ class ShootingFitter:
         """Minimise a problem of this fitter.
 
         `tolerance` is the relative decrease of the cost that counts as none, `name` the stage's for
-        the callback.
+        the callback. A robust loss without a scale gets that of the errors in the end.
         """
+        if self.options.loss == problem.loss.name:
+            return self._minimise(problem, start, tolerance, name)
+        found = self._minimise(problem.rescaled(start), start, tolerance, name)
+        for _ in range(self.options.most_scales - 1):
+            again = found.problem.rescaled(found.result.x)
+            if found.stopped or again.loss.is_near(
+                found.problem.loss, self.options.scale_tolerance
+            ):
+                break
+            found = self._minimise(again, found.result.x, tolerance, name)
+        return found
+
+    def _minimise(
+        self, problem: ShootingProblem, start: Tensor, tolerance: float, name: str
+    ) -> HorizonResult:
         solver = LevenbergMarquardt(
             max_steps=self.options.max_steps,
             gradient_tolerance=self.options.gradient_tolerance,
@@ -293,9 +308,7 @@ def settle_states(problem: ShootingProblem, x: Tensor) -> tuple[Tensor, bool]:
     shared = x[:count]
 
     def of_states(states: Tensor) -> Quadratic:
-        whole = problem.linearise(torch.cat([shared, states]))
-        blocks = (0, whole.blocks[1]) if whole.blocks else None
-        return Quadratic(whole.cost, whole.gradient[count:], whole.hessian[count:, count:], blocks)
+        return problem.linearise_states(torch.cat([shared, states]))
 
     solver = LevenbergMarquardt(
         max_steps=options.settling_steps, cost_tolerance=options.settling_tolerance
@@ -309,21 +322,20 @@ def settle_states(problem: ShootingProblem, x: Tensor) -> tuple[Tensor, bool]:
 def loses(stages: Sequence[HorizonResult], found: HorizonResult) -> bool:
     """True if a stage's parameters lose what the stages before it had found.
 
-    Errors of a measured torque add up over a long window and lead its parameters astray; free
-    swings have none. Where the encoder's rounding explains the residuals of shorter windows, law
-    and plant are right, and a loss of likelihood there beyond that of other parameters within
-    their uncertainty is one. Elsewhere law or plant are wrong, and short horizons may be traded
-    for long ones. As the noise of each is unknown, its log likelihood is that of the root mean
-    square residual; parameters lose that are worse at a shorter horizon by more than its noise,
-    and gain less at their own.
+    Where the encoder's rounding explains the residuals of shorter windows, law and plant are right,
+    and a loss of likelihood there beyond that of other parameters within their uncertainty is one.
+    Elsewhere law or plant are wrong, and short horizons may be traded for long ones: on free swings
+    at will, but errors of a measured torque add up over a long window and lead its parameters
+    astray. As the noise of each horizon is unknown, its log likelihood is that of the root mean
+    square residual; parameters lose that are worse at a shorter horizon by more than its noise, and
+    gain less at their own.
     """
-    if not found.problem.windows.tau.any():
-        return False
     from scipy.special import chdtri  # slow to import
 
     before, chance = stages[-1], found.problem.options.loss_level
     lower, upper = found.problem.variables.bounds()
     fitted = int((lower < upper)[: found.problem.variables.shared_count].sum())
+    driven = bool(found.problem.windows.tau.any())
     total, worse = 0.0, False
     for at in (*stages, found):
         new = _squares(at, found)
@@ -331,6 +343,8 @@ def loses(stages: Sequence[HorizonResult], found: HorizonResult) -> bool:
             lost = float(new.sum() - at.residuals.square().sum()) / at.noise**2
             if not lost <= float(chdtri(fitted, chance)):
                 return True
+            continue
+        if not driven:
             continue
         old = _squares(at, before)
         ratio, spread = log_ratio(new, old)
@@ -345,7 +359,7 @@ def _squares(at: HorizonResult, of: HorizonResult) -> Tensor:
         return of.residuals.square().sum((1, 2))
     count = at.problem.variables.shared_count
     x, _ = settle_states(at.problem, torch.cat([of.result.x[:count], at.result.x[count:]]))
-    return at.problem.errors(x).square().sum((1, 2))
+    return at.problem.counted_errors(x).square().sum((1, 2))
 
 
 def log_ratio(new: Tensor, old: Tensor) -> tuple[float, float]:

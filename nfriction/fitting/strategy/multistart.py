@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.data.windows import Windows
+from nfriction.fitting.robust_loss import RobustLoss
 from nfriction.fitting.strategy.continuation import (
     Continuation,
     EquationError,
@@ -74,8 +75,9 @@ def best_of_starts(
     noise = max(min(size for size in sizes if math.isfinite(size)), options.min_noise)
     implied = equation_error(own.problem.plant_at(nested.parts.plant))[0]
     embedded = embed_nested(law, nested.parts.friction.reshape(len(implied), -1), implied)
-    best, lowest = own, _misfit(own, noise) if same else math.inf
-    limit = _misfit(nested, noise)
+    loss = own.problem.loss
+    best, lowest = own, _misfit(own, noise, loss) if same else math.inf
+    limit = _misfit(nested, noise, loss)
     tolerance = loglik_tolerance(min(lowest, limit), options)
     for coefficients in (implied, embedded):
         if coefficients is embedded and lowest <= limit:
@@ -84,7 +86,7 @@ def best_of_starts(
         start = problem.variables.start(nested.parts.plant, nested.parts.offsets)
         name = f"from the {nested.problem.friction.law.name} law"
         found = fitter.search(problem, start, tolerance, name)
-        misfit = _misfit(found, noise)
+        misfit = _misfit(found, noise, loss)
         surer = found.result.converged and not best.result.converged
         if misfit < lowest * (1 - tolerance) or (surer and misfit < lowest * (1 + tolerance)):
             best, lowest = found, misfit
@@ -114,8 +116,12 @@ def _windows_from(found: HorizonResult) -> Windows:
     return replace(windows, q0=q0, qd0=qd0)
 
 
-def _misfit(found: HorizonResult, noise: float) -> float:
-    """Half the sum of squares of residuals and defects; infinite where the motion diverged."""
-    defects = 0.5 * float(found.problem.defects(found.result.x).square().sum())
-    misfit = weighted_cost(found.residuals, noise) + defects
+def _misfit(found: HorizonResult, noise: float, loss: RobustLoss) -> float:
+    """Half the sum of squares of residuals and defects; infinite where the motion diverged.
+
+    All that are compared have the same loss.
+    """
+    problem, x = replace(found.problem, loss=loss), found.result.x
+    defects = 0.5 * float(problem.defects(x).square().sum())
+    misfit = weighted_cost(problem.counted_errors(x), noise) + defects
     return misfit if math.isfinite(misfit) else math.inf

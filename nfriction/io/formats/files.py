@@ -11,7 +11,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING
 
-from nfriction.io.atomic import write_atomically
+from nfriction.io.files import write_atomically
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-OURS = re.compile(r"time|(q|qd|tau)[1-9]\d{0,3}", re.ASCII)
+OURS = re.compile(r"time|(q|qd|tau|motor|current)[1-9]\d{0,3}", re.ASCII)
+# What a motor's angle and current are converted to.
+_OF_MOTORS = {"motor": "q", "current": "tau"}
 # Usual names of a torque, or of the current that makes it, with a number and a unit behind;
 # "torque_on" and "taut" are none.
 _LIKE_TORQUE = re.compile(
@@ -36,6 +38,8 @@ _PER_SI: dict[str, dict[str, float]] = {
     "qd": {f"{unit}/s": per for unit, per in _ROTATION.items()}
     | {"rpm": 60 / _TURN, "m/s": 1.0, "mm/s": 1e3},
     "tau": {"N m": 1.0, "mN m": 1e3, "N": 1.0, "mN": 1e3},
+    "motor": _ROTATION,
+    "current": {"A": 1.0, "mA": 1e3},
 }
 _SPELLINGS = {
     "°": "deg", "°/s": "deg/s", "degree": "deg", "degrees": "deg", "degrees/s": "deg/s",
@@ -46,10 +50,12 @@ _SPELLINGS = {
 
 
 class Source(NamedTuple):
-    """A column of a table and its unit, None if unknown."""
+    """A column of a table and its unit, None if unknown; of a motor, with what to multiply by."""
 
     column: str
     unit: str | None
+    motor: str = ""
+    factor: float = 1.0
 
 
 class Arrays(NamedTuple):
@@ -67,14 +73,21 @@ class Arrays(NamedTuple):
 
 
 def table_arrays(
-    table: pd.DataFrame, columns: Mapping[str, str] | None = None, *, degrees: bool = False
+    table: pd.DataFrame,
+    columns: Mapping[str, str] | None = None,
+    *,
+    degrees: bool = False,
+    motor_factors: Mapping[str, Sequence[float]] | None = None,
 ) -> Arrays:
     """Arrays time, q and perhaps qd and tau.
 
     Args:
-        table: with columns time, q1 …, perhaps qd1 …, tau1 …; others are ignored.
+        table: with columns time, q1 …, perhaps qd1 …, tau1 …; others are ignored. In place of q1
+            and tau1 it may have motor1 and current1.
         columns: the table's name for ours where they differ, perhaps with a unit: "enc_1:deg".
         degrees: positions and velocities without a unit are in degrees.
+        motor_factors: position per angle of a joint's motor ("motor") and torque per its current
+            ("current"), a number a joint.
     Raises:
         ValueError: a column or unit that is missing, unknown or contradicts another, or a column
             named for a joint that is not there.
@@ -83,10 +96,12 @@ def table_arrays(
     table = table.set_axis([str(name) for name in table.columns], axis=1)
     columns = {key: str(name) for key, name in (columns or {}).items()}
     sources = _sources(table, columns)
+    named = [_joint_key(key) if key in sources else key for key in columns]
+    sources = _of_joints(sources, columns, motor_factors or {})
     joints = max((int(key[1:]) for key in sources if re.fullmatch(r"q\d+", key)), default=1)
     # Of a lone q9999 one missing column is message enough.
     needed = ["time", *(f"q{k + 1}" for k in range(min(joints, len(sources) + 1)))]
-    missing = [key for key in dict.fromkeys((*needed, *columns)) if key not in sources]
+    missing = [key for key in dict.fromkeys((*needed, *named)) if key not in sources]
     if missing:
         raise ValueError(_missing(table, columns, missing))
     beyond = [key for key in columns if _number(key) > joints]
@@ -104,7 +119,11 @@ def table_arrays(
         if all(group) or (key == "tau" and any(group)):
             stack = [_joint_column(table, key, source, degrees) for source in group]
             arrays[key] = np.stack(stack, axis=1)
-    units = [s.unit for key, s in sources.items() if re.fullmatch(r"q\d+", key) and s.unit]
+    units = [
+        s.unit
+        for key, s in sources.items()
+        if re.fullmatch(r"q\d+", key) and s.unit and not s.motor
+    ]
     kinds = {slides(unit) for unit in units}
     if len(kinds) > 1:
         raise ValueError(f"positions must all be angles or all be lengths, got {', '.join(units)}.")
@@ -140,16 +159,16 @@ def to_si(kind: str, values: Array, unit: str) -> Array:
     """Values in SI.
 
     Args:
-        kind: "time", "q", "qd" or "tau".
+        kind: "time", "q", "qd", "tau", "motor" or "current".
         values: any shape.
         unit: s, ms, us, ns; rad, mrad, deg, rev, counts/8192 (any count a revolution), m, mm; those
-            per second, rpm; N m, mN m, N, mN.
+            per second, rpm; N m, mN m, N, mN; A, mA.
     Raises:
         ValueError: no unit of that kind.
     """
     per = _per_si(kind, unit)
     if per is None:
-        known = ", ".join(_PER_SI[kind]) + (", counts/N" if kind == "q" else "")
+        known = ", ".join(_PER_SI[kind]) + (", counts/N" if kind in ("q", "motor") else "")
         raise ValueError(f"{unit!r} is no unit of {kind}; known are {known}.")
     return values if per == 1.0 else values / per
 
@@ -157,7 +176,7 @@ def to_si(kind: str, values: Array, unit: str) -> Array:
 def _per_si(kind: str, unit: str) -> float | None:
     unit = canonical_unit(unit)
     counts = re.fullmatch(r"counts?/([1-9][0-9]{0,11})", unit)
-    if counts and kind == "q":
+    if counts and kind in ("q", "motor"):
         return int(counts[1]) / _TURN
     return _PER_SI[kind].get(unit)
 
@@ -207,6 +226,38 @@ def _known(table: pd.DataFrame, aliases: dict[str, str], source: Source) -> Sour
     return Source(column, source.unit or written)
 
 
+def _joint_key(key: str) -> str:
+    """Our name for what a motor's column is converted to: q1 for motor1."""
+    stem = key.rstrip("0123456789")
+    return _OF_MOTORS.get(stem, stem) + key[len(stem) :]
+
+
+def _of_joints(
+    sources: dict[str, Source], columns: Mapping[str, str], factors: Mapping[str, Sequence[float]]
+) -> dict[str, Source]:
+    """Sources by what they are of joints; a motor's count where the joint has none of its own."""
+    found = {key: source for key, source in sources.items() if _joint_key(key) == key}
+    for key, source in sources.items():
+        ours, kind = _joint_key(key), key.rstrip("0123456789")
+        if ours == key or (ours in found and key not in columns):
+            continue
+        if ours in columns:
+            raise ValueError(
+                f"`columns` names {ours} and {key}, but one follows from the other; drop one."
+            )
+        joint = int(key[len(kind) :])
+        if joint > len(factors.get(kind, ())):
+            if kind == "current" and key not in columns:
+                continue  # a remark says what it needs
+            what = "`torque_constant`" if kind == "current" else "`gear_ratio`"
+            raise ValueError(
+                f"{key} is of a motor: the rig needs a `motor` with a {what} for joint {joint}, "
+                "and the reader that rig (`plant=rig`)."
+            )
+        found[ours] = source._replace(motor=kind, factor=factors[kind][joint - 1])
+    return found
+
+
 def _joint_column(table: pd.DataFrame, key: str, source: Source | None, degrees: bool) -> Array:
     """A joint's numbers in SI; zero without a source."""
     if source is None:
@@ -218,8 +269,8 @@ def _joint_column(table: pd.DataFrame, key: str, source: Source | None, degrees:
                 f"`degrees=True`, but column {source.column} is given as {source.unit!r}; "
                 f"drop one of the two."
             )
-        source = Source(source.column, unit)
-    return _column(table, key, source)
+        source = source._replace(unit=unit)
+    return source.factor * _column(table, source.motor or key, source)
 
 
 def _number(name: str) -> int:
@@ -232,7 +283,7 @@ def _settle_decimal_sign(table: pd.DataFrame, sources: dict[str, Source]) -> lis
     """Settle the decimal sign that the text leaves open; a remark if it remains a guess."""
     columns = set(table.attrs.get("undecided", ()))
     used = [source for source in sources.values() if source.column in columns]
-    for column, unit in used:
+    for column, unit, *_ in used:
         cell = next(str(cell) for cell in table[column] if set(str(cell)) & set(THOUSANDS))
         sign = "," if "," in cell else "."
         # Counts are whole, so it cannot be a decimal sign.
@@ -268,9 +319,9 @@ def _remarks(table: pd.DataFrame, sources: dict[str, Source], joints: int) -> li
         option = f'columns={{"{own if own in free else free[0]}": "{unread[0]}"}}'
         kind, remedy = "torque", f"if it is, name it with {option}"
         if _LIKE_CURRENT.search(unread[0]):
-            kind = "motor current"
-            remedy = "if it drives a joint, multiply it by the torque constant "
-            remedy += f"and name it with {option}"
+            kind, option = "motor current", option.replace('{"tau', '{"current')
+            remedy = "if it drives a joint, give the rig a `motor` with its `torque_constant` "
+            remedy += f"and `gear_ratio`, and name the column with {option}"
         finding = f"column {', '.join(unread[:3])} looks like {kind} and is not read"
         remarks.append((finding, remedy))
     return remarks

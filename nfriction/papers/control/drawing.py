@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from nfriction.io.atomic import atomic_write
+from nfriction.io.files import atomic_write
 from nfriction.papers.control.study import (
     NONE,
     SAMPLE_TIME,

@@ -252,8 +252,8 @@ def balanced(
                   steps=round(seconds / SAMPLE_TIME), electronics=ELECTRONICS)  # fmt: skip
     return {
         name: ControlledMotion(
-            run.time, run.q[k], run.qd[k], run.qdd[k], run.diverged_at[k], run.tau[k],
-            run.measured[k],
+            run.time, run.q[k], run.qd[k], run.qdd[k], run.diverged_at[k],
+            tau=run.tau[k], measured=run.measured[k],
         )
         for k, name in enumerate(compensations)
     }  # fmt: skip

@@ -18,8 +18,7 @@ from torch import Tensor
 
 from nfriction.friction.laws import Law
 from nfriction.fuzzy import FuzzySet
-from nfriction.io import strict_json
-from nfriction.io.atomic import write_atomically
+from nfriction.io.files import parse_json, write_atomically
 from nfriction.papers.controller.mamdani import MamdaniController
 from nfriction.papers.controller.rules import RuleBase, Variable
 
@@ -249,7 +248,7 @@ class _Checkpoint:
         path = options.checkpoint
         if path is None or not path.exists():
             return cls({})
-        content = strict_json.parse(path.read_bytes())
+        content = parse_json(path.read_bytes())
         if content["options"] != _described(options):
             raise ValueError(f"{path}: made with other options; repeat them or take another file.")
         return cls({p: (done, np.array(rows)) for p, (done, rows) in content["found"].items()})

@@ -39,8 +39,7 @@ from pathlib import Path
 from typing import Any
 
 from nfriction.fuzzy.membership import FuzzySet, sets_from_ranges
-from nfriction.io import strict_json
-from nfriction.io.atomic import write_atomically
+from nfriction.io.files import parse_json, write_atomically
 
 FORMAT = "nfriction-rules/1"
 # Bounds of foreign files: inference costs rules times points of the output universe.
@@ -168,7 +167,7 @@ def read_text(path: Path) -> str:
 def parse_rules(text: str, source: str = "rules") -> RuleBase:
     """Rule base from JSON text; `source` names it in errors."""
     try:
-        document = strict_json.parse(text, _unique)
+        document = parse_json(text, _unique)
         return _rule_base(document)
     # Python's parser recurses into brackets, of which a hostile file may open thousands.
     except RecursionError:

@@ -15,8 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nfriction.io import strict_json
-from nfriction.io.atomic import write_atomically
+from nfriction.io.files import parse_json, write_atomically
 from nfriction.io.formats import write_table
 from nfriction.papers.controller.mamdani import MamdaniController, paper_controller
 from nfriction.papers.twin.dataset import Encoder, make
@@ -148,7 +147,7 @@ def read_samples(
     time = tables[0]["time"].to_numpy(dtype=np.float64)
     found = ControllerSamples(tuple(joint_names), outputs, time, x, y)
     path = folder / CHECKSUMS
-    if path.exists() and strict_json.parse(path.read_bytes()) != checksums(found):
+    if path.exists() and parse_json(path.read_bytes()) != checksums(found):
         raise ValueError(f"{folder}: files differ from {CHECKSUMS}; build them again.")
     return found
 

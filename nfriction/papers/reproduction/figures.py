@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 from tqdm import tqdm
 
 from nfriction.evaluation.score import RMSE, Score
-from nfriction.io.atomic import atomic_write
+from nfriction.io.files import atomic_write
 from nfriction.io.model_file import load
 from nfriction.papers.control.drawing import balance_figure, swing_up_animation
 from nfriction.papers.controller.mamdani import paper_controller

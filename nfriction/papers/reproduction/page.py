@@ -9,7 +9,7 @@ from typing import Any
 import jinja2
 import pandas as pd
 
-from nfriction.io.atomic import write_atomically
+from nfriction.io.files import write_atomically
 from nfriction.papers.reproduction.tables import all_tables, conclusion, fit_ends, order
 from nfriction.papers.reproduction.workspace import Workspace
 from nfriction.version import __version__

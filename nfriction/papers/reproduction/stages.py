@@ -26,8 +26,7 @@ from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction import model_by_name
 from nfriction.friction.models import FrictionModel
-from nfriction.io.model_file import load, load_info, save
-from nfriction.io.model_info import ModelInfo
+from nfriction.io.model_file import ModelInfo, load, load_info, save
 from nfriction.papers import twin
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
 from nfriction.papers.afem.classes import class_intervals

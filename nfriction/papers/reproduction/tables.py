@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from nfriction.io.atomic import write_atomically
+from nfriction.io.files import write_atomically
 from nfriction.papers.reproduction.agreement import agreement
 from nfriction.papers.reproduction.stages import (
     ADAPTIVE,

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from nfriction.evaluation.results import model_info
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.identifiability import Interval
-from nfriction.io.atomic import atomic_write, write_atomically
+from nfriction.io.files import atomic_write, write_atomically
 from nfriction.io.model_file import load, load_plant, save
 from nfriction.papers.afem.fit_by_search import SearchState
 from nfriction.papers.control import study

@@ -18,7 +18,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from nfriction.io.atomic import atomic_write
+from nfriction.io.files import atomic_write
 from nfriction.io.formats import write_table
 from nfriction.papers.twin.mechanics import HiddenFriction, Links, TrueMotion, Vector, simulate
 from nfriction.plant import PendulumChain, rigs

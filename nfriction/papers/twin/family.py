@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from nfriction.evaluation.compare import Comparison
-from nfriction.io.atomic import write_atomically
+from nfriction.io.files import write_atomically
 from nfriction.papers.twin.dataset import RATE, Encoder, Release, Twin, record, sample_count, write
 from nfriction.papers.twin.mechanics import Links, TrueMotion, Vector
 from nfriction.plant import rigs

@@ -57,6 +57,7 @@ for (const button of dialog.querySelectorAll("[data-do]")) {
 for (const button of document.querySelectorAll(".zoom")) {
   button.addEventListener("click", async () => {
     const small = button.querySelector("img");
+    picture.style.width = "0"; // until its size is known
     picture.alt = small.alt;
     picture.src = small.currentSrc; // the one for this screen
     dialog.setAttribute("aria-label", small.alt);

@@ -16,17 +16,24 @@ static nf_filter filter;
 #endif
 static unsigned long next_call;
 
-// Position [{{ unit }}] of a joint; here from an analogue pin over one turn.
+// Share of the friction that is compensated: 1 drives the joint where the model is a little high.
+static const nf_real GAIN = (nf_real)0.8;
+// Velocity below which the torque fades, against chatter about standstill [{{ unit }}/s].
+static const nf_real DEAD_BAND = (nf_real)0.05;
+
+// Position [{{ unit }}] of a joint, the first from upright, others relative; here from an analogue pin over one turn.
 static double read_position(int joint)
 {
     return analogRead(A0 + joint) * (6.283185307179586 / 1023.0);
 }
 
 // Hand out the torque that compensates friction [{{ torque_unit }}]; 0 where it is not to be trusted.
-static void write_torque(int joint, nf_real tau, int status)
+static void write_torque(int joint, nf_real tau, nf_real qd, int status)
 {
+    const nf_real speed = qd < 0 ? -qd : qd;
     if (status & NF_NOT_FINITE)
         tau = 0;
+    tau *= GAIN * (speed < DEAD_BAND ? speed / DEAD_BAND : 1);
     analogWrite(9 + joint, (int)constrain(128 + 100 * tau, 0, 255));
 }
 
@@ -76,13 +83,20 @@ void loop()
         q[j] = position;
     }
 #endif
+#if NF_HAS_LOAD
+    nf_real at[NF_JOINTS];
     for (j = 0; j < NF_JOINTS; ++j)
-        load[j] = 1;
+        at[j] = (nf_real)q[j];
+    nf_load(at, qd, load);
+#else
+    for (j = 0; j < NF_JOINTS; ++j)
+        load[j] = 1;  // this law does not read it, or the model file has no rig
+#endif
 #if NF_STATE_SIZE
     nf_step(&state, qd, qdd, load, tau, coefficients, status);
 #else
     nf_step(qd, qdd, load, tau, coefficients, status);
 #endif
     for (j = 0; j < NF_JOINTS; ++j)
-        write_torque(j, tau[j], status[j]);
+        write_torque(j, tau[j], qd[j], status[j]);
 }

@@ -48,6 +48,12 @@ void nf_init(nf_state *state, const nf_real qd[NF_JOINTS], const nf_real qdd[NF_
 }
 
 {% endif %}
+{% if load %}
+void nf_load(
+    const nf_real q[NF_JOINTS], const nf_real qd[NF_JOINTS], nf_real load[NF_JOINTS])
+{{ load_of }}
+
+{% endif %}
 void nf_step(
 {% if state_size %}
     nf_state *state,
@@ -122,7 +128,7 @@ void nf_step(
                 state->memory[NF_STATE_SIZE * j + k] = next[NF_STATE_SIZE * j + k];
 {% endif %}
 {% elif network %}
-    nf_network(v, a, {{ "sign[0], " if along_motion }}{{ "known, " if by_class }}c);
+    nf_network(v, a, {{ "sign[0], " if along_motion or leans }}{{ "known, " if by_class }}c);
 {% else %}
     for (k = 0; k < NF_COEFFICIENTS; ++k)
         for (j = 0; j < NF_JOINTS; ++j)

@@ -33,6 +33,7 @@
 #define NF_COEFFICIENTS {{ coefficients }}
 #define NF_STATE_SIZE {{ state_size }}
 #define NF_FILTER_SIZE {{ filter_size }}
+#define NF_HAS_LOAD {{ 1 if load else 0 }}
 #define NF_OUTSIDE {{ bits.outside }}
 #define NF_NOT_FINITE {{ bits.not_finite }}
 #define NF_SATURATED {{ bits.saturated }}
@@ -51,6 +52,13 @@ typedef struct {
 
 /* Memory before the first sample, whose motion is given. */
 void nf_init(nf_state *state, const nf_real qd[NF_JOINTS], const nf_real qdd[NF_JOINTS]);
+
+{% endif %}
+{% if load %}
+/* Load of each joint, which this law reads, at joint positions and velocities: the first angle from
+ * upright, each further one relative to the link before [{{ safe(about.unit) }}]. */
+void nf_load(
+    const nf_real q[NF_JOINTS], const nf_real qd[NF_JOINTS], nf_real load[NF_JOINTS]);
 
 {% endif %}
 /* Friction torque, coefficients (joint by joint) and status bits of every joint.

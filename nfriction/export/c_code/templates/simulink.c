@@ -1,7 +1,7 @@
 /* Level-2 S-function around {{ name }}.h. Build it together with the controller:
  *     mex {{ name }}_sfun.c {{ name }}.c
- * Inputs: velocity, acceleration and load; outputs: torque, coefficients (joint by joint) and
- * status bits. Runs at the sample time of the block that drives it.
+ * Inputs: velocity, acceleration and, as {{ name }}.h has a function of the load or not, joint
+ * position or load; outputs: torque, coefficients (joint by joint) and status bits. Runs at the sample time of the block that drives it.
  */
 #define S_FUNCTION_NAME {{ name }}_sfun
 #define S_FUNCTION_LEVEL 2
@@ -55,7 +55,7 @@ static void mdlInitializeConditions(SimStruct *S)
 
 static void mdlOutputs(SimStruct *S, int_T tid)
 {
-    nf_real in[3][NF_JOINTS], tau[NF_JOINTS];
+    nf_real in[3][NF_JOINTS], load[NF_JOINTS], tau[NF_JOINTS];
     nf_real coefficients[NF_JOINTS * NF_COEFFICIENTS];
     int status[NF_JOINTS];
     real_T *tau_out = (real_T *)ssGetOutputPortSignal(S, 0);
@@ -75,15 +75,21 @@ static void mdlOutputs(SimStruct *S, int_T tid)
         for (i = 0; i < NF_JOINTS; ++i)
             in[port][i] = (nf_real)signal[i];
     }
+#if NF_HAS_LOAD
+    nf_load(in[2], in[0], load);
+#else
+    for (i = 0; i < NF_JOINTS; ++i)
+        load[i] = in[2][i];
+#endif
 #if NF_STATE_SIZE
     if (!*begun)
         nf_init(&state, in[0], in[1]);
     *begun = 1;
-    nf_step(&state, in[0], in[1], in[2], tau, coefficients, status);
+    nf_step(&state, in[0], in[1], load, tau, coefficients, status);
     for (i = 0; i < NF_JOINTS * NF_STATE_SIZE; ++i)
         memory[i] = (real_T)state.memory[i];
 #else
-    nf_step(in[0], in[1], in[2], tau, coefficients, status);
+    nf_step(in[0], in[1], load, tau, coefficients, status);
 #endif
     for (i = 0; i < NF_JOINTS; ++i) {
         tau_out[i] = (real_T)tau[i];

@@ -42,6 +42,15 @@ public:
         return out;
     }
 
+#if NF_HAS_LOAD
+    // Load of each joint at joint positions, the first from upright, and velocities.
+    static Joints load(const Joints &q, const Joints &qd) {
+        Joints found{};
+        nf_load(q.data(), qd.data(), found.data());
+        return found;
+    }
+#endif
+
     // Forget all samples so far.
     void reset() {
 #if NF_STATE_SIZE

@@ -1,0 +1,93 @@
+"""Friction laws on real tables of friction torque, beside plain least squares.
+
+Prints, for each joint, the NRMSE on contiguous blocks left out: of five models by least squares
+(the baselines of the data cards: offset, Coulomb and viscous; with three Stribeck terms; with
+load-proportional Coulomb friction; five slip elements; all of these), of the best law without
+memory that `nfriction.fit_torque` fits, and of the law that it chooses.
+
+    python benchmarks/friction_tables.py --data DATA [--only kr300 ur10 tribometer]
+"""
+
+import argparse
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import nfriction
+from nfriction.fitting.hysteresis import deflections, path_of, range_of
+from nfriction.recording.torque_table import JointTorque, TorqueTable, blocks
+
+Array = NDArray[np.float64]
+
+TABLES: dict[str, tuple[str, dict[str, Any]]] = {
+    "kr300": ("kuka_kr300/kr300_A_friction.csv.gz", {}),
+    "ur10": ("ur10_rosbag/ur10_exciting_first_friction.csv.gz", {}),
+    "tribometer": (
+        "presliding_tribometer/tribometer_first.csv.gz",
+        {"columns": {"q": "position", "tau": "friction", "load": "normal_force"}, "unit": "m"},
+    ),
+}
+BASELINES = ("standard", "Stribeck", "load", "5 slip", "all")
+
+
+def designs(joint: JointTorque) -> dict[str, Array]:
+    """Regressors of the baselines, (row, column)."""
+    sign, speed = np.sign(joint.qd), np.abs(joint.qd) / np.abs(joint.qd).max()
+    one = np.ones_like(sign)
+    load = one if joint.load is None else joint.load / joint.load.mean()
+    widths = range_of(joint) * np.geomspace(1e-3, 0.3, 5)
+    slip = deflections(path_of(joint), widths, np.zeros(5))
+    drops = [np.exp(-((speed / v) ** 2)) * sign for v in (0.01, 0.05, 0.2)]
+    standard = np.stack([one, sign, joint.qd], 1)
+    every = np.column_stack([standard, *drops, load * sign, slip])
+    return {
+        "standard": standard,
+        "Stribeck": np.column_stack([standard, *drops]),
+        "load": np.column_stack([standard, load * sign]),
+        "5 slip": np.column_stack([one, joint.qd, slip]),
+        "all": every,
+    }
+
+
+def left_out(joint: JointTorque, design: Array, folds: int) -> float:
+    """NRMSE of plain least squares on blocks left out."""
+    square = 0.0
+    for block in blocks(joint, folds):
+        rest = np.setdiff1d(np.arange(len(joint)), block)
+        weights = np.linalg.lstsq(design[rest], joint.tau[rest], rcond=None)[0]
+        square += float(np.sum((design[block] @ weights - joint.tau[block]) ** 2))
+    return float(np.sqrt(square / len(joint)) / joint.tau.std())
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--data", type=Path, required=True, help="folder of the real recordings")
+    parser.add_argument("--only", nargs="+", choices=TABLES, default=list(TABLES))
+    parser.add_argument("--folds", type=int, default=10)
+    arguments = parser.parse_args(argv)
+    for name in arguments.only:
+        path, options = TABLES[name]
+        table = TorqueTable.read(arguments.data / path, **options)
+        begin = time.perf_counter()
+        found = nfriction.fit_torque(table, folds=arguments.folds)
+        errors = found.to_frame()
+        memory = {n for n, fits in found.fits.items() if fits[0].model.law.memory is not None}
+        plain = errors.drop(columns=list(memory)).min(axis=1)
+        print(f"\n{name}: NRMSE on {arguments.folds} blocks left out "
+              f"({time.perf_counter() - begin:.0f} s)")  # fmt: skip
+        heads = (*BASELINES, "no memory", "chosen", "law")
+        print(f"{'':8}" + "".join(f"{head:>10}" for head in heads))
+        for joint in table.joints:
+            chosen = found.chosen[joint.name]
+            numbers = [left_out(joint, d, arguments.folds) for d in designs(joint).values()]
+            numbers += [float(plain[joint.name]), float(errors[chosen][joint.name])]
+            print(f"{joint.name:8}" + "".join(f"{x:10.3f}" for x in numbers) + f"{chosen:>10}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,119 @@
+"""`nfriction fit-torque` and `nfriction score-torque`: tables of friction torque over velocity."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from nfriction.cli import inputs
+from nfriction.cli.console import Parser, Progress, UsageError, check_writable, one_line, warn
+from nfriction.friction import plain_name
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from nfriction.recording.torque_table import TorqueTable
+
+FIT_EXAMPLE = """example:
+  nfriction fit-torque table.csv --models viscous,coulomb-viscous,stribeck --out runs/joint"""
+SCORE_EXAMPLE = """example:
+  nfriction score-torque runs/joint other_table.csv"""
+COLUMNS = "columns qd and tau, perhaps time, q, qdd, load, temperature and joint; or qd1, tau1, ..."
+
+
+def add_fit(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
+    """Register `fit-torque`."""
+    parser = commands.add_parser(
+        "fit-torque", parents=[common], help="fit models to friction torque over velocity",
+        epilog=FIT_EXAMPLE,
+        description="Fit friction models to a table of friction torque over velocity, of "
+        "constant-velocity tests or the residual torque of an inverse dynamics, and compare them "
+        "on blocks left out.",
+    )  # fmt: skip
+    add = parser.add_argument
+    add("table", type=inputs.file, metavar="TABLE", help=f"{COLUMNS} ({inputs.FORMATS})")
+    add("--models", type=inputs.models,
+        help=f"with commas between them: {inputs.MODELS} (default: all constant laws that the "
+        "columns allow)")  # fmt: skip
+    add("--out", type=Path, default=Path("runs/torque"), help="folder to write")
+    add("--folds", type=inputs.count, default=10, metavar="N",
+        help="blocks that are left out in turn")  # fmt: skip
+    add("--no-figures", action="store_true", help="draw no figure")
+    _add_reading(parser)
+    add("--unit", choices=("rad", "m"), default="rad", help="of positions: m for a sliding axis")
+    parser.set_defaults(run=run_fit)
+
+
+def add_score(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
+    """Register `score-torque`."""
+    parser = commands.add_parser(
+        "score-torque", parents=[common], help="score models on friction torque over velocity",
+        epilog=SCORE_EXAMPLE,
+        description="Predict the friction torque of a table by a model file, or by the models that "
+        "fit-torque chose, and print the error of each joint.",
+    )  # fmt: skip
+    add = parser.add_argument
+    add("model", type=Path, metavar="MODEL", help="model file, or folder that fit-torque wrote")
+    add("table", type=inputs.file, metavar="TABLE", help=f"{COLUMNS} ({inputs.FORMATS})")
+    _add_reading(parser)
+    parser.set_defaults(run=run_score)
+
+
+def _add_reading(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--degrees", action="store_true", help="velocities are in degrees")
+    parser.add_argument("--columns", type=inputs.columns, metavar="OURS=THEIRS,...",
+                        help="the table's names of qd, tau, ... where they differ, with a unit "
+                        "where it is not SI, e.g. qd=speed:rpm,tau=torque")  # fmt: skip
+
+
+def run_fit(arguments: argparse.Namespace) -> int:
+    """Fit, write, print."""
+    from nfriction.evaluation.torque_tables import fit_torque
+    from nfriction.report.torque import choice_table, error_table, write_torque_fits
+
+    if arguments.folds < 2:
+        raise UsageError("--folds must be at least 2.")
+    table = _read(arguments, arguments.unit)
+    check_writable(arguments.out)
+    with Progress() as progress:
+        found = fit_torque(table, arguments.models, folds=arguments.folds, progress=progress.stage)
+        progress.stage("write results and figure")
+        written = write_torque_fits(
+            found, arguments.out, command=arguments.command_line,
+            figures=not arguments.no_figures,
+        )  # fmt: skip
+    for name, why in found.failed.items():
+        warn(f"{plain_name(name)} was not fitted: {one_line(why)}")
+    print(f"{error_table(found)}\n\n{choice_table(found)}\n")
+    print(_printed(found.intervals()))
+    print(f"\nwrote {written[-2]}")
+    return 1 if found.failed else 0
+
+
+def run_score(arguments: argparse.Namespace) -> int:
+    """Predict, compare, print."""
+    from nfriction.evaluation.torque_tables import read_models, score_models
+
+    if not arguments.model.exists():
+        raise UsageError(f"{arguments.model} is not there; check the path.")
+    models = read_models(arguments.model)
+    print(_printed(score_models(models, _read(arguments, models[0].unit))))
+    return 0
+
+
+def _read(arguments: argparse.Namespace, unit: str) -> TorqueTable:
+    from nfriction.recording.torque_table import TorqueTable
+
+    table = TorqueTable.read(
+        arguments.table, columns=arguments.columns, degrees=arguments.degrees,
+        unit="m" if unit == "m" else "rad",
+    )  # fmt: skip
+    for remark in table.remarks:
+        warn(one_line(remark))
+    return table
+
+
+def _printed(frame: pd.DataFrame) -> str:
+    text = frame.reset_index().to_string(index=False, float_format=lambda x: f"{x:.4g}", na_rep="")
+    return "\n".join(line.rstrip() for line in text.splitlines())

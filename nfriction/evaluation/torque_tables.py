@@ -1,0 +1,477 @@
+"""Friction laws on tables of friction torque: fits, comparison by blocks left out, prediction."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from nfriction.evaluation.cross_validation import TOLERANCE, Candidate
+from nfriction.evaluation.results import RESULTS
+from nfriction.fitting.options import DEFAULTS, FitOptions
+from nfriction.fitting.torque_table import (
+    LEAD_IN,
+    JointFit,
+    fit_joint,
+    fit_memory,
+    fit_network,
+    join,
+    predict,
+    require_load,
+    turning_velocity,
+)
+from nfriction.friction import model_by_name, model_name, plain_name
+from nfriction.friction.models import FrictionModel
+from nfriction.io.files import parse_json
+from nfriction.io.model_file import ModelInfo, load, load_info
+from nfriction.recording import Unit
+from nfriction.recording.torque_table import JointTorque, TorqueTable, as_table, blocks
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+FOLDS = 10
+# Laws that are fitted by default: to any table, and to those with columns time, load or both.
+LAWS = ("viscous", "coulomb", "coulomb-viscous", "arctan", "stribeck")
+WITH_TIME = ("slip",)
+WITH_LOAD = ("load-coulomb",)
+WITH_BOTH = ("load-slip",)
+# Standard deviations of a network's prior over its own, of which blocks left out choose. No network
+# first: it is kept only where it lowers the error.
+PRIOR_SHARES = (0.0, 1.0, 1 / 3)
+
+
+class TorqueScore(NamedTuple):
+    """Error of a predicted friction torque at one joint.
+
+    Attributes:
+        joint: its name.
+        model: name of the model.
+        rmse: root mean square error [N m; N].
+        nrmse: the same over the standard deviation of the torque [-].
+    """
+
+    joint: str
+    model: str
+    rmse: float
+    nrmse: float
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TorqueFits:
+    """Friction models fitted to a table of friction torque, and the one to use at each joint.
+
+    Attributes:
+        table: the rows.
+        fits: of every model by name, one a joint in the table's order.
+        candidates: errors on blocks left out, by joint: root mean square torque [N m; N].
+        choices: model to use and why, by joint.
+        failed: models that could not be fitted, with the reason.
+    """
+
+    table: TorqueTable
+    fits: Mapping[str, tuple[JointFit, ...]]
+    candidates: Mapping[str, tuple[Candidate, ...]]
+    choices: Mapping[str, tuple[str, str]]
+    failed: Mapping[str, str] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return self.summary()
+
+    @property
+    def unit(self) -> str:
+        """Unit of the torque."""
+        return "N m" if self.table.unit == "rad" else "N"
+
+    @property
+    def chosen(self) -> dict[str, str]:
+        """The model to use at each joint."""
+        return {joint: name for joint, (name, _) in self.choices.items()}
+
+    def model(self, name: str) -> FrictionModel:
+        """A model of all joints, by either of its names.
+
+        Raises:
+            ValueError: if it was not fitted.
+        """
+        return join([found.model for found in self.fits[self._known(name)]])
+
+    def _known(self, name: str) -> str:
+        """The name under which a model was fitted."""
+        known = model_name(name)
+        if known not in self.fits:
+            raise ValueError(f"{name!r} was not fitted; there are {', '.join(self.fits)}.")
+        return known
+
+    def _names(self, model: str | None) -> list[str]:
+        """The model of each joint: a given one, or those chosen."""
+        if model is None:
+            return list(self.chosen.values())
+        return [self._known(model)] * len(self.table.joints)
+
+    def info(self, name: str) -> ModelInfo:
+        """Entries of the model file of a model of all joints."""
+        found = self.fits[self._known(name)]
+        joints = self.table.joints
+        steps = [joint.step for joint in joints if joint.time is not None]
+        ranges = {
+            key: [[float(x.min()), float(x.max())] for x in (getattr(j, key) for j in joints)]
+            for key in ("qd", "qdd")
+        }
+        return ModelInfo(
+            joint_names=self.table.joint_names,
+            unit=self.table.unit,
+            sample_time=max(steps) if steps else None,
+            input_ranges=ranges,
+            training_data={self.table.name or "table": self.table.digest()},
+            fit={
+                "status": "Converged: least squares of the torque."
+                if all(one.converged for one in found)
+                else "Not converged: the step limit was reached.",
+                "intervals": {
+                    i.name: [_finite(i.low), _finite(i.high)]
+                    for one in found
+                    for i in one.intervals
+                },
+            },
+        )
+
+    def predict(self, table: Any, model: str | None = None) -> list[Array]:
+        """Friction torque at the rows of another table, an array (row,) a joint [N m; N].
+
+        Args:
+            table: a `TorqueTable`, a path or a DataFrame, with the joints of the training table.
+            model: by either of its names; by default the one chosen at each joint.
+
+        Raises:
+            ValueError: if its joints are others, or it lacks a load that a model needs.
+        """
+        given = as_table(table, unit=self.table.unit)
+        _check_joints(self.table.joint_names, given)
+        names = self._names(model)
+        return [
+            predict(self.fits[name][k].model, joint).numpy()
+            for k, (name, joint) in enumerate(zip(names, given.joints, strict=True))
+        ]
+
+    def score(self, table: Any, model: str | None = None) -> pd.DataFrame:
+        """Errors of `predict` by joint: model, rmse [N m; N], nrmse [-]."""
+        given = as_table(table, unit=self.table.unit)
+        torques = self.predict(given, model)
+        pairs = zip(given.joints, torques, self._names(model), strict=True)
+        return scores_frame([score_joint(*pair) for pair in pairs])
+
+    def to_frame(self) -> pd.DataFrame:
+        """NRMSE on blocks left out by joint and model."""
+        import pandas as pd  # slow to import
+
+        spread = {joint.name: float(joint.tau.std()) for joint in self.table.joints}
+        rows = {
+            joint: {c.name: c.error / spread[joint] for c in of}
+            for joint, of in self.candidates.items()
+        }
+        return pd.DataFrame.from_dict(rows, orient="index").rename_axis("joint")
+
+    def intervals(self, name: str | None = None) -> pd.DataFrame:
+        """Coefficients of a model, by default of those chosen: value, low and high of 95 %."""
+        import pandas as pd  # slow to import
+
+        rows = []
+        pairs = zip(self.table.joint_names, self._names(name), strict=True)
+        for k, (joint, own) in enumerate(pairs):
+            found = self.fits[own][k]
+            unknown = {n for d in found.unidentifiable for n in d.split(" with ")}
+            values = found.model.schedule.coefficient_sets()
+            known = {i.name: i for i in found.intervals}
+            for where, of in values.items():
+                for c, value in zip(found.model.law.coefficients, of[0].tolist(), strict=True):
+                    label = f"{c.name} of {joint}"
+                    i = known.get(label)
+                    note = "not identifiable" if label in unknown else ""
+                    low, high = (i.low, i.high) if i else (math.nan, math.nan)
+                    label += "" if where == "always" else f", {where.replace('_', ' ')}"
+                    rows.append((own, label, value, low, high, note))
+        columns = ["model", "parameter", "value", "low", "high", "note"]
+        return pd.DataFrame(rows, columns=columns).set_index("parameter")
+
+    def _head(self) -> str:
+        """The choice at each joint with its error, in a line each."""
+        lines = []
+        for joint, (name, why) in self.choices.items():
+            error = float(self.to_frame()[name][joint])
+            lines.append(
+                f"{joint}: {plain_name(name)}, NRMSE {error:.3f} on blocks left out; {why}"
+            )
+        return "\n".join(lines)
+
+    def summary(self) -> str:
+        """Choice, errors on blocks left out, coefficients with 95 % intervals, and remarks."""
+        frames = (self.to_frame(), self.intervals())
+        tables = [f.to_string(float_format=lambda x: f"{x:.4g}", na_rep="") for f in frames]
+        return "\n\n".join([self._head(), *tables, *self.table.remarks])
+
+    def _repr_html_(self) -> str:
+        """The summary for a notebook."""
+        frames = (self.to_frame(), self.intervals())
+        tables = [f.to_html(float_format=lambda x: f"{x:.4g}", na_rep="") for f in frames]
+        head = html.escape(self._head()).replace("\n", "<br>")
+        return f"<p>{head}</p>{''.join(tables)}"
+
+    def plot(self) -> Figure:
+        """Friction torque over velocity with its 95 % band; see `plots.friction_curves`."""
+        # By name, because plots is a layer above this one.
+        figure: Figure = resolve_name("nfriction.plots:friction_curves")(self)
+        return figure
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON: choices, errors on blocks left out, coefficients and intervals."""
+        return {
+            "kind": "torque table",
+            "unit": self.table.unit,
+            "joints": list(self.table.joint_names),
+            "chosen": {j: {"model": n, "reason": why} for j, (n, why) in self.choices.items()},
+            "blocks_left_out": {
+                joint: {c.name: _finite(c.error) for c in of}
+                for joint, of in self.candidates.items()
+            },
+            "residual": {
+                name: {j: one.residual for j, one in zip(self.chosen, found, strict=True)}
+                for name, found in self.fits.items()
+            },
+            "failed": dict(self.failed),
+            "remarks": list(self.table.remarks),
+        }
+
+
+def fit_torque(
+    table: Any,
+    models: str | Sequence[str] | None = None,
+    *,
+    folds: int = FOLDS,
+    options: FitOptions = DEFAULTS,
+    progress: Callable[[str], object] | None = None,
+    **reading: Any,
+) -> TorqueFits:
+    """Fit friction models to a table of friction torque over velocity, joint by joint.
+
+    For constant-velocity tests, and for the residual torque of any inverse dynamics. Constant
+    coefficients come from least squares within bounds, a network from a search under its prior,
+    which is kept where it lowers the error on blocks left out. Models are compared on these blocks,
+    contiguous in time; rows without time are dealt to the blocks by their velocity. Laws with
+    memory follow rows in order of time; the first 0.2 s of a table show how they were deflected
+    before, and are not scored.
+
+    Args:
+        table: a `TorqueTable`, or a path or DataFrame that makes one.
+        models: names, with commas between them or in a list; by default all constant laws that
+            the table's columns allow.
+        folds: blocks that are left out in turn, at least 2.
+        options: tuning constants.
+        progress: called with each stage.
+        reading: `columns`, `degrees` and `unit`, see `TorqueTable.from_pandas`.
+
+    Raises:
+        ValueError: a column that is missing, a joint that does not move, too few rows, or no model
+            that could be fitted; the message names the remedy.
+    """
+    given = as_table(table, **reading)
+    names = [models] if isinstance(models, str) else list(models or _laws_for(given))
+    names = [name for text in names for name in text.split(",")]
+    names = list(dict.fromkeys(map(model_name, names)))
+    if folds < 2:
+        raise ValueError(f"`folds` must be at least 2, got {folds}.")
+    v_smooth = turning_velocity(given)
+    fits: dict[str, tuple[JointFit, ...]] = {}
+    errors: dict[str, list[Candidate]] = {joint: [] for joint in given.joint_names}
+    failed: dict[str, str] = {}
+    for name in names:
+        if progress is not None:
+            progress(f"fit {plain_name(name)}")
+        try:
+            found = [_fit(name, joint, v_smooth, folds, options) for joint in given.joints]
+        except ValueError as error:
+            failed[name] = str(error)
+            continue
+        fits[name] = tuple(fit for fit, _ in found)
+        for joint, (_, candidate) in zip(given.joint_names, found, strict=True):
+            errors[joint].append(candidate)
+    if not fits:
+        raise ValueError(" ".join(failed.values()))
+    choices = {joint: _choose(of) for joint, of in errors.items()}
+    return TorqueFits(given, fits, {j: tuple(of) for j, of in errors.items()}, choices, failed)
+
+
+def _laws_for(table: TorqueTable) -> tuple[str, ...]:
+    """Constant laws that the columns of a table allow."""
+    time = all(joint.time is not None for joint in table.joints)
+    load = all(joint.load is not None for joint in table.joints)
+    found = (LAWS, WITH_TIME * time, WITH_LOAD * load, WITH_BOTH * (time and load))
+    return tuple(name for names in found for name in names)
+
+
+def _choose(candidates: Sequence[Candidate]) -> tuple[str, str]:
+    """The model with the fewest parameters whose error is within a tolerance of the least.
+
+    The scatter over blocks of one run is no measure here: the blocks at rest are unlike the others.
+    """
+    least = min(candidates, key=lambda c: c.error)
+    near = [c for c in candidates if c.error <= (1 + TOLERANCE) * least.error]
+    chosen = min(near, key=lambda c: (c.parameters, c.error))
+    if chosen is not least:
+        return chosen.name, (
+            f"within {100 * TOLERANCE:g} % of the least, of {plain_name(least.name)}, with fewer "
+            "parameters"
+        )
+    others = sorted(c.error for c in candidates if c is not least)
+    if not others:
+        return least.name, "the only model"
+    return least.name, f"the next has {100 * (others[0] / least.error - 1):.0f} % more"
+
+
+def _fit(
+    name: str, joint: JointTorque, v_smooth: float, folds: int, options: FitOptions
+) -> tuple[JointFit, Candidate]:
+    """A model fitted to all rows of a joint, and its errors on blocks left out."""
+    model = model_by_name(name)(1)
+    form = model.schedule.form
+    if model.law.memory is not None:
+        fit, left_out = fit_memory(name, joint, blocks(joint, folds), v_smooth)
+        return fit, Candidate(name, left_out, len(fit.intervals), True)
+    if form not in ("constant", "neurofuzzy"):
+        raise ValueError(
+            f"{plain_name(name)} is not fitted to tables, which have no acceleration classes; use "
+            "its law, or its neuro-fuzzy model."
+        )
+    require_load(name, joint)
+    shares = PRIOR_SHARES if form == "neurofuzzy" else (0.0,)
+    errors = np.zeros((len(shares), folds))
+    for k, test in enumerate(blocks(joint, folds)):
+        rest = joint.rows(np.setdiff1d(np.arange(len(joint)), test))
+        left = joint.rows(test)
+        constant = fit_joint(name, rest, v_smooth, options)
+        for i, share in enumerate(shares):
+            found = fit_network(constant, rest, share, options) if share else constant
+            error = predict(found.model, left) - torch.as_tensor(left.tau)
+            errors[i, k] = float(error.square().mean().sqrt())
+    best = int(np.square(errors).mean(1).argmin())
+    found = fit_joint(name, joint, v_smooth, options)
+    if shares[best]:
+        found = fit_network(found, joint, shares[best], options)
+    # A network that was dropped has no parameters beyond its law's.
+    count = int((found.model.schedule.parameter_vector() != 0).sum())
+    count += len(found.model.law.coefficients) * (form != "constant")
+    return found, Candidate(name, tuple(errors[best].tolist()), count, found.converged)
+
+
+def score_joint(joint: JointTorque, torque: Array, model: str) -> TorqueScore:
+    """Error of a torque predicted at the rows of a joint.
+
+    The lead-in of a law with memory is not scored, because its torque was read.
+    """
+    rows = slice(None)
+    if joint.time is not None and model_by_name(model).definition.memory is not None:
+        rows = slice(int(np.searchsorted(joint.time, joint.time[0] + LEAD_IN)), None)
+    rmse = float(np.sqrt(np.mean((torque - joint.tau)[rows] ** 2)))
+    return TorqueScore(joint.name, model, rmse, rmse / (float(joint.tau[rows].std()) or math.nan))
+
+
+def scores_frame(scores: Sequence[TorqueScore]) -> pd.DataFrame:
+    """Scores as a table, a row a joint."""
+    import pandas as pd  # slow to import
+
+    return pd.DataFrame(scores).set_index("joint")
+
+
+@dataclass(frozen=True, eq=False)
+class SavedModel:
+    """A model of one joint from a file."""
+
+    joint: str
+    unit: Unit
+    model: FrictionModel
+
+
+def read_models(path: str | Path) -> list[SavedModel]:
+    """Models by joint, from a model file or from a folder that `write_torque_fits` wrote.
+
+    Of a folder each joint has the model that was chosen for it.
+
+    Raises:
+        ValueError: it is neither, or damaged.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return _saved(path)
+    index = path / RESULTS
+    try:
+        content = parse_json(index.read_text(encoding="utf-8"))
+        chosen = {str(joint): model_name(of["model"]) for joint, of in content["chosen"].items()}
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+        raise ValueError(
+            f"{path} is no folder that fit-torque wrote: {index.name} is missing or another's."
+        ) from error
+    by_name = {
+        name: {one.joint: one for one in _saved(path / "models" / f"{name}.json")}
+        for name in dict.fromkeys(chosen.values())
+    }
+    lost = [joint for joint, name in chosen.items() if joint not in by_name[name]]
+    if lost:
+        raise ValueError(f"{path}: the model files lack {', '.join(lost)}; fit again.")
+    return [by_name[name][joint] for joint, name in chosen.items()]
+
+
+def _saved(path: Path) -> list[SavedModel]:
+    model, info = load(path), load_info(path)
+    names = info.joint_names or [f"joint{k + 1}" for k in range(model.joints)]
+    unit: Unit = "m" if info.unit == "m" else "rad"
+    return [SavedModel(name, unit, one) for name, one in zip(names, split(model), strict=True)]
+
+
+def score_models(models: Sequence[SavedModel], table: TorqueTable) -> pd.DataFrame:
+    """Errors of models at the rows of a table, by joint.
+
+    Raises:
+        ValueError: if the table's joints are others, or it lacks a load that a model needs.
+    """
+    _check_joints([one.joint for one in models], table)
+    return scores_frame(
+        [
+            score_joint(joint, predict(one.model, joint).numpy(), type(one.model).__name__)
+            for one, joint in zip(models, table.joints, strict=True)
+        ]
+    )
+
+
+def split(model: FrictionModel) -> list[FrictionModel]:
+    """One model a joint from a model of many joints."""
+    state = model.state_dict()
+    make: Any = type(model)
+    found = []
+    for k in range(model.joints):
+        one = make(1, v_smooth=model.v_smooth, **model.schedule.options())
+        one.load_state_dict({key: value[k : k + 1] for key, value in state.items()})
+        found.append(one.requires_grad_(False))
+    return found
+
+
+def _check_joints(names: Sequence[str], table: TorqueTable) -> None:
+    if tuple(names) != table.joint_names:
+        raise ValueError(
+            f"the model is of {', '.join(names)}, the table of {', '.join(table.joint_names)}; "
+            "give a table of the same joints in the same order."
+        )
+
+
+def _finite(x: float) -> float | None:
+    return x if math.isfinite(x) else None

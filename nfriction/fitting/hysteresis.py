@@ -1,0 +1,292 @@
+"""Fits of slip elements to tables of friction torque, by non-negative least squares.
+
+The widths of the elements come from a fine grid, of which non-negative weights keep a few; terms of
+the velocity are added where they lower the error on blocks left out.
+"""
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nfriction.friction.hysteresis import (
+    ASYMMETRY,
+    DROP,
+    ELEMENTS,
+    FIRST,
+    OFFSET,
+    SATURATING,
+    VISCOUS,
+)
+from nfriction.recording.torque_table import JointTorque
+
+Array = NDArray[np.float64]
+
+# Widths of elements over the range of the motion: what is narrower turns within a sample, what is
+# wider is a spring. Many where non-negative weights choose among them, else as many as the law has.
+SPAN = (3e-5, 2.0)
+COUNTS = {True: 30, False: ELEMENTS}
+# Moves before the first row over the range of the motion, which the first torques show.
+PATHS = tuple(np.geomspace(1e-4, 2.0, 10))
+# Velocities over the largest one.
+VELOCITIES = (0.003, 0.01, 0.03, 0.1, 0.3, 0.6)
+# Ridges relative to the information of the data: neighbouring widths are nearly equivalent.
+RIDGES = (1e-1, 1e-2, 1e-3)
+# Relative difference of errors on blocks left out that is too small to choose by.
+TOLERANCE = 0.02
+# Rows from which the start is chosen; it is forgotten over the first strokes.
+START_ROWS = 3000
+
+
+@dataclass(frozen=True)
+class SlipFit:
+    """Slip elements and terms of the velocity that were fitted to a joint.
+
+    Attributes:
+        coefficients: of the law, (coefficient,).
+        errors: root mean square error on each block left out [N m; N].
+        torque: predicted at all rows, (row,).
+        design: torque per unit of each fitted coefficient, (row, fitted).
+        fitted: places of these among the coefficients.
+    """
+
+    coefficients: Array
+    errors: tuple[float, ...]
+    torque: Array
+    design: Array
+    fitted: tuple[int, ...]
+
+
+def path_of(joint: JointTorque) -> Array:
+    """Displacement of every row from the row before, (row,) [rad; m]."""
+    assert joint.time is not None
+    if joint.q is not None:
+        return np.diff(joint.q, prepend=joint.q[0])
+    return joint.qd * np.diff(joint.time, prepend=joint.time[0])
+
+
+def range_of(joint: JointTorque) -> float:
+    """Range of the positions that a joint passes [rad; m]."""
+    return float(np.ptp(np.cumsum(path_of(joint))))
+
+
+def deflections(path: Array, widths: Array, start: Array, every: int = 1) -> Array:
+    """Deflection over width of slip elements, (kept row, *start, width).
+
+    Args:
+        path: displacement of every row, (row,).
+        widths: (width,).
+        start: deflections over widths before the first row, (..., width).
+        every: rows of which one is kept.
+    """
+    moves = path[:, None] / widths
+    found = np.empty((-(-len(path) // every), *start.shape))
+    state = start
+    for k, move in enumerate(moves):
+        state = np.minimum(np.maximum(state + move, -1.0), 1.0)
+        if k % every == 0:
+            found[k // every] = state
+    return found
+
+
+def fit_slip(joint: JointTorque, blocks: Sequence[NDArray[np.intp]], *, loaded: bool) -> SlipFit:
+    """Fit the law `friction.hysteresis` to the rows of a joint in order of time.
+
+    Args:
+        joint: with time.
+        blocks: rows that are left out in turn; terms, signs and ridge are those with the least
+            error there.
+        loaded: friction is in proportion to the load.
+    """
+    reach, path = range_of(joint), path_of(joint)
+    grids = {positive: reach * np.geomspace(*SPAN, count) for positive, count in COUNTS.items()}
+    every = max(1, len(joint) // START_ROWS)
+    start = _likeliest_approach(joint, grids[True], every, loaded)
+    tables = {
+        positive: _Dictionary.of(joint, deflections(path, grid, _approached(grid, start)), loaded)
+        for positive, grid in grids.items()
+    }
+    choices = [tables[shape.positive].best(shape) for shape in _Shape.every()]
+    left_out = [tables[c.shape.positive].left_out(c, blocks) for c in choices]
+    scores = np.sqrt(np.mean(np.square(left_out), 1))
+    # The simplest that is as accurate as the best but for the tolerance.
+    chosen = int(np.flatnonzero(scores <= (1 + TOLERANCE) * scores.min())[0])
+    choice, errors = choices[chosen], left_out[chosen]
+    widths = grids[choice.shape.positive]
+    if choice.shape.positive:
+        # The merged elements, with the weights that suit them.
+        widths = _merged(choice.weights[-len(widths) :], widths)
+        z = deflections(path, widths, _approached(widths, start))
+        table = _Dictionary.of(joint, z, loaded)
+        choice = table.at(choice)
+    else:
+        table = tables[False]
+    return table.result(choice, widths, errors)
+
+
+def _approached(widths: Array, path: float) -> Array:
+    """Deflections over widths after a move from rest, (width,)."""
+    return np.clip(path / widths, -1.0, 1.0)
+
+
+def _likeliest_approach(joint: JointTorque, widths: Array, every: int, loaded: bool) -> float:
+    """Path of the move before the first row that explains the torque best [rad; m]."""
+    paths = range_of(joint) * np.array([0.0, *PATHS, *(-x for x in PATHS)])
+    starts = np.clip(paths[:, None] / widths, -1.0, 1.0)
+    coarse = deflections(path_of(joint), widths, starts, every)
+    some = joint.rows(np.arange(0, len(joint), every))
+    shape = _Shape(positive=True, ridge=RIDGES[-1])
+    costs = [_Dictionary.of(some, z, loaded).best(shape).cost for z in np.moveaxis(coarse, 1, 0)]
+    return float(paths[int(np.argmin(costs))])
+
+
+def _merged(forces: Array, widths: Array) -> Array:
+    """Widths with neighbours that have a force merged, the narrowest first, `ELEMENTS` at most."""
+    used = np.flatnonzero(forces > 1e-6 * forces.max(initial=0.0))
+    groups = np.split(used, np.flatnonzero(np.diff(used) > 1) + 1) if len(used) else []
+    found = [
+        (float(forces[g].sum()), float(np.exp(np.average(np.log(widths[g]), weights=forces[g]))))
+        for g in groups
+    ]
+    # The first element, whose friction drops with speed, is the narrowest in any case.
+    rest = sorted((pair for pair in found if pair[1] > 1.01 * widths[0]), reverse=True)
+    return np.array([widths[0], *sorted(width for _, width in rest[: ELEMENTS - 1])])
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """Terms beside the elements, signs of the forces, and ridge."""
+
+    positive: bool
+    ridge: float
+    saturating: bool = False
+    drop: bool = False
+    asymmetric: bool = False
+
+    @classmethod
+    def every(cls) -> "Iterator[_Shape]":
+        """All shapes, simplest first."""
+        for terms in itertools.product((False, True), repeat=3):
+            for positive in (True, False):
+                for ridge in RIDGES:
+                    yield cls(positive, ridge, *terms)
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """Weights of the columns in given places, -1 for a term that is left out."""
+
+    shape: _Shape
+    places: tuple[int, ...]
+    weights: Array
+    cost: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Dictionary:
+    """Columns of all terms: offset, viscous, asymmetric, those of each velocity, and elements.
+
+    Attributes:
+        whole: (row, column).
+        tau: torque, (row,).
+        velocities: at which friction saturates or drops, (velocity,).
+        gram, right: products of the columns with each other, and with the torque.
+    """
+
+    whole: Array
+    tau: Array
+    velocities: Array
+    gram: Array
+    right: Array
+
+    @classmethod
+    def of(cls, joint: JointTorque, z: Array, loaded: bool) -> "_Dictionary":
+        load = joint.load if loaded and joint.load is not None else np.ones_like(joint.qd)
+        speeds = np.abs(joint.qd).max() * np.array(VELOCITIES)
+        ratio = joint.qd[:, None] / speeds
+        scaled = [np.tanh(ratio), z[:, :1] * np.exp(-(ratio**2)), z]
+        plain = np.stack([np.ones_like(load), joint.qd, np.abs(joint.qd)], 1)
+        whole = np.concatenate([plain, *(load[:, None] * x for x in scaled)], 1)
+        return cls(whole, joint.tau, speeds, whole.T @ whole, whole.T @ joint.tau)
+
+    def options(self, shape: _Shape) -> Iterator[tuple[int, ...]]:
+        """Places of the columns, for every choice of velocities."""
+        n = len(self.velocities)
+        first = 3 + 2 * n
+        turns = range(3, 3 + n) if shape.saturating else (-1,)
+        drops = range(3 + n, first) if shape.drop else (-1,)
+        skew = 2 if shape.asymmetric else -1
+        for turn, drop in itertools.product(turns, drops):
+            yield (0, 1, skew, turn, drop, *range(first, self.whole.shape[1]))
+
+    def best(self, shape: _Shape) -> _Choice:
+        """The choice of velocities with the least sum of squares."""
+        found = (self._choice(shape, places) for places in self.options(shape))
+        return min(found, key=lambda choice: choice.cost)
+
+    def at(self, choice: _Choice) -> _Choice:
+        """The same terms with the weights that suit these elements."""
+        places = (*choice.places[:5], *range(3 + 2 * len(self.velocities), self.whole.shape[1]))
+        return self._choice(choice.shape, places)
+
+    def left_out(self, choice: _Choice, blocks: Sequence[NDArray[np.intp]]) -> list[float]:
+        """Root mean square errors on blocks that are left out in turn."""
+        used = np.array([p for p in choice.places if p >= 0])
+        errors = []
+        for block in blocks:
+            x, y = self.whole[np.ix_(block, used)], self.tau[block]
+            gram = self.gram[np.ix_(used, used)] - x.T @ x
+            weights = _weights(gram, self.right[used] - x.T @ y, choice.shape)
+            errors.append(float(np.sqrt(np.mean((x @ weights - y) ** 2))))
+        return errors
+
+    def _choice(self, shape: _Shape, places: tuple[int, ...]) -> _Choice:
+        used = [p for p in places if p >= 0]
+        gram, right = self.gram[np.ix_(used, used)], self.right[used]
+        solution = _weights(gram, right, shape)
+        weights = np.zeros(len(places))
+        weights[[k for k, p in enumerate(places) if p >= 0]] = solution
+        # But for the square of the torque, which is the same for all.
+        return _Choice(shape, places, weights, float((solution @ gram - 2 * right) @ solution))
+
+    def result(self, choice: _Choice, widths: Array, errors: Sequence[float]) -> SlipFit:
+        """Coefficients of the law."""
+        n, forces = len(self.velocities), choice.weights[5:]
+        turn, drop = (
+            self.velocities[p - first if p >= 0 else -1]
+            for p, first in zip(choice.places[3:5], (3, 3 + n), strict=True)
+        )
+        offset, viscous, skew, saturating, falling = choice.weights[:5]
+        blank = [0.0] * (ELEMENTS - len(forces))
+        # Elements without force are as wide as the widest.
+        wide = [float(widths[-1])] * len(blank)
+        coefficients = np.array(
+            [offset, viscous, skew, saturating, turn, falling, drop, *forces, *blank,
+             *widths, *wide]
+        )  # fmt: skip
+        of = (OFFSET, VISCOUS, ASYMMETRY, SATURATING, DROP, *range(FIRST, FIRST + len(forces)))
+        kept = [k for k, w in enumerate(choice.weights) if w != 0.0]
+        design = self.whole[:, [choice.places[k] for k in kept]]
+        fitted = tuple(of[k] for k in kept)
+        return SlipFit(coefficients, tuple(errors), design @ choice.weights[kept], design, fitted)
+
+
+def _weights(gram: Array, right: Array, shape: _Shape) -> Array:
+    """Weights of columns with these products, by least squares with a ridge."""
+    scale = np.sqrt(np.diag(gram))
+    scale[scale <= 0] = 1.0
+    a = gram / scale[:, None] / scale + shape.ridge * np.eye(len(right))
+    if not shape.positive:
+        return np.linalg.solve(a, right / scale) / scale
+    from scipy.optimize import nnls  # slow to import
+
+    root = np.linalg.cholesky(a).T
+    # Offset and asymmetry may have either sign: their columns once more, reversed.
+    free = [0, 2] if shape.asymmetric else [0]
+    target = np.linalg.solve(root.T, right / scale)
+    both, _ = nnls(np.c_[root, -root[:, free]], target, maxiter=50 * len(right))
+    solution = both[: len(right)]
+    solution[free] -= both[len(right) :]
+    return solution / scale

@@ -1,0 +1,349 @@
+"""Regression of friction laws on tables of friction torque, joint by joint."""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from nfriction.fitting.bristles import BristleFit, fit_bristles
+from nfriction.fitting.equation_error import TorqueBalance, regress
+from nfriction.fitting.hysteresis import PATHS, SlipFit, fit_slip, path_of, range_of
+from nfriction.fitting.options import DEFAULTS, FitOptions
+from nfriction.fitting.result.identifiability import (
+    Information,
+    Interval,
+    confidence_intervals,
+    covariance_root,
+    null_directions,
+)
+from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
+from nfriction.friction import model_by_name, plain_name
+from nfriction.friction.laws import Memory
+from nfriction.friction.models import V_SMOOTH, FrictionModel
+from nfriction.optim.least_squares import Quadratic
+from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
+from nfriction.recording.torque_table import JointTorque, TorqueTable
+
+# The sign of the velocity turns within this share of the largest velocity, or within `V_SMOOTH`.
+TURN_SHARE = 0.01
+# Time whose torque shows how far a law with memory was deflected before, as for simulations [s].
+LEAD_IN = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class JointFit:
+    """A friction model of one joint, fitted to its rows of a table.
+
+    Attributes:
+        model: of one joint, without gradients.
+        intervals: 95 % confidence intervals of constant coefficients.
+        unidentifiable: coefficients, or combinations `"a with b"`, that the rows do not determine.
+        root: R of the covariance R R^T of the model's parameters, (parameter, any).
+        residual: root mean square of the unexplained torque [N m; N].
+        converged: whether the search ended at a minimum.
+    """
+
+    model: FrictionModel
+    intervals: tuple[Interval, ...]
+    unidentifiable: tuple[str, ...]
+    root: Tensor
+    residual: float
+    converged: bool = True
+
+    @torch.no_grad()
+    def steady(self, qd: Tensor, qdd: Tensor, load: Tensor) -> tuple[Tensor, Tensor]:
+        """Torque at motions (row,), and its standard deviation by that of the parameters [N m]."""
+        torque, slopes = torque_and_slopes(self.model, qd, qdd, load)
+        # Without information a coefficient may be anything; the band shows the others.
+        root = torch.where(self.root.isfinite(), self.root, 0.0)
+        return torque, (slopes @ root).norm(dim=-1)
+
+
+def turning_velocity(table: TorqueTable) -> float:
+    """Velocity within which the sign of the velocity turns, for all joints of a table."""
+    slowest = min(float(np.abs(joint.qd).max()) for joint in table.joints)
+    return min(V_SMOOTH, TURN_SHARE * slowest)
+
+
+def fit_joint(
+    name: str, joint: JointTorque, v_smooth: float, options: FitOptions = DEFAULTS
+) -> JointFit:
+    """Constant coefficients of the law of a named model, by least squares within bounds.
+
+    A neuro-fuzzy model is its constant law after that; see `fit_network`.
+
+    Raises:
+        ValueError: if there are too few rows, or the law needs a load that the table lacks.
+    """
+    model = model_by_name(name)(1, v_smooth=v_smooth)
+    law = model.law
+    if len(joint) <= len(law.coefficients):
+        raise ValueError(
+            f"{joint.name} has {len(joint)} rows, too few for the {len(law.coefficients)} "
+            f"coefficients of {name}; measure at more velocities."
+        )
+    require_load(name, joint)
+    part = _balance(joint)
+    found = regress(law, [part], v_smooth, options)
+    schedule: Any = model.schedule
+    values = found.coefficients
+    if schedule.form == "constant":
+        schedule.set_parameter_vector(values.reshape(-1))
+        lower, upper = schedule.bounds()
+        names = schedule.parameter_names([joint.name])
+        kept = (lower < upper).nonzero().flatten()
+        known = Information(found.information[0], torch.zeros(len(names)).double())
+        own = known.subset(kept)
+        part_root = covariance_root(own)
+        root = torch.zeros(len(names), len(kept)).double()
+        root[kept] = part_root
+        fitted = [names[i] for i in kept.tolist()]
+        intervals = confidence_intervals(
+            fitted, values[0][kept], part_root.norm(dim=1), lower[kept], upper[kept]
+        )
+        unknown = null_directions(fitted, own)
+    else:
+        schedule.set_range(*_range(joint, options))
+        schedule.set_reference(values, _scale(model, joint), options.zero_reference)
+        count = len(schedule.parameter_vector())
+        intervals, unknown, root = (), (), torch.zeros(count, 1).double()
+    return JointFit(model.requires_grad_(False), intervals, unknown, root, float(found.residual[0]))
+
+
+def fit_network(
+    constant: JointFit, joint: JointTorque, share: float, options: FitOptions = DEFAULTS
+) -> JointFit:
+    """Train the network of a neuro-fuzzy model that `fit_joint` set to its constant law.
+
+    Args:
+        constant: of the same rows.
+        joint: the rows.
+        share: of the schedule's prior standard deviation.
+    """
+    model = copy.deepcopy(constant.model)
+    qd, qdd, load, tau = _columns(joint)
+    with torch.no_grad():
+        error = (model(qd, qdd, load) - tau)[None]
+    noise = max(effective_noise(error), 1e-12 * float(tau.abs().max()))
+    stride = decimation(error, options)
+    qd, qdd, load, tau = (x[::stride] for x in (qd, qdd, load, tau))
+    # Rows that are left out would have weighed as much as those that stay.
+    precision = stride / noise**2
+    mean, sd = model.schedule.prior()
+    weight = (share * sd).pow(-2)
+
+    def quadratic(x: Tensor) -> Quadratic:
+        model.schedule.set_parameter_vector(x)
+        torque, slopes = torque_and_slopes(model, qd[:, 0], qdd[:, 0], load[:, 0])
+        error = torque - tau[:, 0]
+        pull = weight * (x - mean)
+        cost = 0.5 * precision * error.square().sum() + 0.5 * (pull * (x - mean)).sum()
+        gradient = precision * slopes.T @ error + pull
+        return Quadratic(cost, gradient, precision * slopes.T @ slopes + torch.diag(weight))
+
+    lower, upper = model.schedule.bounds()
+    found = LevenbergMarquardt(cost_tolerance=1e-6, max_steps=options.max_steps).minimise(
+        quadratic, torch.zeros_like(mean), lower=lower, upper=upper
+    )
+    model.schedule.set_parameter_vector(found.x)
+    root = covariance_root(Information(found.hessian - torch.diag(weight), weight))
+    residual = float((predict(model, joint) - torch.as_tensor(joint.tau)).square().mean().sqrt())
+    return replace(
+        constant, model=model.requires_grad_(False), root=root, residual=residual,
+        converged=found.converged,
+    )  # fmt: skip
+
+
+def fit_memory(
+    name: str, joint: JointTorque, blocks: Sequence[NDArray[np.intp]], v_smooth: float
+) -> tuple[JointFit, tuple[float, ...]]:
+    """Coefficients of a named model with memory, and its errors on blocks left out [N m; N].
+
+    Raises:
+        ValueError: if the rows have no time, or the law needs a load that the table lacks.
+    """
+    model = model_by_name(name)(1, v_smooth=v_smooth)
+    if joint.time is None:
+        raise ValueError(
+            f"{plain_name(name)} remembers the motion before, and {joint.name} has no column time; "
+            "add one, or leave the model out."
+        )
+    require_load(name, joint)
+    unknown: tuple[str, ...] = ()
+    found: SlipFit | BristleFit
+    if "sigma_0" in model.law.names:
+        found = fit_bristles(model.law, joint, blocks)
+        if not found.presliding:
+            # A stiff joint explains the rows as well: they hold no presliding.
+            unknown = (f"sigma_0 of {joint.name}",)
+    elif "f_o" in model.law.names:
+        found = fit_slip(joint, blocks, loaded=joint.load is not None and reads_load(model))
+    else:
+        raise ValueError(f"{plain_name(name)} is not fitted to tables; use slip.")
+    schedule = model.schedule
+    schedule.set_parameter_vector(torch.tensor(found.coefficients))
+    error = torch.tensor(found.torque - joint.tau)
+    noise = max(effective_noise(error[None, :, None]), 1e-12 * float(np.abs(joint.tau).max()))
+    design = torch.tensor(found.design) / noise
+    known = Information(design.T @ design, torch.zeros(len(found.fitted)).double())
+    own = covariance_root(known)
+    root = torch.zeros(len(found.coefficients), own.shape[1]).double()
+    kept = list(found.fitted)
+    root[kept] = own
+    names = schedule.parameter_names([joint.name])
+    fitted = [names[k] for k in kept]
+    lower, upper = (bound[kept] for bound in schedule.bounds())
+    values = schedule.parameter_vector()[kept]
+    intervals = confidence_intervals(fitted, values, own.norm(dim=1), lower, upper)
+    residual = float(error.square().mean().sqrt())
+    fit = JointFit(
+        model.requires_grad_(False), intervals, (*unknown, *null_directions(fitted, known)), root,
+        residual,
+    )  # fmt: skip
+    return fit, found.errors
+
+
+def predict(model: FrictionModel, joint: JointTorque, lead_in: float = LEAD_IN) -> Tensor:
+    """Friction torque of a model of one joint at the rows of a table, (row,) [N m; N].
+
+    Args:
+        model: of one joint.
+        joint: rows; in order of time for a law with memory.
+        lead_in: time from the first row [s] whose torque shows a law with memory how far it was
+            deflected before; 0 begins without deflection.
+    """
+    require_load(type(model).__name__, joint, model)
+    if model.law.memory is not None:
+        return _remembered(model, model.law.memory, joint, lead_in)
+    with torch.no_grad():
+        torque: Tensor = model(*_columns(joint)[:3])[:, 0]
+        return torque
+
+
+@torch.no_grad()
+def _remembered(model: FrictionModel, memory: Memory, joint: JointTorque, lead_in: float) -> Tensor:
+    """Torque of a law with memory along rows in order of time."""
+    if joint.time is None:
+        raise ValueError(f"a law with memory needs the time of the rows of {joint.name}.")
+    qd, qdd, load, tau = _columns(joint)
+    coefficients = model.coefficients(qd[:1], qdd[:1])
+    if coefficients.shape[0] != 1:
+        coefficients = coefficients[None]
+    step = np.diff(joint.time, prepend=joint.time[0] - joint.step)
+    moved = torch.tensor(path_of(joint) / step)[:, None]
+    steps = torch.tensor(step)[:, None]
+
+    def along(state: Tensor, rows: range) -> Tensor:
+        """States after rows, (row, *state)."""
+        found = []
+        for k in rows:
+            state = memory.advance(
+                state, moved[k].expand(state.shape[:-1]), load[k], coefficients, steps[k]
+            )
+            found.append(state)
+        return torch.stack(found)
+
+    first = range(int(np.searchsorted(joint.time, joint.time[0] + lead_in)))
+    still = torch.zeros(1, 1, memory.size).double()
+    if len(first):
+        reach = max(range_of(joint), 1e-12)
+        way = torch.tensor(reach * np.array([0.0, *PATHS, *(-x for x in PATHS)]))[:, None]
+        starts = memory.advance(
+            still.expand(len(way), 1, -1), way.sign(), load[0], coefficients, way.abs()
+        )
+        states = along(starts, first)
+        shape = (len(first), len(way), 1)
+        torque = memory.torque(
+            states, qd[: first.stop, None].expand(shape),
+            load[: first.stop, None].expand(shape), coefficients,
+        )  # fmt: skip
+        still = starts[(torque - tau[: first.stop, None]).square().sum((0, 2)).argmin()][None]
+    states = along(still, range(len(joint)))[:, 0]
+    return memory.torque(states, qd, load, coefficients)[:, 0]
+
+
+def torque_and_slopes(
+    model: FrictionModel, qd: Tensor, qdd: Tensor, load: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Torque at motions (row,), and its derivative by the model's parameters, (row, parameter)."""
+    qd, qdd, load = (x[:, None] for x in (qd, qdd, load))
+    with torch.no_grad():
+        coefficients = model.coefficients(qd, qdd).expand(*qd.shape, -1).clone()
+        by_parameter = model.schedule.sensitivities(qd, qdd).parameters
+    with torch.enable_grad():
+        # A law is elementwise, so the sum's gradient is each row's own.
+        coefficients.requires_grad_()
+        # The steady torque of a law with memory.
+        torque = model.law.torque(qd, load, coefficients, model.v_smooth)
+        (by_coefficient,) = torch.autograd.grad(torque.sum(), coefficients)
+    slopes = torch.einsum("sk,skp->sp", by_coefficient[:, 0], by_parameter)
+    return torque.detach()[:, 0], slopes
+
+
+def join(models: Sequence[FrictionModel]) -> FrictionModel:
+    """One model of many joints from as many models of one joint, of the same kind."""
+    first = models[0]
+    make: Any = type(first)
+    joined: FrictionModel = make(len(models), v_smooth=first.v_smooth, **first.schedule.options())
+    states = [model.state_dict() for model in models]
+    joined.load_state_dict({key: torch.cat([s[key] for s in states]) for key in states[0]})
+    return joined.requires_grad_(False)
+
+
+def require_load(name: str, joint: JointTorque, model: FrictionModel | None = None) -> None:
+    """Raise ValueError where the law of a model reads a load that the table lacks."""
+    if joint.load is None and reads_load(model or model_by_name(name)(1)):
+        raise ValueError(
+            f"{name} takes the load, and {joint.name} has no column load; add one, or leave the "
+            "model out."
+        )
+
+
+def reads_load(model: FrictionModel) -> bool:
+    """True where the steady torque of a model of one joint depends on the load."""
+    qd, load = torch.ones(2, 1).double(), torch.tensor([[0.0], [1.0]]).double()
+    units = torch.ones(2, 1, len(model.law.names)).double()
+    torque = model.law.torque(qd, load, units, model.v_smooth)
+    return not torch.equal(torque[0], torque[1])
+
+
+def _columns(joint: JointTorque) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Velocity, acceleration, load (1 where there is none) and torque, each (row, 1)."""
+    load = np.ones_like(joint.qd) if joint.load is None else joint.load
+    qd, qdd, load_, tau = (torch.tensor(x)[:, None] for x in (joint.qd, joint.qdd, load, joint.tau))
+    return qd, qdd, load_, tau
+
+
+def _balance(joint: JointTorque) -> TorqueBalance:
+    qd, _, load, tau = _columns(joint)
+    kept = torch.ones_like(qd, dtype=torch.bool)
+    return TorqueBalance(qd, load, tau, kept, None, joint.step, [(0, len(joint) - 1)])
+
+
+def _range(joint: JointTorque, options: FitOptions) -> tuple[float, list[float]]:
+    """Largest |velocity|, and limits of the acceleration along the motion."""
+    along = joint.qdd * np.sign(joint.qd)
+    low, high = np.quantile(along, options.acceleration_quantiles)
+    if not low < high:
+        # Constant velocities have no acceleration to follow.
+        low, high = low - 1.0, high + 1.0
+    return float(np.abs(joint.qd).max()), [float(low), float(high)]
+
+
+def _scale(model: FrictionModel, joint: JointTorque) -> Tensor:
+    """Size of each coefficient that alone would explain a third of the torque, (1, coefficient).
+
+    Zero where the torque is not linear in the coefficient.
+    """
+    qd, qdd, load, tau = _columns(joint)
+    coefficients = model.coefficients(qd, qdd).detach().expand(*qd.shape, -1).clone()
+    coefficients.requires_grad_()
+    (by,) = torch.autograd.grad(model.torque(qd, load, coefficients).sum(), coefficients)
+    third = tau.square().mean().sqrt() / 3
+    linear = torch.tensor([c.linear for c in model.law.coefficients])
+    return torch.where(linear, third / by.abs().amax(0).clamp_min(1e-12), 0.0)

@@ -1,0 +1,103 @@
+"""Friction with hysteresis for tables of torque: slip elements beside terms of the velocity.
+
+The torque is
+
+    tau_f = f_o + F_v qd + A_v |qd|
+            + s (f_a tanh(qd / v_a) + F_d z_1 exp(-(qd / v_s)^2) + sum_k F_k z_k),
+
+with s = 1, or the load. Each element follows the displacement up to its width d_k and then slips,
+z_k = clip(z_k + qd time_step / d_k, -1, 1). The torque is linear in all forces, so that least
+squares estimates them at given widths. Without elements it is a law of the velocity alone. It is
+passive where no force is negative and offset and asymmetry A_v are zero; a negative force is that
+of friction which falls over some displacement after a breakaway.
+
+References:
+    F. Al-Bender, V. Lampaert and J. Swevers, IEEE Trans. Automatic Control 50 (2005) 1883-1887
+    (Maxwell-slip elements); the drop F_d of the first element is Stribeck's.
+"""
+
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from nfriction.friction.laws import Coefficient, Law, Memory, smooth_sign
+from nfriction.friction.models import ConstantModel
+
+ELEMENTS = 12
+# Places of the coefficients: those of the velocity first, then forces and widths of the elements.
+OFFSET, VISCOUS, ASYMMETRY, SATURATING, TURN, DROP, STRIBECK, FIRST = range(8)
+
+
+def advance_hysteresis(
+    state: Tensor, qd: Tensor, load: Tensor, coefficients: Tensor, time_step: float | Tensor
+) -> Tensor:
+    """Deflections over their widths after a sample, clipped where elements slip."""
+    count = state.shape[-1]
+    width = coefficients[..., FIRST + count :]
+    return (state + (qd * time_step).unsqueeze(-1) / width).clamp(-1.0, 1.0)
+
+
+def hysteresis_torque(
+    state: Tensor, qd: Tensor, load: Tensor, coefficients: Tensor, *, loaded: bool
+) -> Tensor:
+    """Torque of the elements and of the velocity."""
+    count = state.shape[-1]
+    offset, viscous, skew, saturating, turn, drop, stribeck = coefficients[..., :FIRST].unbind(-1)
+    fading = torch.exp(-(qd / stribeck).square())
+    friction = (
+        saturating * torch.tanh(qd / turn)
+        + drop * fading * state.select(-1, 0)
+        + (coefficients[..., FIRST : FIRST + count] * state).sum(-1)
+    )
+    return offset + viscous * qd + skew * qd.abs() + (load * friction if loaded else friction)
+
+
+def steady_hysteresis(
+    qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float, *, loaded: bool, count: int
+) -> Tensor:
+    """Torque at a constant velocity, with all elements slipping."""
+    state = smooth_sign(qd, v_smooth).unsqueeze(-1).expand(*qd.shape, count)
+    return hysteresis_torque(state, qd, load, coefficients, loaded=loaded)
+
+
+def hysteresis_law(name: str, *, loaded: bool, count: int = ELEMENTS) -> Law:
+    """The law with so many elements, in proportion to the load or not."""
+    velocities = (0.003, 0.01, 0.03, 0.1, 0.3)
+    numbers = range(1, count + 1)
+    unit = "-" if loaded else "N m"
+    return Law(
+        name,
+        (
+            Coefficient("f_o", "N m", positive=False),
+            Coefficient("F_v", "N m s/rad", positive=False),
+            Coefficient("A_v", "N m s/rad", positive=False),
+            Coefficient("f_a", unit, positive=False),
+            Coefficient("v_a", "rad/s", linear=False, initial_grid=velocities),
+            Coefficient("F_d", unit, positive=False),
+            Coefficient("v_s", "rad/s", linear=False, initial_grid=velocities),
+            *(Coefficient(f"F_{k}", unit, positive=False) for k in numbers),
+            *(
+                Coefficient(f"d_{k}", "rad", linear=False, initial_grid=(10.0 ** (0.5 * k - 6),))
+                for k in numbers
+            ),
+        ),
+        partial(steady_hysteresis, loaded=loaded, count=count),
+        memory=Memory(count, advance_hysteresis, partial(hysteresis_torque, loaded=loaded)),
+    )
+
+
+SLIP = hysteresis_law("slip", loaded=False)
+LOAD_SLIP = hysteresis_law("load_slip", loaded=True)
+
+
+class Slip(ConstantModel):
+    """Slip elements, viscous and saturating friction, a drop with speed, and an offset."""
+
+    definition = SLIP
+
+
+class LoadSlip(ConstantModel):
+    """The same with all but the viscous friction and the offset in proportion to the load."""
+
+    definition = LOAD_SLIP

@@ -1,0 +1,383 @@
+"""Tables of friction torque over velocity: constant-velocity tests, or residual torques."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nfriction.io import formats
+from nfriction.io.formats.selection import canonical_unit, is_unit, parse_source, to_si
+from nfriction.recording.record import Unit
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+
+# Other names of our columns, with the joint's number behind them or none.
+_NAMES = {
+    "time": "time",
+    "q": "q|position",
+    "qd": "qd|velocity",
+    "qdd": "qdd|acceleration",
+    "tau": "tau|tau_f|friction|torque",
+    "load": "load|normal_force",
+    "temperature": "temperature",
+    "joint": "joint",
+}
+_KEYS = {
+    key: re.compile(rf"(?:{names})_?([1-9]\d{{0,3}})?", re.ASCII) for key, names in _NAMES.items()
+}
+# Units are those of positions, velocities, torques and times; others are taken as they are.
+_KIND = {"time": "time", "q": "q", "qd": "qd", "tau": "tau", "load": "tau"}
+_PER_JOINT = ("q", "qd", "qdd", "tau", "load", "temperature")
+MINIMUM_ROWS = 8
+# Joints faster than this are in degrees per second, or wheels [rad/s].
+FAST = 60.0
+
+
+@dataclass(frozen=True, eq=False)
+class JointTorque:
+    """Friction torque of one joint, row by row.
+
+    Attributes:
+        name: of the joint.
+        qd: velocity [rad/s; m/s], (row,).
+        tau: friction torque, of the sign of the velocity [N m; N], (row,).
+        time: increasing [s], (row,); None for rows in no order, such as constant-velocity tests.
+        q: position [rad; m], (row,), or None.
+        qdd: acceleration [rad/s^2; m/s^2], (row,); zero where it is unknown.
+        load: normal load in any unit, (row,), or None; load-dependent laws take it as it is.
+        temperature: in any unit, (row,), or None.
+    """
+
+    name: str
+    qd: Array
+    tau: Array
+    time: Array | None
+    q: Array | None
+    qdd: Array
+    load: Array | None
+    temperature: Array | None
+
+    def __len__(self) -> int:
+        return len(self.qd)
+
+    @property
+    def step(self) -> float:
+        """Median time between rows [s]; 1 of rows in no order."""
+        return 1.0 if self.time is None else float(np.median(np.diff(self.time)))
+
+    def rows(self, index: NDArray[Any]) -> JointTorque:
+        """Some of the rows, given by a mask or by their numbers."""
+        every = {key: getattr(self, key) for key in ("time", *_PER_JOINT)}
+        some: dict[str, Any] = {k: None if x is None else x[index] for k, x in every.items()}
+        return replace(self, **some)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TorqueTable:
+    """Friction torque over velocity, joint by joint.
+
+    Attributes:
+        joints: rows of each joint, which need not be equally many.
+        unit: of a position, `"rad"` or `"m"`.
+        name: of the table.
+        remarks: doubts about the data, a sentence each.
+    """
+
+    joints: tuple[JointTorque, ...]
+    unit: Unit = "rad"
+    name: str = ""
+    remarks: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        rows = ", ".join(f"{joint.name} {len(joint)}" for joint in self.joints)
+        return f"TorqueTable({self.name or 'unnamed'}: rows of {rows})"
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints."""
+        return tuple(joint.name for joint in self.joints)
+
+    def digest(self) -> str:
+        """SHA-256 of the content in hexadecimal."""
+        digest = hashlib.sha256(repr((self.joint_names, self.unit)).encode())
+        for joint in self.joints:
+            for key in ("time", *_PER_JOINT):
+                values = getattr(joint, key)
+                digest.update(b"-" if values is None else values.tobytes())
+        return digest.hexdigest()
+
+    @classmethod
+    def read(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        columns: Mapping[str, str] | None = None,
+        degrees: bool = False,
+        unit: Unit = "rad",
+    ) -> TorqueTable:
+        """Table from a file, in any of the formats of `Recording.read`.
+
+        Args:
+            path: of the file; the table's name is the file's without its ending.
+            columns, degrees, unit: as for `from_pandas`.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: broken content or missing columns; names the file.
+        """
+        table = formats.read_table(path, list((columns or {}).values()))
+        try:
+            found = cls.from_pandas(table, columns=columns, degrees=degrees, unit=unit)
+        except ValueError as error:
+            raise ValueError(f"'{path}': {error}") from error
+        return replace(found, name=formats.stem(path))
+
+    @classmethod
+    def from_pandas(
+        cls,
+        table: pd.DataFrame,
+        *,
+        columns: Mapping[str, str] | None = None,
+        degrees: bool = False,
+        unit: Unit = "rad",
+    ) -> TorqueTable:
+        """Table from columns qd and tau, perhaps time, q, qdd, load, temperature and joint.
+
+        With a column joint the rows of each joint are taken apart; without, qd1, tau1, qd2, tau2,
+        ... are those of several joints. `tau_f`, `friction` and `torque` are read as tau,
+        `position`, `velocity`, `acceleration` and `normal_force` likewise. Where time and q are
+        given but not qd, velocity and acceleration come from smoothed positions.
+
+        Args:
+            table: units in its header, as in `qd [deg/s]`, are followed.
+            columns: the table's name for ours where they differ, perhaps with a unit: "vel:deg/s".
+            degrees: positions and velocities are in degrees.
+            unit: of positions, `"rad"` or `"m"`.
+
+        Raises:
+            ValueError: a column that is missing, or no number in every row; time that does not
+                increase; a joint that does not move.
+        """
+        if unit not in ("rad", "m"):
+            raise ValueError(f'`unit` must be "rad" or "m", got {unit!r}.')
+        table = table.set_axis([str(name) for name in table.columns], axis=1)
+        sources = _sources(table, columns or {})
+        values = {
+            key: _numbers(table, key[0], *source, degrees=degrees)
+            for key, source in sources.items()
+            if key[0] != "joint"
+        }
+        names: list[str] = []
+        parts: list[dict[str, Array | None]] = []
+        for name, rows, number in _parts(table, sources):
+            found = {key: values.get((key, number)) for key in _PER_JOINT}
+            # One column may be shared by all joints.
+            for key in ("load", "temperature"):
+                if found[key] is None:
+                    found[key] = values.get((key, 0))
+            found["time"] = values.get(("time", 0))
+            names.append(name)
+            parts.append({key: None if x is None else x[rows] for key, x in found.items()})
+        remarks: list[str] = []
+        joints = [_joint(*pair, remarks) for pair in zip(names, parts, strict=True)]
+        if unit == "rad" and not degrees:
+            fast = [j.name for j in joints if np.abs(j.qd).max() > FAST]
+            if fast:
+                remarks.append(
+                    f"The velocity of {', '.join(fast)} exceeds {FAST:g} rad/s, as degrees per "
+                    "second would; if so, read the table with `degrees=True`."
+                )
+        return cls(tuple(joints), unit, "", tuple(remarks))
+
+
+_Key = tuple[str, int]
+
+
+def _sources(table: pd.DataFrame, columns: Mapping[str, str]) -> dict[_Key, tuple[str, str | None]]:
+    """Column and unit of each of our keys, with the number of its joint, 0 for none."""
+    aliases = table.attrs.get("aliases") or {}
+    units = table.attrs.get("units") or {}
+    names = {str(name) for name in table.columns}
+    found: dict[_Key, tuple[str, str | None]] = {}
+    taken = {str(spec).rpartition(":")[0] for spec in columns.values()} | set(columns.values())
+    for name in (*names, *aliases):
+        key = _key(name)
+        if key and name not in taken:
+            own = aliases.get(name, name)
+            if key in found and found[key][0] != own:
+                raise ValueError(
+                    f"columns {found[key][0]} and {own} both are {key[0]}; rename one of them, or "
+                    f'name the one to read with columns={{"{key[0]}": "..."}}.'
+                )
+            found[key] = (own, units.get(own))
+    for ours, spec in columns.items():
+        key = _key(ours)
+        source = parse_source(spec, names) or parse_source(spec, set(aliases))
+        if key is None:
+            raise ValueError(
+                f"`columns` maps {', '.join(_NAMES)}, with the number of a joint behind, to the "
+                f"file's names, got the key {ours!r}."
+            )
+        if source is None:
+            raise ValueError(_missing(table, ours, f"no column {spec!r}"))
+        own = aliases.get(source.column, source.column)
+        found[key] = (own, source.unit or units.get(own))
+    return found
+
+
+def _key(name: str) -> _Key | None:
+    """Our name and the joint's number, 0 for none, of a column's name."""
+    for key, pattern in _KEYS.items():
+        match = pattern.fullmatch(name)
+        if match and not (match[1] and key in ("time", "joint")):
+            return key, int(match[1] or 0)
+    return None
+
+
+def _missing(table: pd.DataFrame, wanted: str, what: str) -> str:
+    shown = ", ".join(str(name)[:60] for name in list(table.columns)[:30])
+    return (
+        f"{what}; found {shown or 'none'}. A table of friction needs qd and tau, or qd1, tau1, "
+        f'qd2, ...; name its columns with columns={{"{wanted}": "..."}}, a unit after a colon '
+        'where it is not SI, as in "velocity:deg/s".'
+    )
+
+
+def _parts(
+    table: pd.DataFrame, sources: Mapping[_Key, tuple[str, str | None]]
+) -> Iterator[tuple[str, NDArray[Any] | slice, int]]:
+    """Name, rows and number of columns of each joint."""
+    numbers = sorted({n for key, n in sources if key == "tau"})
+    if not numbers:
+        raise ValueError(_missing(table, "tau", "no column of friction torque"))
+    for n in numbers:
+        known = {key for key, number in sources if number == n}
+        # Velocity comes from positions where there are stamps.
+        if "qd" not in known and not ("q" in known and ("time", 0) in sources):
+            own = f"qd{n}" if n else "qd"
+            raise ValueError(_missing(table, own, f"column {own} is missing"))
+    if ("joint", 0) not in sources:
+        yield from ((f"joint{n or 1}", slice(None), n) for n in numbers)
+        return
+    if numbers != [0]:
+        raise ValueError(
+            "a table with a column joint has one qd and one tau, this one has tau"
+            f"{numbers[-1]}, too; drop the column joint."
+        )
+    labels = table[sources["joint", 0][0]].astype(str).str.strip().to_numpy()
+    for label in dict.fromkeys(labels):
+        name = f"joint{label}" if re.fullmatch(r"\d+", label) else label
+        yield name, np.flatnonzero(labels == label), 0
+
+
+def _numbers(
+    table: pd.DataFrame, key: str, column: str, unit: str | None, *, degrees: bool
+) -> Array:
+    """A column's numbers in SI, finite in every row."""
+    values = formats.column_numbers(table, column)
+    kind = _KIND.get(key)
+    if degrees and key in ("q", "qd", "qdd"):
+        if unit and not canonical_unit(unit).startswith("deg"):
+            raise ValueError(
+                f"`degrees=True`, but column {column} is given as {unit!r}; drop one of the two."
+            )
+        values = np.deg2rad(values)
+    elif kind and unit and is_unit(unit):
+        values = to_si(kind, values, unit)
+    bad = np.flatnonzero(~np.isfinite(values))
+    if len(bad):
+        raise ValueError(
+            f"column {column}, row {bad[0]} (counted from 0 below the header) is {values[bad[0]]}, "
+            f"one of {len(bad)} that are not finite; every row needs a number, so drop or fill "
+            "these."
+        )
+    return values
+
+
+def _joint(name: str, of: Mapping[str, Array | None], remarks: list[str]) -> JointTorque:
+    """The rows of a joint, checked; velocity from positions where none is given."""
+    time, q, qd, qdd, tau = (of[key] for key in ("time", "q", "qd", "qdd", "tau"))
+    assert tau is not None
+    if len(tau) < MINIMUM_ROWS:
+        raise ValueError(f"{name} has {len(tau)} rows; at least {MINIMUM_ROWS} are needed.")
+    if time is not None and not np.all(np.diff(time) > 0):
+        k = int(np.flatnonzero(np.diff(time) <= 0)[0])
+        raise ValueError(
+            f"time of {name} must increase from row to row, got {time[k]:g} s and then "
+            f"{time[k + 1]:g} s; sort the rows, or drop the column time if they are in no order."
+        )
+    if qd is None:
+        assert time is not None
+        assert q is not None
+        qd, qdd = _derivatives(time, q, qdd)
+    elif qdd is None:
+        qdd = np.zeros_like(qd) if time is None else np.gradient(qd, time)
+    assert qdd is not None
+    largest = float(np.abs(qd).max())
+    if largest == 0.0:
+        raise ValueError(
+            f"{name} does not move: its velocity is zero in every row, so friction has no "
+            "direction; record motion in both directions."
+        )
+    # Slower than a thousandth of the largest is no motion in a direction of its own.
+    ways = [float(np.mean(sign * qd > 1e-3 * largest)) for sign in (1, -1)]
+    if min(ways) == 0.0:
+        remarks.append(
+            f"{name} moves in one direction only: an offset cannot be separated from Coulomb "
+            "friction, and nothing is known of the other direction."
+        )
+    if np.ptp(tau) == 0.0:
+        raise ValueError(f"the friction torque of {name} is {tau[0]:g} in every row.")
+    return JointTorque(name, qd, tau, time, q, qdd, of["load"], of["temperature"])
+
+
+def _derivatives(time: Array, q: Array, qdd: Array | None) -> tuple[Array, Array]:
+    """Velocity and acceleration of smoothed positions."""
+    window = min(len(q) - 1 + len(q) % 2, 11)
+    if math.isclose(float(np.ptp(q)), 0.0):
+        return np.zeros_like(q), np.zeros_like(q)
+    from scipy.signal import savgol_filter  # slow to import
+
+    grid = np.linspace(time[0], time[-1], len(time))
+    even = np.interp(grid, time, q)
+    step = float(grid[1] - grid[0])
+    found = [
+        np.interp(time, grid, savgol_filter(even, window, 2, deriv=k, delta=step)) for k in (1, 2)
+    ]
+    return found[0], found[1] if qdd is None else qdd
+
+
+def as_table(table: Any, **options: Any) -> TorqueTable:
+    """A table as it is, or of a path or DataFrame; options as of `TorqueTable.from_pandas`."""
+    if isinstance(table, TorqueTable):
+        return table
+    if isinstance(table, (str, os.PathLike)):
+        return TorqueTable.read(table, **options)
+    if hasattr(table, "columns"):
+        return TorqueTable.from_pandas(table, **options)
+    raise TypeError(
+        f"`table` must be a TorqueTable, a path or a DataFrame, got {type(table).__name__}."
+    )
+
+
+def blocks(joint: JointTorque, count: int) -> list[NDArray[np.intp]]:
+    """Rows of each of `count` blocks that are left out in turn.
+
+    Contiguous blocks of rows that are ordered in time; others are dealt by their velocity, so that
+    a block left out lies between the rest.
+    """
+    if joint.time is not None:
+        return list(np.array_split(np.arange(len(joint)), count))
+    order = np.argsort(joint.qd, kind="stable")
+    return [np.sort(order[k::count]) for k in range(count)]

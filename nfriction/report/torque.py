@@ -1,0 +1,124 @@
+"""Write fits to a table of friction torque: tables, models, figure, and one HTML page."""
+
+import json
+import shlex
+from pathlib import Path
+from typing import Any
+
+from nfriction.evaluation.results import REPORT, RESULTS, TABLE, exclusive
+from nfriction.evaluation.tables import Table, Value
+from nfriction.evaluation.torque_tables import TorqueFits
+from nfriction.friction import plain_name
+from nfriction.io.files import write_atomically
+from nfriction.io.model_file import save
+from nfriction.plots.saving import DPI
+from nfriction.plots.style import DARK_GROUND, for_dark_screen
+from nfriction.report.page import document, pictures
+from nfriction.report.run import Figure
+
+FIGURE = "friction"
+
+
+def error_table(fits: TorqueFits) -> Table:
+    """NRMSE on blocks left out, by joint and model."""
+    frame = fits.to_frame()
+    heads = tuple(plain_name(str(name)) for name in frame)
+    rows: tuple[tuple[Value, ...], ...] = tuple(
+        (str(joint), *map(float, of)) for joint, of in frame.iterrows()
+    )
+    return Table("NRMSE on blocks left out", ("joint", *heads), rows, "diverged")
+
+
+def choice_table(fits: TorqueFits) -> Table:
+    """Model to use at each joint, its errors, and the reason."""
+    rows: list[tuple[Value, ...]] = []
+    for k, joint in enumerate(fits.table.joints):
+        name, why = fits.choices[joint.name]
+        left_out = next(c.error for c in fits.candidates[joint.name] if c.name == name)
+        rows.append((joint.name, plain_name(name), left_out, fits.fits[name][k].residual, why))
+    heads = ("joint", "model", f"left out [{fits.unit}]", f"all rows [{fits.unit}]", "reason")
+    return Table("Model to use at each joint, root mean square errors", heads, tuple(rows))
+
+
+def coefficient_tables(fits: TorqueFits) -> list[Table]:
+    """Coefficients with 95 % intervals, of every model."""
+    found = []
+    for name in fits.fits:
+        frame = fits.intervals(name)
+        rows = tuple(
+            (str(label), float(row["value"]), float(row["low"]), float(row["high"]), row["note"])
+            for label, row in frame.iterrows()
+        )
+        heads = ("parameter", "value", "from", "to", "note")
+        found.append(Table(f"Coefficients of {plain_name(name)}", heads, rows))
+    return found
+
+
+def write_torque_fits(
+    fits: TorqueFits, folder: str | Path, *, command: str = "", figures: bool = True
+) -> list[Path]:
+    """Write `table.csv`, `results.json`, the models, a figure and `report.html` into a folder.
+
+    Args:
+        fits: of a table.
+        folder: made where it does not exist; files of these names are replaced.
+        command: reproduces the results.
+        figures: draw friction over velocity.
+
+    Raises:
+        OSError: another process is writing a run into the folder, or it cannot be written.
+    """
+    folder = Path(folder)
+    written, drawn = [], []
+    with exclusive(folder):
+        text = fits.to_frame().rename(columns=plain_name).to_csv()
+        written.append(write_atomically(folder / TABLE, text.encode()))
+        for name in fits.fits:
+            path = folder / "models" / f"{name}.json"
+            written.append(save(fits.model(name), path, fits.info(name)))
+        if figures:
+            (folder / "figures").mkdir(exist_ok=True)
+            figure = fits.plot()
+            width, height = (round(DPI * x) for x in figure.get_size_inches())
+            for name in (FIGURE, f"{FIGURE}.dark"):
+                path = folder / "figures" / f"{name}.png"
+                figure.savefig(path, dpi=DPI)
+                drawn.append(Figure(name, path.read_bytes(), width, height))
+                written.append(path)
+                for_dark_screen(figure, ground=DARK_GROUND)
+        page = to_html(fits, folder, drawn, command)
+        written.append(write_atomically(folder / REPORT, page.encode(errors="backslashreplace")))
+        results = fits.to_dict() | {"command": command}
+        text = json.dumps(results, indent=1, allow_nan=False)
+        written.append(write_atomically(folder / RESULTS, text.encode()))
+    return written
+
+
+def to_html(fits: TorqueFits, folder: Path, figures: list[Figure], command: str) -> str:
+    """The page of fits to a table as one HTML document without references to the outside."""
+    table, name = fits.table, next(iter(fits.chosen.values()))
+    rows = tuple(
+        (j.name, float(len(j)), "yes" if j.time is not None else "no", float(j.qd.min()),
+         float(j.qd.max()), float(j.tau.min()), float(j.tau.max()))
+        for j in table.joints
+    )  # fmt: skip
+    heads = (
+        "joint", "rows", "in order of time",
+        f"velocity from [{table.unit}/s]", f"velocity to [{table.unit}/s]",
+        f"torque from [{fits.unit}]", f"torque to [{fits.unit}]",
+    )  # fmt: skip
+    file = str(folder / "models" / f"{name}.json")
+    commands = [*([command] if command else []), shlex.join(["nfriction", "info", file])]
+    commands.append(shlex.join(["nfriction", "export", file, "--format", "c"]))
+    tables: dict[str, Any] = {
+        "errors": error_table(fits),
+        "choices": choice_table(fits),
+        "coefficients": coefficient_tables(fits),
+        "data": Table(f"Rows of {table.name or 'the table'}", heads, rows),
+    }
+    return document(
+        "torque.html.j2", f"Friction torque: {table.name or 'table'}",
+        tables=tables, figures=pictures(figures), commands=commands, remarks=table.remarks,
+        failed={plain_name(name): why for name, why in fits.failed.items()},
+        chosen={joint: plain_name(name) for joint, name in fits.chosen.items()},
+    )  # fmt: skip

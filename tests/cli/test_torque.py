@@ -1,0 +1,60 @@
+"""`nfriction fit-torque` and `nfriction score-torque`."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nfriction.cli import main
+
+
+@pytest.fixture
+def csv(tmp_path: Path) -> Path:
+    """Constant-velocity tests of a joint with Coulomb and viscous friction."""
+    rng = np.random.default_rng(0)
+    qd = np.repeat(np.concatenate([np.linspace(-2, -0.1, 15), np.linspace(0.1, 2, 15)]), 4)
+    tau = 1.5 * np.sign(qd) + 0.4 * qd + rng.normal(0, 0.05, len(qd))
+    path = tmp_path / "table.csv"
+    rows = "".join(f"{v:.6f},{t:.6f}\n" for v, t in zip(qd, tau, strict=True))
+    path.write_text("speed,tau\n" + rows)
+    return path
+
+
+def test_a_table_is_fitted_scored_and_exported(
+    csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    words = ["--columns", "qd=speed", "--models", "viscous,coulomb-viscous"]
+    assert main(["fit-torque", str(csv), *words, "--out", str(out), "--no-figures"]) == 0
+    printed = capsys.readouterr().out
+    assert "NRMSE on blocks left out" in printed
+    assert f"wrote {out / 'report.html'}" in printed
+    results = json.loads((out / "results.json").read_text())
+    assert results["chosen"]["joint1"]["model"] == "CVFM"
+    assert results["command"].startswith("nfriction fit-torque")
+    for model in (out, out / "models" / "CVFM.json"):
+        assert main(["score-torque", str(model), str(csv), "--columns", "qd=speed"]) == 0
+        row = capsys.readouterr().out.splitlines()[-1].split()
+        assert row[:2] == ["joint1", "CVFM"]
+        assert float(row[3]) < 0.05
+    file = str(out / "models" / "CVFM.json")
+    assert main(["info", file]) == 0
+    assert "coulomb-viscous" in capsys.readouterr().out
+    assert main(["export", file, "--format", "torchscript", "--out", str(tmp_path)]) == 0
+
+
+def test_errors_are_one_line_with_the_remedy(
+    csv: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["fit-torque", str(csv), "--out", str(tmp_path / "run")]) == 2
+    line = capsys.readouterr().err
+    assert "column qd is missing; found speed, tau" in line
+    assert "--columns qd=NAME" in line
+    assert main(["score-torque", str(tmp_path), str(csv)]) == 2
+    assert "no folder that fit-torque wrote" in capsys.readouterr().err
+    assert main(["score-torque", str(tmp_path / "none"), str(csv)]) == 2
+    assert "is not there" in capsys.readouterr().err
+    words = ["--columns", "qd=speed", "--folds", "1"]
+    assert main(["fit-torque", str(csv), *words]) == 2
+    assert "--folds must be at least 2" in capsys.readouterr().err

@@ -1,0 +1,190 @@
+"""Tables of friction torque: recovery, intervals, choice by blocks left out, files."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+import nfriction
+from nfriction.evaluation.torque_tables import (
+    fit_torque,
+    read_models,
+    score_models,
+    split,
+)
+from nfriction.fitting.torque_table import fit_joint, join
+from nfriction.recording.torque_table import TorqueTable, blocks
+from nfriction.report.torque import write_torque_fits
+
+
+def motion(rows: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Time, and a velocity of a few sines that passes zero often."""
+    rng = np.random.default_rng(seed)
+    time = np.linspace(0.0, 10.0, rows)
+    phases = rng.uniform(0, 2 * np.pi, 4)
+    qd = sum(
+        a * np.sin(w * time + p)
+        for a, w, p in zip((1.0, 0.6, 0.3, 0.2), (1.3, 2.9, 5.1, 7.7), phases, strict=True)
+    )
+    return time, np.asarray(qd)
+
+
+def coloured(rows: int, sd: float, memory: float, rng: np.random.Generator) -> np.ndarray:
+    """Autoregressive noise of one lag."""
+    found = np.empty(rows)
+    found[0] = rng.normal(0, sd)
+    for k in range(1, rows):
+        found[k] = memory * found[k - 1] + rng.normal(0, sd * np.sqrt(1 - memory**2))
+    return found
+
+
+def stribeck_table(rows: int = 1500, seed: int = 0, sd: float = 0.05) -> pd.DataFrame:
+    time, qd = motion(rows, seed)
+    drop = np.exp(-((qd / 0.1) ** 2))
+    tau = (1.0 + 0.6 * drop) * np.tanh(qd / 3e-3) + 0.5 * qd
+    return pd.DataFrame(
+        {"time": time, "qd": qd, "tau": tau + np.random.default_rng(seed).normal(0, sd, rows)}
+    )
+
+
+def test_known_coefficients_are_found_within_their_intervals() -> None:
+    found = fit_torque(stribeck_table(), "viscous, coulomb-viscous, stribeck")
+    assert found.chosen == {"joint1": "Stribeck"}
+    table = found.intervals()
+    for name, true in (("F_c", 1.0), ("F_d", 0.6), ("F_v", 0.5), ("v_s", 0.1)):
+        row = table.loc[f"{name} of joint1"]
+        assert row["low"] < true < row["high"]
+        assert abs(row["value"] - true) < 0.1 * true
+    errors = found.to_frame().loc["joint1"]
+    assert errors["Stribeck"] < errors["CVFM"] < errors["NCFM"]
+
+
+def test_intervals_of_autocorrelated_residuals_cover_the_truth() -> None:
+    """White-noise intervals would cover about a half here: the noise lasts 20 rows."""
+    rng, inside, wide = np.random.default_rng(5), 0, 0.0
+    for seed in range(60):
+        time, qd = motion(800, seed)
+        tau = 1.0 * np.tanh(qd / 3e-3) + 0.5 * qd + coloured(800, 0.2, 0.95, rng)
+        table = TorqueTable.from_pandas(pd.DataFrame({"time": time, "qd": qd, "tau": tau}))
+        found = fit_joint("CVFM", table.joints[0], 3e-3)
+        for interval, true in zip(found.intervals, (1.0, 0.5), strict=True):
+            inside += interval.low < true < interval.high
+            wide += interval.high - interval.low
+    assert inside >= 0.88 * 120
+    # Nor are they wider than the noise makes the estimates scatter, times some.
+    assert wide / 120 < 0.6
+
+
+def test_a_network_is_kept_where_friction_follows_the_acceleration_and_only_there() -> None:
+    time, qd = motion(1200, 3)
+    qdd = np.gradient(qd, time)
+    noise = np.random.default_rng(0).normal(0, 0.02, 1200)
+    level = {"level": np.ones(1200), "rising": 1.0 + 0.08 * qdd * np.sign(qd)}
+    tables = {
+        name: pd.DataFrame({"time": time, "qd": qd, "qdd": qdd, "tau":
+                            c * np.tanh(qd / 3e-3) + 0.3 * qd + noise})
+        for name, c in level.items()
+    }  # fmt: skip
+    models = "coulomb-viscous,neuro-fuzzy:coulomb-viscous"
+    rising = fit_torque(tables["rising"], models)
+    assert rising.chosen["joint1"] == "NFCVFM"
+    errors = rising.to_frame().loc["joint1"]
+    assert errors["NFCVFM"] < 0.5 * errors["CVFM"]
+    steady = fit_torque(tables["level"], models)
+    assert steady.chosen["joint1"] == "CVFM"
+
+
+def test_rows_in_no_order_are_dealt_by_velocity() -> None:
+    qd = np.repeat(np.linspace(-1, 1, 40), 5)
+    table = TorqueTable.from_pandas(pd.DataFrame({"qd": qd, "tau": qd}))
+    parts = blocks(table.joints[0], 4)
+    assert sorted(np.concatenate(parts)) == list(range(200))
+    assert all(np.ptp(qd[rows]) > 1.9 for rows in parts)
+    timed = TorqueTable.from_pandas(pd.DataFrame({"time": np.arange(200), "qd": qd, "tau": qd}))
+    assert all(np.all(np.diff(rows) == 1) for rows in blocks(timed.joints[0], 4))
+
+
+def two_joints() -> pd.DataFrame:
+    first, second = stribeck_table(seed=1), stribeck_table(seed=2)
+    return pd.DataFrame({
+        "time": first["time"],
+        "qd1": first["qd"], "tau_f1": first["tau"], "load1": 1 + first["qd"] ** 2,
+        "qd2": second["qd"], "tau_f2": 2 * second["tau"], "load2": 1 + second["qd"] ** 2,
+    })  # fmt: skip
+
+
+def test_every_file_of_a_run_predicts_as_the_fit_does(tmp_path: Path) -> None:
+    table = two_joints()
+    models = "coulomb-viscous,load-coulomb,stribeck,neuro-fuzzy:coulomb"
+    found = fit_torque(table, models)
+    other = two_joints().iloc[::3]
+    written = write_torque_fits(found, tmp_path, command="nfriction fit-torque <b>.csv")
+    assert all(path.is_file() for path in written)
+    chosen = score_models(read_models(tmp_path), TorqueTable.from_pandas(other))
+    pd.testing.assert_frame_equal(chosen, found.score(other))
+    for name in found.fits:
+        of_file = score_models(
+            read_models(tmp_path / "models" / f"{name}.json"), TorqueTable.from_pandas(other)
+        )
+        pd.testing.assert_frame_equal(of_file, found.score(other, name))
+    page = (tmp_path / "report.html").read_text()
+    assert "stribeck" in page
+    assert "&lt;b&gt;.csv" in page
+    assert "<b>.csv" not in page
+    assert "data:image/png;base64," in page
+
+
+def test_exports_give_the_predicted_torque(tmp_path: Path) -> None:
+    table = two_joints()
+    found = fit_torque(table, "stribeck")
+    model, info = found.model("stribeck"), found.info("stribeck")
+    path = nfriction.export.torchscript(model, tmp_path / "model.pt", info)
+    assert nfriction.export.verify_artefact(path, model, info, points=200).passed
+    qd = torch.tensor(table[["qd1", "qd2"]].to_numpy())
+    torque = model(qd, torch.zeros_like(qd), torch.ones_like(qd)).numpy()
+    np.testing.assert_allclose(torque, np.stack(found.predict(table), 1), rtol=1e-12)
+
+
+def test_split_and_join_are_inverse() -> None:
+    model = fit_torque(two_joints(), "neuro-fuzzy:coulomb-viscous").model("NFCVFM")
+    again = join(split(model))
+    for name, value in model.state_dict().items():
+        assert torch.equal(value, again.state_dict()[name])
+
+
+def test_models_that_a_table_cannot_show_are_refused_with_the_reason() -> None:
+    table = stribeck_table()
+    found = fit_torque(table, ["coulomb-viscous", "load-coulomb", "adaptive:viscous"])
+    assert list(found.fits) == ["CVFM"]
+    assert "column load" in found.failed["LFM"]
+    assert "acceleration classes" in found.failed["ANCFM"]
+    with pytest.raises(ValueError, match="column load"):
+        fit_torque(table, "load-coulomb")
+    with pytest.raises(ValueError, match="did you mean stribeck"):
+        fit_torque(table, "stribek")
+    with pytest.raises(ValueError, match="was not fitted; there are CVFM"):
+        found.predict(table, "stribeck")
+    with pytest.raises(ValueError, match="`folds` must be at least 2"):
+        fit_torque(table, "viscous", folds=1)
+    with pytest.raises(ValueError, match="give a table of the same joints"):
+        found.predict(two_joints())
+    with pytest.raises(TypeError, match="a path or a DataFrame"):
+        fit_torque(3)
+
+
+def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no folder that fit-torque wrote"):
+        read_models(tmp_path)
+    (tmp_path / "results.json").write_text('{"chosen": 3}')
+    with pytest.raises(ValueError, match="no folder that fit-torque wrote"):
+        read_models(tmp_path)
+
+
+def test_summary_and_notebook_show_choice_and_intervals() -> None:
+    found = fit_torque(stribeck_table(), "coulomb-viscous,stribeck")
+    for text in (repr(found), found.summary(), found._repr_html_()):
+        assert "stribeck" in text
+        assert "F_d of joint1" in text
+    assert found.plot().axes[0].get_title() == "joint1: stribeck"

@@ -1,0 +1,64 @@
+"""Dahl, LuGre and elasto-plastic friction recovered from tables of torque."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from nfriction.evaluation.torque_tables import fit_torque
+from nfriction.fitting.bristles import torques
+from nfriction.fitting.torque_table import predict
+from nfriction.friction import model_by_name
+from nfriction.recording.torque_table import TorqueTable
+
+TRUE = {
+    "Dahl": (1.0, 0.5, 300.0),
+    "LuGre": (1.0, 0.5, 0.02, 500.0, 2.0, 0.4),
+    "ElastoPlastic": (1.0, 0.5, 0.02, 500.0, 2.0, 0.4, 0.5),
+}
+
+
+def table_of(name: str, seed: int = 0, reach: float = 1.0) -> pd.DataFrame:
+    """Presliding and sliding, with the torque of a law and noise."""
+    time = np.linspace(0.0, 8.0, 1600)
+    q = reach * 0.06 * np.sin(1.7 * time + seed) * (0.1 + np.sin(0.43 * time) ** 2)
+    q += reach * 0.003 * np.sin(6.1 * time + 1)
+    given = pd.DataFrame({"time": time, "q": q, "qd": np.gradient(q, time), "tau": q})
+    joint = TorqueTable.from_pandas(given).joints[0]
+    model = model_by_name(name)(1, TRUE[name])
+    noise = np.random.default_rng(seed).normal(0, 0.02, len(q))
+    return given.assign(tau=predict(model, joint, 0.0).numpy() + noise)
+
+
+@pytest.mark.parametrize("name", TRUE)
+def test_coefficients_are_recovered_within_their_intervals(name: str) -> None:
+    found = fit_torque(table_of(name), name, folds=4)
+    values = found.intervals()
+    for coefficient, true in zip(model_by_name(name)(1).law.coefficients, TRUE[name], strict=True):
+        row = values.loc[f"{coefficient.name} of joint1"]
+        assert abs(row["value"] - true) < 0.15 * true
+        if coefficient.fitted:
+            # Twice the interval, of which one in a thousand lies outside.
+            assert abs(row["value"] - true) < row["high"] - row["low"]
+    assert float(found.score(table_of(name, seed=3))["rmse"].iloc[0]) < 0.025
+
+
+def test_a_batch_of_coefficients_gives_the_torque_of_each() -> None:
+    joint = TorqueTable.from_pandas(table_of("LuGre")).joints[0]
+    sets = np.array([TRUE["LuGre"], (0.5, 0.1, 0.05, 100.0, 1.0, 0.1)])
+    found = torques(model_by_name("LuGre")(1).law, joint, sets)
+    for values, torque in zip(sets, found, strict=True):
+        alone = predict(model_by_name("LuGre")(1, values), joint, 0.0)
+        np.testing.assert_allclose(torque, alone, rtol=1e-12)
+
+
+def test_rows_without_presliding_do_not_determine_the_stiffness() -> None:
+    """Strokes of 100 rad pass the presliding of 2 mrad within a sample."""
+    found = fit_torque(table_of("Dahl", reach=2e3), "dahl", folds=4)
+    assert found.intervals().loc["sigma_0 of joint1", "note"] == "not identifiable"
+    seen = fit_torque(table_of("Dahl"), "dahl", folds=4)
+    assert seen.intervals().loc["sigma_0 of joint1", "note"] == ""
+
+
+def test_maxwell_slip_is_referred_to_slip() -> None:
+    with pytest.raises(ValueError, match="use slip"):
+        fit_torque(table_of("Dahl"), "maxwell-slip", folds=4)

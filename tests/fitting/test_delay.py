@@ -1,0 +1,91 @@
+"""The delay of the torque is fitted beside the friction, with its interval."""
+
+import numpy as np
+import pytest
+import torch
+
+from nfriction import CVFM, LinearAxis, Recording, compare, fit
+from nfriction.fitting.data.inputs import adjustable_terms
+from nfriction.fitting.data.windows import cut_windows
+from nfriction.fitting.options import FitOptions
+from nfriction.fitting.plant_parameters import TORQUE_DELAY
+from nfriction.fitting.shooting.problem import ShootingProblem
+from nfriction.fitting.shooting.sensitivity import StepJacobian
+from nfriction.signals import kalman_smoother
+from tests.fitting.recordings import F64, driven_axis, pendulum, swing
+
+LATE = 0.0137
+TRUTH = [0.8, 2.0]
+
+
+def delayed(name: str = "axis", seconds: float = 3.0) -> Recording:
+    """A driven axis whose torque is logged late, by no whole number of samples."""
+    clean = driven_axis(LinearAxis(2.0), CVFM(1, [TRUTH], v_smooth=0.05), seconds=seconds)
+    return clean._replace(tau=clean.torque_at(clean.time - LATE), name=name)
+
+
+def test_a_fitted_delay_is_found_with_its_interval():
+    recording, axis = delayed(), LinearAxis(2.0)
+    settings = {"windows": (0.5, 1.5), "fit_plant": False}
+    late = fit(CVFM(1, v_smooth=0.05), axis, recording, **settings)
+    found = fit(CVFM(1, v_smooth=0.05), axis, recording, fit_delay=True, **settings)
+    assert found.converged
+    # Half a sample: the torque is held over a sample, and the log between them is a line.
+    assert found.torque_delay == pytest.approx(LATE, abs=1e-3)
+    (interval,) = (i for i in found.intervals if i.name == TORQUE_DELAY)
+    assert 0 < interval.sd < 1e-3
+    truth = torch.tensor(TRUTH, dtype=F64)
+    errors = [
+        float((f.model.schedule.coefficient_sets()["always"][0] / truth - 1).abs().max())
+        for f in (late, found)
+    ]
+    assert errors[1] < min(0.02, 0.1 * errors[0])
+    # A mistake that is fitted is none; otherwise it is named, with its cure.
+    assert found.mistakes == ()
+    assert "`fit_delay=True`" in late.warnings[0]
+    assert late.torque_delay == 0.0
+
+
+def test_scores_use_the_fitted_delay():
+    train, test = delayed("one"), delayed("two", 2.0)
+    settings = {"windows": (0.5, 1.5), "fit_plant": False}
+    late = compare(LinearAxis(2.0), "CVFM", train, test, **settings)
+    found = compare(LinearAxis(2.0), "CVFM", train, test, fit_delay=True, **settings)
+    assert found.table().loc["CVFM", "all"] < 0.1 * late.table().loc["CVFM", "all"]
+
+
+def test_gradient_by_the_delay_is_that_of_the_cost():
+    recording, axis = delayed(), LinearAxis(2.0)
+    options = FitOptions(fit_delay=True)
+    terms = adjustable_terms(axis, [recording], options)
+    motion = kalman_smoother(recording.time, recording.q)
+    windows = cut_windows([recording], [motion], 0.5)
+    problem = ShootingProblem(
+        StepJacobian(axis, CVFM(1), terms), CVFM(1, [[1.0, 1.5]]), windows, 1e-3,
+        torch.eye(1, dtype=F64), substeps=2,
+    )  # fmt: skip
+    x = problem.variables.start()
+    k = problem.variables.shared_count - 1
+    assert terms[-1].name == TORQUE_DELAY
+    x[k] = 0.0051
+    # The slope is that over a sample, so the difference is taken over one.
+    step = torch.zeros_like(x)
+    step[k] = 1e-3
+    slope = (problem.cost(x + step) - problem.cost(x - step)) / 2e-3
+    assert float(problem.linearise(x).gradient[k]) == pytest.approx(float(slope), rel=1e-3)
+
+
+def test_torques_between_samples_are_interpolated_and_held_at_the_ends():
+    time = 0.25 * np.arange(8)
+    recording = Recording(time, np.zeros((8, 1)), 4 * time[:, None], unit="m")
+    at = recording.torque_at(np.array([-1.0, 0.125, 1.5625, 9.0]))
+    assert at[:, 0].tolist() == [0.0, 0.5, 6.25, 7.0]
+    assert not Recording(time, np.zeros((8, 2)), unit="m").torque_at(time[:3]).any()
+
+
+def test_a_delay_needs_torques_and_simulated_windows():
+    plant = pendulum()
+    with pytest.raises(ValueError, match="needs recordings with torques"):
+        fit(CVFM(2), plant, swing(plant, CVFM(2)), fit_delay=True)
+    with pytest.raises(ValueError, match='fit_delay=True` needs `method="output_error"`'):
+        FitOptions(method="equation_error", fit_delay=True)

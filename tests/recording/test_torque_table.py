@@ -1,0 +1,93 @@
+"""Reading tables of friction torque, and refusing what is none."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from nfriction.recording.torque_table import TorqueTable
+
+QD = np.concatenate([np.linspace(-1.0, -0.1, 10), np.linspace(0.1, 1.0, 10)])
+
+
+def table(**columns: object) -> pd.DataFrame:
+    return pd.DataFrame({"qd": QD, "tau": np.sign(QD) + QD} | columns)
+
+
+def test_wide_and_long_tables_are_the_same() -> None:
+    wide = pd.DataFrame({"qd1": QD, "tau_f1": QD, "qd2": 2 * QD, "tau_f2": 3 * QD, "load": 1 + QD})
+    parts = [
+        pd.DataFrame({"joint": k, "velocity": k * QD, "torque": tau * QD, "load": 1 + QD})
+        for k, tau in ((1, 1.0), (2, 3.0))
+    ]
+    long = pd.concat(parts, ignore_index=True)
+    for given in (wide, long):
+        found = TorqueTable.from_pandas(given)
+        assert found.joint_names == ("joint1", "joint2")
+        np.testing.assert_array_equal(found.joints[1].qd, 2 * QD)
+        np.testing.assert_array_equal(found.joints[1].tau, 3 * QD)
+        np.testing.assert_array_equal(found.joints[1].load, 1 + QD)
+
+
+def test_units_and_names_of_a_german_file_are_followed(tmp_path: Path) -> None:
+    path = tmp_path / "tests.csv"
+    rows = [f"{np.rad2deg(v):.6f};{1e3 * v:.6f}".replace(".", ",") for v in QD]
+    path.write_text("Drehzahl [deg/s];tau [mN m]\n" + "\n".join(rows) + "\n")
+    found = TorqueTable.read(path, columns={"qd": "Drehzahl"})
+    assert found.name == "tests"
+    np.testing.assert_allclose(found.joints[0].qd, QD, atol=1e-7)
+    np.testing.assert_allclose(found.joints[0].tau, QD, atol=1e-7)
+    degrees = TorqueTable.from_pandas(table(qd=np.rad2deg(QD)), degrees=True)
+    np.testing.assert_allclose(degrees.joints[0].qd, QD)
+
+
+def test_velocity_comes_from_positions_in_time() -> None:
+    time = np.arange(400) * 0.01
+    given = pd.DataFrame({"time": time, "position": np.sin(time), "friction": np.cos(time)})
+    joint = TorqueTable.from_pandas(given, unit="m").joints[0]
+    np.testing.assert_allclose(joint.qd, np.cos(time), atol=1e-3)
+    np.testing.assert_allclose(joint.qdd[10:-10], -np.sin(time)[10:-10], atol=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (table().drop(columns="tau"), "no column of friction torque; found qd"),
+        (table().drop(columns="qd"), "column qd is missing; found tau"),
+        (table(qd=0.0), "joint1 does not move"),
+        (table(tau=2.0), "is 2 in every row"),
+        (table(qd=np.where(QD > 0.9, np.nan, QD)), "column qd, row 19 .* is nan, one of 1"),
+        (table(tau=["x"] * 20), "column tau, row 0 .* must be a number"),
+        (table(time=QD[::-1]), "time of joint1 must increase"),
+        (table().iloc[:5], "joint1 has 5 rows; at least 8"),
+        (table(torque=QD), "both are tau; rename one"),
+        (table(joint=1, qd2=QD, tau2=QD), "drop the column joint"),
+    ],
+)
+def test_what_is_no_table_is_refused(given: pd.DataFrame, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        TorqueTable.from_pandas(given)
+
+
+def test_wrong_names_of_columns_are_refused() -> None:
+    with pytest.raises(ValueError, match="no column 'speed'; found qd, tau"):
+        TorqueTable.from_pandas(table(), columns={"qd": "speed"})
+    with pytest.raises(ValueError, match="got the key 'voltage'"):
+        TorqueTable.from_pandas(table(), columns={"voltage": "qd"})
+    with pytest.raises(ValueError, match='`unit` must be "rad" or "m"'):
+        TorqueTable.from_pandas(table(), unit="deg")  # type: ignore[arg-type]
+
+
+def test_doubts_are_remarked() -> None:
+    one_way = TorqueTable.from_pandas(table(qd=np.abs(QD), tau=np.abs(QD)))
+    assert "one direction only" in one_way.remarks[0]
+    fast = TorqueTable.from_pandas(table(qd=np.rad2deg(2 * QD)))
+    assert "degrees per second" in fast.remarks[0]
+    assert not TorqueTable.from_pandas(table()).remarks
+
+
+def test_a_digest_follows_the_content() -> None:
+    one, same = (TorqueTable.from_pandas(table()) for _ in range(2))
+    assert one.digest() == same.digest()
+    assert one.digest() != TorqueTable.from_pandas(table(tau=QD)).digest()
