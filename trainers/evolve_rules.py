@@ -29,7 +29,8 @@ from nfriction.plots import style
 from nfriction.signals import Motion
 
 MODELS = ("ANCFM", "ACFM", "ACVFM", "ALFM", "ANLFM")
-SAMPLES = 1000  # of the torque, evenly thinned
+# One sample of this many is taken, and errors are averaged over blocks: 50 ms at 1 kHz.
+THINNED, BLOCK = 5, 10
 
 
 def train(argv: Sequence[str] | None) -> str:
@@ -85,12 +86,11 @@ def _samples(plant: Plant, motions: Sequence[Motion], joint: int) -> TorqueSampl
         torch.as_tensor(np.concatenate([getattr(m, key) for m in motions]))
         for key in ("q", "qd", "qdd")
     )
-    every = max(1, len(q) // SAMPLES)
-    q, qd, qdd = q[::every], qd[::every], qdd[::every]
+    q, qd, qdd = q[::THINNED], qd[::THINNED], qdd[::THINNED]
     with torch.no_grad():
         # Without a drive, friction is what the motion lacks.
         torque, load = -plant.inverse_dynamics(q, qd, qdd), plant.load(q, qd)
-    return TorqueSamples(qd[:, joint], qdd[:, joint], load[:, joint], torque[:, joint])
+    return TorqueSamples(qd[:, joint], qdd[:, joint], load[:, joint], torque[:, joint], BLOCK)
 
 
 def _draw(table: pd.DataFrame) -> "style.Figure":

@@ -35,12 +35,15 @@ class TorqueSamples:
     Attributes:
         qd, qdd, load: velocity [rad/s], acceleration [rad/s^2] and normal load [-], (sample,).
         torque: friction torque [N m], (sample,).
+        block: consecutive samples whose errors are averaged. The torque of a smoothed motion has
+            the noise of its acceleration, which may exceed friction; averages remove most of it.
     """
 
     qd: Tensor
     qdd: Tensor
     load: Tensor
     torque: Tensor
+    block: int = 1
 
 
 @dataclass(frozen=True)
@@ -162,10 +165,13 @@ def pareto(candidates: Sequence[Candidate]) -> list[Candidate]:
 def torque_error(
     controller: MamdaniController, law: Law, samples: TorqueSamples, v_smooth: float
 ) -> float:
-    """Root mean square error [N m] of the torque with a controller's coefficients."""
+    """Root mean square error [N m] of the torque, averaged over each block of samples."""
     coefficients = controller(samples.qd.abs(), samples.qdd)
     torque = law.torque(samples.qd, samples.load, coefficients, v_smooth)
-    return float((torque - samples.torque).square().mean().sqrt())
+    # The last block may not be full.
+    whole = len(torque) // samples.block * samples.block
+    errors = (torque - samples.torque)[:whole].reshape(-1, samples.block).mean(-1)
+    return float(errors.square().mean().sqrt())
 
 
 def _genes_of(controller: MamdaniController) -> Array:

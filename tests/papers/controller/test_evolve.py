@@ -89,3 +89,16 @@ def test_a_controller_keeps_a_rule() -> None:
     genes = module._genes_of(START)
     genes[-len(START.rule_base.rules) :] = np.linspace(0.0, 0.4, len(START.rule_base.rules))
     assert len(module._expressed(START, genes.tolist()).rule_base.rules) == 1
+
+
+def test_averages_over_blocks_ignore_noise_that_alternates() -> None:
+    given = samples()
+    noise = 0.1 * (-1.0) ** torch.arange(len(given.qd))
+    noisy = replace(given, torque=torque_of_the_start(given) + noise)
+    assert torque_error(START, LINEAR, noisy, V_SMOOTH) == pytest.approx(0.1)
+    assert torque_error(START, LINEAR, replace(noisy, block=2), V_SMOOTH) < 1e-12
+
+
+def torque_of_the_start(given: TorqueSamples) -> torch.Tensor:
+    coefficients = START(given.qd.abs(), given.qdd)
+    return LINEAR.torque(given.qd, given.load, coefficients, V_SMOOTH)
