@@ -3,7 +3,8 @@ PYTHON ?= python3
 # A torch that is installed as it is here; any from pyproject.toml's range serves.
 TORCH ?= torch==2.13.0
 BIN := .venv/bin
-# As many tests at a time as this process has cores.
+# As many tests at a time as this process has cores; those of a file stay in one process, which then
+# makes their fixtures and kernels once.
 WORKERS ?= $(shell nproc 2>/dev/null || echo auto)
 
 .PHONY: demo reproduce test lint clean
@@ -15,7 +16,7 @@ reproduce: .venv/installed
 	$(BIN)/nfriction reproduce --quick --out runs/papers
 
 test: .venv/installed
-	$(BIN)/python -m pytest -n $(WORKERS) -m "not slow"
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m "not slow"
 
 lint: .venv/installed
 	$(BIN)/ruff check .

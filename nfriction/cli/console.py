@@ -11,7 +11,7 @@ import textwrap
 import threading
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -58,9 +58,12 @@ def check_writable(folder: Path) -> None:
 
 
 # The library advises its caller in Python; who types a command has options instead.
-_OPTIONS = (
+_OPTIONS: tuple[tuple[re.Pattern[str], str | Callable[[re.Match[str]], str]], ...] = (
     (re.compile(r'columns=\{"(\w+)": "\.\.\."\}'), r"--columns \1=NAME"),
-    (re.compile(r'columns=\{"(\w+)": "([^"]+)"\}'), r'--columns "\1=\2"'),
+    (
+        re.compile(r'columns=\{("\w+": "[^"]+"(?:, "\w+": "[^"]+")*)\}'),
+        lambda found: '--columns "' + found[1].replace('": "', "=").replace('", "', ",")[1:],
+    ),
     (re.compile(r"`degrees=True`"), "--degrees"),
     (re.compile(r"`columns`"), "--columns"),
     (

@@ -1,6 +1,7 @@
 """Compile single functions of tensors."""
 
-from collections.abc import Callable, Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,7 @@ import torch
 from torch import Tensor
 
 from nfriction.codegen.batch import (
+    FEW,
     Driver,
     Kernel,
     Layout,
@@ -23,6 +25,10 @@ from nfriction.codegen.llvm.emit import write_function
 from nfriction.codegen.transform import hoist, with_jacobian
 
 _CHECK_TOLERANCE = 1e-10
+# Kernels kept in memory by what they compute, with the shapes of their outputs: fits of one law to
+# parts of the data, or from several starts, share theirs.
+_KEPT = 8
+_known: OrderedDict[Hashable, tuple[Kernel, dict[str, tuple[int, ...]]]] = OrderedDict()
 
 
 def compile_function(
@@ -47,9 +53,7 @@ def compile_function(
         NoBackend, UnsupportedOperation, SelfCheckFailed: see `compile_rollout`.
     """
     jit.require_backend()
-    compiled = CompiledFunction(function, example_inputs, jacobian)
-    compiled.check(example_inputs)
-    return compiled
+    return CompiledFunction(function, example_inputs, jacobian)
 
 
 class CompiledFunction:
@@ -66,12 +70,24 @@ class CompiledFunction:
         self._module = FunctionalModule(Method(function))
         inputs = {f"x{i}": x for i, x in enumerate(example_inputs)}
         program = self._module.trace(inputs)
-        if jacobian:
-            program = with_jacobian(program, [f"x{i}" for i in jacobian])
         self._inputs = {p.name: p.shape for p in program.inputs if p.name in inputs}
-        self._outputs = {f"y{i}": p.shape for i, p in enumerate(program.outputs)}
-        layout = Layout(tuple(self._inputs), tuple(self._outputs))
-        self._kernel = Kernel(lambda width: _driver(program, layout, width), layout)
+        key = program.digest(), self._jacobian
+        known = _known.get(key)
+        self._kernel, self._outputs = known or self._built(program)
+        if known is None:
+            self.check(example_inputs)
+        _known[key] = self._kernel, self._outputs
+        _known.move_to_end(key)
+        if len(_known) > _KEPT:
+            _known.popitem(last=False)
+
+    def _built(self, program: Program) -> tuple[Kernel, dict[str, tuple[int, ...]]]:
+        """The kernel of a traced function, and the shapes of its outputs."""
+        if self._jacobian:
+            program = with_jacobian(program, [f"x{i}" for i in self._jacobian])
+        outputs = {f"y{i}": p.shape for i, p in enumerate(program.outputs)}
+        layout = Layout(tuple(self._inputs), tuple(outputs))
+        return Kernel(lambda width: _driver(program, layout, width), layout), outputs
 
     def source(self, width: int = 0) -> str:
         """LLVM IR that computes so many rows together, 0 for one at a time."""
@@ -116,7 +132,8 @@ class CompiledFunction:
             ]
             with torch.no_grad():
                 eager = self._eager([x.to(self._module.device) for x in inputs])
-            ours = self(*(x[None] for x in inputs))
+            # As many rows as most calls have, so that the code for these is what is checked.
+            ours = self(*(x.expand(FEW, *x.shape) for x in inputs))
             for a, b in zip(
                 ours if isinstance(ours, tuple) else (ours,),
                 eager,

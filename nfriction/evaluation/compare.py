@@ -29,7 +29,7 @@ SCHEMA = 3
 first no number, and `held_out` where it now says `test`."""
 # Models whose errors agree to three digits are tied.
 TIE = 1e-3
-# So many times the error of a simpler model cannot be the luck of a few test recordings.
+# So many times the error of a model no larger cannot be the luck of a few test recordings.
 FAR_WORSE = 2.0
 InitialStates = Mapping[str, tuple[np.ndarray, np.ndarray]]
 Part = Literal["train", "test"]
@@ -214,9 +214,9 @@ class Comparison:
         return tuple(sorted({best, *near}, key=lambda name: (self._parameters(name), rmse[name])))
 
     def unfit(self) -> dict[str, str]:
-        """Models not to be used, with the reason: a simpler one predicts the test far better.
+        """Models not to be used, with the reason: one no larger predicts the test far better.
 
-        A model that is worse than no friction, or at least twice as bad as one with fewer
+        A model that is worse than no friction, or at least twice as bad as one with no more
         parameters by more than the limit of these data, extrapolates wrongly from its training.
         """
         if not self.test:
@@ -224,13 +224,13 @@ class Comparison:
         rmse, limit = self.table()["all"], self.limit() or 0.0
         found = {}
         for name, error in rmse.items():
-            simpler = rmse[[self._parameters(n) < self._parameters(str(name)) for n in rmse.index]]
-            least = simpler.min() if len(simpler) else np.inf
-            # Where the simpler model diverges too, neither is known to be better.
+            smaller = rmse[[self._parameters(n) <= self._parameters(str(name)) for n in rmse.index]]
+            least = smaller.min()
+            # Where all of these diverge, none is known to be better.
             if np.isfinite(least) and error >= FAR_WORSE * least and error > least + limit:
-                found[str(name)] = (
-                    f"{simpler.idxmin()} with fewer parameters has {1e3 * least:.3g} m{self.unit}, "
-                    + (f"it {1e3 * error:.3g}" if np.isfinite(error) else "it diverges")
+                best = f"{smaller.idxmin()} with no more parameters"
+                found[str(name)] = f"{best} has {1e3 * least:.3g} m{self.unit}, " + (
+                    f"it {1e3 * error:.3g}" if np.isfinite(error) else "it diverges"
                 )
             elif NO_FRICTION in rmse and error > rmse[NO_FRICTION] + limit:
                 found[str(name)] = "no friction predicts better"

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from nfriction.evaluation.lead_in import longest_window
 from nfriction.evaluation.parallel import Data, Fits, Progress, fit_models
 from nfriction.evaluation.score import score
-from nfriction.fitting.data.checks import looks_zeroed_per_recording
-from nfriction.fitting.data.inputs import apply_encoder_offsets
+from nfriction.fitting.data.inputs import apply_encoder_offsets, looks_zeroed_per_recording
 from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction import model_by_name, model_name

@@ -152,12 +152,13 @@ class TorqueFits:
 
         Args:
             table: a `TorqueTable`, a path or a DataFrame, with the joints of the training table.
+                Without torque, laws with memory begin without deflection.
             model: by either of its names; by default the one chosen at each joint.
 
         Raises:
             ValueError: if its joints are others, or it lacks a load that a model needs.
         """
-        given = as_table(table, unit=self.table.unit)
+        given = as_table(table, unit=self.table.unit, torque=False)
         _check_joints(self.table.joint_names, given)
         names = self._names(model)
         return [

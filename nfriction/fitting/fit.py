@@ -18,17 +18,15 @@ from pathlib import Path
 
 from torch import Tensor
 
-from nfriction.fitting.data.checks import (
-    ZEROED_PER_RECORDING,
-    data_warnings,
-    looks_zeroed_per_recording,
-)
 from nfriction.fitting.data.inputs import (
+    ZEROED_PER_RECORDING,
     advanced_torques,
     as_model,
     as_recording_list,
+    data_warnings,
     in_joint_coordinates,
     largest_torques,
+    looks_zeroed_per_recording,
     measurement_matrix,
     smoothed_motions,
 )

@@ -7,6 +7,7 @@ the velocity are added where they lower the error on blocks left out.
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,12 +31,18 @@ SPAN = (3e-5, 2.0)
 COUNTS = {True: 30, False: ELEMENTS}
 # Moves before the first row over the range of the motion, which the first torques show.
 PATHS = tuple(np.geomspace(1e-4, 2.0, 10))
+# Path over which the excess of a long rest fades, over the range of the motion.
+FADINGS = tuple(np.geomspace(1e-5, 0.1, 9))
 # Velocities over the largest one.
 VELOCITIES = (0.003, 0.01, 0.03, 0.1, 0.3, 0.6)
 # Ridges relative to the information of the data: neighbouring widths are nearly equivalent.
 RIDGES = (1e-1, 1e-2, 1e-3)
+# Columns that no velocity shapes, and the place of a rest's excess among them.
+PLAIN, REST = 4, 3
 # Relative difference of errors on blocks left out that is too small to choose by.
 TOLERANCE = 0.02
+# Time whose torque shows how a law with memory was deflected before, as for simulations [s].
+LEAD_IN = 0.2
 # Rows from which the start is chosen; it is forgotten over the first strokes.
 START_ROWS = 3000
 
@@ -103,13 +110,16 @@ def fit_slip(joint: JointTorque, blocks: Sequence[NDArray[np.intp]], *, loaded: 
     reach, path = range_of(joint), path_of(joint)
     grids = {positive: reach * np.geomspace(*SPAN, count) for positive, count in COUNTS.items()}
     every = max(1, len(joint) // START_ROWS)
-    start = _likeliest_approach(joint, grids[True], every, loaded)
+    start, fading = _likeliest_start(joint, grids[True], every, loaded)
     tables = {
-        positive: _Dictionary.of(joint, deflections(path, grid, _approached(grid, start)), loaded)
+        positive: _Dictionary.of(
+            joint, deflections(path, grid, _approached(grid, start)), loaded, fading
+        )
         for positive, grid in grids.items()
     }
+    folds = {positive: table.folds(blocks) for positive, table in tables.items()}
     choices = [tables[shape.positive].best(shape) for shape in _Shape.every()]
-    left_out = [tables[c.shape.positive].left_out(c, blocks) for c in choices]
+    left_out = [tables[c.shape.positive].left_out(c, folds[c.shape.positive]) for c in choices]
     scores = np.sqrt(np.mean(np.square(left_out), 1))
     # The simplest that is as accurate as the best but for the tolerance.
     chosen = int(np.flatnonzero(scores <= (1 + TOLERANCE) * scores.min())[0])
@@ -119,11 +129,11 @@ def fit_slip(joint: JointTorque, blocks: Sequence[NDArray[np.intp]], *, loaded: 
         # The merged elements, with the weights that suit them.
         widths = _merged(choice.weights[-len(widths) :], widths)
         z = deflections(path, widths, _approached(widths, start))
-        table = _Dictionary.of(joint, z, loaded)
+        table = _Dictionary.of(joint, z, loaded, fading)
         choice = table.at(choice)
     else:
         table = tables[False]
-    return table.result(choice, widths, errors)
+    return table.result(choice, widths, errors, start)
 
 
 def _approached(widths: Array, path: float) -> Array:
@@ -131,15 +141,24 @@ def _approached(widths: Array, path: float) -> Array:
     return np.clip(path / widths, -1.0, 1.0)
 
 
-def _likeliest_approach(joint: JointTorque, widths: Array, every: int, loaded: bool) -> float:
-    """Path of the move before the first row that explains the torque best [rad; m]."""
-    paths = range_of(joint) * np.array([0.0, *PATHS, *(-x for x in PATHS)])
+def _likeliest_start(
+    joint: JointTorque, widths: Array, every: int, loaded: bool
+) -> tuple[float, float]:
+    """Path of the move before the first row, and the fading, that explain the torque best."""
+    reach = range_of(joint)
+    paths = reach * np.array([0.0, *PATHS, *(-x for x in PATHS)])
     starts = np.clip(paths[:, None] / widths, -1.0, 1.0)
-    coarse = deflections(path_of(joint), widths, starts, every)
+    coarse = np.moveaxis(deflections(path_of(joint), widths, starts, every), 1, 0)
     some = joint.rows(np.arange(0, len(joint), every))
-    shape = _Shape(positive=True, ridge=RIDGES[-1])
-    costs = [_Dictionary.of(some, z, loaded).best(shape).cost for z in np.moveaxis(coarse, 1, 0)]
-    return float(paths[int(np.argmin(costs))])
+
+    def cost(z: Array, fading: float) -> float:
+        return _Dictionary.of(some, z, loaded, fading).best(plain).cost
+
+    plain = _Shape(positive=True, ridge=RIDGES[-1], rested=True)
+    middle = reach * FADINGS[len(FADINGS) // 2]
+    best = int(np.argmin([cost(z, middle) for z in coarse]))
+    fadings = reach * np.array(FADINGS)
+    return float(paths[best]), float(fadings[np.argmin([cost(coarse[best], d) for d in fadings])])
 
 
 def _merged(forces: Array, widths: Array) -> Array:
@@ -164,11 +183,12 @@ class _Shape:
     saturating: bool = False
     drop: bool = False
     asymmetric: bool = False
+    rested: bool = False
 
     @classmethod
     def every(cls) -> "Iterator[_Shape]":
         """All shapes, simplest first."""
-        for terms in itertools.product((False, True), repeat=3):
+        for terms in itertools.product((False, True), repeat=4):
             for positive in (True, False):
                 for ridge in RIDGES:
                     yield cls(positive, ridge, *terms)
@@ -184,15 +204,25 @@ class _Choice:
     cost: float
 
 
+class _Fold(NamedTuple):
+    """Rows that are left out, and the products of the others' columns."""
+
+    block: NDArray[np.intp]
+    gram: Array
+    right: Array
+
+
 @dataclass(frozen=True, eq=False)
 class _Dictionary:
-    """Columns of all terms: offset, viscous, asymmetric, those of each velocity, and elements.
+    """Columns of all terms: offset, viscous, asymmetric, of a rest, of velocities, and elements.
 
     Attributes:
         whole: (row, column).
         tau: torque, (row,).
         velocities: at which friction saturates or drops, (velocity,).
         gram, right: products of the columns with each other, and with the torque.
+        lead: number of rows of the lead-in.
+        fading: path over which the excess of a rest fades [rad; m].
     """
 
     whole: Array
@@ -200,26 +230,35 @@ class _Dictionary:
     velocities: Array
     gram: Array
     right: Array
+    lead: int
+    fading: float
 
     @classmethod
-    def of(cls, joint: JointTorque, z: Array, loaded: bool) -> "_Dictionary":
+    def of(cls, joint: JointTorque, z: Array, loaded: bool, fading: float) -> "_Dictionary":
         load = joint.load if loaded and joint.load is not None else np.ones_like(joint.qd)
         speeds = np.abs(joint.qd).max() * np.array(VELOCITIES)
         ratio = joint.qd[:, None] / speeds
         scaled = [np.tanh(ratio), z[:, :1] * np.exp(-(ratio**2)), z]
-        plain = np.stack([np.ones_like(load), joint.qd, np.abs(joint.qd)], 1)
+        # A rest adds to the friction that holds the joint, and so has the elements' sign.
+        held = float(np.sign(z[0].sum())) or float(np.sign(joint.tau[0]))
+        rest = held * np.exp(-np.cumsum(np.abs(path_of(joint))) / fading)
+        plain = np.stack([np.ones_like(load), joint.qd, np.abs(joint.qd), rest], 1)
         whole = np.concatenate([plain, *(load[:, None] * x for x in scaled)], 1)
-        return cls(whole, joint.tau, speeds, whole.T @ whole, whole.T @ joint.tau)
+        assert joint.time is not None
+        lead = max(1, int(np.searchsorted(joint.time, joint.time[0] + LEAD_IN)))
+        gram, right = whole.T @ whole, whole.T @ joint.tau
+        return cls(whole, joint.tau, speeds, gram, right, lead, fading)
 
     def options(self, shape: _Shape) -> Iterator[tuple[int, ...]]:
         """Places of the columns, for every choice of velocities."""
         n = len(self.velocities)
-        first = 3 + 2 * n
-        turns = range(3, 3 + n) if shape.saturating else (-1,)
-        drops = range(3 + n, first) if shape.drop else (-1,)
+        first = PLAIN + 2 * n
+        turns = range(PLAIN, PLAIN + n) if shape.saturating else (-1,)
+        drops = range(PLAIN + n, first) if shape.drop else (-1,)
         skew = 2 if shape.asymmetric else -1
+        rest = REST if shape.rested else -1
         for turn, drop in itertools.product(turns, drops):
-            yield (0, 1, skew, turn, drop, *range(first, self.whole.shape[1]))
+            yield (0, 1, skew, rest, turn, drop, *range(first, self.whole.shape[1]))
 
     def best(self, shape: _Shape) -> _Choice:
         """The choice of velocities with the least sum of squares."""
@@ -228,18 +267,38 @@ class _Dictionary:
 
     def at(self, choice: _Choice) -> _Choice:
         """The same terms with the weights that suit these elements."""
-        places = (*choice.places[:5], *range(3 + 2 * len(self.velocities), self.whole.shape[1]))
+        first = PLAIN + 2 * len(self.velocities)
+        places = (*choice.places[:6], *range(first, self.whole.shape[1]))
         return self._choice(choice.shape, places)
 
-    def left_out(self, choice: _Choice, blocks: Sequence[NDArray[np.intp]]) -> list[float]:
-        """Root mean square errors on blocks that are left out in turn."""
+    def folds(self, blocks: Sequence[NDArray[np.intp]]) -> "list[_Fold]":
+        """Blocks to leave out in turn, each with the products of the others."""
+        parts = [(self.whole[b].T @ self.whole[b], self.whole[b].T @ self.tau[b]) for b in blocks]
+        found = []
+        for k, block in enumerate(blocks):
+            # Summed anew: a difference would leave rounding in columns that live in one block.
+            rest = [pair for i, pair in enumerate(parts) if i != k]
+            gram, right = (np.sum(x, 0) for x in zip(*rest, strict=True))
+            found.append(_Fold(block, gram, right))
+        return found
+
+    def left_out(self, choice: _Choice, folds: "Sequence[_Fold]") -> list[float]:
+        """Root mean square errors on blocks that are left out in turn.
+
+        The excess of a rest before is that of the lead-in, as for any other table.
+        """
         used = np.array([p for p in choice.places if p >= 0])
+        law = used != REST
         errors = []
-        for block in blocks:
-            x, y = self.whole[np.ix_(block, used)], self.tau[block]
-            gram = self.gram[np.ix_(used, used)] - x.T @ x
-            weights = _weights(gram, self.right[used] - x.T @ y, choice.shape)
-            errors.append(float(np.sqrt(np.mean((x @ weights - y) ** 2))))
+        for block, gram, right in folds:
+            weights = _weights(gram[np.ix_(used, used)], right[used], choice.shape)
+            error = self.whole[np.ix_(block, used[law])] @ weights[law] - self.tau[block]
+            if choice.shape.rested:
+                torque = self.whole[: self.lead][:, used[law]] @ weights[law]
+                left = self.whole[: self.lead, REST]
+                excess = float(left @ (self.tau[: self.lead] - torque) / (left @ left))
+                error = error + excess * self.whole[block, REST]
+            errors.append(float(np.sqrt(np.mean(error**2))))
         return errors
 
     def _choice(self, shape: _Shape, places: tuple[int, ...]) -> _Choice:
@@ -251,26 +310,33 @@ class _Dictionary:
         # But for the square of the torque, which is the same for all.
         return _Choice(shape, places, weights, float((solution @ gram - 2 * right) @ solution))
 
-    def result(self, choice: _Choice, widths: Array, errors: Sequence[float]) -> SlipFit:
+    def result(
+        self, choice: _Choice, widths: Array, errors: Sequence[float], start: float
+    ) -> SlipFit:
         """Coefficients of the law."""
-        n, forces = len(self.velocities), choice.weights[5:]
+        n, forces = len(self.velocities), choice.weights[6:]
         turn, drop = (
             self.velocities[p - first if p >= 0 else -1]
-            for p, first in zip(choice.places[3:5], (3, 3 + n), strict=True)
+            for p, first in zip(choice.places[4:6], (PLAIN, PLAIN + n), strict=True)
         )
-        offset, viscous, skew, saturating, falling = choice.weights[:5]
+        offset, viscous, skew, _, saturating, falling = choice.weights[:6]
         blank = [0.0] * (ELEMENTS - len(forces))
         # Elements without force are as wide as the widest.
         wide = [float(widths[-1])] * len(blank)
+        # Without an excess it would be gone at once.
+        fading = self.fading if choice.shape.rested else 1e-6 * float(widths[0])
         coefficients = np.array(
-            [offset, viscous, skew, saturating, turn, falling, drop, *forces, *blank,
-             *widths, *wide]
+            [offset, viscous, skew, saturating, turn, falling, drop, fading, start,
+             *forces, *blank, *widths, *wide]
         )  # fmt: skip
-        of = (OFFSET, VISCOUS, ASYMMETRY, SATURATING, DROP, *range(FIRST, FIRST + len(forces)))
+        of = (OFFSET, VISCOUS, ASYMMETRY, -1, SATURATING, DROP,
+              *range(FIRST, FIRST + len(forces)))  # fmt: skip
         kept = [k for k, w in enumerate(choice.weights) if w != 0.0]
         design = self.whole[:, [choice.places[k] for k in kept]]
-        fitted = tuple(of[k] for k in kept)
-        return SlipFit(coefficients, tuple(errors), design @ choice.weights[kept], design, fitted)
+        torque = design @ choice.weights[kept]
+        own = [i for i, k in enumerate(kept) if of[k] >= 0]
+        fitted = tuple(of[kept[i]] for i in own)
+        return SlipFit(coefficients, tuple(errors), torque, design[:, own], fitted)
 
 
 def _weights(gram: Array, right: Array, shape: _Shape) -> Array:
@@ -279,7 +345,14 @@ def _weights(gram: Array, right: Array, shape: _Shape) -> Array:
     scale[scale <= 0] = 1.0
     a = gram / scale[:, None] / scale + shape.ridge * np.eye(len(right))
     if not shape.positive:
-        return np.linalg.solve(a, right / scale) / scale
+        weights: Array = np.linalg.solve(a, right / scale) / scale
+        place = REST - (not shape.asymmetric)
+        if shape.rested and weights[place] < 0:
+            rest = np.arange(len(right)) == place
+            weights[rest] = 0.0
+            weights[~rest] = np.linalg.solve(a[~rest][:, ~rest], (right / scale)[~rest])
+            weights[~rest] /= scale[~rest]
+        return weights
     from scipy.optimize import nnls  # slow to import
 
     root = np.linalg.cholesky(a).T

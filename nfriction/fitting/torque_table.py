@@ -12,7 +12,14 @@ from torch import Tensor
 
 from nfriction.fitting.bristles import BristleFit, fit_bristles
 from nfriction.fitting.equation_error import TorqueBalance, regress
-from nfriction.fitting.hysteresis import PATHS, SlipFit, fit_slip, path_of, range_of
+from nfriction.fitting.hysteresis import (
+    LEAD_IN,
+    PATHS,
+    SlipFit,
+    fit_slip,
+    path_of,
+    range_of,
+)
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.result.identifiability import (
     Information,
@@ -31,8 +38,8 @@ from nfriction.recording.torque_table import JointTorque, TorqueTable
 
 # The sign of the velocity turns within this share of the largest velocity, or within `V_SMOOTH`.
 TURN_SHARE = 0.01
-# Time whose torque shows how far a law with memory was deflected before, as for simulations [s].
-LEAD_IN = 0.2
+# Share of the torques by which starts differ that another start than the fit's has to explain.
+START_SHARE = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,9 +238,7 @@ def _remembered(model: FrictionModel, memory: Memory, joint: JointTorque, lead_i
     if joint.time is None:
         raise ValueError(f"a law with memory needs the time of the rows of {joint.name}.")
     qd, qdd, load, tau = _columns(joint)
-    coefficients = model.coefficients(qd[:1], qdd[:1])
-    if coefficients.shape[0] != 1:
-        coefficients = coefficients[None]
+    coefficients = model.coefficients(qd[:1], qdd[:1]).reshape(1, -1)
     step = np.diff(joint.time, prepend=joint.time[0] - joint.step)
     moved = torch.tensor(path_of(joint) / step)[:, None]
     steps = torch.tensor(step)[:, None]
@@ -248,21 +253,33 @@ def _remembered(model: FrictionModel, memory: Memory, joint: JointTorque, lead_i
             found.append(state)
         return torch.stack(found)
 
-    first = range(int(np.searchsorted(joint.time, joint.time[0] + lead_in)))
     still = torch.zeros(1, 1, memory.size).double()
-    if len(first):
-        reach = max(range_of(joint), 1e-12)
-        way = torch.tensor(reach * np.array([0.0, *PATHS, *(-x for x in PATHS)]))[:, None]
+    # A table to predict may have no torque, which then shows nothing.
+    seen = lead_in if bool(tau.isfinite().all()) else 0.0
+    first = slice(int(np.searchsorted(joint.time, joint.time[0] + seen)))
+    if first.stop:
+        names, reach = model.law.names, max(range_of(joint), 1e-12)
+        own = float(coefficients[0, names.index("p_0")]) if "p_0" in names else 0.0
+        way = torch.tensor([own, 0.0, *(sign * reach * x for x in PATHS for sign in (1, -1))])
         starts = memory.advance(
-            still.expand(len(way), 1, -1), way.sign(), load[0], coefficients, way.abs()
-        )
-        states = along(starts, first)
-        shape = (len(first), len(way), 1)
-        torque = memory.torque(
-            states, qd[: first.stop, None].expand(shape),
-            load[: first.stop, None].expand(shape), coefficients,
+            still.expand(len(way), 1, -1), way.sign()[:, None], load[0], coefficients,
+            way.abs()[:, None],
         )  # fmt: skip
-        still = starts[(torque - tau[: first.stop, None]).square().sum((0, 2)).argmin()][None]
+        states = along(starts, range(first.stop))[..., 0, :]
+        speed, force = (x[first].expand(states.shape[:-1]) for x in (qd, load))
+        torque = memory.torque(states, speed, force, coefficients[0])
+        rmse = (tau[first] - torque).square().mean(0).sqrt()
+        best = int(rmse.argmin())
+        # Noise at rest must not choose a start that later rows of the fit would contradict.
+        spread = torque.mean(0).max() - torque.mean(0).min()
+        best = best if rmse[best] + START_SHARE * spread < rmse[0] else 0
+        still = starts[best][None]
+        fading = float(coefficients[0, names.index("d_r")]) if "d_r" in names else 0.0
+        if fading > 1e-6 * reach:
+            # Friction that the elements do not show is the excess of a long rest.
+            left = torch.exp(-(moved[first].abs() * steps[first]).cumsum(0) / fading)[:, 0]
+            error = (tau[first] - torque)[:, best]
+            still[..., -1] = left @ error / left.square().sum()
     states = along(still, range(len(joint)))[:, 0]
     return memory.torque(states, qd, load, coefficients)[:, 0]
 

@@ -3,13 +3,18 @@
 The torque is
 
     tau_f = f_o + F_v qd + A_v |qd|
-            + s (f_a tanh(qd / v_a) + F_d z_1 exp(-(qd / v_s)^2) + sum_k F_k z_k),
+            + s (f_a tanh(qd / v_a) + F_d z_1 exp(-(qd / v_s)^2) + sum_k F_k z_k) + r,
 
 with s = 1, or the load. Each element follows the displacement up to its width d_k and then slips,
-z_k = clip(z_k + qd time_step / d_k, -1, 1). The torque is linear in all forces, so that least
-squares estimates them at given widths. Without elements it is a law of the velocity alone. It is
-passive where no force is negative and offset and asymmetry A_v are zero; a negative force is that
-of friction which falls over some displacement after a breakaway.
+z_k = clip(z_k + qd time_step / d_k, -1, 1). What a long rest before the first sample has added to
+the friction is the state r, zero unless an observer sets it; it fades over the path d_r travelled,
+r exp(-|qd| time_step / d_r). The elements begin undeflected, or, where an observer knows no better,
+as after a move of p_0, with which the rows of the fit began.
+
+The torque is linear in all forces, so that least squares estimates them at given widths. Without
+elements it is a law of the velocity alone. It is passive where no force is negative and offset and
+asymmetry A_v are zero; a negative force is that of friction which falls over some displacement
+after a breakaway.
 
 References:
     F. Al-Bender, V. Lampaert and J. Swevers, IEEE Trans. Automatic Control 50 (2005) 1883-1887
@@ -26,38 +31,44 @@ from nfriction.friction.models import ConstantModel
 
 ELEMENTS = 12
 # Places of the coefficients: those of the velocity first, then forces and widths of the elements.
-OFFSET, VISCOUS, ASYMMETRY, SATURATING, TURN, DROP, STRIBECK, FIRST = range(8)
+OFFSET, VISCOUS, ASYMMETRY, SATURATING, TURN, DROP, STRIBECK, FADING, START, FIRST = range(10)
 
 
 def advance_hysteresis(
     state: Tensor, qd: Tensor, load: Tensor, coefficients: Tensor, time_step: float | Tensor
 ) -> Tensor:
-    """Deflections over their widths after a sample, clipped where elements slip."""
-    count = state.shape[-1]
-    width = coefficients[..., FIRST + count :]
-    return (state + (qd * time_step).unsqueeze(-1) / width).clamp(-1.0, 1.0)
+    """Deflections over their widths, clipped where elements slip, and the rest's excess."""
+    count = state.shape[-1] - 1
+    path = (qd * time_step).unsqueeze(-1)
+    width = coefficients[..., FIRST + count : FIRST + 2 * count]
+    elements = (state[..., :count] + path / width).clamp(-1.0, 1.0)
+    fading = coefficients[..., FADING : FADING + 1]
+    excess = state[..., count:] * torch.exp(-path.abs() / fading)
+    return torch.cat([elements, excess], -1)
 
 
 def hysteresis_torque(
     state: Tensor, qd: Tensor, load: Tensor, coefficients: Tensor, *, loaded: bool
 ) -> Tensor:
     """Torque of the elements and of the velocity."""
-    count = state.shape[-1]
-    offset, viscous, skew, saturating, turn, drop, stribeck = coefficients[..., :FIRST].unbind(-1)
+    count = state.shape[-1] - 1
+    offset, viscous, skew, saturating, turn, drop, stribeck = coefficients[..., :FADING].unbind(-1)
     fading = torch.exp(-(qd / stribeck).square())
     friction = (
         saturating * torch.tanh(qd / turn)
         + drop * fading * state.select(-1, 0)
-        + (coefficients[..., FIRST : FIRST + count] * state).sum(-1)
+        + (coefficients[..., FIRST : FIRST + count] * state[..., :count]).sum(-1)
     )
-    return offset + viscous * qd + skew * qd.abs() + (load * friction if loaded else friction)
+    scaled = load * friction if loaded else friction
+    return offset + viscous * qd + skew * qd.abs() + scaled + state.select(-1, count)
 
 
 def steady_hysteresis(
     qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float, *, loaded: bool, count: int
 ) -> Tensor:
     """Torque at a constant velocity, with all elements slipping."""
-    state = smooth_sign(qd, v_smooth).unsqueeze(-1).expand(*qd.shape, count)
+    sign = smooth_sign(qd, v_smooth).unsqueeze(-1)
+    state = torch.cat([sign.expand(*qd.shape, count), torch.zeros_like(sign)], -1)
     return hysteresis_torque(state, qd, load, coefficients, loaded=loaded)
 
 
@@ -76,6 +87,8 @@ def hysteresis_law(name: str, *, loaded: bool, count: int = ELEMENTS) -> Law:
             Coefficient("v_a", "rad/s", linear=False, initial_grid=velocities),
             Coefficient("F_d", unit, positive=False),
             Coefficient("v_s", "rad/s", linear=False, initial_grid=velocities),
+            Coefficient("d_r", "rad", linear=False, initial_grid=(1e-3,)),
+            Coefficient("p_0", "rad", positive=False, linear=False, initial_grid=(0.0,)),
             *(Coefficient(f"F_{k}", unit, positive=False) for k in numbers),
             *(
                 Coefficient(f"d_{k}", "rad", linear=False, initial_grid=(10.0 ** (0.5 * k - 6),))
@@ -83,7 +96,7 @@ def hysteresis_law(name: str, *, loaded: bool, count: int = ELEMENTS) -> Law:
             ),
         ),
         partial(steady_hysteresis, loaded=loaded, count=count),
-        memory=Memory(count, advance_hysteresis, partial(hysteresis_torque, loaded=loaded)),
+        memory=Memory(count + 1, advance_hysteresis, partial(hysteresis_torque, loaded=loaded)),
     )
 
 

@@ -10,8 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter
 
-from nfriction.fitting.result.identifiability import NORMAL_95
-from nfriction.fitting.result.uncertainty import CoefficientUncertainty
+from nfriction.fitting.result.identifiability import NORMAL_95, CoefficientUncertainty
 from nfriction.friction.laws import Coefficient
 from nfriction.friction.models import FrictionModel
 from nfriction.fuzzy.membership import FuzzyRules

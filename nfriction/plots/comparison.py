@@ -17,8 +17,7 @@ from nfriction.evaluation.score import Score
 from nfriction.fitting.equation_error import friction_torque
 from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.fitting.result.identifiability import NORMAL_95
-from nfriction.fitting.result.uncertainty import CoefficientUncertainty
+from nfriction.fitting.result.identifiability import NORMAL_95, CoefficientUncertainty
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.plots import style

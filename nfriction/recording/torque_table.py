@@ -125,12 +125,13 @@ class TorqueTable:
         columns: Mapping[str, str] | None = None,
         degrees: bool = False,
         unit: Unit = "rad",
+        torque: bool = True,
     ) -> TorqueTable:
         """Table from a file, in any of the formats of `Recording.read`.
 
         Args:
             path: of the file; the table's name is the file's without its ending.
-            columns, degrees, unit: as for `from_pandas`.
+            columns, degrees, unit, torque: as for `from_pandas`.
 
         Raises:
             FileNotFoundError: there is no such file.
@@ -138,7 +139,9 @@ class TorqueTable:
         """
         table = formats.read_table(path, list((columns or {}).values()))
         try:
-            found = cls.from_pandas(table, columns=columns, degrees=degrees, unit=unit)
+            found = cls.from_pandas(
+                table, columns=columns, degrees=degrees, unit=unit, torque=torque
+            )
         except ValueError as error:
             raise ValueError(f"'{path}': {error}") from error
         return replace(found, name=formats.stem(path))
@@ -151,6 +154,7 @@ class TorqueTable:
         columns: Mapping[str, str] | None = None,
         degrees: bool = False,
         unit: Unit = "rad",
+        torque: bool = True,
     ) -> TorqueTable:
         """Table from columns qd and tau, perhaps time, q, qdd, load, temperature and joint.
 
@@ -164,6 +168,7 @@ class TorqueTable:
             columns: the table's name for ours where they differ, perhaps with a unit: "vel:deg/s".
             degrees: positions and velocities are in degrees.
             unit: of positions, `"rad"` or `"m"`.
+            torque: False reads a table without tau, too, to predict its torque; it is NaN then.
 
         Raises:
             ValueError: a column that is missing, or no number in every row; time that does not
@@ -180,7 +185,7 @@ class TorqueTable:
         }
         names: list[str] = []
         parts: list[dict[str, Array | None]] = []
-        for name, rows, number in _parts(table, sources):
+        for name, rows, number in _parts(table, sources, torque):
             found = {key: values.get((key, number)) for key in _PER_JOINT}
             # One column may be shared by all joints.
             for key in ("load", "temperature"):
@@ -255,10 +260,12 @@ def _missing(table: pd.DataFrame, wanted: str, what: str) -> str:
 
 
 def _parts(
-    table: pd.DataFrame, sources: Mapping[_Key, tuple[str, str | None]]
+    table: pd.DataFrame, sources: Mapping[_Key, tuple[str, str | None]], torque: bool
 ) -> Iterator[tuple[str, NDArray[Any] | slice, int]]:
     """Name, rows and number of columns of each joint."""
     numbers = sorted({n for key, n in sources if key == "tau"})
+    if not numbers and not torque:
+        numbers = sorted({n for key, n in sources if key in ("q", "qd")})
     if not numbers:
         raise ValueError(_missing(table, "tau", "no column of friction torque"))
     for n in numbers:
@@ -308,7 +315,10 @@ def _numbers(
 def _joint(name: str, of: Mapping[str, Array | None], remarks: list[str]) -> JointTorque:
     """The rows of a joint, checked; velocity from positions where none is given."""
     time, q, qd, qdd, tau = (of[key] for key in ("time", "q", "qd", "qdd", "tau"))
-    assert tau is not None
+    if tau is None:
+        given = qd if qd is not None else q
+        assert given is not None
+        tau = np.full(len(given), np.nan)
     if len(tau) < MINIMUM_ROWS:
         raise ValueError(f"{name} has {len(tau)} rows; at least {MINIMUM_ROWS} are needed.")
     if time is not None and not np.all(np.diff(time) > 0):

@@ -57,7 +57,7 @@ def test_what_is_not_given_is_left_to_the_fit() -> None:
         ("nan.csv", b"time,q1\n" + b"".join(b"%d,nan\n" % k for k in range(9)), "finite"),
         ("two.csv", b"time,q1,q2\n" + b"".join(b"0.%d,1,2\n" % k for k in range(9)), "2 joints"),
         ("names.csv", b"time,enc_1\n" + b"".join(b"0.%d,1\n" % k for k in range(9)),
-         "--columns q1=NAME"),
+         '--columns "q1=enc_1"'),
         ("log.xlsx", b"0", ".parquet"),
     ],
 )  # fmt: skip

@@ -248,16 +248,19 @@ def test_models_within_the_limit_of_the_best_are_not_told_apart(comparison):
     assert dataclasses.replace(found, test={}).indistinguishable() == ()
 
 
-def test_a_model_that_a_simpler_one_beats_by_far_is_not_fit_for_use(comparison):
+def test_a_model_that_one_no_larger_beats_by_far_is_not_fit_for_use(comparison):
     found, _ = comparison
     assert scored(found, no_friction=5.0, NCFM=1.0, LFM=1.9).unfit() == {}
     runaway = scored(found, no_friction=5.0, NCFM=1.0, LFM=2.1)
     assert set(runaway.unfit()) == {"LFM"}
-    assert "not fit for use: LFM: NCFM with fewer parameters has" in verdict(runaway)
+    assert "not fit for use: LFM: NCFM with no more parameters has" in verdict(runaway)
     assert runaway.to_dict()["unfit"] == runaway.unfit()
     assert "it diverges" in scored(found, no_friction=5.0, NCFM=1.0, LFM=np.inf).unfit()["LFM"]
     worse = scored(found, no_friction=1.0, NCFM=1.2, LFM=1.3).unfit()
     assert worse == dict.fromkeys(("NCFM", "LFM"), "no friction predicts better")
+    # As many parameters are no excuse.
+    equal = dataclasses.replace(found, fits={**found.fits, "CVFM": found.fits["LFM"]})
+    assert set(scored(equal, no_friction=5.0, CVFM=1.0, LFM=2.1).unfit()) == {"LFM"}
     # The data do not separate these.
     assert scored(found, 10.0, no_friction=5.0, NCFM=1.0, LFM=3.0).unfit() == {}
     assert dataclasses.replace(found, test={}).unfit() == {}

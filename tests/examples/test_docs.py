@@ -2,17 +2,19 @@
 
 import importlib
 import re
+import runpy
 import shlex
 import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
 import nfriction
-from nfriction import cli, friction
+from nfriction import LinearAxis, Motor, PendulumChain, Rotor, cli, friction
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
@@ -41,6 +43,52 @@ def test_links_of_the_readme_lead_somewhere_in_the_repository() -> None:
     targets = re.findall(r"\]\(([^)#]+)", README.read_text(encoding="utf-8"))
     assert len(targets) > 5
     assert [t for t in targets if not t.startswith("http") and not (ROOT / t).exists()] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_links_and_figures_of_every_page_are_there(page: Path) -> None:
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.M)
+    text = re.sub(r"`[^`]*`", "", text)
+    for target in re.findall(r"\]\(([^)#\s]+)", text):
+        assert target.startswith("http") or (page.parent / target).exists(), target
+    for name, _, section in (n.partition(":") for n in re.findall(r'^--8<-- "(.*)"$', text, re.M)):
+        assert not section or f"[start:{section}]" in (ROOT / name).read_text(encoding="utf-8")
+
+
+def test_the_reference_of_commands_has_every_command_and_option() -> None:
+    hooks = runpy.run_path(str(ROOT / "docs" / "hooks.py"))
+    page = (ROOT / "docs" / "reference" / "commands.md").read_text(encoding="utf-8")
+    text = hooks["on_page_markdown"](page)
+    for words in (["fit", "--columns"], ["compare", "--also"], ["export", "--law"], ["info"]):
+        assert f"## nfriction {words[0]}\n" in text
+        assert all(f"`{option}" in text for option in words[1:])
+    assert "%(" not in text
+    assert hooks["MARK"] not in text
+    # A bar would begin another cell, and a line break another row.
+    rows = [line for line in text.splitlines() if line.startswith("| `")]
+    assert len(rows) > 60
+    assert all(row.count("|") == 3 for row in rows)
+
+
+def test_the_reference_of_rigs_has_every_key() -> None:
+    text = (ROOT / "docs" / "reference" / "rig_keys.md").read_text(encoding="utf-8")
+    kinds = text.split("\n## ")[1:]
+    named = [set(re.findall(r"`(\w+)`", kind)) for kind in kinds]
+    for part, kind in zip(named, (PendulumChain, Rotor, LinearAxis), strict=False):
+        assert {*kind.required, *kind.optional} <= part
+    assert {field.name for field in fields(Motor)} <= named[3]
+
+
+def test_shapes_are_not_set_in_italics() -> None:
+    markdown = pytest.importorskip("markdown", reason="`pip install .[docs]` to run this")
+    pytest.importorskip("pymdownx", reason="`pip install .[docs]` to run this")
+    assert "pymdownx.betterem: {smart_enable: all}" in (ROOT / "mkdocs.yml").read_text()
+    html = markdown.markdown(
+        "qd, load: (*batch, joint); output (*batch, joint)",
+        extensions=["pymdownx.betterem"],
+        extension_configs={"pymdownx.betterem": {"smart_enable": "all"}},
+    )
+    assert "<em>" not in html
 
 
 def test_there_are_pages_and_commands() -> None:

@@ -1,6 +1,7 @@
 """Every example runs with its tiny horizon, through the public API only."""
 
 import ast
+import json
 import runpy
 from pathlib import Path
 
@@ -50,6 +51,22 @@ def test_runs_quickly(path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     assert SAID[path.stem] in printed
     assert "nan" not in printed
     assert list((tmp_path / "out").rglob("*.*"))
+
+
+NOTEBOOKS = sorted((FOLDER / "notebooks").glob("*.ipynb"))
+
+
+@pytest.mark.filterwarnings("ignore:.*looks like degrees")
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks_run_from_top_to_bottom(path: Path) -> None:
+    torch.set_num_threads(1)
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    assert sum(text.count("seconds = 10.0") for text in code) == 1
+    assert not any(cell.get("outputs") for cell in cells)
+    known: dict[str, object] = {"__name__": "__main__"}
+    for text in code:
+        exec(compile(text.replace("seconds = 10.0", "seconds = 3.0"), path.name, "exec"), known)
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)

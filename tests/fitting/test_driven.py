@@ -178,7 +178,7 @@ def test_models_that_follow_the_motion_take_the_zeros_of_their_constant_law(kind
     plant = geared()
     law = CVFM(2, DRY, v_smooth=V_SMOOTH)
     off = ([0.06, -0.08], [-0.03, 0.05])
-    recordings = [driven(plant, law, seed) for seed in (0, 1)]
+    recordings = [driven(plant, law, seed, seconds=2.0) for seed in (0, 1)]
     moved = [replace(r, q=r.q - o) for r, o in zip(recordings, off, strict=True)]
     found = fit(
         kind(2, v_smooth=V_SMOOTH), plant, moved, windows=(1.0,), encoder_reference="per_recording"

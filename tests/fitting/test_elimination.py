@@ -18,8 +18,12 @@ from nfriction.fitting.result.identifiability import (
     null_directions,
     standard_deviations,
 )
-from nfriction.fitting.shooting.marginalization import Kept, marginalize_states
-from nfriction.fitting.shooting.normal_equations import Rows, normal_equations
+from nfriction.fitting.shooting.normal_equations import (
+    Kept,
+    Rows,
+    marginalize_states,
+    normal_equations,
+)
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.continuation import ShootingFitter

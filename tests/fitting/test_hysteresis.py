@@ -51,7 +51,7 @@ def test_the_law_advances_as_the_fit_does() -> None:
     np.testing.assert_allclose(predict(model, table, 0.0), found.torque, atol=0.02)
     at_rest = SLIP.memory
     assert at_rest is not None
-    state = torch.rand(5, 1, ELEMENTS).double() * 2 - 1
+    state = torch.rand(5, 1, at_rest.size).double() * 2 - 1
     still = torch.zeros(5, 1).double()
     c = torch.tensor(found.coefficients)[None].expand(5, 1, -1)
     assert torch.equal(at_rest.advance(state, still, still, c, 0.1), state)
@@ -95,6 +95,33 @@ def test_the_lead_in_shows_how_a_table_begins() -> None:
     assert np.abs(blank).max() > 0.5
 
 
+def test_a_long_rest_adds_friction_that_the_first_motion_sheds() -> None:
+    def rested(seed: int, excess: float) -> pd.DataFrame:
+        """A table that begins with a rest of 0.3 s, after a move there and a longer rest."""
+        table = slip_table(seed=seed, start=np.sign(excess))
+        still = table.iloc[[0] * 30].assign(qd=0.0, tau=np.sign(excess) * FORCES.sum())
+        table = pd.concat([still, table], ignore_index=True)
+        path = np.cumsum(np.abs(np.diff(table["q"], prepend=table["q"][0])))
+        noise = np.random.default_rng(seed).normal(0, 0.01, len(table))
+        tau = table["tau"] + excess * np.exp(-path / 0.01) + noise * (path == 0)
+        return table.assign(tau=tau, time=np.arange(len(table)) * 0.01)
+
+    found = fit_torque(rested(0, 1.5), "slip", folds=5)
+    for seed, excess in ((2, 1.5), (3, -1.0), (4, 0.0)):
+        # A tenth of the least excess, which is otherwise seen whole in the first strokes.
+        assert float(found.score(rested(seed, excess))["rmse"].iloc[0]) < 0.1
+
+
+def test_a_table_without_torque_is_predicted_from_no_deflection() -> None:
+    found = fit_torque(slip_table(), "slip", folds=5)
+    other = slip_table(seed=5)
+    blind = found.predict(other.drop(columns="tau"))[0]
+    # From where the elements have slipped once, the start is forgotten.
+    np.testing.assert_allclose(blind[800:], found.predict(other)[0][800:], atol=0.02)
+    with pytest.raises(ValueError, match="no column of friction torque"):
+        found.score(other.drop(columns="tau"))
+
+
 def test_files_of_a_law_with_memory_predict_as_the_fit_does(tmp_path) -> None:  # type: ignore[no-untyped-def]
     found = fit_torque(slip_table(), "coulomb-viscous,slip", folds=5)
     write_torque_fits(found, tmp_path)
@@ -126,7 +153,7 @@ def test_forces_without_sign_change_dissipate() -> None:
         c[..., 5] = 0.0
         time = np.linspace(0, 2 * np.pi, 400)
         qd = torch.tensor(np.cos(time) + 0.5 * np.cos(3 * time))[:, None]
-        one, state, work = torch.ones(1, 1).double(), torch.zeros(1, 1, ELEMENTS).double(), []
+        one, state, work = torch.ones(1, 1).double(), torch.zeros(1, 1, memory.size).double(), []
         for _ in range(3):
             work.append(0.0)
             for v in qd:

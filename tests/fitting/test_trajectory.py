@@ -72,8 +72,13 @@ def misfit(p: ShootingProblem, x: torch.Tensor) -> torch.Tensor:
     return torch.cat([p.residuals(x).flatten(), p.defects(x).flatten()])
 
 
-@pytest.mark.parametrize("offset_sd", [None, torch.full((2, 2), 0.05, dtype=torch.float64)])
-@pytest.mark.parametrize("name", ["LFM", "NFLFM"])
+OFFSETS = torch.full((2, 2), 0.05, dtype=F64)
+
+
+# Columns of a network and of offsets are told apart where both are there.
+@pytest.mark.parametrize(
+    ("name", "offset_sd"), [("LFM", None), ("LFM", OFFSETS), ("NFLFM", OFFSETS)]
+)
 @pytest.mark.parametrize(
     ("substeps", "stride", "joined"),
     [(1, 1, False), (2, 1, True), (2, 3, True), (1, 20, False), (1, 12, True)],

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nfriction import LFM, NFLFM, Recording, fit, rigs, rollout
-from nfriction.fitting.result.uncertainty import PIECE, CoefficientUncertainty
+from nfriction.fitting.result.identifiability import PIECE, CoefficientUncertainty
 
 F64 = torch.float64
 

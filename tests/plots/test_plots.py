@@ -20,7 +20,7 @@ from nfriction import plots
 from nfriction.evaluation.compare import NO_FRICTION, Comparison
 from nfriction.evaluation.score import RMSE, Limit, Score
 from nfriction.fitting.fit import fit
-from nfriction.fitting.result.uncertainty import CoefficientUncertainty
+from nfriction.fitting.result.identifiability import CoefficientUncertainty
 from nfriction.friction import model_names
 from nfriction.friction.models import CVFM, LFM, NCFM, NLFM
 from nfriction.friction.neurofuzzy import NFLFM, NFNCFM, NFNLFM

@@ -6,7 +6,7 @@ import torch
 from matplotlib.collections import LineCollection, QuadMesh
 
 from nfriction import LFM, NFLFM, NFStribeck, plots
-from nfriction.fitting.result.uncertainty import CoefficientUncertainty
+from nfriction.fitting.result.identifiability import CoefficientUncertainty
 from nfriction.signals import Motion
 
 F64 = torch.float64

@@ -639,6 +639,17 @@ def test_initial_states_name_their_faults(tmp_path: Path) -> None:
         np.testing.assert_allclose(np.rad2deg(parts), states[label], rtol=4e-16)
 
 
+def test_a_message_on_missing_columns_offers_those_that_look_right() -> None:
+    table = (
+        swing().to_pandas().rename(columns={"time": "Zeit [ms]", "q1": "Winkel 1", "q2": "enc_2"})
+    )
+    offered = r'columns={"time": "Zeit \[ms\]", "q1": "Winkel 1", "q2": "enc_2"}'
+    with pytest.raises(ValueError, match=offered):
+        Recording.from_pandas(table)
+    with pytest.raises(ValueError, match=r'columns={"time": "..."}'):
+        Recording.from_pandas(table.rename(columns={"Zeit [ms]": "a"}))
+
+
 GEARED = Rotor(0.02, motor=Motor(gear_ratio=50, torque_constant=0.03))
 
 

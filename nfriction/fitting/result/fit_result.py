@@ -15,6 +15,7 @@ from nfriction.fitting.equation_error import TorqueFit, peak_dynamics_torque
 from nfriction.fitting.options import Continuity
 from nfriction.fitting.plant_parameters import TORQUE_DELAY
 from nfriction.fitting.result.identifiability import (
+    CoefficientUncertainty,
     Information,
     Interval,
     confidence_intervals,
@@ -27,7 +28,6 @@ from nfriction.fitting.result.identifiability import (
     warnings_of,
     weakly_identified,
 )
-from nfriction.fitting.result.uncertainty import CoefficientUncertainty
 from nfriction.fitting.robust_loss import Outliers, named_outliers, outlier_warning
 from nfriction.fitting.shooting.autocorrelation import bandwidth, effective_noise, hac_sd
 from nfriction.fitting.shooting.problem import ShootingProblem
@@ -149,7 +149,8 @@ class FitResult:
         if times > DOUBTFUL_RATIO:
             reasons.append(far)
         if self.unidentifiable:
-            reasons.append(f"the data do not determine {len(self.unidentifiable)} parameters")
+            count = len(self.unidentifiable)
+            reasons.append(f"the data do not determine {count} parameter{'s' * (count > 1)}")
         return ("doubtful", "; ".join(reasons)) if reasons else ("good", "")
 
     @property

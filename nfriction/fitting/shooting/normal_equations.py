@@ -1,6 +1,17 @@
-"""Normal equations of windows that share variables and have own ones (states, offsets)."""
+"""Normal equations of windows that share variables and have own ones (states, offsets).
+
+For intervals, the windows' states are marginalised on the rows of the Jacobian instead of on J^T J.
+The end of a chaotic motion moves by 1e10 times as much as its start. In J^T J the growth of these
+columns swamps all other information; QR of J keeps it. Each window's rows are triangularised by
+its state's columns, piece by piece; the rows below the triangle depend neither on the state nor on
+its growth, so their squares may be summed.
+
+References:
+    G. J. Bierman, Factorization Methods for Discrete Sequential Estimation (1977), ch. 5.
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -101,3 +112,150 @@ def _scatter(
     hessian.index_put_((rows, shared), mixed, accumulate=True)
     hessian.index_put_((shared, rows), mixed, accumulate=True)
     hessian.index_put_((rows, indices[:, None]), own, accumulate=True)
+
+
+# Information below so many roundings of a row is discarded; motions that grow by 1e20 leave
+# nothing else.
+ROUNDOFF_UNITS = 30.0
+
+
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """The variables that remain: the shared ones, and the encoder offsets of all recordings.
+
+    Attributes:
+        indices: see `DecisionVariables.indices`.
+        state: number of variables of a window's state.
+        size: number of all variables.
+    """
+
+    indices: Tensor
+    state: int
+    size: int
+
+    @property
+    def shared(self) -> int:
+        return int(self.indices[0, 0])
+
+    def split(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Columns of the state, and of the remaining variables, of (*, column)."""
+        common, own, offsets = rows.tensor_split([self.shared, self.shared + self.state], -1)
+        return own, torch.cat([common, offsets], -1)
+
+    def squares(self, rows: Tensor) -> Tensor:
+        """J^T J of rows (window, row, column) without states, (kept, kept)."""
+        states, offsets = len(self.indices) * self.state, self.indices[:, self.state :]
+        if not offsets.shape[1]:
+            flat = rows.flatten(0, 1)
+            return flat.T @ flat
+        total = torch.zeros(self.size - states, self.size - states, dtype=torch.float64)
+        common = torch.arange(self.shared).expand(len(rows), -1)
+        at = torch.cat([common, offsets - states], 1)
+        return total.index_put_((at[:, :, None], at[:, None]), rows.mT @ rows, accumulate=True)
+
+
+def marginalize_states(
+    rows: Iterable[Rows],
+    kept: Kept,
+    precision: Tensor,
+    pairs: Sequence[tuple[int, int]] = (),
+    defect_sd: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Marginalise the windows' states by a square-root information filter.
+
+    Args:
+        rows: of the Jacobian, in the order of time.
+        kept: the remaining variables.
+        precision: of the states' prior, (window, state).
+        pairs: see `Windows.continuity_pairs`, in the order of time.
+        defect_sd: standard deviations of the defects, (state,).
+
+    Returns:
+        Curvature above round-off over the remaining variables, (kept, kept), and the derivatives of
+        each window's state by its columns of these, (window, state, column).
+    """
+    windows, state = precision.shape
+    columns = kept.shared + kept.indices.shape[1] - state
+    triangle = precision.sqrt().diag_embed()
+    right = torch.zeros(windows, state, columns, dtype=torch.float64)
+    data = kept.squares(right)
+    # Sums of squares of all rows, by the state and by the remaining variables.
+    sizes = torch.zeros_like(precision), torch.zeros_like(right[:, 0])
+    ends = torch.zeros(0, dtype=torch.float64)
+    for piece in rows:
+        own, others = kept.split(piece.scaled)
+        triangle, right, free = _triangularise(
+            torch.cat([triangle, own], 1), torch.cat([right, others], 1)
+        )
+        data += kept.squares(free)
+        for size, part in zip(sizes, (own, others), strict=True):
+            size += part.square().sum(1)
+        ends = piece.states[:, -1]
+    links = torch.zeros_like(triangle)
+    if defect_sd is not None:
+        start = torch.cat([torch.zeros(state, state), -torch.diag(1 / defect_sd)])
+        free = torch.zeros_like(right)
+        by_state, by_kept = kept.split(ends / defect_sd[:, None])
+        # Pass the information about each window's end on to the next one's start.
+        for w, after in pairs:
+            triangle[w], top, passed = _triangularise(
+                torch.cat([triangle[w], by_state[w]]),
+                torch.cat([start, torch.cat([right[w], by_kept[w]])], 1),
+            )
+            links[w], right[w] = top[:, :state], top[:, state:]
+            triangle[after], right[after], free[after] = _triangularise(
+                torch.cat([triangle[after], passed[:, :state]]),
+                torch.cat([right[after], passed[:, state:]]),
+            )
+            for size, part in zip(sizes, (by_state, by_kept), strict=True):
+                size[w] += part[w].square().sum(0)
+        data += kept.squares(free)
+    # The state at which each window's rows vanish, the last windows first.
+    response = -torch.linalg.solve_triangular(triangle, right, upper=True)
+    for w, after in reversed(pairs):
+        response[w] = -torch.linalg.solve_triangular(
+            triangle[w], right[w] + links[w] @ response[after], upper=True
+        )
+    squares = sizes[1] + (sizes[0][..., None] * response.square()).sum(1)
+    unsure = kept.squares(squares.sqrt()[:, None]).diagonal()
+    return _discard_roundoff(data, unsure), response
+
+
+def score_covariance(
+    rows: Iterable[Rows], kept: Kept, response: Tensor, precision: Tensor
+) -> Tensor:
+    """Covariance of the gradient, (kept, kept), by rows scaled to their own residuals."""
+    total = kept.squares(precision.sqrt()[..., None] * response)
+    for piece in rows:
+        own, others = kept.split(piece.scaled)
+        total += kept.squares(others + own @ response)
+    return total
+
+
+def _discard_roundoff(data: Tensor, sizes: Tensor) -> Tensor:
+    """Curvature above the round-off of rows with these sums of squares (kept,), (kept, kept).
+
+    Variables whose information is below round-off are dropped one by one, worst first, and
+    marginalised out of the rest.
+    """
+    roundoff = (ROUNDOFF_UNITS * torch.finfo(data.dtype).eps) ** 2 * sizes
+    dropped = torch.zeros_like(roundoff, dtype=torch.bool)
+    while True:
+        share = torch.where(dropped | (roundoff == 0), torch.inf, data.diagonal() / roundoff)
+        worst = int(share.argmin())
+        if not share[worst] <= 1:
+            break
+        pivot = data[worst, worst]
+        if pivot > 0:
+            data = data - torch.outer(data[:, worst], data[worst]) / pivot
+        dropped[worst] = True
+        data = torch.where(dropped[:, None] | dropped, 0.0, data)
+    return data - torch.diag(torch.where(dropped, 0.0, roundoff))
+
+
+def _triangularise(own: Tensor, others: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Rotate rows so that `own` is a triangle above zeros: it, and the others beside both."""
+    reflections, factors = torch.geqrf(own)
+    turned = torch.ormqr(reflections, factors, others, left=True, transpose=True)
+    top, free = turned.tensor_split([own.shape[-1]], -2)
+    return reflections[..., : own.shape[-1], :].triu(), top, free

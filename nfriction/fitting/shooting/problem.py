@@ -34,12 +34,14 @@ from nfriction.fitting.result.identifiability import (
     standard_deviations,
 )
 from nfriction.fitting.robust_loss import SQUARES, RobustLoss
-from nfriction.fitting.shooting.marginalization import Kept, marginalize_states, score_covariance
 from nfriction.fitting.shooting.normal_equations import (
+    Kept,
     Rows,
     add_defects,
+    marginalize_states,
     normal_equations,
     scaled_rows,
+    score_covariance,
 )
 from nfriction.fitting.shooting.sensitivity import StepJacobian, Trajectory, propagate
 from nfriction.fitting.shooting.variables import DecisionVariables, model_at

@@ -8,7 +8,7 @@ neuro-fuzzy models are fitted alike.
 """
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -48,20 +48,17 @@ class StepJacobian:
         self, plant: Plant, friction: FrictionModel, terms: Sequence[PlantParameter]
     ) -> None:
         self.plant, self.friction, self.terms = plant, friction, tuple(terms)
-        self._compiled: codegen.CompiledFunction | None = None
         self.delay_index = delay_index(self.terms)
         joints, k = plant.joints, len(friction.law.coefficients)
         torques = joints if self.delay_index is None else 2 * joints
         generator = torch.Generator().manual_seed(0)
         shapes = ((joints,), (joints,), (joints, k), (torques,), (1,), (len(terms),))
-        example = [
+        q, qd, held, tau, step, vector = (
             scale * torch.rand(shape, generator=generator, dtype=torch.float64)
             for shape, scale in zip(shapes, (1.0, 1.0, 1e-2, 1.0, 1e-3, 1e-2), strict=True)
-        ]
-        try:
-            self._compiled = codegen.compile_function(self._step, example, jacobian=(0, 1, 2, 5))
-        except codegen.CodegenError as error:
-            logger.warning("fits run slowly, as steps are linearised in eager torch: %s", error)
+        )
+        self._by_step = _jacobian(self._step, [q, qd, held, tau, step, vector], (0, 1, 2, 5))
+        self._by_start = _jacobian(self._start, [q, qd, tau, vector], (0, 1, 3))
 
     def __call__(
         self, q: Tensor, qd: Tensor, held: Tensor, tau: Tensor, step: Tensor, vector: Tensor
@@ -71,27 +68,18 @@ class StepJacobian:
         Directions: q, qd, held coefficients (joint-major), plant terms. Where the torque's delay is
         one of the terms, `tau` is the torque at no delay, then its slope over the delay.
         """
-        if self._compiled is not None:
-            given = (q, qd, held, tau, step, vector[None])
-            return torch.from_numpy(self._compiled(*given)[-1])
-        slopes = torch.func.jacfwd(self._step, (0, 1, 2, 5))
-        found = torch.func.vmap(slopes, (0, 0, 0, 0, 0, None), chunk_size=CHUNK)(
-            q, qd, held, tau, step, vector
-        )
-        return torch.cat([slope.flatten(2) for slope in found], -1)
+        return self._by_step(q, qd, held, tau, step, vector)
 
     def initial_acceleration(self, q: Tensor, qd: Tensor, tau: Tensor, vector: Tensor) -> Tensor:
         """Derivatives of the first acceleration, which has no friction, by q, qd and plant terms.
 
         `q`, `qd` and `tau` are (window, joint); the result is (window, joint, direction).
         """
+        return self._by_start(q, qd, tau, vector)
 
-        def acceleration(q: Tensor, qd: Tensor, vector: Tensor, tau: Tensor) -> Tensor:
-            plant = adjusted_plant(self.plant, self.terms, vector)
-            return plant.forward_dynamics(q, qd, self._torque(tau, vector))
-
-        slope = torch.func.vmap(torch.func.jacfwd(acceleration, (0, 1, 2)), (0, 0, None, 0))
-        return torch.cat(slope(q, qd, vector, tau), -1)
+    def _start(self, q: Tensor, qd: Tensor, tau: Tensor, vector: Tensor) -> Tensor:
+        plant = adjusted_plant(self.plant, self.terms, vector)
+        return plant.forward_dynamics(q, qd, self._torque(tau, vector))
 
     def _step(
         self, q: Tensor, qd: Tensor, held: Tensor, tau: Tensor, step: Tensor, vector: Tensor
@@ -107,6 +95,20 @@ class StepJacobian:
             return tau
         at_none, slope = tau.chunk(2, -1)
         return at_none + vector[..., k : k + 1] * slope
+
+
+def _jacobian(
+    function: Callable[..., Tensor], example: Sequence[Tensor], by: tuple[int, ...]
+) -> Callable[..., Tensor]:
+    """The Jacobian of a function by some inputs, over batches of all of them but the last."""
+    try:
+        compiled = codegen.compile_function(function, example, jacobian=by)
+    except codegen.CodegenError as error:
+        logger.warning("fits run slowly, as steps are linearised in eager torch: %s", error)
+        axes = (*[0] * (len(example) - 1), None)
+        slopes = torch.func.vmap(torch.func.jacfwd(function, by), axes, chunk_size=CHUNK)
+        return lambda *given: torch.cat([slope.flatten(2) for slope in slopes(*given)], -1)
+    return lambda *given: torch.from_numpy(compiled(*given[:-1], given[-1][None])[-1])
 
 
 @dataclass(frozen=True, eq=False)

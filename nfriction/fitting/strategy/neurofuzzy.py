@@ -15,8 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.fitting.data.checks import require_motion
-from nfriction.fitting.data.inputs import adjustable_terms, apply_encoder_offsets
+from nfriction.fitting.data.inputs import adjustable_terms, apply_encoder_offsets, require_motion
 from nfriction.fitting.data.windows import Windows, cut_windows
 from nfriction.fitting.equation_error import coefficient_scale
 from nfriction.fitting.fit import FitTask
@@ -82,7 +81,8 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
         extrapolation=prior_on_unvisited_cells(network_of(network), motions, options),
     )  # fmt: skip
     length = start.longest_usable_horizon(options.windows)
-    training = _Training(fitter, start, cut_windows(recordings, motions, length))
+    windows = cut_windows(recordings, motions, length)
+    training = _Training(fitter, start, windows, f"network, {length:g} s windows")
     trained = training.learn()
     judged = None
     if trained is not None:
@@ -274,8 +274,11 @@ def effective_parameters(trained: Trained) -> tuple[tuple[str, float, int], ...]
 class _Training:
     """Searches for a network that corrects a constant fit, on given windows."""
 
-    def __init__(self, fitter: ShootingFitter, start: FitResult, windows: Windows) -> None:
+    def __init__(
+        self, fitter: ShootingFitter, start: FitResult, windows: Windows, stage: str
+    ) -> None:
         self.fitter, self.windows, self.options = fitter, windows, fitter.options
+        self.stage = stage
         # The noise against which priors weigh at first is the law's residual at the same horizon.
         self.noise = effective_noise(start.residuals)
         self.stride = decimation(start.residuals, self.options)
@@ -338,7 +341,7 @@ class _Training:
             most = replace(problem, windows=windows.subset(seen))
             x = torch.cat([parts.friction, parts.plant, parts.states[seen].flatten()])
             tolerance = loglik_tolerance(float(most.cost(x)), self.options)
-            end = fitter.search(most, x, tolerance, "network, block left out")
+            end = fitter.search(most, x, tolerance, f"{self.stage}, block left out")
             if end.stopped:
                 return None
             rest = replace(problem, windows=windows.subset(~seen))
@@ -396,7 +399,7 @@ class _Training:
             fitter = replace(fitter, options=replace(self.options, max_steps=steps))
         # Far from a minimum it is the start's cost, at the noise that the problem has.
         tolerance = loglik_tolerance(float(problem.cost(x)), self.options)
-        return Trained(prior, fitter.search(problem, x, tolerance, "network"))
+        return Trained(prior, fitter.search(problem, x, tolerance, self.stage))
 
     def _noise_of(self, found: Trained, gamma: float) -> float:
         """Noise of what a network leaves: MacKay's, of as many residuals as are independent."""

@@ -27,6 +27,11 @@ _LIKE_TORQUE = re.compile(
     r"(torque|drehmoment|strom|(?<![a-z])(tau|force|current))(_(cmd|command|meas|measured))?[\W_]*\d*\s*([\[(].*)?$",
     re.IGNORECASE,
 )
+_LIKE_TIME = re.compile(r"^(t|time|zeit|timestamp|zeitstempel)\b", re.IGNORECASE)
+_LIKE_POSITION = re.compile(
+    r"^(pos|ang|winkel|gelenk|joint|enc|geber|theta|phi|q(?!d))\w*[\W_]*\d*\s*([\[(].*)?$",
+    re.IGNORECASE,
+)
 _LIKE_CURRENT = re.compile("strom|current", re.IGNORECASE)
 
 _TURN = 2 * math.pi
@@ -358,10 +363,27 @@ def _missing(table: pd.DataFrame, columns: dict[str, str], missing: list[str]) -
     note = f" {unit!r} is no unit known." if stem in found and not is_unit(unit) else ""
     lost = [columns.get(key, key) for key in missing[:10]]
     label = f"column {lost[0]} is" if len(lost) == 1 else f"columns {', '.join(lost)} are"
+    guessed = {} if columns else _guessed(found)
+    pairs = ", ".join(f'"{key}": "{name}"' for key, name in guessed.items())
+    pairs = pairs or f'"{missing[0]}": "..."'
     return (
-        f'{label} missing; found {shown}.{note} Name the columns with columns={{"{missing[0]}": '
-        f'"..."}}, a unit after a colon where it is not SI, as in "enc_1:deg".'
+        f"{label} missing; found {shown}.{note} Name the columns with columns={{{pairs}}}, a unit "
+        'after a colon where it is not SI, as in "enc_1:deg".'
     )
+
+
+def _guessed(found: Sequence[str]) -> dict[str, str]:
+    """Our names with a file's, by usual words for time and positions; empty unless both are there.
+
+    For an error's advice only: what is read is always named by the user.
+    """
+    plain = [name for name in found if not set(name) & set('",=:') and len(name) <= 60]
+    times = [name for name in plain if _LIKE_TIME.search(name)]
+    positions = [name for name in plain if _LIKE_POSITION.search(name)][:10]
+    if len(times) != 1 or not positions:
+        return {}
+    pairs = {"time": times[0]} | {f"q{k}": name for k, name in enumerate(positions, 1)}
+    return {key: name for key, name in pairs.items() if key != name}
 
 
 def _texts(table: pd.DataFrame, key: str) -> dict[str, str]:

@@ -18,8 +18,14 @@ from nfriction.optim.evidence import EvidenceOptions, EvidenceResult
 from nfriction.optim.jacobian import trainable
 from nfriction.optim.regularisation import bayesian_regularisation
 from nfriction.papers.controller.mamdani import MamdaniController
-from nfriction.papers.nffem.projection import LINEAR, project
-from nfriction.papers.nffem.scaling import FuzzyNetwork, Scaling, one_group, to_own_units
+from nfriction.papers.nffem.projection import (
+    LINEAR,
+    FuzzyNetwork,
+    Scaling,
+    one_group,
+    project,
+    to_own_units,
+)
 
 GAUSSIAN = ("gaussian", "left_shoulder", "right_shoulder")
 # Size of the random move to another start, in units of the scaled inputs or of logarithms.

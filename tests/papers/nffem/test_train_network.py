@@ -12,7 +12,7 @@ from nfriction.fuzzy import Anfis, AnfisRBF, RBFNetwork
 from nfriction.optim.evidence import EvidenceState
 from nfriction.optim.jacobian import flatten, trainable
 from nfriction.papers.controller.mamdani import paper_controller
-from nfriction.papers.nffem.scaling import Scaling, one_group, to_own_units
+from nfriction.papers.nffem.projection import Scaling, one_group, to_own_units
 from nfriction.papers.nffem.train_network import (
     TrainingOptions,
     controller_targets,
