@@ -25,8 +25,8 @@ def add(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
     )  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path("runs/papers"), help="folder to write")
     parser.add_argument("--quick", action="store_true",
-                        help="recordings of 10 s and shorter searches: about a minute instead of "
-                        "several minutes on two cores")  # fmt: skip
+                        help="recordings of 10 s and shorter searches: a few minutes on two "
+                        "cores")  # fmt: skip
     parser.add_argument("--seed", type=count, default=0,
                         help="of the encoders' errors and of the searches")  # fmt: skip
     parser.add_argument("--jobs", type=count, default=2, help="models trained at a time")
@@ -38,20 +38,25 @@ def run(arguments: argparse.Namespace) -> int:
     """Run what is not finished, then print and write everything."""
     from dataclasses import replace
 
+    from nfriction.evaluation.results import exclusive
     from nfriction.papers.reproduction import tables
+    from nfriction.papers.reproduction.page import write_page
     from nfriction.papers.reproduction.stages import reproduce
     from nfriction.papers.reproduction.workspace import FULL, QUICK
 
     check_writable(arguments.out)
     settings = replace(QUICK if arguments.quick else FULL, seed=arguments.seed)
-    workspace = reproduce(
-        arguments.out, settings, jobs=arguments.jobs, progress=sys.stderr.isatty()
-    )
-    tables.write_tables(workspace, command=arguments.command_line)
-    print(tables.text(workspace))
-    if not arguments.no_figures:
-        from nfriction.papers.reproduction.figures import draw_all
+    progress = sys.stderr.isatty()
+    # Two runs in one folder would take each other's stages for their own.
+    with exclusive(arguments.out):
+        workspace = reproduce(arguments.out, settings, jobs=arguments.jobs, progress=progress)
+        tables.write_tables(workspace, command=arguments.command_line)
+        print(tables.text(workspace))
+        if not arguments.no_figures:
+            from nfriction.papers.reproduction.figures import draw_all
 
-        draw_all(workspace, progress=sys.stderr.isatty())
-    print(f"\ntables, models and figures are in {arguments.out}")
+            draw_all(workspace, progress=progress)
+        page = write_page(workspace)
+    print(f"\ntables, models and figures are in {arguments.out}, all on one page: {page}\n")
+    print(tables.conclusion(workspace))
     return 0

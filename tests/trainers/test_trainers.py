@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import pandas as pd
 import pytest
 import torch
 
@@ -151,3 +152,20 @@ def test_a_search_that_is_ended_goes_on_to_the_same_result(tmp_path: Path, how: 
     ours, theirs = (load(f / "LFM.json").state_dict() for f in (folder, tmp_path / "whole"))
     assert all((ours[name] == theirs[name]).all() for name in theirs)
     assert load_info(folder / "LFM.json").fit == load_info(tmp_path / "whole" / "LFM.json").fit
+
+
+@pytest.mark.slow
+def test_rules_evolve_to_a_front_and_go_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["evolve_rules.py", *QUICK, "--model", "ANCFM", "--population", "5",
+             "--prices", "0", "0.5", "--generations", "2", "--out", tmp_path]  # fmt: skip
+    train(*words)
+    first = capsys.readouterr().out
+    table = pd.read_csv(tmp_path / "pareto.csv", index_col=0)
+    assert table["rules"].iloc[0] == 25  # as given
+    assert table["rules"].iloc[1:].is_monotonic_increasing
+    assert table["training error [mN m]"].iloc[1:].is_monotonic_decreasing
+    assert (tmp_path / "pareto.png").stat().st_size > 0
+    train(*words, "--resume")
+    assert capsys.readouterr().out == first

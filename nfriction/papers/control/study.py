@@ -1,10 +1,13 @@
-"""Balance of the papers' rig on its driven arm with friction compensation by each class of model.
+"""Control of the papers' rig on its driven arm with friction compensation by each class of model.
+
+A single link is swung up and balanced upright; models are fitted to driven recordings of it
+hanging, then compensate the friction of the arm, the only joint with a motor. All three links are
+balanced as well: there the noise of encoder counts moves the arm by more than friction does.
+Swinging up all three is not attempted.
 
 The rig is the RTIP twin's with its arm free and ball bearings at all links: with the twin's bushing
-at the last one, linear feedback on encoder counts loses the links. The arm, the only joint with a
-motor, has friction of its own. The true friction belongs to no class that is fitted. Models are
-fitted to driven recordings of the hanging rig, then compensate friction while the links are
-balanced upright. A single link is also swung up; swinging up all three is not attempted.
+at the last one, linear feedback on encoder counts loses the links. The true friction belongs to no
+class that is fitted.
 """
 
 from __future__ import annotations
@@ -30,6 +33,7 @@ from nfriction.papers.afem.fit_adaptive import fit_adaptive
 from nfriction.papers.control.feedback import (
     Balance,
     Compensation,
+    LinearPlant,
     SwingUp,
     kalman_gain,
     linearise,
@@ -55,8 +59,9 @@ SHARES = (0.5, 0.8, 1.2)
 # velocity, asymmetry, viscous friction and the velocity from which it thins. A choice of ours.
 ARM = (0.12, 0.03, 0.4, 0.2, 0.06, 0.05, 4.0)
 ELECTRONICS = Electronics(counts=4 * Encoder().lines, delay=1, torque_limit=20.0, torque_bits=16)
-STATE_WEIGHT = (100.0, 100.0, 100.0, 100.0, 10.0, 1.0, 1.0, 1.0)
-TORQUE_NOISE = 1.0  # unknown torques for the Kalman filter [N m]
+# Weights of the arm and of each link in the linear-quadratic cost: angle and rate.
+ARM_WEIGHT, LINK_WEIGHT = (10.0, 1.0), (100.0, 1.0)
+TORQUE_NOISE = 0.1  # unknown torques for the Kalman filter [N m]
 AMPLITUDE, FREQUENCY = 0.3, 0.1  # of the arm's reference [rad, Hz]
 SAMPLE_TIME = ELECTRONICS.sample_time
 WINDOWS = (0.5,)  # of fits that simulate [s]
@@ -207,6 +212,15 @@ def still(_: float) -> tuple[float, float]:
     return 0.0, 0.0
 
 
+def balance_gains(plant: PendulumChain) -> tuple[LinearPlant, Array, Array]:
+    """The plant near the top, and the gains of feedback and of the Kalman filter there."""
+    linear = linearise(plant, torch.zeros(plant.joints, dtype=torch.float64), SAMPLE_TIME)
+    angles, rates = np.array([ARM_WEIGHT, *[LINK_WEIGHT] * (plant.joints - 1)]).T
+    quantum = 2.0 * math.pi / (4 * Encoder().lines)
+    gain = lqr(linear, np.concatenate([angles, rates]), 1.0)
+    return linear, gain, kalman_gain(linear, TORQUE_NOISE, quantum / math.sqrt(12.0))
+
+
 def balanced(
     plant: PendulumChain,
     friction: FrictionModel,
@@ -226,12 +240,10 @@ def balanced(
         shares: of the friction torque that is compensated, by name; by default all of it.
     """
     shares = shares or {}
-    linear = linearise(plant, torch.zeros(plant.joints, dtype=torch.float64), SAMPLE_TIME)
-    gain = lqr(linear, np.array(STATE_WEIGHT), 1.0)
-    noise = 2.0 * math.pi / (ELECTRONICS.counts or math.inf) / math.sqrt(12.0)
+    linear, gain, observer = balance_gains(plant)
     controller = Balance(
-        plant, linear, gain, kalman_gain(linear, TORQUE_NOISE, noise),
-        reference if follow else still, side_by_side(list(compensations.values())),
+        plant, linear, gain, observer, reference if follow else still,
+        side_by_side(list(compensations.values())),
         np.array([shares.get(name, 1.0) for name in compensations]),
     )  # fmt: skip
     tilted = torch.zeros(len(compensations), plant.joints, dtype=torch.float64)
@@ -287,10 +299,10 @@ def run_study(
         seconds, settled: length of each motion, and from where on it counts [s].
 
     Returns:
-        `performance` by task ("still", "follow") and compensation, None for infinity; and thinned
-        motions for figures.
+        `performance` by task ("still", "follow", "three links") and compensation, None for
+        infinity; and thinned motions for figures.
     """
-    plant = rigs.rtip("free")
+    plant = single_link()
     friction = true_friction(plant)
     rows: dict[str, tuple[FrictionModel | None, float]] = {NONE: (None, 0.0)}
     rows |= {name: (model, 1.0) for name, model in models.items()}
@@ -298,13 +310,8 @@ def run_study(
     rows[TRUTH] = (friction, 1.0)
     found: dict[str, dict[str, dict[str, float | None]]] = {}
     kept: dict[str, Array] = {}
-    for task, follow in (("still", False), ("follow", True)):
-        runs = balanced(
-            plant, friction,
-            # Made anew: an adaptive model's remembers the motion before.
-            {n: model and compensation_of(model) for n, (model, _) in rows.items()},
-            seconds=seconds, follow=follow, shares={n: share for n, (_, share) in rows.items()},
-        )  # fmt: skip
+
+    def judge(task: str, runs: Mapping[str, ControlledMotion], follow: bool) -> None:
         found[task] = {
             name: {
                 key: value if math.isfinite(value) else None
@@ -312,7 +319,18 @@ def run_study(
             }
             for name, run in runs.items()
         }
-        kept |= {f"{task}, {name}": run.q[::THINNED].numpy() for name, run in runs.items()}
+        kept.update({f"{task}, {name}": run.q[::THINNED].numpy() for name, run in runs.items()})
+
+    shares = {name: share for name, (_, share) in rows.items()}
+    for task, follow in (("still", False), ("follow", True)):
+        # Made anew: an adaptive model's remembers the motion before.
+        given = {n: model and compensation_of(model) for n, (model, _) in rows.items()}
+        judge(task, balanced(plant, friction, given, seconds=seconds, follow=follow, shares=shares),
+              follow)  # fmt: skip
+    whole = rigs.rtip("free")
+    friction = true_friction(whole)
+    given = {NONE: None, TRUTH: compensation_of(friction)}
+    judge("three links", balanced(whole, friction, given, seconds=seconds, follow=True), True)
     _, lifted, success = swung_up(None)
     found["swing-up"] = {NONE: {"caught": float(success)}}
     return found, kept | {"swing-up": lifted.q[::THINNED].numpy()}
@@ -334,11 +352,7 @@ def swung_up(
     """Swing-up of a single link from hanging, and balance: the rig, its motion, and success."""
     plant = single_link()
     friction = true_friction(plant)
-    linear = linearise(plant, torch.zeros(2, dtype=torch.float64), SAMPLE_TIME)
-    weight = np.array([10.0, 100.0, 1.0, 1.0])
-    noise = 2.0 * math.pi / (ELECTRONICS.counts or math.inf) / math.sqrt(12.0)
-    balance = Balance(plant, linear, lqr(linear, weight, 1.0),
-                      kalman_gain(linear, TORQUE_NOISE, noise), still, compensation)  # fmt: skip
+    balance = Balance(plant, *balance_gains(plant), still, compensation)
     hanging = torch.tensor([0.0, math.pi], dtype=torch.float64)
     run = control(plant, friction, SwingUp(balance), hanging, torch.zeros_like(hanging),
                   steps=round(seconds / SAMPLE_TIME), electronics=ELECTRONICS)  # fmt: skip

