@@ -43,11 +43,13 @@ class RMSE:
         """From errors of shape (..., joint); NaN or infinity make it infinite."""
         with np.errstate(over="ignore", invalid="ignore"):
             square = np.mean(error.reshape(-1, error.shape[-1]) ** 2, axis=0)
+        # A motion that is lost must not look better than one that is merely bad.
         square = np.where(np.isfinite(square), square, np.inf)
         return cls(tuple(float(x) for x in np.sqrt(square)), float(np.sqrt(square.mean())))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON; a diverged simulation has null for a number."""
+        # JSON has no infinity.
         values = [x if np.isfinite(x) else None for x in (*self.joints, self.all)]
         return {"joints": values[:-1], "all": values[-1]}
 
@@ -145,6 +147,7 @@ def score(
             f"without a gap must be longer than the lead-in of {LEAD_IN:g} s."
         )
     windows = {}
+    # Short windows show the torque law, long ones how its errors add up.
     for horizon in horizons:
         run_windows = simulator.windows(horizon)
         if run_windows is not None:
@@ -166,6 +169,7 @@ def score(
 
 def _bound(runs: Sequence[Runs]) -> RMSE:
     """Largest error from all drawn starts, by joint and over all."""
+    # Runs count by their samples, so that a short stretch between gaps does not decide.
     weights = [run.error[..., 0].size for run in runs]
     squares = np.average([run.squares for run in runs], axis=0, weights=weights)
     squares = np.where(np.isfinite(squares), squares, np.inf)

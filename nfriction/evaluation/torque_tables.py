@@ -292,6 +292,7 @@ def fit_torque(
     names = list(dict.fromkeys(map(model_name, names)))
     if folds < 2:
         raise ValueError(f"`folds` must be at least 2, got {folds}.")
+    # One velocity for all joints, as a model file has one.
     v_smooth = turning_velocity(given)
     fits: dict[str, tuple[JointFit, ...]] = {}
     errors: dict[str, list[Candidate]] = {joint: [] for joint in given.joint_names}
@@ -301,6 +302,7 @@ def fit_torque(
             progress(f"fit {plain_name(name)}")
         try:
             found = [_fit(name, joint, v_smooth, folds, options) for joint in given.joints]
+        # One law that does not suit the table must not lose the others.
         except ValueError as error:
             failed[name] = str(error)
             continue
@@ -365,6 +367,7 @@ def _fit(
             found = fit_network(constant, rest, share, options) if share else constant
             error = predict(found.model, left) - torch.as_tensor(left.tau)
             errors[i, k] = float(error.square().mean().sqrt())
+    # Squares, as blocks of equal length then weigh as one table would.
     best = int(np.square(errors).mean(1).argmin())
     found = fit_joint(name, joint, v_smooth, options)
     if shares[best]:
@@ -382,6 +385,7 @@ def score_joint(joint: JointTorque, torque: Array, model: str) -> TorqueScore:
     """
     rows = slice(None)
     if joint.time is not None and model_by_name(model).definition.memory is not None:
+        # Scoring them would reward reading the answer.
         rows = slice(int(np.searchsorted(joint.time, joint.time[0] + LEAD_IN)), None)
     rmse = float(np.sqrt(np.mean((torque - joint.tau)[rows] ** 2)))
     return TorqueScore(joint.name, model, rmse, rmse / (float(joint.tau[rows].std()) or math.nan))

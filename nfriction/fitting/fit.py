@@ -170,6 +170,7 @@ def fit(
         raise ValueError(
             'adaptive and neuro-fuzzy models need `method="output_error"`, simulated windows.'
         )
+    # By name, so that a schedule outside the core brings a strategy of its own.
     strategy: Callable[[FitTask], FitResult] = pkgutil.resolve_name(schedule.fit_strategy)
     return strategy(task).with_warnings(task.data_warnings, task.mistakes)
 
@@ -195,6 +196,7 @@ def prepare_task(
     joint = in_joint_coordinates(plant, model, given)
     if options.eccentricity == "on" and not isinstance(plant, PendulumChain):
         raise ValueError(f"{plant.name or 'the axis'} has no encoders that turn with its joints.")
+    # Torques alone do not depend on a constant offset of the encoders enough to estimate one.
     found: tuple[str, ...] = ()
     per_recording = options.encoder_reference == "per_recording"
     if options.encoder_reference == "auto" and options.method == "output_error":
@@ -206,8 +208,10 @@ def prepare_task(
     if options.fit_delay:
         if not largest_torques(joint).any():
             raise ValueError("`fit_delay=True` needs recordings with torques, got none.")
+        # A search by simulation finds the delay only from nearby: within a cycle of the motion.
         delay, _ = balanced_delay(plant, joint, moved, options)
     advanced = advanced_torques(joint, delay)
+    # With the delay removed, so that it is not named a second time as a mistake.
     stated, mistakes = likely_mistakes(plant, advanced, moved, convention, options)
     found = (
         *mistake_warning(stated, mistakes),

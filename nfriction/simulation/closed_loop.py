@@ -157,12 +157,14 @@ def control(
     for k in range(steps):
         time = k * electronics.sample_time
         reading = electronics.read(q.numpy())
+        # Encoders are read before the torque of the sample acts.
         wanted = np.asarray(controller(time, reading), dtype=np.float64)
         if wanted.shape != reading.shape or not np.isfinite(wanted).all():
             raise ValueError(
                 f"the controller must give finite torques {reading.shape}, got shape "
                 f"{wanted.shape} at {time:g} s."
             )
+        # Samples in flight: those read now act after the delay.
         waiting.append(electronics.drive(wanted))
         tau = torch.as_tensor(waiting.pop(0)).clone()
         if stateful is not None:

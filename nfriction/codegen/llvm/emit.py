@@ -75,6 +75,7 @@ class _Writer:
         """Compute outputs; what is not shared is loaded before anything is stored."""
         outputs = [node for group in groups.values() for node in group]
         order = reachable(outputs, [n for n in reachable(outputs) if n.number in self.places])
+        # An output may be an input array, so a store could destroy what is still to be read.
         for node in order:
             if node.number in self.places and self.places[node.number][0] not in self.shared:
                 self._value(node)

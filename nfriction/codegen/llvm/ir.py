@@ -88,6 +88,7 @@ class Body:
         self.run(f"{following} = add nsw i64 {index}, 1")
         self.run(f"br label %{head}")
         phi = f"phi i64 [ {first}, %{before} ], [ {following}, %{self.label} ]"
+        # Written last, as the label that the loop comes back from is known only now.
         self.lines[place] = f"  {index} = {phi}"
         self.block(after)
 
@@ -115,6 +116,7 @@ class Body:
         if isinstance(value, bool):
             kind, text = "i1", "true" if value else "false"
         else:
+            # As bits, since decimal literals of LLVM must be exact.
             kind, text = "double", f"0x{struct.pack('>d', value).hex().upper()}"
         return f"<{', '.join([f'{kind} {text}'] * width)}>" if width else text
 
@@ -131,6 +133,7 @@ class Body:
         if not width:
             return self.let(f"call double @{op}({', '.join(operands)})")
         found = "poison"
+        # Vectors are taken apart where the C library has only the scalar function.
         for i in range(width):
             parts = [self.let(f"extractelement {x}, i64 {i}") for x in operands]
             one = self.let(f"call double @{op}({', '.join(f'double {x}' for x in parts)})")

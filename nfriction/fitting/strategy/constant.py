@@ -73,6 +73,7 @@ def fit_constant(task: FitTask) -> FitResult:
     search = horizon_continuation(
         fitter, friction, plant, task.motions, None if linear else equation_error
     )
+    # A law with a curved term may end in a local minimum that its nested law does not have.
     if (law := model.law.nested_law) is not None and not search.end.stopped:
         contained = FrictionModel(law, Constant(law, model.joints), model.v_smooth)
         by_torque = regression(task, contained, begun)
@@ -81,6 +82,7 @@ def fit_constant(task: FitTask) -> FitResult:
             (by_torque.coefficients.reshape(-1), plant), task.motions, equation_error,
         )  # fmt: skip
     found = search.end
+    # Terms that few rigs need come last, since they can absorb friction that is not yet fitted.
     undecided = start is None and options.eccentricity == "auto" and options.fit_plant
     if undecided and isinstance(task.plant, PendulumChain) and not found.stopped:
         richer = _fitter(task, model, torque, eccentric=True)
@@ -172,6 +174,7 @@ def richer_by_evidence(
     before = problem.linearise(at_base)
     lower, upper = variables.bounds()
     known = (at_base > lower) & (at_base < upper)
+    # Variables at a bound cannot move, so they take no volume of the posterior.
     known[old:shared] = False
     both = known.clone()
     both[old:shared] = True
@@ -180,6 +183,7 @@ def richer_by_evidence(
     def occam(after: Quadratic) -> float:
         return log_prior - 0.5 * (_log_volume(after, both) - _log_volume(before, known))
 
+    # The prediction costs one step, the search it may save costs a whole fit.
     if _newton_decrease(before, both) - _newton_decrease(before, known) + occam(before) <= 0:
         return None
     start = variables.start(torch.cat([base.parts.plant, zeros]), base.parts.offsets)

@@ -123,6 +123,7 @@ def driven_recordings(
         phase = random.uniform(0, 2 * np.pi, len(frequency))
         tau = np.zeros((steps + 1, plant.joints))
         tau[:, 0] = 0.9 * np.sin(2 * np.pi * frequency * time[:, None] + phase).sum(1)
+        # From hanging, since motion about the top would need a controller while it is recorded.
         hanging = torch.zeros(plant.joints, dtype=torch.float64)
         hanging[1] = math.pi
         run = rollout(plant, friction, hanging, torch.zeros_like(hanging), torch.tensor(tau[:-1]),
@@ -168,6 +169,7 @@ def compensation_of(model: FrictionModel) -> Compensation:
     start = schedule.initial_state(example, example)
 
     def step(qd: Tensor, qdd: Tensor, load: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        # The class of this sample first: a step later it would lag each change of direction.
         following = schedule.advance(qd, qdd, state)
         return model.torque(qd, load, schedule.coefficients_from(qd, qdd, following)), following
 
@@ -284,6 +286,7 @@ def performance(run: ControlledMotion, *, follow: bool, settled: float) -> dict[
         "power [W]": float(np.mean(np.abs(torque * rate))),
         "torque [N m]": float(np.sqrt(np.mean(torque**2))),
     }
+    # A rig that fell has no tracking error worth a comparison.
     fallen = not math.isfinite(found["largest tilt [mrad]"]) or links.max() > 0.5 * math.pi
     return dict.fromkeys(found, math.inf) if fallen else found
 
