@@ -38,6 +38,7 @@ def sampled(model: FrictionModel, sample_time: float) -> FrictionModel:
             f"with {type(model.schedule).__name__}."
         )
     _refuse_load(model, step)
+    # Signed and without bounds: no fit varies them.
     states = tuple(Coefficient(f"state_{k + 1}", "-", False) for k in range(law.state_size))
     flat = Law(law.name, (*law.coefficients, *states), _Torque(law.memory.torque, law.state_size))
     return FrictionModel(flat, _Sampled(model, flat, step), model.v_smooth)
@@ -56,6 +57,7 @@ def _refuse_load(model: FrictionModel, step: float) -> None:
         )
 
 
+# A module and no closure, which TorchScript would not compile.
 class _Torque(nn.Module):
     """Torque of the law, its state the last of the coefficients."""
 
@@ -73,6 +75,7 @@ class _Torque(nn.Module):
 class _Sampled(Schedule):
     """Constant coefficients, and the state of the law that has them."""
 
+    # The law has no trained range, and a clamped velocity would move its state too little.
     handles_range = True
     step: Tensor
     rest: Tensor
@@ -101,6 +104,7 @@ class _Sampled(Schedule):
 
     def coefficients_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
         c = self.constant(qd, qdd)
+        # Adding zeros broadcasts; ONNX has no form of `expand`.
         return torch.cat([c + 0.0 * state[..., :1], state], -1)
 
     def parameter_vector(self) -> Tensor:

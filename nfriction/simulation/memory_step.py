@@ -81,6 +81,7 @@ def memory_step(
     """
     law = memory_of(friction)
     assert law is not None
+    # Held like the torque: a load that changes within a step is of the step's own order.
     load, zero = plant.load(q, qd), torch.zeros_like(qd)
     mobility = _mobility(plant, q, zero)
     at_rest = law.advance(torch.zeros_like(state), zero + SLOW, load, coefficients, step)
@@ -106,6 +107,7 @@ def memory_step(
         v = _solve(mobility, reach.unbind(-1), slope.unbind(-1), list(free.unbind(-1)))
         found, after = friction_at(v)
 
+    # By the same torque in all stages, so that what the mechanism loses is what the law took.
     def rate(q: Tensor, qd: Tensor) -> Tensor:
         return plant.forward_dynamics(q, qd, tau - found)
 
@@ -115,6 +117,7 @@ def memory_step(
 def _mobility(plant: Plant, q: Tensor, zero: Tensor) -> list[list[Tensor]]:
     """Accelerations by unit torques, entry (i, j) of joint i by the torque of joint j."""
     unit = torch.eye(plant.joints, dtype=q.dtype, device=q.device)
+    # Differences from the motion without torque, because plants have no mass matrix in common.
     rest = plant.forward_dynamics(q, zero, zero)
     columns = [
         (plant.forward_dynamics(q, zero, zero + unit[j]) - rest).unbind(-1)
