@@ -343,7 +343,10 @@ class _Regression:
             scale[scale == 0] = 1.0
             system = np.concatenate([a / scale, self.options.ridge * np.eye(len(linear))])
             target = np.concatenate([y, np.zeros(len(linear))])
-            solution = lsq_linear(system, target, bounds=(lower, np.inf), tol=1e-12).x / scale
+            # The triangle of all rows has the same minimum, and costs the same for any table.
+            triangle = np.linalg.qr(np.column_stack([system, target]), mode="r")
+            found = lsq_linear(triangle[:, :-1], triangle[:, -1], bounds=(lower, np.inf), tol=1e-12)
+            solution = found.x / scale
             coefficients[joint, linear] = torch.as_tensor(solution)
             residual[joint] = float(np.sqrt(np.mean((a @ solution - y) ** 2)))
         return coefficients, residual
