@@ -344,7 +344,7 @@ class _Regression:
             system = np.concatenate([a / scale, self.options.ridge * np.eye(len(linear))])
             target = np.concatenate([y, np.zeros(len(linear))])
             # The triangle of all rows has the same minimum, and costs the same for any table.
-            triangle = np.linalg.qr(np.column_stack([system, target]), mode="r")
+            triangle = np.asarray(np.linalg.qr(np.column_stack([system, target]), mode="r"))
             found = lsq_linear(triangle[:, :-1], triangle[:, -1], bounds=(lower, np.inf), tol=1e-12)
             solution = found.x / scale
             coefficients[joint, linear] = torch.as_tensor(solution)

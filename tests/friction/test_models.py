@@ -64,7 +64,7 @@ def test_every_trained_parameter_has_a_gradient(name: str) -> None:
 def test_the_slope_at_rest_is_that_of_differences(name: str) -> None:
     model = named_models()[name]
     rest, load = torch.zeros(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64)
-    step = 1e-4 * model.v_smooth
+    step = 1e-5 * model.v_smooth
     # Of every set of coefficients that may hold at rest, the steepest counts.
     held = model.schedule.rest_coefficients()
     ahead, behind = (model.torque(rest + s, load, held) for s in (step, -step))
