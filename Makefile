@@ -3,8 +3,8 @@ PYTHON ?= python3
 # A torch that is installed as it is here; any from pyproject.toml's range serves.
 TORCH ?= torch==2.13.0
 BIN := .venv/bin
-# As many tests at a time as this process has cores; those of a file stay in one process, which then
-# makes their fixtures and kernels once.
+# As many tests at a time as this process has cores; neighbours mostly share a process, which then makes
+# their fixtures and kernels once.
 WORKERS ?= $(shell nproc 2>/dev/null || echo auto)
 
 .PHONY: demo reproduce test lint clean
