@@ -158,7 +158,7 @@ class FitOptions:
     # Chance that a network no better than its law on the blocks left out is kept.
     gain_level: float = 0.05
     # Updates of a network's prior and noise by evidence; each searches on from the last.
-    evidence_updates: int = 3
+    evidence_updates: int = 6
 
     # --- Extrapolation prior of a network.
     # Grid cells along velocity and acceleration, cells around a visited one that count as
