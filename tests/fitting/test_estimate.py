@@ -215,8 +215,8 @@ def test_windows_that_are_left_out_are_told(monkeypatch):
         network, pendulum(), recording, start=found, windows=(0.5, 1.0, 2.0), max_steps=2,
         callback=lambda stage, step: stages.add(stage),
     )  # fmt: skip
-    assert "network, 0.5 s windows" in stages
-    assert all("0.5 s windows" in stage for stage in stages)
+    assert "0.5 s windows" in stages
+    assert not {"1 s windows", "2 s windows"} & stages
     later = fit(
         CVFM(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5, 1.0, 1.5), max_steps=3
     )

@@ -10,11 +10,7 @@ from tests.report.runs import neuro_fuzzy
 
 def test_a_rule_says_what_the_model_gives_where_its_words_hold():
     model = neuro_fuzzy()
-    written = rules_in_words(model, ["one", "two"])
-    # A rule says the mean of both directions.
-    with torch.no_grad():
-        model.schedule.lean.zero_()
-    for j, of in enumerate(written):
+    for j, of in enumerate(rules_in_words(model, ["one", "two"])):
         assert len(of.rules) == 25
         velocity = {t.name: t.centre for t in of.velocity}
         acceleration = {t.name: t.centre for t in of.acceleration}

@@ -81,8 +81,7 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
         extrapolation=prior_on_unvisited_cells(network_of(network), motions, options),
     )  # fmt: skip
     length = start.longest_usable_horizon(options.windows)
-    windows = cut_windows(recordings, motions, length)
-    training = _Training(fitter, start, windows, f"network, {length:g} s windows")
+    training = _Training(fitter, start, cut_windows(recordings, motions, length))
     trained = training.learn()
     judged = None
     if trained is not None:
@@ -274,11 +273,8 @@ def effective_parameters(trained: Trained) -> tuple[tuple[str, float, int], ...]
 class _Training:
     """Searches for a network that corrects a constant fit, on given windows."""
 
-    def __init__(
-        self, fitter: ShootingFitter, start: FitResult, windows: Windows, stage: str
-    ) -> None:
+    def __init__(self, fitter: ShootingFitter, start: FitResult, windows: Windows) -> None:
         self.fitter, self.windows, self.options = fitter, windows, fitter.options
-        self.stage = stage
         # The noise against which priors weigh at first is the law's residual at the same horizon.
         self.noise = effective_noise(start.residuals)
         self.stride = decimation(start.residuals, self.options)
@@ -341,7 +337,7 @@ class _Training:
             most = replace(problem, windows=windows.subset(seen))
             x = torch.cat([parts.friction, parts.plant, parts.states[seen].flatten()])
             tolerance = loglik_tolerance(float(most.cost(x)), self.options)
-            end = fitter.search(most, x, tolerance, f"{self.stage}, block left out")
+            end = fitter.search(most, x, tolerance, "network, block left out")
             if end.stopped:
                 return None
             rest = replace(problem, windows=windows.subset(~seen))
@@ -399,7 +395,7 @@ class _Training:
             fitter = replace(fitter, options=replace(self.options, max_steps=steps))
         # Far from a minimum it is the start's cost, at the noise that the problem has.
         tolerance = loglik_tolerance(float(problem.cost(x)), self.options)
-        return Trained(prior, fitter.search(problem, x, tolerance, self.stage))
+        return Trained(prior, fitter.search(problem, x, tolerance, "network"))
 
     def _noise_of(self, found: Trained, gamma: float) -> float:
         """Noise of what a network leaves: MacKay's, of as many residuals as are independent."""
