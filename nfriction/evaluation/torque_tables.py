@@ -47,9 +47,6 @@ LAWS = ("viscous", "coulomb", "coulomb-viscous", "arctan", "stribeck")
 WITH_TIME = ("slip",)
 WITH_LOAD = ("load-coulomb",)
 WITH_BOTH = ("load-slip",)
-# Standard deviations of a network's prior over its own, of which blocks left out choose. No network
-# first: it is kept only where it lowers the error.
-PRIOR_SHARES = (0.0, 1.0, 1 / 3)
 
 
 class TorqueScore(NamedTuple):
@@ -357,7 +354,8 @@ def _fit(
             "its law, or its neuro-fuzzy model."
         )
     require_load(name, joint)
-    shares = PRIOR_SHARES if form == "neurofuzzy" else (0.0,)
+    # No network first: it is kept only where it lowers the error.
+    shares = (0.0, *options.prior_shares) if form == "neurofuzzy" else (0.0,)
     errors = np.zeros((len(shares), folds))
     for k, test in enumerate(blocks(joint, folds)):
         rest = joint.rows(np.setdiff1d(np.arange(len(joint)), test))

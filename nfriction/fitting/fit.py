@@ -107,11 +107,9 @@ def fit(
     refines them and the plant. Windows that would lose what shorter ones found are skipped, with a
     warning. Laws with several minima are also started from their grid of initial values and from
     the simpler law that they contain (`Law.nested_law`); the lowest residual wins. A neuro-fuzzy
-    model starts at the constant fit of its law; evidence chooses the priors of its parameters, how
-    near the plant stays to the law's, the noise, and whether its sets move. Each joint takes the
-    share of its correction that blocks left out of the training support, and none if the gain there
-    may be chance. An adaptive model starts at the constant fit, too; `fit_adaptive` has its further
-    settings.
+    model starts at the constant fit of its law and is kept only if its hold-out RMSE is 20 % below
+    the law's; its plant prior is relaxed only for a further 20 %. An adaptive model starts at the
+    constant fit, too; `fit_adaptive` has its further settings.
 
     Args:
         model: the model to fit, changed in place; or the name of one, such as "coulomb-viscous".

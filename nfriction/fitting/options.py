@@ -152,13 +152,14 @@ class FitOptions:
     settling_tolerance: float = 1e-4
 
     # --- Hold-out of a network.
-    # Blocks of consecutive windows, each left out of a network's training once; windows of short
-    # recordings are shortened until there are as many.
-    folds: int = 5
-    # Chance that a network no better than its law on the blocks left out is kept.
-    gain_level: float = 0.05
-    # Updates of a network's prior and noise by evidence; each searches on from the last.
-    evidence_updates: int = 6
+    # Every so many-th window is held out, so that all sizes of the motion are represented.
+    folds: int = 3
+    # Maximum hold-out RMSE ratio to the law fitted on the same windows.
+    max_ratio_same: float = 0.8
+    # Maximum hold-out RMSE ratio to the law fitted on all windows, which it would replace.
+    max_ratio_all: float = 1.1
+    # Candidate priors, relative to the network's own.
+    prior_shares: tuple[float, ...] = (1.0, 1 / 3)
 
     # --- Extrapolation prior of a network.
     # Grid cells along velocity and acceleration, cells around a visited one that count as

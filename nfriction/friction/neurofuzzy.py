@@ -1,6 +1,5 @@
 """Neuro-fuzzy models: coefficients as a network's function of velocity and acceleration."""
 
-import math
 import reprlib
 from collections.abc import Sequence
 from pkgutil import resolve_name
@@ -16,14 +15,12 @@ from nfriction.friction.models import NamedModel
 from nfriction.friction.parameters import Sensitivity, positive_number
 from nfriction.fuzzy import AnfisRBF
 from nfriction.fuzzy.membership import FuzzyRules
-from nfriction.fuzzy.partition import FreePartition
 
 # A coefficient below a thousandth of its scale starts there: from zero it could not rise.
 LEAST_RATIO = 1e-3
-# Wide enough for large swings at once: from a stiffer prior the evidence has a longer way.
+# With a third of it the network is too stiff to follow large swings, and then wrong at smaller
+# ones: on later swings of a real pendulum 6.8 mrad instead of 3.0 (its constant law: 5.3).
 PRIOR_SD = 0.3
-# Of the logistic distribution: that of the logit of a share about which nothing is known.
-LOGIT_SD = math.pi / math.sqrt(3.0)
 
 
 def smooth_relu(u: Tensor, roundness: float) -> Tensor:
@@ -57,9 +54,8 @@ class NeuroFuzzy(Schedule):
     """Coefficients from an ANFIS layer with a radial basis head.
 
     Inputs are |velocity| and acceleration, scaled to their trained range and clamped to it. The
-    network's output, and a lean that changes its sign with the direction of motion, are the
-    deviation from a constant reference, in units of a scale; it starts at zero, so an untrained
-    model *is* the constant law, and a prior around zero pulls toward it.
+    network's output is the deviation from a constant reference, in units of a scale; it starts at
+    zero, so an untrained model *is* the constant law, and a prior around zero pulls toward it.
     Beyond the trained range the deviation tapers off to the constant law.
 
     Args:
@@ -70,16 +66,9 @@ class NeuroFuzzy(Schedule):
         head_units: units of the radial basis head.
         acceleration: `"along_motion"` takes qdd sgn(qd), so that friction is the same in both
             directions; `"signed"` takes qdd as the papers do.
-        interpretable: keep the sets ordered, in range and overlapping, also while a fit moves them.
-        prior_sd: standard deviation of the network's parameters around the start of a fit:
-            consequents and weights in units of the coefficients' scale, widths as logarithms,
-            centres in widths. A fit begins with it and finds that of each group by evidence.
-
-    Attributes:
-        learn_sets: whether a fit moves the sets and the head's units besides what they weigh.
-        learn_lean: whether a fit finds how much the coefficients differ by direction.
-        lean: half that difference of positive coefficients, in units of their scale (joint,
-            coefficient).
+        interpretable: keep the sets ordered, in range and overlapping.
+        prior_sd: standard deviation of the network's parameters around zero, in units of the
+            coefficients' scale; a fit also tries a third of it.
 
     References:
         TLRIP paper, neuro-fuzzy friction estimation (5 x 5 sets, 25 rules, 10 radial basis units).
@@ -94,8 +83,6 @@ class NeuroFuzzy(Schedule):
 
     fit_strategy = "nfriction.fitting.strategy.neurofuzzy:fit_neurofuzzy"
     handles_range = True
-    learn_sets: bool = True
-    learn_lean: bool = True
 
     reference: Tensor
     scale: Tensor
@@ -112,7 +99,7 @@ class NeuroFuzzy(Schedule):
         terms: Sequence[int] = (5, 5),
         head_units: int = 10,
         acceleration: Literal["along_motion", "signed"] = "along_motion",
-        interpretable: bool = True,
+        interpretable: bool = False,
         prior_sd: float = PRIOR_SD,
     ) -> None:
         super().__init__(law, joints)
@@ -132,7 +119,6 @@ class NeuroFuzzy(Schedule):
         self.prior_sd = positive_number("prior_sd", prior_sd)
         self.network = AnfisRBF(joints, 2, terms, k, units=head_units, interpretable=interpretable)
         self.network.init_grid(0.0, 1.0)
-        self.lean = nn.Parameter(torch.zeros(joints, k, dtype=torch.float64))
         for name in ("reference", "scale"):
             self.register_buffer(name, torch.ones(joints, k, dtype=torch.float64))
         for name in ("velocity_range", "acceleration_lower", "acceleration_upper"):
@@ -146,7 +132,7 @@ class NeuroFuzzy(Schedule):
         # Of |velocity|, so that friction is odd in the velocity without any training.
         velocity = qd / self.velocity_range
         if self.along_motion:
-            qdd = qdd * self.direction(qd)
+            qdd = qdd * torch.tanh(velocity / self.turn)
         span = self.acceleration_upper - self.acceleration_lower
         return torch.stack([velocity.abs(), (qdd - self.acceleration_lower) / span], -1)
 
@@ -156,16 +142,7 @@ class NeuroFuzzy(Schedule):
     def residual_coefficients(self, reference: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
         """Coefficients where the network's output is added to a reference in its own units."""
         x, weight = self._clamped_inputs(qd, qdd)
-        leaning = self.leans() * self.direction(qd).unsqueeze(-1)
-        return self.to_coefficients(reference + weight * (self.network(x) + leaning))
-
-    def leans(self) -> Tensor:
-        """The lean of positive coefficients: an offset that turned with the motion would drive."""
-        return self.lean * self.positive
-
-    def direction(self, qd: Tensor) -> Tensor:
-        """Smooth sign of the velocity."""
-        return torch.tanh(qd / self.velocity_range / self.turn)
+        return self.to_coefficients(reference + weight * self.network(x))
 
     def _clamped_inputs(self, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor]:
         """Inputs of the network, and the weight of its output (*batch, joint, 1)."""
@@ -257,36 +234,19 @@ class NeuroFuzzy(Schedule):
         qd = qd.clamp(-self.velocity_range, self.velocity_range)
         sign = torch.ones_like(qd)
         if self.along_motion:
-            sign = self.direction(qd)
+            sign = torch.tanh(qd / self.velocity_range / self.turn)
         held = (sign * qdd).clamp(self.acceleration_lower, self.acceleration_upper)
         # At rest the network's input is zero for every acceleration.
         return qd, torch.where(sign == 0, qdd, held / sign)
 
-    def trained(self) -> tuple[nn.Parameter, ...]:
-        """The parameters that a trajectory fit varies, each (joint, ...).
+    def trained(self) -> tuple[nn.Parameter, nn.Parameter]:
+        """The parameters that a trajectory fit varies, each (joint, coefficient, ...).
 
-        First the `weights`. Then the sets' parameters, and the centres and widths of the head's
-        units.
+        These are the ones that enter the coefficients almost linearly: the rules' planes and the
+        weights of the head. The head's bias stays zero: it would double the rules' constants, and
+        halve the prior on them.
         """
-        if not self.learn_sets:
-            return self.weights()
-        partition, head = self.network.anfis.partition, self.network.head
-        return (*self.weights(), *partition.parameters(), head.centres, head.log_widths)
-
-    def weights(self) -> tuple[nn.Parameter, ...]:
-        """Parameters that enter the coefficients almost linearly, (joint, coefficient, ...).
-
-        The rules' planes, the weights of the head and the lean. The head's bias stays zero: it
-        would double the rules' constants, and halve the prior on them.
-        """
-        both = self.network.anfis.consequents, self.network.head.output_weight
-        return (*both, self.lean) if self.learn_lean else both
-
-    @torch.no_grad()
-    def silence(self) -> None:
-        """Set the network's output to zero, so that coefficients are the reference."""
-        for p in (*self.weights(), self.lean):
-            p.zero_()
+        return self.network.anfis.consequents, self.network.head.output_weight
 
     def parameter_vector(self) -> Tensor:
         return torch.cat([p.detach().reshape(-1) for p in self.trained()])
@@ -298,97 +258,49 @@ class NeuroFuzzy(Schedule):
             p.copy_(part.reshape(p.shape))
 
     def parameter_names(self, joint_names: Sequence[str]) -> list[str]:
-        rules, weights = (p[0, 0].numel() for p in self.weights()[:2])
+        rules, weights = (p[0, 0].numel() for p in self.trained())
         columns = ("velocity slope", "acceleration slope", "constant")
         planes = [
             f"{columns[k % len(columns)]} of rule {k // len(columns) + 1}" for k in range(rules)
         ]
         head = [f"head weight {k + 1}" for k in range(weights)]
-        names = [
+        return [
             f"{name} of {joint}: {part}"
-            for parts in (planes, head, ["lean"])[: len(self.weights())]
+            for parts in (planes, head)
             for joint in joint_names
             for name in self.coefficient_names
             for part in parts
         ]
-        count = len(self.weights())
-        for group, p in zip(self.group_names()[count:], self.trained()[count:], strict=True):
-            parts = [f"{group} {k + 1}" for k in range(p[0].numel())]
-            names += [f"network of {joint}: {part}" for joint in joint_names for part in parts]
-        return names
-
-    def group_names(self) -> tuple[str, ...]:
-        """A name for each tensor of `trained`, whose parameters share a prior."""
-        sets = tuple(
-            f"set {name.removeprefix('log_')}"
-            for name, _ in self.network.anfis.partition.named_parameters()
-        )
-        lean = ("direction",) if self.learn_lean else ()
-        names = ("consequents", "head weights", *lean, *sets, "head centres", "head widths")
-        return names[: len(self.trained())]
-
-    def groups(self) -> Tensor:
-        """Place in `group_names` of each parameter's group, (parameter,)."""
-        sizes = torch.tensor([p.numel() for p in self.trained()])
-        return torch.arange(len(sizes)).repeat_interleave(sizes)
-
-    def joint_of_weights(self) -> Tensor:
-        """The joint that each weight acts on, -1 of the sets' parameters, (parameter,)."""
-        joints = torch.arange(self.joints)
-        parts = [joints.repeat_interleave(p[0].numel()) for p in self.trained()]
-        count = len(self.weights())
-        return torch.cat([*parts[:count], *(torch.full_like(part, -1) for part in parts[count:])])
 
     def bounds(self) -> tuple[Tensor, Tensor]:
         vector = self.parameter_vector()
         # The network of a coefficient that is not fitted stays where it started.
         mask = torch.tensor(self.fitted_mask, device=vector.device)[:, None]
-        fitted = torch.ones_like(vector, dtype=torch.bool)
-        masks = [mask, mask, mask & self.positive[:, None]]
-        linear = [
-            own.expand(self.joints, -1, p[0, 0].numel()).reshape(-1)
-            for own, p in zip(masks, self.weights(), strict=False)
-        ]
-        fitted[: sum(len(part) for part in linear)] = torch.cat(linear)
+        fitted = torch.cat(
+            [mask.expand(self.joints, -1, p[0, 0].numel()).reshape(-1) for p in self.trained()]
+        )
         free = torch.full_like(vector, torch.inf)
         return torch.where(fitted, -free, vector), torch.where(fitted, free, vector)
 
     def prior(self) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation: zero for the network's output, its sets where they are."""
-        partition, head = self.network.anfis.partition, self.network.head
-        mean, units = self.parameter_vector(), {}
-        mean[: sum(p.numel() for p in self.weights())] = 0.0
-        # Centres in units of widths, spacings as logits, all others relative as they are.
-        units[head.centres] = head.log_widths.detach().exp()
-        if isinstance(partition, FreePartition):
-            units[partition.centres] = partition.log_widths.detach().exp()
-        else:
-            spacings = partition.spacings
-            units[spacings] = torch.full_like(spacings, LOGIT_SD / self.prior_sd)
-        sizes = [units.get(p, torch.ones_like(p)).reshape(-1) for p in self.trained()]
-        return mean, self.prior_sd * torch.cat(sizes).detach()
+        vector = self.parameter_vector()
+        return torch.zeros_like(vector), torch.full_like(vector, self.prior_sd)
 
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
         return self.residual_sensitivities(self.reference, qd, qdd)
 
     @torch.no_grad()
-    def motion_sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
-        return Sensitivity((), *self.slopes(qd, qdd, self(qd, qdd)))
-
-    @torch.no_grad()
     def slopes(self, qd: Tensor, qdd: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """Derivatives of the coefficients by the joint's own velocity and acceleration.
 
-        With x the scaled inputs, u the reference plus w n, n the network's outputs at x clamped
-        plus the lean l times t, w their weight, v = qd / v_max and t = tanh(v / turn), of which a
-        signed acceleration takes no notice:
+        With x the scaled inputs, u the reference plus w n, n the network's outputs at x clamped, w
+        their weight, v = qd / v_max and t = tanh(v / turn) (1 where acceleration is signed):
 
             du/dx   = w dn/dx within the range, n dw/dx beyond it,
-            dc/dqd  = dc/du (du/dx_1 sgn(v) / v_max + (du/dx_2 qdd / span + w l) dt/dqd),
+            dc/dqd  = dc/du (du/dx_1 sgn(v) / v_max + du/dx_2 qdd dt/dqd / span),
             dc/dqdd = dc/du du/dx_2 t / span.
         """
-        scaled, turned = self.scaled(qd, qdd), self.direction(qd)
-        by_x = self._slopes_over_range(scaled, self.leans() * turned[..., None])
+        by_x = self._slopes_over_range(self.scaled(qd, qdd))
         # The slope of s = smooth_relu(u) with roundness r is s^2 / (s^2 + r^2).
         s = coefficients / self.scale
         rounded = s * s / (s * s + self.roundness**2)
@@ -396,16 +308,14 @@ class NeuroFuzzy(Schedule):
         velocity, span = self.velocity_range, self.acceleration_upper - self.acceleration_lower
         by_speed, by_acceleration = (by_x * by_u[..., None]).unbind(-1)
         by_acceleration = by_acceleration / span[:, None]
-        turning = ((1.0 - turned * turned) / (velocity * self.turn))[..., None]
-        weight = taper(scaled - scaled.clamp(0.0, 1.0), self.reach)[..., None]
         by_qd = by_speed * (qd.sign() / velocity)[..., None]
-        by_qd = by_qd + by_u * weight * self.leans() * turning
         if not self.along_motion:
             return by_qd, by_acceleration
-        by_qd = by_qd + by_acceleration * qdd[..., None] * turning
-        return by_qd, by_acceleration * turned[..., None]
+        turned = torch.tanh(qd / velocity / self.turn)
+        turning = qdd * (1.0 - turned * turned) / (velocity * self.turn)
+        return by_qd + by_acceleration * turning[..., None], by_acceleration * turned[..., None]
 
-    def _slopes_over_range(self, scaled: Tensor, leaning: Tensor) -> Tensor:
+    def _slopes_over_range(self, scaled: Tensor) -> Tensor:
         """Derivatives of the weighted network by its scaled inputs, (*batch, joint, output, 2)."""
         x = scaled.clamp(0.0, 1.0)
         beyond = scaled - x
@@ -414,7 +324,7 @@ class NeuroFuzzy(Schedule):
         weight = taper(beyond, self.reach)[..., None] * (beyond == 0.0)
         slope = taper_slope(beyond, self.reach)
         by_x = by_x.reshape(*x.shape[:-1], -1, 2) * weight[..., None, :]
-        return by_x + (self.network(x) + leaning)[..., None] * slope[..., None, :]
+        return by_x + self.network(x)[..., None] * slope[..., None, :]
 
     @torch.no_grad()
     def residual_sensitivities(self, reference: Tensor, qd: Tensor, qdd: Tensor) -> Sensitivity:
@@ -425,38 +335,18 @@ class NeuroFuzzy(Schedule):
         both = torch.cat([x, y], -1)
         with torch.enable_grad():
             # The map to coefficients is elementwise, so the sum's gradient is its slope.
-            turned = self.direction(qd)[..., None]
-            leaning = self.leans() * turned
-            u = (reference + weight * (y + head(both) + leaning)).detach().requires_grad_()
+            u = (reference + weight * (y + head(both))).detach().requires_grad_()
             coefficients = self.to_coefficients(u)
             (by_u,) = torch.autograd.grad(coefficients.sum(), u)
         by_u = by_u * weight
         own = torch.eye(y.shape[-1], dtype=y.dtype, device=y.device)
         # The rules' outputs are inputs of the head, too.
         by_y = head.input_jacobian(both)[:, :, x.shape[-1] :].permute(3, 0, 1, 2)
-        by_rules, by_head = by_u[..., None] * (own + by_y), by_u[..., None] * own
         by_qd, by_qdd = self.slopes(qd, qdd, coefficients)
-        lean = ((by_head * self.positive, turned),) if self.learn_lean else ()
-        if not self.learn_sets:
-            factors = ((by_rules, anfis.regressors(x)), (by_head, head.activations(both)))
-            return Sensitivity((*factors, *lean), by_qd, by_qdd)
-        columns, units = anfis.jacobian_columns(x), head.jacobian_columns(both)
-        shared, one = anfis.consequents[0, 0].numel(), torch.ones_like(x[..., :1])
-        by_set = columns[:, shared:].unflatten(1, (y.shape[-1], -1)).permute(3, 0, 1, 2)
-        by_unit = by_u[..., None] * head.output_weight.repeat_interleave(head.inputs, -1)
-        # Of a unit's output by its centre and logarithmic width, both over the width squared.
-        moved = units[:, head.units + 1 :].unflatten(1, (2, -1)).movedim(-1, 0)
-        moved = moved * torch.exp(-2.0 * head.log_widths).flatten(1)[:, None]
         return Sensitivity(
             (
-                (by_rules, columns[:, :shared].movedim(-1, 0)),
-                (by_head, units[:, : head.units].movedim(-1, 0)),
-                *lean,
-                *(
-                    (by_rules @ (by_set @ rows), one)
-                    for rows in anfis.partition.jacobian().values()
-                ),
-                *((by_unit * part.unsqueeze(2), one) for part in moved.unbind(2)),
+                (by_u[..., None] * (own + by_y), anfis.regressors(x)),
+                (by_u[..., None] * own, head.activations(both)),
             ),
             by_qd,
             by_qdd,

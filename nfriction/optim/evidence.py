@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Literal, TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -43,8 +43,6 @@ MESSAGES: dict[str, str] = {
 }
 # Beyond it a step is too short to matter.
 LARGEST_DAMPING = 1e10
-# Updates of precisions on one quadratic model; that of a group without use grows for ever.
-PRECISION_UPDATES = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,94 +168,6 @@ class EvidenceResult:
             variance = torch.stack([((J @ self.covariance) * J).sum(-1) for J in jacobians], -1)
             deviations.append((variance.clamp(min=0) + floor).sqrt().view_as(output))
         return torch.cat(deviations)
-
-
-class GroupEvidence(NamedTuple):
-    """Evidence for the prior precisions of groups, and better ones.
-
-    Attributes:
-        occam: log of the posterior volume over that of the prior, in nats; with the cost at the
-            optimum taken off it is the log evidence, up to a constant.
-        gamma: parameters of each group that the data determine, (groups,).
-        slope: derivative of the log evidence by the log precision of each group, (groups,).
-        precision: new precision of each group, (groups,).
-    """
-
-    occam: float
-    gamma: Tensor
-    slope: Tensor
-    precision: Tensor
-
-
-def group_evidence(
-    data: Tensor, known: Tensor, offset: Tensor, groups: Tensor, precision: Tensor
-) -> GroupEvidence:
-    """MacKay's update of the precisions alpha of groups of parameters beside a known prior.
-
-    With A = data + known + diag(alpha) at the optimum, the log evidence is stationary where
-
-        alpha_g |offset_g|^2 = gamma_g = alpha_g tr_g((known + diag(alpha))^-1 - A^-1).
-
-    Args:
-        data: curvature of the errors, other variables marginalised, (p, p).
-        known: curvature of a prior that does not change, (p, p).
-        offset: parameters less the mean of the prior, at the optimum, (p,).
-        groups: group of each parameter, -1 of those that the known prior alone covers, (p,).
-        precision: alpha of each group, (groups,).
-    """
-    count, mine = len(precision), groups >= 0
-    prior = known + torch.diag(torch.where(mine, precision[groups.clamp_min(0)], 0.0))
-    variances, volumes = [], []
-    for system in (prior, prior + data):
-        # Scaled to a unit diagonal, so that the units of the parameters cost no digits.
-        scale, factor = factorise(system)
-        variances.append(scale.square() * torch.cholesky_inverse(factor).diagonal())
-        volumes.append(float(scale.log().sum() - factor.diagonal().log().sum()))
-    reduced = (variances[0] - variances[1])[mine]
-    squares = group_sums(offset[mine].square(), groups[mine], count)
-    # Rounding may leave less than nothing of a group that the data do not know.
-    gamma = (precision * group_sums(reduced, groups[mine], count)).clamp_min(0.0)
-    # Data that say nothing cannot choose, and a group at its centre divides by zero.
-    usable = (gamma > torch.finfo(gamma.dtype).eps ** 0.5) & (squares > 0)
-    return GroupEvidence(
-        occam=volumes[1] - volumes[0],
-        gamma=gamma,
-        slope=0.5 * (gamma - precision * squares),
-        precision=torch.where(usable, gamma / squares, precision),
-    )
-
-
-def maximise_group_evidence(
-    data: Tensor, known: Tensor, slope: Tensor, offset: Tensor, groups: Tensor, tolerance: float
-) -> tuple[GroupEvidence, float]:
-    """Precisions of groups by the evidence of a quadratic model, each 1 at first.
-
-    The parameters follow the precisions to the minimum of the quadratic, so that no error has to be
-    evaluated.
-
-    Args:
-        data, known, offset, groups: see `group_evidence`; `offset` where the model was made.
-        slope: derivative of the errors and of the known prior there, (p,).
-        tolerance: gain in log evidence that counts as none.
-
-    Returns:
-        The evidence at the last precisions, and a bound of what they gained on the first.
-    """
-    mine = groups >= 0
-    count = int(groups.max()) + 1
-    precision, gained = data.new_ones(count), 0.0
-    for _ in range(PRECISION_UPDATES):
-        alpha = torch.where(mine, precision[groups.clamp_min(0)], 0.0)
-        scale, factor = factorise(data + known + alpha.diag())
-        pull = scale * (slope + alpha * offset)
-        step = -scale * torch.cholesky_solve(pull[:, None], factor)[:, 0]
-        found = group_evidence(data, known, offset + step, groups, precision)
-        change = (found.precision / precision).log()
-        gained = max(gained, float((found.slope * change).abs().sum()))
-        precision = found.precision
-        if float((found.slope * change).abs().max()) <= tolerance:
-            break
-    return found, gained
 
 
 def maximise_evidence(

@@ -52,13 +52,13 @@ INFO = ModelInfo(
 )
 
 
-def random_model(name: str, joints: int = 3, seed: int = 0, **options: object) -> FrictionModel:
+def random_model(name: str, joints: int = 3, seed: int = 0) -> FrictionModel:
     """A named model, every parameter off its start."""
     random = torch.Generator().manual_seed(seed)
     kind = model_by_name(name)
     initial = INITIAL[kind(1).law.name]
     factors = 1.0 + 0.3 * torch.rand(joints, len(initial), generator=random, dtype=torch.float64)
-    model = kind(joints, factors * torch.tensor(initial, dtype=torch.float64), **options)
+    model = kind(joints, factors * torch.tensor(initial, dtype=torch.float64))
     with torch.no_grad():
         for p in model.parameters():
             p.add_(0.1 * torch.randn(p.shape, generator=random, dtype=p.dtype))
@@ -437,7 +437,7 @@ def test_one_input_may_have_fewer_sets_than_the_other(tmp_path, terms):
 
 
 def test_sets_so_narrow_that_all_underflow_export(tmp_path):
-    model = random_model("NFLFM", interpretable=False)
+    model = random_model("NFLFM")
     with torch.no_grad():
         model.schedule.network.anfis.partition.log_widths.sub_(2.7)
     c(model, tmp_path, INFO)

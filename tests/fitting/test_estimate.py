@@ -202,8 +202,8 @@ def test_windows_that_are_left_out_are_told(monkeypatch):
     assert not any("were skipped" in told for told in alone.warnings)
     assert found.residual == pytest.approx(alone.residual, rel=0.2)
     # Whatever starts there says it, too.
-    for kept in (False, True):
-        monkeypatch.setattr("nfriction.fitting.strategy.holdout.Judgement.kept", kept)
+    for score in (2.0, 0.0):
+        monkeypatch.setattr("nfriction.fitting.strategy.holdout.HoldoutScore.score", score)
         network = NFLFM(2, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2)
         further = fit(network, pendulum(), recording, start=found, windows=(0.5,), max_steps=2)
         assert sum("were skipped" in told for told in further.warnings) == 1

@@ -32,7 +32,7 @@ def fits(swings):
     law = fit(LFM(1), *swings, **options)
     with pytest.MonkeyPatch.context() as patch:
         # Nothing is left for a network to find here; it is to be kept all the same.
-        patch.setattr("nfriction.fitting.strategy.holdout.Judgement.kept", True)
+        patch.setattr("nfriction.fitting.strategy.holdout.HoldoutScore.score", 0.0)
         return law, fit(NFLFM(1), *swings, start=law, **options)
 
 
@@ -84,10 +84,7 @@ def test_known_friction_lies_within_and_unvisited_motion_is_less_known(fits):
     error = found.model.schedule(*there).detach() - torch.tensor([4e-4, 2e-3], dtype=F64)
     assert (error.abs() <= 4 * sd).all()
     never = torch.full((1, 1), 1e3, dtype=F64)  # as at the corner of the range
-    # By little: the law is the truth, and the evidence holds the network to it everywhere.
-    assert (found.uncertainty.sd(never, never)[0, 0] > sd.median(0).values).all()
-    # The law's own uncertainty remains, however sure a network is of being silent.
-    assert (sd >= found.uncertainty.law.sd(*there)).all()
+    assert (found.uncertainty.sd(never, never)[0, 0] > 1.5 * sd.median(0).values).all()
 
 
 def test_a_network_that_is_not_kept_is_as_sure_as_its_law(fits):

@@ -102,7 +102,7 @@ def _words(controller: Controller, dialect: ControllerC) -> dict[str, Any]:
     values: dict[str, Any] = {"range": ranges, "torque_limit": controller.torque_limit}
     words: dict[str, Any] = {
         "form": form, "network": network,
-        "by_class": form.startswith("adaptive"), "along_motion": False, "leans": False,
+        "by_class": form.startswith("adaptive"), "along_motion": False,
         "bounded": bool((ranges.abs() < UNBOUNDED).any()), "clamped": controller.clamps,
         "limited": controller.limited, "law_comment": comment(model.law.name),
         # Calls of an own exponential for many joints at once cost flash on a microcontroller.
@@ -120,7 +120,7 @@ def _words(controller: Controller, dialect: ControllerC) -> dict[str, Any]:
         _add_classes(model.schedule, values, words, dialect)
     if network:
         _add_network(model.schedule, values, words, dialect)
-        if words["along_motion"] or words["leans"]:
+        if words["along_motion"]:
             signs.append(dialect.own("NF_RATE[j] * v[j]"))
     words["c"] = dialect.own("NF_CONSTANT") if form == "constant" else "c"
     words["law"] = _law(model, dialect, words["c"], signs if network else None)
@@ -159,7 +159,7 @@ def _add_network(
         "plane": made["planes"].view(joints, -1, sets, sets).permute(3, 2, 1, 0),
         "unit_slope": made["unit_slope"].permute(2, 1, 0),
         "unit_shift": made["unit_shift"].permute(2, 1, 0),
-        "unit_weight": made["weights"].permute(2, 1, 0), "lean": made["lean"].mT,
+        "unit_weight": made["weights"].permute(2, 1, 0),
         "reference": made["reference"].mT, "roundness": made["roundness"].mT,
     }  # fmt: skip
     if words["by_class"]:
@@ -173,8 +173,7 @@ def _add_network(
         runs.append((start, k + 1, positive))
     words |= {
         "sets": sets, "units": units, "seen": made["unit_slope"].shape[2],
-        "along_motion": network.along_motion, "leans": bool(network.leans().any()),
-        "signs_of_coefficients": runs,
+        "along_motion": network.along_motion, "signs_of_coefficients": runs,
         "per_reach": dialect.literal(0.5 / network.reach),
         "least_exponent": dialect.literal(network.network.head.least_exponent),
         "deep": _deepest(made["set_slope"].mT, made["set_shift"].mT) >= _DEEP,
@@ -195,7 +194,6 @@ def tables(schedule: NeuroFuzzy) -> dict[str, Tensor]:
         set, input), with sets of no membership where one input has fewer; `planes` (joint,
         3 coefficient set, set), columns by set of velocity, then of acceleration; `unit_slope` and
         `unit_shift` (joint, unit, input and coefficient); `weights` (joint, unit, coefficient);
-        `lean` (joint, coefficient), of the direction;
         `reference`, `roundness` (joint, coefficient); `positive` (coefficient,).
     """
     anfis, head = schedule.network.anfis, schedule.network.head
@@ -240,7 +238,6 @@ def tables(schedule: NeuroFuzzy) -> dict[str, Tensor]:
         "unit_slope": scale / unit_widths,
         "unit_shift": (seen - head.centres) / unit_widths,
         "weights": (head.output_weight * half.unsqueeze(2)).mT,
-        "lean": half * schedule.leans(),
         "roundness": (schedule.scale * schedule.roundness).square(),
         "positive": schedule.positive,
     }

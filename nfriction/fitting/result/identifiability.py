@@ -255,13 +255,10 @@ class CoefficientUncertainty:
         schedule: whose parameters these are.
         root: R of their covariance R R^T, (parameter, any); rows are infinite for
             unidentifiable parameters, zero for parameters that were not fitted.
-        law: of the constant law that a network corrects. Evidence may hold a network so close to
-            its law that its own parameters are sure of what the law is not; the variances add.
     """
 
     schedule: Schedule
     root: Tensor
-    law: "CoefficientUncertainty | None" = None
 
     @torch.no_grad()
     def sd(self, qd: Tensor, qdd: Tensor) -> Tensor:
@@ -273,8 +270,7 @@ class CoefficientUncertainty:
         shape = qd.shape
         flat = (x.reshape(-1, shape[-1]).split(PIECE) for x in (qd, qdd))
         found = torch.cat([self._sd(v, a) for v, a in zip(*flat, strict=True)])
-        found = found.reshape(*shape, -1)
-        return found if self.law is None else torch.hypot(found, self.law.sd(qd, qdd))
+        return found.reshape(*shape, -1)
 
     def torque_sd(self, model: FrictionModel, qd: Tensor) -> Tensor:
         """Standard deviation of a model's torque at velocities, (sample, joint).

@@ -34,28 +34,17 @@ class ExtrapolationPrior:
 
     @torch.no_grad()
     def residuals(self, schedule: Schedule) -> Tensor:
-        """Deviation of a neuro-fuzzy schedule's coefficients over `sd`, in one row.
-
-        Of the mean over both directions: what they differ by is known from visited points.
-        """
+        """Deviation of a neuro-fuzzy schedule's coefficients over `sd`, in one row."""
         network = cast("NeuroFuzzy", schedule)
-        both = [network(*motion) for motion in self._directions(network)]
-        deviation = sum(both) / len(both) - network.reference_coefficients()
+        deviation = network(self.qd, self.qdd) - network.reference_coefficients()
         return (deviation * self._factor(network)).flatten()
-
-    def _directions(self, network: NeuroFuzzy) -> list[tuple[Tensor, Tensor]]:
-        """The points, and those of the other direction where it makes a difference."""
-        if not network.learn_lean:
-            return [(self.qd, self.qdd)]
-        return [(self.qd, self.qdd), (-self.qd, -self.qdd if network.along_motion else self.qdd)]
 
     def normal_equations(self, schedule: Schedule) -> tuple[Tensor, Tensor]:
         """J^T r and J^T J of the residuals, over the parameter vector."""
         network = cast("NeuroFuzzy", schedule)
-        both = [network.sensitivities(*motion) for motion in self._directions(network)]
-        by, factor = both[0], self._factor(network)
+        by, factor = network.sensitivities(self.qd, self.qdd), self._factor(network)
         r = self.residuals(network).view_as(factor)
-        slopes, count = torch.stack([each.parameters for each in both]).mean(0), len(by.joint)
+        slopes, count = by.parameters, len(by.joint)
         gradient = torch.zeros(count, dtype=torch.float64)
         hessian = torch.zeros(count, count, dtype=torch.float64)
         # No parameter acts on two joints.

@@ -60,12 +60,7 @@ class AdaptiveNeuroFuzzy(Schedule):
         self._law = law
         self.adaptive = Adaptive(law, joints, initial, **(memory or {}))
         # The mean over the classes: the network corrects all of them alike.
-        network = {"interpretable": False, **network}
         self.deviation = NeuroFuzzy(law, joints, self.adaptive.values.mean(1), **network)
-        # Shares of a correction are shares of its parameters, so they have to enter linearly.
-        self.deviation.learn_sets = False
-        # The papers' networks see velocity and acceleration alone.
-        self.deviation.learn_lean = False
 
     @torch.no_grad()
     def set_adaptive(self, adaptive: Adaptive, scale: Tensor | None = None) -> None:
@@ -158,7 +153,9 @@ class AdaptiveNeuroFuzzy(Schedule):
 
     def joint_of_parameters(self) -> Tensor:
         """The joint whose coefficients each entry of the parameter vector moves, (parameter,)."""
-        return self.deviation.joint_of_weights()
+        joints = torch.arange(self.joints)
+        trained = self.deviation.trained()
+        return torch.cat([joints.repeat_interleave(p[0].numel()) for p in trained])
 
     def bounds(self) -> tuple[Tensor, Tensor]:
         return self.deviation.bounds()

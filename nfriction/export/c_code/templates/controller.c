@@ -128,7 +128,7 @@ void nf_step(
                 state->memory[NF_STATE_SIZE * j + k] = next[NF_STATE_SIZE * j + k];
 {% endif %}
 {% elif network %}
-    nf_network(v, a, {{ "sign[0], " if along_motion or leans }}{{ "known, " if by_class }}c);
+    nf_network(v, a, {{ "sign[0], " if along_motion }}{{ "known, " if by_class }}c);
 {% else %}
     for (k = 0; k < NF_COEFFICIENTS; ++k)
         for (j = 0; j < NF_JOINTS; ++j)

@@ -13,8 +13,8 @@
 /* Inputs GAIN x + SHIFT are in [-1, 1] within the trained range. */
 {{ table("gain", 2, "JOINTS") }}
 {{ table("shift", 2, "JOINTS") }}
-{% if along_motion or leans %}
-/* The direction is tanh(RATE qd){{ "; the acceleration counts along it" if along_motion }}. */
+{% if along_motion %}
+/* The acceleration counts along the motion: qdd tanh(RATE qd). */
 {{ table("rate", "JOINTS") }}
 {% endif %}
 /* The membership in set s of input i is exp(-(SET_SLOPE[s][i] x + SET_SHIFT[s][i])^2). */
@@ -28,10 +28,6 @@
 {{ table("unit_slope", "SEEN", "UNITS", "JOINTS") }}
 {{ table("unit_shift", "SEEN", "UNITS", "JOINTS") }}
 {{ table("unit_weight", "COEFFICIENTS", "UNITS", "JOINTS") }}
-{% if leans %}
-/* The coefficients differ by direction: LEAN more in one, LEAN less in the other. */
-{{ table("lean", "COEFFICIENTS", "JOINTS") }}
-{% endif %}
 {% if by_class %}
 /* The coefficients of every class of acceleration: what the network deviates from, and what is
  * added in the end so that without a network they are as they were. */
@@ -46,7 +42,7 @@
 
 static void nf_network(
     const REAL qd[NF_JOINTS], const REAL qdd[NF_JOINTS],
-{% if along_motion or leans %}
+{% if along_motion %}
     const REAL sign[NF_JOINTS],
 {% endif %}
 {% if by_class %}
@@ -118,7 +114,7 @@ static void nf_network(
     nf_exp(&unit[0][0], NF_UNITS * NF_JOINTS{{ spare(units * joints) }}, 0);
     for (k = 0; k < NF_COEFFICIENTS; ++k)
         for (j = 0; j < NF_JOINTS; ++j) {
-            REAL u = seen[2 + k][j]{{ " + NF_LEAN[k][j] * sign[j]" if leans }};
+            REAL u = seen[2 + k][j];
             for (s = 0; s < NF_UNITS; ++s)
                 u += NF_UNIT_WEIGHT[k][s][j] * unit[s][j];
             c[k][j] = NF_REFERENCE{{ "[known[j]]" if by_class }}[k][j] + trust[j] * u;
