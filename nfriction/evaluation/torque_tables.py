@@ -29,6 +29,7 @@ from nfriction.fitting.torque_table import (
     turning_velocity,
 )
 from nfriction.friction import model_by_name, model_name, plain_name
+from nfriction.friction.hysteresis import LOAD_SLIP, SLIP, unused
 from nfriction.friction.models import FrictionModel
 from nfriction.io.files import parse_json
 from nfriction.io.model_file import ModelInfo, load, load_info
@@ -182,7 +183,10 @@ class TorqueFits:
         return pd.DataFrame.from_dict(rows, orient="index").rename_axis("joint")
 
     def intervals(self, name: str | None = None) -> pd.DataFrame:
-        """Coefficients of a model, by default of those chosen: value, low and high of 95 %."""
+        """Coefficients of a model, by default of those chosen: value, low and high of 95 %.
+
+        Slip elements and terms that were not chosen are left out.
+        """
         import pandas as pd  # slow to import
 
         rows = []
@@ -193,8 +197,12 @@ class TorqueFits:
             values = found.model.schedule.coefficient_sets()
             known = {i.name: i for i in found.intervals}
             for where, of in values.items():
-                for c, value in zip(found.model.law.coefficients, of[0].tolist(), strict=True):
-                    label = f"{c.name} of {joint}"
+                named = dict(zip(found.model.law.names, of[0].tolist(), strict=True))
+                hidden = unused(named) if found.model.law in (SLIP, LOAD_SLIP) else set()
+                for symbol, value in named.items():
+                    if symbol in hidden:
+                        continue
+                    label = f"{symbol} of {joint}"
                     i = known.get(label)
                     note = "not identifiable" if label in unknown else ""
                     low, high = (i.low, i.high) if i else (math.nan, math.nan)

@@ -21,6 +21,7 @@ References:
     (Maxwell-slip elements); the drop F_d of the first element is Stribeck's.
 """
 
+from collections.abc import Mapping
 from functools import partial
 
 import torch
@@ -98,6 +99,13 @@ def hysteresis_law(name: str, *, loaded: bool, count: int = ELEMENTS) -> Law:
         partial(steady_hysteresis, loaded=loaded, count=count),
         memory=Memory(count + 1, advance_hysteresis, partial(hysteresis_torque, loaded=loaded)),
     )
+
+
+def unused(values: Mapping[str, float]) -> set[str]:
+    """Names of coefficients that add nothing: forces of zero, and what shapes their terms."""
+    shapes = {"f_a": "v_a", "F_d": "v_s"} | {f"F_{k}": f"d_{k}" for k in range(1, ELEMENTS + 1)}
+    found = {force for force in (*shapes, "A_v") if values[force] == 0.0}
+    return found | {shapes[force] for force in found & shapes.keys()}
 
 
 SLIP = hysteresis_law("slip", loaded=False)

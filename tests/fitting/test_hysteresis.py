@@ -64,6 +64,10 @@ def test_another_run_is_predicted_to_the_noise() -> None:
     scores = {name: float(found.score(other, name)["rmse"].iloc[0]) for name in found.fits}
     assert scores["Slip"] < 0.03
     assert min(e for name, e in scores.items() if name != "Slip") > 4 * scores["Slip"]
+    shown = found.intervals()["value"]
+    assert (shown[shown.index.str.match(r"F_\d")] != 0).all()
+    widths = shown.index.str.startswith("d_").sum() - 1
+    assert 0 < widths < ELEMENTS
     force = found.model("slip").schedule.values[0, FIRST : FIRST + ELEMENTS].sum()
     assert abs(float(force) - FORCES.sum()) < 0.1 * FORCES.sum()
 
