@@ -190,6 +190,7 @@ def test_warnings_and_intervals_of_fits_are_told(
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems refuse such a file name")
+@pytest.mark.slow
 def test_a_file_name_that_is_no_unicode_loses_no_fits(bench: Path, tmp_path: Path) -> None:
     odd, out = tmp_path / os.fsdecode(b"surr\xff.csv"), tmp_path / "out"
     shutil.copy(bench / "b.csv", odd)

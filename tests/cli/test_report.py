@@ -5,6 +5,7 @@ from pathlib import Path
 
 from nfriction import cli
 from nfriction.evaluation.results import COMPLETE
+from nfriction.friction import plain_name
 from tests.cli.benches import compare, results
 
 
@@ -16,7 +17,7 @@ def test_a_comparison_becomes_a_page(compared: Path, tmp_path: Path, capsys) -> 
     figures = list((compared / "figures").glob("*.png"))
     assert html.count("data:image/png;base64,") == len(figures) > 0
     best = results(compared)["best"]["model"]
-    assert f"<strong>{best}</strong> predicts" in html
+    assert f"<strong>{plain_name(best)}</strong> predicts" in html
     assert "nfriction compare" in html
 
 

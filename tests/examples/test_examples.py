@@ -57,7 +57,11 @@ NOTEBOOKS = sorted((FOLDER / "notebooks").glob("*.ipynb"))
 
 
 @pytest.mark.filterwarnings("ignore:.*looks like degrees")
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(p, marks=[pytest.mark.slow] * (p.stem == "free_swing")) for p in NOTEBOOKS],
+    ids=lambda path: path.stem,
+)
 def test_notebooks_run_from_top_to_bottom(path: Path) -> None:
     torch.set_num_threads(1)
     cells = json.loads(path.read_text(encoding="utf-8"))["cells"]

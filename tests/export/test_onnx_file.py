@@ -149,6 +149,7 @@ def test_hostile_files_are_refused(tmp_path: Path) -> None:
 
 
 @needs_onnx
+@pytest.mark.slow
 def test_a_graph_that_fills_the_memory_ends_in_an_error(tmp_path: Path) -> None:
     package: Any = pytest.importorskip("onnx")
     path = onnx(LFM(2), tmp_path / "m.onnx")

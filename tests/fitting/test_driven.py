@@ -173,7 +173,7 @@ def test_zeroed_at_rest_no_velocity_makes_up_for_friction_at_the_start():
     assert starts["per_recording"] < 4e-4 < starts["shared"]
 
 
-@pytest.mark.parametrize("kind", [ACVFM, NFCVFM])
+@pytest.mark.parametrize("kind", [ACVFM, pytest.param(NFCVFM, marks=pytest.mark.slow)])
 def test_models_that_follow_the_motion_take_the_zeros_of_their_constant_law(kind):
     plant = geared()
     law = CVFM(2, DRY, v_smooth=V_SMOOTH)
@@ -191,6 +191,7 @@ def test_models_that_follow_the_motion_take_the_zeros_of_their_constant_law(kind
         assert np.abs(motion.q - recording.joint_coordinates(plant).q).max() < 0.01
 
 
+@pytest.mark.slow
 def test_a_start_with_the_zeros_of_other_recordings_is_fitted_anew():
     plant = geared()
     law = CVFM(2, DRY, v_smooth=V_SMOOTH)
@@ -224,6 +225,7 @@ def test_load_dependent_friction_leaves_more_of_a_geared_mechanism_unexplained()
     assert plain.residual < 0.1 * loaded.residual
 
 
+@pytest.mark.slow
 def test_an_offset_that_the_law_does_not_expect_is_found_where_the_recording_tells_it():
     plant, offset = pendulum(), 4e-4
     truth = NLFM(2, [[offset, 2e-3, 1e-3, 0.0, 1.0]] * 2, v_smooth=V_SMOOTH)

@@ -193,6 +193,7 @@ def test_air_drag_is_told_from_joint_friction():
     assert errors[0] < 0.2 * errors[1]
 
 
+@pytest.mark.slow
 def test_windows_that_are_left_out_are_told(monkeypatch):
     monkeypatch.setattr(HorizonResult, "lost_motion", lambda self, before, options: True)
     recording = swing(pendulum(), true_model(), seconds=2.0)
@@ -474,6 +475,7 @@ def test_stribeck_friction_is_found_again():
     torch.testing.assert_close(found.model.schedule.values, truth, rtol=0.05, atol=0)
 
 
+@pytest.mark.slow
 def test_stribeck_friction_is_found_again_on_a_plant_that_is_a_tenth_off():
     recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH))
     given = PendulumChain([0.27, 0.22], [0.2, 0.15], inertia=[1.5e-3, 4e-4])
@@ -487,7 +489,7 @@ def mine(joints, **settings):
     return FrictionModel(law, Constant(law, joints), **settings)
 
 
-@pytest.mark.parametrize("law", [Stribeck, mine])
+@pytest.mark.parametrize("law", [Stribeck, pytest.param(mine, marks=pytest.mark.slow)])
 def test_a_law_that_torques_mislead_starts_anew_on_the_plant_that_it_found(
     misled, monkeypatch, law
 ):
@@ -508,6 +510,7 @@ def test_a_law_that_torques_mislead_starts_anew_on_the_plant_that_it_found(
     assert fitted().residual > 1.02 * found.residual
 
 
+@pytest.mark.slow
 def test_a_search_in_vain_from_the_simpler_law_leaves_the_model_as_it_was(monkeypatch):
     recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH))
     settings = {"windows": (0.5, 1.0), "fit_plant": False}
@@ -532,7 +535,8 @@ def test_a_search_in_vain_from_the_simpler_law_leaves_the_model_as_it_was(monkey
     assert found.residual == alone.residual
 
 
-@pytest.mark.parametrize("law", [Stribeck, pytest.param(NLFM, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("law", [Stribeck, NLFM])
 def test_a_law_leaves_no_more_over_than_the_simpler_one_in_it(law, monkeypatch):
     """However badly torques mislead it."""
 

@@ -97,6 +97,7 @@ def test_a_contact_that_the_step_resolves_is_solved_to_second_order() -> None:
     assert coarse / fine > 10.0  # 16 in the limit
 
 
+@pytest.mark.slow
 def test_a_contact_too_stiff_for_the_step_is_solved_to_first_order() -> None:
     coarse, fine = error(False, 50), error(False, 400)
     assert fine < 1e-3
