@@ -353,6 +353,8 @@ def _fit(
     """A model fitted to all rows of a joint, and its errors on blocks left out."""
     model = model_by_name(name)(1)
     form = model.schedule.form
+    # Of fewer rows each is left out once.
+    folds = min(folds, len(joint))
     if model.law.memory is not None:
         fit, left_out = fit_memory(name, joint, blocks(joint, folds), v_smooth)
         return fit, Candidate(name, left_out, len(fit.intervals), True)

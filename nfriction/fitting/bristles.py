@@ -247,7 +247,9 @@ def refined(law: Law, joint: JointTorque, start: Array) -> tuple[Array, Array, A
     for _ in range(MOST_STEPS):
         error = torque - joint.tau
         gram = slopes.T @ slopes
-        step = np.linalg.solve(gram + damping * np.diag(np.diag(gram)), -slopes.T @ error)
+        # The shortest step, as rows that only slide leave some coefficients undetermined.
+        damped = gram + damping * np.diag(np.diag(gram))
+        step = np.linalg.lstsq(damped, -slopes.T @ error, rcond=None)[0]
         trial = x.copy()
         trial[places] *= np.exp(np.clip(step, -0.5, 0.5))
         there, slopes_there = _linearised(law, joint, trial, places)

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfriction.io import formats
-from nfriction.io.formats.selection import canonical_unit, is_unit, parse_source, to_si
+from nfriction.io.formats.selection import canonical_unit, is_unit, parse_source, slides, to_si
 from nfriction.recording.record import Unit
+from nfriction.recording.validation import turns_between_samples
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -178,6 +179,7 @@ class TorqueTable:
             raise ValueError(f'`unit` must be "rad" or "m", got {unit!r}.')
         table = table.set_axis([str(name) for name in table.columns], axis=1)
         sources = _sources(table, columns or {})
+        _require_unit(unit, sources)
         values = {
             key: _numbers(table, key[0], *source, degrees=degrees)
             for key, source in sources.items()
@@ -196,6 +198,8 @@ class TorqueTable:
             parts.append({key: None if x is None else x[rows] for key, x in found.items()})
         remarks: list[str] = []
         joints = [_joint(*pair, remarks) for pair in zip(names, parts, strict=True)]
+        if unit == "rad":
+            remarks += filter(None, map(_wrapped, joints))
         if unit == "rad" and not degrees:
             fast = [j.name for j in joints if np.abs(j.qd).max() > FAST]
             if fast:
@@ -241,6 +245,31 @@ def _sources(table: pd.DataFrame, columns: Mapping[str, str]) -> dict[_Key, tupl
     return found
 
 
+def _require_unit(unit: Unit, sources: Mapping[_Key, tuple[str, str | None]]) -> None:
+    """Raise ValueError where a column's own unit is not of such positions."""
+    for (key, _), (column, own) in sources.items():
+        if key in ("q", "qd") and own and is_unit(own):
+            found = "m" if slides(canonical_unit(own).removesuffix("/s")) else "rad"
+            if found != unit:
+                raise ValueError(
+                    f"`unit` is {unit!r}, but column {column} is in {canonical_unit(own)}; read "
+                    f"the table with `unit={found!r}` (`--unit {found}`)."
+                )
+
+
+def _wrapped(joint: JointTorque) -> str | None:
+    """A doubt about positions that jump by a turn."""
+    if joint.q is None or joint.time is None:
+        return None
+    (jumps,) = turns_between_samples(joint.q[:, None], np.empty(0, dtype=np.intp))
+    if not jumps:
+        return None
+    return (
+        f"q of {joint.name} looks wrapped ({jumps} jumps of about a turn); if so, unwrap it with "
+        "`numpy.unwrap`."
+    )
+
+
 def _key(name: str) -> _Key | None:
     """Our name and the joint's number, 0 for none, of a column's name."""
     for key, pattern in _KEYS.items():
@@ -282,7 +311,14 @@ def _parts(
             "a table with a column joint has one qd and one tau, this one has tau"
             f"{numbers[-1]}, too; drop the column joint."
         )
-    labels = table[sources["joint", 0][0]].astype(str).str.strip().to_numpy()
+    column = table[sources["joint", 0][0]]
+    if column.isna().any():
+        row = int(np.flatnonzero(column.isna())[0])
+        raise ValueError(
+            f"column {column.name}, row {row} (counted from 0 below the header) names no joint; "
+            "fill or drop such rows."
+        )
+    labels = column.astype(str).str.strip().to_numpy()
     for label in dict.fromkeys(labels):
         name = f"joint{label}" if re.fullmatch(r"\d+", label) else label
         yield name, np.flatnonzero(labels == label), 0
@@ -349,6 +385,11 @@ def _joint(name: str, of: Mapping[str, Array | None], remarks: list[str]) -> Joi
         )
     if np.ptp(tau) == 0.0:
         raise ValueError(f"the friction torque of {name} is {tau[0]:g} in every row.")
+    if float(tau @ qd) < 0.0:
+        remarks.append(
+            f"The friction torque of {name} drives the joint on average, as one of the wrong sign "
+            "does: it is read as positive with positive velocity. If so, reverse it."
+        )
     return JointTorque(name, qd, tau, time, q, qdd, of["load"], of["temperature"])
 
 

@@ -159,7 +159,7 @@ def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> list[tuple
                 'columns={"q1": "q1:counts/8192"}',
             )
         )
-    jumps = _turns_between_samples(q, pauses)
+    jumps = turns_between_samples(q, pauses)
     if jumps.any():
         wrapped = ", ".join(name for name, n in zip(names, jumps, strict=True) if n)
         found.append(
@@ -171,7 +171,7 @@ def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> list[tuple
     return found
 
 
-def _turns_between_samples(q: Array, pauses: NDArray[np.intp]) -> NDArray[np.intp]:
+def turns_between_samples(q: Array, pauses: NDArray[np.intp]) -> NDArray[np.intp]:
     """Jumps of about a turn between short steps, (joint,): no joint starts and stops so fast."""
     step = np.abs(np.diff(q, axis=0))
     # Across a gap any number of turns is possible.

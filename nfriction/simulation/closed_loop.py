@@ -66,8 +66,8 @@ class Electronics:
     def __post_init__(self) -> None:
         if self.counts is not None and not self.counts > 0:
             raise ValueError(f"`counts` must be positive, got {self.counts}.")
-        if self.delay < 0:
-            raise ValueError(f"`delay` must not be negative, got {self.delay} samples.")
+        if not isinstance(self.delay, int) or self.delay < 0:
+            raise ValueError(f"`delay` must be a whole number of samples, got {self.delay!r}.")
         if not self.torque_limit > 0:
             raise ValueError(f"`torque_limit` must be positive [N m], got {self.torque_limit}.")
         if self.torque_bits is not None and not (
@@ -183,7 +183,8 @@ def control(
         # A motion that is lost must not reach the controllers of the others.
         lost = ~(torch.isfinite(q) & (qd.abs() < SPEED_LIMIT)).all(-1)
         if bool(lost.any()):
-            diverged_at = torch.where(lost, diverged_at.clamp_max(time), diverged_at)
+            # The sample after this one, as of a rollout.
+            diverged_at[lost] = diverged_at[lost].clamp_max((k + 1) * electronics.sample_time)
             q = torch.where(lost[..., None], given.q0, q)
             qd = torch.where(lost[..., None], torch.zeros_like(qd), qd)
     seconds = electronics.sample_time * torch.arange(steps + 1, dtype=q.dtype)

@@ -84,8 +84,11 @@ def memory_step(
     # Held like the torque: a load that changes within a step is of the step's own order.
     load, zero = plant.load(q, qd), torch.zeros_like(qd)
     mobility = _mobility(plant, q, zero)
-    at_rest = law.advance(torch.zeros_like(state), zero + SLOW, load, coefficients, step)
-    steepest = law.torque(at_rest, zero + SLOW, load, coefficients) / SLOW
+    at_ease = torch.zeros_like(state)
+    moved = law.advance(at_ease, zero + SLOW, load, coefficients, step)
+    # A constant offset of the torque is no part of the slope.
+    offset = law.torque(at_ease, zero, load, coefficients)
+    steepest = (law.torque(moved, zero + SLOW, load, coefficients) - offset) / SLOW
     stiffness = step * torch.stack([row[j] for j, row in enumerate(mobility)], -1) * steepest
     theta = (1.0 + stiffness) / (2.0 + stiffness)
     reach = theta * step

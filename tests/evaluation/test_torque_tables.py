@@ -115,6 +115,14 @@ def two_joints() -> pd.DataFrame:
     })  # fmt: skip
 
 
+def test_of_few_rows_each_is_left_out_once() -> None:
+    qd = np.array([-1.0, -0.7, -0.4, -0.1, 0.1, 0.4, 0.7, 1.0])
+    tau = 0.3 * np.sign(qd) + 0.1 * qd + 1e-3 * np.random.default_rng(0).normal(size=8)
+    found = fit_torque(pd.DataFrame({"qd": qd, "tau": tau}), "coulomb-viscous", folds=10)
+    assert len(found.candidates["joint1"][0].errors) == 8
+    assert 0 < found.to_frame().loc["joint1", "CVFM"] < 0.02
+
+
 def test_every_file_of_a_run_predicts_as_the_fit_does(tmp_path: Path) -> None:
     table = two_joints()
     models = "coulomb-viscous,load-coulomb,stribeck,neuro-fuzzy:coulomb"

@@ -59,6 +59,15 @@ def test_rows_without_presliding_do_not_determine_the_stiffness() -> None:
     assert seen.intervals().loc["sigma_0 of joint1", "note"] == ""
 
 
+def test_rows_that_only_slide_are_fitted() -> None:
+    time = np.arange(1000) * 0.02
+    qd = np.where(time < 10.0, 1.0, -0.9) * (1.5 + 0.5 * np.sin(0.7 * time))
+    tau = 0.3 * np.sign(qd) + 0.1 * qd + 0.005 * np.random.default_rng(0).normal(size=len(time))
+    found = fit_torque(pd.DataFrame({"time": time, "qd": qd, "tau": tau}), "lugre", folds=2)
+    assert found.to_frame().loc["joint1", "LuGre"] < 0.1
+    assert "sigma_0 of joint1" in found.fits["LuGre"][0].unidentifiable
+
+
 def test_maxwell_slip_is_referred_to_slip() -> None:
     with pytest.raises(ValueError, match="use slip"):
         fit_torque(table_of("Dahl"), "maxwell-slip", folds=4)

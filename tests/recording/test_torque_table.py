@@ -63,6 +63,7 @@ def test_velocity_comes_from_positions_in_time() -> None:
         (table().iloc[:5], "joint1 has 5 rows; at least 8"),
         (table(torque=QD), "both are tau; rename one"),
         (table(joint=1, qd2=QD, tau2=QD), "drop the column joint"),
+        (table(joint=[1.0] * 19 + [np.nan]), "column joint, row 19 .* names no joint"),
     ],
 )
 def test_what_is_no_table_is_refused(given: pd.DataFrame, message: str) -> None:
@@ -79,7 +80,21 @@ def test_wrong_names_of_columns_are_refused() -> None:
         TorqueTable.from_pandas(table(), unit="deg")  # type: ignore[arg-type]
 
 
+def test_a_unit_of_sliding_joints_needs_to_be_stated(tmp_path: Path) -> None:
+    path = tmp_path / "axis.csv"
+    table(qd=1e3 * QD).rename(columns={"qd": "qd [mm/s]"}).to_csv(path, index=False)
+    with pytest.raises(ValueError, match=r"column qd .*is in mm/s; .*--unit m"):
+        TorqueTable.read(path)
+    np.testing.assert_allclose(TorqueTable.read(path, unit="m").joints[0].qd, QD)
+
+
 def test_doubts_are_remarked() -> None:
+    reversed_sign = TorqueTable.from_pandas(table(tau=-np.sign(QD) - QD))
+    assert "wrong sign" in reversed_sign.remarks[0]
+    time = np.arange(2000) * 0.01
+    q = (3.0 * time + np.pi) % (2 * np.pi) - np.pi
+    wheel = {"time": time, "q": q, "qd": 3.0, "tau": 1.0 + q}
+    assert "looks wrapped (10 jumps" in TorqueTable.from_pandas(pd.DataFrame(wheel)).remarks[-1]
     one_way = TorqueTable.from_pandas(table(qd=np.abs(QD), tau=np.abs(QD)))
     assert "one direction only" in one_way.remarks[0]
     fast = TorqueTable.from_pandas(table(qd=np.rad2deg(2 * QD)))

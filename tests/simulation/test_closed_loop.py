@@ -73,6 +73,8 @@ def test_what_diverges_is_lost_and_the_others_go_on() -> None:
 
     found = control(PLANT, friction(), controller, starts, 0 * starts, steps=20)
     assert found.diverged.tolist() == [True, False]
+    again = rollout(PLANT, friction(), starts, 0 * starts, found.tau)
+    torch.testing.assert_close(found.diverged_at, again.diverged_at)
     assert torch.isnan(found.q[0, -1]).all()
     assert torch.isfinite(found.q[1]).all()
 
@@ -84,7 +86,8 @@ def test_a_torque_that_is_none_is_refused(bad: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [{"counts": 0}, {"delay": -1}, {"torque_limit": 0.0}, {"torque_bits": 8}]
+    "options",
+    [{"counts": 0}, {"delay": -1}, {"delay": 1.5}, {"torque_limit": 0.0}, {"torque_bits": 8}],
 )
 def test_electronics_refuse_nonsense(options: dict) -> None:
     with pytest.raises(ValueError, match=next(iter(options))):

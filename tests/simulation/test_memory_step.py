@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from nfriction import LFM, LinearAxis, PendulumChain, Recording, Stribeck, load, rollout, save
 from nfriction.evaluation.score import score
+from nfriction.friction.hysteresis import ELEMENTS, FIRST, OFFSET, VISCOUS, Slip
 from nfriction.friction.memory import (
     LUGRE,
     Dahl,
@@ -165,6 +166,20 @@ def test_friction_never_feeds_energy_into_a_free_mechanism(name: str) -> None:
     assert float(total.diff().max()) < 2e-3 * swing
     assert float((total - total.cummin(0).values).max()) < 5e-3 * swing
     assert float(kinetic[-1]) < 1e-3 * swing
+
+
+@pytest.mark.parametrize("offset", [0.1, -0.1, -2e-8])
+def test_a_torque_that_cancels_an_offset_leaves_the_motion_as_it_is(offset: float) -> None:
+    def motion(offset: float) -> Tensor:
+        model = Slip(1).requires_grad_(False)
+        c = model.schedule.parameter_vector().clone()
+        c[OFFSET], c[VISCOUS], c[FIRST] = offset, 0.05, 0.3
+        c[FIRST + ELEMENTS] = 0.02
+        model.schedule.set_parameter_vector(c)
+        push = 0.5 * torch.sin(4 * math.pi * 1e-3 * torch.arange(500, dtype=F64)) + offset
+        return rollout(LinearAxis(0.02), model, REST[:1], REST[:1], push[:, None]).q
+
+    torch.testing.assert_close(motion(offset), motion(0.0), rtol=0, atol=1e-9)
 
 
 def test_a_joint_holds_on_a_slope_without_creep() -> None:
