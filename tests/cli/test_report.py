@@ -17,7 +17,7 @@ def test_a_comparison_becomes_a_page(compared: Path, tmp_path: Path, capsys) -> 
     figures = list((compared / "figures").glob("*.png"))
     assert html.count("data:image/png;base64,") == len(figures) > 0
     best = results(compared)["best"]["model"]
-    assert f"<strong>{plain_name(best)}</strong> predicts" in html
+    assert f"<strong>{best}</strong> ({plain_name(best)}) predicts" in html
     assert "nfriction compare" in html
 
 
