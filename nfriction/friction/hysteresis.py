@@ -28,6 +28,7 @@ import torch
 from torch import Tensor
 
 from nfriction.friction.laws import Coefficient, Law, Memory, smooth_sign
+from nfriction.friction.memory import Duration
 from nfriction.friction.models import ConstantModel
 
 ELEMENTS = 12
@@ -36,32 +37,36 @@ OFFSET, VISCOUS, ASYMMETRY, SATURATING, TURN, DROP, STRIBECK, FADING, START, FIR
 
 
 def advance_hysteresis(
-    state: Tensor, qd: Tensor, load: Tensor, coefficients: Tensor, time_step: float | Tensor
+    state: Tensor, qd: Tensor, load: Tensor, coefficients: Tensor, time_step: Duration
 ) -> Tensor:
     """Deflections over their widths, clipped where elements slip, and the rest's excess."""
     count = state.shape[-1] - 1
     path = (qd * time_step).unsqueeze(-1)
-    width = coefficients[..., FIRST + count : FIRST + 2 * count]
+    # Places are written out here and below, as TorchScript takes no global.
+    width = coefficients[..., 9 + count : 9 + 2 * count]
     elements = (state[..., :count] + path / width).clamp(-1.0, 1.0)
-    fading = coefficients[..., FADING : FADING + 1]
+    fading = coefficients[..., 7:8]
     excess = state[..., count:] * torch.exp(-path.abs() / fading)
     return torch.cat([elements, excess], -1)
 
 
-def hysteresis_torque(
-    state: Tensor, qd: Tensor, load: Tensor, coefficients: Tensor, *, loaded: bool
-) -> Tensor:
-    """Torque of the elements and of the velocity."""
+def hysteresis_torque(state: Tensor, qd: Tensor, load: Tensor, coefficients: Tensor) -> Tensor:
+    """Torque of the elements and of the velocity, at any load."""
+    return load_hysteresis_torque(state, qd, torch.ones_like(qd), coefficients)
+
+
+def load_hysteresis_torque(state: Tensor, qd: Tensor, load: Tensor, coefficients: Tensor) -> Tensor:
+    """Torque of the elements and of the velocity, in proportion to the load."""
     count = state.shape[-1] - 1
-    offset, viscous, skew, saturating, turn, drop, stribeck = coefficients[..., :FADING].unbind(-1)
+    offset, viscous, skew, saturating, turn, drop, stribeck = coefficients[..., :7].unbind(-1)
     fading = torch.exp(-(qd / stribeck).square())
     friction = (
         saturating * torch.tanh(qd / turn)
         + drop * fading * state.select(-1, 0)
-        + (coefficients[..., FIRST : FIRST + count] * state[..., :count]).sum(-1)
+        + (coefficients[..., 9 : 9 + count] * state[..., :count]).sum(-1)
     )
-    scaled = load * friction if loaded else friction
-    return offset + viscous * qd + skew * qd.abs() + scaled + state.select(-1, count)
+    smooth = offset + viscous * qd + skew * qd.abs()
+    return smooth + load * friction + state.select(-1, count)
 
 
 def steady_hysteresis(
@@ -70,7 +75,8 @@ def steady_hysteresis(
     """Torque at a constant velocity, with all elements slipping."""
     sign = smooth_sign(qd, v_smooth).unsqueeze(-1)
     state = torch.cat([sign.expand(*qd.shape, count), torch.zeros_like(sign)], -1)
-    return hysteresis_torque(state, qd, load, coefficients, loaded=loaded)
+    torque = load_hysteresis_torque if loaded else hysteresis_torque
+    return torque(state, qd, load, coefficients)
 
 
 def hysteresis_law(name: str, *, loaded: bool, count: int = ELEMENTS) -> Law:
@@ -97,7 +103,12 @@ def hysteresis_law(name: str, *, loaded: bool, count: int = ELEMENTS) -> Law:
             ),
         ),
         partial(steady_hysteresis, loaded=loaded, count=count),
-        memory=Memory(count + 1, advance_hysteresis, partial(hysteresis_torque, loaded=loaded)),
+        # No partial, which TorchScript would not compile.
+        memory=Memory(
+            count + 1,
+            advance_hysteresis,
+            load_hysteresis_torque if loaded else hysteresis_torque,
+        ),
     )
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from nfriction import ModelInfo, export
 from nfriction.export.c_code.export import c_runner, find_compiler
 from nfriction.friction.coefficients import Constant
+from nfriction.friction.hysteresis import ELEMENTS, LoadSlip, Slip
 from nfriction.friction.laws import Coefficient, Law, Memory
 from nfriction.friction.memory import Dahl, ElastoPlastic, LuGre, MaxwellSlip
 from nfriction.friction.models import FrictionModel
@@ -19,11 +20,15 @@ from nfriction.friction.sampled import sampled
 F64 = torch.float64
 STEP = 2e-3
 INFO = ModelInfo(sample_time=STEP)
+HYSTERESIS = [0.1, 0.2, 0.05, 0.3, 0.1, 0.2, 0.03, 1e-3, 0.0]
+HYSTERESIS += [*[0.05] * ELEMENTS, *[10.0 ** (0.2 * k - 4) for k in range(ELEMENTS)]]
 MODELS: dict[str, FrictionModel] = {
     "lugre": LuGre(2, [[1.0, 0.5, 0.001, 1e5, 300.0, 0.4], [0.3, 0.1, 0.01, 1e3, 1.0, 0.1]]),
     "elasto-plastic": ElastoPlastic(2, [1.0, 0.5, 0.001, 1e5, 300.0, 0.4, 0.7]),
     "dahl": Dahl(2, [0.5, 0.1, 1e3]),
-    "slip": MaxwellSlip(2, elements=3),
+    "maxwell-slip": MaxwellSlip(2, elements=3),
+    "slip": Slip(2, HYSTERESIS),
+    "load-slip": LoadSlip(2, HYSTERESIS),
 }
 every_model = pytest.mark.parametrize("name", MODELS)
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
