@@ -56,6 +56,8 @@ class Rotor(PendulumChain):
                 f"`inertia` is about the axis and at least mass com^2 = {mass * com**2:.4g} "
                 f"kg m^2, got {inertia:g}."
             )
+        if not isinstance(motor, Motor | None):
+            raise TypeError(f"`motor` must be a Motor(gear_ratio, ...) or None, got {motor!r}.")
         # All inertia in one number, for none of its parts is identifiable beside the others.
         rotor = 0.0 if motor is None else float(motor.reflected_inertia(1))
         if not inertia + rotor > 0:

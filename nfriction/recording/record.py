@@ -276,12 +276,20 @@ class Recording:
         """
         attributes = table.attrs
         convention = attributes.get("convention") if convention is None else convention
-        arrays, slides, remarks = formats.table_arrays(
+        arrays, slides, remarks, of_motors = formats.table_arrays(
             table,
             columns,
             degrees=degrees,
             motor_factors=None if plant is None else plant.motor_factors,
         )
+        if of_motors and plant is not None and arrays["q"].shape[1] > plant.first_link + 1:
+            angles = AngleConvention.of(plant if convention is None else convention).angles
+            if angles == "absolute":
+                raise ValueError(
+                    "motors turn their joints, so their angles are relative to the link before, but "
+                    "the convention is absolute; give a relative one, such as "
+                    "`convention=('relative', 'hanging')`."
+                )
         found: Unit | None = None if slides is None else "m" if slides else "rad"
         written = attributes.get("unit")
         # The file's own word for what `degrees` states.

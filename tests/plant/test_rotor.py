@@ -3,10 +3,13 @@
 import json
 import math
 
+import numpy as np
+import pandas as pd
 import pytest
 import torch
 
 from nfriction.plant import LinearAxis, Motor, PendulumChain, Rotor, rigs
+from nfriction.recording import Recording
 
 GEARED = Motor(gear_ratio=50, rotor_inertia=1.2e-5, torque_constant=0.03)
 
@@ -100,3 +103,24 @@ def test_a_rig_by_name_file_or_itself(tmp_path) -> None:
     assert rigs.of(tmp_path / "rig.json").to_dict() == rotor.to_dict()
     with pytest.raises(TypeError, match="`plant` must be a mechanism"):
         rigs.of([rotor])  # type: ignore[arg-type]
+
+
+def test_motors_of_several_links_are_no_absolute_angles() -> None:
+    time = np.arange(200) * 1e-3
+    table = pd.DataFrame({"time": time, "motor1": 10 * np.sin(time), "motor2": 20 * np.sin(time)})
+
+    def arm(*convention: str) -> PendulumChain:
+        return PendulumChain([1.0, 0.5], [0.3, 0.2], motor=Motor(10.0), convention=convention)
+
+    with pytest.raises(ValueError, match="relative to the link before"):
+        Recording.from_pandas(table, plant=arm("absolute", "hanging"))
+    plant = arm("relative", "hanging")
+    with pytest.raises(ValueError, match="relative to the link before"):
+        Recording.from_pandas(table, plant=plant, convention="absolute,hanging")
+    q = Recording.from_pandas(table, plant=plant).q
+    np.testing.assert_allclose(q, np.stack([np.sin(time), 2 * np.sin(time)], 1))
+
+
+def test_a_motor_of_a_rotor_is_a_motor() -> None:
+    with pytest.raises(TypeError, match="must be a Motor"):
+        Rotor(0.02, motor={"gear_ratio": 5})  # type: ignore[arg-type]

@@ -70,11 +70,13 @@ class Arrays(NamedTuple):
         values: time, q; qd where every joint has it; tau where any has, zero for the others.
         slides: whether positions are lengths; None if unknown.
         remarks: doubts about the choice of columns, and the remedy of each.
+        of_motors: True if positions follow from the angles of motors.
     """
 
     values: dict[str, Array]
     slides: bool | None
     remarks: tuple[tuple[str, str], ...] = ()
+    of_motors: bool = False
 
 
 def table_arrays(
@@ -133,7 +135,8 @@ def table_arrays(
     if len(kinds) > 1:
         raise ValueError(f"positions must all be angles or all be lengths, got {', '.join(units)}.")
     remarks = (*undecided, *_remarks(table, sources, joints))
-    return Arrays(arrays, kinds.pop() if kinds else None, remarks)
+    of_motors = any(source.motor == "motor" for source in sources.values())
+    return Arrays(arrays, kinds.pop() if kinds else None, remarks, of_motors)
 
 
 def parse_source(spec: str, names: set[str]) -> Source | None:
