@@ -286,8 +286,8 @@ class Recording:
             angles = AngleConvention.of(plant if convention is None else convention).angles
             if angles == "absolute":
                 raise ValueError(
-                    "motors turn their joints, so their angles are relative to the link before, but the"
-                    " convention is absolute; give a relative one, such as "
+                    "motors turn their joints, so their angles are relative to the link before, "
+                    "but the convention is absolute; give a relative one, such as "
                     "`convention=('relative', 'hanging')`."
                 )
         found: Unit | None = None if slides is None else "m" if slides else "rad"
