@@ -132,6 +132,7 @@ def test_a_block_left_out_has_the_zero_of_its_recording():
         assert block_errors(replace(found, encoder_offsets=()), [block], 0.5)[0] > 5 * error
 
 
+@pytest.mark.slow
 def test_recordings_that_all_begin_at_rest_at_zero_are_taken_for_zeroed_there():
     plant = geared()
     law = CVFM(2, DRY, v_smooth=V_SMOOTH)
@@ -160,6 +161,7 @@ def test_recordings_that_all_begin_at_rest_at_zero_are_taken_for_zeroed_there():
     assert not fit(CVFM(2), plant, free, windows=(0.5,), max_steps=1).encoder_offsets
 
 
+@pytest.mark.slow
 def test_zeroed_at_rest_no_velocity_makes_up_for_friction_at_the_start():
     """A law with too smooth a sign lets the links creep away; a free start would hide it."""
     plant = geared()

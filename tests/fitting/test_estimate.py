@@ -558,7 +558,11 @@ def test_a_law_leaves_no_more_over_than_the_simpler_one_in_it(law, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "last", ["0.5 s windows, coulomb_viscous law", "from the coulomb_viscous law"]
+    "last",
+    [
+        pytest.param("0.5 s windows, coulomb_viscous law", marks=pytest.mark.slow),
+        "from the coulomb_viscous law",
+    ],
 )
 def test_what_stops_a_further_search_stops_the_fit_and_keeps_the_best(last):
     recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH), seconds=2.0)

@@ -81,6 +81,7 @@ def test_a_law_without_memory_is_chosen_where_there_is_none() -> None:
     assert found.chosen == {"joint1": "CVFM"}
 
 
+@pytest.mark.slow
 def test_friction_in_proportion_to_the_load_is_recognised() -> None:
     load = np.linspace(0.2, 2.0, 1500)
     found = fit_torque(slip_table(load=load), folds=5)
