@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nfriction.fitting.hysteresis import TOLERANCE, path_of, range_of
+from nfriction.fitting.hysteresis import TOLERANCE, MemoryFit, path_of, range_of
 from nfriction.friction.laws import Law
 from nfriction.recording.torque_table import JointTorque
 
@@ -34,28 +34,7 @@ MOST_STEPS, DIFFERENCE = 15, 1e-4
 MOST_NUMBERS = 2_000_000
 
 
-@dataclass(frozen=True)
-class BristleFit:
-    """A bristle law that was fitted to a joint.
-
-    Attributes:
-        coefficients: of the law, (coefficient,).
-        errors: root mean square error on each block left out [N m; N].
-        torque: predicted at all rows, (row,).
-        design: torque per unit of each fitted coefficient, (row, fitted).
-        fitted: places of these among the coefficients.
-        presliding: False where no stiffness explains the rows better than a stiff joint does.
-    """
-
-    coefficients: Array
-    errors: tuple[float, ...]
-    torque: Array
-    design: Array
-    fitted: tuple[int, ...]
-    presliding: bool
-
-
-def fit_bristles(law: Law, joint: JointTorque, blocks: Sequence[NDArray[np.intp]]) -> BristleFit:
+def fit_bristles(law: Law, joint: JointTorque, blocks: Sequence[NDArray[np.intp]]) -> MemoryFit:
     """Fit a law of one bristle to the rows of a joint in order of time.
 
     Args:
@@ -144,7 +123,7 @@ class _Bundle:
 
     def result(
         self, law: Law, joint: JointTorque, blocks: Sequence[NDArray[np.intp]], stiffest: float
-    ) -> BristleFit:
+    ) -> MemoryFit:
         whole = self.whole
         errors = []
         for k, block in enumerate(blocks):
@@ -164,7 +143,7 @@ class _Bundle:
             coefficients[law.names.index(name)] = scaled
         coefficients[list(self.places)] = forces
         coefficients, torque, slopes, fitted = refined(law, joint, coefficients)
-        return BristleFit(
+        return MemoryFit(
             coefficients, tuple(errors), torque, slopes, tuple(fitted),
             bool(costs[best] * (1 + TOLERANCE) ** 2 < stiffest),
         )  # fmt: skip

@@ -48,8 +48,8 @@ START_ROWS = 3000
 
 
 @dataclass(frozen=True)
-class SlipFit:
-    """Slip elements and terms of the velocity that were fitted to a joint.
+class MemoryFit:
+    """A law with memory that was fitted to a joint.
 
     Attributes:
         coefficients: of the law, (coefficient,).
@@ -57,6 +57,7 @@ class SlipFit:
         torque: predicted at all rows, (row,).
         design: torque per unit of each fitted coefficient, (row, fitted).
         fitted: places of these among the coefficients.
+        presliding: False where no stiffness explains the rows better than a stiff joint does.
     """
 
     coefficients: Array
@@ -64,6 +65,7 @@ class SlipFit:
     torque: Array
     design: Array
     fitted: tuple[int, ...]
+    presliding: bool = True
 
 
 def path_of(joint: JointTorque) -> Array:
@@ -98,7 +100,7 @@ def deflections(path: Array, widths: Array, start: Array, every: int = 1) -> Arr
     return found
 
 
-def fit_slip(joint: JointTorque, blocks: Sequence[NDArray[np.intp]], *, loaded: bool) -> SlipFit:
+def fit_slip(joint: JointTorque, blocks: Sequence[NDArray[np.intp]], *, loaded: bool) -> MemoryFit:
     """Fit the law `friction.hysteresis` to the rows of a joint in order of time.
 
     Args:
@@ -312,7 +314,7 @@ class _Dictionary:
 
     def result(
         self, choice: _Choice, widths: Array, errors: Sequence[float], start: float
-    ) -> SlipFit:
+    ) -> MemoryFit:
         """Coefficients of the law."""
         n, forces = len(self.velocities), choice.weights[6:]
         turn, drop = (
@@ -336,7 +338,7 @@ class _Dictionary:
         torque = design @ choice.weights[kept]
         own = [i for i, k in enumerate(kept) if of[k] >= 0]
         fitted = tuple(of[kept[i]] for i in own)
-        return SlipFit(coefficients, tuple(errors), torque, design[:, own], fitted)
+        return MemoryFit(coefficients, tuple(errors), torque, design[:, own], fitted)
 
 
 def _weights(gram: Array, right: Array, shape: _Shape) -> Array:

@@ -10,12 +10,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nfriction.fitting.bristles import BristleFit, fit_bristles
+from nfriction.fitting.bristles import fit_bristles
 from nfriction.fitting.equation_error import TorqueBalance, regress
 from nfriction.fitting.hysteresis import (
     LEAD_IN,
     PATHS,
-    SlipFit,
     fit_slip,
     path_of,
     range_of,
@@ -182,7 +181,6 @@ def fit_memory(
         )
     require_load(name, joint)
     unknown: tuple[str, ...] = ()
-    found: SlipFit | BristleFit
     if "sigma_0" in model.law.names:
         found = fit_bristles(model.law, joint, blocks)
         if not found.presliding:

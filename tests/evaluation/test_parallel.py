@@ -87,7 +87,7 @@ def test_an_error_names_its_piece_and_keeps_its_kind(jobs: int) -> None:
 
 
 def test_the_callers_backend_does_the_work() -> None:
-    """Such as a Dask cluster's; threads of this process are told apart as easily."""
+    """Such as a Dask cluster's; threads of this process show the same."""
     joblib = pytest.importorskip("joblib")
     with joblib.parallel_config(backend="threading"):
         found = dict(parallel.as_completed(whereabouts, {"a": (1.0,), "b": (2.0,)}, jobs=2))

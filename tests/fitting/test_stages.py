@@ -121,7 +121,7 @@ def test_long_windows_do_not_lose_the_friction_that_short_ones_found():
 
 
 def test_a_free_swing_keeps_what_short_windows_found():
-    """Where rounding explains the short windows, the law is right, and no other is better."""
+    """A law whose error on short windows is the rounding is not given up for a worse one."""
     search, problem = short_search()
     found = search.search(problem, problem.variables.start(), 1e-9, "")
     assert found.explained

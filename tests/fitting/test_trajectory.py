@@ -75,7 +75,7 @@ def misfit(p: ShootingProblem, x: torch.Tensor) -> torch.Tensor:
 OFFSETS = torch.full((2, 2), 0.05, dtype=F64)
 
 
-# Columns of a network and of offsets are told apart where both are there.
+# Both are there in some cases, so that columns of a network and of offsets cannot be confused.
 @pytest.mark.parametrize(
     ("name", "offset_sd"), [("LFM", None), ("LFM", OFFSETS), ("NFLFM", OFFSETS)]
 )

@@ -95,7 +95,7 @@ def looks(tmp_path_factory: pytest.TempPathFactory) -> list[dict]:
 
 
 def found_in_browser(page: Path, profile: Path, *options: str) -> Any:
-    """What the page posts; the browser stays open until it does, however slow the machine is."""
+    """The page's report; the browser stays open until the page has posted it."""
     answers: Queue[bytes] = Queue()
 
     class Handler(SimpleHTTPRequestHandler):
