@@ -11,6 +11,7 @@ law and a schedule.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import torch
@@ -144,6 +145,10 @@ class Schedule(nn.Module, ABC):
     @abstractmethod
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
         """Derivatives of the coefficients at motions of shape (sample, joint)."""
+
+    def motion_sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
+        """Those by velocity and acceleration alone."""
+        return replace(self.sensitivities(qd, qdd), factors=())
 
     def sensitivities_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Sensitivity:
         """Derivatives of `coefficients_from` at a fixed hidden state (sample, joint, state)."""

@@ -109,24 +109,45 @@ class ShootingProblem:
     def linearise(self, x: Tensor) -> Quadratic:
         """Cost, gradient and Gauss-Newton Hessian at `x` from one simulation."""
         run, indices = self._simulate(x, with_memory=True), self.variables.indices()
-        pieces = propagate(self.jacobian, run, self.substeps, self.stride)
-        errors = self._deviation(x, run)
-        scale = self._scale * self.loss.weight(errors).sqrt()
-        rows, errors = scaled_rows(pieces, scale, self.measurement, indices), errors * scale
-        gradient, hessian, ends = normal_equations(rows, errors, indices, len(x))
-        if self.pairs:
-            defects = self._defects(x, run)
-            add_defects(gradient, hessian, defects, ends, self.pairs, indices, self._defect_sd)
+        gradient, hessian = self._normal_equations(x, run, indices, len(x))
         if self.extrapolation is not None:
             slope, curvature = self.extrapolation.normal_equations(run.friction.schedule)
             gradient[: len(slope)] += slope
             hessian[: len(slope), : len(slope)] += curvature
+        return self._quadratic(x, run, gradient, hessian, self.variables.shared_count)
+
+    def linearise_states(self, x: Tensor) -> Quadratic:
+        """The same by the states and offsets of windows alone, far cheaper for many parameters."""
+        run, count = self._simulate(x, with_memory=True), self.variables.shared_count
+        indices = self.variables.indices() - count
+        gradient, hessian = self._normal_equations(x, run, indices, len(x) - count)
+        return self._quadratic(x, run, gradient, hessian, 0)
+
+    def _normal_equations(
+        self, x: Tensor, run: Trajectory, indices: Tensor, size: int
+    ) -> tuple[Tensor, Tensor]:
+        """Gradient and Hessian of errors and defects by the last `size` variables."""
+        shared = size == len(x)
+        pieces = propagate(self.jacobian, run, self.substeps, self.stride, shared=shared)
+        errors = self._deviation(x, run)
+        scale = self._scale * self.loss.weight(errors).sqrt()
+        rows, errors = scaled_rows(pieces, scale, self.measurement, indices), errors * scale
+        gradient, hessian, ends = normal_equations(rows, errors, indices, size)
+        if self.pairs:
+            defects = self._defects(x, run)
+            add_defects(gradient, hessian, defects, ends, self.pairs, indices, self._defect_sd)
+        return gradient, hessian
+
+    def _quadratic(
+        self, x: Tensor, run: Trajectory, gradient: Tensor, hessian: Tensor, shared: int
+    ) -> Quadratic:
+        """With the priors, of which the first `shared` are those of all windows' variables."""
         precision, mean = self.variables.prior()
-        gradient += precision * (x - mean)
-        hessian.diagonal().add_(precision)
+        gradient += (precision * (x - mean))[len(x) - len(gradient) :]
+        hessian.diagonal().add_(precision[len(x) - len(gradient) :])
         # Defects and encoder offsets couple the states of different windows.
         alone = not self.pairs and not self.variables.offset_count
-        blocks = (self.variables.shared_count, self.variables.state_count) if alone else None
+        blocks = (shared, self.variables.state_count) if alone else None
         return Quadratic(self._cost(x, run), gradient, hessian, blocks)
 
     def errors(self, x: Tensor) -> Tensor:

@@ -129,7 +129,7 @@ class Trajectory:
 
 
 def propagate(
-    jacobian: StepJacobian, run: Trajectory, substeps: int, stride: int
+    jacobian: StepJacobian, run: Trajectory, substeps: int, stride: int, *, shared: bool = True
 ) -> Iterator[tuple[slice, Tensor]]:
     """Derivatives of the positions at every `stride`-th sample, some samples at a time.
 
@@ -138,6 +138,7 @@ def propagate(
         run: the windows' motion.
         substeps: steps per sample.
         stride: samples per counted one.
+        shared: also by the parameters; False leaves their columns out.
 
     Yields:
         Samples, and (window, sample, joint, column) by the friction parameters, the plant terms and
@@ -146,15 +147,16 @@ def propagate(
     """
     windows, steps = run.step.shape
     joints, plant_count = run.motion.q.shape[-1], len(run.plant_vector)
-    friction_count = run.friction.schedule.parameter_vector().numel()
-    shared = friction_count + plant_count
-    carried = torch.zeros(windows, 3 * joints, shared + 2 * joints, dtype=torch.float64)
-    carried[:, : 2 * joints, shared:] = torch.eye(2 * joints, dtype=torch.float64)
-    carried[:, 2 * joints :, shared:], carried[:, 2 * joints :, friction_count:shared] = (
-        jacobian.initial_acceleration(
-            run.motion.q[:, 0], run.motion.qd[:, 0], run.tau[:, 0], run.plant_vector
-        ).tensor_split([2 * joints], -1)
-    )
+    friction_count = run.friction.schedule.parameter_vector().numel() if shared else 0
+    count = friction_count + plant_count if shared else 0
+    carried = torch.zeros(windows, 3 * joints, count + 2 * joints, dtype=torch.float64)
+    carried[:, : 2 * joints, count:] = torch.eye(2 * joints, dtype=torch.float64)
+    by_start, by_plant = jacobian.initial_acceleration(
+        run.motion.q[:, 0], run.motion.qd[:, 0], run.tau[:, 0], run.plant_vector
+    ).tensor_split([2 * joints], -1)
+    carried[:, 2 * joints :, count:] = by_start
+    if shared:
+        carried[:, 2 * joints :, friction_count:count] = by_plant
     block = stride * substeps
     many, whole = block * max(1, PIECE // (windows * block)), steps // block * block
     sample = 0
@@ -166,11 +168,11 @@ def propagate(
             for x in (run.motion.q, run.motion.qd, run.motion.qdd, run.tau, run.step[..., None])
         )
         memory = None if run.memory is None else _by_block(run.memory[:, first:last], length)
-        held, slope = _coefficients(run.friction, qd, qdd, memory)
+        held, slope = _coefficients(run.friction, qd, qdd, memory, shared=shared)
         derivative = jacobian(q, qd, held, tau, step, run.plant_vector)
         by_state, by_shared = (
             part.unflatten(0, (-1, windows))
-            for part in _compose(slope, derivative, length, plant_count)
+            for part in _compose(slope, derivative, length, plant_count, shared=shared)
         )
         rows, carried = _carry(by_state, by_shared, carried, joints)
         end = sample + stride * rows.shape[1]
@@ -185,11 +187,13 @@ def _by_block(x: Tensor, length: int) -> Tensor:
 
 
 def _coefficients(
-    friction: FrictionModel, qd: Tensor, qdd: Tensor, memory: Tensor | None
+    friction: FrictionModel, qd: Tensor, qdd: Tensor, memory: Tensor | None, *, shared: bool
 ) -> tuple[Tensor, Sensitivity]:
     """Coefficients held over each step, (sample, joint, coefficient), and their derivatives."""
     schedule = friction.schedule
-    if memory is None:
+    if memory is None and not shared:
+        held, slope = schedule(qd, qdd), schedule.motion_sensitivities(qd, qdd)
+    elif memory is None:
         held, slope = schedule(qd, qdd), schedule.sensitivities(qd, qdd)
     else:
         held = schedule.coefficients_from(qd, qdd, memory)
@@ -198,11 +202,12 @@ def _coefficients(
 
 
 def _compose(
-    slope: Sensitivity, derivative: Tensor, block: int, plant_count: int
+    slope: Sensitivity, derivative: Tensor, block: int, plant_count: int, *, shared: bool
 ) -> tuple[Tensor, Tensor]:
     """Close the loop from the state through the coefficients, and chain the steps of blocks.
 
-    The results are derivatives of the ends of blocks by the state before, and by what is shared.
+    The results are derivatives of the ends of blocks by the state before, and by what is shared,
+    without columns unless it is asked for.
     """
     samples, joints, k = slope.qd.shape
     by_q, by_qd, by_held, by_plant = derivative.split(
@@ -226,6 +231,8 @@ def _compose(
         rows.append(after @ held[:, s])
         total = total + after @ plant[:, s]
         after = after @ state[:, s]
+    if not shared:
+        return after, after.new_zeros(*after.shape[:-1], 0)
     by_coefficient = torch.stack(rows[::-1], 1).unflatten(-1, (joints, k)).transpose(1, 2)
     return after, torch.cat([slope.contract(by_coefficient), total], -1)
 

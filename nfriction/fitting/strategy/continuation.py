@@ -308,9 +308,7 @@ def settle_states(problem: ShootingProblem, x: Tensor) -> tuple[Tensor, bool]:
     shared = x[:count]
 
     def of_states(states: Tensor) -> Quadratic:
-        whole = problem.linearise(torch.cat([shared, states]))
-        blocks = (0, whole.blocks[1]) if whole.blocks else None
-        return Quadratic(whole.cost, whole.gradient[count:], whole.hessian[count:, count:], blocks)
+        return problem.linearise_states(torch.cat([shared, states]))
 
     solver = LevenbergMarquardt(
         max_steps=options.settling_steps, cost_tolerance=options.settling_tolerance
