@@ -32,7 +32,6 @@ from nfriction.fitting.data.inputs import (
 )
 from nfriction.fitting.diagnosis import balanced_delay, likely_mistakes, mistake_warning
 from nfriction.fitting.options import (
-    Continuity,
     Eccentricity,
     EncoderReference,
     FitOptions,
@@ -93,7 +92,6 @@ def fit(
     drag: bool | None = None,
     eccentricity: Eccentricity = "off",
     encoder_reference: EncoderReference = "auto",
-    continuity: Continuity = "none",
     start: FitResult | None = None,
     motions: Sequence[Motion] | None = None,
     max_steps: int = 30,
@@ -131,11 +129,6 @@ def fit(
             (`FitResult.encoder_offsets`) and the plant keeps its own, so scores of the recordings
             include the offsets. `"auto"`: `"per_recording"` if several recordings of a driven
             chain all begin at rest with every encoder at zero, with a warning.
-        continuity: of the state between windows. `"none"`: every window has its own initial
-            state, which suits laws that are not exact and motion that forgets its start.
-            `"penalty"`, `"constraint"`: shooting defects are penalised (sd 0.3 mrad, 0.01 rad/s)
-            or enforced. For a network `"constraint"` applies to its constant law only; an adaptive
-            model has none. Confidence intervals assume exact continuity.
         start: an earlier fit to start from: of the same law for a neuro-fuzzy model, of any model
             for the plant's terms.
         motions: smoothed motions in joint coordinates, to save smoothing again.
@@ -158,7 +151,7 @@ def fit(
     """
     options = FitOptions(
         method, windows, fit_plant, drag,
-        eccentricity, encoder_reference, continuity, max_steps, loss, fit_delay,
+        eccentricity, encoder_reference, max_steps, loss, fit_delay,
     )  # fmt: skip
     task = prepare_task(model, plant, recordings, options, start, motions, callback)
     schedule = task.model.schedule

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.equation_error import TorqueFit, peak_dynamics_torque
-from nfriction.fitting.options import Continuity
 from nfriction.fitting.plant_parameters import TORQUE_DELAY
 from nfriction.fitting.result.identifiability import (
     CoefficientUncertainty,
@@ -83,7 +82,6 @@ class FitResult:
             [rad; m], one row a recording; empty unless encoders were zeroed at each.
         uncertainty: standard deviation of the coefficients at any motion; None after an
             equation-error fit.
-        continuity: of the fitted windows, see `fit`.
         data_warnings: warnings about the data; inherited by fits warm-started from this one.
         mistakes: likely mistakes in recordings or rig, see `fitting.diagnosis`; inherited, too.
         quantisation: noise of the encoder's count [rad; m]; None where the count is unknown, and
@@ -109,7 +107,6 @@ class FitResult:
     warnings: tuple[str, ...] = ()
     encoder_offsets: tuple[tuple[float, ...], ...] = ()
     uncertainty: CoefficientUncertainty | None = None
-    continuity: Continuity = "none"
     data_warnings: tuple[str, ...] = ()
     mistakes: tuple[str, ...] = ()
     quantisation: float | None = None
@@ -185,7 +182,6 @@ class FitResult:
             "unidentifiable": list(self.unidentifiable),
             "stages": [list(stage) for stage in self.stages],
             "warnings": list(self.warnings),
-            **({} if self.continuity == "none" else {"continuity": self.continuity}),
             **(offsets if self.encoder_offsets else {}),
             **({"outliers": [o._asdict() for o in self.outliers]} if self.outliers else {}),
         }
@@ -357,8 +353,7 @@ def result_from_shooting(
         quantisation=encoder_count and encoder_count / math.sqrt(12),
         warnings=warnings_of(
             converged=result.converged, at_bounds=at_bounds, unidentifiable=unidentifiable,
-            at_zero=at_zero, options=problem.options,
-            largest_defect=float(problem.defects(x).abs().max()) if problem.pairs else 0.0,
+            at_zero=at_zero,
         )
         + model_error_warning(
             residual, effective_noise(counted), encoder_count, plant.unit, problem.options

@@ -141,8 +141,7 @@ def propagate(
 
     Yields:
         Samples, and (window, sample, joint, column) by the friction parameters, the plant terms and
-        the window's initial state. The last piece is the windows' last sample, counted or not, with
-        the rows of its velocities below those of the positions.
+        the window's initial state. The last piece is the windows' last sample, counted or not.
     """
     windows, steps = run.step.shape
     joints, plant_count = run.motion.q.shape[-1], len(run.plant_vector)
@@ -176,7 +175,7 @@ def propagate(
         end = sample + stride * rows.shape[1]
         yield slice(sample, end, stride), rows
         sample = end
-    yield slice(steps // substeps, None), carried[:, None, : 2 * joints]
+    yield slice(steps // substeps, None), carried[:, None, :joints]
 
 
 def _by_block(x: Tensor, length: int) -> Tensor:

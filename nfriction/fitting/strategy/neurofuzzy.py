@@ -58,8 +58,6 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     free = ShootingFitter(
         StepJacobian(task.plant, network, terms), network, recordings, task.measurement, options,
         task.callback, plant_prior=(known_terms(start, terms), plant_sd),
-        # From smoothed states at full length a search creeps along constraints.
-        defect_sd=None if options.continuity == "none" else options.penalty_sd,
         extrapolation=prior_on_unvisited_cells(schedule, motions, options),
     )  # fmt: skip
     law = replace(free, friction=start.model, friction_prior=law_prior, extrapolation=None)
@@ -75,7 +73,7 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
         cast("NeuroFuzzy", task.model.schedule).prior_sd = best.prior_sd
     found = replace(
         found, motions=task.motions, encoder_offsets=start.encoder_offsets,
-        continuity=options.continuity, skipped_horizons=start.skipped_horizons,
+        skipped_horizons=start.skipped_horizons,
     )  # fmt: skip
     return found.with_warnings(start.data_warnings)
 

@@ -105,8 +105,8 @@ def fit_by_class(task: FitTask, classes: ClassOptions = DEFAULTS) -> FitResult:
     schedule = task.model.schedule
     if not isinstance(schedule, Adaptive):
         raise ValueError(f"{type(task.model).__name__} is no adaptive model; use `fit`.")
-    # The classes have no encoder eccentricity, and windows are free.
-    options = replace(task.options, eccentricity="off", continuity="none")
+    # The classes have no encoder eccentricity.
+    options = replace(task.options, eccentricity="off")
     task = replace(task, options=options)
     constant = constant_start(task)
     length = constant.longest_usable_horizon(options.windows)
