@@ -15,7 +15,6 @@ from torch import Tensor
 from nfriction.fitting.data.inputs import adjustable_terms, advanced_torques
 from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.equation_error import TorqueFit, fit_equation_error, prior_sd
-from nfriction.fitting.fit import FitTask
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.plant_parameters import TORQUE_DELAY, PlantParameter
 from nfriction.fitting.result.fit_result import (
@@ -35,6 +34,7 @@ from nfriction.fitting.strategy.continuation import (
     loses,
     weighted_cost,
 )
+from nfriction.fitting.task import FitTask
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Law
 from nfriction.friction.models import FrictionModel

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from nfriction.fitting.data.inputs import adjustable_terms, apply_encoder_offsets, require_motion
 from nfriction.fitting.equation_error import coefficient_scale
-from nfriction.fitting.fit import FitTask
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.result.fit_result import FitResult, result_from_shooting
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
@@ -32,6 +31,7 @@ from nfriction.fitting.strategy.continuation import (
 )
 from nfriction.fitting.strategy.extrapolation_prior import prior_on_unvisited_cells
 from nfriction.fitting.strategy.holdout import HoldoutScore, holdout_rmse, holdout_split
+from nfriction.fitting.task import FitTask
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.recording import Recording

@@ -19,7 +19,6 @@ from nfriction.fitting.data.inputs import (
 )
 from nfriction.fitting.data.windows import Windows, cut_windows
 from nfriction.fitting.equation_error import coefficient_scale
-from nfriction.fitting.fit import Callback, FitTask, prepare_task
 from nfriction.fitting.options import EncoderReference, FitOptions
 from nfriction.fitting.result.fit_result import FitResult, result_from_shooting
 from nfriction.fitting.shooting.autocorrelation import effective_noise
@@ -27,6 +26,7 @@ from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.constant import constant_start, known_terms
 from nfriction.fitting.strategy.continuation import ShootingFitter
+from nfriction.fitting.task import Callback, FitTask, prepare_task
 from nfriction.friction.models import FrictionModel
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
 from nfriction.papers.afem.classes import (
