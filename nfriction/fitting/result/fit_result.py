@@ -436,6 +436,7 @@ def _torque_scale(
     table = friction.reshape(len(speed), -1).clone().requires_grad_()
     with torch.enable_grad():
         # A law is elementwise, so the sum's gradient is each coefficient's own slope.
-        torque = problem.friction.torque(speed, torch.ones_like(speed), table)
+        model = problem.friction
+        torque = model.law.torque(speed, torch.ones_like(speed), table, model.v_smooth)
         (slope,) = torch.autograd.grad(torque.sum(), table)
     return slope.flatten(), need[:, None].expand_as(slope).flatten()
