@@ -14,7 +14,6 @@ from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
-
 # A motion that slides forgets its deflections within so long [s]; where none does, they are sought.
 SETTLING = 1.0
 
@@ -83,9 +82,7 @@ class Windows:
             # Before a recording begins, its contacts rest.
             rows = np.maximum(np.arange(first - steps, first + 1), 0)
             lead_ins.append([x[rows] for x in (motion.time[:, None], motion.q, motion.qd)])
-        time, q, qd = (
-            torch.tensor(np.stack(x, 1)) for x in zip(*lead_ins, strict=True)
-        )
+        time, q, qd = (torch.tensor(np.stack(x, 1)) for x in zip(*lead_ins, strict=True))
         load, held = plant.load(q, qd), 0.5 * (qd[1:] + qd[:-1])
         start = q.new_zeros((len(coefficients), *q.shape[1:], memory.size))
         states = states_along(
