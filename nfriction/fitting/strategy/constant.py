@@ -23,11 +23,8 @@ from nfriction.fitting.equation_error import (
 )
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.plant_parameters import TORQUE_DELAY, PlantParameter
-from nfriction.fitting.result.fit_result import (
-    FitResult,
-    result_from_equation_error,
-    result_from_shooting,
-)
+from nfriction.fitting.result.fit_result import FitResult
+from nfriction.fitting.result.of_search import result_from_equation_error, result_from_shooting
 from nfriction.fitting.robust_loss import RobustLoss
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.continuation import (
