@@ -441,7 +441,6 @@ def _torque_scale(
     table = friction.reshape(len(speed), -1).clone().requires_grad_()
     with torch.enable_grad():
         # A law is elementwise, so the sum's gradient is each coefficient's own slope.
-        model = problem.friction
-        torque = model.law.torque(speed, torch.ones_like(speed), table, model.v_smooth)
+        torque = problem.friction.steady_torque(speed, torch.ones_like(speed), table)
         (slope,) = torch.autograd.grad(torque.sum(), table)
     return slope.flatten(), need[:, None].expand_as(slope).flatten()
