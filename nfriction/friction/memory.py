@@ -79,7 +79,6 @@ def states_along(
     return torch.stack(states)
 
 
-@torch.no_grad()
 def slipping_state(memory: Memory, coefficients: Tensor) -> Tensor:
     """Largest state in size: of a contact that slips slowly, (*batch, joint, state)."""
     ahead = torch.ones_like(coefficients[..., 0])
