@@ -31,8 +31,8 @@ class Windows:
         spans: index of each window's recording, its first and its last sample.
         at_rest: windows whose initial state is known: the measured position, and no velocity.
         recordings, motions: that the windows are of, in joint coordinates.
-        law_state: of a law with memory at the start of each window, (window, joint, state).
-        law_sd: its standard deviation, (joint, state).
+        law_state: of a law with memory at the start of each window, over that of a contact that
+            slips slowly, (window, joint, state).
     """
 
     q: Tensor
@@ -46,7 +46,6 @@ class Windows:
     recordings: tuple[Recording, ...] = ()
     motions: tuple[Motion, ...] = ()
     law_state: Tensor | None = None
-    law_sd: Tensor | None = None
 
     def __len__(self) -> int:
         return self.q.shape[0]
@@ -65,8 +64,7 @@ class Windows:
     def settled(self, plant: Plant, law: Law, coefficients: Tensor) -> "list[Windows]":
         """The windows with the deflections that the second before leaves behind.
 
-        It begins without any. The standard deviations are the deflections of a contact that
-        slips slowly.
+        It begins without any.
 
         Args:
             plant: for the load.
@@ -88,8 +86,8 @@ class Windows:
         states = states_along(
             memory, start, held, load[1:], coefficients[:, None], time.diff(dim=0)
         )[-1]
-        sd = slipping_state(memory, coefficients)
-        return [replace(self, law_state=z, law_sd=s) for z, s in zip(states, sd, strict=True)]
+        shares = states / slipping_state(memory, coefficients)[:, None]
+        return [replace(self, law_state=share) for share in shares]
 
     def torque_at(self, delay: float) -> tuple[Tensor, Tensor]:
         """Torque that was recorded `delay` [s] later, and its slope over the delay.

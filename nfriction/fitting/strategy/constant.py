@@ -5,7 +5,7 @@ A nonlinear law has several starts: its own, and two from the law that it contai
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import TypeGuard
 
@@ -69,20 +69,19 @@ def fit_constant(task: FitTask) -> FitResult:
     if options.method == "equation_error":
         return result_from_equation_error(model, task.plant, start, task.motions, torque)
 
-    def equation_error(plant: Plant) -> Tensor:
+    def equation_error(plant: Plant) -> Iterable[Tensor]:
         implied = regression(task, model, plant)
         return with_presliding(torch.cat([implied.coefficients[None], implied.starts]))
 
-    def with_presliding(sliding: Tensor) -> Tensor:
+    def with_presliding(sliding: Tensor) -> Iterable[Tensor]:
         if not model.law.memory:
             return sliding
-        starts = (presliding_start(fitter, c, plant, task.motions) for c in sliding)
-        return torch.stack(list(starts))
+        return (presliding_start(fitter, c, plant, task.motions) for c in sliding)
 
     eccentric = fits_eccentricity(options, start)
     fitter = _fitter(task, model, torque, eccentric)
     plant = known_terms(start, fitter.jacobian.terms, task.delay)
-    friction = with_presliding(torque.coefficients[None]).reshape(-1)
+    friction = next(iter(with_presliding(torque.coefficients[None]))).reshape(-1)
     linear = all(c.linear or not c.fitted for c in model.law.coefficients)
     search = horizon_continuation(
         fitter, friction, plant, task.motions,
@@ -167,9 +166,9 @@ def yielding(law: Law, coefficients: Tensor, displacement: float, time: float) -
         for name in widths:
             values[name] *= scale
             values["k" + name[1:]] /= scale
-    limits = torch.tensor(Constant(law, 1).limits, dtype=torch.float64)
     found = torch.tensor([values[name] for name in law.names], dtype=torch.float64)
-    return found.clamp(limits[:, 0], limits[:, 1])
+    lower, upper = Constant(law, 1, found).bounds()
+    return found.clamp(lower, upper)
 
 
 def _fitter(
@@ -345,7 +344,7 @@ def best_of_starts(
     # With the larger noise of the two, priors would outweigh the data.
     sizes = (own.noise, nested.noise, own.problem.noise_sd, nested.problem.noise_sd)
     noise = max(min(size for size in sizes if math.isfinite(size)), options.min_noise)
-    implied = equation_error(own.problem.plant_at(nested.parts.plant))[0]
+    implied = next(iter(equation_error(own.problem.plant_at(nested.parts.plant))))
     embedded = embed_nested(law, nested.parts.friction.reshape(len(implied), -1), implied)
     loss = own.problem.loss
     best, lowest = own, _misfit(own, noise, loss) if same else math.inf
