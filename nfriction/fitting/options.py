@@ -192,7 +192,7 @@ class FitOptions:
     conditional_ratio: float = 30.0
     # Entries below this share of a direction's largest are not named.
     named_share: float = 0.3
-    # Residuals above this many times the quantisation noise are model error.
+    # Residuals above this many times the measurement noise are model error.
     model_error_ratio: float = 3.0
 
     def __post_init__(self) -> None:

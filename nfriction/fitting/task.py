@@ -76,10 +76,10 @@ def prepare_task(
     plant = rigs.of(plant)
     model = as_model(model, plant.joints)
     given = as_recording_list(recordings, plant)
-    if model.law.memory:
+    if "p_0" in model.law.names:
         raise ValueError(
-            f"the law {model.law.name!r} has an internal state, which fits do not follow yet; fit "
-            "a law without memory, such as Stribeck."
+            f"the law {model.law.name!r} is for tables of torque, see `fit_torque`; to motions fit "
+            "maxwell-slip."
         )
     joint = in_joint_coordinates(plant, model, given)
     if options.eccentricity == "on" and not isinstance(plant, PendulumChain):

@@ -57,6 +57,37 @@ else:
 # 1e-12 keeps 0/0 away where a coefficient is zero; written out, as TorchScript takes no global.
 
 
+@torch.no_grad()
+def states_along(
+    memory: Memory, start: Tensor, qd: Tensor, load: Tensor, coefficients: Tensor, step: Tensor
+) -> Tensor:
+    """States after every sample of a given motion, (sample, *batch, joint, state).
+
+    Args:
+        memory: of the law.
+        start: state before the first sample, (*batch, joint, state).
+        qd: velocity held over the sample [rad/s], (sample, joint) or with a batch.
+        load: likewise [-].
+        coefficients: held all the time, (*batch, joint, coefficient).
+        step: lengths of the samples [s], (sample,) or of the joints of a batch.
+    """
+    state, states = start, []
+    shape = start.shape[:-1]
+    for v, s, h in zip(qd, load, step, strict=True):
+        state = memory.advance(state, v.expand(shape), s.expand(shape), coefficients, h)
+        states.append(state)
+    return torch.stack(states)
+
+
+@torch.no_grad()
+def slipping_state(memory: Memory, coefficients: Tensor) -> Tensor:
+    """Largest state in size: of a contact that slips slowly, (*batch, joint, state)."""
+    ahead = torch.ones_like(coefficients[..., 0])
+    start = ahead.new_zeros((*ahead.shape, memory.size))
+    # Far, at a velocity below that of any Stribeck curve.
+    return memory.advance(start, 1e-9 * ahead, ahead, coefficients, 1e15 * ahead).abs()
+
+
 def growth(x: Tensor) -> Tensor:
     """Share `(1 - exp(-x)) / x` of a held input that a decaying state keeps, 1 at x = 0."""
     # The quotient cancels at small x, where four terms of its series are exact to rounding.

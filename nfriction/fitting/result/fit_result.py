@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.equation_error import TorqueFit, peak_dynamics_torque
+from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.plant_parameters import TORQUE_DELAY
 from nfriction.fitting.result.identifiability import (
     CoefficientUncertainty,
@@ -22,11 +23,11 @@ from nfriction.fitting.result.identifiability import (
     exceeds_drive_torque,
     model_error_warning,
     null_directions,
-    observed_count,
     standard_deviations,
     warnings_of,
     weakly_identified,
 )
+from nfriction.fitting.result.noise import Noise, measurement_noise
 from nfriction.fitting.robust_loss import Outliers, named_outliers, outlier_warning
 from nfriction.fitting.shooting.autocorrelation import bandwidth, effective_noise, hac_sd
 from nfriction.fitting.shooting.problem import ShootingProblem
@@ -48,8 +49,8 @@ BLURRED = (
 )
 
 Usability = Literal["good", "doubtful", "do not use"]
-# Residuals above so many times the quantisation noise are mostly the model's error. A well-fitted
-# law on a real bench has up to ten times.
+# Residuals above so many times the encoder's rounding are mostly the model's error, unless noise of
+# the torque explains them. A well-fitted law on a real bench has up to ten times.
 DOUBTFUL_RATIO = 20.0
 # A lower bound no larger exists only for the logarithm of a positive coefficient, in SI.
 NOTHING = 1e-9
@@ -84,8 +85,7 @@ class FitResult:
             equation-error fit.
         data_warnings: warnings about the data; inherited by fits warm-started from this one.
         mistakes: likely mistakes in recordings or rig, see `fitting.diagnosis`; inherited, too.
-        quantisation: noise of the encoder's count [rad; m]; None where the count is unknown, and
-            after an equation-error fit.
+        noise: of encoders and torque; None after an equation-error fit.
         stages: length of the windows of each stage that was kept [s], and its residual in
             `residual_unit`; of constant coefficients.
         skipped_horizons: lengths of windows that the constant law could not follow [s].
@@ -109,7 +109,7 @@ class FitResult:
     uncertainty: CoefficientUncertainty | None = None
     data_warnings: tuple[str, ...] = ()
     mistakes: tuple[str, ...] = ()
-    quantisation: float | None = None
+    noise: Noise | None = None
     stages: tuple[tuple[float, float], ...] = ()
     skipped_horizons: tuple[float, ...] = ()
     outliers: tuple[Outliers, ...] = ()
@@ -131,16 +131,19 @@ class FitResult:
     @property
     def usability(self) -> tuple[Usability, str]:
         """Fitness for simulation and control, and the reason in a clause."""
-        times = self.residual / self.quantisation if self.quantisation else 0.0
-        far = f"the residual is {times:.0f} times the encoder's quantisation noise"
+        noise = self.noise or Noise(math.inf, math.inf)
+        wrong = self.residual > max(
+            DOUBTFUL_RATIO * noise.rounding, DEFAULTS.model_error_ratio * noise.residual
+        )
+        far = f"the residual is {self.residual / noise.residual:.0f} times the measurement noise"
         if self.mistakes:
             return "do not use", f"a mistake in the data is likely: {self.mistakes[0]}"
-        if not self.converged and times > DOUBTFUL_RATIO:
+        if not self.converged and wrong:
             return "do not use", f"the search did not converge, and {far}"
         reasons = []
         if not self.converged:
             reasons.append("the search did not converge")
-        if times > DOUBTFUL_RATIO:
+        if wrong:
             reasons.append(far)
         if self.unidentifiable:
             count = len(self.unidentifiable)
@@ -324,13 +327,11 @@ def result_from_shooting(
         tuple(names[i] for i in mask.nonzero().flatten().tolist())
         for mask in (hit, hit & result.at_lower[:count] & least)
     )
-    encoder_count = plant.position_quantum or observed_count(
-        problem.windows.q @ problem.measurement.T
-    )
     residuals = problem.errors(x)
     weights, counted = problem.loss.weight(residuals), problem.loss.counted(residuals)
     residual = float(counted.square().mean().sqrt())
     outliers = tuple(outliers_of(problem, weights))
+    noise = measurement_noise(problem, x, residual)
     intervals, unidentifiable, root = _identifiability(
         problem, result, names, residuals * weights, motions
     )
@@ -350,13 +351,13 @@ def result_from_shooting(
         intervals=intervals,
         unidentifiable=unidentifiable,
         encoder_offsets=tuple(map(tuple, offsets.tolist())),
-        quantisation=encoder_count and encoder_count / math.sqrt(12),
+        noise=noise,
         warnings=warnings_of(
             converged=result.converged, at_bounds=at_bounds, unidentifiable=unidentifiable,
             at_zero=at_zero,
         )
         + model_error_warning(
-            residual, effective_noise(counted), encoder_count, plant.unit, problem.options
+            residual, effective_noise(counted), noise.residual, plant.unit, problem.options
         )
         + outlier_warning(outliers),
         outliers=outliers,
@@ -436,6 +437,7 @@ def _torque_scale(
     table = friction.reshape(len(speed), -1).clone().requires_grad_()
     with torch.enable_grad():
         # A law is elementwise, so the sum's gradient is each coefficient's own slope.
-        torque = problem.friction.torque(speed, torch.ones_like(speed), table)
+        model = problem.friction
+        torque = model.law.torque(speed, torch.ones_like(speed), table, model.v_smooth)
         (slope,) = torch.autograd.grad(torque.sum(), table)
     return slope.flatten(), need[:, None].expand_as(slope).flatten()

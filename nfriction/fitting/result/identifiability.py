@@ -202,17 +202,16 @@ def warnings_of(
 def model_error_warning(
     residual: float,
     effective_sd: float,
-    count: float | None,
+    noise: float,
     unit: str,
     options: FitOptions = DEFAULTS,
 ) -> tuple[str, ...]:
-    """A warning if the residual exceeds what the encoder's count [rad; m] explains."""
-    noise = None if count is None else count / 12**0.5
-    if not noise or not residual > options.model_error_ratio * noise:
+    """A warning if the residual exceeds what the measurement noise [rad; m] explains."""
+    if not residual > options.model_error_ratio * noise:
         return ()
     return (
-        f"Residual: {1e3 * residual:.3g} m{unit} RMS, {residual / noise:.0f}x the encoder's "
-        "quantisation noise, so the model is missing something (error is correlated over "
+        f"Residual: {1e3 * residual:.3g} m{unit} RMS, {residual / noise:.0f}x the measurement "
+        "noise, so the model is missing something (error is correlated over "
         f"~{(effective_sd / residual) ** 2:.0f} samples). The intervals do not cover this.",
     )
 

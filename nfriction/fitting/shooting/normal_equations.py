@@ -31,7 +31,7 @@ def scaled_rows(
     """
     joints, shared, own = len(measurement), int(indices[0, 0]), indices.shape[1]
     for part, rows in pieces:
-        if own > 2 * joints:
+        if shared + own > rows.shape[-1]:
             # An encoder offset moves the initial position and the measured ones.
             measured = torch.eye(joints, dtype=torch.float64)
             rows = torch.cat([rows, rows[..., shared : shared + joints] - measured], -1)

@@ -1,7 +1,8 @@
 """Output error by multiple shooting: a cost and its Gauss-Newton model.
 
 A recording is cut into windows. Each is simulated from a state of its own, because the motion of a
-light mechanism forgets its start within seconds. The decision variables x are the friction
+light mechanism forgets its start within seconds. Of a law with memory its deflections are part of
+that state. The decision variables x are the friction
 parameters, the plant terms, each window's initial state and the encoders' offsets, and the cost is
 
     J(x) = 1/2 sum |C (q_sim(t; x) - q(t))|^2 / noise_sd^2      over windows and samples, or a
@@ -188,12 +189,16 @@ class ShootingProblem:
     def _simulate(self, x: Tensor, *, with_memory: bool = False) -> Trajectory:
         """The windows' motion at `x`; the memory of its coefficients only for derivatives."""
         friction, plant, states, _ = self.variables.split(x)
-        model = model_at(self.friction, friction)
-        q0, qd0 = states.chunk(2, -1)
+        model, joints = model_at(self.friction, friction), self.windows.q0.shape[-1]
+        q0, qd0, law = states.tensor_split([joints, 2 * joints], -1)
+        law_state = law.unflatten(-1, (joints, -1)) if model.law.memory else None
         held, linearised = (t.repeat_interleave(self.substeps, 1) for t in self._torques(plant))
         step = self.windows.step.repeat_interleave(self.substeps, 1) / self.substeps
         offsets = self.variables.window_offsets(x)
-        motion = self._integrate(self.plant_at(plant), model, q0 + offsets, qd0, held, step)
+        inputs = RolloutInputs(
+            q0 + offsets, qd0, held, step, hidden_state=self.memory, law_state=law_state
+        )
+        motion = self._integrate(self.plant_at(plant), model, inputs)
         memory = self._memory_along(model, motion) if with_memory else None
         return Trajectory(model, plant, motion, linearised, step, memory)
 
@@ -205,10 +210,7 @@ class ShootingProblem:
         tau, slope = self.windows.torque_at(float(plant[k]))
         return tau, torch.cat([tau - plant[k] * slope, slope], -1)
 
-    def _integrate(
-        self, plant: Plant, model: FrictionModel, q0: Tensor, qd0: Tensor, tau: Tensor, step: Tensor
-    ) -> Rollout:
-        inputs = RolloutInputs(q0, qd0, tau, step, hidden_state=self.memory)
+    def _integrate(self, plant: Plant, model: FrictionModel, inputs: RolloutInputs) -> Rollout:
         return integrate(plant, model, inputs)
 
     @torch.no_grad()

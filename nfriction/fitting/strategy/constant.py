@@ -3,6 +3,7 @@
 A nonlinear law has several starts: its own, and two from the law that it contains.
 """
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,7 +15,12 @@ from torch import Tensor
 
 from nfriction.fitting.data.inputs import adjustable_terms, advanced_torques
 from nfriction.fitting.data.windows import Windows
-from nfriction.fitting.equation_error import TorqueFit, fit_equation_error, prior_sd
+from nfriction.fitting.equation_error import (
+    TorqueFit,
+    fit_equation_error,
+    prior_sd,
+    steady_law,
+)
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.plant_parameters import TORQUE_DELAY, PlantParameter
 from nfriction.fitting.result.fit_result import (
@@ -42,6 +48,11 @@ from nfriction.optim.least_squares import Quadratic
 from nfriction.plant import PendulumChain, Plant
 from nfriction.signals import Motion
 
+# Displacements over which a contact yields, over the range of the motion, and ratios of damping to
+# stiffness [s]: from what hardly shows to what would be no presliding.
+PRESLIDING = tuple(np.geomspace(1e-5, 1.0, 11).tolist())
+BRISTLE_TIMES = (1e-4, 1e-3, 1e-2, 1e-1)
+
 TOO_LONG = (
     "Windows of {:g} s were skipped: the motion forgets its start within them, or law or plant are "
     "wrong."
@@ -63,16 +74,23 @@ def fit_constant(task: FitTask) -> FitResult:
 
     def equation_error(plant: Plant) -> Tensor:
         implied = regression(task, model, plant)
-        return torch.cat([implied.coefficients[None], implied.starts])
+        return with_presliding(torch.cat([implied.coefficients[None], implied.starts]))
+
+    def with_presliding(sliding: Tensor) -> Tensor:
+        if not model.law.memory:
+            return sliding
+        starts = (presliding_start(fitter, c, plant, task.motions) for c in sliding)
+        return torch.stack(list(starts))
 
     eccentric = fits_eccentricity(options, start)
     fitter = _fitter(task, model, torque, eccentric)
-    friction = torque.coefficients.reshape(-1)
     plant = known_terms(start, fitter.jacobian.terms, task.delay)
+    friction = with_presliding(torque.coefficients[None]).reshape(-1)
     linear = all(c.linear or not c.fitted for c in model.law.coefficients)
     search = horizon_continuation(
-        fitter, friction, plant, task.motions, None if linear else equation_error
-    )
+        fitter, friction, plant, task.motions,
+        None if linear else equation_error,
+    )  # fmt: skip
     # A law with a curved term may end in a local minimum that its nested law does not have.
     if (law := model.law.nested_law) is not None and not search.end.stopped:
         contained = FrictionModel(law, Constant(law, model.joints), model.v_smooth)
@@ -103,8 +121,58 @@ def regression(task: FitTask, model: FrictionModel, plant: Plant) -> TorqueFit:
     """Constant coefficients that torques imply on a plant."""
     recordings = advanced_torques(task.recordings, task.delay)
     return fit_equation_error(
-        model.law, plant, recordings, task.motions, model.v_smooth, task.options
+        steady_law(model.law), plant, recordings, task.motions, model.v_smooth, task.options
     )
+
+
+def presliding_start(
+    fitter: ShootingFitter, coefficients: Tensor, plant: Tensor, motions: tuple[Motion, ...]
+) -> Tensor:
+    """Coefficients of a law with memory whose short windows follow the motion best.
+
+    What torques of sliding show stays as given. The displacement over which the contact yields is
+    sought among shares of each joint's range, the damping among times: first for all joints alike,
+    then for each. (joint, coefficient).
+    """
+    law, options = fitter.friction.law, fitter.options
+    windows = fitter.cut(motions, options.windows[0])
+    ranges = torch.tensor(np.max([np.ptp(m.q, axis=0) for m in motions], axis=0))
+    best, lowest = coefficients, math.inf
+    joints = len(coefficients)
+    for chosen in (range(joints), *([j] for j in range(joints) if joints > 1)):
+        trials = []
+        for share, time in itertools.product(PRESLIDING, BRISTLE_TIMES):
+            trial = best.clone()
+            for j in chosen:
+                trial[j] = yielding(law, coefficients[j], share * float(ranges[j]), time)
+            trials.append(trial)
+        sets = torch.stack(trials)
+        for trial, own in zip(sets, windows.settled(fitter.jacobian.plant, law, sets), strict=True):
+            problem = fitter.problem(own, options.first_noise, trial.reshape(-1))
+            cost = float(problem.cost(problem.variables.start(plant)))
+            if cost < lowest:
+                best, lowest = trial, cost
+    return best
+
+
+def yielding(law: Law, coefficients: Tensor, displacement: float, time: float) -> Tensor:
+    """Coefficients of one joint that slides alike, but yields over a displacement before.
+
+    `time` is the ratio of the damping of a bristle to its stiffness [s].
+    """
+    values = dict(zip(law.names, coefficients.tolist(), strict=True))
+    if "sigma_0" in values:
+        values["sigma_0"] = values["F_c"] / max(displacement, 1e-12)
+        values["sigma_1"] = time * values["sigma_0"]
+    else:
+        widths = [name for name in values if name.startswith("d_")]
+        scale = displacement / max(values[name] for name in widths)
+        for name in widths:
+            values[name] *= scale
+            values["k" + name[1:]] /= scale
+    limits = torch.tensor(Constant(law, 1).limits, dtype=torch.float64)
+    found = torch.tensor([values[name] for name in law.names], dtype=torch.float64)
+    return found.clamp(limits[:, 0], limits[:, 1])
 
 
 def _fitter(
@@ -317,7 +385,8 @@ def _windows_from(found: HorizonResult) -> Windows:
     """The windows of a stage at the states that it found, except for those that are known."""
     windows = found.problem.windows
     states = found.problem.variables.split(found.result.x).states
-    q0, qd0 = (x.clone() for x in states.chunk(2, -1))
+    joints = windows.q0.shape[-1]
+    q0, qd0 = (x.clone() for x in states[:, : 2 * joints].chunk(2, -1))
     known = list(windows.at_rest)
     q0[known], qd0[known] = windows.q0[known], windows.qd0[known]
     return replace(windows, q0=q0, qd0=qd0)

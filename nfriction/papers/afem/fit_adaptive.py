@@ -163,15 +163,12 @@ class GivenClassesProblem(ShootingProblem):
 
     classes: Tensor | None = None
 
-    def _integrate(
-        self, plant: Plant, model: FrictionModel, q0: Tensor, qd0: Tensor, tau: Tensor, step: Tensor
-    ) -> Rollout:
+    def _integrate(self, plant: Plant, model: FrictionModel, inputs: RolloutInputs) -> Rollout:
         assert self.classes is not None
         classes = self.classes.repeat_interleave(self.substeps, 1)
         # The schedule reads the class in place of the acceleration; velocity does not enter.
         measured = torch.zeros_like(classes), classes
-        inputs = RolloutInputs(q0, qd0, tau, step, measured=measured)
-        motion = integrate(plant, model, inputs)
+        motion = integrate(plant, model, replace(inputs, measured=measured))
         # The derivatives of a step must be taken at the input that drove it.
         return replace(motion, qdd=torch.cat([classes, classes[:, -1:]], 1))
 
