@@ -250,7 +250,7 @@ def _fastest_decay(system: System) -> float:
     """
     if isinstance(system.fingerprint, codegen.Incomparable):
         return float(system.plant.decay_rate(system.friction.zero_velocity_damping()).max())
-    key = system.fingerprint.key, system.fingerprint.values()
+    key = system.fingerprint, tuple(map(codegen.content, system.tensors.values()))
     if key not in _decay_rates:
         if len(_decay_rates) >= KEPT_RATES:
             _decay_rates.clear()
