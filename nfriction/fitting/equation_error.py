@@ -211,6 +211,23 @@ def fit_equation_error(
     return replace(found, outliers=tuple(named))
 
 
+def steady_law(law: Law) -> Law:
+    """A law with memory as it slides: what only its deflections show keeps a value."""
+    if law.memory is None:
+        return law
+    units = torch.ones(1, 1, len(law.names), dtype=torch.float64, requires_grad=True)
+    one = torch.ones(1, 1, dtype=torch.float64)
+    with torch.enable_grad():
+        torque = law.torque(one, one, units, V_SMOOTH).sum()
+        (slope,) = torch.autograd.grad(torque, units)
+    coefficients = tuple(
+        c if seen or c.linear
+        else replace(c, initial_grid=(c.initial_grid[len(c.initial_grid) // 2],), fitted=False)
+        for c, seen in zip(law.coefficients, slope.flatten() != 0.0, strict=True)
+    )  # fmt: skip
+    return replace(law, coefficients=coefficients)
+
+
 def regress(
     law: Law, parts: Sequence[TorqueBalance], v_smooth: float, options: FitOptions = DEFAULTS
 ) -> TorqueFit:

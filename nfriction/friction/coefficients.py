@@ -11,7 +11,6 @@ law and a schedule.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, ClassVar
 
 import torch
@@ -45,7 +44,7 @@ class Schedule(nn.Module, ABC):
         follows_motion: False where the coefficients are constants.
         handles_range: False where exports must clamp the inputs to the trained range.
         fit_strategy: function that fits such coefficients, as `"module:function"`; it takes a
-            `nfriction.fitting.fit.FitTask`. Empty where there is none.
+            `nfriction.fitting.task.FitTask`. Empty where there is none.
         form: formula that exports have code of their own for; others are traced.
     """
 
@@ -145,10 +144,6 @@ class Schedule(nn.Module, ABC):
     @abstractmethod
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
         """Derivatives of the coefficients at motions of shape (sample, joint)."""
-
-    def motion_sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
-        """Those by velocity and acceleration alone."""
-        return replace(self.sensitivities(qd, qdd), factors=())
 
     def sensitivities_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Sensitivity:
         """Derivatives of `coefficients_from` at a fixed hidden state (sample, joint, state)."""

@@ -339,10 +339,6 @@ class NeuroFuzzy(Schedule):
         return self.residual_sensitivities(self.reference, qd, qdd)
 
     @torch.no_grad()
-    def motion_sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
-        return Sensitivity((), *self.slopes(qd, qdd, self(qd, qdd)))
-
-    @torch.no_grad()
     def slopes(self, qd: Tensor, qdd: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """Derivatives of the coefficients by the joint's own velocity and acceleration.
 

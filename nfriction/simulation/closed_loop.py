@@ -196,4 +196,6 @@ def control(
     law = None
     if law_states:
         law = torch.stack(law_states, -3).masked_fill(gone[..., None], torch.nan)
-    return ControlledMotion(seconds, q, qd, qdd, diverged_at, law, tau=applied, measured=read)
+    return ControlledMotion(
+        step.expand(steps), q, qd, qdd, diverged_at, law, tau=applied, measured=read
+    )

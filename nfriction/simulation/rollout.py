@@ -8,12 +8,13 @@ such a simulation follows a recording.
 
 import logging
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
-from nfriction.simulation.adjoint import adjoint_rollout, own_tensors
+from nfriction.simulation.adjoint import adjoint_rollout
 from nfriction.simulation.compiled import Backend, System, integrate_compiled, wants_compiled
 from nfriction.simulation.memory_step import memory_of, memory_step
 from nfriction.simulation.protocols import (
@@ -47,7 +48,7 @@ class Rollout:
     """A simulated motion.
 
     Attributes:
-        time: [s], shape (steps + 1,) or (*batch, steps + 1).
+        step: sample times [s], shape (steps,) or (*batch, steps).
         q: joint position [rad], shape (*batch, steps + 1, joint).
         qd: joint velocity [rad/s], same shape.
         qdd: joint acceleration known at each sample, that of the step before (at the start: without
@@ -58,12 +59,17 @@ class Rollout:
             None of a law without.
     """
 
-    time: Tensor
+    step: Tensor
     q: Tensor
     qd: Tensor
     qdd: Tensor
     diverged_at: Tensor
     law_state: Tensor | None = None
+
+    @cached_property
+    def time(self) -> Tensor:
+        """Time of each sample [s], shape (steps + 1,) or (*batch, steps + 1)."""
+        return torch.nn.functional.pad(self.step, (1, 0)).cumsum_(-1)
 
     @property
     def diverged(self) -> Tensor:
@@ -153,7 +159,7 @@ def rollout(
     warn_of_sample_time(model, inputs)
     if gradients is None:
         able = backend in ("auto", "torch") and inputs.tau.shape[-2] <= GRADIENT_STEPS
-        given = (inputs.q0, inputs.qd0, inputs.tau, *own_tensors(plant, model))
+        given = (inputs.q0, inputs.qd0, inputs.tau, *system.tensors.values())
         gradients = able and torch.is_grad_enabled() and any(x.requires_grad for x in given)
     states = simulate(system, inputs, gradients, backend, threads, progress)
     return _as_rollout(inputs, states)
@@ -193,19 +199,19 @@ def simulate(
 
 
 def _as_rollout(inputs: RolloutInputs, states: tuple[Tensor, ...]) -> Rollout:
-    """The motion with its time, NaN from where it diverged."""
-    time = torch.nn.functional.pad(inputs.step, (1, 0)).cumsum_(-1)
+    """The motion, NaN from where it diverged."""
     q, qd, qdd, *law = states
-    diverged_at = time.new_full(q.shape[:-2], torch.inf)
+    found = Rollout(inputs.step, q, qd, qdd, q.new_full(q.shape[:-2], torch.inf), *law)
     # What is lost stays NaN, so that the last sample shows whether anything is.
-    if qd[..., -1, :].isnan().any():
-        lost = qd.isnan().any(-1)
-        first = lost.to(torch.int64).argmax(-1, keepdim=True)
-        at = torch.gather(time.expand(lost.shape), -1, first).squeeze(-1)
-        diverged_at = torch.where(lost.any(-1), at, torch.inf)
-        # Masked, since gradients of NaN would spoil those of other motions.
-        q, qd, qdd = (x.masked_fill(lost[..., None], torch.nan) for x in (q, qd, qdd))
-        law = [x.masked_fill(lost[..., None, None], torch.nan) for x in law]
-        count = int(lost.any(-1).sum())
-        logger.warning("%d rollout(s) diverged, first at %.4g s", count, diverged_at.min())
-    return Rollout(time, q, qd, qdd, diverged_at, *law)
+    if not qd[..., -1, :].isnan().any():
+        return found
+    lost = qd.isnan().any(-1)
+    first = lost.to(torch.int64).argmax(-1, keepdim=True)
+    at = torch.gather(found.time.expand(lost.shape), -1, first).squeeze(-1)
+    diverged_at = torch.where(lost.any(-1), at, torch.inf)
+    # Masked, since gradients of NaN would spoil those of other motions.
+    q, qd, qdd = (x.masked_fill(lost[..., None], torch.nan) for x in (q, qd, qdd))
+    law = [x.masked_fill(lost[..., None, None], torch.nan) for x in law]
+    count = int(lost.any(-1).sum())
+    logger.warning("%d rollout(s) diverged, first at %.4g s", count, diverged_at.min())
+    return Rollout(inputs.step, q, qd, qdd, diverged_at, *law)

@@ -119,19 +119,6 @@ def test_a_network_beats_the_law_that_saw_as_much_and_nears_the_one_that_saw_all
     assert (HoldoutScore(same, of_all).score <= 1) is kept
 
 
-def test_states_alone_have_the_same_quadratic_as_among_all_variables(constant):
-    search, motions = refinement(constant), constant[1].motions
-    torch.manual_seed(0)
-    at = 0.1 * torch.randn(vector(search).shape, dtype=F64)
-    problem = search.problem(search.cut(motions, 0.5), 1e-3, at)
-    x = problem.variables.start()
-    whole, part = problem.linearise(x), problem.linearise_states(x)
-    count = problem.variables.shared_count
-    torch.testing.assert_close(part.gradient, whole.gradient[count:])
-    torch.testing.assert_close(part.hessian, whole.hessian[count:, count:])
-    assert float(part.cost) == float(whole.cost)
-
-
 def test_a_model_settles_on_a_coefficient_of_zero(constant):
     search, found = refinement(constant), constant[1]
     zero = replace(found, model=LFM(2, [[0.0, 2e-3]] * 2, v_smooth=V_SMOOTH))

@@ -1,15 +1,21 @@
 """Recordings cut into shooting windows of equal length, each with an initial state of its own."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from nfriction.friction.laws import Law
+from nfriction.friction.memory import slipping_state, states_along
+from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
+
+# A motion that slides forgets its deflections within so long [s]; where none does, they are sought.
+SETTLING = 1.0
 
 
 @dataclass(frozen=True)
@@ -24,7 +30,9 @@ class Windows:
         q0, qd0: smoothed initial state, (window, joint).
         spans: index of each window's recording, its first and its last sample.
         at_rest: windows whose initial state is known: the measured position, and no velocity.
-        recordings: that the windows are of, in joint coordinates.
+        recordings, motions: that the windows are of, in joint coordinates.
+        law_state: of a law with memory at the start of each window, over that of a contact that
+            slips slowly, (window, joint, state).
     """
 
     q: Tensor
@@ -36,26 +44,50 @@ class Windows:
     spans: tuple[tuple[int, int, int], ...] = ()
     at_rest: tuple[int, ...] = ()
     recordings: tuple[Recording, ...] = ()
+    motions: tuple[Motion, ...] = ()
+    law_state: Tensor | None = None
 
     def __len__(self) -> int:
         return self.q.shape[0]
 
-    def continuity_pairs(self) -> list[tuple[int, int]]:
-        """Pairs of windows of which the second begins where the first ends."""
-        begins = {(place, first): w for w, (place, first, _) in enumerate(self.spans)}
-        ends = ((w, begins.get((place, last))) for w, (place, _, last) in enumerate(self.spans))
-        return [(w, after) for w, after in ends if after is not None]
-
     def subset(self, chosen: Tensor) -> "Windows":
         """Some of the windows, by a mask (window,)."""
         index = chosen.nonzero().flatten().tolist()
-        return Windows(
-            q=self.q[index], tau=self.tau[index], step=self.step[index],
+        return replace(
+            self, q=self.q[index], tau=self.tau[index], step=self.step[index],
             weight=self.weight[index], q0=self.q0[index], qd0=self.qd0[index],
             spans=tuple(self.spans[i] for i in index if self.spans),
             at_rest=tuple(k for k, i in enumerate(index) if i in self.at_rest),
-            recordings=self.recordings,
+            law_state=None if self.law_state is None else self.law_state[index],
         )  # fmt: skip
+
+    def settled(self, plant: Plant, law: Law, coefficients: Tensor) -> "list[Windows]":
+        """The windows with the deflections that the second before leaves behind.
+
+        It begins without any.
+
+        Args:
+            plant: for the load.
+            law: with memory.
+            coefficients: some sets, (set, joint, coefficient); one result of each.
+        """
+        memory = law.memory
+        assert memory is not None
+        steps = max(round(SETTLING / r.sample_time) for r in self.recordings)
+        lead_ins = []
+        for place, first, _ in self.spans:
+            motion = self.motions[place]
+            # Before a recording begins, its contacts rest.
+            rows = np.maximum(np.arange(first - steps, first + 1), 0)
+            lead_ins.append([x[rows] for x in (motion.time[:, None], motion.q, motion.qd)])
+        time, q, qd = (torch.tensor(np.stack(x, 1)) for x in zip(*lead_ins, strict=True))
+        load, held = plant.load(q, qd), 0.5 * (qd[1:] + qd[:-1])
+        start = q.new_zeros((len(coefficients), *q.shape[1:], memory.size))
+        states = states_along(
+            memory, start, held, load[1:], coefficients[:, None], time.diff(dim=0)
+        )[-1]
+        shares = states / slipping_state(memory, coefficients)[:, None]
+        return [replace(self, law_state=share) for share in shares]
 
     def torque_at(self, delay: float) -> tuple[Tensor, Tensor]:
         """Torque that was recorded `delay` [s] later, and its slope over the delay.
@@ -124,8 +156,9 @@ def cut_windows(
             start[0, w], start[1, w] = recording.q[0], 0.0
     q_, tau_, step_, weight_, q0, qd0 = map(torch.as_tensor, (q, tau, step, weight, *start))
     return Windows(
-        q_, tau_, step_, weight_, q0, qd0, tuple(spans), tuple(at_rest), tuple(recordings)
-    )
+        q_, tau_, step_, weight_, q0, qd0,
+        tuple(spans), tuple(at_rest), tuple(recordings), tuple(motions),
+    )  # fmt: skip
 
 
 def _cut(recording: Recording, length: float) -> Iterator[tuple[int, int]]:

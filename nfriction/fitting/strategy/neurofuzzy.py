@@ -18,10 +18,10 @@ from torch import Tensor
 
 from nfriction.fitting.data.inputs import adjustable_terms, apply_encoder_offsets, require_motion
 from nfriction.fitting.equation_error import coefficient_scale
-from nfriction.fitting.fit import FitTask
 from nfriction.fitting.options import DEFAULTS, FitOptions
-from nfriction.fitting.result.fit_result import FitResult, result_from_shooting
+from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.identifiability import information
+from nfriction.fitting.result.of_search import result_from_shooting
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.shooting.variables import model_at
@@ -40,6 +40,7 @@ from nfriction.fitting.strategy.continuation import (
 )
 from nfriction.fitting.strategy.extrapolation_prior import prior_on_unvisited_cells
 from nfriction.fitting.strategy.holdout import HoldoutScore, holdout_rmse, holdout_split
+from nfriction.fitting.task import FitTask
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.optim.evidence import GroupEvidence, group_evidence
@@ -67,8 +68,6 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     free = ShootingFitter(
         StepJacobian(task.plant, network, terms), network, recordings, task.measurement, options,
         task.callback, plant_prior=(known_terms(start, terms), plant_sd),
-        # From smoothed states at full length a search creeps along constraints.
-        defect_sd=None if options.continuity == "none" else options.penalty_sd,
         extrapolation=prior_on_unvisited_cells(schedule, motions, options),
     )  # fmt: skip
     law = replace(free, friction=start.model, friction_prior=law_prior, extrapolation=None)
@@ -95,7 +94,7 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
         )
     found = replace(
         found, motions=task.motions, encoder_offsets=start.encoder_offsets,
-        continuity=options.continuity, skipped_horizons=start.skipped_horizons,
+        skipped_horizons=start.skipped_horizons,
     )  # fmt: skip
     return found.with_warnings(start.data_warnings)
 
