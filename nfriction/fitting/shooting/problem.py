@@ -50,8 +50,8 @@ from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Quadratic
 from nfriction.plant import Plant
 from nfriction.signals import Motion
-from nfriction.simulation.protocols import RolloutInputs
-from nfriction.simulation.rollout import Rollout, integrate
+from nfriction.simulation.protocols import Rollout, RolloutInputs
+from nfriction.simulation.rollout import integrate
 
 
 @dataclass(frozen=True, eq=False)

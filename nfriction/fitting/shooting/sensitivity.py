@@ -22,8 +22,8 @@ from nfriction.friction.models import FrictionModel
 from nfriction.friction.parameters import Sensitivity
 from nfriction.plant import Plant
 from nfriction.simulation.memory_step import memory_step
+from nfriction.simulation.protocols import Rollout
 from nfriction.simulation.rk4 import rk4_step
-from nfriction.simulation.rollout import Rollout
 
 logger = logging.getLogger(__name__)
 
