@@ -146,9 +146,8 @@ def presliding_start(
             for j in chosen:
                 trial[j] = yielding(law, coefficients[j], share * float(ranges[j]), time)
             trials.append(trial)
-        sets = torch.stack(trials)
-        for trial, own in zip(sets, windows.settled(fitter.jacobian.plant, law, sets), strict=True):
-            problem = fitter.problem(own, options.first_noise, trial.reshape(-1))
+        for trial in trials:
+            problem = fitter.problem(windows, options.first_noise, trial.reshape(-1))
             cost = float(problem.cost(problem.variables.start(plant)))
             if cost < lowest:
                 best, lowest = trial, cost
