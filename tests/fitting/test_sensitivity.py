@@ -81,9 +81,7 @@ def test_compiled_and_eager_and_autograd_agree(case, law, monkeypatch, caplog):
 
     state, held, tau, step, vector = given
     for i in range(len(state)):
-        blocks = torch.func.jacrev(after, (0, 1, 2))(
-            state[i], held[i], vector, tau[i], step[i]
-        )
+        blocks = torch.func.jacrev(after, (0, 1, 2))(state[i], held[i], vector, tau[i], step[i])
         exact = torch.cat([b.flatten(1) for b in blocks], -1)
         torch.testing.assert_close(found[i], exact, rtol=1e-10, atol=1e-10)
 
