@@ -151,6 +151,8 @@ class FitOptions:
     max_ratio_all: float = 1.1
     # Candidate priors, relative to the network's own.
     prior_shares: tuple[float, ...] = (1.0, 1 / 3)
+    # Updates of the priors of a network's groups by evidence; each searches on from the last.
+    evidence_updates: int = 3
 
     # --- Extrapolation prior of a network.
     # Grid cells along velocity and acceleration, cells around a visited one that count as

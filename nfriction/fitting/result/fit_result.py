@@ -70,6 +70,8 @@ class FitResult:
             `residual_unit`; of constant coefficients.
         skipped_horizons: lengths of windows that the constant law could not follow [s].
         outliers: stretches of samples that a robust loss counts less than half.
+        effective_parameters: of a network: name of each group of its parameters, how many of them
+            the data determine (MacKay's gamma), and how many there are.
     """
 
     model: FrictionModel
@@ -93,6 +95,7 @@ class FitResult:
     stages: tuple[tuple[float, float], ...] = ()
     skipped_horizons: tuple[float, ...] = ()
     outliers: tuple[Outliers, ...] = ()
+    effective_parameters: tuple[tuple[str, float, int], ...] = ()
 
     def longest_usable_horizon(self, windows: Sequence[float]) -> float:
         """The last of growing window lengths that the constant law could follow [s]."""
@@ -150,6 +153,7 @@ class FitResult:
     def to_dict(self) -> dict[str, Any]:
         """Summary for JSON."""
         offsets = {"encoder_offsets": [list(row) for row in self.encoder_offsets]}
+        gamma = {name: value for name, value, _ in self.effective_parameters}
         return {
             "status": self.status,
             "converged": self.converged,
@@ -167,6 +171,7 @@ class FitResult:
             "warnings": list(self.warnings),
             **(offsets if self.encoder_offsets else {}),
             **({"outliers": [o._asdict() for o in self.outliers]} if self.outliers else {}),
+            **({"effective_parameters": gamma} if gamma else {}),
         }
 
     def to_pandas(self) -> "pd.DataFrame":
