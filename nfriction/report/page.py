@@ -164,6 +164,7 @@ _CAPTIONS = {
     "is the limit of these data, the effect of the uncertainty of the start",
     "rmse_train": "Position error by model and joint, training recordings",
     "horizons_train": "Position error over the length of the simulation, training recordings",
+    "mechanism": "The mechanism as the rig file describes it",
     "positions_test_": "Measured and simulated position with the error below, test: ",
     "positions_train_": "Measured and simulated position with the error below, training: ",
     "friction": "Friction torque over velocity: rows, their medians with quartiles in bins of "

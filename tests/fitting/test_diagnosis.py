@@ -19,8 +19,8 @@ from nfriction import (
     fit,
     rollout,
 )
-from nfriction.fitting.fit import prepare_task
 from nfriction.fitting.options import FitOptions
+from nfriction.fitting.task import prepare_task
 from nfriction.signals import kalman_smoother
 
 COUNT = 2 * math.pi / 4096

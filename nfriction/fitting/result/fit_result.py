@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from torch import Tensor
 
-from nfriction.fitting.options import DEFAULTS, Continuity
+from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.plant_parameters import TORQUE_DELAY
 from nfriction.fitting.result.identifiability import CoefficientUncertainty, Interval
 from nfriction.fitting.robust_loss import Outliers
@@ -63,7 +63,6 @@ class FitResult:
             [rad; m], one row a recording; empty unless encoders were zeroed at each.
         uncertainty: standard deviation of the coefficients at any motion; None after an
             equation-error fit.
-        continuity: of the fitted windows, see `fit`.
         data_warnings: warnings about the data; inherited by fits warm-started from this one.
         mistakes: likely mistakes in recordings or rig, see `fitting.diagnosis`; inherited, too.
         noise: of encoders and torque; None after an equation-error fit.
@@ -71,6 +70,8 @@ class FitResult:
             `residual_unit`; of constant coefficients.
         skipped_horizons: lengths of windows that the constant law could not follow [s].
         outliers: stretches of samples that a robust loss counts less than half.
+        effective_parameters: of a network: name of each group of its parameters, how many of them
+            the data determine (MacKay's gamma), and how many there are.
     """
 
     model: FrictionModel
@@ -88,13 +89,13 @@ class FitResult:
     warnings: tuple[str, ...] = ()
     encoder_offsets: tuple[tuple[float, ...], ...] = ()
     uncertainty: CoefficientUncertainty | None = None
-    continuity: Continuity = "none"
     data_warnings: tuple[str, ...] = ()
     mistakes: tuple[str, ...] = ()
     noise: Noise | None = None
     stages: tuple[tuple[float, float], ...] = ()
     skipped_horizons: tuple[float, ...] = ()
     outliers: tuple[Outliers, ...] = ()
+    effective_parameters: tuple[tuple[str, float, int], ...] = ()
 
     def longest_usable_horizon(self, windows: Sequence[float]) -> float:
         """The last of growing window lengths that the constant law could follow [s]."""
@@ -152,6 +153,7 @@ class FitResult:
     def to_dict(self) -> dict[str, Any]:
         """Summary for JSON."""
         offsets = {"encoder_offsets": [list(row) for row in self.encoder_offsets]}
+        gamma = {name: value for name, value, _ in self.effective_parameters}
         return {
             "status": self.status,
             "converged": self.converged,
@@ -167,9 +169,9 @@ class FitResult:
             "unidentifiable": list(self.unidentifiable),
             "stages": [list(stage) for stage in self.stages],
             "warnings": list(self.warnings),
-            **({} if self.continuity == "none" else {"continuity": self.continuity}),
             **(offsets if self.encoder_offsets else {}),
             **({"outliers": [o._asdict() for o in self.outliers]} if self.outliers else {}),
+            **({"effective_parameters": gamma} if gamma else {}),
         }
 
     def to_pandas(self) -> "pd.DataFrame":

@@ -180,8 +180,6 @@ def warnings_of(
     at_bounds: Sequence[str],
     unidentifiable: Sequence[str],
     at_zero: Sequence[str] = (),
-    largest_defect: float = 0.0,
-    options: FitOptions = DEFAULTS,
 ) -> tuple[str, ...]:
     """Warnings about the end of a search, a sentence each.
 
@@ -191,11 +189,6 @@ def warnings_of(
     found = []
     if not converged:
         found.append("The search did not reach a minimum; the intervals may be too narrow.")
-    if not largest_defect <= options.max_defect:
-        found.append(
-            f"Windows are not continuous: the largest defect is {largest_defect:.3g} times its "
-            "standard deviation. The law is wrong, or the motion forgets its start."
-        )
     if none := [name for name in at_zero if not any(name in d for d in unidentifiable)]:
         found.append(f"At zero: {', '.join(none)}; the data show none.")
     if beyond := [name for name in at_bounds if name not in at_zero]:
@@ -282,7 +275,7 @@ class CoefficientUncertainty:
             held = model.coefficients(qd, rest).detach().expand(*qd.shape, -1).clone()
             held.requires_grad_()
             # A law is elementwise, so the sum's gradient is each joint's slope.
-            (slopes,) = torch.autograd.grad(model.torque(qd, load, held).sum(), held)
+            (slopes,) = torch.autograd.grad(model.steady_torque(qd, load, held).sum(), held)
         with torch.no_grad():
             pieces = (x.split(PIECE) for x in (qd, rest, slopes))
             return torch.cat([self._sd(*piece) for piece in zip(*pieces, strict=True)])[..., 0]

@@ -108,8 +108,12 @@ def result_from_shooting(
     problem: ShootingProblem,
     result: LeastSquaresResult,
     motions: tuple[Motion, ...],
+    ambiguous: Sequence[str] = (),
 ) -> FitResult:
-    """The result of a search, whose end is written into the model."""
+    """The result of a search, whose end is written into the model.
+
+    `ambiguous` are parameters for which quite other values explain the data as well.
+    """
     plant, variables, x = problem.jacobian.plant, problem.variables, result.x
     friction, vector, _, offsets = variables.split(x)
     model.load_state_dict(model_at(problem.friction, friction).state_dict())
@@ -130,7 +134,7 @@ def result_from_shooting(
     outliers = tuple(outliers_of(problem, weights))
     noise = measurement_noise(problem, x, residual)
     intervals, unidentifiable, root = _identifiability(
-        problem, result, names, residuals * weights, motions
+        problem, result, names, residuals * weights, motions, ambiguous
     )
     return FitResult(
         model=model.requires_grad_(False),
@@ -151,8 +155,7 @@ def result_from_shooting(
         noise=noise,
         warnings=warnings_of(
             converged=result.converged, at_bounds=at_bounds, unidentifiable=unidentifiable,
-            at_zero=at_zero, options=problem.options,
-            largest_defect=float(problem.defects(x).abs().max()) if problem.pairs else 0.0,
+            at_zero=at_zero,
         )
         + model_error_warning(
             residual, effective_noise(counted), noise.residual, plant.unit, problem.options
@@ -183,6 +186,7 @@ def _identifiability(
     names: Sequence[str],
     residuals: Tensor,
     motions: Sequence[Motion],
+    ambiguous: Sequence[str],
 ) -> tuple[tuple[Interval, ...], tuple[str, ...], Tensor | None]:
     """Confidence intervals, unidentifiable parameters, and a covariance root of the friction.
 
@@ -202,6 +206,7 @@ def _identifiability(
     known = problem.information(result.x, sd).subset(fitted)
     root = torch.zeros(count, len(fitted), dtype=torch.float64)
     root[fitted] = covariance_root(known)
+    root[[names.index(name) for name in ambiguous]] = torch.inf
     sd = root.norm(dim=1)
     shown = fitted if constant else fitted[fitted >= friction_count]
     intervals = confidence_intervals(
@@ -211,7 +216,7 @@ def _identifiability(
     if constant:
         friction = fitted[fitted < friction_count]
         coefficients = fitted_names[: len(friction)]
-        unidentifiable = null_directions(fitted_names, known, options)
+        unidentifiable = (*null_directions(fitted_names, known, options), *ambiguous)
         slope, need = _torque_scale(problem, result, motions)
         weak = (
             *weakly_identified(coefficients, result.x[friction], known, options),
@@ -235,7 +240,7 @@ def _torque_scale(
     table = friction.reshape(len(speed), -1).clone().requires_grad_()
     with torch.enable_grad():
         # A law is elementwise, so the sum's gradient is each coefficient's own slope.
-        torque = problem.friction.torque(speed, torch.ones_like(speed), table)
+        torque = problem.friction.steady_torque(speed, torch.ones_like(speed), table)
         (slope,) = torch.autograd.grad(torque.sum(), table)
     return slope.flatten(), need[:, None].expand_as(slope).flatten()
 
@@ -295,7 +300,7 @@ def _by_torque(problem: ShootingProblem, x: Tensor, errors: Tensor, seed: int = 
     # alone makes the errors.
     exact = windows.q + torch.linalg.solve(problem.measurement, errors.mT).mT
     friction, plant, states, _ = problem.variables.split(x)
-    q0, qd0 = states.chunk(2, -1)
+    q0, qd0 = states[:, : 2 * windows.q0.shape[-1]].chunk(2, -1)
     noisy = replace(windows, q=exact, q0=q0, qd0=qd0, recordings=recordings)
     noisy = replace(noisy, tau=noisy.torque_at(0.0)[0])
     of_friction, of_plant = problem.variables.split(problem.variables.prior()[0])[:2]
