@@ -340,7 +340,8 @@ def _cards(run: Run) -> list[dict[str, Any]]:
         lines = []
         for name in next(iter(sets.values()), {}):
             values = [of[name][j] for of in sets.values() if name in of]
-            unit = f" {units[name]}" if name in units else ""
+            # A unit stays on the line of its number.
+            unit = f" {units[name]}".replace(" ", "\N{NO-BREAK SPACE}") if name in units else ""
             low, high = run.fits[best].intervals.get(f"{name} of {joint}", (math.nan, math.nan))
             note = ""
             if len(values) > 1:
