@@ -314,9 +314,7 @@ def _fit(run: Run, name: str) -> dict[str, Any]:
     ]
     if intervals:
         tables.append(interval_table(name, intervals, bool(fit.plant)))
-    # Runs of older versions say only whether a search converged.
-    old = ("good" if fit.converged else "doubtful", "")
-    verdict, why = fit.usability if len(fit.usability) == 2 else old
+    verdict, why = fit.usability
     return {
         "name": name,
         "record": fit,
