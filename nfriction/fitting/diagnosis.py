@@ -124,6 +124,23 @@ def _tested(
         yield _delay_in_words(delay), share
     for text, rig in _corrected_terms(plant, given, options):
         yield text, _unexplained(rig, given)
+    if len(recordings) > 1:
+        yield _odd_one_out(plant, recordings, motions, options)
+
+
+def _odd_one_out(
+    plant: Plant, recordings: Sequence[Recording], motions: Sequence[Motion], options: FitOptions
+) -> tuple[str, float]:
+    """The recording that friction of its own explains least, and what the others leave."""
+    pairs = list(zip(recordings, motions, strict=True))
+    few = replace(options, diagnosis_samples=max(1, options.diagnosis_samples // len(pairs)))
+    alone = [_unexplained(plant, _collect([r], [m], few)) for r, m in pairs]
+    odd = int(np.argmax(np.nan_to_num(alone, nan=-1.0)))
+    name = recordings[odd].name or f"recording {odd + 1}"
+    del pairs[odd]
+    others = _collect([r for r, _ in pairs], [m for _, m in pairs], options)
+    text = f"{name} is of another rig, or recorded in another way, than the others"
+    return text, _unexplained(plant, others)
 
 
 def _collect(

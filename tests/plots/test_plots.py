@@ -19,7 +19,7 @@ from PIL import Image
 
 from nfriction import plots
 from nfriction.evaluation.compare import NO_FRICTION, Comparison
-from nfriction.evaluation.score import RMSE, Limit, Score
+from nfriction.evaluation.score import RMSE, Errors, Score
 from nfriction.fitting.fit import fit
 from nfriction.fitting.result.identifiability import CoefficientUncertainty
 from nfriction.friction import model_names
@@ -50,9 +50,9 @@ def score_of(
     free_run = RMSE.of(simulated - recording.q)
     windows = {h: RMSE.of(s * (simulated - recording.q)) for h, s in (("1", 0.5), ("2", 0.8))}
     floor = RMSE.of(np.full((2, recording.joints), 1e-3))
-    limit = Limit(floor, dict.fromkeys(windows, floor)) if limited else None
+    limit = Errors(floor, dict.fromkeys(windows, floor)) if limited else None
     end = 1.0 if lost else np.inf
-    return Score(recording.name, free_run, windows, limit, recording.time, simulated, end)
+    return Score(free_run, windows, limit, recording.name, recording.time, simulated, end)
 
 
 def scores_of(

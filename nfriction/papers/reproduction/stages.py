@@ -35,6 +35,7 @@ from nfriction.papers.afem.fit_by_search import SearchMethod, SearchOptions, fit
 from nfriction.papers.control import study
 from nfriction.papers.nffem.refine_adaptive import refine_adaptive
 from nfriction.papers.nffem.train_network import TrainingOptions
+from nfriction.papers.reproduction.missed_torque import missed_torque
 from nfriction.papers.reproduction.procedure import papers_neuro_fuzzy
 from nfriction.papers.reproduction.workspace import (
     FULL,
@@ -46,8 +47,8 @@ from nfriction.papers.reproduction.workspace import (
 )
 from nfriction.recording import Recording
 from nfriction.signals import causal_motion
-from nfriction.simulation.rk4 import required_substeps
 from nfriction.simulation.rollout import rollout
+from nfriction.simulation.validate import required_substeps
 
 logger = logging.getLogger(__name__)
 
@@ -206,7 +207,12 @@ def make_twin(workspace: Workspace, name: str) -> dict[str, Any]:
     for label, motion in zip(made.recordings, motions, strict=True):
         arrays |= {f"{label}_{key}": getattr(motion, key) for key in ("q", "qd", "qdd")}
     workspace.write_arrays(f"twin-{name}", arrays)
-    return {"recordings": {label: r.digest() for label, r in made.recordings.items()}}
+    found: dict[str, Any] = {
+        "recordings": {label: r.digest() for label, r in made.recordings.items()}
+    }
+    if made.part("test"):
+        found["missed_torque"] = missed_torque(made)
+    return found
 
 
 def fit_constant(workspace: Workspace, bench: Bench, name: str) -> FitResult:
