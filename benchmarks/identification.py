@@ -7,7 +7,7 @@
     python benchmarks/identification.py intervals DATA [--only triple ...] [--models CFM]
                                                       [--seconds 5]
     python benchmarks/identification.py own-rigs [--seeds 10] [--rigs 10]
-    python benchmarks/identification.py presliding [--seeds 20]
+    python benchmarks/identification.py presliding [--seeds 20] [--torque-noise 0] [--substeps 1]
 
 Run from the repository's root, on one thread. `recovery` simulates the papers' three links with
 viscous and Coulomb friction, reads them with encoders of 8192 counts at 1 kHz and fits friction
@@ -38,7 +38,9 @@ laws. It prints each coefficient's error, half its 95 % interval, and whether th
 interval wider than 3 % that holds the truth), or neither: MISSED.
 
 `presliding` fits LuGre's six coefficients on a driven axis to a recording below breakaway and one
-that slides, 10 s at 1 kHz with encoders of 14 bits; every seed has coefficients of its own.
+that slides, 10 s at 1 kHz with encoders of 14 bits; every seed has coefficients of its own. The
+recorded torque has noise of the given standard deviation [N]; more substeps make the recordings
+more accurate than the simulations of a fit.
 """
 
 import argparse
@@ -80,6 +82,8 @@ def main() -> int:
     own.add_argument("--rigs", type=int, default=10)
     memory = commands.add_parser("presliding", help="LuGre friction found again")
     memory.add_argument("--seeds", type=int, default=20)
+    memory.add_argument("--torque-noise", type=float, default=0.0)
+    memory.add_argument("--substeps", type=int, default=1)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     if arguments.command == "recovery":
@@ -89,7 +93,7 @@ def main() -> int:
     elif arguments.command == "own-rigs":
         own_rigs(arguments.seeds, arguments.rigs)
     elif arguments.command == "presliding":
-        presliding(arguments.seeds)
+        presliding(arguments.seeds, arguments.torque_noise, arguments.substeps)
     else:
         peer = arguments.peer is not None
         real(

@@ -39,6 +39,8 @@ class Rig(NamedTuple):
     effort: tuple[float, ...] = ()
     counts: int = COUNTS
     rate: int = RATE
+    torque_noise: float = TORQUE_NOISE
+    substeps: int = 8
 
     @property
     def driven(self) -> bool:
@@ -68,7 +70,7 @@ def own_rigs(seeds: int, rigs: int) -> None:
     print(", ".join(f"{count} {verdict}" for verdict, count in counts.items()))
 
 
-def presliding(seeds: int) -> None:
+def presliding(seeds: int, torque_noise: float, substeps: int) -> None:
     """Print how well LuGre friction is found again from presliding and sliding."""
     axis, errors, held = LinearAxis(0.13), [], []
     names = model_by_name("LuGre").definition.names
@@ -83,7 +85,7 @@ def presliding(seeds: int) -> None:
         friction = model_by_name("LuGre")(1, truth.tolist())
         rig = Rig(
             f"presliding {seed}", axis, known(axis, seed, True), "LuGre", (tuple(truth),), (1.0,),
-            FINE_COUNTS, FINE_RATE,
+            FINE_COUNTS, FINE_RATE, torque_noise, substeps,
         )  # fmt: skip
         recordings = [
             recording(rig._replace(effort=(effort,)), friction, random, f"{rig.name} {effort}", "m")
@@ -199,8 +201,8 @@ def recording(
         begin = begin + torch.as_tensor(random.uniform(0.5, 1.2, joints))
     tau = torch.as_tensor(smooth_torque(rig, random)) if rig.driven else None
     run = rollout(
-        rig.plant, friction, begin, rest, tau, sample_time=1 / rig.rate, steps=steps, substeps=8,
-        gradients=False,
+        rig.plant, friction, begin, rest, tau, sample_time=1 / rig.rate, steps=steps,
+        substeps=rig.substeps, gradients=False,
     )  # fmt: skip
     q = run.q.numpy() - [
         math.pi if isinstance(rig.plant, PendulumChain) else 0.0,
@@ -209,7 +211,7 @@ def recording(
     read = None
     if tau is not None:
         read = np.vstack([tau.numpy(), tau[-1:].numpy()])
-        read = read + TORQUE_NOISE * random.standard_normal(read.shape)
+        read = read + rig.torque_noise * random.standard_normal(read.shape)
     return Recording(run.time.numpy(), quantise(q, rig.counts), tau=read, unit=unit, name=name)
 
 
