@@ -16,8 +16,8 @@ from nfriction.plots.comparison import (
     rmse_bars,
     torque_over_velocity,
 )
+from nfriction.plots.drawing import animate, mechanism
 from nfriction.plots.fuzzy import controller_surface, memberships
-from nfriction.plots.mechanism import animate, mechanism
 from nfriction.plots.saving import save_all
 from nfriction.plots.style import for_dark_screen
 from nfriction.plots.torque_table import friction_curves

@@ -17,8 +17,8 @@ from nfriction.plots.coefficients import (
     coefficients_over_time,
 )
 from nfriction.plots.comparison import horizon_curve, positions, rmse_bars, torque_over_velocity
+from nfriction.plots.drawing import mechanism
 from nfriction.plots.fuzzy import memberships
-from nfriction.plots.mechanism import mechanism
 from nfriction.plots.style import DARK_GROUND, for_dark_screen
 from nfriction.recording import Recording
 

@@ -18,10 +18,11 @@ from nfriction.simulation.protocols import (
     Friction,
     NoFriction,
     Plant,
+    Rollout,
     RolloutInputs,
     as_stateful,
 )
-from nfriction.simulation.rollout import Rollout, simulate
+from nfriction.simulation.rollout import simulate
 from nfriction.simulation.validate import (
     outside_inference_mode,
     require_stability,

@@ -462,7 +462,7 @@ def test_gradients_reach_the_parameters_of_model_and_plant():
 
 
 def test_gradients_are_recorded_where_asked_for_and_affordable(monkeypatch):
-    monkeypatch.setattr("nfriction.simulation.rollout.GRADIENT_STEPS", 20)
+    monkeypatch.setattr("nfriction.simulation.adjoint.MOST_STEPS", 20)
     model = smooth_model()
     assert rollout(CHAIN, model, Q0, QD0, steps=20).q.requires_grad
     assert not rollout(CHAIN, model, Q0, QD0, steps=21).q.requires_grad

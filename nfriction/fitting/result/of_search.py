@@ -108,8 +108,12 @@ def result_from_shooting(
     problem: ShootingProblem,
     result: LeastSquaresResult,
     motions: tuple[Motion, ...],
+    ambiguous: Sequence[str] = (),
 ) -> FitResult:
-    """The result of a search, whose end is written into the model."""
+    """The result of a search, whose end is written into the model.
+
+    `ambiguous` are parameters for which quite other values explain the data as well.
+    """
     plant, variables, x = problem.jacobian.plant, problem.variables, result.x
     friction, vector, _, offsets = variables.split(x)
     model.load_state_dict(model_at(problem.friction, friction).state_dict())
@@ -130,7 +134,7 @@ def result_from_shooting(
     outliers = tuple(outliers_of(problem, weights))
     noise = measurement_noise(problem, x, residual)
     intervals, unidentifiable, root = _identifiability(
-        problem, result, names, residuals * weights, motions
+        problem, result, names, residuals * weights, motions, ambiguous
     )
     return FitResult(
         model=model.requires_grad_(False),
@@ -182,6 +186,7 @@ def _identifiability(
     names: Sequence[str],
     residuals: Tensor,
     motions: Sequence[Motion],
+    ambiguous: Sequence[str],
 ) -> tuple[tuple[Interval, ...], tuple[str, ...], Tensor | None]:
     """Confidence intervals, unidentifiable parameters, and a covariance root of the friction.
 
@@ -201,6 +206,7 @@ def _identifiability(
     known = problem.information(result.x, sd).subset(fitted)
     root = torch.zeros(count, len(fitted), dtype=torch.float64)
     root[fitted] = covariance_root(known)
+    root[[names.index(name) for name in ambiguous]] = torch.inf
     sd = root.norm(dim=1)
     shown = fitted if constant else fitted[fitted >= friction_count]
     intervals = confidence_intervals(
@@ -210,7 +216,7 @@ def _identifiability(
     if constant:
         friction = fitted[fitted < friction_count]
         coefficients = fitted_names[: len(friction)]
-        unidentifiable = null_directions(fitted_names, known, options)
+        unidentifiable = (*null_directions(fitted_names, known, options), *ambiguous)
         slope, need = _torque_scale(problem, result, motions)
         weak = (
             *weakly_identified(coefficients, result.x[friction], known, options),

@@ -50,8 +50,8 @@ from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Quadratic
 from nfriction.plant import Plant
 from nfriction.signals import Motion
-from nfriction.simulation.protocols import RolloutInputs
-from nfriction.simulation.rollout import Rollout, integrate
+from nfriction.simulation.protocols import Rollout, RolloutInputs
+from nfriction.simulation.rollout import integrate
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,7 +261,7 @@ def _deflected(model: FrictionModel, shares: Tensor) -> tuple[Tensor | None, Ten
     slipping = slipping.detach()
     joints, size = slipping.shape
     share = shares.unflatten(-1, (joints, size))
-    # Each joint's state depends on its own coefficients: (window, joint, state, joint, coefficient).
+    # Each joint's state depends on its own coefficients, (window, joint, state, joint, k).
     own = torch.eye(joints, dtype=torch.float64)[:, None, :, None]
     by_coefficient = own * (share[..., None] * torch.stack(rows, 1))[..., None, :]
     by_share = torch.diag(slipping.flatten()).expand(len(shares), -1, -1)

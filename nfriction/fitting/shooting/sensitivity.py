@@ -3,8 +3,8 @@
 A window's motion is a chain of identical step maps. All of them are linearised in one kernel call
 by a few directions (state, held coefficients, plant terms); steps between counted samples are
 chained in these directions; a recursion of small matrix products then carries the sensitivities
-through time. Of a law with memory its state is part of the state. The cost hardly depends on the number of friction parameters, so constant and
-neuro-fuzzy models are fitted alike.
+through time. The state includes that of a law with memory. The cost hardly depends on the number of
+friction parameters, so constant and neuro-fuzzy models are fitted alike.
 """
 
 import logging
@@ -22,8 +22,8 @@ from nfriction.friction.models import FrictionModel
 from nfriction.friction.parameters import Sensitivity
 from nfriction.plant import Plant
 from nfriction.simulation.memory_step import memory_step
+from nfriction.simulation.protocols import Rollout
 from nfriction.simulation.rk4 import rk4_step
-from nfriction.simulation.rollout import Rollout
 
 logger = logging.getLogger(__name__)
 

@@ -40,8 +40,8 @@ from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 from nfriction.simulation.compiled import System, integrate_compiled
-from nfriction.simulation.protocols import RolloutInputs
-from nfriction.simulation.rollout import Rollout, integrate
+from nfriction.simulation.protocols import Rollout, RolloutInputs
+from nfriction.simulation.rollout import integrate
 
 logger = logging.getLogger(__name__)
 # Relative decrease of the cost that ends the search by class.

@@ -44,6 +44,7 @@ class RBFCoefficients(Schedule):
     """
 
     handles_range = True
+    fit_strategy = "nfriction.papers.nffem.fit_rbf:fit_rbf"
 
     # Final, so that TorchScript takes it for a constant.
     turn: Final[float] = 3e-3  # where qdd sgn(qd) turns, in units of the velocity's universe
@@ -208,6 +209,11 @@ class RBFCoefficients(Schedule):
         layer = vector.reshape(*bias.shape, -1)
         weight.copy_(layer[..., :-1])
         bias.copy_(layer[..., -1])
+
+    def joint_of_parameters(self) -> Tensor:
+        """The joint whose coefficients each entry of the parameter vector moves, (parameter,)."""
+        size = self.parameter_vector().numel() // self.joints
+        return torch.arange(self.joints).repeat_interleave(size)
 
     def bounds(self) -> tuple[Tensor, Tensor]:
         vector = self.parameter_vector()
