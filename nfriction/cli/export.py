@@ -47,6 +47,9 @@ def add_export(commands: "argparse._SubParsersAction[Parser]", common: Parser) -
                         help="take raw positions, with the causal filter inside")  # fmt: skip
     parser.add_argument("--cutoff", type=_numbers, default="20", metavar="HZ",
                         help="cut-off of that filter [Hz]")  # fmt: skip
+    parser.add_argument("--online", type=_numbers, metavar="NOISE",
+                        help="C of a model with the papers' network that also learns while it "
+                        "runs, from a friction torque measured to this [N m]")  # fmt: skip
     group = parser.add_argument_group("mjcf and urdf")
     group.add_argument("--recording", type=inputs.file, action="append", default=[],
                        help="motion along which the nearest parameters are sought; can be given "
@@ -125,6 +128,11 @@ def _write_controller(
         name = name if is_identifier(name) else f"nf_{name}"
         paths = export.c(model, arguments.out, info, name=name, **options)
         _prove(paths[0], model, info)
+        if arguments.online:
+            from nfriction.papers.nffem.online import OnlineOptions, write_online
+
+            learning = OnlineOptions(arguments.online[0], sample_time=info.sample_time or 1e-3)
+            paths += write_online(model, arguments.out, learning, name=f"{name}_online")
         return paths
     writer = getattr(export, target)
     return [writer(model, arguments.out / f"{stem}{CONTROLLERS[target]}", info, **options)]

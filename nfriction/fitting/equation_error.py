@@ -357,7 +357,11 @@ class _Regression:
             target = np.concatenate([y, np.zeros(len(linear))])
             # The triangle of all rows has the same minimum, and costs the same for any table.
             triangle = np.asarray(np.linalg.qr(np.column_stack([system, target]), mode="r"))
-            found = lsq_linear(triangle[:, :-1], triangle[:, -1], bounds=(lower, np.inf), tol=1e-12)
+            # A step along an open bound is 0 times infinity inside SciPy, which drops it.
+            with np.errstate(invalid="ignore"):
+                found = lsq_linear(
+                    triangle[:, :-1], triangle[:, -1], bounds=(lower, np.inf), tol=1e-12
+                )
             solution = found.x / scale
             coefficients[joint, linear] = torch.as_tensor(solution)
             residual[joint] = float(np.sqrt(np.mean((a @ solution - y) ** 2)))

@@ -288,8 +288,7 @@ def torque_and_slopes(
     with torch.enable_grad():
         # A law is elementwise, so the sum's gradient is each row's own.
         coefficients.requires_grad_()
-        # The steady torque of a law with memory.
-        torque = model.law.torque(qd, load, coefficients, model.v_smooth)
+        torque = model.steady_torque(qd, load, coefficients)
         (by_coefficient,) = torch.autograd.grad(torque.sum(), coefficients)
     slopes = torch.einsum("sk,skp->sp", by_coefficient[:, 0], by_parameter)
     return torque.detach()[:, 0], slopes
@@ -318,7 +317,7 @@ def reads_load(model: FrictionModel) -> bool:
     """True where the steady torque of a model of one joint depends on the load."""
     qd, load = torch.ones(2, 1).double(), torch.tensor([[0.0], [1.0]]).double()
     units = torch.ones(2, 1, len(model.law.names)).double()
-    torque = model.law.torque(qd, load, units, model.v_smooth)
+    torque = model.steady_torque(qd, load, units)
     return not torch.equal(torque[0], torque[1])
 
 

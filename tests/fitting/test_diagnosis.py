@@ -171,6 +171,31 @@ def test_an_advanced_torque_is_in_line_again():
         Recording(late.time, q).advance_torque(0.01)
 
 
+@pytest.mark.parametrize("name", ["driven", "motor", "axis", "wheel"])
+def test_a_driven_motion_without_torque_is_named(name):
+    plant, q, _ = measured(name)
+    (found, *_) = warnings_of(plant, q, None)
+    assert "has no torque, but its motion gains energy up to" in found
+
+
+def test_a_recording_of_another_rig_is_named():
+    plant, q, tau = measured("motor")
+    heavy = plant.replace(gravity_moment=2 * plant.gravity_moment)
+    start = torch.tensor([math.pi], dtype=torch.float64)
+    other = rollout(
+        heavy, CVFM(1, [[0.8, 0.3]]).requires_grad_(False), start, 0 * start, sample_time=STEP,
+        steps=SAMPLES - 1, substeps=8, tau=torch.as_tensor(tau[:-1]),
+    )  # fmt: skip
+    files = {"monday": q, "tuesday": q + 2e-3 * np.sin(q), "other": other.q.numpy()}
+    recordings = [
+        Recording(STEP * np.arange(SAMPLES), x, tau, convention="relative,upright", name=name)
+        for name, x in files.items()
+    ]
+    found = prepare_task(CVFM(1), plant, recordings, FitOptions()).mistakes
+    assert found == ("other is of another rig, or recorded in another way, than the others",)
+    assert not prepare_task(CVFM(1), plant, recordings[:2], FitOptions()).mistakes
+
+
 @pytest.mark.parametrize("rounded", [True, False])
 def test_a_spike_is_named_with_its_time(rounded):
     plant, q, tau = measured("driven")

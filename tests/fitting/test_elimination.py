@@ -11,13 +11,13 @@ from nfriction import LFM
 from nfriction.fitting.data.inputs import adjustable_terms, measurement_matrix
 from nfriction.fitting.data.windows import cut_windows
 from nfriction.fitting.options import FitOptions
-from nfriction.fitting.result.fit_result import result_from_shooting
 from nfriction.fitting.result.identifiability import (
     Information,
     information,
     null_directions,
     standard_deviations,
 )
+from nfriction.fitting.result.of_search import result_from_shooting
 from nfriction.fitting.shooting.normal_equations import (
     Kept,
     marginalize_states,

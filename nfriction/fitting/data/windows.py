@@ -8,14 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.friction.laws import Law
-from nfriction.friction.memory import slipping_state, states_along
+from nfriction.friction.memory import slipping_state
+from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
-
-# A motion that slides forgets its deflections within so long [s]; where none does, they are sought.
-SETTLING = 1.0
 
 
 @dataclass(frozen=True)
@@ -31,8 +28,8 @@ class Windows:
         spans: index of each window's recording, its first and its last sample.
         at_rest: windows whose initial state is known: the measured position, and no velocity.
         recordings, motions: that the windows are of, in joint coordinates.
-        law_state: of a law with memory at the start of each window, (window, joint, state).
-        law_sd: its standard deviation, (joint, state).
+        law_state: of a law with memory at the start of each window, over that of a contact that
+            slips slowly, (window, joint, state).
     """
 
     q: Tensor
@@ -46,7 +43,6 @@ class Windows:
     recordings: tuple[Recording, ...] = ()
     motions: tuple[Motion, ...] = ()
     law_state: Tensor | None = None
-    law_sd: Tensor | None = None
 
     def __len__(self) -> int:
         return self.q.shape[0]
@@ -62,34 +58,21 @@ class Windows:
             law_state=None if self.law_state is None else self.law_state[index],
         )  # fmt: skip
 
-    def settled(self, plant: Plant, law: Law, coefficients: Tensor) -> "list[Windows]":
-        """The windows with the deflections that the second before leaves behind.
+    def deflected(self, plant: Plant, model: FrictionModel) -> "Windows":
+        """The windows with deflections of a law with memory that balance the torques.
 
-        It begins without any. The standard deviations are the deflections of a contact that
-        slips slowly.
-
-        Args:
-            plant: for the load.
-            law: with memory.
-            coefficients: some sets, (set, joint, coefficient); one result of each.
+        The motion before would show them only where it is known to a fraction of the displacement
+        over which contacts yield.
         """
-        memory = law.memory
-        assert memory is not None
-        steps = max(round(SETTLING / r.sample_time) for r in self.recordings)
-        lead_ins = []
-        for place, first, _ in self.spans:
-            motion = self.motions[place]
-            # Before a recording begins, its contacts rest.
-            rows = np.maximum(np.arange(first - steps, first + 1), 0)
-            lead_ins.append([x[rows] for x in (motion.time[:, None], motion.q, motion.qd)])
-        time, q, qd = (torch.tensor(np.stack(x, 1)) for x in zip(*lead_ins, strict=True))
-        load, held = plant.load(q, qd), 0.5 * (qd[1:] + qd[:-1])
-        start = q.new_zeros((len(coefficients), *q.shape[1:], memory.size))
-        states = states_along(
-            memory, start, held, load[1:], coefficients[:, None], time.diff(dim=0)
-        )[-1]
-        sd = slipping_state(memory, coefficients)
-        return [replace(self, law_state=z, law_sd=s) for z, s in zip(states, sd, strict=True)]
+        assert model.law.memory is not None
+        coefficients = model.schedule.rest_coefficients().detach()
+        still, unit = torch.zeros_like(self.q0[0]), torch.ones_like(self.q0[0])
+        slipping = slipping_state(model.law.memory, coefficients)
+        largest = model.law.memory.torque(slipping, still, unit, coefficients)
+        qdd = [torch.as_tensor(self.motions[place].qdd)[first] for place, first, _ in self.spans]
+        found = self.tau[:, 0] - plant.inverse_dynamics(self.q0, self.qd0, torch.stack(qdd))
+        share = (found / largest.clamp(min=1e-12)).clamp(-1.0, 1.0)
+        return replace(self, law_state=share[..., None].expand(-1, -1, slipping.shape[-1]))
 
     def torque_at(self, delay: float) -> tuple[Tensor, Tensor]:
         """Torque that was recorded `delay` [s] later, and its slope over the delay.

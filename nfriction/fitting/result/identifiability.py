@@ -275,7 +275,7 @@ class CoefficientUncertainty:
             held = model.coefficients(qd, rest).detach().expand(*qd.shape, -1).clone()
             held.requires_grad_()
             # A law is elementwise, so the sum's gradient is each joint's slope.
-            (slopes,) = torch.autograd.grad(model.torque(qd, load, held).sum(), held)
+            (slopes,) = torch.autograd.grad(model.steady_torque(qd, load, held).sum(), held)
         with torch.no_grad():
             pieces = (x.split(PIECE) for x in (qd, rest, slopes))
             return torch.cat([self._sd(*piece) for piece in zip(*pieces, strict=True)])[..., 0]

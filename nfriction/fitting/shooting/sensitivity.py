@@ -3,8 +3,8 @@
 A window's motion is a chain of identical step maps. All of them are linearised in one kernel call
 by a few directions (state, held coefficients, plant terms); steps between counted samples are
 chained in these directions; a recursion of small matrix products then carries the sensitivities
-through time. Of a law with memory its state is part of the state. The cost hardly depends on the number of friction parameters, so constant and
-neuro-fuzzy models are fitted alike.
+through time. The state includes that of a law with memory. The cost hardly depends on the number of
+friction parameters, so constant and neuro-fuzzy models are fitted alike.
 """
 
 import logging
@@ -125,7 +125,8 @@ class Trajectory:
 
     `motion` is (window, step + 1, joint), `tau` (window, step, any) as `StepJacobian` takes it,
     `step` (window, step). The `memory` of the coefficients (window, step, joint, state_size) is
-    held constant in derivatives.
+    held constant in derivatives. `law_slope` are derivatives of the first state of a law with
+    memory, by the friction parameters and by its variables, (window, joint state, column).
     """
 
     friction: FrictionModel
@@ -134,6 +135,7 @@ class Trajectory:
     tau: Tensor
     step: Tensor
     memory: Tensor | None = None
+    law_slope: Tensor | None = None
 
     @property
     def state(self) -> Tensor:
@@ -165,6 +167,11 @@ def propagate(
     own = state.shape[-1]
     carried = torch.zeros(windows, own + joints, shared + own, dtype=torch.float64)
     carried[:, :own, shared:] = torch.eye(own, dtype=torch.float64)
+    if run.law_slope is not None:
+        law = slice(2 * joints, own)
+        carried[:, law, :friction_count], carried[:, law, shared + 2 * joints :] = (
+            run.law_slope.tensor_split([friction_count], -1)
+        )
     motion = slice(shared, shared + 2 * joints)
     carried[:, own:, motion], carried[:, own:, friction_count:shared] = (
         jacobian.initial_acceleration(

@@ -25,8 +25,8 @@ def model_at(model: FrictionModel, vector: Tensor) -> FrictionModel:
 class Parts(NamedTuple):
     """A vector of decision variables, taken apart.
 
-    `friction` and `plant` are parameter vectors, `states` position, velocity and deflections of a
-    law with memory at the start of each window, (window, any), `offsets` those of the encoders,
+    `friction` and `plant` are parameter vectors, `states` position and velocity at the start of
+    each window, and `Windows.law_state`, (window, any), `offsets` those of the encoders,
     (recording, joint) or no rows.
     """
 
@@ -146,8 +146,7 @@ class DecisionVariables:
         """Prior standard deviation of the initial states, (window, 2 joint)."""
         joints = self.windows.q0.shape[-1]
         sd = torch.empty(len(self.windows), self.state_count, dtype=torch.float64)
-        if self.windows.law_sd is not None:
-            sd[:, 2 * joints :] = self.windows.law_sd.flatten()
+        sd[:, 2 * joints :] = 1.0
         for rows, (of_q, of_qd) in (
             (slice(None), self.options.start_sd),
             (list(self.windows.at_rest), self.options.rest_sd),

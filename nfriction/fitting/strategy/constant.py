@@ -5,7 +5,7 @@ A nonlinear law has several starts: its own, and two from the law that it contai
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import TypeGuard
 
@@ -23,11 +23,8 @@ from nfriction.fitting.equation_error import (
 )
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.plant_parameters import TORQUE_DELAY, PlantParameter
-from nfriction.fitting.result.fit_result import (
-    FitResult,
-    result_from_equation_error,
-    result_from_shooting,
-)
+from nfriction.fitting.result.fit_result import FitResult
+from nfriction.fitting.result.of_search import result_from_equation_error, result_from_shooting
 from nfriction.fitting.robust_loss import RobustLoss
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.continuation import (
@@ -53,6 +50,9 @@ from nfriction.signals import Motion
 PRESLIDING = tuple(np.geomspace(1e-5, 1.0, 11).tolist())
 BRISTLE_TIMES = (1e-4, 1e-3, 1e-2, 1e-1)
 
+# Stiffness and damping of a rival over those found: its contacts relax at once.
+STIFFER = (10.0, 0.01)
+
 TOO_LONG = (
     "Windows of {:g} s were skipped: the motion forgets its start within them, or law or plant are "
     "wrong."
@@ -72,20 +72,19 @@ def fit_constant(task: FitTask) -> FitResult:
     if options.method == "equation_error":
         return result_from_equation_error(model, task.plant, start, task.motions, torque)
 
-    def equation_error(plant: Plant) -> Tensor:
+    def equation_error(plant: Plant) -> Iterable[Tensor]:
         implied = regression(task, model, plant)
         return with_presliding(torch.cat([implied.coefficients[None], implied.starts]))
 
-    def with_presliding(sliding: Tensor) -> Tensor:
+    def with_presliding(sliding: Tensor) -> Iterable[Tensor]:
         if not model.law.memory:
             return sliding
-        starts = (presliding_start(fitter, c, plant, task.motions) for c in sliding)
-        return torch.stack(list(starts))
+        return (presliding_start(fitter, c, plant, task.motions) for c in sliding)
 
     eccentric = fits_eccentricity(options, start)
     fitter = _fitter(task, model, torque, eccentric)
     plant = known_terms(start, fitter.jacobian.terms, task.delay)
-    friction = with_presliding(torque.coefficients[None]).reshape(-1)
+    friction = next(iter(with_presliding(torque.coefficients[None]))).reshape(-1)
     linear = all(c.linear or not c.fitted for c in model.law.coefficients)
     search = horizon_continuation(
         fitter, friction, plant, task.motions,
@@ -106,7 +105,10 @@ def fit_constant(task: FitTask) -> FitResult:
         richer = _fitter(task, model, torque, eccentric=True)
         tolerance = loglik_tolerance(found.result.cost, options)
         found = richer_by_evidence(found, richer, tolerance) or found
-    fitted = result_from_shooting(model, found.problem, found.result, task.motions)
+    ambiguous: list[str] = []
+    if "sigma_0" in model.law.names and not found.stopped:
+        ambiguous = ambiguous_stiffness(fitter, search.stages[0])
+    fitted = result_from_shooting(model, found.problem, found.result, task.motions, ambiguous)
     lengths = zip(options.windows, search.stages, strict=False)
     fitted = replace(
         fitted,
@@ -146,13 +148,44 @@ def presliding_start(
             for j in chosen:
                 trial[j] = yielding(law, coefficients[j], share * float(ranges[j]), time)
             trials.append(trial)
-        sets = torch.stack(trials)
-        for trial, own in zip(sets, windows.settled(fitter.jacobian.plant, law, sets), strict=True):
-            problem = fitter.problem(own, options.first_noise, trial.reshape(-1))
+        for trial in trials:
+            problem = fitter.problem(windows, options.first_noise, trial.reshape(-1))
             cost = float(problem.cost(problem.variables.start(plant)))
             if cost < lowest:
                 best, lowest = trial, cost
     return best
+
+
+def ambiguous_stiffness(fitter: ShootingFitter, found: HorizonResult) -> list[str]:
+    """Names of stiffness and damping of bristles that the data leave open.
+
+    Presliding below what the encoder resolves has minima of about equal cost at quite different
+    stiffness. A search from far stiffer bristles finds another one; where it differs by more than
+    a factor of two, and the likelihood does not prefer the first, neither is known.
+
+    Args:
+        fitter: of the law.
+        found: a stage of short windows, whose states hardly trap a search.
+    """
+    from scipy.special import chdtri  # slow to import
+
+    problem, law = found.problem, found.problem.friction.law
+    places = [law.names.index(name) for name in ("sigma_0", "sigma_1") if name in law.names]
+    table = found.parts.friction.reshape(-1, len(law.names)).clone()
+    table[:, places] *= torch.tensor(STIFFER[: len(places)])
+    lower, upper = problem.friction.schedule.bounds()
+    start = torch.cat([table.reshape(-1).clamp(lower, upper), found.result.x[table.numel() :]])
+    rival = fitter.search(problem, start, fitter.options.loose_tolerance, "stiffer bristles")
+    # The noise of a first stage is a guess.
+    lost = float(rival.result.cost - found.result.cost) * (problem.noise_sd / found.noise) ** 2
+    if not lost < 0.5 * float(chdtri(len(table) * len(places), 0.05)):
+        return []
+    apart = (rival.parts.friction / found.parts.friction).log().abs().reshape(table.shape)
+    names = problem.friction.schedule.parameter_names(problem.jacobian.plant.joint_names)
+    return [
+        names[j * table.shape[1] + k]
+        for j in range(len(table)) if apart[j, places[0]] > math.log(2.0) for k in places
+    ]  # fmt: skip
 
 
 def yielding(law: Law, coefficients: Tensor, displacement: float, time: float) -> Tensor:
@@ -170,9 +203,9 @@ def yielding(law: Law, coefficients: Tensor, displacement: float, time: float) -
         for name in widths:
             values[name] *= scale
             values["k" + name[1:]] /= scale
-    limits = torch.tensor(Constant(law, 1).limits, dtype=torch.float64)
     found = torch.tensor([values[name] for name in law.names], dtype=torch.float64)
-    return found.clamp(limits[:, 0], limits[:, 1])
+    lower, upper = Constant(law, 1, found).bounds()
+    return found.clamp(lower, upper)
 
 
 def _fitter(
@@ -348,7 +381,7 @@ def best_of_starts(
     # With the larger noise of the two, priors would outweigh the data.
     sizes = (own.noise, nested.noise, own.problem.noise_sd, nested.problem.noise_sd)
     noise = max(min(size for size in sizes if math.isfinite(size)), options.min_noise)
-    implied = equation_error(own.problem.plant_at(nested.parts.plant))[0]
+    implied = next(iter(equation_error(own.problem.plant_at(nested.parts.plant))))
     embedded = embed_nested(law, nested.parts.friction.reshape(len(implied), -1), implied)
     loss = own.problem.loss
     best, lowest = own, _misfit(own, noise, loss) if same else math.inf

@@ -1,7 +1,7 @@
 """Horizon continuation: shooting windows of growing length, each started at the last end."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -24,9 +24,9 @@ from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
-# Coefficients (start, joint, coefficient) that torques imply on a plant: the best, then the best at
-# each of the law's initial values.
-EquationError = Callable[[Plant], Tensor]
+# Coefficients (joint, coefficient) that torques imply on a plant: the best, then the best at each
+# of the law's initial values.
+EquationError = Callable[[Plant], Iterable[Tensor]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,9 +115,8 @@ class ShootingFitter:
         """The problem of windows that starts at these friction parameters."""
         model = model_at(self.friction, friction)
         longest_step = max(r.longest_step for r in self.recordings)
-        if model.law.memory and windows.law_state is None:
-            coefficients = model.schedule.rest_coefficients().detach()
-            (windows,) = windows.settled(self.jacobian.plant, model.law, coefficients[None])
+        if model.law.memory:
+            windows = windows.deflected(self.jacobian.plant, model)
         return ShootingProblem(
             self.jacobian, model, windows, noise, self.measurement,
             substeps=integration_substeps(
