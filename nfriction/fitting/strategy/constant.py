@@ -110,7 +110,7 @@ def fit_constant(task: FitTask) -> FitResult:
         found = richer_by_evidence(found, richer, tolerance) or found
     ambiguous: list[str] = []
     if "sigma_0" in model.law.names and not found.stopped:
-        ambiguous = ambiguous_stiffness(fitter, search.stages[0])
+        ambiguous = ambiguous_stiffness(fitter, found, search.stages[0])
     fitted = result_from_shooting(model, found.problem, found.result, task.motions, ambiguous)
     lengths = zip(options.windows, search.stages, strict=False)
     fitted = replace(
@@ -160,7 +160,9 @@ def presliding_start(
     return best
 
 
-def ambiguous_stiffness(fitter: ShootingFitter, found: HorizonResult) -> list[str]:
+def ambiguous_stiffness(
+    fitter: ShootingFitter, found: HorizonResult, stage: HorizonResult
+) -> list[str]:
     """Names of stiffness and damping of bristles that the data leave open.
 
     Presliding below what the encoder resolves has minima of about equal cost at quite different
@@ -169,17 +171,22 @@ def ambiguous_stiffness(fitter: ShootingFitter, found: HorizonResult) -> list[st
 
     Args:
         fitter: of the law.
-        found: a stage of short windows, whose states hardly trap a search.
+        found: its end.
+        stage: of short windows, whose states hardly trap a search.
     """
     from scipy.special import chdtri  # slow to import
 
-    problem, law = found.problem, found.problem.friction.law
+    problem, law = stage.problem, stage.problem.friction.law
+    count, tolerance = problem.variables.shared_count, fitter.options.loose_tolerance
+    # Terms that only the end may have come last.
+    start = torch.cat([found.result.x[:count], stage.result.x[count:]])
+    found = fitter.search(problem, start, tolerance, "stiffness")
     places = [law.names.index(name) for name in ("sigma_0", "sigma_1") if name in law.names]
     table = found.parts.friction.reshape(-1, len(law.names)).clone()
     table[:, places] *= torch.tensor(STIFFER[: len(places)])
     lower, upper = problem.friction.schedule.bounds()
     start = torch.cat([table.reshape(-1).clamp(lower, upper), found.result.x[table.numel() :]])
-    rival = fitter.search(problem, start, fitter.options.loose_tolerance, "stiffer bristles")
+    rival = fitter.search(problem, start, tolerance, "stiffer bristles")
     # The noise of a first stage is a guess.
     lost = float(rival.result.cost - found.result.cost) * (problem.noise_sd / found.noise) ** 2
     if not lost < 0.5 * float(chdtri(len(table) * len(places), 0.05)):
