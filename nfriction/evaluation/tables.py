@@ -12,6 +12,8 @@ from nfriction.io.model_file import ModelInfo, describe
 
 Value = str | float
 Sets = Mapping[str, Mapping[str, Sequence[float]]]
+# Coefficients side by side that a line of a terminal holds; more are written one below another.
+MOST_COLUMNS = 8
 # A positive coefficient at its bound is 1e-12 of its unit.
 ZERO = 1.001e-12
 
@@ -160,6 +162,9 @@ def coefficient_table(
             rows.append((joint, *([label.replace("_", " ")] if follows else []), *values))
     heads = [f"{name} [{units[name]}]" if name in units else name for name in names]
     caption = f"Coefficients of {model}" + (" (they follow the motion)" if follows else "")
+    if len(names) > MOST_COLUMNS and not follows:
+        by_name = list(zip(heads, *(row[1:] for row in rows), strict=True))
+        return Table(caption, ("coefficient", *joints), tuple(by_name))
     return Table(caption, ("joint", *(["applies"] if follows else []), *heads), tuple(rows))
 
 

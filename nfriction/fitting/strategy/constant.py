@@ -3,11 +3,10 @@
 A nonlinear law has several starts: its own, and two from the law that it contains.
 """
 
-import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import TypeGuard
+from typing import NamedTuple, TypeGuard
 
 import numpy as np
 import torch
@@ -52,6 +51,8 @@ from nfriction.signals import Motion
 # stiffness [s]: from what hardly shows to what would be no presliding.
 PRESLIDING = tuple(np.geomspace(1e-5, 1.0, 11).tolist())
 BRISTLE_TIMES = (1e-4, 1e-3, 1e-2, 1e-1)
+# Displacements that are searched from where the first leaves more than the encoder's rounding.
+MOST_STARTS = 4
 
 # Stiffness and damping of a rival over those found: its contacts relax at once.
 STIFFER = (10.0, 0.01)
@@ -82,7 +83,7 @@ def fit_constant(task: FitTask) -> FitResult:
     def with_presliding(sliding: Tensor) -> Iterable[Tensor]:
         if not model.law.memory:
             return sliding
-        return (presliding_start(fitter, c, plant, task.motions) for c in sliding)
+        return presliding_starts(fitter, sliding, plant, task.motions)
 
     eccentric = fits_eccentricity(options, start)
     fitter = _fitter(task, model, torque, eccentric)
@@ -131,33 +132,52 @@ def regression(task: FitTask, model: FrictionModel, plant: Plant) -> TorqueFit:
     )
 
 
-def presliding_start(
-    fitter: ShootingFitter, coefficients: Tensor, plant: Tensor, motions: tuple[Motion, ...]
-) -> Tensor:
-    """Coefficients of a law with memory whose short windows follow the motion best.
+def presliding_starts(
+    fitter: ShootingFitter, sliding: Tensor, plant: Tensor, motions: tuple[Motion, ...]
+) -> Iterator[Tensor]:
+    """Coefficients of a law with memory to start from, (joint, coefficient), the best first.
 
-    What torques of sliding show stays as given. The displacement over which the contact yields is
-    sought among shares of each joint's range, the damping among times: first for all joints alike,
-    then for each. (joint, coefficient).
+    `sliding` are sets of coefficients that torques imply, (set, joint, coefficient), which show how
+    a joint slides alone. The displacement over which its contact yields is sought among shares of
+    the joint's range, its damping among times, by the cost of short windows. Several displacements
+    of the first set follow, and the best of every other one.
     """
-    law, options = fitter.friction.law, fitter.options
-    windows = fitter.cut(motions, options.windows[0])
-    ranges = torch.tensor(np.max([np.ptp(m.q, axis=0) for m in motions], axis=0))
-    best, lowest = coefficients, math.inf
-    joints = len(coefficients)
-    for chosen in (range(joints), *([j] for j in range(joints) if joints > 1)):
-        trials = []
-        for share, time in itertools.product(PRESLIDING, BRISTLE_TIMES):
-            trial = best.clone()
-            for j in chosen:
-                trial[j] = yielding(law, coefficients[j], share * float(ranges[j]), time)
-            trials.append(trial)
-        for trial in trials:
-            problem = fitter.problem(windows, options.first_noise, trial.reshape(-1))
-            cost = float(problem.cost(problem.variables.start(plant)))
-            if cost < lowest:
-                best, lowest = trial, cost
-    return best
+    for place, coefficients in enumerate(sliding):
+        found = _yielding_alike(fitter, coefficients, plant, motions)
+        yield from found[: 1 if place else MOST_STARTS]
+
+
+def _yielding_alike(
+    fitter: ShootingFitter, coefficients: Tensor, plant: Tensor, motions: tuple[Motion, ...]
+) -> list[Tensor]:
+    """The best coefficients of every share of the range, least cost of short windows first."""
+    law, windows = fitter.friction.law, fitter.cut(motions, fitter.options.windows[0])
+    ranges = np.max([np.ptp(m.q, axis=0) for m in motions], axis=0)
+
+    def tried(share: float, time: float, base: Tensor, joints: Sequence[int]) -> _Start:
+        trial = base.clone()
+        for j in joints:
+            trial[j] = yielding(law, coefficients[j], share * float(ranges[j]), time)
+        problem = fitter.problem(windows, fitter.options.first_noise, trial.reshape(-1))
+        return _Start(float(problem.cost(problem.variables.start(plant))), trial)
+
+    def best(joints: Sequence[int], base: Tensor) -> list[_Start]:
+        rows = ([tried(s, t, base, joints) for t in BRISTLE_TIMES] for s in PRESLIDING)
+        return sorted((min(row, key=_Start.rank) for row in rows), key=_Start.rank)
+
+    # All joints alike first, then each by itself.
+    found = best(range(len(coefficients)), coefficients)
+    for j in range(len(coefficients)) if len(coefficients) > 1 else ():
+        found = [*best([j], found[0].coefficients)[:1], *found]
+    return [start.coefficients for start in sorted(found, key=_Start.rank)]
+
+
+class _Start(NamedTuple):
+    cost: float
+    coefficients: Tensor
+
+    def rank(self) -> float:
+        return self.cost if math.isfinite(self.cost) else math.inf
 
 
 def ambiguous_stiffness(
