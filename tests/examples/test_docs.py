@@ -238,9 +238,10 @@ def shown_at(place: int, shown: list[str], printed: list[str]) -> bool:
         if a == b:
             return True
         try:
-            return math.isclose(float(a.strip("()[],;%")), float(b.strip("()[],;%")), rel_tol=0.01)
+            x, y = (float(word.strip("()[],;%")) for word in (a, b))
         except ValueError:
             return False
+        return math.isclose(x, y, rel_tol=0.01, abs_tol=1e-12)
 
     there = printed[place : place + len(shown)]
     return len(there) == len(shown) and all(map(same, shown, there))
