@@ -79,9 +79,9 @@ class Score(Errors):
     """Errors of one model on one recording; they are plain data, without plant or model.
 
     Attributes:
-        limit: errors that the uncertainty of the start alone may cause, in simulations of this
-            model; None where it was not asked for. The true model stays below in 95 of 100
-            recordings; smaller differences between models are not meaningful.
+        limit: errors that the uncertainty of the start and the noise of the torque may cause, in
+            simulations of this model; None where it was not asked for. The true model stays below
+            in 95 of 100 recordings; smaller differences between models are not meaningful.
         recording: its name.
         time, simulated: the free run with its lead-ins, in the recording's coordinates, for
             figures; NaN between gaps that leave no room for a lead-in.
