@@ -156,8 +156,9 @@ class CompiledFunction:
         eager = _tuple(self._function(*inputs))
         if not self._jacobian:
             return eager
-        blocks = torch.func.jacfwd(outputs, argnums=self._jacobian)(*inputs)
-        flat = [block.reshape(block.shape[0], -1) for block in blocks]
+        # By plain autograd: `torch.func` imports the whole of torch._dynamo (2 s).
+        blocks = torch.autograd.functional.jacobian(outputs, tuple(inputs))
+        flat = [blocks[i].reshape(len(blocks[i]), -1) for i in self._jacobian]
         return (*eager, torch.cat(flat, -1))
 
 

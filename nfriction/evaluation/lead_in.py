@@ -14,12 +14,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from nfriction.friction.memory import states_along
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
-from nfriction.signals import causal_motion
-from nfriction.simulation.rk4 import required_substeps
+from nfriction.signals import Motion, causal_motion
 from nfriction.simulation.rollout import Scheme, rollout
+from nfriction.simulation.validate import required_substeps
 
 logger = logging.getLogger(__name__)
 
@@ -126,10 +127,21 @@ class Simulator:
         if scheme != "time_stepping":
             self.substeps = _substeps(plant, friction, recording)
         self.states: torch.Tensor | None = None
-        if friction is not None and friction.state_size:
-            # Those of a controller at every sample, from which windows go on.
+        self.law_states: torch.Tensor | None = None
+        # Those of a controller at every sample, from which windows go on.
+        if friction is not None and (friction.state_size or friction.law.memory):
             motion = _causal_motion(plant, recording)
-            self.states = friction.schedule.states(*map(torch.tensor, motion))
+            q, qd, qdd = (torch.tensor(x) for x in (motion.q, motion.qd, motion.qdd))
+            if friction.state_size:
+                self.states = friction.schedule.states(qd, qdd)
+            if friction.law.memory:
+                # Not deflected before the first sample.
+                step = torch.tensor(np.diff(self.time, prepend=0.0))
+                start = friction.law.initial_state(qd[0])
+                held = friction.coefficients(qd[0], qdd[0])
+                self.law_states = states_along(
+                    friction.law.memory, start, qd, plant.load(q, qd), held, step
+                )
 
     def free_runs(self, initial_state: tuple[Array, Array] | None) -> list[Runs]:
         """One run of each segment that is longer than a lead-in."""
@@ -215,11 +227,14 @@ class Simulator:
         held = samples[:, :-1]
         tau = None if self.recording.tau is None else torch.tensor(self.recording.tau[held])
         step = torch.tensor(np.diff(self.time)[held])
-        memory = None if self.states is None else self.states[samples[:, 0]]
+        memory, law_state = (
+            None if x is None else x[samples[:, 0]] for x in (self.states, self.law_states)
+        )
         with torch.no_grad():
             run = rollout(
                 self.plant, self.friction, torch.tensor(q0), torch.tensor(qd0), tau,
                 sample_time=step, substeps=self.substeps, scheme=self.scheme, hidden_state=memory,
+                law_state=law_state,
             )  # fmt: skip
         q = self.convention.position_from_joint(run.q.numpy(), first_link)
         return q, run.diverged_at.numpy()
@@ -329,13 +344,12 @@ def _noise(y: Array, quantum: float | None) -> Array:
     return np.maximum(seen, np.maximum(least, 1e-12 * np.maximum(np.abs(y).max(axis=1), 1.0)))
 
 
-def _causal_motion(plant: Plant, recording: Recording) -> tuple[Array, Array]:
-    """Velocity and acceleration in joint coordinates as a controller has them, (sample, joint)."""
+def _causal_motion(plant: Plant, recording: Recording) -> Motion:
+    """The motion in joint coordinates as a controller has it."""
     joint = recording.joint_coordinates(plant)
     quantum = plant.position_quantum or np.finfo(np.float64).eps
     cutoff = min(CUTOFF, 0.2 / joint.sample_time)
-    motion = causal_motion(joint.time, joint.q, math.tau / quantum, cutoff)
-    return motion.qd, motion.qdd
+    return causal_motion(joint.time, joint.q, math.tau / quantum, cutoff)
 
 
 def _substeps(plant: Plant, friction: FrictionModel | None, recording: Recording) -> int | None:

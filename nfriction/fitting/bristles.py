@@ -17,6 +17,7 @@ from torch import Tensor
 
 from nfriction.fitting.hysteresis import TOLERANCE, MemoryFit, path_of, range_of
 from nfriction.friction.laws import Law
+from nfriction.friction.memory import states_along
 from nfriction.recording.torque_table import JointTorque
 
 Array = NDArray[np.float64]
@@ -192,12 +193,10 @@ def _states(law: Law, joint: JointTorque, coefficients: Tensor) -> Tensor:
     assert joint.time is not None
     step = torch.tensor(np.diff(joint.time, prepend=joint.time[0] - joint.step))
     moved = torch.tensor(path_of(joint)) / step
-    one = torch.ones(coefficients.shape[:-1]).double()
-    state, states = one[..., None].expand(*one.shape, law.memory.size) * 0.0, []
-    for v, h in zip(moved, step, strict=True):
-        state = law.memory.advance(state, v * one, one, coefficients, h)
-        states.append(state)
-    return torch.stack(states, 1)
+    one = torch.ones(len(moved), 1).double()
+    start = coefficients.new_zeros((*coefficients.shape[:-1], law.memory.size))
+    along = states_along(law.memory, start, moved[:, None], one, coefficients, step)
+    return along.transpose(0, 1)
 
 
 def torques(law: Law, joint: JointTorque, coefficients: Array) -> Array:

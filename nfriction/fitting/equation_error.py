@@ -211,6 +211,23 @@ def fit_equation_error(
     return replace(found, outliers=tuple(named))
 
 
+def steady_law(law: Law) -> Law:
+    """A law with memory as it slides: what only its deflections show keeps a value."""
+    if law.memory is None:
+        return law
+    units = torch.ones(1, 1, len(law.names), dtype=torch.float64, requires_grad=True)
+    one = torch.ones(1, 1, dtype=torch.float64)
+    with torch.enable_grad():
+        torque = law.torque(one, one, units, V_SMOOTH).sum()
+        (slope,) = torch.autograd.grad(torque, units)
+    coefficients = tuple(
+        c if seen or c.linear
+        else replace(c, initial_grid=(c.initial_grid[len(c.initial_grid) // 2],), fitted=False)
+        for c, seen in zip(law.coefficients, slope.flatten() != 0.0, strict=True)
+    )  # fmt: skip
+    return replace(law, coefficients=coefficients)
+
+
 def regress(
     law: Law, parts: Sequence[TorqueBalance], v_smooth: float, options: FitOptions = DEFAULTS
 ) -> TorqueFit:
@@ -294,17 +311,12 @@ class _Regression:
         """Slopes (sample, joint, coefficient) and residuals (sample, joint); 0 if left out."""
         rows = []
         for part in self.parts:
-
-            def torque(values: Tensor, part: TorqueBalance = part) -> Tensor:
-                return self.law.torque(part.qd, part.load, values, self.v_smooth)
-
-            units = torch.eye(coefficients.shape[1], dtype=coefficients.dtype)
-            pairs = [
-                torch.func.jvp(torque, (coefficients,), (unit.expand_as(coefficients),))
-                for unit in units
-            ]
-            values = torch.stack([pairs[0][0], *(pair[1] for pair in pairs)], -1)
-            rows.append(part.smoothed(values))
+            # A law is elementwise, so the sum's gradient has every sample's slopes.
+            own = coefficients.expand(len(part.qd), -1, -1).clone().requires_grad_()
+            with torch.enable_grad():
+                torque = self.law.torque(part.qd, part.load, own, self.v_smooth)
+                slopes = torch.autograd.grad(torque.sum(), own)[0]
+            rows.append(part.smoothed(torch.cat([torque.detach()[..., None], slopes], -1)))
         found = self.root[..., None] * torch.where(self.kept[..., None], torch.cat(rows), 0.0)
         return found[..., 1:], found[..., 0] - self.root * torch.where(self.kept, self.torque, 0.0)
 
@@ -345,7 +357,11 @@ class _Regression:
             target = np.concatenate([y, np.zeros(len(linear))])
             # The triangle of all rows has the same minimum, and costs the same for any table.
             triangle = np.asarray(np.linalg.qr(np.column_stack([system, target]), mode="r"))
-            found = lsq_linear(triangle[:, :-1], triangle[:, -1], bounds=(lower, np.inf), tol=1e-12)
+            # A step along an open bound is 0 times infinity inside SciPy, which drops it.
+            with np.errstate(invalid="ignore"):
+                found = lsq_linear(
+                    triangle[:, :-1], triangle[:, -1], bounds=(lower, np.inf), tol=1e-12
+                )
             solution = found.x / scale
             coefficients[joint, linear] = torch.as_tensor(solution)
             residual[joint] = float(np.sqrt(np.mean((a @ solution - y) ** 2)))

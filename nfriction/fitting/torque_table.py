@@ -30,6 +30,7 @@ from nfriction.fitting.result.identifiability import (
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
 from nfriction.friction import model_by_name, plain_name
 from nfriction.friction.laws import Memory
+from nfriction.friction.memory import states_along
 from nfriction.friction.models import V_SMOOTH, FrictionModel
 from nfriction.optim.least_squares import Quadratic
 from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
@@ -239,17 +240,11 @@ def _remembered(model: FrictionModel, memory: Memory, joint: JointTorque, lead_i
     coefficients = model.coefficients(qd[:1], qdd[:1]).reshape(1, -1)
     step = np.diff(joint.time, prepend=joint.time[0] - joint.step)
     moved = torch.tensor(path_of(joint) / step)[:, None]
-    steps = torch.tensor(step)[:, None]
+    steps = torch.tensor(step)
 
-    def along(state: Tensor, rows: range) -> Tensor:
+    def along(state: Tensor, rows: slice) -> Tensor:
         """States after rows, (row, *state)."""
-        found = []
-        for k in rows:
-            state = memory.advance(
-                state, moved[k].expand(state.shape[:-1]), load[k], coefficients, steps[k]
-            )
-            found.append(state)
-        return torch.stack(found)
+        return states_along(memory, state, moved[rows], load[rows], coefficients, steps[rows])
 
     still = torch.zeros(1, 1, memory.size).double()
     # A table to predict may have no torque, which then shows nothing.
@@ -263,7 +258,7 @@ def _remembered(model: FrictionModel, memory: Memory, joint: JointTorque, lead_i
             still.expand(len(way), 1, -1), way.sign()[:, None], load[0], coefficients,
             way.abs()[:, None],
         )  # fmt: skip
-        states = along(starts, range(first.stop))[..., 0, :]
+        states = along(starts, first)[..., 0, :]
         speed, force = (x[first].expand(states.shape[:-1]) for x in (qd, load))
         torque = memory.torque(states, speed, force, coefficients[0])
         rmse = (tau[first] - torque).square().mean(0).sqrt()
@@ -275,10 +270,10 @@ def _remembered(model: FrictionModel, memory: Memory, joint: JointTorque, lead_i
         fading = float(coefficients[0, names.index("d_r")]) if "d_r" in names else 0.0
         if fading > 1e-6 * reach:
             # Friction that the elements do not show is the excess of a long rest.
-            left = torch.exp(-(moved[first].abs() * steps[first]).cumsum(0) / fading)[:, 0]
+            left = torch.exp(-(moved[first].abs() * steps[first, None]).cumsum(0) / fading)[:, 0]
             error = (tau[first] - torque)[:, best]
             still[..., -1] = left @ error / left.square().sum()
-    states = along(still, range(len(joint)))[:, 0]
+    states = along(still, slice(None))[:, 0]
     return memory.torque(states, qd, load, coefficients)[:, 0]
 
 
@@ -293,8 +288,7 @@ def torque_and_slopes(
     with torch.enable_grad():
         # A law is elementwise, so the sum's gradient is each row's own.
         coefficients.requires_grad_()
-        # The steady torque of a law with memory.
-        torque = model.law.torque(qd, load, coefficients, model.v_smooth)
+        torque = model.steady_torque(qd, load, coefficients)
         (by_coefficient,) = torch.autograd.grad(torque.sum(), coefficients)
     slopes = torch.einsum("sk,skp->sp", by_coefficient[:, 0], by_parameter)
     return torque.detach()[:, 0], slopes
@@ -323,7 +317,7 @@ def reads_load(model: FrictionModel) -> bool:
     """True where the steady torque of a model of one joint depends on the load."""
     qd, load = torch.ones(2, 1).double(), torch.tensor([[0.0], [1.0]]).double()
     units = torch.ones(2, 1, len(model.law.names)).double()
-    torque = model.law.torque(qd, load, units, model.v_smooth)
+    torque = model.steady_torque(qd, load, units)
     return not torch.equal(torque[0], torque[1])
 
 

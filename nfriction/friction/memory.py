@@ -57,6 +57,36 @@ else:
 # 1e-12 keeps 0/0 away where a coefficient is zero; written out, as TorchScript takes no global.
 
 
+@torch.no_grad()
+def states_along(
+    memory: Memory, start: Tensor, qd: Tensor, load: Tensor, coefficients: Tensor, step: Tensor
+) -> Tensor:
+    """States after every sample of a given motion, (sample, *batch, joint, state).
+
+    Args:
+        memory: of the law.
+        start: state before the first sample, (*batch, joint, state).
+        qd: velocity held over the sample [rad/s], (sample, joint) or with a batch.
+        load: likewise [-].
+        coefficients: held all the time, (*batch, joint, coefficient).
+        step: lengths of the samples [s], (sample,) or of the joints of a batch.
+    """
+    state, states = start, []
+    shape = start.shape[:-1]
+    for v, s, h in zip(qd, load, step, strict=True):
+        state = memory.advance(state, v.expand(shape), s.expand(shape), coefficients, h)
+        states.append(state)
+    return torch.stack(states)
+
+
+def slipping_state(memory: Memory, coefficients: Tensor) -> Tensor:
+    """Largest state in size: of a contact that slips slowly, (*batch, joint, state)."""
+    ahead = torch.ones_like(coefficients[..., 0])
+    start = ahead.new_zeros((*ahead.shape, memory.size))
+    # Far, at a velocity below that of any Stribeck curve.
+    return memory.advance(start, 1e-9 * ahead, ahead, coefficients, 1e15 * ahead).abs()
+
+
 def growth(x: Tensor) -> Tensor:
     """Share `(1 - exp(-x)) / x` of a held input that a decaying state keeps, 1 at x = 0."""
     # The quotient cancels at small x, where four terms of its series are exact to rounding.
@@ -235,10 +265,9 @@ def _weakening(qd: Tensor, coefficients: Tensor) -> Tensor:
 _F_C = Coefficient("F_c", "N m")
 _F_D = Coefficient("F_d", "N m", prior_scale=1.0)
 _V_S = Coefficient("v_s", "rad/s", linear=False, initial_grid=(0.003, 0.01, 0.03, 0.1, 0.3))
-_STIFFNESS = Coefficient(
-    "sigma_0", "N m/rad", linear=False, initial_grid=(30.0, 300.0, 3e3, 3e4, 3e5)
-)
-_DAMPING = Coefficient("sigma_1", "N m s/rad", linear=False, initial_grid=(1e-3, 0.1, 10.0))
+# From hobby servos to machine tools; a fit looks for its start relative to the data.
+_STIFFNESS = Coefficient("sigma_0", "N m/rad", linear=False, initial_grid=(0.3, 3e3, 3e7))
+_DAMPING = Coefficient("sigma_1", "N m s/rad", linear=False, initial_grid=(1e-5, 0.1, 1e3))
 _VISCOUS = Coefficient("sigma_2", "N m s/rad")
 
 DAHL = Law(
@@ -272,7 +301,8 @@ def maxwell_slip(elements: int) -> Law:
 
     Its coefficients are the stiffnesses k_i, in which the torque is linear, the deflections d_i at
     which elements slip at high speed, viscous friction F_v, the relative rise of the friction at
-    rest over that at high speed, and the velocity v_s at which it fades.
+    rest over that at high speed, and the velocity v_s at which it fades. A fit seeks the scale of
+    the deflections and keeps their ratios.
 
     Raises:
         ValueError: if `elements` is not a whole number from 1 to 100.
@@ -287,7 +317,7 @@ def maxwell_slip(elements: int) -> Law:
         (
             *(Coefficient(f"k_{i}", "N m/rad") for i in numbers),
             *(
-                Coefficient(f"d_{i}", "rad", linear=False, initial_grid=(d,))
+                Coefficient(f"d_{i}", "rad", linear=False, initial_grid=(d,), fitted=False)
                 for i, d in zip(numbers, spread, strict=True)
             ),
             Coefficient("F_v", "N m s/rad"),

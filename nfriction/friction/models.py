@@ -110,6 +110,10 @@ class FrictionModel(nn.Module):
             )
         return self.law_torque(qd, load, coefficients, self.v_smooth)
 
+    def steady_torque(self, qd: Tensor, load: Tensor, coefficients: Tensor) -> Tensor:
+        """The same at velocities that last: what a law with memory approaches."""
+        return self.law_torque(qd, load, coefficients, self.v_smooth)
+
     def zero_velocity_damping(self) -> Tensor:
         """Slope of the torque over velocity at rest under unit load [N m s/rad], (joint,).
 

@@ -397,7 +397,8 @@ def _torque(model: FrictionModel, qd: Array, joint: int) -> Array:
     """Torque of one joint over its velocity, at the load at rest and without acceleration."""
     velocity = torch.as_tensor(qd)[:, None].expand(-1, model.joints)
     with torch.no_grad():
-        torque = model(velocity, torch.zeros_like(velocity), torch.ones_like(velocity))
+        held = model.coefficients(velocity, torch.zeros_like(velocity))
+        torque = model.steady_torque(velocity, torch.ones_like(velocity), held)
     return torque[:, joint].numpy()
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from nfriction import LFM, NFLFM, ModelInfo, Recording, cli, rigs, save
-from nfriction.cli import verify
+from nfriction.cli import export
 from nfriction.cli.console import Parser
 from nfriction.export.c_code.dialect import ControllerC
 from nfriction.export.c_code.export import find_compiler
@@ -30,7 +30,7 @@ def model(tmp_path: Path) -> Path:
 
 def run_verify(*words: Any) -> int:
     parser = Parser()
-    verify.add(parser.add_subparsers(), Parser(add_help=False))
+    export.add_verify(parser.add_subparsers(), Parser(add_help=False))
     arguments = parser.parse_args(["verify", *map(str, words)], argparse.Namespace())
     return int(arguments.run(arguments))
 

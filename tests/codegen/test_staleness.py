@@ -10,17 +10,12 @@ import pytest
 import torch
 from torch import nn
 
-from nfriction.codegen import Incomparable
-from nfriction.codegen import fingerprint as full
+from nfriction.codegen import Incomparable, fingerprint
 
 F64 = torch.float64
 Pair = namedtuple("Pair", "a b")
 KNOBS = {"list": [1.0], "array": np.zeros(5_000)}
 RUNNING = iter([1.0])
-
-
-def fingerprint(modules, *others):
-    return full(modules, *others).key
 
 
 class Grade(enum.Enum):
@@ -31,6 +26,8 @@ class Grade(enum.Enum):
 class Slotted:
     __slots__ = ("value",)
 
+
+class Held:
     def __init__(self, value):
         self.value = value
 
@@ -45,21 +42,12 @@ class Ring:
 
 def test_the_same_is_equal_and_another_differs():
     values = [
-        *(0.0, -0.0, 1.0, 1, True, math.nan, "1", b"1", None, [1.0], (1.0,), {"a": 1.0}),
-        *(
-            Pair(1.0, 2.0),
-            Pair(1.0, 3.0),
-            defaultdict(int),
-            defaultdict(list),
-            {1, 2},
-            slice(1),
-            slice(2),
-        ),
+        *(0.0, -0.0, 1.0, 1, True, math.nan, "1", b"1", None, [1.0], (1.0,), {1}, {"a": 1.0}),
         *(np.zeros(3), np.zeros((3, 1)), np.zeros(3, dtype=int), np.float64(1.0)),
         *(torch.zeros(2), torch.zeros(2, dtype=F64), torch.ones(2), torch.zeros(()), torch.int64),
-        *(Slotted(1.0), Slotted(2.0), Grade.THIN, Grade.THICK, torch.tanh, torch.sin, math.sin),
-        *(functools.partial(max, 1.0), functools.partial(max, 2.0), [].append, "a".join),
-        *(Slotted(3.0).get, Slotted(4.0).get, nn.Linear, Ring(), nn.Tanh(), nn.Sigmoid()),
+        *(Held(1.0), Held(2.0), Grade.THIN, Grade.THICK, torch.tanh, torch.sin, math.sin),
+        *(functools.partial(max, 1.0), functools.partial(max, 2.0)),
+        *(Held(3.0).get, Held(4.0).get, nn.Linear, Ring(), nn.Tanh(), nn.Sigmoid()),
     ]
     prints = [fingerprint((), value) for value in values]
     assert prints == [fingerprint((), value) for value in values]
@@ -70,7 +58,6 @@ def test_the_same_is_equal_and_another_differs():
 def test_parameters_are_inputs_where_they_are_the_modules_own():
     module, other = nn.Linear(2, 2), nn.Linear(2, 2)
     assert fingerprint((module,)) == fingerprint((other,))
-    assert full((module,)).values() != full((other,)).values()
     # Held by a function, they are constants of the trace.
     assert fingerprint((), module) != fingerprint((), other)
     assert fingerprint((), lambda: module.weight) != fingerprint((), lambda: other.weight)
@@ -130,6 +117,10 @@ def _runs():
         (np.array([[], None], dtype=object), "array of objects"),
         (torch.eye(2).to_sparse(), "layout"),
         (torch.Generator(), "Generator"),
+        (Slotted(), "Slotted"),
+        (Pair(1.0, 2.0), "Pair"),
+        (defaultdict(int), "defaultdict"),
+        ([].append, "builtin_function"),
     ],
 )
 def test_what_cannot_be_compared_is_named(value, named):

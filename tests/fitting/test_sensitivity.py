@@ -8,20 +8,22 @@ from nfriction.codegen import NoBackend
 from nfriction.fitting.plant_parameters import adjusted_buffers, plant_parameters
 from nfriction.fitting.shooting.sensitivity import CHUNK, StepJacobian, Trajectory, propagate
 from nfriction.friction import model_by_name
+from nfriction.simulation.memory_step import memory_step
 from nfriction.simulation.protocols import RolloutInputs
 from nfriction.simulation.rk4 import rk4_step
 from nfriction.simulation.rollout import integrate
 from tests.fitting.recordings import F64, pendulum
 
 
-def samples(joints, k, parameters, count=5, seed=0):
+def samples(joints, k, parameters, count=5, seed=0, memory=0):
     g = torch.Generator().manual_seed(seed)
 
     def draw(*shape):
         return torch.randn(*shape, generator=g, dtype=F64)
 
+    states = 2 * draw(count, joints), 3 * draw(count, joints), 1e-3 * draw(count, memory)
     return (
-        2 * draw(count, joints), 3 * draw(count, joints), 0.01 * draw(count, joints, k).abs() + 0.1,
+        torch.cat(states, -1), 0.01 * draw(count, joints, k).abs() + 0.1,
         0.1 * draw(count, joints), 1e-3 * (1 + draw(count, 1).abs()), 0.05 * draw(parameters),
     )  # fmt: skip
 
@@ -48,6 +50,8 @@ CASES = {
     [
         ("pendulum", "LFM"),
         ("axis", "Stribeck"),
+        ("axis", "MaxwellSlip"),
+        pytest.param("pendulum", "LuGre", marks=pytest.mark.slow),
         pytest.param("drag", "Stribeck", marks=pytest.mark.slow),
         pytest.param("armature", "NLFM", marks=pytest.mark.slow),
     ],
@@ -57,7 +61,8 @@ def test_compiled_and_eager_and_autograd_agree(case, law, monkeypatch, caplog):
     terms = plant_parameters(plant, **settings)
     model = model_by_name(law)(plant.joints, v_smooth=0.5)
     k = len(model.law.coefficients)
-    given = samples(plant.joints, k, len(terms))
+    joints, size = plant.joints, model.law.state_size
+    given = samples(joints, k, len(terms), memory=joints * size)
     compiled = StepJacobian(plant, model, terms)
     assert not caplog.records
     found = compiled(*given)
@@ -65,15 +70,18 @@ def test_compiled_and_eager_and_autograd_agree(case, law, monkeypatch, caplog):
     assert "eager torch" in caplog.text
     torch.testing.assert_close(found, eager(*given), rtol=1e-10, atol=1e-10)
 
-    def after(q, qd, held, vector, tau, step):
+    def after(state, held, vector, tau, step):
         moved = plant.replace(**adjusted_buffers(plant, terms, vector))
-        return torch.cat(rk4_step(moved, model, q, qd, tau, held, step), -1)
+        q, qd, z = state.tensor_split([joints, 2 * joints], -1)
+        if not size:
+            return torch.cat(rk4_step(moved, model, q, qd, tau, held, step), -1)
+        z = z.reshape(joints, size)
+        q, qd, qdd, z = memory_step(moved, model, q, qd, tau, held, step, z)
+        return torch.cat([q, qd, z.flatten(), qdd], -1)
 
-    q, qd, held, tau, step, vector = given
-    for i in range(len(q)):
-        blocks = torch.func.jacrev(after, (0, 1, 2, 3))(
-            q[i], qd[i], held[i], vector, tau[i], step[i]
-        )
+    state, held, tau, step, vector = given
+    for i in range(len(state)):
+        blocks = torch.func.jacrev(after, (0, 1, 2))(state[i], held[i], vector, tau[i], step[i])
         exact = torch.cat([b.flatten(1) for b in blocks], -1)
         torch.testing.assert_close(found[i], exact, rtol=1e-10, atol=1e-10)
 
@@ -101,7 +109,8 @@ def test_a_plant_may_have_no_adjustable_terms(monkeypatch):
 def test_the_start_slope_is_the_frictionless_acceleration_s():
     plant = pendulum()
     terms = plant_parameters(plant, driven=(0, 1), largest_torque=1.0)
-    q, qd, _, tau, _, vector = samples(2, 2, len(terms))
+    state, _, tau, _, vector = samples(2, 2, len(terms))
+    q, qd = state.chunk(2, -1)
     found = StepJacobian(plant, LFM(2), terms).initial_acceleration(q, qd, tau, vector)
     step = 1e-6
     columns = []

@@ -1,13 +1,16 @@
 """Recordings cut into shooting windows of equal length, each with an initial state of its own."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from nfriction.friction.memory import slipping_state
+from nfriction.friction.models import FrictionModel
+from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
@@ -24,7 +27,9 @@ class Windows:
         q0, qd0: smoothed initial state, (window, joint).
         spans: index of each window's recording, its first and its last sample.
         at_rest: windows whose initial state is known: the measured position, and no velocity.
-        recordings: that the windows are of, in joint coordinates.
+        recordings, motions: that the windows are of, in joint coordinates.
+        law_state: of a law with memory at the start of each window, over that of a contact that
+            slips slowly, (window, joint, state).
     """
 
     q: Tensor
@@ -36,26 +41,38 @@ class Windows:
     spans: tuple[tuple[int, int, int], ...] = ()
     at_rest: tuple[int, ...] = ()
     recordings: tuple[Recording, ...] = ()
+    motions: tuple[Motion, ...] = ()
+    law_state: Tensor | None = None
 
     def __len__(self) -> int:
         return self.q.shape[0]
 
-    def continuity_pairs(self) -> list[tuple[int, int]]:
-        """Pairs of windows of which the second begins where the first ends."""
-        begins = {(place, first): w for w, (place, first, _) in enumerate(self.spans)}
-        ends = ((w, begins.get((place, last))) for w, (place, _, last) in enumerate(self.spans))
-        return [(w, after) for w, after in ends if after is not None]
-
     def subset(self, chosen: Tensor) -> "Windows":
         """Some of the windows, by a mask (window,)."""
         index = chosen.nonzero().flatten().tolist()
-        return Windows(
-            q=self.q[index], tau=self.tau[index], step=self.step[index],
+        return replace(
+            self, q=self.q[index], tau=self.tau[index], step=self.step[index],
             weight=self.weight[index], q0=self.q0[index], qd0=self.qd0[index],
             spans=tuple(self.spans[i] for i in index if self.spans),
             at_rest=tuple(k for k, i in enumerate(index) if i in self.at_rest),
-            recordings=self.recordings,
+            law_state=None if self.law_state is None else self.law_state[index],
         )  # fmt: skip
+
+    def deflected(self, plant: Plant, model: FrictionModel) -> "Windows":
+        """The windows with deflections of a law with memory that balance the torques.
+
+        The motion before would show them only where it is known to a fraction of the displacement
+        over which contacts yield.
+        """
+        assert model.law.memory is not None
+        coefficients = model.schedule.rest_coefficients().detach()
+        still, unit = torch.zeros_like(self.q0[0]), torch.ones_like(self.q0[0])
+        slipping = slipping_state(model.law.memory, coefficients)
+        largest = model.law.memory.torque(slipping, still, unit, coefficients)
+        qdd = [torch.as_tensor(self.motions[place].qdd)[first] for place, first, _ in self.spans]
+        found = self.tau[:, 0] - plant.inverse_dynamics(self.q0, self.qd0, torch.stack(qdd))
+        share = (found / largest.clamp(min=1e-12)).clamp(-1.0, 1.0)
+        return replace(self, law_state=share[..., None].expand(-1, -1, slipping.shape[-1]))
 
     def torque_at(self, delay: float) -> tuple[Tensor, Tensor]:
         """Torque that was recorded `delay` [s] later, and its slope over the delay.
@@ -124,8 +141,9 @@ def cut_windows(
             start[0, w], start[1, w] = recording.q[0], 0.0
     q_, tau_, step_, weight_, q0, qd0 = map(torch.as_tensor, (q, tau, step, weight, *start))
     return Windows(
-        q_, tau_, step_, weight_, q0, qd0, tuple(spans), tuple(at_rest), tuple(recordings)
-    )
+        q_, tau_, step_, weight_, q0, qd0,
+        tuple(spans), tuple(at_rest), tuple(recordings), tuple(motions),
+    )  # fmt: skip
 
 
 def _cut(recording: Recording, length: float) -> Iterator[tuple[int, int]]:

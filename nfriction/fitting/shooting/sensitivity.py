@@ -3,8 +3,8 @@
 A window's motion is a chain of identical step maps. All of them are linearised in one kernel call
 by a few directions (state, held coefficients, plant terms); steps between counted samples are
 chained in these directions; a recursion of small matrix products then carries the sensitivities
-through time. The cost hardly depends on the number of friction parameters, so constant and
-neuro-fuzzy models are fitted alike.
+through time. The state includes that of a law with memory. The cost hardly depends on the number of
+friction parameters, so constant and neuro-fuzzy models are fitted alike.
 """
 
 import logging
@@ -21,8 +21,9 @@ from nfriction.fitting.plant_parameters import PlantParameter, adjusted_plant, d
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.parameters import Sensitivity
 from nfriction.plant import Plant
+from nfriction.simulation.memory_step import memory_step
+from nfriction.simulation.protocols import Rollout
 from nfriction.simulation.rk4 import rk4_step
-from nfriction.simulation.rollout import Rollout
 
 logger = logging.getLogger(__name__)
 
@@ -57,18 +58,20 @@ class StepJacobian:
             scale * torch.rand(shape, generator=generator, dtype=torch.float64)
             for shape, scale in zip(shapes, (1.0, 1.0, 1e-2, 1.0, 1e-3, 1e-2), strict=True)
         )
-        self._by_step = _jacobian(self._step, [q, qd, held, tau, step, vector], (0, 1, 2, 5))
+        state = torch.cat([q, qd, 1e-3 * held.new_ones(joints * friction.law.state_size)])
+        self._by_step = _jacobian(self._step, [state, held, tau, step, vector], (0, 1, 4))
         self._by_start = _jacobian(self._start, [q, qd, tau, vector], (0, 1, 3))
 
     def __call__(
-        self, q: Tensor, qd: Tensor, held: Tensor, tau: Tensor, step: Tensor, vector: Tensor
+        self, state: Tensor, held: Tensor, tau: Tensor, step: Tensor, vector: Tensor
     ) -> Tensor:
-        """Derivatives of (q, qd, qdd) after a step, (sample, 3 joint, direction).
+        """Derivatives of the state and the acceleration after a step, (sample, row, direction).
 
-        Directions: q, qd, held coefficients (joint-major), plant terms. Where the torque's delay is
-        one of the terms, `tau` is the torque at no delay, then its slope over the delay.
+        The state is q, qd and that of a law with memory. Directions: state, held coefficients
+        (joint-major), plant terms. Where the torque's delay is one of the terms, `tau` is the
+        torque at no delay, then its slope over the delay.
         """
-        return self._by_step(q, qd, held, tau, step, vector)
+        return self._by_step(state, held, tau, step, vector)
 
     def initial_acceleration(self, q: Tensor, qd: Tensor, tau: Tensor, vector: Tensor) -> Tensor:
         """Derivatives of the first acceleration, which has no friction, by q, qd and plant terms.
@@ -82,12 +85,17 @@ class StepJacobian:
         return plant.forward_dynamics(q, qd, self._torque(tau, vector))
 
     def _step(
-        self, q: Tensor, qd: Tensor, held: Tensor, tau: Tensor, step: Tensor, vector: Tensor
+        self, state: Tensor, held: Tensor, tau: Tensor, step: Tensor, vector: Tensor
     ) -> Tensor:
-        """State after one step, (*batch, 3 joint)."""
+        """State and acceleration after one step, (*batch, row)."""
         plant = adjusted_plant(self.plant, self.terms, vector)
-        torque = self._torque(tau, vector)
-        return torch.cat(rk4_step(plant, self.friction, q, qd, torque, held, step), -1)
+        torque, joints = self._torque(tau, vector), self.plant.joints
+        q, qd = state[..., :joints], state[..., joints : 2 * joints]
+        if not self.friction.law.memory:
+            return torch.cat(rk4_step(plant, self.friction, q, qd, torque, held, step), -1)
+        law = state[..., 2 * joints :].unflatten(-1, (joints, -1))
+        q, qd, qdd, law = memory_step(plant, self.friction, q, qd, torque, held, step, law)
+        return torch.cat([q, qd, law.flatten(-2), qdd], -1)
 
     def _torque(self, tau: Tensor, vector: Tensor) -> Tensor:
         k = self.delay_index
@@ -117,7 +125,8 @@ class Trajectory:
 
     `motion` is (window, step + 1, joint), `tau` (window, step, any) as `StepJacobian` takes it,
     `step` (window, step). The `memory` of the coefficients (window, step, joint, state_size) is
-    held constant in derivatives.
+    held constant in derivatives. `law_slope` are derivatives of the first state of a law with
+    memory, by the friction parameters and by its variables, (window, joint state, column).
     """
 
     friction: FrictionModel
@@ -126,6 +135,14 @@ class Trajectory:
     tau: Tensor
     step: Tensor
     memory: Tensor | None = None
+    law_slope: Tensor | None = None
+
+    @property
+    def state(self) -> Tensor:
+        """Position, velocity and state of a law with memory, (window, step + 1, any)."""
+        law = self.motion.law_state
+        parts = [self.motion.q, self.motion.qd] + ([] if law is None else [law.flatten(-2)])
+        return torch.cat(parts, -1)
 
 
 def propagate(
@@ -141,16 +158,22 @@ def propagate(
 
     Yields:
         Samples, and (window, sample, joint, column) by the friction parameters, the plant terms and
-        the window's initial state. The last piece is the windows' last sample, counted or not, with
-        the rows of its velocities below those of the positions.
+        the window's initial state. The last piece is the windows' last sample, counted or not.
     """
     windows, steps = run.step.shape
     joints, plant_count = run.motion.q.shape[-1], len(run.plant_vector)
     friction_count = run.friction.schedule.parameter_vector().numel()
-    shared = friction_count + plant_count
-    carried = torch.zeros(windows, 3 * joints, shared + 2 * joints, dtype=torch.float64)
-    carried[:, : 2 * joints, shared:] = torch.eye(2 * joints, dtype=torch.float64)
-    carried[:, 2 * joints :, shared:], carried[:, 2 * joints :, friction_count:shared] = (
+    shared, state = friction_count + plant_count, run.state
+    own = state.shape[-1]
+    carried = torch.zeros(windows, own + joints, shared + own, dtype=torch.float64)
+    carried[:, :own, shared:] = torch.eye(own, dtype=torch.float64)
+    if run.law_slope is not None:
+        law = slice(2 * joints, own)
+        carried[:, law, :friction_count], carried[:, law, shared + 2 * joints :] = (
+            run.law_slope.tensor_split([friction_count], -1)
+        )
+    motion = slice(shared, shared + 2 * joints)
+    carried[:, own:, motion], carried[:, own:, friction_count:shared] = (
         jacobian.initial_acceleration(
             run.motion.q[:, 0], run.motion.qd[:, 0], run.tau[:, 0], run.plant_vector
         ).tensor_split([2 * joints], -1)
@@ -161,13 +184,13 @@ def propagate(
     # Steps after the last whole block are a shorter block of their own.
     for first, last in pairwise(sorted({*range(0, whole, many), whole, steps})):
         length = min(block, last - first)
-        q, qd, qdd, tau, step = (
+        before, qd, qdd, tau, step = (
             _by_block(x[:, first:last], length)
-            for x in (run.motion.q, run.motion.qd, run.motion.qdd, run.tau, run.step[..., None])
+            for x in (state, run.motion.qd, run.motion.qdd, run.tau, run.step[..., None])
         )
         memory = None if run.memory is None else _by_block(run.memory[:, first:last], length)
         held, slope = _coefficients(run.friction, qd, qdd, memory)
-        derivative = jacobian(q, qd, held, tau, step, run.plant_vector)
+        derivative = jacobian(before, held, tau, step, run.plant_vector)
         by_state, by_shared = (
             part.unflatten(0, (-1, windows))
             for part in _compose(slope, derivative, length, plant_count)
@@ -176,7 +199,7 @@ def propagate(
         end = sample + stride * rows.shape[1]
         yield slice(sample, end, stride), rows
         sample = end
-    yield slice(steps // substeps, None), carried[:, None, : 2 * joints]
+    yield slice(steps // substeps, None), carried[:, None, :joints]
 
 
 def _by_block(x: Tensor, length: int) -> Tensor:
@@ -205,14 +228,15 @@ def _compose(
     The results are derivatives of the ends of blocks by the state before, and by what is shared.
     """
     samples, joints, k = slope.qd.shape
-    by_q, by_qd, by_held, by_plant = derivative.split(
-        [joints, joints, joints * k, plant_count], dim=-1
-    )
+    own = derivative.shape[-2] - joints
+    by_own, by_held, by_plant = derivative.split([own, joints * k, plant_count], dim=-1)
     of_joint = by_held.unflatten(-1, (joints, k))
+    by_q, by_qd, by_law = by_own.tensor_split([joints, 2 * joints], -1)
     by_state = torch.cat(
         [
             by_q,
             by_qd + torch.einsum("sijk,sjk->sij", of_joint, slope.qd),
+            by_law,
             torch.einsum("sijk,sjk->sij", of_joint, slope.qdd),
         ],
         -1,

@@ -26,7 +26,8 @@ class Parts(NamedTuple):
     """A vector of decision variables, taken apart.
 
     `friction` and `plant` are parameter vectors, `states` position and velocity at the start of
-    each window, (window, 2 joint), `offsets` those of the encoders, (recording, joint) or no rows.
+    each window, and `Windows.law_state`, (window, any), `offsets` those of the encoders,
+    (recording, joint) or no rows.
     """
 
     friction: Tensor
@@ -37,7 +38,7 @@ class Parts(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DecisionVariables:
-    """[friction parameters, plant terms, q0 and qd0 of each window, offsets of each recording].
+    """[friction parameters, plant terms, state of each window, offsets of each recording].
 
     The shared variables, those of all windows, come first.
 
@@ -70,7 +71,7 @@ class DecisionVariables:
     @property
     def state_count(self) -> int:
         """Number of initial-state variables of one window."""
-        return 2 * self.windows.q0.shape[-1]
+        return self._smoothed().numel() // len(self.windows)
 
     @property
     def offset_count(self) -> int:
@@ -93,7 +94,7 @@ class DecisionVariables:
         """The parts of a vector."""
         windows, joints = self.windows.q0.shape
         friction, plant, states, offsets = x.split(
-            [self.friction_count, len(self.terms), 2 * windows * joints, self.offset_count]
+            [self.friction_count, len(self.terms), windows * self.state_count, self.offset_count]
         )
         return Parts(friction, plant, states.reshape(windows, -1), offsets.reshape(-1, joints))
 
@@ -136,15 +137,20 @@ class DecisionVariables:
         return torch.tensor([place for place, *_ in self.windows.spans])
 
     def _smoothed(self) -> Tensor:
-        return torch.cat([self.windows.q0, self.windows.qd0], -1).reshape(-1)
+        parts = [self.windows.q0, self.windows.qd0]
+        if self.windows.law_state is not None:
+            parts.append(self.windows.law_state.flatten(-2))
+        return torch.cat(parts, -1).reshape(-1)
 
     def _state_sd(self) -> Tensor:
         """Prior standard deviation of the initial states, (window, 2 joint)."""
+        joints = self.windows.q0.shape[-1]
         sd = torch.empty(len(self.windows), self.state_count, dtype=torch.float64)
+        sd[:, 2 * joints :] = 1.0
         for rows, (of_q, of_qd) in (
             (slice(None), self.options.start_sd),
             (list(self.windows.at_rest), self.options.rest_sd),
         ):
-            sd[rows, : self.state_count // 2] = of_q
-            sd[rows, self.state_count // 2 :] = of_qd
+            sd[rows, :joints] = of_q
+            sd[rows, joints : 2 * joints] = of_qd
         return sd

@@ -3,8 +3,9 @@
 A nonlinear law has several starts: its own, and two from the law that it contains.
 """
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import TypeGuard
 
@@ -14,15 +15,16 @@ from torch import Tensor
 
 from nfriction.fitting.data.inputs import adjustable_terms, advanced_torques
 from nfriction.fitting.data.windows import Windows
-from nfriction.fitting.equation_error import TorqueFit, fit_equation_error, prior_sd
-from nfriction.fitting.fit import FitTask
-from nfriction.fitting.options import Continuity, FitOptions
-from nfriction.fitting.plant_parameters import TORQUE_DELAY, PlantParameter
-from nfriction.fitting.result.fit_result import (
-    FitResult,
-    result_from_equation_error,
-    result_from_shooting,
+from nfriction.fitting.equation_error import (
+    TorqueFit,
+    fit_equation_error,
+    prior_sd,
+    steady_law,
 )
+from nfriction.fitting.options import FitOptions
+from nfriction.fitting.plant_parameters import TORQUE_DELAY, PlantParameter
+from nfriction.fitting.result.fit_result import FitResult
+from nfriction.fitting.result.of_search import result_from_equation_error, result_from_shooting
 from nfriction.fitting.robust_loss import RobustLoss
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.continuation import (
@@ -35,12 +37,21 @@ from nfriction.fitting.strategy.continuation import (
     loses,
     weighted_cost,
 )
+from nfriction.fitting.task import FitTask
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Law
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Quadratic
 from nfriction.plant import PendulumChain, Plant
 from nfriction.signals import Motion
+
+# Displacements over which a contact yields, over the range of the motion, and ratios of damping to
+# stiffness [s]: from what hardly shows to what would be no presliding.
+PRESLIDING = tuple(np.geomspace(1e-5, 1.0, 11).tolist())
+BRISTLE_TIMES = (1e-4, 1e-3, 1e-2, 1e-1)
+
+# Stiffness and damping of a rival over those found: its contacts relax at once.
+STIFFER = (10.0, 0.01)
 
 TOO_LONG = (
     "Windows of {:g} s were skipped: the motion forgets its start within them, or law or plant are "
@@ -61,18 +72,24 @@ def fit_constant(task: FitTask) -> FitResult:
     if options.method == "equation_error":
         return result_from_equation_error(model, task.plant, start, task.motions, torque)
 
-    def equation_error(plant: Plant) -> Tensor:
+    def equation_error(plant: Plant) -> Iterable[Tensor]:
         implied = regression(task, model, plant)
-        return torch.cat([implied.coefficients[None], implied.starts])
+        return with_presliding(torch.cat([implied.coefficients[None], implied.starts]))
+
+    def with_presliding(sliding: Tensor) -> Iterable[Tensor]:
+        if not model.law.memory:
+            return sliding
+        return (presliding_start(fitter, c, plant, task.motions) for c in sliding)
 
     eccentric = fits_eccentricity(options, start)
     fitter = _fitter(task, model, torque, eccentric)
-    friction = torque.coefficients.reshape(-1)
     plant = known_terms(start, fitter.jacobian.terms, task.delay)
+    friction = next(iter(with_presliding(torque.coefficients[None]))).reshape(-1)
     linear = all(c.linear or not c.fitted for c in model.law.coefficients)
     search = horizon_continuation(
-        fitter, friction, plant, task.motions, None if linear else equation_error
-    )
+        fitter, friction, plant, task.motions,
+        None if linear else equation_error,
+    )  # fmt: skip
     # A law with a curved term may end in a local minimum that its nested law does not have.
     if (law := model.law.nested_law) is not None and not search.end.stopped:
         contained = FrictionModel(law, Constant(law, model.joints), model.v_smooth)
@@ -88,11 +105,13 @@ def fit_constant(task: FitTask) -> FitResult:
         richer = _fitter(task, model, torque, eccentric=True)
         tolerance = loglik_tolerance(found.result.cost, options)
         found = richer_by_evidence(found, richer, tolerance) or found
-    fitted = result_from_shooting(model, found.problem, found.result, task.motions)
+    ambiguous: list[str] = []
+    if "sigma_0" in model.law.names and not found.stopped:
+        ambiguous = ambiguous_stiffness(fitter, search.stages[0])
+    fitted = result_from_shooting(model, found.problem, found.result, task.motions, ambiguous)
     lengths = zip(options.windows, search.stages, strict=False)
     fitted = replace(
         fitted,
-        continuity=options.continuity,
         stages=tuple((float(length), stage.rms) for length, stage in lengths),
         skipped_horizons=search.skipped,
     )
@@ -104,8 +123,89 @@ def regression(task: FitTask, model: FrictionModel, plant: Plant) -> TorqueFit:
     """Constant coefficients that torques imply on a plant."""
     recordings = advanced_torques(task.recordings, task.delay)
     return fit_equation_error(
-        model.law, plant, recordings, task.motions, model.v_smooth, task.options
+        steady_law(model.law), plant, recordings, task.motions, model.v_smooth, task.options
     )
+
+
+def presliding_start(
+    fitter: ShootingFitter, coefficients: Tensor, plant: Tensor, motions: tuple[Motion, ...]
+) -> Tensor:
+    """Coefficients of a law with memory whose short windows follow the motion best.
+
+    What torques of sliding show stays as given. The displacement over which the contact yields is
+    sought among shares of each joint's range, the damping among times: first for all joints alike,
+    then for each. (joint, coefficient).
+    """
+    law, options = fitter.friction.law, fitter.options
+    windows = fitter.cut(motions, options.windows[0])
+    ranges = torch.tensor(np.max([np.ptp(m.q, axis=0) for m in motions], axis=0))
+    best, lowest = coefficients, math.inf
+    joints = len(coefficients)
+    for chosen in (range(joints), *([j] for j in range(joints) if joints > 1)):
+        trials = []
+        for share, time in itertools.product(PRESLIDING, BRISTLE_TIMES):
+            trial = best.clone()
+            for j in chosen:
+                trial[j] = yielding(law, coefficients[j], share * float(ranges[j]), time)
+            trials.append(trial)
+        for trial in trials:
+            problem = fitter.problem(windows, options.first_noise, trial.reshape(-1))
+            cost = float(problem.cost(problem.variables.start(plant)))
+            if cost < lowest:
+                best, lowest = trial, cost
+    return best
+
+
+def ambiguous_stiffness(fitter: ShootingFitter, found: HorizonResult) -> list[str]:
+    """Names of stiffness and damping of bristles that the data leave open.
+
+    Presliding below what the encoder resolves has minima of about equal cost at quite different
+    stiffness. A search from far stiffer bristles finds another one; where it differs by more than
+    a factor of two, and the likelihood does not prefer the first, neither is known.
+
+    Args:
+        fitter: of the law.
+        found: a stage of short windows, whose states hardly trap a search.
+    """
+    from scipy.special import chdtri  # slow to import
+
+    problem, law = found.problem, found.problem.friction.law
+    places = [law.names.index(name) for name in ("sigma_0", "sigma_1") if name in law.names]
+    table = found.parts.friction.reshape(-1, len(law.names)).clone()
+    table[:, places] *= torch.tensor(STIFFER[: len(places)])
+    lower, upper = problem.friction.schedule.bounds()
+    start = torch.cat([table.reshape(-1).clamp(lower, upper), found.result.x[table.numel() :]])
+    rival = fitter.search(problem, start, fitter.options.loose_tolerance, "stiffer bristles")
+    # The noise of a first stage is a guess.
+    lost = float(rival.result.cost - found.result.cost) * (problem.noise_sd / found.noise) ** 2
+    if not lost < 0.5 * float(chdtri(len(table) * len(places), 0.05)):
+        return []
+    apart = (rival.parts.friction / found.parts.friction).log().abs().reshape(table.shape)
+    names = problem.friction.schedule.parameter_names(problem.jacobian.plant.joint_names)
+    return [
+        names[j * table.shape[1] + k]
+        for j in range(len(table)) if apart[j, places[0]] > math.log(2.0) for k in places
+    ]  # fmt: skip
+
+
+def yielding(law: Law, coefficients: Tensor, displacement: float, time: float) -> Tensor:
+    """Coefficients of one joint that slides alike, but yields over a displacement before.
+
+    `time` is the ratio of the damping of a bristle to its stiffness [s].
+    """
+    values = dict(zip(law.names, coefficients.tolist(), strict=True))
+    if "sigma_0" in values:
+        values["sigma_0"] = values["F_c"] / max(displacement, 1e-12)
+        values["sigma_1"] = time * values["sigma_0"]
+    else:
+        widths = [name for name in values if name.startswith("d_")]
+        scale = displacement / max(values[name] for name in widths)
+        for name in widths:
+            values[name] *= scale
+            values["k" + name[1:]] /= scale
+    found = torch.tensor([values[name] for name in law.names], dtype=torch.float64)
+    lower, upper = Constant(law, 1, found).bounds()
+    return found.clamp(lower, upper)
 
 
 def _fitter(
@@ -121,7 +221,6 @@ def _fitter(
         StepJacobian(plant, model, terms), model, task.recordings, task.measurement, options,
         task.callback, friction_prior=constant_prior(model, torque, options),
         offset_sd=torch.full(shape, sd, dtype=torch.float64) if task.per_recording else None,
-        defect_sd=options.defect_sd,
     )  # fmt: skip
 
 
@@ -203,23 +302,20 @@ def _log_volume(local: Quadratic, chosen: Tensor) -> float:
     return float(torch.linalg.slogdet(local.hessian[chosen][:, chosen]).logabsdet)
 
 
-def is_constant_fit(
-    start: FitResult | None, model: FrictionModel, continuity: Continuity = "none"
-) -> TypeGuard[FitResult]:
+def is_constant_fit(start: FitResult | None, model: FrictionModel) -> TypeGuard[FitResult]:
     """True for an output-error fit of the model's law with constant coefficients."""
     return (
         start is not None
         and start.model.law == model.law
         and not start.model.schedule.follows_motion
         and start.residuals.numel() > 0
-        and start.continuity == continuity
     )
 
 
 def constant_start(task: FitTask) -> FitResult:
     """The constant fit of a model's law; `task.start` if it is one of the same recordings."""
     model, start = task.model, task.start
-    if is_constant_fit(start, model, task.options.continuity) and _offsets_match(start, task):
+    if is_constant_fit(start, model) and _offsets_match(start, task):
         return start
     constant = FrictionModel(model.law, Constant(model.law, model.joints), model.v_smooth)
     return fit_constant(replace(task, model=constant)).with_warnings(task.data_warnings)
@@ -285,7 +381,7 @@ def best_of_starts(
     # With the larger noise of the two, priors would outweigh the data.
     sizes = (own.noise, nested.noise, own.problem.noise_sd, nested.problem.noise_sd)
     noise = max(min(size for size in sizes if math.isfinite(size)), options.min_noise)
-    implied = equation_error(own.problem.plant_at(nested.parts.plant))[0]
+    implied = next(iter(equation_error(own.problem.plant_at(nested.parts.plant))))
     embedded = embed_nested(law, nested.parts.friction.reshape(len(implied), -1), implied)
     loss = own.problem.loss
     best, lowest = own, _misfit(own, noise, loss) if same else math.inf
@@ -322,18 +418,18 @@ def _windows_from(found: HorizonResult) -> Windows:
     """The windows of a stage at the states that it found, except for those that are known."""
     windows = found.problem.windows
     states = found.problem.variables.split(found.result.x).states
-    q0, qd0 = (x.clone() for x in states.chunk(2, -1))
+    joints = windows.q0.shape[-1]
+    q0, qd0 = (x.clone() for x in states[:, : 2 * joints].chunk(2, -1))
     known = list(windows.at_rest)
     q0[known], qd0[known] = windows.q0[known], windows.qd0[known]
     return replace(windows, q0=q0, qd0=qd0)
 
 
 def _misfit(found: HorizonResult, noise: float, loss: RobustLoss) -> float:
-    """Half the sum of squares of residuals and defects; infinite where the motion diverged.
+    """Half the sum of squares of residuals; infinite where the motion diverged.
 
     All that are compared have the same loss.
     """
     problem, x = replace(found.problem, loss=loss), found.result.x
-    defects = 0.5 * float(problem.defects(x).square().sum())
-    misfit = weighted_cost(problem.counted_errors(x), noise) + defects
+    misfit = weighted_cost(problem.counted_errors(x), noise)
     return misfit if math.isfinite(misfit) else math.inf

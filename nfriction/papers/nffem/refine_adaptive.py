@@ -16,7 +16,8 @@ from nfriction.fitting.data.inputs import (
 )
 from nfriction.fitting.equation_error import coefficient_scale
 from nfriction.fitting.options import DEFAULTS, FitOptions
-from nfriction.fitting.result.fit_result import FitResult, result_from_shooting
+from nfriction.fitting.result.fit_result import FitResult
+from nfriction.fitting.result.of_search import result_from_shooting
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian

@@ -17,7 +17,8 @@ from tqdm import tqdm
 from nfriction.evaluation.score import RMSE, Score
 from nfriction.io.files import atomic_write
 from nfriction.io.model_file import load
-from nfriction.papers.control.drawing import balance_figure, swing_up_animation
+from nfriction.papers.control.drawing import balance_figure
+from nfriction.papers.control.study import SAMPLE_TIME, THINNED, single_link
 from nfriction.papers.controller.mamdani import paper_controller
 from nfriction.papers.controller.rules import Variable
 from nfriction.papers.reproduction import tables
@@ -32,6 +33,7 @@ from nfriction.papers.reproduction.stages import (
 from nfriction.papers.reproduction.workspace import Array, Workspace
 from nfriction.plant import PendulumChain, rigs
 from nfriction.plots import (
+    animate,
     coefficients_over_time,
     controller_surface,
     positions,
@@ -76,8 +78,10 @@ def draw_all(workspace: Workspace, *, progress: bool = False) -> list[Path]:
         figure.clear()
         written.append(path)
     lifted = workspace.arrays("control")["swing-up"]
-    gif = swing_up_animation(lifted, workspace.folder / "figures" / "control_swing_up.gif")
-    return [*written, gif]
+    time = THINNED * SAMPLE_TIME * np.arange(len(lifted), dtype=np.float64)
+    gif = workspace.folder / "figures" / "control_swing_up.gif"
+    motion = {"swing-up of one link": lifted}
+    return [*written, animate(single_link(), time, motion, gif, seconds=np.inf)]
 
 
 def figures(workspace: Workspace) -> dict[str, Callable[[], Figure]]:

@@ -48,8 +48,8 @@ from nfriction.papers.reproduction.workspace import (
 )
 from nfriction.recording import Recording
 from nfriction.signals import causal_motion
-from nfriction.simulation.rk4 import required_substeps
 from nfriction.simulation.rollout import rollout
+from nfriction.simulation.validate import required_substeps
 
 logger = logging.getLogger(__name__)
 
