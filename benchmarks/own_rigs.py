@@ -22,6 +22,10 @@ FLYWHEEL = (0.35, 0.15, 0.12, 0.3, 2.0)
 # An error up to here counts as found.
 ENOUGH = 0.03
 LAWS = ("CFM", "CVFM", "LFM", "Stribeck", "NLFM")
+# Of contacts with memory: an encoder of 14 bits, a record below breakaway and one that slides [N].
+FINE_COUNTS, FINE_RATE, EFFORTS = 2**14, 1000, (0.35, 1.1)
+# Errors up to here count as found; of the bristles' stiffness and damping twice as much.
+CLOSE = 0.05
 
 
 class Rig(NamedTuple):
@@ -33,6 +37,10 @@ class Rig(NamedTuple):
     law: str
     truth: tuple[tuple[float, ...], ...]
     effort: tuple[float, ...] = ()
+    counts: int = COUNTS
+    rate: int = RATE
+    torque_noise: float = TORQUE_NOISE
+    substeps: int = 8
 
     @property
     def driven(self) -> bool:
@@ -60,6 +68,50 @@ def own_rigs(seeds: int, rigs: int) -> None:
             flush=True,
         )
     print(", ".join(f"{count} {verdict}" for verdict, count in counts.items()))
+
+
+def presliding(seeds: int, torque_noise: float, substeps: int) -> None:
+    """Print how well LuGre friction is found again from presliding and sliding."""
+    axis, errors, held = LinearAxis(0.13), [], []
+    names = model_by_name("LuGre").definition.names
+    print(f"{'seed':>4} " + " ".join(f"{name:>9}" for name in names) + "  [%] off; held; says")
+    for seed in range(seeds):
+        random = np.random.default_rng([7, seed])
+        f_c, f_d, viscous = random.uniform((0.25, 0.1, 0.08), (0.45, 0.2, 0.16))
+        # A contact yields over half a count to ten, and its oscillation is damped at 0.3 to 1.
+        stiffness = (f_c + f_d) / float(2e-4 * 20 ** random.uniform())
+        damping = 2 * random.uniform(0.3, 1.0) * math.sqrt(stiffness * 0.13)
+        truth = np.array([f_c, f_d, random.uniform(0.03, 0.2), stiffness, damping, viscous])
+        friction = model_by_name("LuGre")(1, truth.tolist())
+        rig = Rig(
+            f"presliding {seed}", axis, known(axis, seed, True), "LuGre", (tuple(truth),), (1.0,),
+            FINE_COUNTS, FINE_RATE, torque_noise, substeps,
+        )  # fmt: skip
+        recordings = [
+            recording(rig._replace(effort=(effort,)), friction, random, f"{rig.name} {effort}", "m")
+            for effort in EFFORTS
+        ]
+        begun = time.perf_counter()
+        found = fit(model_by_name("LuGre")(1), rig.given, recordings)
+        own = found.intervals[: len(truth)]
+        error = np.array([i.value for i in own]) / truth - 1
+        inside = [i.low <= x <= i.high for i, x in zip(own, truth, strict=True)]
+        errors.append(error)
+        held.append(inside)
+        print(
+            f"{seed:4} " + " ".join(f"{100 * x:9.2f}" for x in error)
+            + f"  {sum(inside)}/{len(inside)}; {', '.join(found.unidentifiable) or found.status}"
+            f" ({time.perf_counter() - begun:.0f} s)", flush=True,
+        )  # fmt: skip
+    size = np.abs(errors)
+    bristle = np.array([name in ("sigma_0", "sigma_1") for name in names])
+    near = size <= np.where(bristle, 2 * CLOSE, CLOSE)
+    print("median and worst error [%]: " + ", ".join(
+        f"{name} {100 * np.median(x):.2g} {100 * x.max():.2g}"
+        for name, x in zip(names, size.T, strict=True)
+    ))  # fmt: skip
+    print(f"within 5 % (bristles 10 %): {100 * near.mean():.1f} %; "
+          f"intervals hold {100 * np.mean(held):.1f} %")  # fmt: skip
 
 
 def cases(seeds: int, rigs: int) -> Iterator[Rig]:
@@ -139,7 +191,7 @@ def recorded(rig: Rig, seed: int) -> list[Recording]:
 def recording(
     rig: Rig, friction: FrictionModel, random: np.random.Generator, name: str, unit: str
 ) -> Recording:
-    joints, steps = rig.plant.joints, round(SECONDS * RATE)
+    joints, steps = rig.plant.joints, round(SECONDS * rig.rate)
     rest = torch.zeros(joints, dtype=torch.float64)
     # Joint angles are from upright; a driven rig starts hanging at rest.
     begin = rest.clone()
@@ -149,8 +201,8 @@ def recording(
         begin = begin + torch.as_tensor(random.uniform(0.5, 1.2, joints))
     tau = torch.as_tensor(smooth_torque(rig, random)) if rig.driven else None
     run = rollout(
-        rig.plant, friction, begin, rest, tau, sample_time=1 / RATE, steps=steps, substeps=8,
-        gradients=False,
+        rig.plant, friction, begin, rest, tau, sample_time=1 / rig.rate, steps=steps,
+        substeps=rig.substeps, gradients=False,
     )  # fmt: skip
     q = run.q.numpy() - [
         math.pi if isinstance(rig.plant, PendulumChain) else 0.0,
@@ -159,13 +211,13 @@ def recording(
     read = None
     if tau is not None:
         read = np.vstack([tau.numpy(), tau[-1:].numpy()])
-        read = read + TORQUE_NOISE * random.standard_normal(read.shape)
-    return Recording(run.time.numpy(), quantise(q, COUNTS), tau=read, unit=unit, name=name)
+        read = read + rig.torque_noise * random.standard_normal(read.shape)
+    return Recording(run.time.numpy(), quantise(q, rig.counts), tau=read, unit=unit, name=name)
 
 
 def smooth_torque(rig: Rig, random: np.random.Generator) -> NDArray[np.float64]:
     """Random smooth torque of a few hertz that overcomes friction again and again [N m]."""
-    t = np.arange(round(SECONDS * RATE))[:, None, None] / RATE
+    t = np.arange(round(SECONDS * rig.rate))[:, None, None] / rig.rate
     joints, waves = rig.plant.joints, 6
     rates = 2 * math.pi * random.uniform(0.1, 1.5, (joints, waves))
     phases = random.uniform(0, 2 * math.pi, (joints, waves))

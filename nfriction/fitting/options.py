@@ -61,6 +61,9 @@ class FitOptions:
     # Torques are averaged over so long, short against a swing [s], and so many samples are used.
     diagnosis_block: float = 0.03
     diagnosis_samples: int = 8_000
+    # Rise of the energy of a free motion over its largest kinetic energy; inertias that are off by
+    # their bound feign 0.43.
+    energy_rise: float = 0.5
     # Longest delay between torques and positions: some samples of a slow bus [s].
     largest_delay: float = 0.1
     # More substeps would mean a sign function too steep for the sample time.
@@ -153,6 +156,9 @@ class FitOptions:
     prior_shares: tuple[float, ...] = (1.0, 1 / 3)
     # Updates of the priors of a network's groups by evidence; each searches on from the last.
     evidence_updates: int = 3
+    # Log ratio of evidences that is worth mentioning: half the logarithm of 10 (H. Jeffreys,
+    # Theory of Probability, 3rd ed. 1961, appendix B).
+    evidence_gain: float = 0.5 * math.log(10.0)
 
     # --- Extrapolation prior of a network.
     # Grid cells along velocity and acceleration, cells around a visited one that count as

@@ -300,8 +300,9 @@ def maxwell_slip(elements: int) -> Law:
     """Generalised Maxwell-slip law with so many elements.
 
     Its coefficients are the stiffnesses k_i, in which the torque is linear, the deflections d_i at
-    which elements slip at high speed (a fit seeks their scale, and keeps their ratios), viscous friction F_v, the relative rise of the friction at
-    rest over that at high speed, and the velocity v_s at which it fades.
+    which elements slip at high speed, viscous friction F_v, the relative rise of the friction at
+    rest over that at high speed, and the velocity v_s at which it fades. A fit seeks the scale of
+    the deflections and keeps their ratios.
 
     Raises:
         ValueError: if `elements` is not a whole number from 1 to 100.

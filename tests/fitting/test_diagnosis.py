@@ -171,6 +171,13 @@ def test_an_advanced_torque_is_in_line_again():
         Recording(late.time, q).advance_torque(0.01)
 
 
+@pytest.mark.parametrize("name", ["driven", "motor", "axis", "wheel"])
+def test_a_driven_motion_without_torque_is_named(name):
+    plant, q, _ = measured(name)
+    (found, *_) = warnings_of(plant, q, None)
+    assert "has no torque, but its motion gains energy up to" in found
+
+
 def test_a_recording_of_another_rig_is_named():
     plant, q, tau = measured("motor")
     heavy = plant.replace(gravity_moment=2 * plant.gravity_moment)

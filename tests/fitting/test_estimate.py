@@ -478,7 +478,7 @@ def mine(joints, **settings):
 def test_a_law_that_torques_mislead_starts_anew_on_the_plant_that_it_found(
     misled, monkeypatch, law
 ):
-    recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH))
+    recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH), seconds=2.0)
 
     def fitted():
         misled.clear()

@@ -245,5 +245,5 @@ def test_what_has_no_state_yet_refuses_such_a_law() -> None:
     with pytest.raises(ValueError, match="has an internal state"):
         model(rest, rest, rest)
     recording = Recording(np.arange(100) * 0.01, np.zeros((100, 1)))
-    with pytest.raises(ValueError, match="is for tables of torque.*to motions fit maxwell-slip"):
+    with pytest.raises(ValueError, match=r"is for tables of torque.*to motions fit maxwell-slip"):
         fit("slip", multiarm_single(), recording)

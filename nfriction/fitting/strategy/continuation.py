@@ -24,8 +24,8 @@ from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
-# Coefficients (joint, coefficient) that torques imply on a plant: the best, then the best at each of
-# the law's initial values.
+# Coefficients (joint, coefficient) that torques imply on a plant: the best, then the best at each
+# of the law's initial values.
 EquationError = Callable[[Plant], Iterable[Tensor]]
 
 
