@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -57,7 +58,7 @@ def friction_curves(fits: "TorqueFits") -> Figure:
         ax.set_xlabel(f"position [{fits.table.unit}]" if looped
                       else f"velocity [{fits.table.unit}/s]")  # fmt: skip
     names = [name for name in fits.fits if name in shown]
-    entries = {
+    entries: dict[str, Artist] = {
         "rows": Line2D([], [], linestyle="", marker=".", color=style.FAINT),
         **{plain_name(name): looks[name].handle for name in names},
     }
