@@ -23,7 +23,6 @@ import torch
 from torch import Tensor, nn
 
 from nfriction.fuzzy import Anfis, AnfisRBF, RBFNetwork
-from nfriction.fuzzy import train_hybrid as hybrid
 from nfriction.papers.controller.mamdani import MamdaniController, paper_controller
 from nfriction.papers.nffem.train_network import (
     TrainingOptions,
@@ -41,17 +40,6 @@ def trained(
     chosen = TrainingOptions(**options)
     train_on_controller(network, controller, samples=samples, options=chosen)
     return lambda x: network(x.unsqueeze(1))[:, 0]
-
-
-def classical(controller: MamdaniController, samples: int, epochs: int) -> Predictor:
-    """Jang's hybrid step on an even 5 x 5 grid, inputs and outputs on their ranges' scale."""
-    x, y = controller_targets(controller, samples, 0)
-    half, middle = 0.5 * (x.amax(0) - x.amin(0)), 0.5 * (x.amax(0) + x.amin(0))
-    scale = y.amax(0)
-    network = Anfis(1, 2, [5, 5], 2)
-    network.init_grid(-1.0, 1.0)
-    hybrid(network, ((x - middle) / half).unsqueeze(1), (y / scale).unsqueeze(1), epochs)
-    return lambda x: network(((x - middle) / half).unsqueeze(1))[:, 0] * scale
 
 
 def perceptron(controller: MamdaniController, samples: int) -> Predictor:
@@ -99,7 +87,6 @@ def learning(controller: MamdaniController, samples: int) -> dict[str, Callable[
         "ANFIS 5x5 + RBF head": ours(lambda: AnfisRBF(1, 2, [5, 5], 2), max_steps=10),
         "RBF 2-10-2, one start": ours(lambda: RBFNetwork(1), **rbf),
         "RBF 2-10-2, best of 5 by evidence": ours(lambda: RBFNetwork(1), starts=5, **rbf),
-        "ANFIS 5x5, hybrid step, 20 epochs": partial(classical, controller, samples, 20),
     }
     if importlib.util.find_spec("sklearn") is None:
         print("scikit-learn is not installed: its rows are left out")

@@ -19,8 +19,8 @@ from nfriction import Recording
 from nfriction.fitting.fit import fit
 from nfriction.fitting.plant_parameters import PlantParameter, adjusted_buffers, plant_parameters
 from nfriction.friction.models import FrictionModel
-from nfriction.simulation.rk4 import required_substeps
 from nfriction.simulation.rollout import rollout
+from nfriction.simulation.validate import required_substeps
 
 Array = NDArray[np.float64]
 SECONDS = (1.0, 3.0, np.inf)

@@ -56,7 +56,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     wanted = controller(x[:, 0], x[:, 1])
     error = (network(x[:, None])[:, 0] - wanted).square().mean(0).sqrt().detach()
     span = wanted.amax(0) - wanted.amin(0)
-    print("error of the network on new points, in % of range:", (100 * error / span).tolist())
+    print(
+        "error of the network on new points, in % of range:", *(100 * error / span).numpy().round(2)
+    )
     return 0
 
 

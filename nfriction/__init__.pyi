@@ -49,6 +49,6 @@ from .plant import rigs as rigs
 from .recording import Recording as Recording
 from .recording.angles import AngleConvention as AngleConvention
 from .recording.torque_table import TorqueTable as TorqueTable
-from .simulation.rollout import Rollout as Rollout
+from .simulation.protocols import Rollout as Rollout
 from .simulation.rollout import rollout as rollout
 from .version import __version__ as __version__

@@ -79,7 +79,7 @@ void run(const Case &chosen) {
         }
         torque = next;
     }
-    std::printf("%-34s %4.1f  %9.2f  %11.3f  %9.4f\n", chosen.name, chosen.gain,
+    std::printf("%-34s %4.1f  %9.2f  %11.2f  %9.3f\n", chosen.name, chosen.gain,
                 1e3 * std::sqrt(squares / moving), 1e3 * std::sqrt(chatter / holding),
                 std::sqrt(effort / holding));
 }

@@ -12,7 +12,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 
-from nfriction.cli import demo, estimate, export, inspect, reproduce, torque, verify
+from nfriction.cli import data, demo, estimate, export, inspect, reproduce, torque
 from nfriction.cli.console import (
     Parser,
     UsageError,
@@ -26,7 +26,8 @@ from nfriction.version import __version__
 # They register the commands, in the order in which the help lists them.
 COMMANDS = (
     estimate.add_fit, estimate.add_compare, torque.add_fit, torque.add_score, demo.add,
-    inspect.add_report, inspect.add_info, export.add, verify.add, reproduce.add, demo.add_twin,
+    inspect.add_report, inspect.add_info, export.add_export, export.add_verify, data.add,
+    reproduce.add, demo.add_twin,
 )  # fmt: skip
 
 

@@ -72,8 +72,9 @@ def add_comparison_options(parser: argparse.ArgumentParser) -> None:
     add("--select", action="store_true", help="also choose a model on the training recordings "
         "alone, by cross-validation over blocks of time")  # fmt: skip
     add("--no-figures", action="store_true", help="draw no figures")
-    add("--also", choices=("svg", "pdf"), action="append", default=[], metavar="FORMAT",
-        help="write figures as svg or pdf, too, for a paper; can be given twice")  # fmt: skip
+    add("--also", choices=("svg", "pdf", "gif"), action="append", default=[], metavar="FORMAT",
+        help="write figures as svg or pdf, too, for a paper, or test recordings as animations "
+        "(gif); can be given several times")  # fmt: skip
     add("--jobs", type=inputs.jobs, default=1, metavar="N",
         help="fits at the same time, each in a process of its own; -1 for one to each core (needs "
         "joblib; the results are the same)")  # fmt: skip

@@ -1,4 +1,4 @@
-"""`nfriction export`: write a model file as artefacts for controllers and simulators."""
+"""`nfriction export` and `nfriction verify`: artefacts for controllers and simulators."""
 
 import argparse
 from pathlib import Path
@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 EXAMPLE = """example:
   nfriction export model.json --format torchscript,c --out artefacts"""
+VERIFY_EXAMPLE = """example:
+  nfriction verify artefacts/model.pt model.json"""
 
 # Ending of the file that each target is written to; C is a folder of files.
 CONTROLLERS = {"torchscript": ".pt", "c": ".c", "pt2": ".pt2", "onnx": ".onnx"}
@@ -23,8 +25,8 @@ TARGETS = (*CONTROLLERS, *SIMULATORS)
 IN_SINGLE = ("c", "onnx")
 
 
-def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
-    """Register the command."""
+def add_export(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
+    """Register `export`."""
     parser = commands.add_parser(
         "export", parents=[common], help="write artefacts for controllers and simulators",
         description="Write a fitted model as artefacts for controllers, proven equal to it, or as "
@@ -45,6 +47,9 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
                         help="take raw positions, with the causal filter inside")  # fmt: skip
     parser.add_argument("--cutoff", type=_numbers, default="20", metavar="HZ",
                         help="cut-off of that filter [Hz]")  # fmt: skip
+    parser.add_argument("--online", type=_numbers, metavar="NOISE",
+                        help="C of a model with the papers' network that also learns while it "
+                        "runs, from a friction torque measured to this [N m]")  # fmt: skip
     group = parser.add_argument_group("mjcf and urdf")
     group.add_argument("--recording", type=inputs.file, action="append", default=[],
                        help="motion along which the nearest parameters are sought; can be given "
@@ -61,10 +66,27 @@ def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
                        help="the recordings' names of time, q1, ..., tau1, ... where they differ, "
                        "e.g. time=t,q1=enc_1,q2=enc_2")  # fmt: skip
     inputs.add_law_option(parser)
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run_export)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def add_verify(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
+    """Register `verify`."""
+    parser = commands.add_parser(
+        "verify", parents=[common], epilog=VERIFY_EXAMPLE,
+        help="prove that an artefact is its model",
+        description="Run an artefact (.pt, .pt2, .onnx, or .c with its .contract.json beside it) "
+        "over its test vectors and over many points beside the model. Exit status 1 if they "
+        "differ. C is compiled and run as it is: verify it from hands that you trust.",
+    )  # fmt: skip
+    parser.add_argument("artefact", type=Path, metavar="ARTEFACT", help="what export wrote")
+    parser.add_argument("model", type=inputs.file, metavar="MODEL", help="model file")
+    parser.add_argument("--points", type=inputs.count, default=5000, metavar="N",
+                        help="points to draw, to 10 %% beyond the range")  # fmt: skip
+    inputs.add_law_option(parser)
+    parser.set_defaults(run=run_verify)
+
+
+def run_export(arguments: argparse.Namespace) -> int:
     """Load, then write each artefact."""
     from nfriction.io.model_file import load, load_info
 
@@ -75,6 +97,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("--patch takes one of mjcf and urdf in --format.")
     if len(arguments.cutoff) != 1:
         raise UsageError("--cutoff takes one number.")
+    if arguments.online and (len(arguments.online) != 1 or "c" not in arguments.format):
+        raise UsageError("--online takes one number, with c in --format.")
     model, info = load(arguments.model), load_info(arguments.model)
     check_writable(arguments.out)
     for target in arguments.format:
@@ -106,6 +130,11 @@ def _write_controller(
         name = name if is_identifier(name) else f"nf_{name}"
         paths = export.c(model, arguments.out, info, name=name, **options)
         _prove(paths[0], model, info)
+        if arguments.online:
+            from nfriction.papers.nffem.online import OnlineOptions, write_online
+
+            learning = OnlineOptions(arguments.online[0], sample_time=info.sample_time or 1e-3)
+            paths += write_online(model, arguments.out, learning, name=f"{name}_online")
         return paths
     writer = getattr(export, target)
     return [writer(model, arguments.out / f"{stem}{CONTROLLERS[target]}", info, **options)]
@@ -149,6 +178,31 @@ def _write_simulator(
     writer = getattr(export, target)
     print(writer(model, path, motions, info, load=plant.load, patch=arguments.patch))
     print(f"wrote {path}")
+
+
+def run_verify(arguments: argparse.Namespace) -> int:
+    """Compare, print a table, tell the verdict by the exit status."""
+    from nfriction.export import verify_artefact
+    from nfriction.io.model_file import load, load_info
+
+    if not arguments.points:
+        raise UsageError("--points must be at least 1.")
+    model, info = load(arguments.model), load_info(arguments.model)
+    verdict = verify_artefact(arguments.artefact, model, info, points=arguments.points)
+    head = ("compared at", "points", "torque error", "tolerance", "coefficients", "edges")
+    print("{:<14}{:>8}{:>14}{:>11}{:>14}{:>7}  verdict".format(*head))
+    for name, parity in (("its vectors", verdict.vectors), ("drawn points", verdict.points)):
+        print(
+            f"{name:<14}{parity.points:>8}{parity.torque_error:>14.1e}{parity.tolerance:>11.0e}"
+            f"{parity.coefficient_error:>14.1e}{parity.edges:>7}  "
+            f"{'equal' if parity.passed else 'DIFFERENT'}"
+        )
+    for difference in verdict.differences:
+        print(difference)
+    where = Path(arguments.artefact).name
+    verb = "is" if verdict.passed else "IS NOT"
+    print(f"{where} {verb} {Path(arguments.model).name} (errors relative to full scale)")
+    return 0 if verdict.passed else 1
 
 
 def _limit(numbers: list[float] | None) -> float | list[float] | None:

@@ -36,7 +36,7 @@ RIG_FILES = (".json", ".toml", ".urdf", ".xml", ".mjcf")
 DEFAULT_MODELS = "viscous,load-coulomb,arctan,neuro-fuzzy:load-coulomb"
 # Of `nfriction.fit`; where an option is not given, its own default.
 _FIT_OPTIONS = (
-    "windows", "fit_plant", "drag", "eccentricity", "encoder_reference", "continuity", "max_steps",
+    "windows", "fit_plant", "drag", "eccentricity", "encoder_reference", "max_steps",
     "loss", "fit_delay",
 )  # fmt: skip
 
@@ -199,9 +199,6 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
         help="when incremental encoders were set to zero: before all recordings (shared), or at "
         "the start of each in a pose held by stiction (default: per_recording if all recordings "
         "of a driven rig begin at rest at zero)")  # fmt: skip
-    add("--continuity", choices=CHOICES["continuity"], default="none",
-        help="continuity between shooting windows: none, penalised, or enforced (default: none)"
-        )  # fmt: skip
     add("--max-steps", type=count, default=30, metavar="N",
         help="limit of search steps at each window length (default: 30)")  # fmt: skip
     add("--loss", choices=CHOICES["loss"], default="linear",

@@ -20,13 +20,12 @@ from nfriction.codegen.rollout import (
     compile_rollout,
     trace_rollout,
 )
-from nfriction.codegen.staleness import Fingerprint, fingerprint
+from nfriction.codegen.staleness import content, fingerprint
 
 __all__ = [
     "CodegenError",
     "CompiledFunction",
     "CompiledRollout",
-    "Fingerprint",
     "Incomparable",
     "NoBackend",
     "RolloutSignals",
@@ -36,6 +35,7 @@ __all__ = [
     "cache_folder",
     "compile_function",
     "compile_rollout",
+    "content",
     "fingerprint",
     "supported_operations",
     "trace_rollout",

@@ -25,9 +25,9 @@ from nfriction.codegen.llvm.emit import write_function
 from nfriction.codegen.transform import hoist, with_jacobian
 
 _CHECK_TOLERANCE = 1e-10
-# Kernels kept in memory by what they compute, with the shapes of their outputs: fits of one law to
-# parts of the data, or from several starts, share theirs.
-_KEPT = 8
+# Kernels kept in memory by what they compute, with the shapes of their outputs: fits to parts of
+# the data, or from several starts, share theirs. Six laws have twelve, of some ten megabytes each.
+_KEPT = 16
 _known: OrderedDict[Hashable, tuple[Kernel, dict[str, tuple[int, ...]]]] = OrderedDict()
 
 
@@ -156,8 +156,9 @@ class CompiledFunction:
         eager = _tuple(self._function(*inputs))
         if not self._jacobian:
             return eager
-        blocks = torch.func.jacfwd(outputs, argnums=self._jacobian)(*inputs)
-        flat = [block.reshape(block.shape[0], -1) for block in blocks]
+        # By plain autograd: `torch.func` imports the whole of torch._dynamo (2 s).
+        blocks = torch.autograd.functional.jacobian(outputs, tuple(inputs))
+        flat = [blocks[i].reshape(len(blocks[i]), -1) for i in self._jacobian]
         return (*eager, torch.cat(flat, -1))
 
 

@@ -11,7 +11,7 @@ import dis
 import enum
 import functools
 import types
-from collections import defaultdict, deque
+from collections import OrderedDict
 from collections.abc import Hashable, Iterable
 from typing import Any, NamedTuple
 
@@ -37,54 +37,36 @@ _CONSTANT = frozenset({
     *("enum", "contextlib", "numbers"),
 })  # fmt: skip
 # Built-in functions that reach what no name shows.
-_REACHING = frozenset({"open", "input", "eval", "exec", "globals", "locals", "vars", "__import__"})
+_REACHING = frozenset({
+    *("open", "input", "eval", "exec", "globals", "locals", "vars", "getattr", "__import__"),
+})  # fmt: skip
 _ATOMS = frozenset({
     *(type(None), bool, int, str, bytes, type(Ellipsis), type(NotImplemented), range),
     *(torch.dtype, torch.device, torch.Size, np.ufunc, types.CodeType),
 })  # fmt: skip
-_MAPPINGS = (dict, types.MappingProxyType)
-_SEQUENCES = (list, tuple, set, frozenset, deque)
+_SEQUENCES = frozenset({list, tuple, set, frozenset})
+_MAPPINGS = frozenset({dict, OrderedDict, types.MappingProxyType})
 _TENSORS = frozenset({Tensor, nn.Parameter})
 # Attributes that decide what objects of these classes compute.
 _HOLDING: dict[type, tuple[str, ...]] = {
     types.MethodType: ("__func__", "__self__"),
     functools.partial: ("func", "args", "keywords"),
-    slice: ("start", "stop", "step"),
     staticmethod: ("__func__",),
     classmethod: ("__func__",),
     property: ("fget", "fset"),
-    functools.cached_property: ("func",),
 }
-_METHODS = (types.BuiltinFunctionType, types.MethodWrapperType)
-# Descriptors of what an object holds, which is followed in the object.
-_FIELDS = (types.MemberDescriptorType, types.GetSetDescriptorType, type(_Read.names))
-_DESCRIPTORS = (types.WrapperDescriptorType, types.MethodDescriptorType)
 # Fields of every module; those that decide what it computes are followed by themselves.
 _OF_MODULES = frozenset(vars(nn.Module())) - {"training"}
 _HOOKS = ("_forward_hooks", "_forward_pre_hooks")
 # Parts of a fingerprint; following more of them takes longer than another trace.
 _LIMIT = 20_000
 _HEAP_TYPE = 1 << 9  # of a class's flags: made by Python code
+# Of an object that has its attributes and a place for weak references, and nothing else.
+_PLAIN_SIZE = type("Plain", (), {}).__basicsize__
 
 
-class Fingerprint(NamedTuple):
-    """All that a trace may read.
-
-    Attributes:
-        key: it differs where the traced code may differ.
-        inputs: values of the traced code's inputs, which the key leaves out.
-    """
-
-    key: Hashable
-    inputs: tuple[Tensor, ...]
-
-    def values(self) -> Hashable:
-        """The contents of the inputs."""
-        return tuple(map(_content, self.inputs))
-
-
-def fingerprint(modules: Iterable[nn.Module], *others: Any) -> Fingerprint:
-    """A fingerprint of these objects.
+def fingerprint(modules: Iterable[nn.Module], *others: Any) -> Hashable:
+    """A value that differs where the code traced from these objects may differ.
 
     Args:
         modules: their floating-point parameters and buffers are inputs of the traced code, so that
@@ -100,11 +82,15 @@ def fingerprint(modules: Iterable[nn.Module], *others: Any) -> Fingerprint:
             walk.add(value)
     except RecursionError:
         raise Incomparable("a chain of objects that is too long to follow") from None
-    return Fingerprint(tuple(walk.parts), tuple(walk.inputs))
+    return tuple(walk.parts)
 
 
-def _content(value: Any) -> bytes:
-    """Elements of a tensor or an array."""
+def content(value: Any) -> bytes:
+    """Elements of a tensor or an array.
+
+    Raises:
+        Incomparable: if it has none that can be read.
+    """
     if not isinstance(value, Tensor):
         if value.dtype.hasobject:
             raise Incomparable("an array of objects")
@@ -144,7 +130,6 @@ class _Walk:
     def __init__(self, modules: Iterable[nn.Module]) -> None:
         self.parts: list[Any] = []
         self.seen: dict[Any, int] = {}
-        self.inputs: list[Tensor] = []
         self.modules: set[int] = set()
         found = list(modules)
         while found:
@@ -160,26 +145,24 @@ class _Walk:
             parts.append(value)
         elif kind is float or kind is complex:
             parts.append(repr(value))  # tells signs of zero apart, and NaN equals itself
-        elif kind in _TENSORS or isinstance(value, np.ndarray | np.generic):
-            parts += (value.shape, value.dtype, _content(value))
+        elif kind in _TENSORS or kind is np.ndarray or isinstance(value, np.generic):
+            parts += (value.shape, value.dtype, content(value))
         elif self._is_new(id(value)):
             self._compound(kind, value)
 
     def _is_new(self, *key: Hashable) -> bool:
         """False where the same was met before, so that circles end."""
-        before = self.seen.setdefault(key, len(self.seen))
-        self.parts.append(before)
-        return before == len(self.seen) - 1
+        new = key not in self.seen
+        self.parts.append(self.seen.setdefault(key, len(self.seen)))
+        return new
 
     def _compound(self, kind: type, value: Any) -> None:
         if isinstance(value, nn.Module):
             self._module(value)
-        elif isinstance(value, _SEQUENCES):
+        elif kind in _SEQUENCES:
             self._all(value)
-            self._subclass(kind, value, _SEQUENCES)
-        elif isinstance(value, _MAPPINGS):
+        elif kind in _MAPPINGS:
             self._mapping(value)
-            self._subclass(kind, value, _MAPPINGS)
         elif kind is types.FunctionType:
             self._function(value)
         elif kind in _HOLDING:
@@ -188,11 +171,9 @@ class _Walk:
         elif isinstance(value, type):
             self._class(value)
         elif isinstance(value, enum.Enum):
-            self.parts.append(value.name)
             self._class(kind)
-        elif isinstance(value, _METHODS):
-            self._built_in(value)
-        elif isinstance(value, _DESCRIPTORS) and _is_constant(value.__objclass__.__module__):
+            self._mapping(vars(value))
+        elif kind is types.BuiltinFunctionType and _is_constant(_home(value)):
             self.parts.append(value)
         elif kind is types.ModuleType and _is_constant(value.__name__):
             self.parts.append(value.__name__)
@@ -215,15 +196,6 @@ class _Walk:
             self.add(key)
             self.add(value)
 
-    def _subclass(self, kind: type, value: Any, plain: tuple[type, ...]) -> None:
-        """All that a container has beside its elements."""
-        if kind is defaultdict:
-            self.add(value.default_factory)
-        elif kind not in plain:
-            self._class(kind)
-            if hasattr(value, "__dict__"):
-                self._mapping(vars(value))
-
     def _module(self, module: nn.Module) -> None:
         own = id(module) in self.modules
         for tensors in (module._parameters, module._buffers):
@@ -231,7 +203,6 @@ class _Walk:
                 self.parts.append(name)
                 if tensor is not None and own and tensor.is_floating_point():
                     self.parts += (tensor.shape, tensor.dtype)
-                    self.inputs.append(tensor)
                 else:
                     self.add(tensor)
         for name, part in module._modules.items():
@@ -283,10 +254,9 @@ class _Walk:
             return
         self.parts.append(value.__name__)
         if self._is_new(id(value), attributes):
-            has = vars(value)
-            for name in sorted(has if "getattr" in attributes else attributes & has.keys()):
+            for name in sorted(attributes & vars(value).keys()):
                 self.parts.append(name)
-                self._reached(has[name], attributes)
+                self._reached(vars(value)[name], attributes)
 
     def _class(self, kind: type) -> None:
         for base in kind.__mro__:
@@ -295,48 +265,24 @@ class _Walk:
                 for name, value in vars(base).items():
                     # Of the names that Python gives, functions alone compute something.
                     given = name.startswith("__") or name == "_abc_impl"
-                    wanted = not given or isinstance(value, types.FunctionType)
-                    if wanted and not isinstance(value, _FIELDS):
+                    if issubclass(base, enum.Enum):
+                        given = name.startswith("_") and name != "_member_map_"
+                    if not given or isinstance(value, types.FunctionType):
                         self.parts.append(name)
                         self.add(value)
 
-    def _built_in(self, value: Any) -> None:
-        owner = value.__self__
-        self.parts.append(value.__name__)
-        if isinstance(owner, types.ModuleType | type):
-            name = owner.__name__ if isinstance(owner, types.ModuleType) else owner.__module__
-            if not _is_constant(name):
-                raise Incomparable(f"`{name}.{value.__name__}`, which is not written in Python")
-            self.parts.append(owner)
-        else:
-            self.add(owner)
-
     def _object(self, kind: type, value: Any) -> None:
         """An object of a class in Python: its class and all of its attributes."""
-        slots = _slots(kind)
-        if slots is None:
+        python = all(k.__flags__ & _HEAP_TYPE for k in kind.__mro__ if k is not object)
+        if not python or kind.__basicsize__ > _PLAIN_SIZE or not hasattr(value, "__dict__"):
             raise Incomparable(f"an object of {kind.__module__}.{kind.__qualname__}")
         self._class(kind)
-        for name in slots:
-            self.parts.append(name)
-            if hasattr(value, name):
-                self.add(getattr(value, name))
-        if hasattr(value, "__dict__"):
-            self._mapping(vars(value))
+        self._mapping(vars(value))
 
 
-@functools.lru_cache(1024)
-def _slots(kind: type) -> tuple[str, ...] | None:
-    """Slots of a class whose objects hold these and attributes alone, else None."""
-    slots = tuple(
-        name
-        for base in kind.__mro__
-        for name, slot in vars(base).items()
-        if isinstance(slot, types.MemberDescriptorType)
-    )
-    if kind is types.SimpleNamespace:
-        return slots
-    # Beside its slots, an object in Python has its attributes and a place for weak references.
-    most = object.__basicsize__ + tuple.__itemsize__ * (len(slots) + 2)
-    python = all(k.__flags__ & _HEAP_TYPE for k in kind.__mro__ if k is not object)
-    return slots if python and kind.__basicsize__ <= most and not kind.__itemsize__ else None
+def _home(function: Any) -> str:
+    """The module of a function that is not written in Python; empty for a method of an object."""
+    owner = function.__self__
+    if isinstance(owner, types.ModuleType):
+        return owner.__name__
+    return "torch" if owner is None else ""

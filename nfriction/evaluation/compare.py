@@ -246,6 +246,26 @@ class Comparison:
 
         return plots.horizon_curve(self)
 
+    def animate(self, recording: Recording, path: str | Path) -> Path:
+        """Write a recording and its simulation by the best model as a GIF; see `plots.animate`.
+
+        Raises:
+            ValueError: if it is not among the recordings compared, or nothing was fitted.
+        """
+        from nfriction import plots
+
+        best = self.best() or NO_FRICTION
+        found = self.fits.get(best) or next(iter(self.fits.values()), None)
+        scored = [s for part in self.parts for s in self.scores(part)[best]]
+        scores = [score for score in scored if score.recording == recording.name]
+        if found is None or not scores:
+            raise ValueError(f"nothing was simulated on {recording.name!r}, or nothing was fitted.")
+        plant, motions = found.plant, {"measured": recording.q, best: scores[0].simulated}
+        if plant.unit == "rad":
+            to_joint = recording.resolve_convention(plant).position_to_joint
+            motions = {name: to_joint(q, plant.first_link) for name, q in motions.items()}
+        return plots.animate(plant, recording.time, motions, path)
+
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON: coefficients, scores, how each fit ended, and which model is best."""
         models: dict[str, Any] = {}

@@ -19,8 +19,8 @@ from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion, causal_motion
-from nfriction.simulation.rk4 import required_substeps
 from nfriction.simulation.rollout import Scheme, rollout
+from nfriction.simulation.validate import required_substeps
 
 logger = logging.getLogger(__name__)
 

@@ -29,7 +29,7 @@ logger = logging.getLogger(__name__)
 
 RESULTS, TABLE, REPORT = "results.json", "table.csv", "report.html"
 # Files that a run may have written and a later one removes: in its own folders, no way out of them.
-OURS = re.compile(r"table\.csv|models/[\w-]+\.(json|pt)|figures/\w[\w.-]*\.(png|svg|pdf)")
+OURS = re.compile(r"table\.csv|models/[\w-]+\.(json|pt)|figures/\w[\w.-]*\.(png|svg|pdf|gif)")
 REPORT_MARK = b'<meta name="generator" content="nfriction'
 """Near the top of every report; a `report.html` without it is the user's own."""
 # In the folder while it is written: the lock, files that are not complete, files that are.

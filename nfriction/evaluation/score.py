@@ -55,15 +55,14 @@ class RMSE:
 
 
 @dataclass(frozen=True)
-class Limit:
-    """Errors that the uncertainty of the start alone may cause.
-
-    The true model stays below in 95 of 100 recordings; smaller differences between models are not
-    meaningful.
+class Errors:
+    """Position errors of simulations of a recording.
 
     Attributes:
-        free_run: of one simulation over the whole recording.
-        windows: of simulations restarted from the recording, by horizon [s].
+        free_run: error of one simulation, from a given state or from a lead-in of 0.2 s; behind a
+            gap in time it restarts from another lead-in.
+        windows: error of simulations that follow each other, by horizon [s]; each starts from a
+            lead-in of its own.
     """
 
     free_run: RMSE
@@ -77,34 +76,29 @@ class Limit:
 
 
 @dataclass(frozen=True)
-class Score:
+class Score(Errors):
     """Errors of one model on one recording; they are plain data, without plant or model.
 
     Attributes:
+        limit: errors that the uncertainty of the start alone may cause, in simulations of this
+            model; None where it was not asked for. The true model stays below in 95 of 100
+            recordings; smaller differences between models are not meaningful.
         recording: its name.
-        free_run: error of one simulation, from a given state or from a lead-in of 0.2 s; behind a
-            gap in time it restarts from another lead-in.
-        windows: error of simulations that follow each other, by horizon [s]; each starts from a
-            lead-in of its own.
-        limit: of these data, in simulations of this model; None where it was not asked for.
         time, simulated: the free run with its lead-ins, in the recording's coordinates, for
             figures; NaN between gaps that leave no room for a lead-in.
         diverged_at: time at which the free run diverged [s], infinity where it did not. Friction
             too steep at rest to be simulated at all counts as diverged from the start.
     """
 
+    limit: Errors | None
     recording: str
-    free_run: RMSE
-    windows: dict[str, RMSE]
-    limit: Limit | None
     time: Array = field(repr=False)
     simulated: Array = field(repr=False)
     diverged_at: float
 
     def to_dict(self) -> dict[str, Any]:
         return {
-            "free_run": self.free_run.to_dict(),
-            "windows": {horizon: rmse.to_dict() for horizon, rmse in self.windows.items()},
+            **super().to_dict(),
             "limit": None if self.limit is None else self.limit.to_dict(),
             "diverged_at": self.diverged_at if np.isfinite(self.diverged_at) else None,
         }
@@ -156,11 +150,11 @@ def score(
     for run in runs:
         simulated[run.samples] = run.q
     return Score(
-        recording.name,
         RMSE.of(np.concatenate([run.error for run in runs], axis=1)),
         {horizon: RMSE.of(run.error) for horizon, run in windows.items()},
-        Limit(_bound(runs), {horizon: _bound([run]) for horizon, run in windows.items()})
+        Errors(_bound(runs), {horizon: _bound([run]) for horizon, run in windows.items()})
         if limit else None,
+        recording.name,
         recording.time,
         simulated,
         min(run.diverged_at for run in runs),

@@ -12,10 +12,9 @@ from nfriction.io.model_file import ModelInfo, describe
 
 Value = str | float
 Sets = Mapping[str, Mapping[str, Sequence[float]]]
-# Coefficients side by side that a line of a terminal holds; more are written one below another.
-MOST_COLUMNS = 8
 # A positive coefficient at its bound is 1e-12 of its unit.
 ZERO = 1.001e-12
+_WIDEST = 8  # coefficients side by side
 
 
 @dataclass(frozen=True)
@@ -147,6 +146,8 @@ def coefficient_table(
 ) -> Table:
     """Coefficients by joint, and by where they apply if they follow the motion.
 
+    Joints are rows; many constants, as of a law with memory, are rows themselves.
+
     Args:
         model: its name.
         joints: names.
@@ -155,16 +156,16 @@ def coefficient_table(
     """
     names = list(next(iter(sets.values()), {}))
     follows = list(sets) != ["always"]
+    heads = [f"{name} [{units[name]}]" if name in units else name for name in names]
+    caption = f"Coefficients of {model}" + (" (they follow the motion)" if follows else "")
     rows: list[tuple[Value, ...]] = []
+    if len(names) > _WIDEST and not follows:
+        rows += [(head, *sets["always"][name]) for head, name in zip(heads, names, strict=True)]
+        return Table(caption, ("coefficient", *joints), tuple(rows))
     for j, joint in enumerate(joints):
         for label, of in sets.items():
             values = [of[name][j] if name in of else math.nan for name in names]
             rows.append((joint, *([label.replace("_", " ")] if follows else []), *values))
-    heads = [f"{name} [{units[name]}]" if name in units else name for name in names]
-    caption = f"Coefficients of {model}" + (" (they follow the motion)" if follows else "")
-    if len(names) > MOST_COLUMNS and not follows:
-        by_name = list(zip(heads, *(row[1:] for row in rows), strict=True))
-        return Table(caption, ("coefficient", *joints), tuple(by_name))
     return Table(caption, ("joint", *(["applies"] if follows else []), *heads), tuple(rows))
 
 

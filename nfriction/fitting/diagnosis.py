@@ -17,7 +17,7 @@ from torch import Tensor
 
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.plant_parameters import plant_parameters
-from nfriction.plant import PendulumChain, Plant
+from nfriction.plant import LinearAxis, PendulumChain, Plant
 from nfriction.recording import Recording
 from nfriction.recording.angles import AngleConvention, Angles, MeasuredFrom
 from nfriction.signals import Motion
@@ -31,7 +31,8 @@ class Mistake:
 
     Attributes:
         text: a clause such as "the sign of joint2's position is reversed".
-        unexplained: share of the torque that friction does not explain once it is corrected [-].
+        unexplained: share of the torque that friction does not explain once it is corrected [-];
+            NaN where no correction is known.
     """
 
     text: str
@@ -89,6 +90,8 @@ def likely_mistakes(
         for text, share in _tested(plant, recordings, motions, convention, given, options)
         if share < stated / options.diagnosis_ratio
     ]
+    if not found and not given.tau.any() and isinstance(plant, PendulumChain | LinearAxis):
+        return stated, tuple(_driven_without_torque(plant, recordings, motions, options))
     # Nearly equal shares: the data do not distinguish these corrections; simple ones come first.
     least = min((mistake.unexplained for mistake in found), default=0.0)
     return stated, tuple(m for m in found if m.unexplained < options.diagnosis_tie * least)[:3]
@@ -99,10 +102,33 @@ def mistake_warning(stated: float, mistakes: Sequence[Mistake]) -> tuple[str, ..
     if not mistakes:
         return ()
     causes = ", or ".join(mistake.text for mistake in mistakes)
-    return (
-        f"A mistake in the data is likely: {causes}. Corrected, friction leaves "
-        f"{mistakes[0].unexplained:.2g} of the torque unexplained, and not {stated:.2g}.",
+    left = (
+        f" Corrected, friction leaves {mistakes[0].unexplained:.2g} of the torque unexplained, and "
+        f"not {stated:.2g}."
     )
+    known = not math.isnan(mistakes[0].unexplained)
+    return (f"A mistake in the data is likely: {causes}.{left if known else ''}",)
+
+
+def _driven_without_torque(
+    plant: PendulumChain | LinearAxis,
+    recordings: Sequence[Recording],
+    motions: Sequence[Motion],
+    options: FitOptions,
+) -> Iterator[Mistake]:
+    """The first recording whose energy rises by more than an error of the rig could feign."""
+    for recording, motion in zip(recordings, motions, strict=True):
+        kinetic, potential = plant.energy(torch.tensor(motion.q), torch.tensor(motion.qd))
+        energy = (kinetic + potential).numpy()
+        rise = energy - np.minimum.accumulate(energy)
+        if rise.max() > options.energy_rise * float(kinetic.max()):
+            text = (
+                f"{recording.name or 'a recording'} has no torque, but its motion gains energy up "
+                f"to {motion.time[rise.argmax()]:.3g} s; name the columns of the torque, or cut "
+                "off the part in which something else drives it"
+            )
+            yield Mistake(text, math.nan)
+            return
 
 
 def _tested(
@@ -124,6 +150,23 @@ def _tested(
         yield _delay_in_words(delay), share
     for text, rig in _corrected_terms(plant, given, options):
         yield text, _unexplained(rig, given)
+    if len(recordings) > 1:
+        yield _odd_one_out(plant, recordings, motions, options)
+
+
+def _odd_one_out(
+    plant: Plant, recordings: Sequence[Recording], motions: Sequence[Motion], options: FitOptions
+) -> tuple[str, float]:
+    """The recording that friction of its own explains least, and what the others leave."""
+    pairs = list(zip(recordings, motions, strict=True))
+    few = replace(options, diagnosis_samples=max(1, options.diagnosis_samples // len(pairs)))
+    alone = [_unexplained(plant, _collect([r], [m], few)) for r, m in pairs]
+    odd = int(np.argmax(np.nan_to_num(alone, nan=-1.0)))
+    name = recordings[odd].name or f"recording {odd + 1}"
+    del pairs[odd]
+    others = _collect([r for r, _ in pairs], [m for _, m in pairs], options)
+    text = f"{name} is of another rig, or recorded in another way, than the others"
+    return text, _unexplained(plant, others)
 
 
 def _collect(

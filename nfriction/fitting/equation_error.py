@@ -311,17 +311,12 @@ class _Regression:
         """Slopes (sample, joint, coefficient) and residuals (sample, joint); 0 if left out."""
         rows = []
         for part in self.parts:
-
-            def torque(values: Tensor, part: TorqueBalance = part) -> Tensor:
-                return self.law.torque(part.qd, part.load, values, self.v_smooth)
-
-            units = torch.eye(coefficients.shape[1], dtype=coefficients.dtype)
-            pairs = [
-                torch.func.jvp(torque, (coefficients,), (unit.expand_as(coefficients),))
-                for unit in units
-            ]
-            values = torch.stack([pairs[0][0], *(pair[1] for pair in pairs)], -1)
-            rows.append(part.smoothed(values))
+            # A law is elementwise, so the sum's gradient has every sample's slopes.
+            own = coefficients.expand(len(part.qd), -1, -1).clone().requires_grad_()
+            with torch.enable_grad():
+                torque = self.law.torque(part.qd, part.load, own, self.v_smooth)
+                slopes = torch.autograd.grad(torque.sum(), own)[0]
+            rows.append(part.smoothed(torch.cat([torque.detach()[..., None], slopes], -1)))
         found = self.root[..., None] * torch.where(self.kept[..., None], torch.cat(rows), 0.0)
         return found[..., 1:], found[..., 0] - self.root * torch.where(self.kept, self.torque, 0.0)
 
@@ -362,7 +357,11 @@ class _Regression:
             target = np.concatenate([y, np.zeros(len(linear))])
             # The triangle of all rows has the same minimum, and costs the same for any table.
             triangle = np.asarray(np.linalg.qr(np.column_stack([system, target]), mode="r"))
-            found = lsq_linear(triangle[:, :-1], triangle[:, -1], bounds=(lower, np.inf), tol=1e-12)
+            # A step along an open bound is 0 times infinity inside SciPy, which drops it.
+            with np.errstate(invalid="ignore"):
+                found = lsq_linear(
+                    triangle[:, :-1], triangle[:, -1], bounds=(lower, np.inf), tol=1e-12
+                )
             solution = found.x / scale
             coefficients[joint, linear] = torch.as_tensor(solution)
             residual[joint] = float(np.sqrt(np.mean((a @ solution - y) ** 2)))

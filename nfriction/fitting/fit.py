@@ -13,73 +13,15 @@ order. The next step is `nfriction.fitting.shooting.problem`, the cost of the se
 
 import pkgutil
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
-from torch import Tensor
-
-from nfriction.fitting.data.inputs import (
-    ZEROED_PER_RECORDING,
-    advanced_torques,
-    as_model,
-    as_recording_list,
-    data_warnings,
-    in_joint_coordinates,
-    largest_torques,
-    looks_zeroed_per_recording,
-    measurement_matrix,
-    smoothed_motions,
-)
-from nfriction.fitting.diagnosis import balanced_delay, likely_mistakes, mistake_warning
-from nfriction.fitting.options import (
-    Continuity,
-    Eccentricity,
-    EncoderReference,
-    FitOptions,
-    Loss,
-    Method,
-)
+from nfriction.fitting.options import Eccentricity, EncoderReference, FitOptions, Loss, Method
 from nfriction.fitting.result.fit_result import FitResult
+from nfriction.fitting.task import Callback, FitTask, prepare_task
 from nfriction.friction.models import FrictionModel
-from nfriction.optim.least_squares import Step
-from nfriction.plant import PendulumChain, Plant, rigs
-from nfriction.recording import Recording, RecordingLike
+from nfriction.plant import Plant
+from nfriction.recording import RecordingLike
 from nfriction.signals import Motion
-
-Callback = Callable[[str, Step], bool | None]
-
-
-@dataclass(frozen=True, eq=False)
-class FitTask:
-    """Checked arguments of a fit, as every strategy (`Schedule.fit_strategy`) takes them.
-
-    Attributes:
-        model: the model to fit; a strategy changes it once, at the end.
-        plant: the mechanism as given.
-        recordings: in joint coordinates.
-        measurement: matrix from joint to recorded coordinates, see `measurement_matrix`.
-        motions: smoothed motion of each recording, in joint coordinates.
-        options: settings of the fit.
-        start: an earlier fit to start from.
-        callback: called with a stage name after every step; True stops.
-        per_recording: whether encoders were set to zero at the start of each recording.
-        delay: of the torque after the positions by the balance of torques [s]; 0 unless fitted.
-        data_warnings: warnings about the recordings.
-        mistakes: likely mistakes in recordings or plant.
-    """
-
-    model: FrictionModel
-    plant: Plant
-    recordings: Sequence[Recording]
-    measurement: Tensor
-    motions: tuple[Motion, ...]
-    options: FitOptions
-    start: FitResult | None = None
-    callback: Callback | None = None
-    per_recording: bool = False
-    delay: float = 0.0
-    data_warnings: tuple[str, ...] = ()
-    mistakes: tuple[str, ...] = ()
 
 
 def fit(
@@ -93,7 +35,6 @@ def fit(
     drag: bool | None = None,
     eccentricity: Eccentricity = "off",
     encoder_reference: EncoderReference = "auto",
-    continuity: Continuity = "none",
     start: FitResult | None = None,
     motions: Sequence[Motion] | None = None,
     max_steps: int = 30,
@@ -108,8 +49,8 @@ def fit(
     warning. Laws with several minima are also started from their grid of initial values and from
     the simpler law that they contain (`Law.nested_law`); the lowest residual wins. A neuro-fuzzy
     model starts at the constant fit of its law and is kept only if its hold-out RMSE is 20 % below
-    the law's; its plant prior is relaxed only for a further 20 %. An adaptive model starts at the
-    constant fit, too; `fit_adaptive` has its further settings.
+    the law's; its plant prior is relaxed, and its sets move, only for a further 20 %. An adaptive
+    model starts at the constant fit, too; `fit_adaptive` has its further settings.
 
     Args:
         model: the model to fit, changed in place; or the name of one, such as "coulomb-viscous".
@@ -131,11 +72,6 @@ def fit(
             (`FitResult.encoder_offsets`) and the plant keeps its own, so scores of the recordings
             include the offsets. `"auto"`: `"per_recording"` if several recordings of a driven
             chain all begin at rest with every encoder at zero, with a warning.
-        continuity: of the state between windows. `"none"`: every window has its own initial
-            state, which suits laws that are not exact and motion that forgets its start.
-            `"penalty"`, `"constraint"`: shooting defects are penalised (sd 0.3 mrad, 0.01 rad/s)
-            or enforced. For a network `"constraint"` applies to its constant law only; an adaptive
-            model has none. Confidence intervals assume exact continuity.
         start: an earlier fit to start from: of the same law for a neuro-fuzzy model, of any model
             for the plant's terms.
         motions: smoothed motions in joint coordinates, to save smoothing again.
@@ -158,7 +94,7 @@ def fit(
     """
     options = FitOptions(
         method, windows, fit_plant, drag,
-        eccentricity, encoder_reference, continuity, max_steps, loss, fit_delay,
+        eccentricity, encoder_reference, max_steps, loss, fit_delay,
     )  # fmt: skip
     task = prepare_task(model, plant, recordings, options, start, motions, callback)
     schedule = task.model.schedule
@@ -171,63 +107,3 @@ def fit(
     # By name, so that a schedule outside the core brings a strategy of its own.
     strategy: Callable[[FitTask], FitResult] = pkgutil.resolve_name(schedule.fit_strategy)
     return strategy(task).with_warnings(task.data_warnings, task.mistakes)
-
-
-def prepare_task(
-    model: FrictionModel | str,
-    plant: Plant | str | Path,
-    recordings: RecordingLike | Iterable[RecordingLike],
-    options: FitOptions,
-    start: FitResult | None = None,
-    motions: Sequence[Motion] | None = None,
-    callback: Callback | None = None,
-) -> FitTask:
-    """Check and convert the arguments of a fit; see `fit`."""
-    plant = rigs.of(plant)
-    model = as_model(model, plant.joints)
-    given = as_recording_list(recordings, plant)
-    if "p_0" in model.law.names:
-        raise ValueError(
-            f"the law {model.law.name!r} is for tables of torque, see `fit_torque`; to motions fit "
-            "maxwell-slip."
-        )
-    joint = in_joint_coordinates(plant, model, given)
-    if options.eccentricity == "on" and not isinstance(plant, PendulumChain):
-        raise ValueError(f"{plant.name or 'the axis'} has no encoders that turn with its joints.")
-    # Torques alone do not depend on a constant offset of the encoders enough to estimate one.
-    found: tuple[str, ...] = ()
-    per_recording = options.encoder_reference == "per_recording"
-    if options.encoder_reference == "auto" and options.method == "output_error":
-        per_recording = looks_zeroed_per_recording(plant, given, options)
-        found = (ZEROED_PER_RECORDING,) if per_recording else ()
-    moved = smoothed_motions(joint, motions)
-    convention = given[0].resolve_convention(plant)
-    delay = 0.0
-    if options.fit_delay:
-        if not largest_torques(joint).any():
-            raise ValueError("`fit_delay=True` needs recordings with torques, got none.")
-        # A search by simulation finds the delay only from nearby: within a cycle of the motion.
-        delay, _ = balanced_delay(plant, joint, moved, options)
-    advanced = advanced_torques(joint, delay)
-    # With the delay removed, so that it is not named a second time as a mistake.
-    stated, mistakes = likely_mistakes(plant, advanced, moved, convention, options)
-    found = (
-        *mistake_warning(stated, mistakes),
-        *found,
-        *data_warnings(plant, given, joint, moved, options),
-    )
-    measurement = measurement_matrix(plant, convention)
-    return FitTask(
-        model,
-        plant,
-        joint,
-        measurement,
-        moved,
-        options,
-        start,
-        callback,
-        per_recording,
-        delay,
-        found,
-        tuple(m.text for m in mistakes),
-    )

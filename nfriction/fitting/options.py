@@ -9,8 +9,6 @@ Method = Literal["equation_error", "output_error"]
 Eccentricity = Literal["off", "on", "auto"]
 # When incremental encoders were set to zero: before all recordings, or at the start of each.
 EncoderReference = Literal["auto", "shared", "per_recording"]
-# Defects between shooting windows: free, penalised, or enforced.
-Continuity = Literal["none", "penalty", "constraint"]
 # Of SciPy's robust losses those that keep growing, so that a start far away still comes near.
 Loss = Literal["linear", "soft_l1", "huber", "cauchy"]
 
@@ -18,7 +16,6 @@ CHOICES = {
     "method": get_args(Method),
     "eccentricity": get_args(Eccentricity),
     "encoder_reference": get_args(EncoderReference),
-    "continuity": get_args(Continuity),
     "loss": get_args(Loss),
 }
 
@@ -42,7 +39,6 @@ class FitOptions:
     drag: bool | None = None
     eccentricity: Eccentricity = "off"
     encoder_reference: EncoderReference = "auto"
-    continuity: Continuity = "none"
     max_steps: int = 30
     loss: Loss = "linear"
     fit_delay: bool = False
@@ -65,6 +61,9 @@ class FitOptions:
     # Torques are averaged over so long, short against a swing [s], and so many samples are used.
     diagnosis_block: float = 0.03
     diagnosis_samples: int = 8_000
+    # Rise of the energy of a free motion over its largest kinetic energy; inertias that are off by
+    # their bound feign 0.43.
+    energy_rise: float = 0.5
     # Longest delay between torques and positions: some samples of a slow bus [s].
     largest_delay: float = 0.1
     # More substeps would mean a sign function too steep for the sample time.
@@ -113,11 +112,6 @@ class FitOptions:
     rest_sd: tuple[float, float] = (1e-4, 1e-3)
     # Dry friction of a tenth of the gravity moment holds a link up to 0.1 rad off [rad].
     encoder_offset_sd: float = 0.05
-    # Defects of position and velocity [rad, rad/s]. Beside a penalty this weak, short windows
-    # still converge from far away.
-    penalty_sd: tuple[float, float] = (3e-4, 0.01)
-    # From far away a search along such a tight constraint would creep.
-    constraint_sd: tuple[float, float] = (1e-6, 3e-5)
 
     # --- Search.
     gradient_tolerance: float = 1e-6
@@ -160,6 +154,11 @@ class FitOptions:
     max_ratio_all: float = 1.1
     # Candidate priors, relative to the network's own.
     prior_shares: tuple[float, ...] = (1.0, 1 / 3)
+    # Updates of the priors of a network's groups by evidence; each searches on from the last.
+    evidence_updates: int = 3
+    # Log ratio of evidences that is worth mentioning: half the logarithm of 10 (H. Jeffreys,
+    # Theory of Probability, 3rd ed. 1961, appendix B).
+    evidence_gain: float = 0.5 * math.log(10.0)
 
     # --- Extrapolation prior of a network.
     # Grid cells along velocity and acceleration, cells around a visited one that count as
@@ -201,10 +200,8 @@ class FitOptions:
     conditional_ratio: float = 30.0
     # Entries below this share of a direction's largest are not named.
     named_share: float = 0.3
-    # Residuals above this many times the quantisation noise are model error.
+    # Residuals above this many times the measurement noise are model error.
     model_error_ratio: float = 3.0
-    # Windows are continuous while no defect exceeds this many sd.
-    max_defect: float = 5.0
 
     def __post_init__(self) -> None:
         for name, allowed in CHOICES.items():
@@ -219,14 +216,6 @@ class FitOptions:
                 )
             if self.fit_delay:
                 raise ValueError('`fit_delay=True` needs `method="output_error"`.')
-            if self.continuity != "none":
-                raise ValueError(f'`continuity="{self.continuity}"` needs `method="output_error"`.')
-
-    @property
-    def defect_sd(self) -> tuple[float, float] | None:
-        """Standard deviation of the defects that `continuity` asks for; None for free windows."""
-        found = {"none": None, "penalty": self.penalty_sd, "constraint": self.constraint_sd}
-        return found[self.continuity]
 
 
 def _checked_lengths(windows: object) -> tuple[float, ...]:

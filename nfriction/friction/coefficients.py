@@ -44,7 +44,7 @@ class Schedule(nn.Module, ABC):
         follows_motion: False where the coefficients are constants.
         handles_range: False where exports must clamp the inputs to the trained range.
         fit_strategy: function that fits such coefficients, as `"module:function"`; it takes a
-            `nfriction.fitting.fit.FitTask`. Empty where there is none.
+            `nfriction.fitting.task.FitTask`. Empty where there is none.
         form: formula that exports have code of their own for; others are traced.
     """
 

@@ -1,5 +1,6 @@
 """Neuro-fuzzy models: coefficients as a network's function of velocity and acceleration."""
 
+import math
 import reprlib
 from collections.abc import Sequence
 from pkgutil import resolve_name
@@ -15,12 +16,15 @@ from nfriction.friction.models import NamedModel
 from nfriction.friction.parameters import Sensitivity, positive_number
 from nfriction.fuzzy import AnfisRBF
 from nfriction.fuzzy.membership import FuzzyRules
+from nfriction.fuzzy.partition import FreePartition
 
 # A coefficient below a thousandth of its scale starts there: from zero it could not rise.
 LEAST_RATIO = 1e-3
 # With a third of it the network is too stiff to follow large swings, and then wrong at smaller
 # ones: on later swings of a real pendulum 6.8 mrad instead of 3.0 (its constant law: 5.3).
 PRIOR_SD = 0.3
+# Of the logistic distribution: that of the logit of a share about which nothing is known.
+LOGIT_SD = math.pi / math.sqrt(3.0)
 
 
 def smooth_relu(u: Tensor, roundness: float) -> Tensor:
@@ -66,9 +70,14 @@ class NeuroFuzzy(Schedule):
         head_units: units of the radial basis head.
         acceleration: `"along_motion"` takes qdd sgn(qd), so that friction is the same in both
             directions; `"signed"` takes qdd as the papers do.
-        interpretable: keep the sets ordered, in range and overlapping.
-        prior_sd: standard deviation of the network's parameters around zero, in units of the
-            coefficients' scale; a fit also tries a third of it.
+        interpretable: keep the sets ordered, in range and overlapping, also while a fit moves them.
+        prior_sd: standard deviation of the network's parameters around the start of a fit:
+            consequents and weights in units of the coefficients' scale, widths as logarithms,
+            centres in widths. A fit also tries a third of it for the weights, and finds that of
+            the sets by evidence.
+
+    Attributes:
+        learn_sets: whether a fit moves the sets and the head's units besides what they weigh.
 
     References:
         TLRIP paper, neuro-fuzzy friction estimation (5 x 5 sets, 25 rules, 10 radial basis units).
@@ -83,6 +92,7 @@ class NeuroFuzzy(Schedule):
 
     fit_strategy = "nfriction.fitting.strategy.neurofuzzy:fit_neurofuzzy"
     handles_range = True
+    learn_sets: bool = False
 
     reference: Tensor
     scale: Tensor
@@ -239,12 +249,22 @@ class NeuroFuzzy(Schedule):
         # At rest the network's input is zero for every acceleration.
         return qd, torch.where(sign == 0, qdd, held / sign)
 
-    def trained(self) -> tuple[nn.Parameter, nn.Parameter]:
-        """The parameters that a trajectory fit varies, each (joint, coefficient, ...).
+    def trained(self) -> tuple[nn.Parameter, ...]:
+        """The parameters that a trajectory fit varies, each (joint, ...).
 
-        These are the ones that enter the coefficients almost linearly: the rules' planes and the
-        weights of the head. The head's bias stays zero: it would double the rules' constants, and
-        halve the prior on them.
+        First the `weights`. Then the sets' parameters, and the centres and widths of the head's
+        units.
+        """
+        if not self.learn_sets:
+            return self.weights()
+        partition, head = self.network.anfis.partition, self.network.head
+        return (*self.weights(), *partition.parameters(), head.centres, head.log_widths)
+
+    def weights(self) -> tuple[nn.Parameter, nn.Parameter]:
+        """Parameters that enter the coefficients almost linearly, (joint, coefficient, ...).
+
+        The rules' planes and the weights of the head. The head's bias stays zero: it would double
+        the rules' constants, and halve the prior on them.
         """
         return self.network.anfis.consequents, self.network.head.output_weight
 
@@ -258,33 +278,62 @@ class NeuroFuzzy(Schedule):
             p.copy_(part.reshape(p.shape))
 
     def parameter_names(self, joint_names: Sequence[str]) -> list[str]:
-        rules, weights = (p[0, 0].numel() for p in self.trained())
+        rules, weights = (p[0, 0].numel() for p in self.weights())
         columns = ("velocity slope", "acceleration slope", "constant")
         planes = [
             f"{columns[k % len(columns)]} of rule {k // len(columns) + 1}" for k in range(rules)
         ]
         head = [f"head weight {k + 1}" for k in range(weights)]
-        return [
+        names = [
             f"{name} of {joint}: {part}"
             for parts in (planes, head)
             for joint in joint_names
             for name in self.coefficient_names
             for part in parts
         ]
+        for group, p in zip(self.group_names()[2:], self.trained()[2:], strict=True):
+            parts = [f"{group} {k + 1}" for k in range(p[0].numel())]
+            names += [f"network of {joint}: {part}" for joint in joint_names for part in parts]
+        return names
+
+    def group_names(self) -> tuple[str, ...]:
+        """A name for each tensor of `trained`, whose parameters share a prior."""
+        sets = tuple(
+            f"set {name.removeprefix('log_')}"
+            for name, _ in self.network.anfis.partition.named_parameters()
+        )
+        names = ("consequents", "head weights", *sets, "head centres", "head widths")
+        return names[: len(self.trained())]
+
+    def groups(self) -> Tensor:
+        """Place in `group_names` of each parameter's group, (parameter,)."""
+        sizes = torch.tensor([p.numel() for p in self.trained()])
+        return torch.arange(len(sizes)).repeat_interleave(sizes)
 
     def bounds(self) -> tuple[Tensor, Tensor]:
         vector = self.parameter_vector()
         # The network of a coefficient that is not fitted stays where it started.
         mask = torch.tensor(self.fitted_mask, device=vector.device)[:, None]
-        fitted = torch.cat(
-            [mask.expand(self.joints, -1, p[0, 0].numel()).reshape(-1) for p in self.trained()]
-        )
+        fitted = torch.ones_like(vector, dtype=torch.bool)
+        linear = [mask.expand(self.joints, -1, p[0, 0].numel()).reshape(-1) for p in self.weights()]
+        fitted[: sum(len(part) for part in linear)] = torch.cat(linear)
         free = torch.full_like(vector, torch.inf)
         return torch.where(fitted, -free, vector), torch.where(fitted, free, vector)
 
     def prior(self) -> tuple[Tensor, Tensor]:
-        vector = self.parameter_vector()
-        return torch.zeros_like(vector), torch.full_like(vector, self.prior_sd)
+        """Mean and standard deviation: zero for the network's output, its sets where they are."""
+        partition, head = self.network.anfis.partition, self.network.head
+        mean, units = self.parameter_vector(), {}
+        mean[: sum(p.numel() for p in self.weights())] = 0.0
+        # Centres in units of widths, spacings as logits, all others relative as they are.
+        units[head.centres] = head.log_widths.detach().exp()
+        if isinstance(partition, FreePartition):
+            units[partition.centres] = partition.log_widths.detach().exp()
+        else:
+            spacings = partition.spacings
+            units[spacings] = torch.full_like(spacings, LOGIT_SD / self.prior_sd)
+        sizes = [units.get(p, torch.ones_like(p)).reshape(-1) for p in self.trained()]
+        return mean, self.prior_sd * torch.cat(sizes).detach()
 
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
         return self.residual_sensitivities(self.reference, qd, qdd)
@@ -342,11 +391,27 @@ class NeuroFuzzy(Schedule):
         own = torch.eye(y.shape[-1], dtype=y.dtype, device=y.device)
         # The rules' outputs are inputs of the head, too.
         by_y = head.input_jacobian(both)[:, :, x.shape[-1] :].permute(3, 0, 1, 2)
+        by_rules, by_head = by_u[..., None] * (own + by_y), by_u[..., None] * own
         by_qd, by_qdd = self.slopes(qd, qdd, coefficients)
+        if not self.learn_sets:
+            factors = ((by_rules, anfis.regressors(x)), (by_head, head.activations(both)))
+            return Sensitivity(factors, by_qd, by_qdd)
+        columns, units = anfis.jacobian_columns(x), head.jacobian_columns(both)
+        shared, one = anfis.consequents[0, 0].numel(), torch.ones_like(x[..., :1])
+        by_set = columns[:, shared:].unflatten(1, (y.shape[-1], -1)).permute(3, 0, 1, 2)
+        by_unit = by_u[..., None] * head.output_weight.repeat_interleave(head.inputs, -1)
+        # Of a unit's output by its centre and logarithmic width, both over the width squared.
+        moved = units[:, head.units + 1 :].unflatten(1, (2, -1)).movedim(-1, 0)
+        moved = moved * torch.exp(-2.0 * head.log_widths).flatten(1)[:, None]
         return Sensitivity(
             (
-                (by_u[..., None] * (own + by_y), anfis.regressors(x)),
-                (by_u[..., None] * own, head.activations(both)),
+                (by_rules, columns[:, :shared].movedim(-1, 0)),
+                (by_head, units[:, : head.units].movedim(-1, 0)),
+                *(
+                    (by_rules @ (by_set @ rows), one)
+                    for rows in anfis.partition.jacobian().values()
+                ),
+                *((by_unit * part.unsqueeze(2), one) for part in moved.unbind(2)),
             ),
             by_qd,
             by_qdd,

@@ -52,9 +52,7 @@ RAISE, LOWER = 4.0, 6.0
 class LevenbergMarquardt:
     """Damped Gauss-Newton minimiser of 1/2 sum r^2 within bounds.
 
-    Each step minimises the local quadratic plus damping/2 * |D^(1/2) step|^2 with the largest
-    diagonal D of the Hessian so far. All tests are made in these units, so that a fit does not
-    depend on the units of its parameters.
+    All tests are made in units of D, so that a fit does not depend on the units of its parameters.
 
     Args:
         max_steps: limit of accepted steps.

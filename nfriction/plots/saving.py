@@ -17,6 +17,7 @@ from nfriction.plots.coefficients import (
     coefficients_over_time,
 )
 from nfriction.plots.comparison import horizon_curve, positions, rmse_bars, torque_over_velocity
+from nfriction.plots.drawing import mechanism
 from nfriction.plots.fuzzy import memberships
 from nfriction.plots.style import DARK_GROUND, for_dark_screen
 from nfriction.recording import Recording
@@ -36,7 +37,7 @@ def save_all(
 ) -> list[Path]:
     """Write every figure of a comparison as PNG, and as `NAME.dark.png` for a dark screen.
 
-    `rmse_*` and `horizons_*` for test and training recordings, `positions_*` for each
+    `mechanism`, `rmse_*` and `horizons_*` for test and training recordings, `positions_*` for each
     recording given, `torque_over_velocity`, `over_time_*` for each law of which a model follows the
     motion, and for each neuro-fuzzy model `coefficients_*`, `sections_*` and `memberships_*`. A
     network that was rejected has constant coefficients and none of these.
@@ -46,7 +47,8 @@ def save_all(
         recordings: those compared, or some of them.
         folder: made where it does not exist; files of the same name are replaced.
         run: id of the run, kept in each PNG file.
-        formats: further ones for papers, `"svg"` or `"pdf"`.
+        formats: further ones: `"svg"` or `"pdf"` for papers, `"gif"` for animations of the test
+            recordings, `motion_1.gif` and so on.
 
     Returns:
         The files written.
@@ -77,13 +79,17 @@ def save_all(
             path = folder / f"{stem}_{count}.png"
         kept = {RUN_KEY: run} if run else {}
         figure.savefig(path, dpi=DPI, metadata=kept)
-        for ending in formats:
+        for ending in set(formats) - {"gif"}:
             figure.savefig(path.with_suffix(f".{ending}"))
             written.append(path.with_suffix(f".{ending}"))
         shade = path.with_suffix(".dark.png")
         for_dark_screen(figure, ground=DARK_GROUND).savefig(shade, dpi=DPI, metadata=kept)
         figure.clear()
         written += [path, shade]
+    if "gif" in formats and comparison.fits:
+        tested = {s.recording for of in comparison.test.values() for s in of}
+        for k, recording in enumerate(r for r in recordings if r.name in tested):
+            written.append(comparison.animate(recording, folder / f"motion_{k + 1}.gif"))
     return written
 
 
@@ -103,6 +109,7 @@ def _figures(
     if not comparison.fits:
         return
     last = list(comparison.fits.values())[-1]
+    yield "mechanism", mechanism(last.plant)
     moved = last.motions
     if last.encoder_offsets:
         # Motions are kept as recorded; the plant expects corrected angles.

@@ -300,7 +300,8 @@ class Recording:
             raise ValueError(
                 f"`unit` is {unit!r}, but the columns are in {found!r}; drop one of the two."
             )
-        if degrees and unit == "m":
+        # Angles of motors are converted before their screws make them lengths.
+        if degrees and unit == "m" and (not of_motors or "qd" in arrays):
             raise ValueError("`degrees=True` needs angles, but `unit` is 'm'; drop one of the two.")
         # One text, for CSV comments and Parquet metadata hold no lists.
         names = [part.strip() for part in str(attributes.get("names", "")).split(",")]

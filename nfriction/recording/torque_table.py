@@ -40,6 +40,11 @@ _KEYS = {
 # Units are those of positions, velocities, torques and times; others are taken as they are.
 _KIND = {"time": "time", "q": "q", "qd": "qd", "tau": "tau", "load": "tau"}
 _PER_JOINT = ("q", "qd", "qdd", "tau", "load", "temperature")
+# Usual names, without a unit behind.
+_LIKE = {
+    "qd": re.compile(r"(speed|vel|omega|drehzahl|geschw)", re.IGNORECASE),
+    "tau": re.compile(r"[^\[(]*(torque|moment|tau|force|kraft|friction)", re.IGNORECASE),
+}
 MINIMUM_ROWS = 8
 # Joints faster than this are in degrees per second, or wheels [rad/s].
 FAST = 60.0
@@ -280,10 +285,19 @@ def _key(name: str) -> _Key | None:
 
 
 def _missing(table: pd.DataFrame, wanted: str, what: str) -> str:
-    shown = ", ".join(str(name)[:60] for name in list(table.columns)[:30])
+    found = [str(name)[:60] for name in table.columns][:30]
+    shown = ", ".join(found)
+    # For this advice only: what is read is always named by the user.
+    guessed = {}
+    for key, words in _LIKE.items():
+        near = [n for n in found if words.match(n) and _key(n) is None and not set(n) & set('",=:')]
+        if len(near) == 1:
+            guessed[key] = near[0]
+    pairs = guessed if wanted in guessed else {wanted: "..."}
+    named = ", ".join(f'"{key}": "{name}"' for key, name in pairs.items())
     return (
         f"{what}; found {shown or 'none'}. A table of friction needs qd and tau, or qd1, tau1, "
-        f'qd2, ...; name its columns with columns={{"{wanted}": "..."}}, a unit after a colon '
+        f"qd2, ...; name its columns with columns={{{named}}}, a unit after a colon "
         'where it is not SI, as in "velocity:deg/s".'
     )
 

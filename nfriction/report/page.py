@@ -164,6 +164,7 @@ _CAPTIONS = {
     "is the limit of these data, the effect of the uncertainty of the start",
     "rmse_train": "Position error by model and joint, training recordings",
     "horizons_train": "Position error over the length of the simulation, training recordings",
+    "mechanism": "The mechanism as the rig file describes it",
     "positions_test_": "Measured and simulated position with the error below, test: ",
     "positions_train_": "Measured and simulated position with the error below, training: ",
     "friction": "Friction torque over velocity: rows, their medians with quartiles in bins of "
@@ -313,9 +314,7 @@ def _fit(run: Run, name: str) -> dict[str, Any]:
     ]
     if intervals:
         tables.append(interval_table(name, intervals, bool(fit.plant)))
-    # Runs of older versions say only whether a search converged.
-    old = ("good" if fit.converged else "doubtful", "")
-    verdict, why = fit.usability if len(fit.usability) == 2 else old
+    verdict, why = fit.usability
     return {
         "name": name,
         "record": fit,
@@ -339,7 +338,8 @@ def _cards(run: Run) -> list[dict[str, Any]]:
         lines = []
         for name in next(iter(sets.values()), {}):
             values = [of[name][j] for of in sets.values() if name in of]
-            unit = f" {units[name]}" if name in units else ""
+            # A unit stays on the line of its number.
+            unit = f" {units[name]}".replace(" ", "\N{NO-BREAK SPACE}") if name in units else ""
             low, high = run.fits[best].intervals.get(f"{name} of {joint}", (math.nan, math.nan))
             note = ""
             if len(values) > 1:

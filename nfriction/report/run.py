@@ -28,8 +28,6 @@ _RUN = re.compile(rb"tEXtnfriction run\0([0-9a-f]{16})")
 # Squares of smaller numbers are finite.
 LARGEST_NUMBER = 10**100
 
-# Entries whose names have changed since the first schema.
-_RENAMED = {"held_out": "test", "alike": "indistinguishable", "lost": "unidentifiable"}
 Coefficients = dict[str, dict[str, tuple[float, ...]]]
 
 
@@ -43,7 +41,7 @@ class _EntryError(ValueError):
 
 @dataclass(frozen=True)
 class FitRecord:
-    """End of a fit, from `FitResult.to_dict`; entries that an older version lacks are empty.
+    """End of a fit, from `FitResult.to_dict`.
 
     Attributes:
         usability: "good", "doubtful" or "do not use", and why.
@@ -53,7 +51,7 @@ class FitRecord:
 
     status: str = "unknown"
     converged: bool = False
-    usability: tuple[str, ...] = ()
+    usability: tuple[str, str] = ("doubtful", "")
     residual: float = math.nan
     residual_unit: str = ""
     at_bounds: tuple[str, ...] = ()
@@ -79,14 +77,13 @@ class Run:
     """A comparison as read from its folder.
 
     Attributes:
-        id: of the run, in every file that it wrote; empty of older versions.
+        id: of the run, in every file that it wrote.
         comparison: the scores, without simulated positions and without fits.
         fits: status of each fit, by model.
         coefficients: by model, then by where they apply (`"always"` for a constant model),
             then by name: a value a joint.
         best: name of the best model, None where there was no test recording.
-        indistinguishable: the best and all models tied with it, simplest first; of older versions
-            none.
+        indistinguishable: the best and all models tied with it, simplest first.
         unfit: models not to be used, and why.
         recordings: digest by name of the `"train"` and `"test"` recordings.
         models: those whose files could be read, with the information in them.
@@ -136,8 +133,6 @@ def read_run(folder: str | Path) -> Run:
         raise RunError(f"{path}: is too large for results of a comparison.")
     try:
         content = parse_json(path.read_text(encoding="utf-8"))
-        if isinstance(content, dict) and "schema" not in content:
-            content = _renamed(content)
     except (ValueError, RecursionError) as error:
         raise RunError(f"{path}: is no JSON, or cut short ({error}).") from error
     try:
@@ -146,19 +141,10 @@ def read_run(folder: str | Path) -> Run:
         raise RunError(f"{path}: not results of a comparison: {error}.") from error
 
 
-def _renamed(value: Any) -> Any:
-    """JSON of the first schema with today's names."""
-    if isinstance(value, list):
-        return [_renamed(entry) for entry in value]
-    if isinstance(value, dict):
-        return {_RENAMED.get(key, key): _renamed(entry) for key, entry in value.items()}
-    return value
-
-
 def _run(folder: Path, content: dict[str, Any]) -> Run:
-    schema = _read(float, content.get("schema", 1), "`schema`")
-    if schema > SCHEMA:
-        raise _EntryError(f"its schema {schema:g} is newer than {SCHEMA}; update nfriction")
+    if content.get("schema") != SCHEMA:
+        found = str(content.get("schema"))[:40]
+        raise _EntryError(f"its schema is {found}, not {SCHEMA}; run the comparison again")
     joints = _read(tuple[str, ...], content.get("joints"), "`joints`")
     unit = content.get("units")
     if unit not in ("rad", "m"):
@@ -301,10 +287,8 @@ def _figures(folder: Path) -> tuple[tuple[Figure, ...], list[str]]:
             notes.append(f"figure {path.name}: not a PNG file")
             continue
         width, height = (int.from_bytes(png[k : k + 4], "big") for k in (16, 20))
-        # Earlier versions said `held_out` for `test`.
-        name = re.sub(r"^(rmse|horizons|positions)_held_out", r"\1_test", path.stem)
         run = _RUN.search(png[:4096])
-        found.append(Figure(name, png, width, height, run[1].decode() if run else ""))
+        found.append(Figure(path.stem, png, width, height, run[1].decode() if run else ""))
     return tuple(found), notes
 
 

@@ -10,7 +10,7 @@ References:
     Numerical Integration, 2nd ed., 2006, section VI.4.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,7 +26,17 @@ from nfriction.simulation.rk4 import acceleration, runge_kutta
 # cache or (at some 20 KB each) the memory.
 CHUNK = {"cpu": 2**13, "cuda": 2**18}
 
+# Beyond this many steps gradients are rarely meant and may take gigabytes: they must be asked for.
+MOST_STEPS = 10_000
+
 States = tuple[Tensor, ...]
+
+
+def wants_gradients(inputs: RolloutInputs, tensors: Iterable[Tensor]) -> bool:
+    """True where an input of a rollout or one of its modules' tensors requires a gradient."""
+    given = (inputs.q0, inputs.qd0, inputs.tau, *tensors)
+    short = inputs.step.shape[-1] <= MOST_STEPS
+    return short and torch.is_grad_enabled() and any(x.requires_grad for x in given)
 
 
 def adjoint_rollout(

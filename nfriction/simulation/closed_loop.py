@@ -18,10 +18,11 @@ from nfriction.simulation.protocols import (
     Friction,
     NoFriction,
     Plant,
+    Rollout,
     RolloutInputs,
     as_stateful,
 )
-from nfriction.simulation.rollout import Rollout, simulate
+from nfriction.simulation.rollout import simulate
 from nfriction.simulation.validate import (
     outside_inference_mode,
     require_stability,
@@ -196,4 +197,6 @@ def control(
     law = None
     if law_states:
         law = torch.stack(law_states, -3).masked_fill(gone[..., None], torch.nan)
-    return ControlledMotion(seconds, q, qd, qdd, diverged_at, law, tau=applied, measured=read)
+    return ControlledMotion(
+        step.expand(steps), q, qd, qdd, diverged_at, law, tau=applied, measured=read
+    )

@@ -38,21 +38,31 @@ class System:
 
     Attributes:
         plant, friction: the mechanism and its friction model.
-        fingerprint: of all that they read; the error that says why there is none.
+        tensors: their floating-point parameters and buffers, by "plant." or "friction." and name.
+        fingerprint: of all else that they read; the error that says why there is none.
     """
 
     plant: Any
     friction: Any
-    fingerprint: "codegen.Fingerprint | codegen.Incomparable"
+    tensors: Mapping[str, Tensor]
+    fingerprint: Hashable
 
     @classmethod
     def of(cls, plant: Any, friction: Any) -> "System":
         """The two as they are now."""
-        modules = [m for m in (plant, friction) if isinstance(m, nn.Module)]
+        modules = {"plant": plant, "friction": friction}
+        modules = {name: m for name, m in modules.items() if isinstance(m, nn.Module)}
+        tensors = {
+            f"{prefix}.{name}": value
+            for prefix, module in modules.items()
+            for name, value in (*module.named_parameters(), *module.named_buffers())
+            if value.is_floating_point()
+        }
         try:
-            return cls(plant, friction, codegen.fingerprint(modules, plant, friction))
+            found = codegen.fingerprint(modules.values(), plant, friction)
         except codegen.Incomparable as reason:
-            return cls(plant, friction, reason.with_traceback(None))
+            found = reason.with_traceback(None)
+        return cls(plant, friction, tensors, found)
 
 
 def wants_compiled(backend: Backend, q: Tensor, gradients: bool) -> bool:
@@ -112,7 +122,7 @@ def integrate_compiled(
         return x[0] if x.ndim == trailing and not x.stride(0) else x
 
     drive = None if measured is None else (rows(measured[0], 2), rows(measured[1], 2))
-    values = _values(system.plant, system.friction, compiled.parameter_names)
+    values = {name: system.tensors[name].detach() for name in compiled.parameter_names}
     for name, value in (parameters or {}).items():
         own = value.shape[len(batch) :]
         values[f"friction.{name}"] = value.detach().reshape(-1, *own)
@@ -158,7 +168,7 @@ def _compiled(
         )
         found = _attempt(plant, friction, step_function)
     else:
-        key = system.fingerprint.key, step_function
+        key = system.fingerprint, step_function
         found = _known.get(key) or _attempt(plant, friction, step_function)
         _keep(_known, key, found)
     if isinstance(found, codegen.CodegenError):
@@ -223,13 +233,3 @@ def _check_compilable(plant: Any, friction: Any) -> None:
             raise codegen.CodegenError(
                 "a plant or friction model with a batch of its own cannot be compiled"
             )
-
-
-def _values(plant: nn.Module, friction: Any, names: Any) -> dict[str, Tensor]:
-    """The parameters and buffers of these very modules."""
-    found = {}
-    for prefix, module in (("plant", plant), ("friction", friction)):
-        if isinstance(module, nn.Module):
-            for name, value in (*module.named_parameters(), *module.named_buffers()):
-                found[f"{prefix}.{name}"] = value.detach()
-    return {name: value for name, value in found.items() if name in names}

@@ -1,11 +1,15 @@
-"""Interfaces and inputs of a rollout: mechanism, friction, initial state and what drives it."""
+"""Interfaces, inputs and result of a rollout: mechanism, friction, what drives it, the motion."""
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol, cast
 
 import torch
 from torch import Tensor, nn
+
+logger = logging.getLogger(__name__)
 
 
 class Plant(Protocol):
@@ -92,3 +96,56 @@ class RolloutInputs:
     measured: tuple[Tensor, Tensor] | None = None
     hidden_state: Tensor | None = None
     law_state: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """A simulated motion.
+
+    Attributes:
+        step: sample times [s], shape (steps,) or (*batch, steps).
+        q: joint position [rad], shape (*batch, steps + 1, joint).
+        qd: joint velocity [rad/s], same shape.
+        qdd: joint acceleration known at each sample, that of the step before (at the start: without
+            friction) [rad/s^2], same shape; with `qd` it drives the coefficients.
+        diverged_at: time [s] at which a motion of the batch stopped being finite, infinity where
+            it never did, shape (*batch,).
+        law_state: internal state of a friction law with memory, (*batch, steps + 1, joint, state);
+            None of a law without.
+    """
+
+    step: Tensor
+    q: Tensor
+    qd: Tensor
+    qdd: Tensor
+    diverged_at: Tensor
+    law_state: Tensor | None = None
+
+    @classmethod
+    def of(cls, inputs: RolloutInputs, states: tuple[Tensor, ...]) -> "Rollout":
+        """The motion of these states, NaN from where it diverged."""
+        q, qd, qdd, *law = states
+        found = cls(inputs.step, q, qd, qdd, q.new_full(q.shape[:-2], torch.inf), *law)
+        # What is lost stays NaN, so that the last sample shows whether anything is.
+        if not qd[..., -1, :].isnan().any():
+            return found
+        lost = qd.isnan().any(-1)
+        first = lost.to(torch.int64).argmax(-1, keepdim=True)
+        at = torch.gather(found.time.expand(lost.shape), -1, first).squeeze(-1)
+        diverged_at = torch.where(lost.any(-1), at, torch.inf)
+        # Masked, since gradients of NaN would spoil those of other motions.
+        q, qd, qdd = (x.masked_fill(lost[..., None], torch.nan) for x in (q, qd, qdd))
+        law = [x.masked_fill(lost[..., None, None], torch.nan) for x in law]
+        count = int(lost.any(-1).sum())
+        logger.warning("%d rollout(s) diverged, first at %.4g s", count, diverged_at.min())
+        return cls(inputs.step, q, qd, qdd, diverged_at, *law)
+
+    @cached_property
+    def time(self) -> Tensor:
+        """Time of each sample [s], shape (steps + 1,) or (*batch, steps + 1)."""
+        return torch.nn.functional.pad(self.step, (1, 0)).cumsum_(-1)
+
+    @property
+    def diverged(self) -> Tensor:
+        """True for motions that diverged, shape (*batch,)."""
+        return torch.isfinite(self.diverged_at)

@@ -25,19 +25,6 @@ from nfriction.simulation.protocols import (
     as_stateful,
 )
 
-# RK4 is stable on the negative real axis down to h * lambda = -2.785.
-RK4_STABILITY = 2.785
-
-
-def required_substeps(plant: Plant, friction: Friction, sample_time: float) -> int:
-    """Integration steps per sample that keep friction stable where it is steepest, at rest.
-
-    Linearised there, friction damps each joint: M(q) d(qd)/dt = -D qd. Its fastest mode decays at
-    the largest eigenvalue lambda of M^-1 D, over all poses, so h lambda must stay below 2.785.
-    """
-    rate = plant.decay_rate(friction.zero_velocity_damping())
-    return max(1, int(torch.ceil(rate.max() * (sample_time / RK4_STABILITY * (1 - 1e-9)))))
-
 
 def acceleration(
     plant: Plant, friction: Friction, q: Tensor, qd: Tensor, tau: Tensor, coefficients: Tensor

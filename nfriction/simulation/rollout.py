@@ -6,20 +6,20 @@ acceleration needs friction. The next step is `nfriction.fitting.fit`: the coeff
 such a simulation follows a recording.
 """
 
-import logging
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
-from nfriction.simulation.adjoint import adjoint_rollout, own_tensors
+from nfriction.simulation.adjoint import adjoint_rollout, wants_gradients
 from nfriction.simulation.compiled import Backend, System, integrate_compiled, wants_compiled
 from nfriction.simulation.memory_step import memory_of, memory_step
 from nfriction.simulation.protocols import (
     Friction,
     NoFriction,
     Plant,
+    Rollout,
     RolloutInputs,
     StepFunction,
 )
@@ -35,40 +35,7 @@ from nfriction.simulation.validate import (
     with_law_state,
 )
 
-logger = logging.getLogger(__name__)
-
 Scheme = Literal["rk4", "time_stepping"]
-# Beyond this many steps gradients are rarely meant and may take gigabytes: they must be asked for.
-GRADIENT_STEPS = 10_000
-
-
-@dataclass(frozen=True)
-class Rollout:
-    """A simulated motion.
-
-    Attributes:
-        time: [s], shape (steps + 1,) or (*batch, steps + 1).
-        q: joint position [rad], shape (*batch, steps + 1, joint).
-        qd: joint velocity [rad/s], same shape.
-        qdd: joint acceleration known at each sample, that of the step before (at the start: without
-            friction) [rad/s^2], same shape; with `qd` it drives the coefficients.
-        diverged_at: time [s] at which a motion of the batch stopped being finite, infinity where
-            it never did, shape (*batch,).
-        law_state: internal state of a friction law with memory, (*batch, steps + 1, joint, state);
-            None of a law without.
-    """
-
-    time: Tensor
-    q: Tensor
-    qd: Tensor
-    qdd: Tensor
-    diverged_at: Tensor
-    law_state: Tensor | None = None
-
-    @property
-    def diverged(self) -> Tensor:
-        """True for motions that diverged, shape (*batch,)."""
-        return torch.isfinite(self.diverged_at)
 
 
 @outside_inference_mode
@@ -147,23 +114,21 @@ def rollout(
     if scheme not in get_args(Scheme):
         raise ValueError(f"`scheme` must be one of {get_args(Scheme)}, got {scheme!r}.")
     if scheme == "time_stepping":
-        return _as_rollout(inputs, simulate_stiction(plant, model, inputs, progress, gradients))
+        return Rollout.of(inputs, simulate_stiction(plant, model, inputs, progress, gradients))
     system = System.of(plant, model)
     require_stability(system, inputs)
     warn_of_sample_time(model, inputs)
     if gradients is None:
-        able = backend in ("auto", "torch") and inputs.tau.shape[-2] <= GRADIENT_STEPS
-        given = (inputs.q0, inputs.qd0, inputs.tau, *own_tensors(plant, model))
-        gradients = able and torch.is_grad_enabled() and any(x.requires_grad for x in given)
+        gradients = backend != "compiled" and wants_gradients(inputs, system.tensors.values())
     states = simulate(system, inputs, gradients, backend, threads, progress)
-    return _as_rollout(inputs, states)
+    return Rollout.of(inputs, states)
 
 
 def integrate(plant: Plant, friction: Friction | None, inputs: RolloutInputs) -> Rollout:
     """`rollout` without checks and gradients, for searches whose trials may well be unstable."""
     model = NoFriction(plant.joints) if friction is None else friction
     inputs = with_law_state(inputs, model, inputs.law_state)
-    return _as_rollout(inputs, simulate(System.of(plant, model), inputs))
+    return Rollout.of(inputs, simulate(System.of(plant, model), inputs))
 
 
 def simulate(
@@ -190,22 +155,3 @@ def simulate(
         with torch.set_grad_enabled(gradients and torch.is_grad_enabled()):
             states = simulate_eager(system.plant, system.friction, inputs, progress, step_function)
     return states
-
-
-def _as_rollout(inputs: RolloutInputs, states: tuple[Tensor, ...]) -> Rollout:
-    """The motion with its time, NaN from where it diverged."""
-    time = torch.nn.functional.pad(inputs.step, (1, 0)).cumsum_(-1)
-    q, qd, qdd, *law = states
-    diverged_at = time.new_full(q.shape[:-2], torch.inf)
-    # What is lost stays NaN, so that the last sample shows whether anything is.
-    if qd[..., -1, :].isnan().any():
-        lost = qd.isnan().any(-1)
-        first = lost.to(torch.int64).argmax(-1, keepdim=True)
-        at = torch.gather(time.expand(lost.shape), -1, first).squeeze(-1)
-        diverged_at = torch.where(lost.any(-1), at, torch.inf)
-        # Masked, since gradients of NaN would spoil those of other motions.
-        q, qd, qdd = (x.masked_fill(lost[..., None], torch.nan) for x in (q, qd, qdd))
-        law = [x.masked_fill(lost[..., None, None], torch.nan) for x in law]
-        count = int(lost.any(-1).sum())
-        logger.warning("%d rollout(s) diverged, first at %.4g s", count, diverged_at.min())
-    return Rollout(time, q, qd, qdd, diverged_at, *law)

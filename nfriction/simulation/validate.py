@@ -16,13 +16,14 @@ from nfriction import codegen
 from nfriction.simulation.compiled import System
 from nfriction.simulation.memory_step import memory_of
 from nfriction.simulation.protocols import Friction, NoFriction, Plant, RolloutInputs
-from nfriction.simulation.rk4 import RK4_STABILITY, required_substeps
 
 logger = logging.getLogger(__name__)
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
+# RK4 is stable on the negative real axis down to h * lambda = -2.785.
+RK4_STABILITY = 2.785
 # Some tens of kilobytes each.
 KEPT_RATES = 64
 _decay_rates: dict[Hashable, float] = {}
@@ -207,6 +208,16 @@ def with_law_state(
     return replace(inputs, q0=q0, qd0=qd0, law_state=given.expand(*shape, law.size))
 
 
+def required_substeps(plant: Plant, friction: Friction, sample_time: float) -> int:
+    """Integration steps per sample that keep friction stable where it is steepest, at rest.
+
+    Linearised there, friction damps each joint: M(q) d(qd)/dt = -D qd. Its fastest mode decays at
+    the largest eigenvalue lambda of M^-1 D, over all poses, so h lambda must stay below 2.785.
+    """
+    rate = plant.decay_rate(friction.zero_velocity_damping())
+    return max(1, int(torch.ceil(rate.max() * (sample_time / RK4_STABILITY * (1 - 1e-9)))))
+
+
 def require_stability(system: System, inputs: RolloutInputs) -> None:
     """Refuse friction too steep at rest for stable Runge-Kutta steps."""
     plant, friction = system.plant, system.friction
@@ -239,7 +250,7 @@ def _fastest_decay(system: System) -> float:
     """
     if isinstance(system.fingerprint, codegen.Incomparable):
         return float(system.plant.decay_rate(system.friction.zero_velocity_damping()).max())
-    key = system.fingerprint.key, system.fingerprint.values()
+    key = system.fingerprint, tuple(map(codegen.content, system.tensors.values()))
     if key not in _decay_rates:
         if len(_decay_rates) >= KEPT_RATES:
             _decay_rates.clear()

@@ -23,7 +23,6 @@ def test_what_is_not_given_is_left_to_the_fit() -> None:
     assert "windows" not in settings
     assert settings["drag"] is None
     assert settings["encoder_reference"] == "auto"
-    assert settings["continuity"] == "none"
     assert f"(default: {','.join(f'{w:g}' for w in DEFAULTS.windows)})" in " ".join(
         parser.format_help().split()
     )
@@ -36,15 +35,12 @@ def test_what_is_not_given_is_left_to_the_fit() -> None:
             "--no-drag",
             "--encoder-reference",
             "per_recording",
-            "--continuity",
-            "penalty",
         ]
     )
     settings = inputs.fit_settings(told)
     assert settings["windows"] == (1.0, 3.0)
     assert settings["drag"] is False
     assert settings["encoder_reference"] == "per_recording"
-    assert settings["continuity"] == "penalty"
 
 
 @pytest.mark.parametrize(

@@ -50,7 +50,7 @@ def test_errors_are_one_line_with_the_remedy(
     assert main(["fit-torque", str(csv), "--out", str(tmp_path / "run")]) == 2
     line = capsys.readouterr().err
     assert "column qd is missing; found speed, tau" in line
-    assert "--columns qd=NAME" in line
+    assert '--columns "qd=speed"' in line
     assert main(["score-torque", str(tmp_path), str(csv)]) == 2
     assert "no folder that fit-torque wrote" in capsys.readouterr().err
     assert main(["score-torque", str(tmp_path / "none"), str(csv)]) == 2

@@ -11,7 +11,7 @@ from nfriction import LFM, NFLFM, compare
 from nfriction.cli.tables import error_tables, verdict
 from nfriction.evaluation.compare import Comparison, coefficient_summary
 from nfriction.evaluation.parallel import Progress
-from nfriction.evaluation.score import RMSE, Limit, Score
+from nfriction.evaluation.score import RMSE, Errors, Score
 from nfriction.papers.afem.adaptive import ALFM
 from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import pendulum, swing
@@ -187,9 +187,9 @@ def scored(found: Comparison, limit: float | None = None, **errors: float) -> Co
     test = {
         name.replace("_", " "): [
             Score(
-                recording, RMSE((e, e), e), {},
-                None if limit is None else Limit(RMSE((0.0, 0.0), k * limit), {}),
-                np.zeros(1), np.zeros((1, 2)), np.inf,
+                RMSE((e, e), e), {},
+                None if limit is None else Errors(RMSE((0.0, 0.0), k * limit), {}),
+                recording, np.zeros(1), np.zeros((1, 2)), np.inf,
             )
             for k, recording in enumerate("bc", 1)
         ]

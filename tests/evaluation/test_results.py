@@ -34,7 +34,7 @@ def recording() -> Recording:
 
 def scored(rmse: float) -> Score:
     error = RMSE((rmse,), rmse)
-    return Score("r", error, {"1": error}, None, TIME, np.zeros((len(TIME), 1)), np.inf)
+    return Score(error, {"1": error}, None, "r", TIME, np.zeros((len(TIME), 1)), np.inf)
 
 
 @pytest.fixture(scope="module")

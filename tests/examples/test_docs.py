@@ -1,6 +1,8 @@
 """The documentation names only what there is: commands parse, code compiles, names resolve."""
 
 import importlib
+import math
+import os
 import re
 import runpy
 import shlex
@@ -151,6 +153,98 @@ def test_every_page_is_in_the_menu_and_every_figure_function_in_the_reference() 
 
     described = {name.rpartition(".")[2] for name in REFERENCES}
     assert set(plots.__all__) - described <= {"save_all"}
+
+
+# What the commands of pages need beforehand, and how their readers come by it.
+TWIN = """nfriction twin --seconds 5 --out twin
+    for k in 1 2; do gunzip -c twin/train_*$k.csv.gz > run$k.csv; done
+    gunzip -c twin/test_1.csv.gz > run3.csv; cp twin/rig.json ."""
+BEFORE = {
+    "README.md": TWIN,
+    "motor.md": """python examples/motor_bench.py; head -3 runs/motor/run1.csv
+        sed /rotor_inertia/d runs/motor/rig.json > no_inertia.json
+        nfriction fit runs/motor/run[12].csv --rig no_inertia.json --model coulomb-viscous \\
+            --columns "time=Zeit [ms],motor1=Geber:counts/8192,current1=Strom [A]" 2>&1""",
+    "own_rig.md": "python examples/own_rig.py; head -3 runs/own_rig/log.csv",
+    "export.md": "python examples/fit_a_recording.py",
+    "own_law.md": f"{TWIN}; cp examples/own_law.py .",
+    "torque_table.md": """gunzip -c $DATA/kuka_kr300/kr300_A_friction.csv.gz > table.csv
+        cp table.csv other_table.csv""",
+}
+# Pages that build on each other run in one folder.
+QUICK = {"which_law.md"}
+SESSIONS = [
+    pytest.param(pages.split(), marks=[] if pages in QUICK else pytest.mark.slow, id=pages)
+    for pages in (
+        "which_law.md", "own_rules.md", "own_law.md", "explanation.md", "tour.md",
+        "motor.md compensation.md", "own_rig.md export.md", "torque_table.md", "README.md",
+    )
+]  # fmt: skip
+# They need a robot file of the reader's, a network, make, or minutes that another test takes.
+NOT_RUN = (
+    'rig = rigs.read("robot.urdf")', "nfriction: error: arm.urdf", "nfriction data get",
+    "cd data/", "make demo", "Without friction, simulations of the test",
+    "recording, signals", "pip install",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("pages", SESSIONS)
+def test_pages_print_what_they_show(
+    pages: list[str], tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    for name in ("examples", "tests"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "200"}
+    if "torque_table.md" in pages:
+        environment["DATA"] = str(request.getfixturevalue("data_dir"))
+    head = "set -e; " + "".join(
+        f'{word}() {{ "{sys.executable}" {option} "$@"; }}; '
+        for word, option in (("python", ""), ("nfriction", "-m nfriction"))
+    )
+    printed: list[str] = []
+
+    def run(command: str) -> None:
+        done = subprocess.run(
+            ["bash", "-c", head + command], cwd=tmp_path, env=environment, text=True,
+            capture_output=True, timeout=1200,
+        )  # fmt: skip
+        assert done.returncode == 0, f"{command}\n{done.stdout[-2000:]}{done.stderr[-2000:]}"
+        printed.extend(f"{done.stdout} {done.stderr}".split())
+
+    for name in pages:
+        page = next(p for p in (README, *PAGES) if p.name == name)
+        run(BEFORE.get(name, "true"))
+        text = page.read_text(encoding="utf-8")
+        for language, block in re.findall(r"^ *```(\w*)\n(.*?)^ *```", text, re.DOTALL | re.M):
+            if block.startswith(NOT_RUN):
+                continue
+            if language == "sh":
+                run(block)
+            elif language == "python":
+                snippet = re.fullmatch(r'--8<-- "(.*)"\n', block)
+                run(f"python {snippet[1]}" if snippet else f"python -c {shlex.quote(block)}")
+            elif not language:
+                place = 0
+                for line in filter(None, map(str.split, block.splitlines())):
+                    found = [k for k in range(place, len(printed)) if shown_at(k, line, printed)]
+                    assert found, f"{name} shows what no command prints: {' '.join(line)}"
+                    place = found[0] + len(line)
+
+
+def shown_at(place: int, shown: list[str], printed: list[str]) -> bool:
+    """Whether words are printed from a place on, numbers to 1 %: processors round differently."""
+
+    def same(a: str, b: str) -> bool:
+        if a == b:
+            return True
+        try:
+            x, y = (float(word.strip("()[],;%")) for word in (a, b))
+        except ValueError:
+            return False
+        return math.isclose(x, y, rel_tol=0.01, abs_tol=1e-12)
+
+    there = printed[place : place + len(shown)]
+    return len(there) == len(shown) and all(map(same, shown, there))
 
 
 @pytest.mark.slow

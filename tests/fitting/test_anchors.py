@@ -7,8 +7,8 @@ import torch
 from nfriction import NFLFM
 from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.options import DEFAULTS
-from nfriction.fitting.result.fit_result import result_from_shooting
 from nfriction.fitting.result.identifiability import CoefficientUncertainty, covariance_root
+from nfriction.fitting.result.of_search import result_from_shooting
 from nfriction.fitting.shooting.autocorrelation import bandwidth, hac_sd
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian

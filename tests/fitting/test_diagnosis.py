@@ -19,8 +19,8 @@ from nfriction import (
     fit,
     rollout,
 )
-from nfriction.fitting.fit import prepare_task
 from nfriction.fitting.options import FitOptions
+from nfriction.fitting.task import prepare_task
 from nfriction.signals import kalman_smoother
 
 COUNT = 2 * math.pi / 4096
@@ -43,7 +43,7 @@ def torque(peaks: list[float], seed: int) -> np.ndarray:
 
 
 @functools.cache
-def measured(name: str) -> tuple[Plant, np.ndarray, np.ndarray | None]:
+def measured(name: str, count: float | None = COUNT) -> tuple[Plant, np.ndarray, np.ndarray | None]:
     """Rig, positions in joint coordinates as encoders round them, and torques."""
     plants = {"free": PendulumChain(**DOUBLE), "driven": PendulumChain(**DOUBLE),
               "motor": PendulumChain(**MOTOR), "axis": LinearAxis(0.13),
@@ -58,7 +58,8 @@ def measured(name: str) -> tuple[Plant, np.ndarray, np.ndarray | None]:
         plant, model, q0, torch.zeros_like(q0), sample_time=STEP, steps=SAMPLES - 1, substeps=8,
         tau=None if tau is None else torch.as_tensor(tau[:-1]),
     )  # fmt: skip
-    return plant, COUNT * np.round(found.q.numpy() / COUNT), tau
+    q = found.q.numpy()
+    return plant, count * np.round(q / count) if count else q, tau
 
 
 def warnings_of(plant: Plant, q: np.ndarray, tau: np.ndarray | None, **given) -> tuple[str, ...]:
@@ -170,6 +171,31 @@ def test_an_advanced_torque_is_in_line_again():
         Recording(late.time, q).advance_torque(0.01)
 
 
+@pytest.mark.parametrize("name", ["driven", "motor", "axis", "wheel"])
+def test_a_driven_motion_without_torque_is_named(name):
+    plant, q, _ = measured(name)
+    (found, *_) = warnings_of(plant, q, None)
+    assert "has no torque, but its motion gains energy up to" in found
+
+
+def test_a_recording_of_another_rig_is_named():
+    plant, q, tau = measured("motor")
+    heavy = plant.replace(gravity_moment=2 * plant.gravity_moment)
+    start = torch.tensor([math.pi], dtype=torch.float64)
+    other = rollout(
+        heavy, CVFM(1, [[0.8, 0.3]]).requires_grad_(False), start, 0 * start, sample_time=STEP,
+        steps=SAMPLES - 1, substeps=8, tau=torch.as_tensor(tau[:-1]),
+    )  # fmt: skip
+    files = {"monday": q, "tuesday": q + 2e-3 * np.sin(q), "other": other.q.numpy()}
+    recordings = [
+        Recording(STEP * np.arange(SAMPLES), x, tau, convention="relative,upright", name=name)
+        for name, x in files.items()
+    ]
+    found = prepare_task(CVFM(1), plant, recordings, FitOptions()).mistakes
+    assert found == ("other is of another rig, or recorded in another way, than the others",)
+    assert not prepare_task(CVFM(1), plant, recordings[:2], FitOptions()).mistakes
+
+
 @pytest.mark.parametrize("rounded", [True, False])
 def test_a_spike_is_named_with_its_time(rounded):
     plant, q, tau = measured("driven")
@@ -205,4 +231,26 @@ def test_a_fit_says_whether_it_is_usable():
     # Viscous friction alone is far from dry friction.
     verdict, reason = fit(NCFM(1), plant, recording, **settings).usability
     assert verdict == "doubtful"
-    assert "times the encoder's quantisation noise" in reason
+    assert "times the measurement noise" in reason
+
+
+def test_noise_of_the_torque_is_no_error_of_the_law():
+    plant, fine, tau = measured("wheel", COUNT / 16)
+    noisy = tau + 0.05 * np.random.default_rng(0).standard_normal(tau.shape)
+    recording = Recording(STEP * np.arange(len(fine)), fine, noisy)
+    settings = {"windows": (2.0,), "fit_plant": False}
+    right = fit(CVFM(1), plant, recording, **settings)
+    # Far above the rounding, and just what the noise of the torque explains.
+    assert right.residual > 50 * right.noise.rounding
+    assert right.residual == pytest.approx(right.noise.residual, rel=0.5)
+    assert right.usability == ("good", "")
+    assert not any("missing something" in warning for warning in right.warnings)
+    assert fit(NCFM(1), plant, recording, **settings).usability[0] == "doubtful"
+
+
+def test_an_encoder_without_visible_count_excuses_no_law():
+    plant, smooth, tau = measured("wheel", None)
+    recording = Recording(STEP * np.arange(len(smooth)), smooth, tau)
+    settings = {"windows": (1.0,), "fit_plant": False}
+    assert fit(CVFM(1), plant, recording, **settings).usability == ("good", "")
+    assert fit(NCFM(1), plant, recording, **settings).usability[0] == "doubtful"

@@ -11,16 +11,15 @@ from nfriction import LFM
 from nfriction.fitting.data.inputs import adjustable_terms, measurement_matrix
 from nfriction.fitting.data.windows import cut_windows
 from nfriction.fitting.options import FitOptions
-from nfriction.fitting.result.fit_result import result_from_shooting
 from nfriction.fitting.result.identifiability import (
     Information,
     information,
     null_directions,
     standard_deviations,
 )
+from nfriction.fitting.result.of_search import result_from_shooting
 from nfriction.fitting.shooting.normal_equations import (
     Kept,
-    Rows,
     marginalize_states,
     normal_equations,
 )
@@ -73,13 +72,11 @@ def by_squares(p: ShootingProblem, x: torch.Tensor, sd: torch.Tensor) -> Informa
     return information(hessian, p.variables.prior()[0], p.variables.shared_count, covariance)
 
 
-@pytest.mark.parametrize("defect_sd", [None, (3e-4, 0.01), (1e-6, 3e-5)])
 @pytest.mark.parametrize("offset_sd", [None, torch.full((2, 2), 0.05, dtype=F64)])
 @pytest.mark.parametrize("stride", [1, 3])
-def test_rows_tell_what_squares_do_where_motion_is_tame(stride, offset_sd, defect_sd):
-    p = tame(stride, offset_sd=offset_sd, defect_sd=defect_sd)
+def test_rows_tell_what_squares_do_where_motion_is_tame(stride, offset_sd):
+    p = tame(stride, offset_sd=offset_sd)
     assert len(p.windows) == 6
-    assert len(p.pairs) == (4 if defect_sd else 0)
     x, sd = p.variables.start(), error_sizes(p)
     found, expected = p.information(x, sd), by_squares(p, x, sd)
     torch.testing.assert_close(found.prior, expected.prior)
@@ -93,7 +90,7 @@ def test_rows_tell_what_squares_do_where_motion_is_tame(stride, offset_sd, defec
 
 @pytest.mark.parametrize("piece", [1, 50])
 def test_pieces_do_not_show(piece, monkeypatch):
-    p = tame(offset_sd=torch.full((2, 2), 0.05, dtype=F64), defect_sd=(3e-4, 0.01))
+    p = tame(offset_sd=torch.full((2, 2), 0.05, dtype=F64))
     x, sd = p.variables.start(), error_sizes(p)
     whole = p.information(x, sd)
     monkeypatch.setattr("nfriction.fitting.shooting.sensitivity.PIECE", piece)
@@ -119,7 +116,7 @@ def grown(growth, told, seed=0):
     precision = torch.full((size,), 1e-12, dtype=F64)
     precision[:shared] = 0.0
     kept = Kept(torch.arange(shared, size)[None], STATE, size)
-    pieces = [Rows(slice(None), part[None], part[None, None]) for part in jacobian.split(60)]
+    pieces = [(slice(None), part[None]) for part in jacobian.split(60)]
     data, _ = marginalize_states(pieces, kept, precision[None, shared:])
     hessian = jacobian.T @ jacobian + torch.diag(precision)
     return Information(data, precision[:shared]), information(hessian, precision, shared)
@@ -213,7 +210,7 @@ def test_a_chaotic_window_loses_nothing_that_it_tells():
     assert float(result.hessian.max()) > 1e24
     moved = tuple(kalman_smoother(r.time, r.q) for r in search.recordings)
     assert result_from_shooting(p.friction, p, result, moved).unidentifiable == ()
-    rows = torch.cat([piece.scaled for piece in p._rows(p._simulate(x), p._scale)], 1)[0]
+    rows = torch.cat([scaled for _, scaled in p._rows(p._simulate(x), p._scale)], 1)[0]
     exact = in_whole_numbers(rows.numpy(), count, p.variables.prior()[0][count:].tolist())
     lower, upper = p.variables.bounds()
     fitted = (lower < upper)[:count]

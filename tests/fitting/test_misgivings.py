@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from nfriction import CVFM, LFM, NFLFM, PendulumChain, Recording, fit
-from nfriction.fitting.fit import prepare_task
 from nfriction.fitting.options import FitOptions
+from nfriction.fitting.task import prepare_task
 from tests.fitting.recordings import COUNTS, pendulum, swing
 
 COUNT = 2 * np.pi / COUNTS

@@ -8,7 +8,6 @@ import torch
 
 from nfriction import LFM, NFLFM
 from nfriction.fitting.data.windows import Windows
-from nfriction.fitting.options import FitOptions
 from nfriction.fitting.plant_parameters import plant_parameters
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian, _carry
@@ -20,8 +19,8 @@ from tests.fitting.recordings import F64, pendulum, solve
 ABSOLUTE = torch.tensor([[1.0, 0.0], [1.0, 1.0]], dtype=F64)
 
 
-def windows(steps=20, step=2e-3, joined=False) -> Windows:
-    """Two windows with torque, the second of them shorter; it may begin where the first ends."""
+def windows(steps=20, step=2e-3) -> Windows:
+    """Two windows with torque, the second of them shorter."""
     g = torch.Generator().manual_seed(5)
     q0 = torch.tensor([[1.6, 0.5], [2.5, -0.4]], dtype=F64)
     qd0 = torch.tensor([[2.0, -3.0], [-1.0, 4.0]], dtype=F64)
@@ -31,18 +30,16 @@ def windows(steps=20, step=2e-3, joined=False) -> Windows:
     steps_[1, -4:], weight[1, -4:] = 0.0, 0.0
     truth = LFM(2, [[4e-3, 3e-3], [2e-3, 1e-3]], v_smooth=0.1)
     q = integrate(pendulum(), truth, RolloutInputs(q0, qd0, tau, steps_)).q
-    second = (0, steps, 2 * steps - 4) if joined else (1, 0, steps - 4)
-    spans = ((0, 0, steps), second)
+    spans = ((0, 0, steps), (1, 0, steps - 4))
     return Windows(q, tau, steps_, weight, q0, qd0, spans)
 
 
-def problem(model, substeps=2, stride=1, joined=False, **settings) -> ShootingProblem:
+def problem(model, substeps=2, stride=1, **settings) -> ShootingProblem:
     plant = pendulum()
     terms = plant_parameters(plant, driven=(0, 1), largest_torque=0.1)
     jacobian = StepJacobian(plant, model, terms)
-    settings = {"defect_sd": (3e-4, 0.01), **settings}
     return ShootingProblem(
-        jacobian, model, windows(joined=joined), 1e-3, ABSOLUTE, substeps, stride=stride, **settings
+        jacobian, model, windows(), 1e-3, ABSOLUTE, substeps, stride=stride, **settings
     )
 
 
@@ -69,7 +66,7 @@ def point(p: ShootingProblem) -> torch.Tensor:
 
 
 def misfit(p: ShootingProblem, x: torch.Tensor) -> torch.Tensor:
-    return torch.cat([p.residuals(x).flatten(), p.defects(x).flatten()])
+    return p.residuals(x).flatten()
 
 
 OFFSETS = torch.full((2, 2), 0.05, dtype=F64)
@@ -79,13 +76,10 @@ OFFSETS = torch.full((2, 2), 0.05, dtype=F64)
 @pytest.mark.parametrize(
     ("name", "offset_sd"), [("LFM", None), ("LFM", OFFSETS), ("NFLFM", OFFSETS)]
 )
-@pytest.mark.parametrize(
-    ("substeps", "stride", "joined"),
-    [(1, 1, False), (2, 1, True), (2, 3, True), (1, 20, False), (1, 12, True)],
-)
-def test_gradient_and_hessian_against_finite_differences(name, substeps, stride, offset_sd, joined):
+@pytest.mark.parametrize(("substeps", "stride"), [(1, 1), (2, 1), (2, 3), (1, 20), (1, 12)])
+def test_gradient_and_hessian_against_finite_differences(name, substeps, stride, offset_sd):
     """Also where samples are passed over: 3 and 12 leave steps after the last that counts."""
-    p = problem(bent(name), substeps, stride, joined, offset_sd=offset_sd)
+    p = problem(bent(name), substeps, stride, offset_sd=offset_sd)
     x = point(p)
     found = p.linearise(x)
     torch.testing.assert_close(found.cost, p.cost(x))
@@ -208,54 +202,9 @@ def test_a_traced_motion_is_the_simulated_one_where_windows_lie():
     assert not before.q.any()
 
 
-def halves(noise: float = 1e-3) -> Windows:
-    """One motion with noise, cut in two, from starts that are a little off."""
-    g = torch.Generator().manual_seed(7)
-    truth = LFM(2, [[4e-3, 3e-3], [2e-3, 1e-3]], v_smooth=0.1)
-    q0, qd0 = torch.tensor([[1.6, 0.5]], dtype=F64), torch.tensor([[2.0, -3.0]], dtype=F64)
-    step = torch.full((1, 80), 5e-3, dtype=F64)
-    run = integrate(
-        pendulum(), truth, RolloutInputs(q0, qd0, torch.zeros(1, 80, 2, dtype=F64), step)
-    )
-    q = run.q + noise * torch.randn(run.q.shape, generator=g, dtype=F64)
-    start = [x[0, [0, 40]] + 0.01 for x in (run.q, run.qd)]
-    return Windows(
-        torch.cat([q[:, :41], q[:, 40:]]), torch.zeros(2, 40, 2, dtype=F64),
-        step.reshape(2, 40), torch.ones(2, 41, dtype=F64), *start,
-        ((0, 0, 40), (0, 40, 80)),
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize("continuity", ["none", "penalty", "constraint"])
-def test_windows_come_together_as_far_as_they_are_to(continuity):
-    model = LFM(2, [3e-3, 2e-3], v_smooth=0.1)
-    jacobian = StepJacobian(pendulum(), model, [])
-    settings = {"noise_sd": 1e-3, "measurement": ABSOLUTE}
-    sd = FitOptions(continuity=continuity).defect_sd
-    p = ShootingProblem(jacobian, model, halves(), defect_sd=sd, **settings)
-    result = solve(p, p.variables.start(), cost_tolerance=1e-10)
-    assert result.converged
-    apart = replace(p, defect_sd=(1.0, 1.0))
-    jump = apart.defects(result.x).abs().amax(0)
-    assert (jump[:2].max() > 3e-4) == (continuity == "none")
-    if sd is not None:
-        assert (jump[:2] < 2 * sd[0]).all()
-        assert (jump[2:] < 2 * sd[1]).all()
-
-
-def test_only_neighbours_in_time_have_seams():
-    w = replace(windows(), spans=((0, 0, 20), (1, 20, 36)))
-    assert w.continuity_pairs() == []
-    assert replace(w, spans=((0, 0, 20), (0, 20, 36))).continuity_pairs() == [(0, 1)]
-    assert replace(w, spans=((0, 20, 36), (0, 0, 20))).continuity_pairs() == [(1, 0)]
-    assert replace(w, spans=((0, 0, 20), (0, 21, 36))).continuity_pairs() == []
-    assert replace(w, spans=()).continuity_pairs() == []
-
-
-@pytest.mark.parametrize("joined", [False, True])
 @pytest.mark.parametrize("offset_sd", [None, torch.full((2, 2), 0.05, dtype=torch.float64)])
-def test_states_are_told_to_be_blocks_only_where_they_are(joined, offset_sd):
-    p = problem(bent("LFM"), joined=joined, offset_sd=offset_sd)
+def test_states_are_told_to_be_blocks_only_where_they_are(offset_sd):
+    p = problem(bent("LFM"), offset_sd=offset_sd)
     found = p.linearise(point(p))
     first, count = p.variables.shared_count, 2 * p.windows.q0.shape[-1]
     across = found.hessian[first : first + count, first + count :]

@@ -12,7 +12,7 @@ from torch.func import functional_call, jacrev
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import LINEAR, NONLINEAR, STRIBECK, VISCOUS
 from nfriction.friction.models import FrictionModel
-from nfriction.friction.neurofuzzy import LEAST_RATIO, NeuroFuzzy
+from nfriction.friction.neurofuzzy import LEAST_RATIO, LOGIT_SD, NeuroFuzzy
 from tests.friction.samples import LAWS, QUADRATIC, motion, normal, randomise
 
 every_law = pytest.mark.parametrize("law", [*LAWS, QUADRATIC], ids=lambda law: law.name)
@@ -20,8 +20,10 @@ both_ways = pytest.mark.parametrize("acceleration", ["along_motion", "signed"])
 
 
 def trained(law=LINEAR, joints: int = 2, spread: float = 0.5, seed: int = 0, **options: object):
+    learn_sets = bool(options.pop("learn_sets", False))
     schedule = NeuroFuzzy(law, joints, **options)
     randomise(schedule, spread, seed)
+    schedule.learn_sets = learn_sets
     return schedule
 
 
@@ -184,9 +186,14 @@ def test_the_parameter_vector_goes_round_bit_for_bit() -> None:
 
 
 def test_the_prior_pulls_to_the_reference() -> None:
-    schedule = trained(prior_sd=0.2)
+    schedule = trained(prior_sd=0.2, learn_sets=True, interpretable=True)
     mean, sd = schedule.prior()
-    assert (sd == 0.2).all()
+    # Weights, widths relative to their start, spacings as logits, and centres in widths.
+    widths = schedule.network.head.log_widths.detach().exp().reshape(-1)
+    units = {"set spacings": LOGIT_SD / 0.2, "head centres": widths}
+    for k, name in enumerate(schedule.group_names()):
+        expected = torch.ones(int((schedule.groups() == k).sum())).double() * units.get(name, 1.0)
+        torch.testing.assert_close(sd[schedule.groups() == k], 0.2 * expected)
     with torch.no_grad():
         schedule.network.head.output_bias.zero_()
     schedule.set_parameter_vector(mean)
@@ -225,11 +232,12 @@ def by_parameters(schedule: NeuroFuzzy, qd: Tensor, qdd: Tensor) -> Tensor:
 
 
 @both_ways
-@pytest.mark.parametrize("interpretable", [False, True])
-def test_parameter_sensitivities_are_the_whole_jacobian(acceleration: str, interpretable: bool):
+@pytest.mark.parametrize("sets", [None, {"interpretable": False}, {"interpretable": True}])
+def test_parameter_sensitivities_are_the_whole_jacobian(acceleration: str, sets: dict | None):
+    learnt = sets is not None
     schedule = trained(
-        NONLINEAR, 2, terms=(3, 2), head_units=4, acceleration=acceleration,
-        interpretable=interpretable,
+        NONLINEAR, 2, terms=(3, 2), head_units=4, acceleration=acceleration, learn_sets=learnt,
+        **(sets or {}),
     )  # fmt: skip
     qd, qdd, _ = motion(6, 2)
     qd[0] = 0.0
@@ -301,7 +309,7 @@ def test_options_are_refused_by_name() -> None:
 
 
 def test_parameter_names_say_where_a_parameter_acts() -> None:
-    schedule = trained()
+    schedule = trained(learn_sets=True)
     joints = [f"pivot {k + 1}" for k in range(schedule.joints)]
     names = schedule.parameter_names(joints)
     vector = schedule.parameter_vector()
@@ -316,10 +324,14 @@ def test_parameter_names_say_where_a_parameter_acts() -> None:
     for k in tried:
         schedule.set_parameter_vector(vector + 0.1 * (torch.arange(len(vector)) == k))
         moved = (schedule(qd, qdd).detach() - before).abs().amax(0)
+        where = names[k].split(":")[0]
+        # Sets and units belong to a joint, consequents and weights to one of its coefficients.
+        whole = where.startswith("network")
         found = {
-            f"{schedule.coefficient_names[c]} of {joints[j]}" for j, c in moved.nonzero().tolist()
+            f"{'network' if whole else schedule.coefficient_names[c]} of {joints[j]}"
+            for j, c in moved.nonzero().tolist()
         }
-        assert found <= {names[k].split(":")[0]}
+        assert found <= {where}
         acting += len(found)
     # Rules that no sample of the motion fires do nothing.
     assert acting > 0.5 * len(tried)

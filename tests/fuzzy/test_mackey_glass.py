@@ -1,4 +1,4 @@
-"""The chaotic series of the benchmark: its integration, and Jang's result on it."""
+"""The chaotic series of the benchmark: its integration and its pairs."""
 
 import importlib.util
 from pathlib import Path
@@ -6,8 +6,6 @@ from types import ModuleType
 
 import pytest
 import torch
-
-from nfriction.fuzzy import Anfis, train_hybrid
 
 FLOAT64 = torch.float64
 
@@ -47,18 +45,3 @@ def test_pairs_are_four_past_values_and_one_to_come(benchmark: ModuleType) -> No
     assert x[0].tolist() == [100, 106, 112, 118]
     assert (y[:, 0] - x[:, 3] == 6).all()
     assert y[-1].item() == 1123
-
-
-@pytest.mark.slow
-def test_hybrid_learning_finds_jangs_error(benchmark: ModuleType) -> None:
-    # Jang (1993): after 500 epochs an RMSE of 0.0016 on the pairs learnt from and of 0.0015 on the
-    # others, an NDEI of 0.007 on these.
-    x, y = benchmark.pairs(benchmark.mackey_glass(1123))
-    layer = Anfis(1, 4, [2] * 4, 1, kind="bell")
-    layer.init_grid(x[:500].amin(0), x[:500].amax(0))
-    course = train_hybrid(layer, x[:500].unsqueeze(1), y[:500].unsqueeze(1), 500)
-    with torch.no_grad():
-        said = layer(x[500:].unsqueeze(1))[:, 0]
-    assert course.rmse.min().item() == pytest.approx(0.0016, abs=1e-4)
-    assert (said - y[500:]).square().mean().sqrt().item() == pytest.approx(0.0015, abs=1e-4)
-    assert benchmark.ndei(said, y[500:]) == pytest.approx(0.007, abs=5e-4)

@@ -15,17 +15,18 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
+from PIL import Image
 
 from nfriction import plots
 from nfriction.evaluation.compare import NO_FRICTION, Comparison
-from nfriction.evaluation.score import RMSE, Limit, Score
+from nfriction.evaluation.score import RMSE, Errors, Score
 from nfriction.fitting.fit import fit
 from nfriction.fitting.result.identifiability import CoefficientUncertainty
 from nfriction.friction import model_names
 from nfriction.friction.models import CVFM, LFM, NCFM, NLFM
 from nfriction.friction.neurofuzzy import NFLFM, NFNCFM, NFNLFM
 from nfriction.papers.controller.mamdani import paper_controller
-from nfriction.plant import LinearAxis, rigs
+from nfriction.plant import LinearAxis, Rotor, rigs
 from nfriction.plots import style
 from nfriction.recording import Recording
 from nfriction.signals import Motion
@@ -49,9 +50,9 @@ def score_of(
     free_run = RMSE.of(simulated - recording.q)
     windows = {h: RMSE.of(s * (simulated - recording.q)) for h, s in (("1", 0.5), ("2", 0.8))}
     floor = RMSE.of(np.full((2, recording.joints), 1e-3))
-    limit = Limit(floor, dict.fromkeys(windows, floor)) if limited else None
+    limit = Errors(floor, dict.fromkeys(windows, floor)) if limited else None
     end = 1.0 if lost else np.inf
-    return Score(recording.name, free_run, windows, limit, recording.time, simulated, end)
+    return Score(free_run, windows, limit, recording.name, recording.time, simulated, end)
 
 
 def scores_of(
@@ -374,7 +375,8 @@ def test_save_all_writes_every_figure_and_leaves_matplotlib_alone(tmp_path):
     expected = {
         "rmse_train", "horizons_train", "positions_train_push_1_µ", "rmse_test",
         "horizons_test", "positions_test_unseen", "torque_over_velocity",
-        "over_time_viscous", "coefficients_NFNCFM", "sections_NFNCFM", "memberships_NFNCFM",
+        "mechanism", "over_time_viscous",
+        "coefficients_NFNCFM", "sections_NFNCFM", "memberships_NFNCFM",
     }  # fmt: skip
     assert {f.name for f in files} == {f"{n}{of}.png" for n in expected for of in ("", ".dark")}
     assert all(f.read_bytes().startswith(b"\x89PNG") for f in files)
@@ -392,6 +394,44 @@ def test_save_all_writes_every_figure_and_leaves_matplotlib_alone(tmp_path):
     assert not any("test" in f.name or "positions" in f.name for f in only_train)
     with pytest.raises(ValueError, match="not in the comparison"):
         plots.save_all(comparison, [swing(1, "m", name="other")], tmp_path)
+
+
+def test_drawn_mass_centres_bear_the_weight_that_the_plant_feels():
+    plant = rigs.tlrip(arm="free")
+    figure = plots.mechanism(plant)
+    _, along, _ = figure.axes
+    (line, *crosses) = along.lines
+    corners = np.stack(line.get_data(), -1)
+    np.testing.assert_allclose(np.hypot(*np.diff(corners, axis=0).T), plant.length, rtol=1e-12)
+    angles = np.arctan2(-np.diff(corners[:, 0]), np.diff(corners[:, 1]))  # from upright
+    pose = torch.as_tensor(np.diff(angles, prepend=0.0))
+    weight = 9.81 * np.array(plant.to_dict()["mass"])
+    levers = np.array([cross.get_xdata()[0] for cross in crosses])
+    still = torch.cat([torch.zeros(1, dtype=pose.dtype), pose])
+    gravity = plant.bias(still, torch.zeros_like(still))
+    np.testing.assert_allclose(weight @ levers, gravity[1], rtol=1e-9)
+    assert_tidy(figure)
+
+
+@pytest.mark.parametrize("plant", [Rotor(0.02), Rotor(0.1, 0.5, 0.3), LinearAxis(2.0)])
+def test_every_kind_of_rig_is_drawn_with_its_data(plant):
+    figure = plots.mechanism(plant)
+    words = "\n".join(text.get_text() for text in figure.axes[-1].texts)
+    given = plant.to_dict()
+    assert all(f"{given[key]:g}" in words for key in ("inertia", "mass", "com") if given.get(key))
+    assert_tidy(figure)
+
+
+def test_an_animation_has_a_frame_each_40_ms_and_ends_where_asked(tmp_path):
+    time = np.arange(200) * 0.01
+    q = np.sin(3 * time)[:, None] * [0.5, -0.3]
+    lost = np.where(time[:, None] > 1.0, np.nan, q)
+    plant = rigs.of("multiarm-double")
+    path = plots.animate(
+        plant, time, {"measured": q, "NCFM": lost}, tmp_path / "a.gif", seconds=0.4
+    )
+    with Image.open(path) as gif:
+        assert (gif.n_frames, gif.info["duration"]) == (10, 40)
 
 
 def test_all_models_are_told_apart_by_marker_and_by_dashes():

@@ -14,7 +14,7 @@ import pandas as pd
 import pytest
 import torch
 
-from nfriction.plant import Motor, Rotor
+from nfriction.plant import LinearAxis, Motor, Rotor
 from nfriction.recording import Recording, RecordingWarning, read_initial_states
 from nfriction.recording.angles import AngleConvention
 
@@ -671,6 +671,15 @@ def test_angle_and_current_of_a_motor_become_those_of_its_joint() -> None:
         plant=GEARED,
     )
     np.testing.assert_allclose(milli.tau, recording.tau)
+
+
+def test_a_motor_on_a_screw_may_be_logged_in_degrees() -> None:
+    axis = LinearAxis(2.0, motor=Motor(gear_ratio=1000, torque_constant=0.03))
+    table = motor_log(motor1=360.0 * np.arange(20))
+    found = Recording.from_pandas(table, degrees=True, plant=axis)
+    np.testing.assert_allclose(found.q[:, 0], 2 * np.pi * np.arange(20) / 1000)
+    with pytest.raises(ValueError, match="needs angles, but `unit` is 'm'"):
+        Recording.from_pandas(table.assign(qd1=0.0), degrees=True, plant=axis)
 
 
 def test_columns_of_joints_win_over_those_of_motors_unless_named() -> None:

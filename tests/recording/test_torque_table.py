@@ -55,6 +55,10 @@ def test_velocity_comes_from_positions_in_time() -> None:
     [
         (table().drop(columns="tau"), "no column of friction torque; found qd"),
         (table().drop(columns="qd"), "column qd is missing; found tau"),
+        (
+            table().rename(columns={"qd": "Drehzahl [1/min]", "tau": "Reibmoment [Nm]"}),
+            r'columns={"qd": "Drehzahl \[1/min\]", "tau": "Reibmoment \[Nm\]"}',
+        ),
         (table(qd=0.0), "joint1 does not move"),
         (table(tau=2.0), "is 2 in every row"),
         (table(qd=np.where(QD > 0.9, np.nan, QD)), "column qd, row 19 .* is nan, one of 1"),

@@ -32,7 +32,7 @@ def fit(**changes: Any) -> dict[str, Any]:
         "status": "converged: A full step can lower the cost no more.", "converged": True,
         "residual": 1e-3, "residual_unit": "rad", "at_bounds": [], "plant": {"inertia 1": 0.02},
         "intervals": {"B of second": [1e-3, None], "inertia 1": [0.01, 0.03]},
-        "unidentifiable": [], "warnings": [],
+        "unidentifiable": [], "warnings": [], "usability": ["good", ""],
     }  # fmt: skip
     return found | changes
 
@@ -52,7 +52,7 @@ def results() -> dict[str, Any]:
     models["NLFM"] |= {
         "fit": fit(
             status=f"not converged: {EVIL}", converged=False, warnings=[EVIL],
-            unidentifiable=["f_a with f_v"], at_bounds=["f_b"],
+            usability=["doubtful", ""], unidentifiable=["f_a with f_v"], at_bounds=["f_b"],
         )
     }  # fmt: skip
     sets = {label: {"B": [1e-3, 2e-3], "C": [1e-3, 1e-2]} for label in ("at_rest", "reference")}

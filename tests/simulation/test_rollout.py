@@ -16,7 +16,7 @@ from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.models import FrictionModel
 from nfriction.papers.afem.adaptive import Adaptive
-from nfriction.simulation.rk4 import RK4_STABILITY, required_substeps
+from nfriction.simulation.validate import RK4_STABILITY, required_substeps
 
 F64 = torch.float64
 CHAIN = PendulumChain([0.3, 0.2], [0.2, 0.15], inertia=[1e-3, 4e-4])
@@ -462,7 +462,7 @@ def test_gradients_reach_the_parameters_of_model_and_plant():
 
 
 def test_gradients_are_recorded_where_asked_for_and_affordable(monkeypatch):
-    monkeypatch.setattr("nfriction.simulation.rollout.GRADIENT_STEPS", 20)
+    monkeypatch.setattr("nfriction.simulation.adjoint.MOST_STEPS", 20)
     model = smooth_model()
     assert rollout(CHAIN, model, Q0, QD0, steps=20).q.requires_grad
     assert not rollout(CHAIN, model, Q0, QD0, steps=21).q.requires_grad

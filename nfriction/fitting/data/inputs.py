@@ -27,7 +27,7 @@ from nfriction.plant import PendulumChain, Plant
 from nfriction.recording import Recording, RecordingLike
 from nfriction.recording.angles import AngleConvention
 from nfriction.signals import Motion, count_seen, kalman_smoother
-from nfriction.simulation.rk4 import required_substeps
+from nfriction.simulation.validate import required_substeps
 
 logger = logging.getLogger(__name__)
 

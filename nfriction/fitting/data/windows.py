@@ -47,12 +47,6 @@ class Windows:
     def __len__(self) -> int:
         return self.q.shape[0]
 
-    def continuity_pairs(self) -> list[tuple[int, int]]:
-        """Pairs of windows of which the second begins where the first ends."""
-        begins = {(place, first): w for w, (place, first, _) in enumerate(self.spans)}
-        ends = ((w, begins.get((place, last))) for w, (place, _, last) in enumerate(self.spans))
-        return [(w, after) for w, after in ends if after is not None]
-
     def subset(self, chosen: Tensor) -> "Windows":
         """Some of the windows, by a mask (window,)."""
         index = chosen.nonzero().flatten().tolist()

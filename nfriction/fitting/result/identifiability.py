@@ -180,8 +180,6 @@ def warnings_of(
     at_bounds: Sequence[str],
     unidentifiable: Sequence[str],
     at_zero: Sequence[str] = (),
-    largest_defect: float = 0.0,
-    options: FitOptions = DEFAULTS,
 ) -> tuple[str, ...]:
     """Warnings about the end of a search, a sentence each.
 
@@ -191,11 +189,6 @@ def warnings_of(
     found = []
     if not converged:
         found.append("The search did not reach a minimum; the intervals may be too narrow.")
-    if not largest_defect <= options.max_defect:
-        found.append(
-            f"Windows are not continuous: the largest defect is {largest_defect:.3g} times its "
-            "standard deviation. The law is wrong, or the motion forgets its start."
-        )
     if none := [name for name in at_zero if not any(name in d for d in unidentifiable)]:
         found.append(f"At zero: {', '.join(none)}; the data show none.")
     if beyond := [name for name in at_bounds if name not in at_zero]:
@@ -209,17 +202,16 @@ def warnings_of(
 def model_error_warning(
     residual: float,
     effective_sd: float,
-    count: float | None,
+    noise: float,
     unit: str,
     options: FitOptions = DEFAULTS,
 ) -> tuple[str, ...]:
-    """A warning if the residual exceeds what the encoder's count [rad; m] explains."""
-    noise = None if count is None else count / 12**0.5
-    if not noise or not residual > options.model_error_ratio * noise:
+    """A warning if the residual exceeds what the measurement noise [rad; m] explains."""
+    if not residual > options.model_error_ratio * noise:
         return ()
     return (
-        f"Residual: {1e3 * residual:.3g} m{unit} RMS, {residual / noise:.0f}x the encoder's "
-        "quantisation noise, so the model is missing something (error is correlated over "
+        f"Residual: {1e3 * residual:.3g} m{unit} RMS, {residual / noise:.0f}x the measurement "
+        "noise, so the model is missing something (error is correlated over "
         f"~{(effective_sd / residual) ** 2:.0f} samples). The intervals do not cover this.",
     )
 

@@ -10,25 +10,16 @@ References:
     G. J. Bierman, Factorization Methods for Discrete Sequential Estimation (1977), ch. 5.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-
-class Rows(NamedTuple):
-    """Rows of the Jacobian at some samples (`part`) of all windows.
-
-    Columns are the shared variables, then each window's own (`DecisionVariables.indices`). `scaled`
-    are rows of the scaled errors, (window, row, column); `states` those of the positions, and at
-    the end of a window of the velocities, in joint coordinates, (window, sample, row, column).
-    """
-
-    part: slice
-    scaled: Tensor
-    states: Tensor
+# Rows of the Jacobian at some samples of all windows: these samples, and derivatives of the scaled
+# errors, (window, row, column), by the shared variables, then each window's own
+# (`DecisionVariables.indices`).
+Rows = tuple[slice, Tensor]
 
 
 def scaled_rows(
@@ -42,20 +33,16 @@ def scaled_rows(
     for part, rows in pieces:
         if shared + own > rows.shape[-1]:
             # An encoder offset moves the initial position and the measured ones.
-            measured = torch.eye(rows.shape[2], joints, dtype=torch.float64)
+            measured = torch.eye(joints, dtype=torch.float64)
             rows = torch.cat([rows, rows[..., shared : shared + joints] - measured], -1)
-        scaled = (measurement @ rows[:, :, :joints]) * scale[:, part, :, None]
-        yield Rows(part, scaled.flatten(1, 2), rows)
+        scaled = (measurement @ rows) * scale[:, part, :, None]
+        yield part, scaled.flatten(1, 2)
 
 
 def normal_equations(
     rows: Iterable[Rows], r: Tensor, indices: Tensor, size: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """J^T r and J^T J of all variables, and derivatives of the windows' final states.
-
-    `r` are the scaled errors, (window, sample, joint); the last result is (window, 2 joint,
-    column).
-    """
+) -> tuple[Tensor, Tensor]:
+    """J^T r and J^T J of all variables, for scaled errors `r`, (window, sample, joint)."""
     windows, count = indices.shape
     shared = int(indices[0, 0])
     gradient = torch.zeros(size, dtype=torch.float64)
@@ -63,8 +50,7 @@ def normal_equations(
     slope = torch.zeros(windows, count, dtype=torch.float64)
     mixed = torch.zeros(windows, count, shared, dtype=torch.float64)
     curvature = torch.zeros(windows, count, count, dtype=torch.float64)
-    ends = torch.zeros(0, dtype=torch.float64)
-    for part, scaled, states in rows:
+    for part, scaled in rows:
         common, own = scaled.split([shared, count], -1)
         errors, flat = r[:, part].flatten(1), common.flatten(0, 1)
         gradient[:shared] += errors.flatten() @ flat
@@ -72,46 +58,12 @@ def normal_equations(
         slope += (errors[:, None] @ own)[:, 0]
         mixed += own.mT @ common
         curvature += own.mT @ own
-        ends = states[:, -1]
-    _scatter(gradient, hessian, indices, slope, mixed, curvature)
-    return gradient, hessian, ends
-
-
-def add_defects(
-    gradient: Tensor,
-    hessian: Tensor,
-    defects: Tensor,
-    ends: Tensor,
-    pairs: Sequence[tuple[int, int]],
-    indices: Tensor,
-    sd: Tensor,
-) -> None:
-    """Add the defects between windows to normal equations, in place.
-
-    `defects` are over their standard deviations `sd`, (pair, 2 joint) and (2 joint,); `ends` come
-    from `normal_equations`.
-    """
-    shared, state = int(indices[0, 0]), len(sd)
-    before, after = ([pair[k] for pair in pairs] for k in (0, 1))
-    start = -torch.eye(state, dtype=torch.float64).expand(len(pairs), -1, -1)
-    rows = torch.cat([ends[before], start], -1) / sd[:, None]
-    common, own = rows[..., :shared], rows[..., shared:]
-    flat = common.flatten(0, 1)
-    gradient[:shared] += defects.flatten() @ flat
-    hessian[:shared, :shared] += flat.T @ flat
-    both = torch.cat([indices[before], indices[after, :state]], -1)
-    _scatter(gradient, hessian, both, (defects[:, None] @ own)[:, 0], own.mT @ common, own.mT @ own)
-
-
-def _scatter(
-    gradient: Tensor, hessian: Tensor, indices: Tensor, slope: Tensor, mixed: Tensor, own: Tensor
-) -> None:
-    """Add blocks of the windows' own variables where `indices` names them, in place."""
-    rows, shared = indices[:, :, None], torch.arange(mixed.shape[-1])
+    places, common = indices[:, :, None], torch.arange(shared)
     gradient.index_put_((indices,), slope, accumulate=True)
-    hessian.index_put_((rows, shared), mixed, accumulate=True)
-    hessian.index_put_((shared, rows), mixed, accumulate=True)
-    hessian.index_put_((rows, indices[:, None]), own, accumulate=True)
+    hessian.index_put_((places, common), mixed, accumulate=True)
+    hessian.index_put_((common, places), mixed, accumulate=True)
+    hessian.index_put_((places, indices[:, None]), curvature, accumulate=True)
+    return gradient, hessian
 
 
 # Information below so many roundings of a row is discarded; motions that grow by 1e20 leave
@@ -155,11 +107,7 @@ class Kept:
 
 
 def marginalize_states(
-    rows: Iterable[Rows],
-    kept: Kept,
-    precision: Tensor,
-    pairs: Sequence[tuple[int, int]] = (),
-    defect_sd: Tensor | None = None,
+    rows: Iterable[Rows], kept: Kept, precision: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Marginalise the windows' states by a square-root information filter.
 
@@ -167,8 +115,6 @@ def marginalize_states(
         rows: of the Jacobian, in the order of time.
         kept: the remaining variables.
         precision: of the states' prior, (window, state).
-        pairs: see `Windows.continuity_pairs`, in the order of time.
-        defect_sd: standard deviations of the defects, (state,).
 
     Returns:
         Curvature above round-off over the remaining variables, (kept, kept), and the derivatives of
@@ -181,41 +127,16 @@ def marginalize_states(
     data = kept.squares(right)
     # Sums of squares of all rows, by the state and by the remaining variables.
     sizes = torch.zeros_like(precision), torch.zeros_like(right[:, 0])
-    ends = torch.zeros(0, dtype=torch.float64)
-    for piece in rows:
-        own, others = kept.split(piece.scaled)
+    for _, scaled in rows:
+        own, others = kept.split(scaled)
         triangle, right, free = _triangularise(
             torch.cat([triangle, own], 1), torch.cat([right, others], 1)
         )
         data += kept.squares(free)
         for size, part in zip(sizes, (own, others), strict=True):
             size += part.square().sum(1)
-        ends = piece.states[:, -1]
-    links = torch.zeros_like(triangle)
-    if defect_sd is not None:
-        start = torch.cat([torch.zeros(state, state), -torch.diag(1 / defect_sd)])
-        free = torch.zeros_like(right)
-        by_state, by_kept = kept.split(ends / defect_sd[:, None])
-        # Pass the information about each window's end on to the next one's start.
-        for w, after in pairs:
-            triangle[w], top, passed = _triangularise(
-                torch.cat([triangle[w], by_state[w]]),
-                torch.cat([start, torch.cat([right[w], by_kept[w]])], 1),
-            )
-            links[w], right[w] = top[:, :state], top[:, state:]
-            triangle[after], right[after], free[after] = _triangularise(
-                torch.cat([triangle[after], passed[:, :state]]),
-                torch.cat([right[after], passed[:, state:]]),
-            )
-            for size, part in zip(sizes, (by_state, by_kept), strict=True):
-                size[w] += part[w].square().sum(0)
-        data += kept.squares(free)
-    # The state at which each window's rows vanish, the last windows first.
+    # The state at which each window's rows vanish.
     response = -torch.linalg.solve_triangular(triangle, right, upper=True)
-    for w, after in reversed(pairs):
-        response[w] = -torch.linalg.solve_triangular(
-            triangle[w], right[w] + links[w] @ response[after], upper=True
-        )
     squares = sizes[1] + (sizes[0][..., None] * response.square()).sum(1)
     unsure = kept.squares(squares.sqrt()[:, None]).diagonal()
     return _discard_roundoff(data, unsure), response
@@ -226,8 +147,8 @@ def score_covariance(
 ) -> Tensor:
     """Covariance of the gradient, (kept, kept), by rows scaled to their own residuals."""
     total = kept.squares(precision.sqrt()[..., None] * response)
-    for piece in rows:
-        own, others = kept.split(piece.scaled)
+    for _, scaled in rows:
+        own, others = kept.split(scaled)
         total += kept.squares(others + own @ response)
     return total
 

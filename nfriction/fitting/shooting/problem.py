@@ -1,19 +1,16 @@
 """Output error by multiple shooting: a cost and its Gauss-Newton model.
 
 A recording is cut into windows. Each is simulated from a state of its own, because the motion of a
-light mechanism forgets its start within seconds. Of a law with memory deflections are part of that
-state, over those of a contact that slips, so that the torque at the start is the same at any
-stiffness. The decision variables x are the friction
-parameters, the plant terms, each window's initial state and the encoders' offsets, and the cost is
+light mechanism forgets its start within seconds; of a law with memory the deflections are part of
+that state. The decision variables x are the friction parameters, the plant terms, each window's
+initial state and the encoders' offsets, and the cost is
 
     J(x) = 1/2 sum |C (q_sim(t; x) - q(t))|^2 / noise_sd^2      over windows and samples, or a
                                                                 robust loss of these errors
-         + 1/2 sum |defect|^2 / defect_sd^2                     where windows meet, if asked for
          + 1/2 sum (x - mean)^2 / sd^2                          priors
 
-with C the matrix from joint to recorded coordinates, and a defect the jump of the state from the
-end of a window to the start of the next. Every method takes x; plant and friction model stay as
-they are. The next step is `nfriction.optim.levenberg_marquardt`, which minimises J.
+with C the matrix from joint to recorded coordinates. Every method takes x; plant and friction model
+stay as they are. The next step is `nfriction.optim.levenberg_marquardt`, which minimises J.
 
 References:
     H. G. Bock, in: Modelling of Chemical Reaction Systems, Springer (1981), 102-125.
@@ -39,27 +36,25 @@ from nfriction.fitting.robust_loss import SQUARES, RobustLoss
 from nfriction.fitting.shooting.normal_equations import (
     Kept,
     Rows,
-    add_defects,
     marginalize_states,
     normal_equations,
     scaled_rows,
     score_covariance,
 )
 from nfriction.fitting.shooting.sensitivity import StepJacobian, Trajectory, propagate
-from nfriction.fitting.shooting.variables import DecisionVariables, model_at
+from nfriction.fitting.shooting.variables import DecisionVariables, deflected, model_at
 from nfriction.fitting.strategy.extrapolation_prior import ExtrapolationPrior
-from nfriction.friction.memory import slipping_state
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Quadratic
 from nfriction.plant import Plant
 from nfriction.signals import Motion
-from nfriction.simulation.protocols import RolloutInputs
-from nfriction.simulation.rollout import Rollout, integrate
+from nfriction.simulation.protocols import Rollout, RolloutInputs
+from nfriction.simulation.rollout import integrate
 
 
 @dataclass(frozen=True, eq=False)
 class ShootingProblem:
-    """Half the sum of squares of position errors, defects and priors over windows.
+    """Half the sum of squares of position errors and priors over windows.
 
     Args:
         jacobian: derivatives of a step; has the plant and its adjustable terms.
@@ -72,8 +67,6 @@ class ShootingProblem:
         stride: every so many samples one counts, with that weight: model errors last far longer
             than a sample, and sums over many parameters dominate the time of a step.
         friction_prior, plant_prior, offset_sd: see `DecisionVariables`.
-        defect_sd: of position and velocity from the end of a window to the start of the next
-            [rad, rad/s; m, m/s]; None leaves windows apart.
         extrapolation: prior of a neuro-fuzzy schedule where there are no data.
         memory: hidden state of the coefficients (see `Schedule`) at the start of each window,
             (window, joint, state_size); None of a schedule without. It advances with every step.
@@ -91,7 +84,6 @@ class ShootingProblem:
     friction_prior: tuple[Tensor, Tensor] | None = None
     plant_prior: tuple[Tensor, Tensor] | None = None
     offset_sd: Tensor | None = None
-    defect_sd: tuple[float, float] | None = None
     extrapolation: ExtrapolationPrior | None = None
     memory: Tensor | None = None
     loss: RobustLoss = SQUARES
@@ -106,20 +98,16 @@ class ShootingProblem:
         )  # fmt: skip
 
     def cost(self, x: Tensor) -> Tensor:
-        """Half the sum of squares of errors, defects and priors."""
+        """Half the sum of squares of errors and priors."""
         return self._cost(x, self._simulate(x))
 
     def linearise(self, x: Tensor) -> Quadratic:
         """Cost, gradient and Gauss-Newton Hessian at `x` from one simulation."""
-        run, indices = self._simulate(x, with_memory=True), self.variables.indices()
-        pieces = propagate(self.jacobian, run, self.substeps, self.stride)
+        run = self._simulate(x, with_memory=True)
         errors = self._deviation(x, run)
         scale = self._scale * self.loss.weight(errors).sqrt()
-        rows, errors = scaled_rows(pieces, scale, self.measurement, indices), errors * scale
-        gradient, hessian, ends = normal_equations(rows, errors, indices, len(x))
-        if self.pairs:
-            defects = self._defects(x, run)
-            add_defects(gradient, hessian, defects, ends, self.pairs, indices, self._defect_sd)
+        rows = self._rows(run, scale)
+        gradient, hessian = normal_equations(rows, errors * scale, self.variables.indices(), len(x))
         if self.extrapolation is not None:
             slope, curvature = self.extrapolation.normal_equations(run.friction.schedule)
             gradient[: len(slope)] += slope
@@ -127,8 +115,8 @@ class ShootingProblem:
         precision, mean = self.variables.prior()
         gradient += precision * (x - mean)
         hessian.diagonal().add_(precision)
-        # Defects and encoder offsets couple the states of different windows.
-        alone = not self.pairs and not self.variables.offset_count
+        # Encoder offsets couple the states of different windows.
+        alone = not self.variables.offset_count
         blocks = (self.variables.shared_count, self.variables.state_count) if alone else None
         return Quadratic(self._cost(x, run), gradient, hessian, blocks)
 
@@ -150,15 +138,6 @@ class ShootingProblem:
     def residuals(self, x: Tensor) -> Tensor:
         """Errors of the counted samples over the noise, (window, step + 1, joint)."""
         return self._deviation(x, self._simulate(x)) * self._scale
-
-    def defects(self, x: Tensor) -> Tensor:
-        """From a window's end to the next one's start over `defect_sd`, (pair, 2 joint)."""
-        return self._defects(x, self._simulate(x))
-
-    @cached_property
-    def pairs(self) -> list[tuple[int, int]]:
-        """Windows whose defects count."""
-        return self.windows.continuity_pairs() if self.defect_sd else []
 
     def plant_at(self, vector: Tensor) -> Plant:
         """The plant with its adjustable terms at a parameter vector."""
@@ -193,9 +172,8 @@ class ShootingProblem:
         shared, (precision, _) = variables.shared_count, variables.prior()
         of_states, of_offsets = variables.split(precision)[2:]
         kept = Kept(variables.indices(), variables.state_count, len(x))
-        joined = (self.pairs, self._defect_sd) if self.pairs else ((), None)
         scale = self._scale * self.loss.weight(self._deviation(x, run)).sqrt()
-        data, response = marginalize_states(self._rows(run, scale), kept, of_states, *joined)
+        data, response = marginalize_states(self._rows(run, scale), kept, of_states)
         rows = self._rows(run, self._scale * sd / self.noise_sd)
         score = score_covariance(rows, kept, response, of_states)
         prior = torch.cat([precision[:shared], of_offsets.flatten()])
@@ -208,17 +186,12 @@ class ShootingProblem:
         counted[:, :: self.stride] = self.windows.weight[:, :: self.stride] * self.stride**0.5
         return counted[..., None] / self.noise_sd
 
-    @cached_property
-    def _defect_sd(self) -> Tensor:
-        sd = torch.tensor(self.defect_sd or (torch.inf, torch.inf), dtype=torch.float64)
-        return sd.repeat_interleave(self.windows.q0.shape[-1])
-
     def _simulate(self, x: Tensor, *, with_memory: bool = False) -> Trajectory:
         """The windows' motion at `x`; the memory of its coefficients only for derivatives."""
         friction, plant, states, _ = self.variables.split(x)
         model, joints = model_at(self.friction, friction), self.windows.q0.shape[-1]
         q0, qd0, shares = states.tensor_split([joints, 2 * joints], -1)
-        law_state, law_slope = _deflected(model, shares)
+        law_state, law_slope = deflected(model, shares)
         held, linearised = (t.repeat_interleave(self.substeps, 1) for t in self._torques(plant))
         step = self.windows.step.repeat_interleave(self.substeps, 1) / self.substeps
         offsets = self.variables.window_offsets(x)
@@ -254,18 +227,10 @@ class ShootingProblem:
         q = run.motion.q[:, :: self.substeps] - self.variables.window_offsets(x)[:, None]
         return (q - self.windows.q) @ self.measurement.T
 
-    def _defects(self, x: Tensor, run: Trajectory) -> Tensor:
-        before, after = ([pair[k] for pair in self.pairs] for k in (0, 1))
-        q = run.motion.q[before, -1] - self.variables.window_offsets(x)[before]
-        end = torch.cat([q, run.motion.qd[before, -1]], -1)
-        start = self.variables.split(x).states[after, : end.shape[-1]]
-        return (end - start) / self._defect_sd
-
     def _cost(self, x: Tensor, run: Trajectory) -> Tensor:
-        squares = [self.loss.counted(self._deviation(x, run)) * self._scale, self._defects(x, run)]
+        misfit = (self.loss.counted(self._deviation(x, run)) * self._scale).square().sum()
         if self.extrapolation is not None:
-            squares.append(self.extrapolation.residuals(run.friction.schedule))
-        misfit = torch.stack([row.square().sum() for row in squares]).sum()
+            misfit = misfit + self.extrapolation.residuals(run.friction.schedule).square().sum()
         precision, mean = self.variables.prior()
         return 0.5 * (misfit + (precision * (x - mean) ** 2).sum())
 
@@ -273,30 +238,3 @@ class ShootingProblem:
         """Rows of the Jacobian, some samples at a time."""
         pieces = propagate(self.jacobian, run, self.substeps, self.stride)
         return scaled_rows(pieces, scale, self.measurement, self.variables.indices())
-
-
-def _deflected(model: FrictionModel, shares: Tensor) -> tuple[Tensor | None, Tensor | None]:
-    """State of a law with memory, (window, joint, state), by shares of that of a slipping contact.
-
-    Besides its derivatives by all coefficients and shares, (window, joint state, column).
-    """
-    memory = model.law.memory
-    if memory is None:
-        return None, None
-    coefficients = model.schedule.rest_coefficients().detach().clone().requires_grad_()
-    with torch.enable_grad():
-        slipping = slipping_state(memory, coefficients)
-        # A law is elementwise, so the sum's gradient is each joint's own.
-        rows = [
-            torch.autograd.grad(x.sum(), coefficients, retain_graph=True)[0]
-            for x in slipping.unbind(-1)
-        ]
-    slipping = slipping.detach()
-    joints, size = slipping.shape
-    share = shares.unflatten(-1, (joints, size))
-    # Each joint's state depends on its own coefficients, (window, joint, state, joint, k).
-    own = torch.eye(joints, dtype=torch.float64)[:, None, :, None]
-    by_coefficient = own * (share[..., None] * torch.stack(rows, 1))[..., None, :]
-    by_share = torch.diag(slipping.flatten()).expand(len(shares), -1, -1)
-    slope = torch.cat([by_coefficient.flatten(1, 2).flatten(2), by_share], -1)
-    return share * slipping, slope

@@ -22,8 +22,8 @@ from nfriction.friction.models import FrictionModel
 from nfriction.friction.parameters import Sensitivity
 from nfriction.plant import Plant
 from nfriction.simulation.memory_step import memory_step
+from nfriction.simulation.protocols import Rollout
 from nfriction.simulation.rk4 import rk4_step
-from nfriction.simulation.rollout import Rollout
 
 logger = logging.getLogger(__name__)
 
@@ -161,8 +161,7 @@ def propagate(
 
     Yields:
         Samples, and (window, sample, joint, column) by the friction parameters, the plant terms and
-        the window's initial state. The last piece is the windows' last sample, counted or not, with
-        the rows of its velocities below those of the positions.
+        the window's initial state. The last piece is the windows' last sample, counted or not.
     """
     windows, steps = run.step.shape
     joints, plant_count = run.motion.q.shape[-1], len(run.plant_vector)
@@ -203,7 +202,7 @@ def propagate(
         end = sample + stride * rows.shape[1]
         yield slice(sample, end, stride), rows
         sample = end
-    yield slice(steps // substeps, None), carried[:, None, : 2 * joints]
+    yield slice(steps // substeps, None), carried[:, None, :joints]
 
 
 def _by_block(x: Tensor, length: int) -> Tensor:

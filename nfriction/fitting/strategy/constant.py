@@ -20,14 +20,10 @@ from nfriction.fitting.equation_error import (
     prior_sd,
     steady_law,
 )
-from nfriction.fitting.fit import FitTask
-from nfriction.fitting.options import Continuity, FitOptions
+from nfriction.fitting.options import FitOptions
 from nfriction.fitting.plant_parameters import TORQUE_DELAY, PlantParameter
-from nfriction.fitting.result.fit_result import (
-    FitResult,
-    result_from_equation_error,
-    result_from_shooting,
-)
+from nfriction.fitting.result.fit_result import FitResult
+from nfriction.fitting.result.of_search import result_from_equation_error, result_from_shooting
 from nfriction.fitting.robust_loss import RobustLoss
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.continuation import (
@@ -40,6 +36,7 @@ from nfriction.fitting.strategy.continuation import (
     loses,
     weighted_cost,
 )
+from nfriction.fitting.task import FitTask
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Law
 from nfriction.friction.models import FrictionModel
@@ -116,7 +113,6 @@ def fit_constant(task: FitTask) -> FitResult:
     lengths = zip(options.windows, search.stages, strict=False)
     fitted = replace(
         fitted,
-        continuity=options.continuity,
         stages=tuple((float(length), stage.rms) for length, stage in lengths),
         skipped_horizons=search.skipped,
     )
@@ -252,7 +248,6 @@ def _fitter(
         StepJacobian(plant, model, terms), model, task.recordings, task.measurement, options,
         task.callback, friction_prior=constant_prior(model, torque, options),
         offset_sd=torch.full(shape, sd, dtype=torch.float64) if task.per_recording else None,
-        defect_sd=options.defect_sd,
     )  # fmt: skip
 
 
@@ -334,23 +329,20 @@ def _log_volume(local: Quadratic, chosen: Tensor) -> float:
     return float(torch.linalg.slogdet(local.hessian[chosen][:, chosen]).logabsdet)
 
 
-def is_constant_fit(
-    start: FitResult | None, model: FrictionModel, continuity: Continuity = "none"
-) -> TypeGuard[FitResult]:
+def is_constant_fit(start: FitResult | None, model: FrictionModel) -> TypeGuard[FitResult]:
     """True for an output-error fit of the model's law with constant coefficients."""
     return (
         start is not None
         and start.model.law == model.law
         and not start.model.schedule.follows_motion
         and start.residuals.numel() > 0
-        and start.continuity == continuity
     )
 
 
 def constant_start(task: FitTask) -> FitResult:
     """The constant fit of a model's law; `task.start` if it is one of the same recordings."""
     model, start = task.model, task.start
-    if is_constant_fit(start, model, task.options.continuity) and _offsets_match(start, task):
+    if is_constant_fit(start, model) and _offsets_match(start, task):
         return start
     constant = FrictionModel(model.law, Constant(model.law, model.joints), model.v_smooth)
     return fit_constant(replace(task, model=constant)).with_warnings(task.data_warnings)
@@ -461,11 +453,10 @@ def _windows_from(found: HorizonResult) -> Windows:
 
 
 def _misfit(found: HorizonResult, noise: float, loss: RobustLoss) -> float:
-    """Half the sum of squares of residuals and defects; infinite where the motion diverged.
+    """Half the sum of squares of residuals; infinite where the motion diverged.
 
     All that are compared have the same loss.
     """
     problem, x = replace(found.problem, loss=loss), found.result.x
-    defects = 0.5 * float(problem.defects(x).square().sum())
-    misfit = weighted_cost(problem.counted_errors(x), noise) + defects
+    misfit = weighted_cost(problem.counted_errors(x), noise)
     return misfit if math.isfinite(misfit) else math.inf

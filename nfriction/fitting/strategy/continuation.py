@@ -96,7 +96,6 @@ class ShootingFitter:
     friction_prior: tuple[Tensor, Tensor] | None = None
     plant_prior: tuple[Tensor, Tensor] | None = None
     offset_sd: Tensor | None = None
-    defect_sd: tuple[float, float] | None = None
     extrapolation: ExtrapolationPrior | None = None
 
     def cut(self, motions: Sequence[Motion], length: float) -> Windows:
@@ -112,12 +111,8 @@ class ShootingFitter:
         friction: Tensor,
         *,
         stride: int = 1,
-        far: bool = False,
     ) -> ShootingProblem:
-        """The problem of windows that starts at these friction parameters.
-
-        Where the start is `far` away, defects are at most penalised.
-        """
+        """The problem of windows that starts at these friction parameters."""
         model = model_at(self.friction, friction)
         longest_step = max(r.longest_step for r in self.recordings)
         if model.law.memory:
@@ -129,7 +124,6 @@ class ShootingFitter:
             ),
             stride=stride, friction_prior=self.friction_prior, plant_prior=self.plant_prior,
             offset_sd=self.offset_sd, extrapolation=self.extrapolation, options=self.options,
-            defect_sd=self.options.penalty_sd if far and self.defect_sd else self.defect_sd,
         )  # fmt: skip
 
     def search(
@@ -266,8 +260,8 @@ def horizon_continuation(
     noise, simulated = options.first_noise, motions
     for place, length in enumerate(options.windows):
         rest = tuple(options.windows[place:])
-        far, last = not stages and len(options.windows) > 1, len(rest) == 1
-        problem = fitter.problem(fitter.cut(simulated, length), noise, friction, far=far)
+        last = len(rest) == 1
+        problem = fitter.problem(fitter.cut(simulated, length), noise, friction)
         start = problem.variables.start(plant, offsets)
         if stages:
             # States of shorter windows drift apart within longer ones. Corrected together with

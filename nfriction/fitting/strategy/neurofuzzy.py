@@ -1,9 +1,15 @@
-"""Neuro-fuzzy coefficients: a network that corrects a constant law, kept if it passes hold-out."""
+"""Neuro-fuzzy coefficients: a network that corrects a constant law, kept if it passes hold-out.
+
+First its sets stay where they are, and windows held out choose the priors. Then it trains on at the
+noise that it left, with a prior for each group of parameters by evidence, and moves its sets if the
+evidence favours that; as long as the windows held out gain by it, at ever less noise.
+"""
 
 import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import cast
 
 import numpy as np
@@ -12,11 +18,13 @@ from torch import Tensor
 
 from nfriction.fitting.data.inputs import adjustable_terms, apply_encoder_offsets, require_motion
 from nfriction.fitting.equation_error import coefficient_scale
-from nfriction.fitting.fit import FitTask
 from nfriction.fitting.options import DEFAULTS, FitOptions
-from nfriction.fitting.result.fit_result import FitResult, result_from_shooting
+from nfriction.fitting.result.fit_result import FitResult
+from nfriction.fitting.result.identifiability import information
+from nfriction.fitting.result.of_search import result_from_shooting
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
 from nfriction.fitting.shooting.sensitivity import StepJacobian
+from nfriction.fitting.shooting.variables import model_at
 from nfriction.fitting.strategy.constant import (
     constant_prior,
     constant_start,
@@ -32,8 +40,10 @@ from nfriction.fitting.strategy.continuation import (
 )
 from nfriction.fitting.strategy.extrapolation_prior import prior_on_unvisited_cells
 from nfriction.fitting.strategy.holdout import HoldoutScore, holdout_rmse, holdout_split
+from nfriction.fitting.task import FitTask
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
+from nfriction.optim.evidence import GroupEvidence, group_evidence
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
@@ -58,24 +68,35 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     free = ShootingFitter(
         StepJacobian(task.plant, network, terms), network, recordings, task.measurement, options,
         task.callback, plant_prior=(known_terms(start, terms), plant_sd),
-        # From smoothed states at full length a search creeps along constraints.
-        defect_sd=None if options.continuity == "none" else options.penalty_sd,
         extrapolation=prior_on_unvisited_cells(schedule, motions, options),
     )  # fmt: skip
     law = replace(free, friction=start.model, friction_prior=law_prior, extrapolation=None)
     validation = _Validation(law, start, motions, start.longest_usable_horizon(options.windows))
     best = validation.best_trial(_with_narrowed_priors(free, start))
+    if best is not None and best.finite:
+        before = None
+        while best is not None and best is not before:
+            before, best = best, validation.trained_on(best)
     if best is None:
         found = _constant_kept(task, network, start, INTERRUPTED, converged=False)
     elif best.score.score > 1:
         found = _constant_kept(task, network, start, str(best.score))
     else:
         end = validation.fit_all(best)
-        found = result_from_shooting(task.model, end.problem, end.result, motions)
+        model = copy.deepcopy(end.problem.friction)
+        found = result_from_shooting(model, end.problem, end.result, motions)
+        task.model.load_state_dict(model.state_dict())
         cast("NeuroFuzzy", task.model.schedule).prior_sd = best.prior_sd
+        moved = " Its sets moved." if cast("NeuroFuzzy", model.schedule).learn_sets else ""
+        found = replace(
+            found,
+            model=task.model.requires_grad_(False),
+            status=found.status + moved,
+            effective_parameters=effective_parameters(end),
+        )
     found = replace(
         found, motions=task.motions, encoder_offsets=start.encoder_offsets,
-        continuity=options.continuity, skipped_horizons=start.skipped_horizons,
+        skipped_horizons=start.skipped_horizons,
     )  # fmt: skip
     return found.with_warnings(start.data_warnings)
 
@@ -135,6 +156,51 @@ def _with_narrowed_priors(free: ShootingFitter, start: FitResult) -> tuple[Shoot
     return (near,) if torch.equal(narrow, sd) else (near, free)
 
 
+def local_model(end: HorizonResult) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Curvature of errors and of known priors, offsets and groups, for `group_evidence`.
+
+    By the Gauss-Newton model of a search's end with window states integrated out, in units of the
+    network's prior, so that each group has precision 1. The plant's prior and that on unvisited
+    motion are known.
+    """
+    problem, variables = end.problem, end.problem.variables
+    schedule = cast("NeuroFuzzy", model_at(problem.friction, end.parts.friction).schedule)
+    shared, count = variables.shared_count, variables.friction_count
+    precision, mean = variables.prior()
+    data = information(end.result.hessian, precision, shared).data
+    known = torch.zeros_like(data)
+    if problem.extrapolation is not None:
+        known[:count, :count] = problem.extrapolation.normal_equations(schedule)[1]
+        data = data - known
+    known.diagonal()[count:] += precision[count:shared]
+    unit = precision[:shared].rsqrt()
+    data, known = (unit[:, None] * part * unit for part in (data, known))
+    own = schedule.groups()
+    groups = torch.cat([own, own.new_full((shared - count,), -1)])
+    lower, upper = (bound[:shared] for bound in variables.bounds())
+    fitted = (lower < upper).nonzero().flatten()
+    values, vectors = torch.linalg.eigh(data[fitted][:, fitted])
+    # Less than none is the rounding of states that grow by orders of magnitude.
+    data = (vectors * values.clamp_min(0.0)) @ vectors.T
+    offset = (end.result.x - mean)[:shared] / unit
+    return data, known[fitted][:, fitted], offset[fitted], groups[fitted]
+
+
+def network_evidence(end: HorizonResult) -> GroupEvidence:
+    """Evidence for the prior of each group of a network's parameters, relative to that it has."""
+    groups = len(cast("NeuroFuzzy", end.problem.friction.schedule).group_names())
+    return group_evidence(*local_model(end), torch.ones(groups, dtype=torch.float64))
+
+
+def effective_parameters(end: HorizonResult) -> tuple[tuple[str, float, int], ...]:
+    """Name of each group of a network, how many parameters the data determine, and its size."""
+    if not torch.isfinite(end.result.hessian).all():
+        return ()
+    schedule = cast("NeuroFuzzy", end.problem.friction.schedule)
+    sizes, gamma = schedule.groups().bincount().tolist(), network_evidence(end).gamma.tolist()
+    return tuple(zip(schedule.group_names(), gamma, sizes, strict=True))
+
+
 @dataclass(frozen=True)
 class _Trial:
     """A network trained on some windows, its score on the others, and its priors."""
@@ -143,6 +209,19 @@ class _Trial:
     fitter: ShootingFitter
     prior_sd: float
     end: HorizonResult
+    tolerance: float
+
+    @property
+    def finite(self) -> bool:
+        """False where the motion diverges."""
+        return math.isfinite(self.score.score) and bool(self.end.result.hessian.isfinite().all())
+
+    @cached_property
+    def log_evidence(self) -> float:
+        """Log evidence up to a constant, comparable at one noise; -inf where it is not finite."""
+        if not self.end.result.hessian.isfinite().all():
+            return -math.inf
+        return network_evidence(self.end).occam - float(self.end.result.cost)
 
 
 class _Validation:
@@ -172,11 +251,12 @@ class _Validation:
         of_all = holdout_rmse(self.test, same.problem, values, self.plant)
         if of_all is None:
             return None
+        self.of_law = of_same, of_all
         best: _Trial | None = None
         for fitter in fitters:
             trials = []
             for share in self.options.prior_shares:
-                trial = self._trial(fitter, share, of_same, of_all)
+                trial = self._trial(fitter, share)
                 if trial is None:
                     return None
                 trials.append(trial)
@@ -186,18 +266,65 @@ class _Validation:
                 best = trial
         return best
 
+    def trained_on(self, trial: _Trial) -> _Trial | None:
+        """A trial trained on at the noise that it left, or itself where that gains too little.
+
+        Beside the law's error as noise, sets could hardly move. They move if the evidence favours
+        it. The windows held out are few, so the gain there has to be as large as that of a network
+        on its law. None if stopped.
+        """
+        noise = min(effective_noise(trial.end.residuals), self.noise)
+        held = self._adapted(trial, noise, learn_sets=False)
+        moved = held and self._adapted(held, noise, learn_sets=True)
+        if held is None or moved is None:
+            return None
+        gained = moved.log_evidence - held.log_evidence
+        better = moved if gained > self.options.evidence_gain else held
+        error = self._error(better.end)
+        if error is None:
+            return None
+        better = replace(better, score=self._score(error))
+        limit = self.options.max_ratio_same * trial.score.score
+        return better if better.score.score < limit else trial
+
+    def _adapted(self, trial: _Trial, noise: float, *, learn_sets: bool) -> _Trial | None:
+        """A trial trained on, the prior of each group tightened as far as evidence favours it.
+
+        It is never widened: beyond it the model of the errors is not quadratic in the sets.
+        """
+        model = model_at(trial.fitter.friction, trial.end.parts.friction)
+        schedule = cast("NeuroFuzzy", model.schedule)
+        schedule.learn_sets = learn_sets
+        mean, sd = schedule.prior()
+        weights = sum(p.numel() for p in schedule.weights())
+        assert trial.fitter.friction_prior is not None
+        mean[:weights], sd[:weights] = (part[:weights] for part in trial.fitter.friction_prior)
+        rest = trial.end.result.x[len(trial.end.parts.friction) :]
+        x = torch.cat([schedule.parameter_vector(), rest])
+        best, groups = None, schedule.groups()
+        for _ in range(self.options.evidence_updates + 1):
+            fitter = replace(trial.fitter, friction=model, friction_prior=(mean, sd))
+            problem = fitter.problem(self.train, noise, x[: len(mean)], stride=self.stride)
+            tolerance = self.options.evidence_gain / max(float(problem.cost(x)), 1.0)
+            end = fitter.search(problem, x, tolerance, "network's sets, hold-out")
+            if end.stopped:
+                return None
+            found = replace(trial, fitter=fitter, end=end, tolerance=tolerance)
+            gain = found.log_evidence - (best.log_evidence if best else -math.inf)
+            if not gain > self.options.evidence_gain:
+                break
+            best, x = found, end.result.x
+            sd = sd * network_evidence(end).precision.clamp_min(1.0).rsqrt()[groups]
+        return best or found
+
     def fit_all(self, trial: _Trial) -> HorizonResult:
         """The network of a trial, fitted to all windows."""
-        windows = trial.fitter.cut(self.motions, self.length)
-        problem = trial.fitter.problem(
-            windows, self.noise, trial.end.parts.friction, stride=self.stride
-        )
+        windows, noise = trial.fitter.cut(self.motions, self.length), trial.end.problem.noise_sd
+        problem = trial.fitter.problem(windows, noise, trial.end.parts.friction, stride=self.stride)
         start = problem.variables.start(trial.end.parts.plant)
-        return trial.fitter.search(problem, start, self.tolerance, f"{self.length:g} s windows")
+        return trial.fitter.search(problem, start, trial.tolerance, f"{self.length:g} s windows")
 
-    def _trial(
-        self, fitter: ShootingFitter, share: float, of_same: float, of_all: float
-    ) -> _Trial | None:
+    def _trial(self, fitter: ShootingFitter, share: float) -> _Trial | None:
         """A network under a prior, from zero: from another prior's end it would stay there."""
         widest = cast("NeuroFuzzy", fitter.friction.schedule).prior_sd
         zeros = torch.zeros_like(fitter.friction.schedule.parameter_vector())
@@ -207,9 +334,12 @@ class _Validation:
         error = self._error(end)
         if error is None:
             return None
-        ratios = [error / law if math.isfinite(error) else math.inf for law in (of_same, of_all)]
-        score = HoldoutScore(ratios[0], ratios[1], self.options)
-        return _Trial(score, fitter, share * widest, end)
+        return _Trial(self._score(error), fitter, share * widest, end, self.tolerance)
+
+    def _score(self, error: float) -> HoldoutScore:
+        """Score of an error on the windows held out."""
+        ratios = [error / law if math.isfinite(error) else math.inf for law in self.of_law]
+        return HoldoutScore(ratios[0], ratios[1], self.options)
 
     def _search(self, fitter: ShootingFitter, friction: Tensor, name: str) -> HorizonResult:
         """Search of the training windows."""

@@ -19,14 +19,15 @@ from nfriction.fitting.data.inputs import (
 )
 from nfriction.fitting.data.windows import Windows, cut_windows
 from nfriction.fitting.equation_error import coefficient_scale
-from nfriction.fitting.fit import Callback, FitTask, prepare_task
 from nfriction.fitting.options import EncoderReference, FitOptions
-from nfriction.fitting.result.fit_result import FitResult, result_from_shooting
+from nfriction.fitting.result.fit_result import FitResult
+from nfriction.fitting.result.of_search import result_from_shooting
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.constant import constant_start, known_terms
 from nfriction.fitting.strategy.continuation import ShootingFitter
+from nfriction.fitting.task import Callback, FitTask, prepare_task
 from nfriction.friction.models import FrictionModel
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
 from nfriction.papers.afem.classes import (
@@ -39,8 +40,8 @@ from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 from nfriction.simulation.compiled import System, integrate_compiled
-from nfriction.simulation.protocols import RolloutInputs
-from nfriction.simulation.rollout import Rollout, integrate
+from nfriction.simulation.protocols import Rollout, RolloutInputs
+from nfriction.simulation.rollout import integrate
 
 logger = logging.getLogger(__name__)
 # Relative decrease of the cost that ends the search by class.
@@ -105,8 +106,8 @@ def fit_by_class(task: FitTask, classes: ClassOptions = DEFAULTS) -> FitResult:
     schedule = task.model.schedule
     if not isinstance(schedule, Adaptive):
         raise ValueError(f"{type(task.model).__name__} is no adaptive model; use `fit`.")
-    # The classes have no encoder eccentricity, and windows are free.
-    options = replace(task.options, eccentricity="off", continuity="none")
+    # The classes have no encoder eccentricity.
+    options = replace(task.options, eccentricity="off")
     task = replace(task, options=options)
     constant = constant_start(task)
     length = constant.longest_usable_horizon(options.windows)

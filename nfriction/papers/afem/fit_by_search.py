@@ -18,11 +18,11 @@ from torch import Tensor
 from nfriction.fitting.data.inputs import integration_substeps
 from nfriction.fitting.data.windows import cut_windows
 from nfriction.fitting.equation_error import coefficient_scale
-from nfriction.fitting.fit import FitTask, prepare_task
 from nfriction.fitting.options import FitOptions, Method
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.fitting.strategy.constant import constant_start, fit_constant
+from nfriction.fitting.task import FitTask, prepare_task
 from nfriction.friction.coefficients import Constant, Tabulated
 from nfriction.friction.models import FrictionModel
 from nfriction.papers.afem.adaptive import Adaptive

@@ -1,19 +1,26 @@
 """Coefficients by the papers' network: one radial basis network a joint, taught by a controller."""
 
+import math
 from collections.abc import Sequence
 from typing import Any, Final, Literal
 
+import numpy as np
 import torch
+from scipy.signal import lfilter
 from torch import Tensor, nn
 
 from nfriction.friction.coefficients import Constant, Schedule
 from nfriction.friction.laws import Law
-from nfriction.friction.parameters import Sensitivity
+from nfriction.friction.parameters import Sensitivity, positive_number
 from nfriction.fuzzy import RBFNetwork
 
 
 class RBFCoefficients(Schedule):
     """A radial basis network of |velocity| and acceleration gives the coefficients of a law.
+
+    Jerk and snap, the acceleration's first two derivatives, can be further inputs. They are taken
+    of the acceleration through a first-order low pass, snap through another, as causal as in a
+    controller; the hidden state is what these filters carry.
 
     Its numbers are those of the network itself, in SI, so what was trained on a controller's
     outputs is copied in as it is. Inputs are clamped to the universe on which it was trained, the
@@ -25,16 +32,23 @@ class RBFCoefficients(Schedule):
         joints: number of joints.
         initial: coefficients at the start in SI, (joint, coefficient) or (coefficient,).
         head_units: units of each joint's network; the papers take 10.
-        acceleration: `"along_motion"` takes qdd sgn(qd), `"signed"` qdd as the papers do.
+        acceleration: `"along_motion"` takes qdd sgn(qd), `"signed"` qdd as the papers do; jerk and
+            snap alike.
+        derivatives: of the acceleration that are inputs: 0, 1 (jerk) or 2 (and snap).
+        smoothing: time constant of their filters [s]; by default that of 20 Hz.
+        sample_time: at which they are advanced [s].
 
     References:
-        TLRIP paper, neuro-fuzzy friction estimation (2-10-2 network a joint).
+        TLRIP paper, neuro-fuzzy friction estimation (2-10-2 network a joint); its future work
+        (jerk and snap).
     """
 
     handles_range = True
+    fit_strategy = "nfriction.papers.nffem.fit_rbf:fit_rbf"
 
     # Final, so that TorchScript takes it for a constant.
     turn: Final[float] = 3e-3  # where qdd sgn(qd) turns, in units of the velocity's universe
+    remembers: Final[bool]
 
     input_lower: Tensor
     input_upper: Tensor
@@ -49,19 +63,33 @@ class RBFCoefficients(Schedule):
         *,
         head_units: int = 10,
         acceleration: Literal["along_motion", "signed"] = "along_motion",
+        derivatives: int = 0,
+        smoothing: float = 8e-3,
+        sample_time: float = 1e-3,
     ) -> None:
         super().__init__(law, joints)
+        if derivatives not in (0, 1, 2):
+            raise ValueError(f"`derivatives` must be 0, 1 (jerk) or 2 (snap), got {derivatives!r}.")
+        self.derivatives = int(derivatives)
+        self.remembers = self.derivatives > 0
+        self.state_size = self.derivatives + 1 if self.remembers else 0
+        self.smoothing = positive_number("smoothing", smoothing)
+        self.set_sample_time(sample_time)
         if acceleration not in ("along_motion", "signed"):
             raise ValueError(
                 f'`acceleration` must be "along_motion" or "signed", got {acceleration!r}.'
             )
         self.along_motion = acceleration == "along_motion"
         self.head_units = head_units
-        self.network = RBFNetwork(joints, 2, head_units, len(law.names))
+        inputs = 2 + self.derivatives
+        self.network = RBFNetwork(joints, inputs, head_units, len(law.names))
         values = Constant(law, joints, initial).values
+        # As wide as the papers' motion.
+        size = torch.tensor([20.0, 200.0, 1e4, 1e6], dtype=values.dtype)[:inputs].repeat(joints, 1)
+        zero_speed = torch.tensor([0.0, -1.0, -1.0, -1.0], dtype=values.dtype)[:inputs]
         for name, start in (
-            ("input_lower", torch.tensor([0.0, -200.0], dtype=values.dtype).repeat(joints, 1)),
-            ("input_upper", torch.tensor([20.0, 200.0], dtype=values.dtype).repeat(joints, 1)),
+            ("input_lower", zero_speed * size),
+            ("input_upper", size),
             ("output_lower", values.clone()),
             ("output_upper", values.clone()),
         ):
@@ -71,16 +99,65 @@ class RBFCoefficients(Schedule):
         with torch.no_grad():
             self.network.output_bias.copy_(values)
 
-    def inputs(self, qd: Tensor, qdd: Tensor) -> Tensor:
-        """Inputs of the network in SI, clamped to their universe, (*batch, joint, 2)."""
+    def set_sample_time(self, sample_time: float) -> None:
+        """Set the time between samples [s], from which the filters of jerk and snap follow.
+
+        Raises:
+            ValueError: if it is not positive and finite.
+        """
+        self.step = positive_number("sample_time", sample_time)
+        # A network of velocity and acceleration alone runs at any rate.
+        self.sample_time = self.step if self.remembers else None
+        self.gain = 1.0 - math.exp(-self.step / self.smoothing)
+
+    def inputs(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
+        """Inputs of the network in SI, clamped to their universe, (*batch, joint, input)."""
+        rest = qdd.unsqueeze(-1)
+        if self.remembers:
+            rest = torch.cat([rest, state.narrow(-1, 1, self.derivatives)], -1)
         if self.along_motion:
-            qdd = qdd * torch.tanh(qd / (self.turn * self.input_upper.select(-1, 0)))
-        x = torch.stack([qd.abs(), qdd], -1)
+            rest = rest * torch.tanh(qd / (self.turn * self.input_upper.select(-1, 0))).unsqueeze(
+                -1
+            )
+        x = torch.cat([qd.abs().unsqueeze(-1), rest], -1)
         return torch.minimum(torch.maximum(x, self.input_lower), self.input_upper)
 
     def forward(self, qd: Tensor, qdd: Tensor) -> Tensor:
-        y = self.network(self.inputs(qd, qdd))
+        return self.coefficients_from(qd, qdd, self.initial_state(qd, qdd))
+
+    def coefficients_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
+        y = self.network(self.inputs(qd, qdd, state))
         return torch.minimum(torch.maximum(y, self.output_lower), self.output_upper)
+
+    def initial_state(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        """Smoothed acceleration, jerk and snap, (*batch, joint, 1 + derivatives); or nothing."""
+        rest = torch.zeros_like(qdd)
+        return torch.stack([qdd, rest, rest], -1).narrow(-1, 0, self.state_size)
+
+    def advance(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
+        if not self.remembers:
+            return state
+        before = state.select(-1, 0)
+        smoothed = before + self.gain * (qdd - before)
+        jerk = (smoothed - before) / self.step
+        if self.derivatives == 1:
+            return torch.stack([smoothed, jerk], -1)
+        snap = state.select(-1, 2)
+        change = (jerk - state.select(-1, 1)) / self.step
+        return torch.stack([smoothed, jerk, snap + self.gain * (change - snap)], -1)
+
+    def states(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        if not self.remembers:
+            return self.initial_state(qd, qdd)
+        # As in the base class, but without a step of torch to every sample.
+        filtered, rate = ([self.gain], [1.0, self.gain - 1.0]), 1.0 / self.step
+        start = (1.0 - self.gain) * qdd[:1].numpy()
+        found = [lfilter(*filtered, qdd.numpy(), axis=0, zi=start)[0]]
+        jerk = rate * np.diff(found[0], axis=0, prepend=found[0][:1])
+        found.append(jerk)
+        change = rate * np.diff(jerk, axis=0, prepend=jerk[:1])
+        found.append(lfilter(*filtered, change, axis=0))
+        return torch.tensor(np.stack(found[: self.derivatives + 1], -1))
 
     @torch.no_grad()
     def set_network(self, network: RBFNetwork, inputs: Tensor, outputs: Tensor) -> None:
@@ -133,6 +210,11 @@ class RBFCoefficients(Schedule):
         weight.copy_(layer[..., :-1])
         bias.copy_(layer[..., -1])
 
+    def joint_of_parameters(self) -> Tensor:
+        """The joint whose coefficients each entry of the parameter vector moves, (parameter,)."""
+        size = self.parameter_vector().numel() // self.joints
+        return torch.arange(self.joints).repeat_interleave(size)
+
     def bounds(self) -> tuple[Tensor, Tensor]:
         vector = self.parameter_vector()
         mask = torch.tensor(self.fitted_mask, device=vector.device)[:, None]
@@ -140,31 +222,45 @@ class RBFCoefficients(Schedule):
         free = torch.full_like(vector, torch.inf)
         return torch.where(fitted, -free, vector), torch.where(fitted, free, vector)
 
-    @torch.no_grad()
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
-        x = self.inputs(qd, qdd)
+        """Derivatives at motions (sample, joint), each sample taken for a first one."""
+        return self.sensitivities_from(qd, qdd, self.initial_state(qd, qdd))
+
+    @torch.no_grad()
+    def sensitivities_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Sensitivity:
+        x = self.inputs(qd, qdd, state)
         y = self.network(x)
         # What is clamped does not move.
         free = ((y > self.output_lower) & (y < self.output_upper)).to(y.dtype)
         moving = ((x > self.input_lower) & (x < self.input_upper)).to(y.dtype)
         own = torch.eye(y.shape[-1], dtype=y.dtype, device=y.device)
         by_input = self.network.input_jacobian(x).permute(3, 0, 1, 2)
-        by_speed, by_qdd = (by_input * free[..., None] * moving[:, :, None]).unbind(-1)
+        by_input = by_input * free[..., None] * moving[:, :, None]
         # The network reads |qd|.
-        by_qd = by_speed * qd.sign()[..., None]
+        by_qd, by_qdd = by_input[..., 0] * qd.sign()[..., None], by_input[..., 1]
         if self.along_motion:
             turn = self.turn * self.input_upper.select(-1, 0)
             sign = torch.tanh(qd / turn)
-            by_qd = by_qd + by_qdd * (qdd * (1.0 - sign * sign) / turn)[..., None]
+            rest = torch.cat([qdd.unsqueeze(-1), state[..., 1:]], -1)
+            turning = (by_input[..., 1:] * rest[:, :, None]).sum(-1)
+            by_qd = by_qd + turning * ((1.0 - sign * sign) / turn)[..., None]
             by_qdd = by_qdd * sign[..., None]
         return Sensitivity(((free[..., None] * own, self.network.regressors(x)),), by_qd, by_qdd)
 
     def options(self) -> dict[str, Any]:
-        return {
+        found: dict[str, Any] = {
             "network": "rbf",
             "head_units": self.head_units,
             "acceleration": "along_motion" if self.along_motion else "signed",
         }
+        # Without further inputs there is nothing to smooth, as in files from before there were any.
+        if self.remembers:
+            found |= {
+                "derivatives": self.derivatives,
+                "smoothing": self.smoothing,
+                "sample_time": self.step,
+            }
+        return found
 
     def extra_repr(self) -> str:
         return ", ".join(f"{name}={value!r}" for name, value in self.options().items())

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -15,7 +16,8 @@ from nfriction.fitting.data.inputs import (
 )
 from nfriction.fitting.equation_error import coefficient_scale
 from nfriction.fitting.options import DEFAULTS, FitOptions
-from nfriction.fitting.result.fit_result import FitResult, result_from_shooting
+from nfriction.fitting.result.fit_result import FitResult
+from nfriction.fitting.result.of_search import result_from_shooting
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
@@ -23,7 +25,7 @@ from nfriction.fitting.strategy.continuation import ShootingFitter
 from nfriction.fitting.strategy.holdout import cut_for_folds
 from nfriction.fitting.strategy.neurofuzzy import input_range
 from nfriction.friction.models import FrictionModel
-from nfriction.optim.least_squares import Step
+from nfriction.optim.least_squares import LeastSquaresResult, Step
 from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.nffem.adaptive_neurofuzzy import AdaptiveNeuroFuzzy
 from nfriction.recording import Recording
@@ -91,22 +93,15 @@ def refine_adaptive(
         FitOptions(max_steps=max_steps, patience=0), callback,
     )  # fmt: skip
     name = f"{length:g} s windows, correction by class"
-    begun, shares = _cross_fitted(schedule, whole, fitter, name)
-    # Parameters of a joint whose share is zero stay at the adaptive model.
-    part = shares[schedule.joint_of_parameters()]
-    if part.any():
-        start = whole.variables.start(friction=begun)
-        result = fitter.search(whole, start, LOOSE, name).result
-        result.x[: len(begun)] *= part
-    if not part.any() or not _improves(whole, result.x[: len(begun)]):
+    base = torch.zeros_like(schedule.parameter_vector())
+    result, shares = kept_correction(schedule, whole, fitter, base, name)
+    if result is None:
         schedule.adaptive.set_sample_time(sample_time)
         note = "The correction is no better: the adaptive model is kept."
         return replace(adaptive, model=model, status=f"{adaptive.status} {note}")
     found = result_from_shooting(model, whole, result, motions)
     schedule.adaptive.set_sample_time(sample_time)
-    parts = zip(shares.tolist(), plant.joint_names, strict=True)
-    taken = ", ".join(f"{share:g} of {name}'s" for share, name in parts)
-    status = f"{found.status} Taken of the correction: {taken}."
+    status = f"{found.status} {taken(shares, plant.joint_names)}"
     # The plant is that of the adaptive fit, and so are the terms reported.
     return replace(found, status=status, plant_terms=adaptive.plant_terms)
 
@@ -127,40 +122,82 @@ def _schedules_of(model: FrictionModel, adaptive: FitResult) -> tuple[AdaptiveNe
     return schedule, reference
 
 
+class Corrected(Protocol):
+    """A schedule whose parameters each move one joint's coefficients."""
+
+    joints: int
+
+    def joint_of_parameters(self) -> Tensor:
+        """The joint that each entry of the parameter vector moves, (parameter,)."""
+
+
+def kept_correction(
+    schedule: Corrected, whole: ShootingProblem, fitter: ShootingFitter, base: Tensor, name: str
+) -> tuple[LeastSquaresResult | None, Tensor]:
+    """A correction learned from all windows, as far as hold-out windows found it useful.
+
+    Args:
+        schedule: of the problem's model.
+        whole: all windows.
+        fitter: searches.
+        base: parameter vector without a correction.
+        name: of the stage.
+
+    Returns:
+        The search's result with the shares taken, None where none is; the shares, (joint,).
+    """
+    begun, shares = _cross_fitted(schedule, whole, fitter, base, name)
+    # Parameters of a joint whose share is zero stay as they were.
+    part = shares[schedule.joint_of_parameters()]
+    if not part.any():
+        return None, shares
+    start = whole.variables.start(friction=begun)
+    result = fitter.search(whole, start, LOOSE, name).result
+    vector = result.x[: len(base)]
+    vector.copy_(base + part * (vector - base))
+    # The shares were chosen for the corrections of the parts, and may not suit this one.
+    ratio = _errors(whole, vector) / _errors(whole, base)
+    return (result if bool((ratio.log().mean(0) <= 0).all()) else None), shares
+
+
+def taken(shares: Tensor, joint_names: Sequence[str]) -> str:
+    """The shares of a correction in words."""
+    parts = zip(shares.tolist(), joint_names, strict=True)
+    words = ", ".join(f"{share:g} of {name}'s" for share, name in parts)
+    return f"Taken of the correction: {words}."
+
+
 def _cross_fitted(
-    schedule: AdaptiveNeuroFuzzy, whole: ShootingProblem, fitter: ShootingFitter, name: str
+    schedule: Corrected, whole: ShootingProblem, fitter: ShootingFitter, base: Tensor, name: str
 ) -> tuple[Tensor, Tensor]:
     """The mean of corrections learned from parts, and the share of them for each joint."""
     windows, memory = whole.windows, whole.memory
-    assert memory is not None
-    zero = torch.zeros_like(schedule.parameter_vector())
     fold = torch.arange(len(windows)) % FOLDS
     learned, unseen = [], []
     for k in range(FOLDS):
         seen, rest = (
-            replace(whole, windows=windows.subset(chosen), memory=memory[chosen])
+            replace(
+                whole,
+                windows=windows.subset(chosen),
+                memory=None if memory is None else memory[chosen],
+            )
             for chosen in (fold != k, fold == k)
         )
-        found = fitter.search(seen, seen.variables.start(friction=zero), LOOSE, name)
-        learned.append(found.parts.friction)
+        found = fitter.search(seen, seen.variables.start(friction=base), LOOSE, name)
+        learned.append(found.parts.friction - base)
         unseen.append(rest)
         if found.stopped:
             break
     of_joint = schedule.joint_of_parameters()
 
     def errors(shares: Tensor) -> Tensor:
-        parts = [_errors(p, shares[of_joint] * v) for p, v in zip(unseen, learned, strict=True)]
+        parts = [
+            _errors(p, base + shares[of_joint] * v) for p, v in zip(unseen, learned, strict=True)
+        ]
         return torch.cat(parts)
 
     shares = stacking_weights(errors, schedule.joints)
-    return torch.stack(learned).mean(0), shares
-
-
-def _improves(whole: ShootingProblem, vector: Tensor) -> bool:
-    """True if a correction is no worse on any joint over the windows it learned from."""
-    # The shares were chosen for the corrections of the parts, and may not suit this one.
-    ratio = _errors(whole, vector) / _errors(whole, torch.zeros_like(vector))
-    return bool((ratio.log().mean(0) <= 0).all())
+    return base + torch.stack(learned).mean(0), shares
 
 
 def _errors(problem: ShootingProblem, vector: Tensor) -> Tensor:

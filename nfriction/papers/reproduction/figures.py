@@ -17,7 +17,8 @@ from tqdm import tqdm
 from nfriction.evaluation.score import RMSE, Score
 from nfriction.io.files import atomic_write
 from nfriction.io.model_file import load
-from nfriction.papers.control.drawing import balance_figure, swing_up_animation
+from nfriction.papers.control.drawing import balance_figure
+from nfriction.papers.control.study import SAMPLE_TIME, THINNED, single_link
 from nfriction.papers.controller.mamdani import paper_controller
 from nfriction.papers.controller.rules import Variable
 from nfriction.papers.reproduction import tables
@@ -32,6 +33,7 @@ from nfriction.papers.reproduction.stages import (
 from nfriction.papers.reproduction.workspace import Array, Workspace
 from nfriction.plant import PendulumChain, rigs
 from nfriction.plots import (
+    animate,
     coefficients_over_time,
     controller_surface,
     positions,
@@ -40,6 +42,7 @@ from nfriction.plots import (
     torque_over_velocity,
 )
 from nfriction.recording import Recording
+from nfriction.recording.angles import AngleConvention
 from nfriction.signals import Motion
 from nfriction.simulation.rollout import rollout
 
@@ -49,6 +52,9 @@ SHOWN, SECOND_SHOWN = "test_hanging", "test_bent"
 SECOND_SECONDS = 10.0  # as the RTIP paper shows
 INERTIA_SECONDS = 3.0
 """Beyond this a frictionless swing from upright shows rounding rather than inertia."""
+WITHOUT_FRICTION_SECONDS = 6.0
+"""Then the motion without friction has nothing in common with the measured one any more."""
+MEASURED = "measured"
 FULL_TENSOR = tuple((0.1 * izz, izz, izz, 0.0, 0.0, 0.0) for izz in (0.04, 0.05, 0.05))
 """Ixx, Iyy, Izz, products of each link [kg m^2]: the printed Izz across, a tenth along it."""
 CLASS_COLOURS = {"low": "#eef3f7", "medium": "#cfe0ec", "high": "#a3c4dc"}
@@ -72,8 +78,10 @@ def draw_all(workspace: Workspace, *, progress: bool = False) -> list[Path]:
         figure.clear()
         written.append(path)
     lifted = workspace.arrays("control")["swing-up"]
-    gif = swing_up_animation(lifted, workspace.folder / "figures" / "control_swing_up.gif")
-    return [*written, gif]
+    time = THINNED * SAMPLE_TIME * np.arange(len(lifted), dtype=np.float64)
+    gif = workspace.folder / "figures" / "control_swing_up.gif"
+    motion = {"swing-up of one link": lifted}
+    return [*written, animate(single_link(), time, motion, gif, seconds=np.inf)]
 
 
 def figures(workspace: Workspace) -> dict[str, Callable[[], Figure]]:
@@ -131,6 +139,8 @@ def inertia_cases() -> Figure:
 def second_swing() -> Figure:
     """Frictionless swing of the RTIP rig with its arm free, a panel a joint.
 
+    The angles count from hanging, as in that paper.
+
     References:
         RTIP paper, Fig. 3.
     """
@@ -138,22 +148,35 @@ def second_swing() -> Figure:
 
 
 def _swings(plants: Mapping[str, PendulumChain], seconds: float) -> Figure:
-    """Joint positions of rigs with a free arm, released at 0, 20, 30, 40 degrees."""
-    q0 = torch.deg2rad(torch.tensor([0.0, 20.0, 30.0, 40.0], dtype=torch.float64))
-    figure, axes = style.panels(len(q0), 1, style.PAGE, 5.2, sharex=True)
-    looks = style.looks(plants)
+    """Joint positions of rigs with a free arm, released at 0, 20, 30, 40 degrees as they count."""
+    q0 = np.deg2rad([0.0, 20.0, 30.0, 40.0])
+    motions = {}
+    for label, plant in plants.items():
+        convention, first = AngleConvention.of(plant), plant.first_link
+        start = torch.as_tensor(convention.position_to_joint(q0, first))
+        steps = round(seconds * 1000)
+        run = rollout(plant, None, start, torch.zeros_like(start), sample_time=1e-3, steps=steps)
+        motions[label] = convention.position_from_joint(run.q.numpy(), first)
+    return _lines(motions, ("joint 1", *tables.JOINTS))
+
+
+def _lines(motions: Mapping[str, Array], names: Sequence[str]) -> Figure:
+    """Joint positions at 1 ms (sample, joint), a panel a joint, a line a motion."""
+    figure, axes = style.panels(len(names), 1, style.PAGE, 1.3 * len(names), sharex=True)
+    looks = style.looks(n for n in motions if n != MEASURED)
     handles: list[Any] = []
     # Later lines are thinner, so that lines can be distinguished where they coincide.
-    for (label, plant), width in zip(plants.items(), (2.2, 1.6, 1.0), strict=False):
-        steps = round(seconds * 1000)
-        run = rollout(plant, None, q0, torch.zeros_like(q0), sample_time=1e-3, steps=steps)
-        line = looks[label].line | {"linewidth": width}
-        for ax, q in zip(axes[:, 0], run.q.numpy().T, strict=True):
-            ax.plot(run.time.numpy(), q, **line)
+    widths = iter((2.2, 1.6, 1.0))
+    for label, motion in motions.items():
+        line = style.MEASURED
+        if label != MEASURED:
+            line = looks[label].line | {"linewidth": next(widths)}
+        for ax, q in zip(axes[:, 0], motion.T, strict=True):
+            ax.plot(np.arange(len(q)) / 1000, q, **line)
         handles.append(Line2D([], [], **line))
-    _joint_axes(axes[:, 0].tolist(), ("joint 1", *tables.JOINTS), "rad")
+    _joint_axes(axes[:, 0].tolist(), names, "rad")
     figure.align_ylabels(axes[:, 0])
-    style.legend(figure, handles, list(plants))
+    style.legend(figure, handles, list(motions))
     return figure
 
 
@@ -171,14 +194,13 @@ def without_friction(workspace: Workspace) -> Figure:
     convention = recording.resolve_convention(bench.plant)
     q0, qd0 = bench.states[SHOWN]
     assert isinstance(bench.plant, PendulumChain)
+    first = recording[recording.time < recording.time[0] + WITHOUT_FRICTION_SECONDS]
     simulated = simulations(
         bench.plant, convention.position_to_joint(q0), convention.rate_to_joint(qd0),
-        len(recording) - 1,
+        len(first) - 1,
     )  # fmt: skip
-    return positions(
-        recording,
-        {n: _score(recording, convention.position_from_joint(q)) for n, q in simulated.items()},
-    )
+    motions = {name: convention.position_from_joint(q) for name, q in simulated.items()}
+    return _lines({MEASURED: first.q} | motions, tables.JOINTS)
 
 
 def coefficients(workspace: Workspace, name: str) -> Figure:
@@ -251,9 +273,9 @@ def experiment(workspace: Workspace) -> Figure:
         _strip(axes[0, joint], tables.TABLE_6[name])
     figure.align_ylabels(axes[:, 0])
     handles: list[Any] = [Patch(facecolor=colour) for colour in CLASS_COLOURS.values()]
+    handles.append(Patch(facecolor="none", edgecolor=style.INK, linewidth=0.4))
     texts = [f"{known} acceleration" for known in CLASS_COLOURS]
-    texts[-1] += "; strip at the top: as printed"
-    style.legend(figure, handles, texts)
+    style.legend(figure, handles, [*texts, "strip at the top: as printed"])
     return figure
 
 

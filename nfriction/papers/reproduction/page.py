@@ -51,7 +51,8 @@ FIRST = (
          "Rules (b) and (c) are lost; all joints have rules (a)."),
     Item("Figs. 11, 12, 13: coefficients of the neuro-fuzzy models in the experiment",
          ("fig_11_coefficients_NFNCFM", "fig_12_coefficients_NFLFM",
-          "fig_13_coefficients_NFNLFM")),
+          "fig_13_coefficients_NFNLFM"),
+         "A joint whose correction did not pass its hold-out windows has the classes' steps."),
     Item("Fig. 14: measured and simulated position", ("fig_14_positions_NFNLFM",),
          "On a recording that no model was fitted to."),
     Item("Table 10: position error of every model",
@@ -60,21 +61,23 @@ FIRST = (
     Item("Table 11: error of NFNLFM below that of each other model", ("table_11", "error_saved")),
 )  # fmt: skip
 SECOND = (
-    Item("Fig. 3: four joints from 0°, 20°, 30°, 40°", ("second_fig_3_free_arm",)),
+    Item("Fig. 3: four joints from 0°, 20°, 30°, 40°", ("second_fig_3_free_arm",),
+         "Counted from hanging, as that paper does."),
     Item("Tables I, II, III: coefficients",
          ("second_table_i", "second_table_ii", "second_table_iii"),
          "Coefficients of the twin."),
     Item("Figs. 5, 6, 7: measured and simulated position, first 10 s, one scale of error",
          ("second_fig_5_NCFM", "second_fig_6_LFM", "second_fig_7_NLFM"),
          "From 20°, 30°, 40°, which no model was fitted to; the paper shows its own fit from 45°."),
-    Item("Fig. 8: friction torque over velocity", ("second_fig_8_torque",)),
+    Item("Fig. 8: friction torque over velocity", ("second_fig_8_torque",),
+         "Dots: the torque that the smoothed motion implies."),
     Item("Table IV: position error", ("second_table_iv", "second_rmse")),
 )  # fmt: skip
 FUTURE = (
     Item("Control of the rig with the friction models",
          ("control_still", "control_follow", "control_balance", "control_swing_up",
           "control_three_links"),
-         "In simulation. Swinging up all three links was not attempted."),
+         "In simulation; three links are balanced, one is swung up."),
 )  # fmt: skip
 OTHERS = (
     Item("Positions by kind of model", tuple(f"positions_joint_{joint}" for joint in (2, 3, 4))),

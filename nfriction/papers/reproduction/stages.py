@@ -27,6 +27,7 @@ from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction import model_by_name
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import ModelInfo, load, load_info, save
+from nfriction.optim.evidence import EvidenceState
 from nfriction.papers import twin
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
 from nfriction.papers.afem.classes import class_intervals
@@ -35,6 +36,7 @@ from nfriction.papers.afem.fit_by_search import SearchMethod, SearchOptions, fit
 from nfriction.papers.control import study
 from nfriction.papers.nffem.refine_adaptive import refine_adaptive
 from nfriction.papers.nffem.train_network import TrainingOptions
+from nfriction.papers.reproduction.missed_torque import missed_torque
 from nfriction.papers.reproduction.procedure import papers_neuro_fuzzy
 from nfriction.papers.reproduction.workspace import (
     FULL,
@@ -46,8 +48,8 @@ from nfriction.papers.reproduction.workspace import (
 )
 from nfriction.recording import Recording
 from nfriction.signals import causal_motion
-from nfriction.simulation.rk4 import required_substeps
 from nfriction.simulation.rollout import rollout
+from nfriction.simulation.validate import required_substeps
 
 logger = logging.getLogger(__name__)
 
@@ -206,7 +208,12 @@ def make_twin(workspace: Workspace, name: str) -> dict[str, Any]:
     for label, motion in zip(made.recordings, motions, strict=True):
         arrays |= {f"{label}_{key}": getattr(motion, key) for key in ("q", "qd", "qdd")}
     workspace.write_arrays(f"twin-{name}", arrays)
-    return {"recordings": {label: r.digest() for label, r in made.recordings.items()}}
+    found: dict[str, Any] = {
+        "recordings": {label: r.digest() for label, r in made.recordings.items()}
+    }
+    if made.part("test"):
+        found["missed_torque"] = missed_torque(made)
+    return found
 
 
 def fit_constant(workspace: Workspace, bench: Bench, name: str) -> FitResult:
@@ -247,6 +254,19 @@ def fit_network(workspace: Workspace, bench: Bench, name: str) -> FitResult:
     ))  # fmt: skip
 
 
+def fit_without_classes(workspace: Workspace, bench: Bench, name: str) -> FitResult:
+    """A neuro-fuzzy model from the constant fit of its law."""
+    settings = workspace.settings
+    start = fit_constant(workspace, bench, name.removeprefix("NF"))
+    model = model_by_name(name)(
+        bench.plant.joints, terms=settings.terms, head_units=settings.head_units
+    )
+    return workspace.fit(name, bench, lambda step: fit(
+        model, bench.plant, bench.train, windows=settings.windows, max_steps=settings.max_steps,
+        fit_plant=settings.fit_plant, start=start, motions=bench.train_motions, callback=step,
+    ))  # fmt: skip
+
+
 def fit_searched(
     workspace: Workspace,
     bench: Bench,
@@ -273,11 +293,21 @@ def network_by_controller(
 ) -> tuple[FrictionModel, dict[str, Any]]:
     """A neuro-fuzzy model the papers' way, from the coefficients by class; how its fit ended."""
     settings = workspace.settings
+    joints = iter(bench.plant.joint_names)
+    losses: dict[str, list[float]] = {}
+
+    def keep(state: EvidenceState) -> None:
+        # The training of each joint counts its steps from 1.
+        if state.step == 1:
+            losses[next(joints)] = []
+        losses[[*losses][-1]].append(0.5 / state.beta)
+
     model, fits = papers_neuro_fuzzy(
         load(workspace.model(f"A{law}")), bench.train_motions,
         samples=settings.controller_samples, units=settings.network_units,
-        options=TrainingOptions(seed=settings.seed, progress=progress),
+        options=TrainingOptions(seed=settings.seed, progress=progress, callback=keep),
     )  # fmt: skip
+    workspace.finish(f"NF{law}-losses", losses)
     unfinished = [fit.evidence.message for fit in fits if not fit.evidence.converged]
     status = f"Not converged: {len(unfinished)} of {len(fits)} networks. {' '.join(unfinished[:1])}"
     return model, {

@@ -1,14 +1,18 @@
 """The page of a reproduction, its conclusion, and the agreement of simulations."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from nfriction import rigs
 from nfriction.papers.reproduction import tables
 from nfriction.papers.reproduction.agreement import MUJOCO, TWIN, agreement
-from nfriction.papers.reproduction.figures import figures
+from nfriction.papers.reproduction.figures import figures, second_swing
+from nfriction.papers.reproduction.missed_torque import missed_torque
 from nfriction.papers.reproduction.page import PARTS, write_page
 from nfriction.papers.reproduction.workspace import QUICK, Workspace
+from nfriction.papers.twin.dataset import make
 from tests.papers.reproduction.test_tables import workspace
 
 ITEMS = [item for _, items in PARTS for item in items]
@@ -40,11 +44,36 @@ def test_the_page_is_self_contained_and_in_the_papers_order(tmp_path) -> None:
 def test_the_conclusion_follows_the_errors(tmp_path) -> None:
     errors = {"NCFM": 4.0, "LFM": 4.0, "NLFM": 4.0, "rtip-NLFM": 0.5}
     errors |= dict.fromkeys(tables.ADAPTIVE, 3.0) | dict.fromkeys(tables.NEURO_FUZZY, 2.0)
-    errors |= dict.fromkeys(tables.PAPERS_WAY, 3.5)
+    errors |= dict.fromkeys(tables.PAPERS_WAY, 3.5) | {"NFLFM": 3.2}
     lines = tables.conclusion(workspace(tmp_path, errors)).splitlines()
     assert len(lines) == 6
     held = [line.split(":")[0] for line in lines[1:5]]
-    assert held == ["reproduced", "reproduced", "NOT reproduced", "reproduced"]
+    assert held == ["reproduced", "reproduced for 2 of 3", "NOT reproduced", "reproduced"]
+    assert lines[5].startswith("Why: ")
+    assert "misses 25.0%" in lines[5]
+    assert "12.5%; 1 of 16 fits" in lines[5]
+
+
+@pytest.mark.parametrize("effect", [0.0, 1.0])
+def test_the_reason_sees_what_acceleration_does(effect) -> None:
+    made = make("tlrip", duration=2.0)
+    truth = {
+        label: replace(m, tau_f=np.sign(m.qd) * (1.0 + np.abs(m.qd)) + effect * m.qdd)
+        for label, m in made.truth.items()
+    }
+    found = missed_torque(replace(made, truth=truth))
+    if effect:
+        assert found["speed and acceleration"] < 0.5 * found["speed"]
+    else:
+        # The torque varies little within a cell of speed.
+        assert max(found.values()) < 0.2
+
+
+def test_the_second_papers_swing_starts_as_that_paper_counts() -> None:
+    lines = [ax.lines[0].get_ydata() for ax in second_swing().axes]
+    np.testing.assert_allclose([q[0] for q in lines], np.deg2rad([0.0, 20.0, 30.0, 40.0]))
+    # From hanging, so that no link swings over the top.
+    assert max(np.abs(q).max() for q in lines) < np.pi
 
 
 def test_independent_simulations_agree() -> None:

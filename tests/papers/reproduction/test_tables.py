@@ -43,6 +43,7 @@ def workspace(folder: Path, errors: Mapping[str, float | None]) -> Workspace:
                 "intervals": [[["high", 0.0, 7.5], ["low", 7.5, 40.0]]] * 3,
                 "tables": {task: {"none": {"power [W]": None}} for task in CONTROL},
                 "fit": {"status": "ended", "converged": name != "ALFM"},
+                "missed_torque": {"speed": 0.25, "speed and acceleration": 0.125},
             },
         )
     return made

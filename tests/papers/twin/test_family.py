@@ -168,7 +168,7 @@ def test_command_writes_what_compare_reads(
 def test_held_out_errors_as_median_and_pooled() -> None:
     def score(name: str, error: float) -> Score:
         rmse = RMSE((error,), error)
-        return Score(name, rmse, {}, None, np.arange(3.0), np.zeros((3, 1)), np.inf)
+        return Score(rmse, {}, None, name, np.arange(3.0), np.zeros((3, 1)), np.inf)
 
     scores = {"LFM": [score(str(k), error) for k, error in enumerate((3.0, 1.0, 50.0))]}
     table = family.held_out(Comparison({}, {}, scores, "rad", ("joint1",)))

@@ -1,0 +1,123 @@
+"""The checked arguments of a fit, which every strategy takes."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from torch import Tensor
+
+from nfriction.fitting.data.inputs import (
+    ZEROED_PER_RECORDING,
+    advanced_torques,
+    as_model,
+    as_recording_list,
+    data_warnings,
+    in_joint_coordinates,
+    largest_torques,
+    looks_zeroed_per_recording,
+    measurement_matrix,
+    smoothed_motions,
+)
+from nfriction.fitting.diagnosis import balanced_delay, likely_mistakes, mistake_warning
+from nfriction.fitting.options import FitOptions
+from nfriction.fitting.result.fit_result import FitResult
+from nfriction.friction.models import FrictionModel
+from nfriction.optim.least_squares import Step
+from nfriction.plant import PendulumChain, Plant, rigs
+from nfriction.recording import Recording, RecordingLike
+from nfriction.signals import Motion
+
+Callback = Callable[[str, Step], bool | None]
+
+
+@dataclass(frozen=True, eq=False)
+class FitTask:
+    """Checked arguments of a fit, as every strategy (`Schedule.fit_strategy`) takes them.
+
+    Attributes:
+        model: the model to fit; a strategy changes it once, at the end.
+        plant: the mechanism as given.
+        recordings: in joint coordinates.
+        measurement: matrix from joint to recorded coordinates, see `measurement_matrix`.
+        motions: smoothed motion of each recording, in joint coordinates.
+        options: settings of the fit.
+        start: an earlier fit to start from.
+        callback: called with a stage name after every step; True stops.
+        per_recording: whether encoders were set to zero at the start of each recording.
+        delay: of the torque after the positions by the balance of torques [s]; 0 unless fitted.
+        data_warnings: warnings about the recordings.
+        mistakes: likely mistakes in recordings or plant.
+    """
+
+    model: FrictionModel
+    plant: Plant
+    recordings: Sequence[Recording]
+    measurement: Tensor
+    motions: tuple[Motion, ...]
+    options: FitOptions
+    start: FitResult | None = None
+    callback: Callback | None = None
+    per_recording: bool = False
+    delay: float = 0.0
+    data_warnings: tuple[str, ...] = ()
+    mistakes: tuple[str, ...] = ()
+
+
+def prepare_task(
+    model: FrictionModel | str,
+    plant: Plant | str | Path,
+    recordings: RecordingLike | Iterable[RecordingLike],
+    options: FitOptions,
+    start: FitResult | None = None,
+    motions: Sequence[Motion] | None = None,
+    callback: Callback | None = None,
+) -> FitTask:
+    """Check and convert the arguments of a fit; see `fit`."""
+    plant = rigs.of(plant)
+    model = as_model(model, plant.joints)
+    given = as_recording_list(recordings, plant)
+    if "p_0" in model.law.names:
+        raise ValueError(
+            f"the law {model.law.name!r} is for tables of torque, see `fit_torque`; to motions fit "
+            "maxwell-slip."
+        )
+    joint = in_joint_coordinates(plant, model, given)
+    if options.eccentricity == "on" and not isinstance(plant, PendulumChain):
+        raise ValueError(f"{plant.name or 'the axis'} has no encoders that turn with its joints.")
+    # Torques alone do not depend on a constant offset of the encoders enough to estimate one.
+    found: tuple[str, ...] = ()
+    per_recording = options.encoder_reference == "per_recording"
+    if options.encoder_reference == "auto" and options.method == "output_error":
+        per_recording = looks_zeroed_per_recording(plant, given, options)
+        found = (ZEROED_PER_RECORDING,) if per_recording else ()
+    moved = smoothed_motions(joint, motions)
+    convention = given[0].resolve_convention(plant)
+    delay = 0.0
+    if options.fit_delay:
+        if not largest_torques(joint).any():
+            raise ValueError("`fit_delay=True` needs recordings with torques, got none.")
+        # A search by simulation finds the delay only from nearby: within a cycle of the motion.
+        delay, _ = balanced_delay(plant, joint, moved, options)
+    advanced = advanced_torques(joint, delay)
+    # With the delay removed, so that it is not named a second time as a mistake.
+    stated, mistakes = likely_mistakes(plant, advanced, moved, convention, options)
+    found = (
+        *mistake_warning(stated, mistakes),
+        *found,
+        *data_warnings(plant, given, joint, moved, options),
+    )
+    measurement = measurement_matrix(plant, convention)
+    return FitTask(
+        model,
+        plant,
+        joint,
+        measurement,
+        moved,
+        options,
+        start,
+        callback,
+        per_recording,
+        delay,
+        found,
+        tuple(m.text for m in mistakes),
+    )

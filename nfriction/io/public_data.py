@@ -1,0 +1,207 @@
+"""Public recordings of real mechanisms: fetch the originals, convert them to tables in SI.
+
+A commit in a web address fixes the content of an original. The SHA-256 of a converted table is that
+of the table on which the documentation's results were computed.
+"""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import json
+import urllib.error
+import urllib.parse
+import urllib.request
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from scipy.io import loadmat
+from scipy.signal import savgol_filter
+
+
+@dataclass(frozen=True)
+class PublicSet:
+    """A set of recordings in a public repository.
+
+    Attributes:
+        about: mechanism, sensors, authors.
+        licence: of the originals.
+        repository: owner and name on GitHub.
+        commit: that fixes the content.
+        folder: of the originals in the repository.
+        source: kind of originals, one of `_CONVERT`.
+        digits: printf format of columns, by the first letters of their names.
+        recordings: original and SHA-256 of the table, by recording.
+    """
+
+    about: str
+    licence: str
+    repository: str
+    commit: str
+    folder: str
+    source: str
+    digits: Mapping[str, str]
+    recordings: Mapping[str, tuple[str, str]]
+
+    def address(self, original: str) -> str:
+        """Web address of an original."""
+        path = f"{self.repository}/{self.commit}/{self.folder}/{original}"
+        return f"https://raw.githubusercontent.com/{urllib.parse.quote(path)}"
+
+
+@dataclass(frozen=True)
+class Fetched:
+    """A set's tables, and the recordings whose tables are not those of the documentation."""
+
+    tables: tuple[Path, ...]
+    differing: tuple[str, ...]
+
+
+def public_sets() -> dict[str, PublicSet]:
+    """All sets by name."""
+    text = resources.files(__package__).joinpath("public_sets.json").read_text()
+    return {name: PublicSet(**fields) for name, fields in json.loads(text).items()}
+
+
+def fetch(name: str, folder: Path) -> Fetched:
+    """Fetch the originals of a set that are not in its folder yet, convert and write them.
+
+    Args:
+        name: of one of `public_sets()`.
+        folder: of the set. Gets `originals`, a table of each recording, and `recordings.csv`, which
+            has initial states where the set gives them.
+
+    Raises:
+        ValueError: for an unknown name, or an original that is not what it should be.
+        OSError: if an original cannot be fetched; names its address and where to put it.
+    """
+    sets = public_sets()
+    if name not in sets:
+        raise ValueError(f"no public set {name!r}; there are {', '.join(sets)}.")
+    chosen = sets[name]
+    tables, rows, differing = [], [], []
+    for recording, (original, digest) in chosen.recordings.items():
+        path, address = folder / "originals" / original, chosen.address(original)
+        if not path.exists():
+            _download(address, path)
+        try:
+            table, state = _CONVERT[chosen.source](path, recording)
+        except (KeyError, TypeError, ValueError, NotImplementedError) as error:
+            raise ValueError(
+                f"'{path}' is not what {address} contains ({type(error).__name__}: {error}); "
+                "delete it and fetch it again."
+            ) from error
+        text = _csv(table, chosen.digits)
+        if hashlib.sha256(text).hexdigest() != digest:
+            differing.append(recording)
+        tables.append(folder / f"{recording}.csv.gz")
+        tables[-1].write_bytes(gzip.compress(text, mtime=0))
+        rows.append({"id": recording, "file": tables[-1].name, "source": address, **state})
+    pd.DataFrame(rows).to_csv(folder / "recordings.csv", index=False)
+    return Fetched(tuple(tables), tuple(differing))
+
+
+def _download(address: str, path: Path) -> None:
+    try:
+        with urllib.request.urlopen(address, timeout=60) as answer:
+            content = answer.read()
+    except (urllib.error.URLError, TimeoutError) as error:
+        raise OSError(
+            f"cannot fetch {address} ({error}); fetch it where there is a network, save it as "
+            f"'{path}' and repeat the command."
+        ) from error
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f"{path.name}.part")
+    part.write_bytes(content)
+    part.replace(path)
+
+
+def _csv(table: pd.DataFrame, digits: Mapping[str, str]) -> bytes:
+    """A table whose columns have the format of the longest beginning of their names."""
+    columns = []
+    for name, values in table.items():
+        form = digits[max((key for key in digits if str(name).startswith(key)), key=len)]
+        columns.append([form % value for value in values])
+    lines = [",".join(table.columns), *(",".join(row) for row in zip(*columns, strict=True))]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _multiarm(path: Path, recording: str) -> tuple[pd.DataFrame, dict[str, float]]:
+    """A block of a free swing; its initial state is of Savitzky and Golay's filter.
+
+    The authors cut a recording into consecutive pieces of angles and velocities (2 joint, time),
+    first those that they fitted, then those that they checked by.
+    """
+    cells = loadmat(path)
+    pieces = [piece for key in ("Y_id", "Y_vad") for piece in cells[key].ravel()]
+    q, qd = np.split(np.concatenate(pieces, axis=1), 2)
+    q = q - np.pi  # from hanging
+    length = {1: 9160, 2: 9990, 3: 9980}[len(q)]
+    first = 20 + int(recording[-1]) * length
+    block = slice(first, first + length)
+    columns, state = {"time": 1e-3 * np.arange(length)}, {}
+    for key, values in (("q", q), ("qd", qd)):
+        columns |= {f"{key}{joint}": row[block] for joint, row in enumerate(values, 1)}
+    for joint, row in enumerate(q, 1):
+        for key, order in (("q0", 0), ("qd0", 1)):
+            smooth = savgol_filter(row, 31, 3, deriv=order, delta=1e-3)
+            state[f"{key}_{joint}"] = round(float(smooth[first]), 7 - order)
+    return pd.DataFrame(columns), state
+
+
+def _dfki(path: Path, _: str) -> tuple[pd.DataFrame, dict[str, float]]:
+    """A driven run from rest: what the drives measure, and the torques commanded."""
+    table = pd.read_csv(path)
+    names = {"time": "time"}
+    for ours, theirs in (
+        ("q", "pos_meas"), ("qd", "vel_meas"), ("tau", "tau_meas"), ("tau_cmd", "tau_con"),
+    ):  # fmt: skip
+        names |= {f"{theirs}{joint}": f"{ours}{joint}" for joint in (1, 2)}
+    table = table[list(names)].rename(columns=names)
+    start = {f"q0_{joint}": float(table[f"q{joint}"].iloc[0]) for joint in (1, 2)}
+    return table, start | {"qd0_1": 0.0, "qd0_2": 0.0}
+
+
+def _emps(path: Path, _: str) -> tuple[pd.DataFrame, dict[str, float]]:
+    """The first half of the axis's run; force is voltage times the drive's gain."""
+    values = loadmat(path)
+    q, reference, u = (np.ravel(values[key])[10:12420] for key in ("qm", "qg", "vir"))
+    columns = {"time": 1e-3 * np.arange(12410), "q1": q, "q_ref1": reference}
+    return pd.DataFrame(columns | {"tau1": float(values["gtau"].item()) * u, "u1": u}), {}
+
+
+def _xl330(path: Path, recording: str) -> tuple[pd.DataFrame, dict[str, float]]:
+    """A log of the servo, or the part of it after the torque was released."""
+    log = pd.DataFrame(json.loads(path.read_text())["entries"])
+    if recording.startswith("drop"):
+        log = log[~log["torque_enable"].astype(bool)]
+    time = log["timestamp"] - log["timestamp"].iloc[0]
+    table = pd.DataFrame({"time": time, "q1": log["position"]})
+    if recording.startswith("drop"):
+        return table.assign(tau1=0), {}
+    # The register is a signed number of 16 bits, in 1/885 of the full voltage.
+    duty = log["load"].to_numpy(np.uint16).view(np.int16) / 885
+    return table.assign(
+        qd1_reg=log["speed"], duty1=duty, volt=log["input_volts"], q_goal1=log["goal_position"],
+        torque_on=log["torque_enable"],
+    ), {}  # fmt: skip
+
+
+def _tribometer(path: Path, _: str) -> tuple[pd.DataFrame, dict[str, float]]:
+    """The first half of the strokes; friction gets the sign of the velocity."""
+    table = pd.read_csv(path, sep="\t").iloc[:21289]
+    return pd.DataFrame({
+        "time": table["Time [s]"],
+        "position": (1e-3 * table["Position [mm]"]).round(7),
+        "normal_force": (1e-6 * table["Normal [uN]"]).round(7),
+        "friction": (-1e-6 * table["Friction [uN]"]).round(7),
+    }), {}  # fmt: skip
+
+
+_CONVERT = {
+    "multiarm": _multiarm, "dfki": _dfki, "emps": _emps, "xl330": _xl330, "tribometer": _tribometer,
+}  # fmt: skip

@@ -1,0 +1,191 @@
+"""The mechanism, drawn from its plant, and its motion as a GIF."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle
+from numpy.typing import NDArray
+
+from nfriction.io.files import atomic_write
+from nfriction.plant import LinearAxis, PendulumChain, Plant, Rotor
+from nfriction.plots import style
+
+Array = NDArray[np.float64]
+MEASURED = "measured"
+_FRAMES_A_SECOND, _DPI = 25, 80
+_BENT = 0.5  # between links of the drawing, so that none hides another [rad]
+
+
+class _View(NamedTuple):
+    title: str
+    reach: float  # of the drawing from its middle [m]
+    points: Callable[[Array], Array]  # joints in a pose (joint,) -> (point, 2) [m]
+
+
+def mechanism(plant: Plant) -> Figure:
+    """The mechanism in a pose near rest: links, joints and mass centres, and the data of each.
+
+    Args:
+        plant: as given, or as fitted.
+    """
+    views = _views(plant)
+    figure, axes = style.panels(
+        1, len(views) + 1, style.PAGE, 2.8, width_ratios=[*[1.0] * len(views), 1.1]
+    )
+    pose = np.zeros(plant.joints)
+    if plant.unit == "rad":
+        links = pose[plant.first_link :]
+        links[:] = np.diff(_BENT * (-1.0) ** np.arange(len(links)), prepend=0.0)
+        links[0] += np.pi if plant.convention[1] == "hanging" else 0.0
+    for ax, view in zip(axes[0], views, strict=False):
+        _frame(ax, view, plant)
+        points = view.points(pose)
+        ax.plot(*points.T, **_line(style.COLOURS[0]))
+        if isinstance(plant, PendulumChain) and not isinstance(plant, Rotor):
+            ax.autoscale()
+            ax.margins(0.2)
+            ax.set_adjustable("datalim")
+        if isinstance(plant, PendulumChain) and view is views[-1]:
+            steps = np.diff(points, axis=0)
+            for share, start, step in zip(_centres(plant), points, steps, strict=False):
+                ax.plot(*(start + share * step), "X", color=style.COLOURS[1], zorder=3)
+    words = axes[0, -1]
+    words.set_axis_off()
+    words.set(xticks=[], yticks=[])
+    words.text(0, 0.95, "\n".join(_data(plant)), va="top", fontsize=style.SMALL, color=style.INK)
+    return figure
+
+
+def animate(
+    plant: Plant,
+    time: Array,
+    motions: Mapping[str, Array],
+    path: str | Path,
+    *,
+    seconds: float = 10.0,
+) -> Path:
+    """Write motions of a mechanism over each other as a GIF, in real time.
+
+    Args:
+        plant: the mechanism.
+        time: [s], (time,).
+        motions: positions in joint coordinates by name, (time, joint); "measured" is drawn broad
+            and grey. A motion vanishes where it is not finite.
+        path: of the file.
+        seconds: drawn at most.
+    """
+    from matplotlib.animation import FuncAnimation, PillowWriter  # slow to import
+
+    views = _views(plant)
+    if plant.unit == "m":
+        known = np.concatenate([np.abs(q[np.isfinite(q)]) for q in motions.values()])
+        views = [views[0]._replace(reach=float(known.max(initial=1e-3)))]
+    figure, axes = style.panels(1, len(views), style.COLUMN * len(views), 3.0)
+    looks = style.looks(name for name in motions if name != MEASURED)
+    lines = {}
+    for name in motions:
+        look = (
+            {"color": style.FAINT, "linewidth": 6.0}
+            if name == MEASURED
+            else _line(looks[name].line["color"])
+        )
+        lines[name] = [ax.plot([], [], **look)[0] for ax in axes[0]]
+    for ax, view in zip(axes[0], views, strict=True):
+        _frame(ax, view, plant)
+    clock = axes[0, -1].text(
+        0.02, 0.93, "", transform=axes[0, -1].transAxes, fontsize=style.SMALL, color=style.INK
+    )
+    handles: list[Line2D] = [of[0] for of in lines.values()]
+    style.legend(figure, handles, list(motions))
+    end = min(float(time[-1]), float(time[0]) + seconds)
+    frames = np.searchsorted(time, np.arange(float(time[0]), end, 1 / _FRAMES_A_SECOND))
+
+    def draw(frame: int) -> Sequence[Line2D]:
+        for name, q in motions.items():
+            for line, view in zip(lines[name], views, strict=True):
+                line.set_data(*view.points(q[frame]).T)
+        clock.set_text(f"{time[frame] - time[0]:.1f} s")
+        return handles
+
+    moving = FuncAnimation(figure, draw, frames=frames.tolist())
+    with atomic_write(path) as temporary:
+        gif = temporary.with_suffix(".gif")
+        moving.save(gif, writer=PillowWriter(fps=_FRAMES_A_SECOND), dpi=_DPI)
+        gif.replace(temporary)
+    return Path(path)
+
+
+def _views(plant: Plant) -> list[_View]:
+    """Views of the mechanism: of an arm from above, and of links along it."""
+    if isinstance(plant, LinearAxis):
+        return [_View("", 1.0, lambda q: np.array([[q[0], 0.0]]))]
+    if not isinstance(plant, PendulumChain):
+        raise ValueError(f"no drawing is known of a {type(plant).__name__}.")
+    lengths, first = plant.length.detach().numpy(), plant.first_link
+
+    def links(q: Array) -> Array:
+        # Positive angles tilt a link against an arm's sense of turning.
+        angles = np.cumsum(q[first:])
+        ends = np.cumsum(lengths[:, None] * np.stack([-np.sin(angles), np.cos(angles)], -1), 0)
+        return np.concatenate([np.zeros((1, 2)), ends])
+
+    views = [_View("along the arm" if first else "", float(lengths.sum()), links)]
+    if first:
+        arm = float(plant.to_dict()["arm"]["length"])
+        views.insert(0, _View("from above", arm, lambda q: arm * np.array(
+            [[0.0, 0.0], [np.cos(q[0]), np.sin(q[0])]]
+        )))  # fmt: skip
+    return views
+
+
+def _centres(plant: PendulumChain) -> Array:
+    """Mass centres as shares of the links' lengths; none of a balanced rotor."""
+    if isinstance(plant, Rotor):
+        return np.array([0.5] * bool(plant.to_dict()["mass"]))
+    return np.divide(plant.to_dict()["com"], plant.length.detach().numpy())
+
+
+def _frame(ax: Axes, view: _View, plant: Plant) -> None:
+    style.title(ax, view.title)
+    ax.set_aspect("equal")
+    for limit in (ax.set_xlim, ax.set_ylim):
+        limit(-1.15 * view.reach, 1.15 * view.reach)
+    ax.set_xlabel("[m]")
+    if isinstance(plant, LinearAxis):
+        ax.axhline(0, color=style.FAINT, linewidth=1.0)
+        ax.set_yticks([])
+    elif isinstance(plant, Rotor) and not plant.to_dict()["mass"]:
+        ax.add_patch(Circle((0, 0), view.reach, fill=False, edgecolor=style.FAINT))
+        ax.set(xticks=[], yticks=[], xlabel="not to scale")
+
+
+def _line(colour: str) -> dict[str, object]:
+    return {"color": colour, "linewidth": 2.5, "marker": "o", "markersize": 6.0}
+
+
+def _data(plant: Plant) -> list[str]:
+    """The plant's numbers in words, a line each."""
+    lines, given = [plant.name or "unnamed", ""], plant.to_dict()
+    if isinstance(plant, LinearAxis):
+        lines.append(f"moving mass {given['mass']:.4g} kg")
+    elif isinstance(plant, Rotor):
+        units = {"inertia": "kg m² about the axis", "mass": "kg", "com": "m to the mass centre"}
+        lines += [f"{key} {given[key]:.4g} {unit}" for key, unit in units.items() if given[key]]
+    elif isinstance(plant, PendulumChain):
+        if plant.first_link:
+            lines.append(f"arm: {given['arm']['length']:.4g} m")
+        for k in range(plant.links):
+            mass, length, com = (given[key][k] for key in ("mass", "length", "com"))
+            lines += [
+                f"{plant.joint_names[k + plant.first_link]}: {mass:.4g} kg",
+                f"    length {length:.4g} m, mass centre at {com:.4g} m",
+            ]
+        lines += ["", "× mass centres"]
+    return lines
