@@ -145,16 +145,16 @@ class _Walk:
             parts.append(value)
         elif kind is float or kind is complex:
             parts.append(repr(value))  # tells signs of zero apart, and NaN equals itself
-        elif kind in _TENSORS or isinstance(value, np.ndarray | np.generic):
+        elif kind in _TENSORS or kind is np.ndarray or isinstance(value, np.generic):
             parts += (value.shape, value.dtype, content(value))
         elif self._is_new(id(value)):
             self._compound(kind, value)
 
     def _is_new(self, *key: Hashable) -> bool:
         """False where the same was met before, so that circles end."""
-        before = self.seen.setdefault(key, len(self.seen))
-        self.parts.append(before)
-        return before == len(self.seen) - 1
+        new = key not in self.seen
+        self.parts.append(self.seen.setdefault(key, len(self.seen)))
+        return new
 
     def _compound(self, kind: type, value: Any) -> None:
         if isinstance(value, nn.Module):
@@ -171,7 +171,8 @@ class _Walk:
         elif isinstance(value, type):
             self._class(value)
         elif isinstance(value, enum.Enum):
-            self.parts.append(value.name)
+            self._class(kind)
+            self._mapping(vars(value))
         elif kind is types.BuiltinFunctionType and _is_constant(_home(value)):
             self.parts.append(value)
         elif kind is types.ModuleType and _is_constant(value.__name__):
@@ -264,6 +265,8 @@ class _Walk:
                 for name, value in vars(base).items():
                     # Of the names that Python gives, functions alone compute something.
                     given = name.startswith("__") or name == "_abc_impl"
+                    if issubclass(base, enum.Enum):
+                        given = name.startswith("_") and name != "_member_map_"
                     if not given or isinstance(value, types.FunctionType):
                         self.parts.append(name)
                         self.add(value)

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import gzip
 import hashlib
+import http.client
 import json
-import urllib.error
 import urllib.parse
 import urllib.request
 from collections.abc import Mapping
@@ -21,6 +21,8 @@ import numpy as np
 import pandas as pd
 from scipy.io import loadmat
 from scipy.signal import savgol_filter
+
+from nfriction.io.files import write_atomically
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,7 @@ def fetch(name: str, folder: Path) -> Fetched:
             _download(address, path)
         try:
             table, state = _CONVERT[chosen.source](path, recording)
-        except (KeyError, TypeError, ValueError, NotImplementedError) as error:
+        except Exception as error:
             raise ValueError(
                 f"'{path}' is not what {address} contains ({type(error).__name__}: {error}); "
                 "delete it and fetch it again."
@@ -99,9 +101,10 @@ def fetch(name: str, folder: Path) -> Fetched:
         if hashlib.sha256(text).hexdigest() != digest:
             differing.append(recording)
         tables.append(folder / f"{recording}.csv.gz")
-        tables[-1].write_bytes(gzip.compress(text, mtime=0))
+        write_atomically(tables[-1], gzip.compress(text, mtime=0))
         rows.append({"id": recording, "file": tables[-1].name, "source": address, **state})
-    pd.DataFrame(rows).to_csv(folder / "recordings.csv", index=False)
+    states = pd.DataFrame(rows).to_csv(index=False, lineterminator="\n")
+    write_atomically(folder / "recordings.csv", states.encode())
     return Fetched(tuple(tables), tuple(differing))
 
 
@@ -109,15 +112,12 @@ def _download(address: str, path: Path) -> None:
     try:
         with urllib.request.urlopen(address, timeout=60) as answer:
             content = answer.read()
-    except (urllib.error.URLError, TimeoutError) as error:
+    except (OSError, http.client.HTTPException) as error:
         raise OSError(
             f"cannot fetch {address} ({error}); fetch it where there is a network, save it as "
             f"'{path}' and repeat the command."
         ) from error
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.name}.part")
-    part.write_bytes(content)
-    part.replace(path)
+    write_atomically(path, content)
 
 
 def _csv(table: pd.DataFrame, digits: Mapping[str, str]) -> bytes:

@@ -21,6 +21,18 @@ RUNNING = iter([1.0])
 class Grade(enum.Enum):
     THIN = 1
     THICK = 2
+    LISTED = [1.0]  # noqa: RUF012
+
+    def known(self):
+        return KNOBS["list"]
+
+
+class Finish(str, enum.Enum):
+    FINE = "fine"
+
+
+class Tagged(np.ndarray):
+    pass
 
 
 class Slotted:
@@ -92,6 +104,17 @@ def test_what_functions_read_is_followed():
         torch.set_default_dtype(precise)
 
 
+def test_members_of_an_enumeration_are_followed_to_what_they_compute():
+    for value in (Grade.THIN, Grade):
+        for changed in (KNOBS["list"], Grade.LISTED.value):
+            before = fingerprint((), value)
+            changed.append(2.0)
+            assert fingerprint((), value) != before
+            changed.pop()
+            assert fingerprint((), value) == before
+    assert fingerprint((), Finish.FINE) == fingerprint((), Finish.FINE)
+
+
 def _opens():
     return open("settings")
 
@@ -115,6 +138,8 @@ def _runs():
         (functools.lru_cache(_runs), "lru_cache"),
         (list(range(30_000)), "values"),
         (np.array([[], None], dtype=object), "array of objects"),
+        (np.zeros(2).view(Tagged), "Tagged"),
+        (np.ma.array([1.0]), "MaskedArray"),
         (torch.eye(2).to_sparse(), "layout"),
         (torch.Generator(), "Generator"),
         (Slotted(), "Slotted"),

@@ -1,8 +1,12 @@
 """Public recordings: originals as their authors lay them out become the tables of the cards."""
 
+import http.client
+import io
 import json
+import threading
 import urllib.error
 import urllib.request
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -92,6 +96,50 @@ def test_without_a_network_the_address_and_the_place_are_named(tmp_path: Path) -
     with pytest.raises(OSError, match=r"githubusercontent.com/forgi86.*DATA_EMPS.mat.*save it as"):
         fetch("emps", tmp_path)
     assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("failure", [http.client.IncompleteRead(b"x"), ConnectionResetError()])
+def test_a_download_that_breaks_off_is_named(
+    failure: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Answer(io.BytesIO):
+        def read(self, _: int | None = None) -> bytes:
+            raise failure
+
+    monkeypatch.setattr(urllib.request, "urlopen", lambda *_, **__: Answer())
+    with pytest.raises(OSError, match=r"DATA_EMPS.mat.*save it as"):
+        fetch("emps", tmp_path)
+    assert not any(tmp_path.iterdir())
+
+
+def test_part_of_an_original_is_refused(tmp_path: Path) -> None:
+    path = put(tmp_path, "emps", "emps_first")
+    scipy.io.savemat(path, {"qm": np.linspace(0.0, 1.0, 1000) ** 2}, do_compression=True)
+    whole = path.read_bytes()
+    for content in (b"", whole[:200]):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match="fetch it again"):
+            fetch("emps", tmp_path)
+
+
+def test_downloads_of_the_same_at_the_same_time_do_not_meet(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    together = threading.Barrier(2)
+    written = Path.write_bytes
+
+    def write(path: Path, content: bytes) -> int:
+        count = written(path, content)
+        together.wait(10)
+        return count
+
+    monkeypatch.setattr(urllib.request, "urlopen", lambda *_, **__: io.BytesIO(b"<html>"))
+    monkeypatch.setattr(Path, "write_bytes", write)
+    with ThreadPoolExecutor(2) as both:
+        found = [both.submit(fetch, "emps", tmp_path) for _ in range(2)]
+    for one in found:
+        with pytest.raises(ValueError, match="fetch it again"):
+            one.result()
 
 
 def test_another_file_is_refused(tmp_path: Path) -> None:
