@@ -5,11 +5,13 @@ import json
 import shutil
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, NoReturn
 
+import numpy as np
 import torch
+from matplotlib.ticker import MaxNLocator
 
 from nfriction.evaluation.results import model_info
 from nfriction.evaluation.score import score
@@ -20,6 +22,7 @@ from nfriction.io.model_file import ModelInfo, save
 from nfriction.papers import twin
 from nfriction.papers.reproduction.workspace import Bench, Settings, Workspace, smoothed
 from nfriction.plant import Plant, rigs
+from nfriction.plots import style
 from nfriction.recording import Recording
 from nfriction.recording.angles import AngleConvention
 
@@ -116,8 +119,10 @@ def finish(given: argparse.Namespace, bench: Bench, found: FitResult) -> str:
 def write(
     given: argparse.Namespace, bench: Bench, model: FrictionModel, info: ModelInfo, plant: Plant
 ) -> str:
-    """Write a model and its TorchScript, and report its errors."""
+    """Write a model, its TorchScript and a figure of the loss by step, and report its errors."""
     name = type(model).__name__
+    kept = json.loads((given.out / "checkpoints" / "stages" / f"{name}-losses.json").read_text())
+    draw_losses(kept["result"], given.out / f"{name}-loss.png")
     path = save(model, given.out / f"{name}.json", info)
     torchscript(model, path.with_suffix(".pt"), info)
     lines = [f"{name}: {info.fit.get('status', 'made')}"]
@@ -129,7 +134,27 @@ def write(
             f"{recording.name}, {split}: position RMSE of the free run by joint {joints} "
             f"m{plant.unit}"
         )
-    return "\n".join([*lines, f"wrote {path} and {path.with_suffix('.pt')}"])
+    return "\n".join([*lines, f"wrote {path}, {path.with_suffix('.pt')} and {name}-loss.png"])
+
+
+def draw_losses(losses: Mapping[str, Sequence[float]], path: Path) -> None:
+    """Draw the loss over the steps of a training, a line a part of it.
+
+    Parts differ in what they sum over, so that each is shown relative to its first loss.
+    """
+    figure, axes = style.panels(1, 1, style.PAGE, 2.4)
+    looks, ax = style.looks(losses), axes[0, 0]
+    for part, values in losses.items():
+        steps = np.arange(1, len(values) + 1)
+        ax.plot(steps, np.array(values) / values[0], **looks[part].line | {"marker": "."})
+    if min(min(values) / values[0] for values in losses.values()) < 0.1:
+        ax.set_yscale("log")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.set_xlabel("step")
+    ax.set_ylabel("loss over the first [-]")
+    style.legend(figure, [looks[part].handle for part in losses], list(losses))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=150)
 
 
 def _end(folder: Path) -> NoReturn:

@@ -6,7 +6,7 @@
 The data set is `tlrip_controller`: 40,000 samples a joint of velocity, acceleration and the outputs
 of the papers' own controllers, coefficients B and C of the linear law. `--adaptive` takes
 controllers that the coefficients by class of an adaptive model span instead, of any law, along the
-same motion. Writes the model with its TorchScript, a figure of the error by step and one of what
+same motion. Writes the model with its TorchScript, a figure of the loss by step and one of what
 the networks learnt. A run takes about a minute and starts again after an interruption.
 """
 
@@ -51,14 +51,13 @@ def train(argv: Sequence[str] | None) -> str:
     parser.add_argument("--out", type=Path, default=Path("runs/supervised"), help="folder to write")
     given = parser.parse_args(argv)
     law, controllers, samples = _data(given)
-    losses: list[list[float]] = []
+    losses: dict[str, list[float]] = {}
 
     def keep(state: EvidenceState) -> None:
         # The training of each joint counts its steps from 1.
         if state.step == 1:
-            losses.append([])
-        # The noise is relative to half the range of an output.
-        losses[-1].append(50.0 * (0.5 / state.beta) ** 0.5)
+            losses[samples.joint_names[len(losses)]] = []
+        losses[[*losses][-1]].append(0.5 / state.beta)
 
     options = TrainingOptions(
         max_steps=given.max_steps, seed=given.seed, starts=given.starts, callback=keep
@@ -78,11 +77,8 @@ def train(argv: Sequence[str] | None) -> str:
     learnt = model.schedule(samples.x[..., 0], samples.x[..., 1])
     span = samples.y.amax(0) - samples.y.amin(0)
     error = (learnt - samples.y).square().mean(0).sqrt() / span
-    for name, figure in (
-        ("loss", _loss(losses, samples.joint_names)),
-        ("outputs", _outputs(samples, learnt)),
-    ):
-        figure.savefig(given.out / f"{path.stem}-{name}.png", dpi=150)
+    common.draw_losses(losses, given.out / f"{path.stem}-loss.png")
+    _outputs(samples, learnt).savefig(given.out / f"{path.stem}-outputs.png", dpi=150)
     lines = [
         f"{path.stem}: {len(samples)} samples a joint, {given.units} units",
         *ended,
@@ -119,19 +115,6 @@ def _data(
     )
     again = sampled(controllers, motion, joint_names=samples.joint_names)
     return adaptive.law, controllers, again
-
-
-def _loss(losses: Sequence[Sequence[float]], joints: Sequence[str]) -> Figure:
-    """Estimated error of the outputs over the steps of the training, a line a joint."""
-    figure, axes = style.panels(1, 1, style.PAGE, 2.4)
-    looks, ax = style.looks(joints), axes[0, 0]
-    for joint, values in zip(joints, losses, strict=False):
-        ax.plot(range(1, len(values) + 1), values, **looks[joint].line)
-    ax.set_yscale("log")
-    ax.set_xlabel("step of Bayesian regularisation")
-    ax.set_ylabel("error [% of the range]")
-    style.legend(figure, [looks[joint].handle for joint in joints], list(joints))
-    return figure
 
 
 def _outputs(samples: ControllerSamples, learnt: torch.Tensor) -> Figure:

@@ -97,8 +97,8 @@ def run_export(arguments: argparse.Namespace) -> int:
         raise UsageError("--patch takes one of mjcf and urdf in --format.")
     if len(arguments.cutoff) != 1:
         raise UsageError("--cutoff takes one number.")
-    if arguments.online and ("c" not in arguments.format or len(arguments.online) != 1):
-        raise UsageError("--online takes one number, and needs c in --format.")
+    if arguments.online and (len(arguments.online) != 1 or "c" not in arguments.format):
+        raise UsageError("--online takes one number, with c in --format.")
     model, info = load(arguments.model), load_info(arguments.model)
     check_writable(arguments.out)
     for target in arguments.format:

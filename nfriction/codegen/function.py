@@ -25,9 +25,9 @@ from nfriction.codegen.llvm.emit import write_function
 from nfriction.codegen.transform import hoist, with_jacobian
 
 _CHECK_TOLERANCE = 1e-10
-# Kernels kept in memory by what they compute, with the shapes of their outputs: fits of one law to
-# parts of the data, or from several starts, share theirs.
-_KEPT = 8
+# Kernels kept in memory by what they compute, with the shapes of their outputs: fits to parts of
+# the data, or from several starts, share theirs. Six laws have twelve, of some ten megabytes each.
+_KEPT = 16
 _known: OrderedDict[Hashable, tuple[Kernel, dict[str, tuple[int, ...]]]] = OrderedDict()
 
 

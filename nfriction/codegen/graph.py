@@ -18,7 +18,6 @@ import torch
 from torch import Tensor, nn
 from torch.utils._mode_utils import no_dispatch
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves, tree_map
 
 from nfriction.codegen.errors import UnsupportedOperation
 from nfriction.codegen.operations import OPERATIONS, constants
@@ -103,7 +102,9 @@ class _Rules:
         kwargs = kwargs or {}
         if torch.Tag.nondeterministic_seeded in func.tags:
             raise UnsupportedOperation(_name(func), "draws random numbers")
-        tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
+        tensors: list[Tensor] = []
+        for value in (*args, *kwargs.values()):
+            _each(lambda x: tensors.append(x) if isinstance(x, Tensor) else None, value)
         traced = [tensor for tensor in tensors if isinstance(tensor, ScalarTensor)]
         if traced:
             return _interpret(self, func, args, kwargs, traced)
@@ -146,8 +147,13 @@ def _interpret(
     def example_of(leaf: Any) -> Any:
         return leaf.example if isinstance(leaf, ScalarTensor) else leaf
 
-    nodes = operation(graph, *tree_map(nodes_of, args), **tree_map(nodes_of, kwargs))
-    example = func(*tree_map(example_of, args), **tree_map(example_of, kwargs))
+    def given(function: Callable[[Any], Any]) -> tuple[list[Any], dict[str, Any]]:
+        return _each(function, args), {name: _each(function, x) for name, x in kwargs.items()}
+
+    own, named = given(nodes_of)
+    nodes = operation(graph, *own, **named)
+    own, named = given(example_of)
+    example = func(*own, **named)
     if torch.Tag.inplace_view in func.tags:
         return _reshape_in_place(args[0], nodes, func, args, kwargs)
     if in_place:
@@ -156,6 +162,13 @@ def _interpret(
         wrapped = [_wrap(n, e, graph, name, leaves) for n, e in zip(nodes, example, strict=True)]
         return type(example)(wrapped)
     return _wrap(nodes, example, graph, name, leaves)
+
+
+def _each(function: Callable[[Any], Any], value: Any) -> Any:
+    """The function of a value, or of each in lists; torch's own `tree_map` takes half a trace."""
+    if isinstance(value, (list, tuple)):
+        return [_each(function, x) for x in value]
+    return function(value)
 
 
 def _wrap(

@@ -111,7 +111,8 @@ class Graph:
 
     def apply(self, op: str, *args: Node) -> Node:
         """The simplified value of `op` on `args`."""
-        if all(a.op == "constant" for a in args):
+        rate = max([a.rate for a in args])
+        if rate == UpdateRate.CONSTANT:
             with np.errstate(all="ignore"):
                 folded = EVALUATE[op](*(np.asarray(a.value) for a in args))
             return self.constant(folded.item())
@@ -122,7 +123,7 @@ class Graph:
         # In one order, so that a + b and b + a are one node.
         if op in _COMMUTATIVE and args[0].number > args[1].number:
             args = args[::-1]
-        return self._intern(op, args, None, max(a.rate for a in args))
+        return self._intern(op, args, None, rate)
 
     def total(self, terms: Sequence[Node], op: str = "add") -> Node:
         """`terms` folded by `op` as a balanced tree: less rounding, more parallelism."""

@@ -33,22 +33,23 @@ def with_jacobian(program: Program, wrt: Sequence[str]) -> Program:
     outputs = [node for port in program.outputs for node in port.nodes]
     one, zero = graph.constant(1.0), graph.constant(0.0)
     named = {port.name: port for port in program.inputs}
+    needed = reachable(outputs)
     columns = [
-        tangents(graph, outputs, {node.number: one}) for name in wrt for node in named[name].nodes
+        tangents(graph, needed, {node.number: one}) for name in wrt for node in named[name].nodes
     ]
     entries = tuple(column.get(node.number, zero) for node in outputs for column in columns)
     jacobian = Port("jacobian", (len(outputs), len(columns)), entries)
     return Program(graph, program.inputs, (*program.outputs, jacobian))
 
 
-def tangents(graph: Graph, outputs: Iterable[Node], seed: Tangents) -> dict[int, Node]:
-    """Derivative of every node that `outputs` need along one direction.
+def tangents(graph: Graph, nodes: Iterable[Node], seed: Tangents) -> dict[int, Node]:
+    """Derivatives of nodes along one direction.
 
     What does not depend on the direction is left out, so its derivative is zero and costs nothing.
 
     Args:
         graph: the graph to extend.
-        outputs: nodes whose derivatives are wanted.
+        nodes: those whose derivatives are wanted, with all that they need, arguments first.
         seed: derivative of input nodes along the direction, by node number.
 
     Returns:
@@ -58,7 +59,7 @@ def tangents(graph: Graph, outputs: Iterable[Node], seed: Tangents) -> dict[int,
         UnsupportedOperation: an operation without a rule lies on the way, named.
     """
     found = dict(seed)
-    for node in reachable(outputs):
+    for node in nodes:
         # Comparisons jump: their derivative is zero wherever they have one.
         if not any(a.number in found for a in node.args) or is_predicate(node):
             continue

@@ -172,7 +172,7 @@ class Comparison:
     def limit(
         self, horizon: str | None = None, column: str = "all", *, part: Part = "test"
     ) -> float | None:
-        """Error that the uncertainty of the start alone may cause, in the best model's simulations.
+        """Error that start and torque may cause by their noise, in the best model's simulations.
 
         Smaller differences between models are not meaningful.
 

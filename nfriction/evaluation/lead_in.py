@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from nfriction.fitting.result.of_search import white_noise
 from nfriction.friction.memory import states_along
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
@@ -39,8 +40,8 @@ FEWEST = 8  # samples
 # Friction that needs more integration steps to a sample than this is a wall: scoring it would take
 # minutes, and the search that found it has failed anyhow.
 MOST_SUBSTEPS = 100
-# Starts drawn for the limit. The true start is one more like them, so that it errs by less than the
-# worst of them in 39 of 40 cases.
+# Starts drawn for the limit, each with noise of the torque. The true start is one more like them,
+# so that it errs by less than the worst of them in 39 of 40 cases.
 DRAWS = 39
 # Samples of draws that are simulated together: a long recording of many takes much memory.
 DRAWN_SAMPLES = 2**20
@@ -126,6 +127,9 @@ class Simulator:
         self.substeps: int | None = math.ceil(recording.longest_step / STOP_STEP)
         if scheme != "time_stepping":
             self.substeps = _substeps(plant, friction, recording)
+        self.torque_sd = torch.zeros(plant.joints, dtype=torch.float64)
+        if recording.tau is not None:
+            self.torque_sd = white_noise(torch.tensor(recording.tau)[None])
         self.states: torch.Tensor | None = None
         self.law_states: torch.Tensor | None = None
         # Those of a controller at every sample, from which windows go on.
@@ -192,7 +196,7 @@ class Simulator:
         at_once = max(1, DRAWN_SAMPLES // samples.size)
         # Where the run itself diverged there is no limit.
         for k in range(0, self.draws if np.isinf(diverged_at).all() else 0, at_once):
-            drawn, _ = self.simulate(state + starts.deviations[k : k + at_once], samples)
+            drawn, _ = self.simulate(state + starts.deviations[k : k + at_once], samples, noise=k)
             apart = (self._as_read(drawn, measured) - q)[:, :, scored]
             squares[k : k + at_once] = np.mean(apart**2, axis=(1, 2))
         return Runs(
@@ -210,12 +214,16 @@ class Simulator:
         rounding = (self.plant.position_quantum or 0.0) ** 2 / 12
         return np.mean(np.maximum(starts.noise**2 - rounding, 0.0), axis=0)
 
-    def simulate(self, states: Array, samples: NDArray[np.intp]) -> tuple[Array, Array]:
+    def simulate(
+        self, states: Array, samples: NDArray[np.intp], noise: int | None = None
+    ) -> tuple[Array, Array]:
         """Positions (*batch, window, sample, joint), and when they diverged (*batch, window).
 
         Args:
             states: positions and velocities at the first samples, (*batch, window, 2 joint).
             samples: (window, sample).
+            noise: seed of noise that is added to the torque, as large as the recorded one; None
+                for none.
         """
         joints, first_link = self.plant.joints, self.plant.first_link
         if self.substeps is None:
@@ -226,6 +234,10 @@ class Simulator:
         # Copies, because a recording's arrays are read-only, which tensors cannot be.
         held = samples[:, :-1]
         tau = None if self.recording.tau is None else torch.tensor(self.recording.tau[held])
+        if tau is not None and noise is not None:
+            random = np.random.default_rng([noise, 1])
+            shape = (*states.shape[:-1], *tau.shape[1:])
+            tau = tau + self.torque_sd * torch.tensor(random.standard_normal(shape))
         step = torch.tensor(np.diff(self.time)[held])
         memory, law_state = (
             None if x is None else x[samples[:, 0]] for x in (self.states, self.law_states)

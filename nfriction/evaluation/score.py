@@ -49,7 +49,6 @@ class RMSE:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON; a diverged simulation has null for a number."""
-        # JSON has no infinity.
         values = [x if np.isfinite(x) else None for x in (*self.joints, self.all)]
         return {"joints": values[:-1], "all": values[-1]}
 
@@ -80,9 +79,9 @@ class Score(Errors):
     """Errors of one model on one recording; they are plain data, without plant or model.
 
     Attributes:
-        limit: errors that the uncertainty of the start alone may cause, in simulations of this
-            model; None where it was not asked for. The true model stays below in 95 of 100
-            recordings; smaller differences between models are not meaningful.
+        limit: errors that the uncertainty of the start and the noise of the torque may cause, in
+            simulations of this model; None where it was not asked for. The true model stays below
+            in 95 of 100 recordings; smaller differences between models are not meaningful.
         recording: its name.
         time, simulated: the free run with its lead-ins, in the recording's coordinates, for
             figures; NaN between gaps that leave no room for a lead-in.
@@ -140,12 +139,9 @@ def score(
             f"{recording.name or 'the recording'} is too short to be scored: its longest stretch "
             f"without a gap must be longer than the lead-in of {LEAD_IN:g} s."
         )
-    windows = {}
     # Short windows show the torque law, long ones how its errors add up.
-    for horizon in horizons:
-        run_windows = simulator.windows(horizon)
-        if run_windows is not None:
-            windows[f"{horizon:g}"] = run_windows
+    found = {f"{horizon:g}": simulator.windows(horizon) for horizon in horizons}
+    windows = {horizon: run for horizon, run in found.items() if run is not None}
     simulated = np.full_like(recording.q, np.nan)
     for run in runs:
         simulated[run.samples] = run.q

@@ -14,6 +14,7 @@ Value = str | float
 Sets = Mapping[str, Mapping[str, Sequence[float]]]
 # A positive coefficient at its bound is 1e-12 of its unit.
 ZERO = 1.001e-12
+_WIDEST = 8  # coefficients side by side
 
 
 @dataclass(frozen=True)
@@ -145,6 +146,8 @@ def coefficient_table(
 ) -> Table:
     """Coefficients by joint, and by where they apply if they follow the motion.
 
+    Joints are rows; many constants, as of a law with memory, are rows themselves.
+
     Args:
         model: its name.
         joints: names.
@@ -153,13 +156,16 @@ def coefficient_table(
     """
     names = list(next(iter(sets.values()), {}))
     follows = list(sets) != ["always"]
+    heads = [f"{name} [{units[name]}]" if name in units else name for name in names]
+    caption = f"Coefficients of {model}" + (" (they follow the motion)" if follows else "")
     rows: list[tuple[Value, ...]] = []
+    if len(names) > _WIDEST and not follows:
+        rows += [(head, *sets["always"][name]) for head, name in zip(heads, names, strict=True)]
+        return Table(caption, ("coefficient", *joints), tuple(rows))
     for j, joint in enumerate(joints):
         for label, of in sets.items():
             values = [of[name][j] if name in of else math.nan for name in names]
             rows.append((joint, *([label.replace("_", " ")] if follows else []), *values))
-    heads = [f"{name} [{units[name]}]" if name in units else name for name in names]
-    caption = f"Coefficients of {model}" + (" (they follow the motion)" if follows else "")
     return Table(caption, ("joint", *(["applies"] if follows else []), *heads), tuple(rows))
 
 

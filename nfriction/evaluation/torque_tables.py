@@ -205,7 +205,9 @@ class TorqueFits:
                     label = f"{symbol} of {joint}"
                     i = known.get(label)
                     note = "not identifiable" if label in unknown else ""
-                    low, high = (i.low, i.high) if i else (math.nan, math.nan)
+                    # Ends that nothing bounds are left blank.
+                    ends = (i.low, i.high) if i else (math.nan, math.nan)
+                    low, high = (x if math.isfinite(x) else math.nan for x in ends)
                     label += "" if where == "always" else f", {where.replace('_', ' ')}"
                     rows.append((own, label, value, low, high, note))
         columns = ["model", "parameter", "value", "low", "high", "note"]

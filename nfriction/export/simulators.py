@@ -12,7 +12,6 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import torch
-from scipy.optimize import nnls
 from torch import Tensor
 
 from nfriction.friction.models import FrictionModel
@@ -208,6 +207,8 @@ def _torque(model: FrictionModel, motion: Motion, load: Load | None) -> Tensor:
 
 def _fit(columns: np.ndarray, tau: np.ndarray, joint: int) -> tuple[float, float]:
     """Damping and friction loss, neither negative: a simulator must not gain energy."""
+    from scipy.optimize import nnls  # slow to import
+
     sizes = np.sqrt((columns**2).mean(0))
     if not (np.isfinite(tau).all() and np.isfinite(sizes).all() and (sizes > 0).all()):
         raise ValueError(f"joint {joint + 1} stands still along the motion, or it is not finite.")

@@ -156,6 +156,9 @@ class FitOptions:
     prior_shares: tuple[float, ...] = (1.0, 1 / 3)
     # Updates of the priors of a network's groups by evidence; each searches on from the last.
     evidence_updates: int = 3
+    # Log ratio of evidences that is worth mentioning: half the logarithm of 10 (H. Jeffreys,
+    # Theory of Probability, 3rd ed. 1961, appendix B).
+    evidence_gain: float = 0.5 * math.log(10.0)
 
     # --- Extrapolation prior of a network.
     # Grid cells along velocity and acceleration, cells around a visited one that count as

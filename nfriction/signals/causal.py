@@ -60,7 +60,6 @@ def period_counting(
     counts_per_revolution: float,
     *,
     offset: float = 0.0,
-    edge_time: ArrayLike | None = None,
 ) -> Array:
     """Causal velocity from the time between encoder edges, accurate at low speed.
 
@@ -74,18 +73,12 @@ def period_counting(
         q: position [rad], shape (time, joint); quantised here, which leaves counts as they are.
         counts_per_revolution: counts after quadrature.
         offset: position of one count's centre [rad].
-        edge_time: time of the last edge at or before each sample [s], shape like `q`, where the
-            hardware latches it; without it edges are known to the sample clock.
     Returns:
         Velocity [rad/s], shape (time, joint).
     """
     time, q = check_motion(time, q)
     quantum = _quantum(counts_per_revolution)
     counts = np.rint((q - offset) / quantum)
-    latched = np.broadcast_to(time[:, None], q.shape) if edge_time is None else edge_time
-    latched = np.asarray(latched, dtype=np.float64)
-    if latched.shape != q.shape:
-        raise ValueError(f"`edge_time` must be shaped like `q` {q.shape}, got {latched.shape}.")
     velocity = np.zeros_like(q)
     for joint in range(q.shape[1]):
         step = np.diff(counts[:, joint])
@@ -95,9 +88,7 @@ def period_counting(
             continue
         # An edge lies half a count before the new count, on the side it came from.
         place = counts[edges, joint] - 0.5 * np.sign(step[edges - 1])
-        moment = latched[edges, joint]
-        if np.any(np.diff(moment) <= 0):
-            raise ValueError("`edge_time` must increase from edge to edge.")
+        moment = time[edges]
         at_edge = quantum * np.diff(place) / np.diff(moment)
         # For every sample the number of the last edge, counted from the second one on.
         last = np.searchsorted(edges, np.arange(len(q)), side="right") - 2

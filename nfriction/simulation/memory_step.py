@@ -88,7 +88,8 @@ def memory_step(
     moved = law.advance(at_ease, zero + SLOW, load, coefficients, step)
     # A constant offset of the torque is no part of the slope.
     offset = law.torque(at_ease, zero, load, coefficients)
-    steepest = (law.torque(moved, zero + SLOW, load, coefficients) - offset) / SLOW
+    # Friction that falls over the first displacement is taken as flat: it would not stabilise.
+    steepest = ((law.torque(moved, zero + SLOW, load, coefficients) - offset) / SLOW).clamp(min=0.0)
     stiffness = step * torch.stack([row[j] for j, row in enumerate(mobility)], -1) * steepest
     theta = (1.0 + stiffness) / (2.0 + stiffness)
     reach = theta * step

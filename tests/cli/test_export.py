@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nfriction import LFM, ModelInfo, Recording, cli, rigs, save
+from nfriction import LFM, NFLFM, ModelInfo, Recording, cli, rigs, save
 from nfriction.cli import export
 from nfriction.cli.console import Parser
 from nfriction.export.c_code.dialect import ControllerC
@@ -55,6 +55,22 @@ def test_to_controllers_and_back(
     said = capsys.readouterr().out
     assert "DIFFERENT" in said
     assert "lfm.pt IS NOT other.json" in said
+
+
+def test_the_papers_network_is_also_written_to_learn_online(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = save(NFLFM(2, network="rbf"), tmp_path / "arm.json")
+    words = ["export", str(path), "--out", str(tmp_path), "--online", "0.02"]
+    assert cli.main([*words, "--format", "c"]) == 0
+    assert "arm_online_learn(" in (tmp_path / "arm_online.h").read_text("ascii")
+    capsys.readouterr()
+    assert cli.main(words) == 2
+    assert "--online takes one number, with c in --format" in capsys.readouterr().err
+    other = save(LFM(2), tmp_path / "lfm.json")
+    failed = cli.main(["export", str(other), *words[2:], "--format", "c"])
+    assert failed
+    assert 'network="rbf"' in capsys.readouterr().err
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="needs a C compiler")
@@ -150,7 +166,7 @@ def test_a_recording_in_degrees_with_names_of_its_own_gives_the_same(
         (["--torque-limit", "1,2"], "torque_limit"),
         (["--cutoff", "1,2"], "takes one number"),
         (["--with-filter", "--cutoff", "900"], "cutoff_hz"),
-        (["--online", "0.1"], "--online takes one number, and needs c"),
+        (["--online", "0.1"], "--online takes one number, with c in"),
         (["--online", "0.1,0.2", "--format", "c"], "--online takes one number"),
     ],
 )

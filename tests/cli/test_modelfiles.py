@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from nfriction import LFM, NFLFM, ModelInfo, cli, load, save
+from nfriction.friction import model_by_name
 from tests.cli.benches import QUICK
 
 
@@ -72,3 +73,17 @@ def test_info_of_a_file_that_says_little(
     # An untrained network deviates nowhere from its reference.
     for row in ("joint2  at rest", "joint2  reference"):
         assert values(said, row) == pytest.approx([3.0, 4.0])
+
+
+def test_info_of_many_coefficients_fits_a_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = model_by_name("slip")(2)
+    file = save(model, tmp_path / "slip.json", ModelInfo(sample_time=1e-3))
+    assert cli.main(["info", str(file)]) == 0
+    said = capsys.readouterr().out
+    for k, coefficient in enumerate(model.law.coefficients):
+        (row,) = (line for line in said.splitlines() if line.startswith(f"{coefficient.name} "))
+        shown = [float(word) for word in row.split()[-2:]]
+        assert shown == pytest.approx(model.schedule.values[:, k].tolist(), rel=1e-3)
+    assert max(map(len, said.splitlines())) <= 100

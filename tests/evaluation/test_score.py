@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction import LFM, PendulumChain, Recording, rollout, score
+from nfriction import CVFM, LFM, LinearAxis, PendulumChain, Recording, rollout, score
 from nfriction.evaluation.compare import Comparison
 from nfriction.evaluation.lead_in import Simulator, estimate_starts, lead_in_samples
 from nfriction.evaluation.score import RMSE, Score
@@ -188,6 +188,23 @@ def test_scores_of_the_true_model_are_below_the_limit():
 @pytest.mark.slow
 def test_scores_of_the_true_model_are_below_the_limit_in_95_of_100_releases():
     assert below_the_limit(range(100)) >= 95
+
+
+def test_the_limit_knows_the_noise_of_the_torque():
+    """A fine encoder on an axis: torques as recorded lead even the true law astray."""
+    axis = LinearAxis(0.1, position_quantum=1e-6)
+    friction = CVFM(1, [[0.3, 0.1]]).requires_grad_(False)
+    time, rest = 2e-3 * np.arange(1501), torch.zeros(1, dtype=torch.float64)
+    tau = np.sin(2 * np.pi * time)[:, None] + 0.5 * np.sin(7 * time)[:, None]
+    run = rollout(axis, friction, rest, rest, torch.tensor(tau[:-1]), sample_time=2e-3)
+    within = 0
+    for seed in range(6):
+        noise = 0.02 * np.random.default_rng(seed).standard_normal(tau.shape)
+        found = score(axis, friction, Recording(time, run.q.numpy(), tau + noise, unit="m"))
+        within += found.free_run.all <= found.limit.free_run.all
+        # Not by being wide.
+        assert found.limit.free_run.all < 10 * found.free_run.all
+    assert within >= 5
 
 
 def below_the_limit(seeds: Iterable[int]) -> int:

@@ -13,10 +13,13 @@ from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 
 import nfriction
-from nfriction import LinearAxis, Motor, PendulumChain, Rotor, cli, friction
+from nfriction import LinearAxis, Motor, PendulumChain, Rotor, cli, friction, rigs
+from tests.cli.benches import pendulum, swing
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
@@ -229,6 +232,33 @@ def test_pages_print_what_they_show(
                     found = [k for k in range(place, len(printed)) if shown_at(k, line, printed)]
                     assert found, f"{name} shows what no command prints: {' '.join(line)}"
                     place = found[0] + len(line)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("page", ["scikit_learn.md", "many_fits.md"])
+def test_python_of_pages_runs_from_top_to_bottom(
+    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("sklearn", reason="`pip install nfriction[sklearn]` to run this")
+    monkeypatch.chdir(tmp_path)
+    plant = pendulum()
+    rigs.write(plant, tmp_path / "rig.json")
+    recordings = [swing(f"run{k}", 0.6 + 0.2 * k) for k in range(6)]
+    for recording in recordings:
+        for folder in (tmp_path, tmp_path / "logs"):
+            folder.mkdir(exist_ok=True)
+            recording.write(folder / f"{recording.name}.csv")
+    given = recordings[0].to_pandas()
+    table = pd.DataFrame({"t": 1e3 * given["time"], "enc": np.rad2deg(given["q1"])})
+    known = {"table": table, "rig": plant, "train": recordings[:2], "test": recordings[2:3]}
+    ran = 0
+    for name, block in blocks("python"):
+        if name == page and "--8<--" not in block and "dask" not in block:
+            one_job = re.sub(r"jobs=-?\d+", "jobs=1", block)
+            exec(compile(one_job, page, "exec"), known)
+            ran += 1
+    assert ran > 1
 
 
 def shown_at(place: int, shown: list[str], printed: list[str]) -> bool:

@@ -236,6 +236,7 @@ def test_sets_move_and_the_evidence_rises_where_even_sets_are_wrong(
     assert moved.end.rms < 0.8 * held.end.rms
     pairs = zip(*(m.schedule.network.anfis.sets() for m in (model, even)), strict=True)
     assert min((new - old)[0, :3].abs().max() for new, old in pairs) > 0.05
+    assert "sets moved" in found.status
     gamma = found.to_dict()["effective_parameters"]
     assert set(gamma) >= {"set centres", "set widths", "head centres", "head widths"}
     assert all(0 <= value <= size for _, value, size in found.effective_parameters)

@@ -50,8 +50,8 @@ CASES = {
     [
         ("pendulum", "LFM"),
         ("axis", "Stribeck"),
-        ("axis", "MaxwellSlip"),
-        pytest.param("pendulum", "LuGre", marks=pytest.mark.slow),
+        ("axis", "LuGre"),
+        pytest.param("pendulum", "MaxwellSlip", marks=pytest.mark.slow),
         pytest.param("drag", "Stribeck", marks=pytest.mark.slow),
         pytest.param("armature", "NLFM", marks=pytest.mark.slow),
     ],

@@ -168,16 +168,6 @@ def test_period_counting_of_a_steady_turn(speed: float) -> None:
     assert abs(found.mean() - speed) < 0.02 * abs(speed)
 
 
-def test_latched_edge_times_make_period_counting_exact() -> None:
-    speed, time = 2.3, np.arange(1000) * 1e-3
-    q = speed * time[:, None]
-    edge = (np.floor(q / QUANTUM - 0.5) + 0.5) * QUANTUM / speed
-    found = period_counting(time, q, COUNTS, edge_time=np.maximum(edge, 0))
-    np.testing.assert_allclose(found[10:], speed, rtol=1e-9)
-    with pytest.raises(ValueError, match="`edge_time` must be shaped like"):
-        period_counting(time, q, COUNTS, edge_time=edge[:-1])
-
-
 def test_period_counting_falls_to_zero_at_rest_and_ignores_dither() -> None:
     time = np.arange(3000) * 1e-3
     moving = np.minimum(time, 1.0)[:, None]

@@ -11,7 +11,16 @@ from torch import Tensor, nn
 
 from nfriction import LFM, LinearAxis, PendulumChain, Recording, Stribeck, load, rollout, save
 from nfriction.evaluation.score import score
-from nfriction.friction.hysteresis import ELEMENTS, FIRST, OFFSET, VISCOUS, Slip
+from nfriction.friction.hysteresis import (
+    ELEMENTS,
+    FADING,
+    FIRST,
+    OFFSET,
+    STRIBECK,
+    TURN,
+    VISCOUS,
+    Slip,
+)
 from nfriction.friction.memory import (
     LUGRE,
     Dahl,
@@ -180,6 +189,21 @@ def test_a_torque_that_cancels_an_offset_leaves_the_motion_as_it_is(offset: floa
         return rollout(LinearAxis(0.02), model, REST[:1], REST[:1], push[:, None]).q
 
     torch.testing.assert_close(motion(offset), motion(0.0), rtol=0, atol=1e-9)
+
+
+def test_friction_that_falls_over_the_first_displacement_keeps_the_order() -> None:
+    """A fitted `slip` may have a negative narrow element, whose slope at rest is negative."""
+    values = [0.0] * (FIRST + 2 * ELEMENTS)
+    values[VISCOUS], values[TURN], values[STRIBECK], values[FADING] = 0.5, 0.1, 0.1, 1e-9
+    values[FIRST : FIRST + 2] = [-0.2, 1.0]
+    values[FIRST + ELEMENTS :] = [1e-5] + [1e-3] * (ELEMENTS - 1)
+    model = Slip(1, values).requires_grad_(False)
+    zero = torch.zeros(1, dtype=F64)
+    push = 3.0 * torch.sin(2 * math.pi * torch.arange(1000, dtype=F64) / 1000)[:, None]
+    coarse, fine = (
+        rollout(LinearAxis(0.5), model, zero, zero, push, substeps=n).q for n in (1, 50)
+    )
+    assert float((coarse - fine).abs().max()) < 2e-4
 
 
 def test_a_joint_holds_on_a_slope_without_creep() -> None:

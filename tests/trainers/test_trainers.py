@@ -123,6 +123,7 @@ def test_networks_are_trained_on_the_supervised_set(
         ("train_adaptive.py", "ANCFM", []),
         ("train_neurofuzzy.py", "NFNCFM", ["--terms", "3", "2", "--units", "4"]),
         ("train_neurofuzzy.py", "NFNCFM", ["--procedure", "papers", "--samples", "200"]),
+        ("train_neurofuzzy.py", "NFNCFM", ["--procedure", "fit", "--terms", "3", "2"]),
     ],
 )
 def test_every_kind_of_model_is_trained(
@@ -131,6 +132,7 @@ def test_every_kind_of_model_is_trained(
     train(script, *QUICK, "--model", model, "--out", tmp_path, *options)
     assert type(load(tmp_path / f"{model}.json")).__name__ == model
     assert (tmp_path / "checkpoints" / "stages" / "NCFM-fit.json").exists()
+    assert (tmp_path / f"{model}-loss.png").stat().st_size > 0
 
 
 @pytest.mark.slow
@@ -152,6 +154,19 @@ def test_a_search_that_is_ended_goes_on_to_the_same_result(tmp_path: Path, how: 
     ours, theirs = (load(f / "LFM.json").state_dict() for f in (folder, tmp_path / "whole"))
     assert all((ours[name] == theirs[name]).all() for name in theirs)
     assert load_info(folder / "LFM.json").fit == load_info(tmp_path / "whole" / "LFM.json").fit
+
+
+def test_a_law_without_an_adaptive_model_needs_another_procedure(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match="--procedure fit"):
+        train("train_neurofuzzy.py", *QUICK, "--model", "NFStribeck", "--out", tmp_path)
+
+
+@pytest.mark.slow
+def test_a_network_learns_while_friction_falls(tmp_path: Path) -> None:
+    train("learn_online.py", "--seconds", "40", "--warming", "5", "--out", tmp_path)
+    table = pd.read_csv(tmp_path / "drift.csv", index_col=0)
+    assert table["learning"].iloc[-1] < 0.7 * table["frozen"].iloc[-1]
+    assert (tmp_path / "arm.c").exists()
 
 
 @pytest.mark.slow

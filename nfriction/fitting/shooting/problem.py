@@ -1,10 +1,9 @@
 """Output error by multiple shooting: a cost and its Gauss-Newton model.
 
 A recording is cut into windows. Each is simulated from a state of its own, because the motion of a
-light mechanism forgets its start within seconds. Of a law with memory deflections are part of that
-state, over those of a contact that slips, so that the torque at the start is the same at any
-stiffness. The decision variables x are the friction
-parameters, the plant terms, each window's initial state and the encoders' offsets, and the cost is
+light mechanism forgets its start within seconds; of a law with memory the deflections are part of
+that state. The decision variables x are the friction parameters, the plant terms, each window's
+initial state and the encoders' offsets, and the cost is
 
     J(x) = 1/2 sum |C (q_sim(t; x) - q(t))|^2 / noise_sd^2      over windows and samples, or a
                                                                 robust loss of these errors
@@ -43,9 +42,8 @@ from nfriction.fitting.shooting.normal_equations import (
     score_covariance,
 )
 from nfriction.fitting.shooting.sensitivity import StepJacobian, Trajectory, propagate
-from nfriction.fitting.shooting.variables import DecisionVariables, model_at
+from nfriction.fitting.shooting.variables import DecisionVariables, deflected, model_at
 from nfriction.fitting.strategy.extrapolation_prior import ExtrapolationPrior
-from nfriction.friction.memory import slipping_state
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Quadratic
 from nfriction.plant import Plant
@@ -193,7 +191,7 @@ class ShootingProblem:
         friction, plant, states, _ = self.variables.split(x)
         model, joints = model_at(self.friction, friction), self.windows.q0.shape[-1]
         q0, qd0, shares = states.tensor_split([joints, 2 * joints], -1)
-        law_state, law_slope = _deflected(model, shares)
+        law_state, law_slope = deflected(model, shares)
         held, linearised = (t.repeat_interleave(self.substeps, 1) for t in self._torques(plant))
         step = self.windows.step.repeat_interleave(self.substeps, 1) / self.substeps
         offsets = self.variables.window_offsets(x)
@@ -240,30 +238,3 @@ class ShootingProblem:
         """Rows of the Jacobian, some samples at a time."""
         pieces = propagate(self.jacobian, run, self.substeps, self.stride)
         return scaled_rows(pieces, scale, self.measurement, self.variables.indices())
-
-
-def _deflected(model: FrictionModel, shares: Tensor) -> tuple[Tensor | None, Tensor | None]:
-    """State of a law with memory, (window, joint, state), by shares of that of a slipping contact.
-
-    Besides its derivatives by all coefficients and shares, (window, joint state, column).
-    """
-    memory = model.law.memory
-    if memory is None:
-        return None, None
-    coefficients = model.schedule.rest_coefficients().detach().clone().requires_grad_()
-    with torch.enable_grad():
-        slipping = slipping_state(memory, coefficients)
-        # A law is elementwise, so the sum's gradient is each joint's own.
-        rows = [
-            torch.autograd.grad(x.sum(), coefficients, retain_graph=True)[0]
-            for x in slipping.unbind(-1)
-        ]
-    slipping = slipping.detach()
-    joints, size = slipping.shape
-    share = shares.unflatten(-1, (joints, size))
-    # Each joint's state depends on its own coefficients, (window, joint, state, joint, k).
-    own = torch.eye(joints, dtype=torch.float64)[:, None, :, None]
-    by_coefficient = own * (share[..., None] * torch.stack(rows, 1))[..., None, :]
-    by_share = torch.diag(slipping.flatten()).expand(len(shares), -1, -1)
-    slope = torch.cat([by_coefficient.flatten(1, 2).flatten(2), by_share], -1)
-    return share * slipping, slope

@@ -12,6 +12,7 @@ from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.plant_parameters import PlantParameter
 from nfriction.friction.coefficients import Schedule
+from nfriction.friction.memory import slipping_state
 from nfriction.friction.models import FrictionModel
 
 
@@ -20,6 +21,34 @@ def model_at(model: FrictionModel, vector: Tensor) -> FrictionModel:
     moved = copy.deepcopy(model)
     moved.schedule.set_parameter_vector(vector)
     return moved
+
+
+def deflected(model: FrictionModel, shares: Tensor) -> tuple[Tensor | None, Tensor | None]:
+    """State of a law with memory, (window, joint, state), by shares of that of a slipping contact.
+
+    By these shares the torque at the start is the same at any stiffness. The other result is the
+    state's derivatives by all coefficients and shares, (window, joint state, column).
+    """
+    memory = model.law.memory
+    if memory is None:
+        return None, None
+    coefficients = model.schedule.rest_coefficients().detach().clone().requires_grad_()
+    with torch.enable_grad():
+        slipping = slipping_state(memory, coefficients)
+        # A law is elementwise, so the sum's gradient is each joint's own.
+        rows = [
+            torch.autograd.grad(x.sum(), coefficients, retain_graph=True)[0]
+            for x in slipping.unbind(-1)
+        ]
+    slipping = slipping.detach()
+    joints, size = slipping.shape
+    share = shares.unflatten(-1, (joints, size))
+    # Each joint's state depends on its own coefficients, (window, joint, state, joint, k).
+    own = torch.eye(joints, dtype=torch.float64)[:, None, :, None]
+    by_coefficient = own * (share[..., None] * torch.stack(rows, 1))[..., None, :]
+    by_share = torch.diag(slipping.flatten()).expand(len(shares), -1, -1)
+    slope = torch.cat([by_coefficient.flatten(1, 2).flatten(2), by_share], -1)
+    return share * slipping, slope
 
 
 class Parts(NamedTuple):

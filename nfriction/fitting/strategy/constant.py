@@ -3,11 +3,10 @@
 A nonlinear law has several starts: its own, and two from the law that it contains.
 """
 
-import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import TypeGuard
+from typing import NamedTuple, TypeGuard
 
 import numpy as np
 import torch
@@ -49,6 +48,8 @@ from nfriction.signals import Motion
 # stiffness [s]: from what hardly shows to what would be no presliding.
 PRESLIDING = tuple(np.geomspace(1e-5, 1.0, 11).tolist())
 BRISTLE_TIMES = (1e-4, 1e-3, 1e-2, 1e-1)
+# Displacements that are searched from where the first leaves more than the encoder's rounding.
+MOST_STARTS = 4
 
 # Stiffness and damping of a rival over those found: its contacts relax at once.
 STIFFER = (10.0, 0.01)
@@ -79,7 +80,7 @@ def fit_constant(task: FitTask) -> FitResult:
     def with_presliding(sliding: Tensor) -> Iterable[Tensor]:
         if not model.law.memory:
             return sliding
-        return (presliding_start(fitter, c, plant, task.motions) for c in sliding)
+        return presliding_starts(fitter, sliding, plant, task.motions)
 
     eccentric = fits_eccentricity(options, start)
     fitter = _fitter(task, model, torque, eccentric)
@@ -107,7 +108,7 @@ def fit_constant(task: FitTask) -> FitResult:
         found = richer_by_evidence(found, richer, tolerance) or found
     ambiguous: list[str] = []
     if "sigma_0" in model.law.names and not found.stopped:
-        ambiguous = ambiguous_stiffness(fitter, search.stages[0])
+        ambiguous = ambiguous_stiffness(fitter, found, search.stages[0])
     fitted = result_from_shooting(model, found.problem, found.result, task.motions, ambiguous)
     lengths = zip(options.windows, search.stages, strict=False)
     fitted = replace(
@@ -127,36 +128,57 @@ def regression(task: FitTask, model: FrictionModel, plant: Plant) -> TorqueFit:
     )
 
 
-def presliding_start(
-    fitter: ShootingFitter, coefficients: Tensor, plant: Tensor, motions: tuple[Motion, ...]
-) -> Tensor:
-    """Coefficients of a law with memory whose short windows follow the motion best.
+def presliding_starts(
+    fitter: ShootingFitter, sliding: Tensor, plant: Tensor, motions: tuple[Motion, ...]
+) -> Iterator[Tensor]:
+    """Coefficients of a law with memory to start from, (joint, coefficient), the best first.
 
-    What torques of sliding show stays as given. The displacement over which the contact yields is
-    sought among shares of each joint's range, the damping among times: first for all joints alike,
-    then for each. (joint, coefficient).
+    `sliding` are sets of coefficients that torques imply, (set, joint, coefficient), which show how
+    a joint slides alone. The displacement over which its contact yields is sought among shares of
+    the joint's range, its damping among times, by the cost of short windows. Several displacements
+    of the first set follow, and the best of every other one.
     """
-    law, options = fitter.friction.law, fitter.options
-    windows = fitter.cut(motions, options.windows[0])
-    ranges = torch.tensor(np.max([np.ptp(m.q, axis=0) for m in motions], axis=0))
-    best, lowest = coefficients, math.inf
-    joints = len(coefficients)
-    for chosen in (range(joints), *([j] for j in range(joints) if joints > 1)):
-        trials = []
-        for share, time in itertools.product(PRESLIDING, BRISTLE_TIMES):
-            trial = best.clone()
-            for j in chosen:
-                trial[j] = yielding(law, coefficients[j], share * float(ranges[j]), time)
-            trials.append(trial)
-        for trial in trials:
-            problem = fitter.problem(windows, options.first_noise, trial.reshape(-1))
-            cost = float(problem.cost(problem.variables.start(plant)))
-            if cost < lowest:
-                best, lowest = trial, cost
-    return best
+    for place, coefficients in enumerate(sliding):
+        found = _yielding_alike(fitter, coefficients, plant, motions)
+        yield from found[: 1 if place else MOST_STARTS]
 
 
-def ambiguous_stiffness(fitter: ShootingFitter, found: HorizonResult) -> list[str]:
+def _yielding_alike(
+    fitter: ShootingFitter, coefficients: Tensor, plant: Tensor, motions: tuple[Motion, ...]
+) -> list[Tensor]:
+    """The best coefficients of every share of the range, least cost of short windows first."""
+    law, windows = fitter.friction.law, fitter.cut(motions, fitter.options.windows[0])
+    ranges = np.max([np.ptp(m.q, axis=0) for m in motions], axis=0)
+
+    def tried(share: float, time: float, base: Tensor, joints: Sequence[int]) -> _Start:
+        trial = base.clone()
+        for j in joints:
+            trial[j] = yielding(law, coefficients[j], share * float(ranges[j]), time)
+        problem = fitter.problem(windows, fitter.options.first_noise, trial.reshape(-1))
+        return _Start(float(problem.cost(problem.variables.start(plant))), trial)
+
+    def best(joints: Sequence[int], base: Tensor) -> list[_Start]:
+        rows = ([tried(s, t, base, joints) for t in BRISTLE_TIMES] for s in PRESLIDING)
+        return sorted((min(row, key=_Start.rank) for row in rows), key=_Start.rank)
+
+    # All joints alike first, then each by itself.
+    found = best(range(len(coefficients)), coefficients)
+    for j in range(len(coefficients)) if len(coefficients) > 1 else ():
+        found = [*best([j], found[0].coefficients)[:1], *found]
+    return [start.coefficients for start in sorted(found, key=_Start.rank)]
+
+
+class _Start(NamedTuple):
+    cost: float
+    coefficients: Tensor
+
+    def rank(self) -> float:
+        return self.cost if math.isfinite(self.cost) else math.inf
+
+
+def ambiguous_stiffness(
+    fitter: ShootingFitter, found: HorizonResult, stage: HorizonResult
+) -> list[str]:
     """Names of stiffness and damping of bristles that the data leave open.
 
     Presliding below what the encoder resolves has minima of about equal cost at quite different
@@ -165,17 +187,22 @@ def ambiguous_stiffness(fitter: ShootingFitter, found: HorizonResult) -> list[st
 
     Args:
         fitter: of the law.
-        found: a stage of short windows, whose states hardly trap a search.
+        found: its end.
+        stage: of short windows, whose states hardly trap a search.
     """
     from scipy.special import chdtri  # slow to import
 
-    problem, law = found.problem, found.problem.friction.law
+    problem, law = stage.problem, stage.problem.friction.law
+    count, tolerance = problem.variables.shared_count, fitter.options.loose_tolerance
+    # Terms that only the end may have come last.
+    start = torch.cat([found.result.x[:count], stage.result.x[count:]])
+    found = fitter.search(problem, start, tolerance, "stiffness")
     places = [law.names.index(name) for name in ("sigma_0", "sigma_1") if name in law.names]
     table = found.parts.friction.reshape(-1, len(law.names)).clone()
     table[:, places] *= torch.tensor(STIFFER[: len(places)])
     lower, upper = problem.friction.schedule.bounds()
     start = torch.cat([table.reshape(-1).clamp(lower, upper), found.result.x[table.numel() :]])
-    rival = fitter.search(problem, start, fitter.options.loose_tolerance, "stiffer bristles")
+    rival = fitter.search(problem, start, tolerance, "stiffer bristles")
     # The noise of a first stage is a guess.
     lost = float(rival.result.cost - found.result.cost) * (problem.noise_sd / found.noise) ** 2
     if not lost < 0.5 * float(chdtri(len(table) * len(places), 0.05)):

@@ -87,9 +87,11 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
         found = result_from_shooting(model, end.problem, end.result, motions)
         task.model.load_state_dict(model.state_dict())
         cast("NeuroFuzzy", task.model.schedule).prior_sd = best.prior_sd
+        moved = " Its sets moved." if cast("NeuroFuzzy", model.schedule).learn_sets else ""
         found = replace(
             found,
             model=task.model.requires_grad_(False),
+            status=found.status + moved,
             effective_parameters=effective_parameters(end),
         )
     found = replace(
@@ -277,7 +279,7 @@ class _Validation:
         if held is None or moved is None:
             return None
         gained = moved.log_evidence - held.log_evidence
-        better = moved if gained > self.options.loglik_tolerance else held
+        better = moved if gained > self.options.evidence_gain else held
         error = self._error(better.end)
         if error is None:
             return None
@@ -303,13 +305,13 @@ class _Validation:
         for _ in range(self.options.evidence_updates + 1):
             fitter = replace(trial.fitter, friction=model, friction_prior=(mean, sd))
             problem = fitter.problem(self.train, noise, x[: len(mean)], stride=self.stride)
-            tolerance = loglik_tolerance(float(problem.cost(x)), self.options)
+            tolerance = self.options.evidence_gain / max(float(problem.cost(x)), 1.0)
             end = fitter.search(problem, x, tolerance, "network's sets, hold-out")
             if end.stopped:
                 return None
             found = replace(trial, fitter=fitter, end=end, tolerance=tolerance)
             gain = found.log_evidence - (best.log_evidence if best else -math.inf)
-            if not gain > self.options.loglik_tolerance:
+            if not gain > self.options.evidence_gain:
                 break
             best, x = found, end.result.x
             sd = sd * network_evidence(end).precision.clamp_min(1.0).rsqrt()[groups]

@@ -116,13 +116,6 @@ class MamdaniController(nn.Module):
             y = torch.cat([self._defuzzify(block) for block in blocks], 0)
         return y.reshape(x.shape[:-1] + self.middle.shape)
 
-    def rule_strengths(self, x: Tensor) -> Tensor:
-        """Strength of every rule (*batch, rules), for inputs (*batch, inputs) in own units.
-
-        A recording never fires the rules whose largest strength over its samples is near zero.
-        """
-        return self._rule_strengths(x).movedim(0, -1).reshape(x.shape[:-1] + self.weights.shape[:1])
-
     def memberships(self, x: Tensor) -> list[Tensor]:
         """Membership of every term, one (*batch, terms) for each input, in own units."""
         clamped = torch.clamp(x, self.lower, self.upper)

@@ -248,14 +248,19 @@ class RBFCoefficients(Schedule):
         return Sensitivity(((free[..., None] * own, self.network.regressors(x)),), by_qd, by_qdd)
 
     def options(self) -> dict[str, Any]:
-        return {
+        found: dict[str, Any] = {
             "network": "rbf",
             "head_units": self.head_units,
             "acceleration": "along_motion" if self.along_motion else "signed",
-            "derivatives": self.derivatives,
-            "smoothing": self.smoothing,
-            "sample_time": self.step,
         }
+        # Without further inputs there is nothing to smooth, as in files from before there were any.
+        if self.remembers:
+            found |= {
+                "derivatives": self.derivatives,
+                "smoothing": self.smoothing,
+                "sample_time": self.step,
+            }
+        return found
 
     def extra_repr(self) -> str:
         return ", ".join(f"{name}={value!r}" for name, value in self.options().items())

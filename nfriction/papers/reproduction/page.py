@@ -77,7 +77,7 @@ FUTURE = (
     Item("Control of the rig with the friction models",
          ("control_still", "control_follow", "control_balance", "control_swing_up",
           "control_three_links"),
-         "In simulation. Swinging up all three links was not attempted."),
+         "In simulation; three links are balanced, one is swung up."),
 )  # fmt: skip
 OTHERS = (
     Item("Positions by kind of model", tuple(f"positions_joint_{joint}" for joint in (2, 3, 4))),

@@ -27,6 +27,7 @@ from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction import model_by_name
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import ModelInfo, load, load_info, save
+from nfriction.optim.evidence import EvidenceState
 from nfriction.papers import twin
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
 from nfriction.papers.afem.classes import class_intervals
@@ -253,6 +254,19 @@ def fit_network(workspace: Workspace, bench: Bench, name: str) -> FitResult:
     ))  # fmt: skip
 
 
+def fit_without_classes(workspace: Workspace, bench: Bench, name: str) -> FitResult:
+    """A neuro-fuzzy model from the constant fit of its law."""
+    settings = workspace.settings
+    start = fit_constant(workspace, bench, name.removeprefix("NF"))
+    model = model_by_name(name)(
+        bench.plant.joints, terms=settings.terms, head_units=settings.head_units
+    )
+    return workspace.fit(name, bench, lambda step: fit(
+        model, bench.plant, bench.train, windows=settings.windows, max_steps=settings.max_steps,
+        fit_plant=settings.fit_plant, start=start, motions=bench.train_motions, callback=step,
+    ))  # fmt: skip
+
+
 def fit_searched(
     workspace: Workspace,
     bench: Bench,
@@ -279,11 +293,21 @@ def network_by_controller(
 ) -> tuple[FrictionModel, dict[str, Any]]:
     """A neuro-fuzzy model the papers' way, from the coefficients by class; how its fit ended."""
     settings = workspace.settings
+    joints = iter(bench.plant.joint_names)
+    losses: dict[str, list[float]] = {}
+
+    def keep(state: EvidenceState) -> None:
+        # The training of each joint counts its steps from 1.
+        if state.step == 1:
+            losses[next(joints)] = []
+        losses[[*losses][-1]].append(0.5 / state.beta)
+
     model, fits = papers_neuro_fuzzy(
         load(workspace.model(f"A{law}")), bench.train_motions,
         samples=settings.controller_samples, units=settings.network_units,
-        options=TrainingOptions(seed=settings.seed, progress=progress),
+        options=TrainingOptions(seed=settings.seed, progress=progress, callback=keep),
     )  # fmt: skip
+    workspace.finish(f"NF{law}-losses", losses)
     unfinished = [fit.evidence.message for fit in fits if not fit.evidence.converged]
     status = f"Not converged: {len(unfinished)} of {len(fits)} networks. {' '.join(unfinished[:1])}"
     return model, {

@@ -62,8 +62,8 @@ class Settings:
     head_units: int = 10
     network_units: int = 10
     controller_samples: int = 40_000
-    search_horizon: float = 5.0
-    search_evaluations: int = 1500
+    search_horizon: float = 80.0
+    search_evaluations: int = 20_000
     control_models: tuple[str, ...] = study.MODELS
     control_seconds: float = 16.0
     fit_plant: bool = False
@@ -83,7 +83,7 @@ class Settings:
 
 
 FULL = Settings()
-"""As the papers: recordings of 40 and 80 s."""
+"""As the papers: recordings of 40 and 80 s, searched in one run."""
 
 QUICK = Settings(
     tlrip_seconds=10.0,
@@ -93,11 +93,12 @@ QUICK = Settings(
     terms=(3, 3),
     head_units=5,
     controller_samples=2000,
+    search_horizon=5.0,
     search_evaluations=200,
     control_models=("NCFM", "LFM", "NLFM"),
     control_seconds=4.0,
 )
-"""A look at everything within a minute or two; the figures are then not the papers'."""
+"""A look at everything within minutes; the numbers are then not those of whole recordings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,19 +196,27 @@ class Workspace:
         return self.folder / "models" / f"{stage}.json"
 
     def fit(self, stage: str, bench: Bench, make: Callable[[Callback], FitResult]) -> FitResult:
-        """The fit of a stage: read where it is finished, else made by `make(callback)` and kept."""
+        """The fit of a stage: read where it is finished, else made by `make(callback)` and kept.
+
+        Its loss after every step is the result of `<stage>-losses`, by part of the fit.
+        """
         name, path = f"{stage}-fit", self.model(stage)
         if (kept := self.result(name)) is not None:
             return _restored(kept, path, self.arrays(name), bench)
+        losses: dict[str, list[float]] = {}
         with tqdm(desc=stage, unit=" steps", disable=not self.progress) as bar:
 
-            def step(*about: object) -> None:
-                # Fits report the name of their stage, searches their state.
-                if about and isinstance(about[0], str):
-                    bar.set_description(f"{stage}, {about[0]}")
+            def step(about: Any, *at: Any) -> None:
+                # Fits report the name of their stage and a step, searches their state.
+                part, loss = (about, at[0].cost) if at else (about.method, about.value)
+                # JSON knows no infinity.
+                if np.isfinite(loss):
+                    losses.setdefault(part, []).append(float(loss))
+                bar.set_description(f"{stage}, {part}")
                 bar.update()
 
             found = make(step)
+        self.finish(f"{stage}-losses", losses)
         # The JSON file comes last: it marks the stage as finished.
         self.write_arrays(name, _tables(found))
         save(found.model, path, model_info(found, bench.train))
@@ -224,7 +233,7 @@ class Workspace:
         """A callback that keeps every state of a pattern search."""
 
         def keep(state: SearchState) -> None:
-            step()
+            step(state)
             # SQP has no state that would continue it exactly, and JSON no infinity.
             if state.method == "pattern" and np.isfinite(state.value):
                 self.finish(f"{stage}-search", asdict(state))

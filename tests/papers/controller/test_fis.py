@@ -92,8 +92,8 @@ def test_or_is_the_stronger_of_both_conditions() -> None:
         (("*", "driving"), ("high", "*"), 0.5),
         (("middle", "*"), ("low", "low"), 1.0),
     ]
-    x = torch.tensor([8.0, -5.0], dtype=FLOAT64)  # fast, not driving
-    assert controller.rule_strengths(x)[1:3].amax().item() == 0.5
+    x = torch.tensor([[8.0, -5.0]], dtype=FLOAT64)  # fast, not driving
+    assert controller._rule_strengths(x)[1:3].amax().item() == 0.5
 
 
 def test_an_import_survives_our_own_format(tmp_path: Path) -> None:

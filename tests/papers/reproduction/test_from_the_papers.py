@@ -30,7 +30,7 @@ FUTURE = """jerk and snap; evolutionary tuning; control with the friction models
 
 def rows(heading: str) -> list[list[str]]:
     """Cells of the table below a heading, without its head."""
-    part = TEXT.split(f"{heading}\n", 1)[1].split("\n## ", 1)[0]
+    part = TEXT.split(f"{heading}\n", 1)[1].split("\n##", 1)[0]
     lines = [line for line in part.splitlines() if line.startswith("|")]
     return [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines[2:]]
 

@@ -1,0 +1,158 @@
+"""Fits of friction with memory to motions: recovery, starts of windows, what data leave open."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from nfriction import LinearAxis, Plant, Recording, fit, rollout
+from nfriction.evaluation.score import score
+from nfriction.fitting.data.windows import cut_windows
+from nfriction.fitting.shooting.problem import ShootingProblem
+from nfriction.fitting.shooting.sensitivity import StepJacobian
+from nfriction.friction import model_by_name
+from nfriction.friction.memory import LuGre, MaxwellSlip
+from nfriction.friction.models import FrictionModel
+from nfriction.signals import kalman_smoother, quantise
+from tests.fitting.recordings import F64, pendulum
+
+AXIS = LinearAxis(0.5)
+SOFT = (1.0, 0.5, 0.05, 300.0, 5.0, 0.4)
+SLIPS = (1.0, 0.5, 0.3, 0.2, 0.1, 5e-3, 0.01, 0.02, 0.05, 0.1, 3e-3, 0.3, 0.3)
+# Presliding over a thousandth of an encoder's count.
+STIFF = (1.0, 0.5, 0.05, 3e6, 5.0, 0.4)
+
+
+def pushed(model: FrictionModel, seed: int, *, seconds: float, rate: int) -> Recording:
+    """An axis from rest, pushed below breakaway and beyond, read by 14 bits."""
+    random = np.random.default_rng(seed)
+    time = np.arange(round(seconds * rate)) / rate
+    waves = [
+        random.uniform(0.4, 1.0) * np.sin(2 * np.pi * f * time + random.uniform(0, 6.28))
+        for f in (0.3, 0.7, 1.1, 1.9)
+    ]
+    force = (sum(waves) * (0.5 + 2.0 * np.sin(np.pi * time / 5) ** 2))[:, None]
+    zero = torch.zeros(1, dtype=F64)
+    run = rollout(AXIS, model, zero, zero, torch.as_tensor(force), sample_time=1 / rate)
+    tau = np.concatenate([force, force[-1:]])
+    return Recording(run.time.numpy(), quantise(run.q.numpy(), 2**14), tau=tau, unit="m")
+
+
+@cache
+def recorded(truth: tuple[float, ...], seed: int, seconds: float, rate: int) -> Recording:
+    return pushed(LuGre(1, truth).requires_grad_(False), seed, seconds=seconds, rate=rate)
+
+
+@pytest.mark.parametrize(
+    ("name", "plant", "values"),
+    [
+        ("LuGre", LinearAxis(0.5), SOFT),
+        pytest.param("MaxwellSlip", LinearAxis(0.05), SLIPS, marks=pytest.mark.slow),
+        pytest.param("LuGre", pendulum(), (0.03, 0.015, 0.3, 3.0, 0.01, 0.003),
+                     marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
+def test_derivatives_follow_the_deflections_from_a_windows_start(
+    name: str, plant: Plant, values: tuple[float, ...]
+) -> None:
+    """Gradients of the cost are its differences, also by coefficients that scale the start."""
+    joints = plant.joints
+    model = model_by_name(name)(joints, values).requires_grad_(False)
+    start = torch.tensor([1.6, 0.8], dtype=F64)[:joints]
+    run = rollout(plant, model, start, 0.5 * start, sample_time=2e-3, steps=100)
+    recording = Recording(run.time.numpy(), run.q.numpy() + 1e-3, unit=plant.unit)
+    windows = cut_windows([recording], [kalman_smoother(recording.time, recording.q)], 0.1)
+    problem = ShootingProblem(
+        StepJacobian(plant, model, []), model, windows.deflected(plant, model), 1e-3,
+        torch.eye(joints, dtype=F64),
+    )  # fmt: skip
+    x = problem.variables.start()
+    states = problem.variables.split(x).states
+    assert states.shape == (2, joints * (2 + model.law.state_size))
+    own = states[:, 2 * joints :]
+    own[:] = torch.linspace(-0.9, 0.8, own.numel(), dtype=F64).reshape(own.shape)
+    found = problem.linearise(x).gradient
+    for k in [*range(joints * len(values)), *range(len(x) - states.numel(), len(x))]:
+        step = 1e-6 * max(abs(float(x[k])), 1e-3)
+        ahead, back = x.clone(), x.clone()
+        ahead[k] += step
+        back[k] -= step
+        slope = float(problem.cost(ahead) - problem.cost(back)) / (2 * step)
+        assert float(found[k]) == pytest.approx(slope, rel=1e-3, abs=1e-2)
+
+
+def test_windows_begin_with_the_deflection_that_holds_the_joint() -> None:
+    model = LuGre(1, SOFT).requires_grad_(False)
+    # Held below breakaway, then slid.
+    force = np.repeat([[0.9], [3.0]], 400, 0)
+    zero = torch.zeros(1, dtype=F64)
+    run = rollout(AXIS, model, zero, zero, torch.as_tensor(force), sample_time=1e-3)
+    tau = np.concatenate([force, force[-1:]])
+    recording = Recording(run.time.numpy(), run.q.numpy(), tau=tau, unit="m")
+    windows = cut_windows([recording], [kalman_smoother(recording.time, recording.q)], 0.2)
+    share = windows.deflected(AXIS, model).law_state
+    assert share is not None
+    largest = sum(SOFT[:2]) / SOFT[3]
+    true = run.law_state[[first for _, first, _ in windows.spans]] / largest
+    # The second and fourth begin amid a push; viscous friction is taken for a deflection, too.
+    assert float(share[1]) == pytest.approx(float(true[1]), abs=0.05)
+    assert float(true[3]) < float(share[3]) <= 1.0
+
+
+@pytest.fixture(scope="module")
+def short():
+    recording = recorded(SOFT, 2, 5.0, 500)
+    return recording, fit("lugre", AXIS, recording, windows=(0.5,), fit_plant=False)
+
+
+def test_presliding_and_sliding_give_all_coefficients(short) -> None:
+    _, found = short
+    assert found.model.schedule.values[0].tolist() == pytest.approx(SOFT, rel=0.03)
+    assert all(i.low < x < i.high for i, x in zip(found.intervals, SOFT, strict=True))
+    assert found.converged
+    assert not found.unidentifiable
+
+
+def test_a_fit_with_memory_is_scored_saved_and_tabulated(short, tmp_path) -> None:
+    recording, found = short
+    errors = score(found.plant, found.model, recording, limit=False)
+    assert errors.free_run.all < 1e-3
+    # Windows go on from the deflection that the motion before has left.
+    assert errors.windows["1"].all < 1e-3
+    assert "sigma_0 of joint1" in found.summary()
+    assert found.uncertainty is not None
+    sd = found.uncertainty.torque_sd(found.model, torch.tensor([[-0.5], [0.5]], dtype=F64))
+    assert (sd > 0).all()
+    assert (sd < 0.1).all()
+
+
+@pytest.mark.slow
+def test_stiffness_that_the_encoder_hides_is_not_identifiable() -> None:
+    recordings = [recorded(STIFF, seed, 20.0, 1000) for seed in (0, 1)]
+    found = fit("lugre", AXIS, recordings, windows=(0.5,))
+    assert {"sigma_0 of joint1", "sigma_1 of joint1"} <= set(found.unidentifiable)
+    interval = next(i for i in found.intervals if i.name == "sigma_0 of joint1")
+    assert interval.low < STIFF[3] < interval.high
+    # Sliding still shows the others.
+    values = found.model.schedule.values[0]
+    assert values[[0, 5]].tolist() == pytest.approx([STIFF[0], STIFF[5]], rel=0.02)
+
+
+@pytest.mark.slow
+def test_default_fits_find_coefficients_and_plant() -> None:
+    recordings = [recorded(SOFT, seed, 20.0, 1000) for seed in (0, 1)]
+    found = fit("lugre", LinearAxis(0.55), recordings)
+    assert found.model.schedule.values[0].tolist() == pytest.approx(SOFT, rel=0.02)
+    assert float(found.plant.mass) == pytest.approx(0.5, rel=1e-3)
+    held = [i.low <= x <= i.high for i, x in zip(found.intervals, SOFT, strict=False)]
+    assert sum(held) >= 4
+
+
+@pytest.mark.slow
+def test_slip_elements_follow_a_bristle() -> None:
+    """Five widths in fixed ratios make up a contact that yields over one."""
+    recording = recorded(SOFT, 0, 5.0, 500)
+    found = fit(MaxwellSlip(1), AXIS, recording, windows=(0.5,), fit_plant=False)
+    plain = fit("stribeck", AXIS, recording, windows=(0.5,), fit_plant=False)
+    assert found.residual < 0.5 * plain.residual
