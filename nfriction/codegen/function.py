@@ -125,9 +125,13 @@ class CompiledFunction:
         """
         generator = torch.Generator().manual_seed(0)
         # At the examples themselves a kink may lie, where derivatives of both sides are right.
+        # Relative to the examples, since functions may grow without bound where signs change.
         for spread in (0.1,) if self._jacobian else (0.0, 0.01, 0.1):
             inputs = [
-                x.detach() + spread * torch.randn(x.shape, generator=generator, dtype=x.dtype)
+                x.detach()
+                + spread
+                * (x.detach().abs() if self._jacobian else 1.0)
+                * torch.randn(x.shape, generator=generator, dtype=x.dtype)
                 for x in example_inputs
             ]
             with torch.no_grad():

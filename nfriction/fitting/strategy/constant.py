@@ -218,14 +218,15 @@ def ambiguous_stiffness(
 def yielding(law: Law, coefficients: Tensor, displacement: float, time: float) -> Tensor:
     """Coefficients of one joint that slides alike, but yields over a displacement before.
 
-    `time` is the ratio of the damping of a bristle to its stiffness [s].
+    `time` is the ratio of the damping of a bristle to its stiffness [s]. Laws that name their
+    coefficients otherwise stay as they are.
     """
     values = dict(zip(law.names, coefficients.tolist(), strict=True))
-    if "sigma_0" in values:
+    widths = [name for name in values if name.startswith("d_") and f"k{name[1:]}" in values]
+    if {"sigma_0", "F_c"} <= values.keys():
         values["sigma_0"] = values["F_c"] / max(displacement, 1e-12)
         values["sigma_1"] = time * values["sigma_0"]
-    else:
-        widths = [name for name in values if name.startswith("d_")]
+    elif widths:
         scale = displacement / max(values[name] for name in widths)
         for name in widths:
             values[name] *= scale
