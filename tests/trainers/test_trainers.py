@@ -165,7 +165,7 @@ def test_a_law_without_an_adaptive_model_needs_another_procedure(tmp_path: Path)
 def test_a_network_learns_while_friction_falls(tmp_path: Path) -> None:
     train("learn_online.py", "--seconds", "40", "--warming", "5", "--out", tmp_path)
     table = pd.read_csv(tmp_path / "drift.csv", index_col=0)
-    assert table["learning"].iloc[-1] < 0.7 * table["frozen"].iloc[-1]
+    assert (table["learning"].iloc[1:] < 0.8 * table["frozen"].iloc[1:]).all()
     assert (tmp_path / "arm.c").exists()
 
 

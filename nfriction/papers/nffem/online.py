@@ -95,7 +95,10 @@ class OnlineNetwork:
                 f"got {type(schedule).__name__}."
             )
         self.model, self.schedule, self.options = model, schedule, options
-        lower, upper = schedule.output_lower, schedule.output_upper
+        # What was trained is what the network gives where its units lie, along the motion.
+        found = schedule.network(schedule.network.centres.detach().transpose(0, 1)).detach()
+        held = torch.minimum(torch.maximum(found, schedule.output_lower), schedule.output_upper)
+        lower, upper = held.amin(0), held.amax(0)
         self.scale = torch.maximum(lower.abs(), upper.abs()).clamp_min(1e-12)
         margin = options.margin
         self.least = torch.where(lower > 0, lower / margin, lower * margin)

@@ -85,7 +85,7 @@ def test_wild_torques_leave_everything_bounded() -> None:
     _, coefficients = online(qd, qdd, load)
     assert (coefficients <= online.most).all()
     assert (coefficients >= online.least).all()
-    assert (online.most == 3 * 1.2 * made.schedule.network.output_bias).all()
+    torch.testing.assert_close(online.most, 3 * made.schedule.network.output_bias.detach())
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
