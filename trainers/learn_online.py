@@ -52,6 +52,9 @@ def train(argv: Sequence[str] | None) -> str:
     parser.add_argument("--seed", type=int, default=0, help="of the motor's torque")
     parser.add_argument("--out", type=Path, default=Path("runs/online"), help="folder to write")
     given = parser.parse_args(argv)
+    # A row of the table is a whole block.
+    if given.seconds < BLOCK:
+        parser.error(f"--seconds must be at least {BLOCK:g}, got {given.seconds:g}.")
     plant = study.single_link()
     cold = study.driven_recordings(
         plant, study.true_friction(plant), count=1, seconds=COLD_SECONDS, seed=given.seed

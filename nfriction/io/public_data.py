@@ -12,6 +12,7 @@ import http.client
 import json
 import urllib.parse
 import urllib.request
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
@@ -20,9 +21,16 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from scipy.io import loadmat
+from scipy.io.matlab import MatReadError
 from scipy.signal import savgol_filter
 
 from nfriction.io.files import write_atomically
+
+# By readers of something else, or of part of an original.
+_NOT_IT = (
+    *(AttributeError, EOFError, LookupError, OSError, RuntimeError, TypeError, ValueError),
+    *(MatReadError, zlib.error),
+)
 
 
 @dataclass(frozen=True)
@@ -92,7 +100,7 @@ def fetch(name: str, folder: Path) -> Fetched:
             _download(address, path)
         try:
             table, state = _CONVERT[chosen.source](path, recording)
-        except Exception as error:
+        except _NOT_IT as error:
             raise ValueError(
                 f"'{path}' is not what {address} contains ({type(error).__name__}: {error}); "
                 "delete it and fetch it again."

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from nfriction.codegen import compile_function
+from nfriction.codegen import CompiledFunction, compile_function
 from nfriction.codegen.llvm import jit
 from tests.codegen.mechanisms import F64, NeuroFuzzy
 
@@ -137,3 +137,20 @@ def test_all_functions_of_the_library_are_known_to_the_loader():
     called = set(re.findall(r"declare double @([a-z0-9]+)\(", compiled.source()))
     assert called <= set(jit.LIBRARY)
     assert {"fmod", "pow", "log1p"} - called == {"fmod"}  # a remainder is LLVM's own instruction
+
+
+def test_jacobians_are_checked_where_their_inputs_have_the_signs_of_the_example(monkeypatch):
+    """A stiffness below zero or a step back in time may grow without bound, and then only noise."""
+    checked = []
+    eager = CompiledFunction._eager
+
+    def kept(self, inputs):
+        checked.extend(inputs)
+        return eager(self, inputs)
+
+    monkeypatch.setattr(CompiledFunction, "_eager", kept)
+    small, size = torch.full((50,), 1e-3, dtype=F64), torch.full((50,), -3.0, dtype=F64)
+    compile_function(lambda x, y: (x * y).sum()[None], (small, size), jacobian=(0, 1))
+    assert (checked[0] > 0).all()
+    assert (checked[1] < 0).all()
+    assert not torch.equal(checked[0], small)

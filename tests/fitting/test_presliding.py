@@ -1,5 +1,6 @@
 """Fits of friction with memory to motions: recovery, starts of windows, what data leave open."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -11,9 +12,11 @@ from nfriction.evaluation.score import score
 from nfriction.fitting.data.windows import cut_windows
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
+from nfriction.fitting.strategy.constant import yielding
 from nfriction.friction import model_by_name
-from nfriction.friction.memory import LuGre, MaxwellSlip
+from nfriction.friction.memory import DAHL, LuGre, MaxwellSlip
 from nfriction.friction.models import FrictionModel
+from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.signals import kalman_smoother, quantise
 from tests.fitting.recordings import F64, pendulum
 
@@ -98,6 +101,20 @@ def test_windows_begin_with_the_deflection_that_holds_the_joint() -> None:
     # The second and fourth begin amid a push; viscous friction is taken for a deflection, too.
     assert float(share[1]) == pytest.approx(float(true[1]), abs=0.05)
     assert float(true[3]) < float(share[3]) <= 1.0
+
+
+def test_a_network_of_a_law_with_memory_is_refused_before_the_fit() -> None:
+    model = FrictionModel(DAHL, NeuroFuzzy(DAHL, 1))
+    with pytest.raises(ValueError, match=r"only with constant coefficients; got NeuroFuzzy"):
+        fit(model, AXIS, recorded(SOFT, 2, 5.0, 500), windows=(0.5,), max_steps=1)
+
+
+def test_a_law_of_ones_own_may_name_its_coefficients_otherwise() -> None:
+    coefficients = torch.tensor([1.0, 0.4, 300.0], dtype=F64)
+    named = [replace(c, name=f"own_{k}") for k, c in enumerate(DAHL.coefficients)]
+    own = replace(DAHL, name="own", coefficients=tuple(named))
+    assert torch.equal(yielding(own, coefficients, 1e-3, 1e-3), coefficients)
+    assert yielding(DAHL, coefficients, 1e-3, 1e-3).tolist() == [1.0, 0.4, 1e3]
 
 
 @pytest.fixture(scope="module")

@@ -161,6 +161,15 @@ def test_a_law_without_an_adaptive_model_needs_another_procedure(tmp_path: Path)
         train("train_neurofuzzy.py", *QUICK, "--model", "NFStribeck", "--out", tmp_path)
 
 
+def test_a_motion_too_short_for_the_table_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        train("learn_online.py", "--seconds", "5", "--out", tmp_path / "out")
+    assert "--seconds must be at least 10" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.slow
 def test_a_network_learns_while_friction_falls(tmp_path: Path) -> None:
     train("learn_online.py", "--seconds", "40", "--warming", "5", "--out", tmp_path)
