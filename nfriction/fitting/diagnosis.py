@@ -147,7 +147,9 @@ def _tested(
         for text, data in _corrected_torques(plant, given, options):
             yield text, _unexplained(plant, data)
         delay, share = balanced_delay(plant, recordings, motions, options)
-        yield _delay_in_words(delay), share
+        # A torque that is held until the next sample acts late by up to a step.
+        if not -max(r.sample_time for r in recordings) <= delay <= 0:
+            yield _delay_in_words(delay), share
     for text, rig in _corrected_terms(plant, given, options):
         yield text, _unexplained(rig, given)
     if len(recordings) > 1:

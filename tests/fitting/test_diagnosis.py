@@ -78,6 +78,22 @@ def test_sound_data_raise_no_alarm(name):
     assert warnings_of(*measured(name)) == ()
 
 
+def test_a_torque_held_for_long_steps_is_no_delay():
+    plant, step = PendulumChain(**DOUBLE | {"inertia": [0.005, 0.002]}), 4e-3
+    rng = np.random.default_rng(0)
+    time, joints = step * np.arange(501), 2
+    rate, phase = rng.uniform(0.3, 2.5, (4, joints)), rng.uniform(0, 6.28, (4, joints))
+    tau = 0.5 * np.sin(2 * np.pi * rate * time[:, None, None] + phase).sum(1)
+    tau *= np.minimum(time, 1)[:, None]
+    model = CVFM(joints, [[0.1, 0.02], [0.05, 0.01]]).requires_grad_(False)
+    q0 = torch.tensor([math.pi, 0.0], dtype=torch.float64)
+    found = rollout(
+        plant, model, q0, 0 * q0, torch.as_tensor(tau[:-1]), sample_time=step, substeps=16
+    )
+    q = 1e-4 * np.round(found.q.numpy() / 1e-4)
+    assert warnings_of(plant, q, tau, time=time) == ()
+
+
 @pytest.mark.parametrize(
     ("name", "change", "finding"),
     [
