@@ -254,7 +254,7 @@ def balanced(
                   steps=round(seconds / SAMPLE_TIME), electronics=ELECTRONICS)  # fmt: skip
     return {
         name: ControlledMotion(
-            run.time, run.q[k], run.qd[k], run.qdd[k], run.diverged_at[k],
+            run.step, run.q[k], run.qd[k], run.qdd[k], run.diverged_at[k],
             tau=run.tau[k], measured=run.measured[k],
         )
         for k, name in enumerate(compensations)
