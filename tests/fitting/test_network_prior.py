@@ -84,6 +84,7 @@ def test_a_law_that_is_not_linear_has_a_network_too(constant):
     assert float(model.schedule.parameter_vector().abs().max()) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("sets_stay")
 def test_the_plant_stays_about_as_near_to_the_laws_as_that_left_it_open(constant, monkeypatch):
     recording, _ = constant
