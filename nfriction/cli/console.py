@@ -26,8 +26,8 @@ class _Help(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpF
     """Shows defaults where there is one; leaves examples as they are written."""
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
-        # "(default: None)" would say nothing.
-        if action.default in (None, False, []):
+        # "(default: None)" would say nothing, and some helps say it in words.
+        if action.default in (None, False, []) or "(default: " in (action.help or ""):
             return action.help
         return super()._get_help_string(action)
 
