@@ -262,7 +262,7 @@ def test_python_of_pages_runs_from_top_to_bottom(
 
 
 def shown_at(place: int, shown: list[str], printed: list[str]) -> bool:
-    """Whether words are printed from a place on, numbers to 1 %: processors round differently."""
+    """Compare shown words with those printed; numbers to 1 %, as processors round differently."""
 
     def same(a: str, b: str) -> bool:
         if a == b:

@@ -1,4 +1,4 @@
-"""How far a network may deviate from its constant law is for windows held back to say."""
+"""Hold-out windows decide how far a network may deviate from its constant law."""
 
 import math
 

@@ -18,6 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -42,6 +43,7 @@ from nfriction.papers.control.feedback import (
 from nfriction.papers.twin.dataset import SPECIFICATIONS, Encoder
 from nfriction.plant import PendulumChain, rigs
 from nfriction.plant.chain import Arm
+from nfriction.plots import style
 from nfriction.recording import Recording
 from nfriction.recording.angles import AngleConvention
 from nfriction.simulation.closed_loop import ControlledMotion, Electronics, control
@@ -361,3 +363,30 @@ def swung_up(
                   steps=round(seconds / SAMPLE_TIME), electronics=ELECTRONICS)  # fmt: skip
     late = run.q[run.time >= seconds - 1.0, 1].numpy()
     return plant, run, bool(np.abs(np.angle(np.exp(1j * late))).max() < 0.1)
+
+
+def balance_figure(motions: Mapping[str, Array]) -> Figure:
+    """Arm and tilt of the links while the arm follows its reference, a line a compensation."""
+    shown = {n: motions[f"follow, {n}"] for n in (NONE, SHARED, TRUTH) if f"follow, {n}" in motions}
+    figure, axes = style.panels(2, 1, style.PAGE, 3.6, sharex=True)
+    looks = style.looks(shown)
+    above, below = axes[:, 0]
+    for name, q in shown.items():
+        time = THINNED * SAMPLE_TIME * np.arange(len(q))
+        above.plot(time, q[:, 0], **looks[name].line)
+        tilt = np.abs(q[:, 1:].cumsum(-1)).max(-1)
+        below.plot(time, 1e3 * tilt, **looks[name].line)
+    (asked,) = above.plot(time, [reference(t)[0] for t in time.tolist()], **style.MEASURED)
+    asked.set_zorder(0)
+    above.set_ylabel("arm [rad]")
+    below.set_ylabel("largest tilt [mrad]")
+    below.set_xlabel("time [s]")
+    handles = [asked, *(looks[name].handle for name in shown)]
+    style.legend(figure, handles, ["reference", *(_label(name) for name in shown)])
+    return figure
+
+
+def _label(name: str) -> str:
+    return {NONE: "no compensation", TRUTH: "true friction compensated"}.get(
+        name, f"{name} compensated"
+    )

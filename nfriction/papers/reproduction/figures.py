@@ -17,8 +17,7 @@ from tqdm import tqdm
 from nfriction.evaluation.score import RMSE, Score
 from nfriction.io.files import atomic_write
 from nfriction.io.model_file import load
-from nfriction.papers.control.drawing import balance_figure
-from nfriction.papers.control.study import SAMPLE_TIME, THINNED, single_link
+from nfriction.papers.control.study import SAMPLE_TIME, THINNED, balance_figure, single_link
 from nfriction.papers.controller.mamdani import paper_controller
 from nfriction.papers.controller.rules import Variable
 from nfriction.papers.reproduction import tables
