@@ -83,6 +83,7 @@ def save_all(
             figure.savefig(path.with_suffix(f".{ending}"))
             written.append(path.with_suffix(f".{ending}"))
         shade = path.with_suffix(".dark.png")
+        figure.set_layout_engine("none")  # colours alone change: the layout, slow to find, stays
         for_dark_screen(figure, ground=DARK_GROUND).savefig(shade, dpi=DPI, metadata=kept)
         figure.clear()
         written += [path, shade]
