@@ -100,7 +100,10 @@ def _figures(
     """Name and figure, one after the other, so that only one is in memory."""
     for part in comparison.parts:
         scores = comparison.scores(part)
-        yield f"rmse_{part}", rmse_bars(comparison.table(part=part), comparison.unit)
+        table = comparison.table(part=part)
+        if len(comparison.joint_names) == 1:
+            table = table.drop(columns="all")  # it would repeat the joint's bars
+        yield f"rmse_{part}", rmse_bars(table, comparison.unit)
         yield f"horizons_{part}", horizon_curve(comparison, part=part)
         for recording in recordings:
             of = {m: s for m, many in scores.items() for s in many if s.recording == recording.name}
