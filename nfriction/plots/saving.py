@@ -83,6 +83,7 @@ def save_all(
             figure.savefig(path.with_suffix(f".{ending}"))
             written.append(path.with_suffix(f".{ending}"))
         shade = path.with_suffix(".dark.png")
+        figure.set_layout_engine("none")  # colours alone change: the layout, slow to find, stays
         for_dark_screen(figure, ground=DARK_GROUND).savefig(shade, dpi=DPI, metadata=kept)
         figure.clear()
         written += [path, shade]
@@ -99,7 +100,10 @@ def _figures(
     """Name and figure, one after the other, so that only one is in memory."""
     for part in comparison.parts:
         scores = comparison.scores(part)
-        yield f"rmse_{part}", rmse_bars(comparison.table(part=part), comparison.unit)
+        table = comparison.table(part=part)
+        if len(comparison.joint_names) == 1:
+            table = table.drop(columns="all")  # it would repeat the joint's bars
+        yield f"rmse_{part}", rmse_bars(table, comparison.unit)
         yield f"horizons_{part}", horizon_curve(comparison, part=part)
         for recording in recordings:
             of = {m: s for m, many in scores.items() for s in many if s.recording == recording.name}

@@ -17,6 +17,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from numpy.typing import NDArray
 
 from nfriction.evaluation.compare import NO_FRICTION
+from nfriction.friction import both_names
 from nfriction.friction.laws import Coefficient
 
 COLUMN, PAGE = 3.5, 7.0
@@ -90,7 +91,11 @@ def dress(ax: Axes) -> None:
 
 
 def legend(figure: Figure, handles: Iterable[Artist], labels: Sequence[str]) -> None:
-    """A legend above all panels, in as many columns as fit; the figure grows by its height."""
+    """A legend above all panels, in as many columns as fit; the figure grows by its height.
+
+    Models are labelled by their plain names and abbreviations, other labels stay.
+    """
+    labels = [both_names(label) for label in labels]
     longest = max(len(label) for label in labels)
     columns = min(len(labels), max(1, int(figure.get_figwidth() / (0.5 + 0.05 * longest))))
     rows = -(-len(labels) // columns)

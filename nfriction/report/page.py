@@ -28,7 +28,7 @@ from nfriction.evaluation.tables import (
     interval_table,
     selection_table,
 )
-from nfriction.friction import model_names, plain_name
+from nfriction.friction import both_names
 from nfriction.friction.models import FrictionModel
 from nfriction.io.files import write_atomically
 from nfriction.io.model_file import ModelInfo
@@ -165,6 +165,7 @@ _CAPTIONS = {
     "rmse_train": "Position error by model and joint, training recordings",
     "horizons_train": "Position error over the length of the simulation, training recordings",
     "mechanism": "The mechanism as the rig file describes it",
+    "motion_": "Measured (grey) and simulated motion of the best model, test recording ",
     "positions_test_": "Measured and simulated position with the error below, test: ",
     "positions_train_": "Measured and simulated position with the error below, training: ",
     "friction": "Friction torque over velocity: rows, their medians with quartiles in bins of "
@@ -186,9 +187,7 @@ _JINJA = jinja2.Environment(
     lstrip_blocks=True,
 )
 _JINJA.filters["four"] = lambda value: f"{value:.0f}" if 1e3 <= value < 1e7 else f"{value:.4g}"
-_JINJA.filters["plain"] = lambda name: (
-    f" ({plain_name(name)})" if name in model_names() and plain_name(name) != name.lower() else ""
-)
+_JINJA.filters["both"] = both_names
 # JavaScript reads Infinity where Python writes inf.
 _JINJA.filters["sortable"] = lambda value: (
     "Infinity" if math.isnan(value) else str(value).replace("inf", "Infinity")
@@ -271,8 +270,10 @@ def pictures(figures: Sequence[Figure]) -> list[dict[str, Any]]:
                 rank, caption = k, words + name.removeprefix(prefix)
         picture = {"caption": caption, "width": figure.width, "height": figure.height}
         for screen, of in (("light", figure), ("dark", by_name.get(name + _DARK))):
-            data = of and base64.b64encode(of.png).decode()
-            picture[screen] = data and f"data:image/png;base64,{data}"
+            data = of and base64.b64encode(of.data).decode()
+            # The first bytes name the format: \x89PNG or GIF89a.
+            kind = "gif" if of and of.data.startswith(b"GIF") else "png"
+            picture[screen] = data and f"data:image/{kind};base64,{data}"
         found.append((rank, picture))
     return [picture for _, picture in sorted(found, key=lambda pair: pair[0])]
 

@@ -85,6 +85,7 @@ def write_torque_fits(
                 figure.savefig(path, dpi=DPI)
                 drawn.append(Figure(name, path.read_bytes(), width, height))
                 written.append(path)
+                figure.set_layout_engine("none")  # the same layout, in other colours
                 for_dark_screen(figure, ground=DARK_GROUND)
         page = to_html(fits, folder, drawn, command)
         written.append(write_atomically(folder / REPORT, page.encode(errors="backslashreplace")))

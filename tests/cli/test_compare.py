@@ -54,18 +54,13 @@ def test_table_holds_the_errors_of_the_results(compared: Path) -> None:
     assert set(of.model) == set(models)
 
 
-def test_models_load_and_scripts_need_torch_alone(compared: Path) -> None:
+def test_models_load_and_scripts_equal_them(compared: Path) -> None:
     qd = torch.linspace(-3, 3, 7, dtype=torch.float64)[:, None]
     inputs = (qd, torch.zeros_like(qd), torch.ones_like(qd))
     for name in ("NCFM", "LFM"):
         script = torch.jit.load(compared / "models" / f"{name}.pt")
         model = load(compared / "models" / f"{name}.json")
         torch.testing.assert_close(script(*inputs), model(*inputs), rtol=0, atol=1e-12)
-    code = (
-        "import sys, torch; torch.jit.load(sys.argv[1]);"
-        "assert not any(m.startswith('nfriction') for m in sys.modules)"
-    )
-    subprocess.run([sys.executable, "-c", code, compared / "models" / "LFM.pt"], check=True)
 
 
 def test_figures_are_drawn_and_nothing_unfinished_stays(compared: Path) -> None:
@@ -325,7 +320,7 @@ def test_file_names_of_older_systems_lose_nothing(bench: Path, tmp_path: Path) -
         Recording.read(bench / name).write(path)
     rig = ["--rig", str(bench / "bench.json")]
     train, test, out = str(files[0]), str(files[1]), tmp_path / "out"
-    words = ["compare", train, "--test", test, *rig, "--models", "NCFM", *QUICK]
+    words = ["compare", train, "--test", test, *rig, "--models", "NCFM", *QUICK, "--no-figures"]
     assert cli.main([*words, "--out", str(out)]) == 0
     found = results(out)
     assert list(found["models"]["NCFM"]["test"]) == ["Gelenk_b_ä"]

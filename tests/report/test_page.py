@@ -6,6 +6,7 @@ import re
 from html.parser import HTMLParser
 
 import pytest
+from PIL import Image
 
 from nfriction import LFM, NFLFM, ModelInfo, save
 from nfriction.evaluation.tables import Table, error_table
@@ -86,6 +87,16 @@ def test_a_dark_screen_gets_the_dark_twin(page, tmp_path):
     assert not alone.all("source")
 
 
+def test_an_animation_moves_on_the_page(tmp_path):
+    folder = write(tmp_path)
+    still = Image.new("P", (30, 20))
+    still.save(folder / "figures" / "motion_1.gif", save_all=True, append_images=[still])
+    page = Page(to_html(read_run(folder)))
+    (shown,) = (i for i in page.all("img") if i.get("src", "").startswith("data:image/gif"))
+    assert (shown["width"], shown["height"]) == ("30", "20")
+    assert "simulated motion of the best model" in shown["alt"]
+
+
 def test_what_a_reader_of_the_screen_needs(page):
     assert page.all("html")[0]["lang"] == "en"
     assert all(a["alt"] for a in page.all("img")[:-1])  # the last one is the empty large picture
@@ -102,7 +113,7 @@ def test_what_a_reader_of_the_screen_needs(page):
 def test_verdicts_warnings_and_rules_are_told(page):
     text = " ".join("".join(page.text).split())
     for said in (
-        "LFM (load-coulomb) predicts the test recordings best: 100 mrad, where no friction leaves "
+        "load-coulomb (LFM) predicts the test recordings best: 100 mrad, where no friction leaves "
         "2000.",
         "Fit of LFM: good",
         "0.002 N m s/rad",

@@ -39,7 +39,7 @@ def test_a_damaged_model_or_figure_is_said_and_does_not_stop_the_report(tmp_path
     assert "LFM" not in run.models
     said = " ".join(run.notes)
     assert "LFM" in said
-    assert "rmse_test.png: not a PNG file" in said
+    assert "rmse_test.png: not a PNG or GIF file" in said
     assert "<svg" not in to_html(run)
 
 
