@@ -418,7 +418,7 @@ def _balance(plant: Plant, data: _Data, extra: Tensor | None = None) -> tuple[Te
     if not np.isfinite(rows).all():
         return torch.full_like(weight, math.inf), math.nan
     # The triangular factor has the same normal equations.
-    factor = np.linalg.qr(rows, mode="r")
+    _, factor = np.linalg.qr(rows)
     found = nnls(factor[:, :-1], factor[:, -1], maxiter=50 * len(norm))[0] / norm
     residual = left - design @ torch.as_tensor(found)
     factor_of_extra = found[0] - found[len(free) + len(signed)] if free else 0.0
