@@ -54,4 +54,4 @@ def pytest_collection_finish() -> None:
     """Let garbage collection pass over libraries and tests; it took a fifth of the run."""
     gc.collect()
     gc.freeze()
-    gc.set_threshold(20_000, 20, 20)
+    gc.set_threshold(20_000)
