@@ -153,8 +153,6 @@ def _in_order(centres: Sequence[float], names: Sequence[str]) -> list[str]:
     return [named[k] for k in range(len(centres))]
 
 
-# A figure's twin for a dark screen.
-_DARK = ".dark"
 # In the order of the page: friction and errors first, then motions, then the models' insides.
 _CAPTIONS = {
     "torque_over_velocity": "Friction torque over velocity: the models' laws with their 95 % bands "
@@ -258,23 +256,19 @@ def write_report(folder: str | Path, path: str | Path) -> Run:
 
 
 def pictures(figures: Sequence[Figure]) -> list[dict[str, Any]]:
-    """Figures in the order of the page as URLs, each with its twin for a dark screen if any."""
-    by_name, found = {figure.name: figure for figure in figures}, []
+    """Figures as URLs, in the order of the page."""
+    found = []
     for figure in figures:
         name = figure.name
-        if name.removesuffix(_DARK) in by_name.keys() - {name}:
-            continue  # shown with the other
         rank, caption = len(_CAPTIONS), name.replace("_", " ")
         for k, (prefix, words) in enumerate(_CAPTIONS.items()):
             if name == prefix or (prefix.endswith("_") and name.startswith(prefix)):
                 rank, caption = k, words + name.removeprefix(prefix)
-        picture = {"caption": caption, "width": figure.width, "height": figure.height}
-        for screen, of in (("light", figure), ("dark", by_name.get(name + _DARK))):
-            data = of and base64.b64encode(of.data).decode()
-            # The first bytes name the format: \x89PNG or GIF89a.
-            kind = "gif" if of and of.data.startswith(b"GIF") else "png"
-            picture[screen] = data and f"data:image/{kind};base64,{data}"
-        found.append((rank, picture))
+        # The first bytes name the format: \x89PNG or GIF89a.
+        kind = "gif" if figure.data.startswith(b"GIF") else "png"
+        url = f"data:image/{kind};base64,{base64.b64encode(figure.data).decode()}"
+        size = {"width": figure.width, "height": figure.height}
+        found.append((rank, {"caption": caption, "url": url, **size}))
     return [picture for _, picture in sorted(found, key=lambda pair: pair[0])]
 
 

@@ -379,7 +379,7 @@ def test_save_all_writes_every_figure_and_leaves_matplotlib_alone(tmp_path, monk
         "mechanism", "over_time_viscous",
         "coefficients_NFNCFM", "sections_NFNCFM", "memberships_NFNCFM",
     }  # fmt: skip
-    assert {f.name for f in files} == {f"{n}{of}.png" for n in expected for of in ("", ".dark")}
+    assert {f.name for f in files} == {f"{n}.png" for n in expected}
     assert all(f.read_bytes().startswith(b"\x89PNG") for f in files)
     assert rc_params() == before
     assert (tmp_path / "figures" / "rmse_test.png").is_file()

@@ -24,8 +24,7 @@ def test_a_run_is_what_its_files_say(folder):
     assert set(run.models) == {"LFM", "NFLFM"}
     assert run.comparison.table()["all"]["LFM"] == pytest.approx(0.1)
     assert run.comparison.scores()["NLFM"][0].diverged_at == 0.5
-    assert {f.name for f in run.figures} == {
-        "positions_train_calm", "rmse_test", "rmse_test.dark"}  # fmt: skip
+    assert {f.name for f in run.figures} == {"positions_train_calm", "rmse_test"}
     assert (run.figures[0].width, run.figures[0].height) == (800, 200)
     assert any("NLFM" in note for note in run.notes)  # its model file is not there
 
