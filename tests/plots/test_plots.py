@@ -26,7 +26,7 @@ from nfriction.friction import model_names
 from nfriction.friction.models import CVFM, LFM, NCFM, NLFM
 from nfriction.friction.neurofuzzy import NFLFM, NFNCFM, NFNLFM
 from nfriction.papers.controller.mamdani import paper_controller
-from nfriction.plant import LinearAxis, Rotor, rigs
+from nfriction.plant import LinearAxis, Motor, Rotor, rigs
 from nfriction.plots import saving, style
 from nfriction.recording import Recording
 from nfriction.signals import Motion
@@ -379,7 +379,7 @@ def test_save_all_writes_every_figure_and_leaves_matplotlib_alone(tmp_path, monk
         "mechanism", "over_time_viscous",
         "coefficients_NFNCFM", "sections_NFNCFM", "memberships_NFNCFM",
     }  # fmt: skip
-    assert {f.name for f in files} == {f"{n}{of}.png" for n in expected for of in ("", ".dark")}
+    assert {f.name for f in files} == {f"{n}.png" for n in expected}
     assert all(f.read_bytes().startswith(b"\x89PNG") for f in files)
     assert rc_params() == before
     assert (tmp_path / "figures" / "rmse_test.png").is_file()
@@ -443,3 +443,18 @@ def test_all_models_are_told_apart_by_marker_and_by_dashes():
     assert len({(look.line["color"], str(look.line["linestyle"])) for look in looks}) == len(
         model_names()
     )
+
+
+def test_a_motor_is_drawn_with_its_data_in_no_frame():
+    figure = plots.mechanism(Rotor(0.02, motor=Motor(50, 1.2e-5, 0.03), name="wheel"))
+    wheel, words = figure.axes
+    assert not wheel.axison
+    (text,) = words.texts
+    for line in ("wheel", "gear ratio 50", "rotor inertia 1.2e-05 kg m²", "N m/A"):
+        assert line in text.get_text()
+
+
+def test_legends_name_models_as_papers_and_in_plain_words():
+    figure = comparison_of(swing(1)).plot()
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert {"no friction", "viscous (NCFM)", "neuro-fuzzy:load-coulomb (NFLFM)"} < set(labels)
