@@ -253,8 +253,11 @@ def read_recordings(
     warnings.simplefilter("ignore", RecordingWarning)
     if in_degrees:
         # If the option is missing for one file, it is missing for all.
+        pairs = {"q1": "q1"} | (arguments.columns or {})
+        ours = "motor1" if "motor1" in pairs else "q1"
         warn(
             f"{', '.join(in_degrees)}: positions look like degrees or encoder counts; if so, add "
-            "--degrees, or state the counts of a turn, as in --columns q1=q1:counts/8192."
+            f"--degrees, or state the counts of a turn, as in --columns {ours}={pairs[ours]}"
+            ":counts/8192."
         )
     return recordings

@@ -14,7 +14,7 @@ from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.plant_parameters import TORQUE_DELAY
 from nfriction.fitting.result.identifiability import CoefficientUncertainty, Interval
 from nfriction.fitting.robust_loss import Outliers
-from nfriction.friction import model_names, plain_name
+from nfriction.friction import both_names
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
@@ -206,12 +206,11 @@ class FitResult:
 
     def _head(self) -> str:
         """Model, usability, status and residual in a line."""
-        name, (verdict, reason) = type(self.model).__name__, self.usability
-        known = f" ({plain_name(name)})" if name in model_names() else ""
+        name, (verdict, reason) = both_names(type(self.model).__name__), self.usability
         why = f" ({reason})" if reason else ""
         unit = self.residual_unit
         return (
-            f"{name}{known}: {verdict}{why}. {self.status.rstrip('.')}. Residual "
+            f"{name}: {verdict}{why}. {self.status.rstrip('.')}. Residual "
             f"{1e3 * self.residual:.3g} m{unit} RMS over the training data."
         )
 

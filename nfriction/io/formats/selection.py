@@ -29,7 +29,7 @@ _LIKE_TORQUE = re.compile(
 )
 _LIKE_TIME = re.compile(r"^(t|time|zeit|timestamp|zeitstempel)\b", re.IGNORECASE)
 _LIKE_POSITION = re.compile(
-    r"^(pos|ang|winkel|gelenk|joint|enc|geber|theta|phi|q(?!d))\w*[\W_]*\d*\s*([\[(].*)?$",
+    r"^(pos|ang|winkel|gelenk|joint|motor|enc|geber|theta|phi|q(?!d))\w*[\W_]*\d*\s*([\[(].*)?$",
     re.IGNORECASE,
 )
 _LIKE_CURRENT = re.compile("strom|current", re.IGNORECASE)
@@ -376,16 +376,27 @@ def _missing(table: pd.DataFrame, columns: dict[str, str], missing: list[str]) -
 
 
 def _guessed(found: Sequence[str]) -> dict[str, str]:
-    """Our names with a file's, by usual words for time and positions; empty unless both are there.
+    """Our names with a file's, by usual words; empty unless time and positions are among them.
 
     For an error's advice only: what is read is always named by the user.
     """
     plain = [name for name in found if not set(name) & set('",=:') and len(name) <= 60]
     times = [name for name in plain if _LIKE_TIME.search(name)]
-    positions = [name for name in plain if _LIKE_POSITION.search(name)][:10]
+    torques = [name for name in plain if _LIKE_TORQUE.search(name)]
+    positions = [name for name in plain if _LIKE_POSITION.search(name) and name not in torques][:10]
     if len(times) != 1 or not positions:
         return {}
-    pairs = {"time": times[0]} | {f"q{k}": name for k, name in enumerate(positions, 1)}
+    pairs = {"time": times[0]}
+    pairs |= {
+        f"{'motor' if name.lower().startswith('motor') else 'q'}{k}": name
+        for k, name in enumerate(positions, 1)
+    }
+    # Fewer than joints: it is not known which are driven.
+    if len(torques) == len(positions):
+        pairs |= {
+            f"{'current' if _LIKE_CURRENT.search(name) else 'tau'}{k}": name
+            for k, name in enumerate(torques, 1)
+        }
     return {key: name for key, name in pairs.items() if key != name}
 
 
