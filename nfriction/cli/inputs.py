@@ -261,9 +261,10 @@ def read_recordings(
         # If the option is missing for one file, it is missing for all.
         pairs = {"q1": "q1"} | (arguments.columns or {})
         ours = "motor1" if "motor1" in pairs else "q1"
+        theirs, _, _ = pairs[ours].partition(":")
         warn(
             f"{', '.join(in_degrees)}: positions look like degrees or encoder counts; if so, add "
-            f"--degrees, or state the counts of a turn, as in --columns {ours}={pairs[ours]}"
+            f"--degrees, or state the counts of a turn, as in --columns {ours}={theirs}"
             ":counts/8192."
         )
     return recordings
