@@ -207,6 +207,17 @@ def test_the_limit_knows_the_noise_of_the_torque():
     assert within >= 5
 
 
+def test_the_limit_knows_the_rounding_that_only_the_recording_shows():
+    """A joint held by friction reads a constant, up to half a count off."""
+    friction = CVFM(2, [[5e-2, 2e-3], [2e-2, 2e-3]], v_smooth=0.01).requires_grad_(False)
+    recording = swing(plant(), friction, **SETTINGS | {"start": (2.8, 0.3)})
+    stated, shown = (
+        score(plant(count), friction, recording, horizons=[1.0]).limit for count in (QUANTUM, None)
+    )
+    assert shown.free_run.all == pytest.approx(stated.free_run.all, rel=0.001)
+    assert shown.windows["1"].all == pytest.approx(stated.windows["1"].all, rel=0.001)
+
+
 def below_the_limit(seeds: Iterable[int]) -> int:
     """Number of random releases whose score by the true model is within the limit."""
     scores = (score(rig, MODEL, r, horizons=()) for rig, r, _ in map(release, seeds))

@@ -37,7 +37,7 @@ def hac_sd(residuals: Tensor, band: float, options: FitOptions = DEFAULTS) -> Te
     The noise level is the residuals' peak spectral density within the motion's bandwidth, which
     bounds the variance of their sum times a sensitivity of that bandwidth. It is estimated stretch
     by stretch: quantisation error is white while a joint moves and constant while it is nearly at
-    rest.
+    rest. Errors that occur again later, as rounding does in a periodic motion, count once.
 
     Args:
         residuals: [rad; m], shape (window, sample, joint), like the result.
@@ -57,7 +57,31 @@ def hac_sd(residuals: Tensor, band: float, options: FitOptions = DEFAULTS) -> Te
         [_max_spectral_density(_autocovariance(part), band, options) for part in stretches]
     )
     lengths = torch.tensor([part.shape[1] for part in stretches])
-    return (power * density).sqrt().transpose(0, 1).repeat_interleave(lengths, 1)
+    level, spread = (
+        x.sqrt().transpose(0, 1).repeat_interleave(lengths, 1) for x in (power, power * density)
+    )
+    return spread * repetition(residuals / level.clamp_min(1e-300), int(length)).sqrt()
+
+
+def repetition(residuals: Tensor, length: int) -> Tensor:
+    """Number of times that errors (window, sample, joint) in order of time occur, (joint,).
+
+    By their autocorrelation at lags of more than `length` samples, where it exceeds what errors
+    that last no longer than a window reach by chance at one of all lags.
+
+    References:
+        M. S. Bartlett, J. Royal Statistical Society Suppl. 8 (1946), 27-41 (variance at a lag).
+    """
+    # The last sample of a window is the first of the next.
+    series = residuals[:, :-1].flatten(0, 1)
+    count = len(series)
+    if count <= length:
+        return torch.ones_like(residuals[0, 0])
+    correlation = _correlation(_autocovariance(series[None]))[0]
+    variance = (2 * correlation[: residuals.shape[1]].square().sum(0) - 1) / count
+    highest = torch.stack([part.amax(0) for part in correlation[length:].split(length)])
+    found = highest.square() > 2 * math.log(count) * variance
+    return 1 + 2 * torch.where(found, highest, 0.0).clamp_min(0.0).sum(0)
 
 
 def decimation(residuals: Tensor, options: FitOptions = DEFAULTS) -> int:
