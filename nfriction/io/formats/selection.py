@@ -54,6 +54,10 @@ _SPELLINGS = {
 }  # fmt: skip
 
 
+# Those that mean nothing else: "rev" may be a direction, and SI needs no word.
+_UNIT_IN_NAME = re.compile(r"_(ms|us|ns|mrad|deg|mm|rpm|mNm|mA)$")
+
+
 class Source(NamedTuple):
     """A column of a table and its unit, None if unknown; of a motor, with what to multiply by."""
 
@@ -140,10 +144,14 @@ def table_arrays(
 
 
 def parse_source(spec: str, names: set[str]) -> Source | None:
-    """The column that a specification such as "enc_1" or "enc_1:deg" names, None if not there."""
+    """The column that a specification such as "enc_1" or "enc_1:deg" names, None if not there.
+
+    A unit at the end of a column's name, as in "speed_rpm", holds unless another one is stated.
+    """
     stem, _, unit = spec.rpartition(":")
     if spec in names:
-        return Source(spec, None)
+        in_name = _UNIT_IN_NAME.search(spec)
+        return Source(spec, in_name and canonical_unit(in_name[1]))
     return Source(stem, unit) if stem in names and is_unit(unit) else None
 
 
