@@ -29,7 +29,8 @@ are kept apart. A model that is twice as bad as one named before it is marked as
 DATA holds a folder to each set, with a `recordings.csv` of initial states.
 
 `intervals` fits pieces of recordings, each alone, and prints how often the difference of what two
-of them say lies within its 95 % interval.
+of them say lies within its 95 % interval; and how often the intervals hold the truth where each
+piece is simulated by its own fit, so that law and plant are right.
 
 `own-rigs` fits rigs as a new user brings them, two recordings of 10 s at 500 Hz with 4096 counts
 each, by default settings and on a plant that is off by as much as a fit expects: a driven flywheel

@@ -14,6 +14,7 @@ FIGURES = (
         "horizons_test": "horizons",
         "sections_NFCVFM": "sections",
         "coefficients_NFCVFM": "maps",
+        "mechanism": "mechanism",
     },
     {"torque_over_velocity": "motor"},
 )

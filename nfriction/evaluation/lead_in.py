@@ -146,7 +146,7 @@ class Simulator:
                 # Not deflected before the first sample.
                 step = torch.tensor(np.diff(self.time, prepend=0.0))
                 start = friction.law.initial_state(qd[0])
-                held = friction.coefficients(qd[0], qdd[0])
+                held = friction.coefficients(qd, qdd).expand(*qd.shape, -1)
                 self.law_states = states_along(
                     friction.law.memory, start, qd, plant.load(q, qd), held, step
                 )

@@ -195,7 +195,9 @@ def _states(law: Law, joint: JointTorque, coefficients: Tensor) -> Tensor:
     moved = torch.tensor(path_of(joint)) / step
     one = torch.ones(len(moved), 1).double()
     start = coefficients.new_zeros((*coefficients.shape[:-1], law.memory.size))
-    along = states_along(law.memory, start, moved[:, None], one, coefficients, step)
+    along = states_along(
+        law.memory, start, moved[:, None], one, coefficients.expand(len(moved), -1, -1, -1), step
+    )
     return along.transpose(0, 1)
 
 

@@ -81,11 +81,6 @@ def prepare_task(
             f"the law {model.law.name!r} is for tables of torque, see `fit_torque`; to motions fit "
             "maxwell-slip."
         )
-    if model.law.memory and model.schedule.follows_motion:
-        raise ValueError(
-            f"the law {model.law.name!r} has an internal state, which fits follow only with "
-            f"constant coefficients; got {type(model.schedule).__name__}."
-        )
     joint = in_joint_coordinates(plant, model, given)
     if options.eccentricity == "on" and not isinstance(plant, PendulumChain):
         raise ValueError(f"{plant.name or 'the axis'} has no encoders that turn with its joints.")

@@ -182,6 +182,11 @@ def fit_memory(
         )
     require_load(name, joint)
     unknown: tuple[str, ...] = ()
+    if model.schedule.follows_motion:
+        raise ValueError(
+            f"{plain_name(name)} is fitted to recordings of motion, not to tables; use its law, or "
+            "slip."
+        )
     if "sigma_0" in model.law.names:
         found = fit_bristles(model.law, joint, blocks)
         if not found.presliding:
@@ -244,7 +249,8 @@ def _remembered(model: FrictionModel, memory: Memory, joint: JointTorque, lead_i
 
     def along(state: Tensor, rows: slice) -> Tensor:
         """States after rows, (row, *state)."""
-        return states_along(memory, state, moved[rows], load[rows], coefficients, steps[rows])
+        held = coefficients.expand(len(steps[rows]), -1, -1)
+        return states_along(memory, state, moved[rows], load[rows], held, steps[rows])
 
     still = torch.zeros(1, 1, memory.size).double()
     # A table to predict may have no torque, which then shows nothing.

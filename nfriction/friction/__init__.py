@@ -28,13 +28,10 @@ _LAWS = {
     "coulomb-viscous": "CVFM",
     "stribeck": "Stribeck",
 }
-# Laws with memory, which have no other kinds yet.
-_MEMORY = {
-    "dahl": "Dahl",
-    "lugre": "LuGre",
-    "elasto-plastic": "ElastoPlastic",
-    "maxwell-slip": "MaxwellSlip",
-}
+# Laws with memory: of bristles, whose Coulomb and Stribeck friction a network may correct, and of
+# elements that slip.
+_BRISTLES = {"dahl": "Dahl", "lugre": "LuGre", "elasto-plastic": "ElastoPlastic"}
+_MEMORY = _BRISTLES | {"maxwell-slip": "MaxwellSlip"}
 # Slip elements beside terms of the velocity, for tables of torque.
 _HYSTERESIS = {"slip": "Slip", "load-slip": "LoadSlip"}
 # Classes are resolved only when asked for: a command line then starts quickly, and the core does
@@ -53,10 +50,12 @@ _MODELS = {
     if (kind.prefix, law) != _MISSING
 }
 _KIND_OF_MEMORY = _Kind("", "", "nfriction.friction.memory")
+_KIND_OF_BRISTLES = _Kind("neuro-fuzzy:", "NF", "nfriction.friction.memory")
 _KIND_OF_HYSTERESIS = _Kind("", "", "nfriction.friction.hysteresis")
 _ALL = (
     _MODELS
     | {name: (_KIND_OF_MEMORY, law) for law, name in _MEMORY.items()}
+    | {"NF" + name: (_KIND_OF_BRISTLES, law) for law, name in _BRISTLES.items()}
     | {name: (_KIND_OF_HYSTERESIS, law) for law, name in _HYSTERESIS.items()}
 )
 _BY_TEXT = {
@@ -102,7 +101,7 @@ def model_names() -> tuple[str, ...]:
 
 def memory_names() -> tuple[str, ...]:
     """Names of the models of laws with memory."""
-    return (*_MEMORY.values(), *_HYSTERESIS.values())
+    return tuple(name for name in _ALL if name not in _MODELS)
 
 
 def plain_name(name: str) -> str:
@@ -137,7 +136,8 @@ def model_list() -> str:
     before = " or ".join(f"{kind.prefix} ({kind.letters}{first}, ...)" for kind in others)
     return (
         f"{laws}; also with {before} before them, except {''.join(_MISSING)}; "
-        f"with memory {', '.join((*_MEMORY, *_HYSTERESIS))}"
+        f"with memory {', '.join((*_MEMORY, *_HYSTERESIS))}; neuro-fuzzy: may precede "
+        f"{', '.join(_BRISTLES)}, too"
     )
 
 

@@ -48,6 +48,7 @@ class Coefficient:
         prior_scale: standard deviation of a prior around zero, relative to the root mean square of
             the joint's friction torque; infinite for no prior. Use it where most joints have little
             of an effect that short recordings seem to show.
+        stores: scales the energy of a law's memory, so that networks leave it constant.
 
     Raises:
         ValueError: if a nonlinear coefficient has no initial grid, or has a prior, or a start value
@@ -61,6 +62,7 @@ class Coefficient:
     initial_grid: tuple[float, ...] = ()
     fitted: bool = True
     prior_scale: float = math.inf
+    stores: bool = False
 
     def __post_init__(self) -> None:
         if not self.linear and not self.initial_grid:

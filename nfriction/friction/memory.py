@@ -47,7 +47,8 @@ import torch
 from torch import Tensor
 
 from nfriction.friction.laws import Coefficient, Law, Memory, smooth_sign
-from nfriction.friction.models import V_SMOOTH, ConstantModel
+from nfriction.friction.models import V_SMOOTH, ConstantModel, FrictionModel, NamedModel
+from nfriction.friction.neurofuzzy import NeuroFuzzy
 
 # TorchScript has no arithmetic on unions: it compiles these functions for tensors.
 if TYPE_CHECKING:
@@ -68,15 +69,20 @@ def states_along(
         start: state before the first sample, (*batch, joint, state).
         qd: velocity held over the sample [rad/s], (sample, joint) or with a batch.
         load: likewise [-].
-        coefficients: held all the time, (*batch, joint, coefficient).
+        coefficients: held over the sample, (sample, *batch, joint, coefficient).
         step: lengths of the samples [s], (sample,) or of the joints of a batch.
     """
     state, states = start, []
     shape = start.shape[:-1]
-    for v, s, h in zip(qd, load, step, strict=True):
-        state = memory.advance(state, v.expand(shape), s.expand(shape), coefficients, h)
+    for v, s, c, h in zip(qd, load, coefficients, step, strict=True):
+        state = memory.advance(state, v.expand(shape), s.expand(shape), c, h)
         states.append(state)
     return torch.stack(states)
+
+
+def reference_coefficients(model: FrictionModel) -> Tensor:
+    """Constants that deflections are measured by: a network's are those from which it deviates."""
+    return [*model.schedule.coefficient_sets().values()][-1].clone()
 
 
 def slipping_state(memory: Memory, coefficients: Tensor) -> Tensor:
@@ -266,7 +272,9 @@ _F_C = Coefficient("F_c", "N m")
 _F_D = Coefficient("F_d", "N m", prior_scale=1.0)
 _V_S = Coefficient("v_s", "rad/s", linear=False, initial_grid=(0.003, 0.01, 0.03, 0.1, 0.3))
 # From hobby servos to machine tools; a fit looks for its start relative to the data.
-_STIFFNESS = Coefficient("sigma_0", "N m/rad", linear=False, initial_grid=(0.3, 3e3, 3e7))
+_STIFFNESS = Coefficient(
+    "sigma_0", "N m/rad", linear=False, initial_grid=(0.3, 3e3, 3e7), stores=True
+)
 _DAMPING = Coefficient("sigma_1", "N m s/rad", linear=False, initial_grid=(1e-5, 0.1, 1e3))
 _VISCOUS = Coefficient("sigma_2", "N m s/rad")
 
@@ -315,7 +323,7 @@ def maxwell_slip(elements: int) -> Law:
     return Law(
         f"maxwell_slip_{elements}",
         (
-            *(Coefficient(f"k_{i}", "N m/rad") for i in numbers),
+            *(Coefficient(f"k_{i}", "N m/rad", stores=True) for i in numbers),
             *(
                 Coefficient(f"d_{i}", "rad", linear=False, initial_grid=(d,), fitted=False)
                 for i, d in zip(numbers, spread, strict=True)
@@ -345,6 +353,31 @@ class ElastoPlastic(ConstantModel):
     """LuGre bristles that do not drift at rest: elastic up to a share rho of F_c."""
 
     definition = ELASTO_PLASTIC
+
+
+# The stiffness stays constant under a network: energy stored at one is given back at another. What
+# friction dissipates may follow the motion, so that these are passive like their laws.
+
+
+class NFDahl(NamedModel):
+    """Dahl's law with neuro-fuzzy F_c and F_v, and a constant stiffness."""
+
+    definition = DAHL
+    make_schedule = NeuroFuzzy
+
+
+class NFLuGre(NamedModel):
+    """LuGre bristles of constant stiffness, with neuro-fuzzy friction and damping."""
+
+    definition = LUGRE
+    make_schedule = NeuroFuzzy
+
+
+class NFElastoPlastic(NamedModel):
+    """Bristles that do not drift at rest, with neuro-fuzzy friction and damping."""
+
+    definition = ELASTO_PLASTIC
+    make_schedule = NeuroFuzzy
 
 
 class MaxwellSlip(ConstantModel):

@@ -113,6 +113,7 @@ class NeuroFuzzy(Schedule):
         prior_sd: float = PRIOR_SD,
     ) -> None:
         super().__init__(law, joints)
+        self.fitted_mask = [c.fitted and not c.stores for c in law.coefficients]
         if acceleration not in ("along_motion", "signed"):
             raise ValueError(
                 f'`acceleration` must be "along_motion" or "signed", got {acceleration!r}.'

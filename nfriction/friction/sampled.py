@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
-from nfriction.friction.coefficients import Constant, Schedule
+from nfriction.friction.coefficients import Schedule
 from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.parameters import Sensitivity, positive_number
@@ -23,19 +23,19 @@ def sampled(model: FrictionModel, sample_time: float) -> FrictionModel:
     hidden state before a first sample is that of a joint at rest, nothing deflected.
 
     Args:
-        model: of a law with memory and constant coefficients.
+        model: of a law with memory, whose coefficients have no hidden state of their own.
         sample_time: time between samples [s].
 
     Raises:
-        ValueError: if the coefficients follow the motion, if the state depends on the load, which
-            a schedule does not see, or if the sample time is not positive.
+        ValueError: if the coefficients have a hidden state, if the law's state depends on the
+            load, which a schedule does not see, or if the sample time is not positive.
     """
     step = positive_number("sample_time", sample_time, "s")
     law = model.law
-    if law.memory is None or not isinstance(model.schedule, Constant):
+    if law.memory is None or model.state_size:
         raise ValueError(
-            f"only a law with memory and constant coefficients can be sampled, got {law.name!r} "
-            f"with {type(model.schedule).__name__}."
+            "only a law with memory can be sampled, with coefficients that have no hidden state; "
+            f"got {law.name!r} with {type(model.schedule).__name__}."
         )
     _refuse_load(model, step)
     # Signed and without bounds: no fit varies them.
@@ -73,7 +73,7 @@ class _Torque(nn.Module):
 
 
 class _Sampled(Schedule):
-    """Constant coefficients, and the state of the law that has them."""
+    """Coefficients, and the state of the law that has them."""
 
     # The law has no trained range, and a clamped velocity would move its state too little.
     handles_range = True
@@ -85,7 +85,7 @@ class _Sampled(Schedule):
         assert model.law.memory is not None
         self.state_size = model.law.state_size
         self.sample_time = sample_time
-        self.constant = model.schedule
+        self.given = model.schedule
         self.law_advance = model.law.memory.advance
         step = torch.tensor(sample_time, dtype=torch.float64)
         self.register_buffer("step", step, persistent=False)
@@ -100,24 +100,24 @@ class _Sampled(Schedule):
 
     def advance(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
         load = 0.0 * qd  # has no part in it
-        return self.law_advance(state, qd, load, self.constant(qd, qdd), self.step)
+        return self.law_advance(state, qd, load, self.given(qd, qdd), self.step)
 
     def coefficients_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
-        c = self.constant(qd, qdd)
+        c = self.given(qd, qdd)
         # Adding zeros broadcasts; ONNX has no form of `expand`.
         return torch.cat([c + 0.0 * state[..., :1], state], -1)
 
     def parameter_vector(self) -> Tensor:
-        return self.constant.parameter_vector()
+        return self.given.parameter_vector()
 
     def set_parameter_vector(self, vector: Tensor) -> None:
-        self.constant.set_parameter_vector(vector)
+        self.given.set_parameter_vector(vector)
 
     def parameter_names(self, joint_names: Sequence[str]) -> list[str]:
-        return self.constant.parameter_names(joint_names)
+        return self.given.parameter_names(joint_names)
 
     def bounds(self) -> tuple[Tensor, Tensor]:
-        return self.constant.bounds()
+        return self.given.bounds()
 
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
         raise NotImplementedError("a sampled law is for controllers; fit the law itself.")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction import CVFM, LFM, LinearAxis, PendulumChain, Recording, rollout, score
+from nfriction import CVFM, LFM, LinearAxis, PendulumChain, Recording, rigs, rollout, score
 from nfriction.evaluation.compare import Comparison
 from nfriction.evaluation.lead_in import Simulator, estimate_starts, lead_in_samples
 from nfriction.evaluation.score import RMSE, Score
@@ -284,3 +284,12 @@ def test_tables_are_root_mean_squares_and_percentages():
     np.testing.assert_allclose(saved[0], 0.0, atol=1e-12)
     assert saved[1, -1] == pytest.approx(100 * (1 - table[1, -1] / table[0, -1]))
     assert not torch.is_grad_enabled() or MODEL.schedule.raw.grad is None
+
+
+def test_a_path_and_the_name_of_a_rig_do(tmp_path):
+    time = np.arange(300) * 2e-3
+    recording = Recording(time, 0.01 * np.sin(time)[:, None], convention="relative,hanging")
+    recording.write(tmp_path / "run.csv")
+    named = score("multiarm-single", None, tmp_path / "run.csv", limit=False)
+    given = score(rigs.of("multiarm-single"), None, recording, limit=False)
+    assert named.free_run == given.free_run

@@ -13,7 +13,7 @@ from nfriction.export.c_code.export import c_runner, find_compiler
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.hysteresis import ELEMENTS, LoadSlip, Slip
 from nfriction.friction.laws import Coefficient, Law, Memory
-from nfriction.friction.memory import Dahl, ElastoPlastic, LuGre, MaxwellSlip
+from nfriction.friction.memory import Dahl, ElastoPlastic, LuGre, MaxwellSlip, NFLuGre
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.sampled import sampled
 
@@ -22,6 +22,17 @@ STEP = 2e-3
 INFO = ModelInfo(sample_time=STEP)
 HYSTERESIS = [0.1, 0.2, 0.05, 0.3, 0.1, 0.2, 0.03, 1e-3, 0.0]
 HYSTERESIS += [*[0.05] * ELEMENTS, *[10.0 ** (0.2 * k - 4) for k in range(ELEMENTS)]]
+
+
+def corrected(model: FrictionModel, size: float = 0.2) -> FrictionModel:
+    """A model whose network is anything that a fit may find."""
+    model.schedule.set_range(0.5, [-3.0, 3.0])
+    lower, upper = model.schedule.bounds()
+    noise = torch.randn(lower.shape, generator=torch.Generator().manual_seed(0), dtype=F64)
+    model.schedule.set_parameter_vector(torch.where(lower < upper, size * noise, 0.0))
+    return model
+
+
 MODELS: dict[str, FrictionModel] = {
     "lugre": LuGre(2, [[1.0, 0.5, 0.001, 1e5, 300.0, 0.4], [0.3, 0.1, 0.01, 1e3, 1.0, 0.1]]),
     "elasto-plastic": ElastoPlastic(2, [1.0, 0.5, 0.001, 1e5, 300.0, 0.4, 0.7]),
@@ -29,6 +40,7 @@ MODELS: dict[str, FrictionModel] = {
     "maxwell-slip": MaxwellSlip(2, elements=3),
     "slip": Slip(2, HYSTERESIS),
     "load-slip": LoadSlip(2, HYSTERESIS),
+    "neuro-fuzzy lugre": corrected(NFLuGre(2, [1.0, 0.5, 0.05, 1e3, 3.0, 0.4], terms=(3, 2))),
 }
 every_model = pytest.mark.parametrize("name", MODELS)
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -43,11 +55,11 @@ def motion(count: int) -> Tensor:
 
 def torques(model: FrictionModel, qd: Tensor) -> Tensor:
     """Torques along a motion by the law's own two functions."""
-    law, c = model.law.memory, model.schedule.rest_coefficients().detach()
+    law = model.law.memory
     assert law is not None
     state, one = torch.zeros(2, law.size, dtype=F64), torch.ones(2, dtype=F64)
-    found = []
-    for v in qd:
+    along, found = model.coefficients(qd, 0.0 * qd).detach().expand(*qd.shape, -1), []
+    for v, c in zip(qd, along, strict=True):
         state = law.advance(state, v, one, c, STEP)
         found.append(law.torque(state, v, one, c))
     return torch.stack(found)

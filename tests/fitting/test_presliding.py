@@ -14,9 +14,8 @@ from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.constant import yielding
 from nfriction.friction import model_by_name
-from nfriction.friction.memory import DAHL, LuGre, MaxwellSlip
+from nfriction.friction.memory import DAHL, LuGre, MaxwellSlip, NFLuGre
 from nfriction.friction.models import FrictionModel
-from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.signals import kalman_smoother, quantise
 from tests.fitting.recordings import F64, pendulum
 
@@ -51,6 +50,7 @@ def recorded(truth: tuple[float, ...], seed: int, seconds: float, rate: int) -> 
     ("name", "plant", "values"),
     [
         ("LuGre", LinearAxis(0.5), SOFT),
+        ("NFLuGre", LinearAxis(0.5), SOFT),
         pytest.param("MaxwellSlip", LinearAxis(0.05), SLIPS, marks=pytest.mark.slow),
         pytest.param("LuGre", pendulum(), (0.03, 0.015, 0.3, 3.0, 0.01, 0.003),
                      marks=pytest.mark.slow),
@@ -77,7 +77,8 @@ def test_derivatives_follow_the_deflections_from_a_windows_start(
     own[:] = torch.linspace(-0.9, 0.8, own.numel(), dtype=F64).reshape(own.shape)
     found = problem.linearise(x).gradient
     for k in [*range(joints * len(values)), *range(len(x) - states.numel(), len(x))]:
-        step = 1e-6 * max(abs(float(x[k])), 1e-3)
+        # A network's parameters are zero.
+        step = 1e-6 * max(abs(float(x[k])), 1e-3) if x[k] else 1e-5
         ahead, back = x.clone(), x.clone()
         ahead[k] += step
         back[k] -= step
@@ -101,12 +102,6 @@ def test_windows_begin_with_the_deflection_that_holds_the_joint() -> None:
     # The second and fourth begin amid a push; viscous friction is taken for a deflection, too.
     assert float(share[1]) == pytest.approx(float(true[1]), abs=0.05)
     assert float(true[3]) < float(share[3]) <= 1.0
-
-
-def test_a_network_of_a_law_with_memory_is_refused_before_the_fit() -> None:
-    model = FrictionModel(DAHL, NeuroFuzzy(DAHL, 1))
-    with pytest.raises(ValueError, match=r"only with constant coefficients; got NeuroFuzzy"):
-        fit(model, AXIS, recorded(SOFT, 2, 5.0, 500), windows=(0.5,), max_steps=1)
 
 
 def test_a_law_of_ones_own_may_name_its_coefficients_otherwise() -> None:
@@ -142,6 +137,39 @@ def test_a_fit_with_memory_is_scored_saved_and_tabulated(short, tmp_path) -> Non
     sd = found.uncertainty.torque_sd(found.model, torch.tensor([[-0.5], [0.5]], dtype=F64))
     assert (sd > 0).all()
     assert (sd < 0.1).all()
+
+
+@pytest.mark.slow
+def test_a_network_that_the_data_do_not_ask_for_is_left_out(short) -> None:
+    recording, law = short
+    found = fit("neuro-fuzzy:lugre", AXIS, recording, windows=(0.5,), fit_plant=False, start=law)
+    assert "constant law is kept" in found.status
+    at = torch.linspace(-1.0, 1.0, 9, dtype=F64)[:, None]
+    coefficients = found.model.coefficients(at, 10.0 * at)
+    torch.testing.assert_close(coefficients, law.model.schedule.values.expand(9, 1, -1))
+
+
+@pytest.mark.slow
+def test_a_network_corrects_bristles_where_friction_is_another() -> None:
+    truth = NFLuGre(1, SOFT)
+    schedule = truth.schedule
+    schedule.set_range(3.0, [-40.0, 40.0])
+    # F_c and viscous friction of no law.
+    rules, random = schedule.network.anfis.consequents, torch.Generator().manual_seed(3)
+    with torch.no_grad():
+        for k in (0, 5):
+            rules[0, k] = 0.25 * torch.randn(rules[0, k].shape, generator=random, dtype=F64)
+    truth.requires_grad_(False)
+    first, second, apart = (pushed(truth, seed, seconds=20.0, rate=500) for seed in (0, 1, 7))
+    given = {"windows": (0.5, 2.0), "fit_plant": False}
+    law = fit("lugre", AXIS, [first, second], **given)
+    found = fit("neuro-fuzzy:lugre", AXIS, [first, second], **given, start=law)
+    better, plain = (score(f.plant, f.model, apart, limit=False).free_run.all for f in (found, law))
+    assert better < 0.5 * plain
+    # The contact stores energy at one stiffness.
+    at = torch.linspace(-2.0, 2.0, 9, dtype=F64)[:, None]
+    stiffness = found.model.coefficients(at, 10.0 * at)[..., 3]
+    assert float(np.ptp(stiffness.numpy())) == 0.0
 
 
 @pytest.mark.slow

@@ -133,11 +133,13 @@ def test_names_from_files_run_no_script(looks):
 
 def test_headings_sort_their_table(looks):
     for look in looks:
-        assert look["before"] == ["no friction", "LFM", "NLFM", "NFLFM"]
-        by_error = ["LFM", "NFLFM", "no friction", "NLFM"]  # NLFM diverged
+        linear, arctan = "load-coulomb (LFM)", "arctan (NLFM)"
+        fuzzy, none = "neuro-fuzzy:load-coulomb (NFLFM)", "no friction"
+        assert look["before"] == [none, linear, arctan, fuzzy]
+        by_error = [linear, fuzzy, none, arctan]  # arctan diverged
         assert look["ascending"] == [by_error, "ascending"]
         assert look["descending"] == [by_error[::-1], "descending"]
-        assert look["words"] == [["LFM", "NFLFM", "NLFM", "no friction"], "none"]
+        assert look["words"] == [[arctan, linear, fuzzy, none], "none"]
 
 
 def test_figures_open_grow_and_close(looks):

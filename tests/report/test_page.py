@@ -133,7 +133,7 @@ def test_verdicts_warnings_and_rules_are_told(page):
     for said in (
         "load-coulomb (LFM) predicts the test recordings best: 100 mrad, where no friction leaves "
         "2000.",
-        "Fit of LFM: good",
+        "Fit of load-coulomb (LFM): good",
         "0.002 N m s/rad",
         f"it is statistically tied with {EVIL}; the simplest of them is {EVIL}.",
         "Doubtful.",

@@ -27,6 +27,7 @@ from nfriction.friction.memory import (
     ElastoPlastic,
     LuGre,
     MaxwellSlip,
+    NFLuGre,
     steady_friction,
 )
 from nfriction.friction.models import FrictionModel
@@ -68,6 +69,12 @@ def models() -> dict[str, FrictionModel]:
             2, [1.0, 0.5, 0.3, 0.2, 0.1, 1e-3, 5e-3, 0.02, 0.05, 0.1, 3e-3, 0.3, 0.1]
         ),
     }
+    network = NFLuGre(2, SOFT, terms=(3, 2))
+    network.schedule.set_range(10.0, [-100.0, 100.0])
+    lower, upper = network.schedule.bounds()
+    noise = torch.randn(lower.shape, generator=torch.Generator().manual_seed(0), dtype=F64)
+    network.schedule.set_parameter_vector(torch.where(lower < upper, 0.3 * noise, 0.0))
+    found["neuro-fuzzy"] = network
     return {name: model.requires_grad_(False) for name, model in found.items()}
 
 
@@ -160,7 +167,7 @@ def test_a_stiff_contact_is_stable_where_an_explicit_step_is_not() -> None:
     assert abs(v) > 1e3
 
 
-@pytest.mark.parametrize("name", ["lugre", "stiff", "dahl", "elasto-plastic", "slip"])
+@every_model
 def test_friction_never_feeds_energy_into_a_free_mechanism(name: str) -> None:
     model = models()[name]
     run = rollout(CHAIN, model, Q0, REST, sample_time=1e-3, steps=10_000)

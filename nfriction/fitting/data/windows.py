@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.friction.memory import slipping_state
+from nfriction.friction.memory import reference_coefficients, slipping_state
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
@@ -65,7 +65,7 @@ class Windows:
         over which contacts yield.
         """
         assert model.law.memory is not None
-        coefficients = model.schedule.rest_coefficients().detach()
+        coefficients = reference_coefficients(model)
         still, unit = torch.zeros_like(self.q0[0]), torch.ones_like(self.q0[0])
         slipping = slipping_state(model.law.memory, coefficients)
         largest = model.law.memory.torque(slipping, still, unit, coefficients)

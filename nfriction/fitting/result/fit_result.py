@@ -5,8 +5,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
 from torch import Tensor
 
 from nfriction.fitting.options import DEFAULTS
@@ -24,16 +25,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Usability = Literal["good", "doubtful", "do not use"]
-# Residuals above so many times the encoder's rounding are mostly the model's error, unless noise of
-# the torque explains them. A well-fitted law on a real bench has up to ten times.
-DOUBTFUL_RATIO = 20.0
-
-
-class Noise(NamedTuple):
-    """Root mean square of the encoders' rounding, and residual of a right law [rad; m]."""
-
-    rounding: float
-    residual: float
+# Normalised root mean square error that makes a fit doubtful: a fit of less than 99 % as system
+# identification counts it (L. Ljung, System Identification, 2nd ed. 1999, section 16.3).
+DOUBTFUL_ERROR = 0.01
+# Standard deviation of an angle of which nothing is known [rad].
+UNIFORM_TURN = math.pi / 3**0.5
 
 
 @dataclass(frozen=True)
@@ -65,7 +61,8 @@ class FitResult:
             equation-error fit.
         data_warnings: warnings about the data; inherited by fits warm-started from this one.
         mistakes: likely mistakes in recordings or rig, see `fitting.diagnosis`; inherited, too.
-        noise: of encoders and torque; None after an equation-error fit.
+        noise: root mean square residual of a right law, by the noise of encoders and torque
+            [rad; m]; None after an equation-error fit.
         stages: length of the windows of each stage that was kept [s], and its residual in
             `residual_unit`; of constant coefficients.
         skipped_horizons: lengths of windows that the constant law could not follow [s].
@@ -91,7 +88,7 @@ class FitResult:
     uncertainty: CoefficientUncertainty | None = None
     data_warnings: tuple[str, ...] = ()
     mistakes: tuple[str, ...] = ()
-    noise: Noise | None = None
+    noise: float | None = None
     stages: tuple[tuple[float, float], ...] = ()
     skipped_horizons: tuple[float, ...] = ()
     outliers: tuple[Outliers, ...] = ()
@@ -113,12 +110,21 @@ class FitResult:
 
     @property
     def usability(self) -> tuple[Usability, str]:
-        """Fitness for simulation and control, and the reason in a clause."""
-        noise = self.noise or Noise(math.inf, math.inf)
-        wrong = self.residual > max(
-            DOUBTFUL_RATIO * noise.rounding, DEFAULTS.model_error_ratio * noise.residual
+        """Fitness for simulation and control, and the reason in a clause.
+
+        The residual is judged by how far the joints move: a fine encoder shows errors that hardly
+        matter, and noise is no error of the model.
+        """
+        noise = math.inf if self.noise is None else self.noise
+        moved = np.concatenate([m.q.var(axis=0) for m in self.motions] or [[math.inf]])
+        # A joint that turns over and over is somewhere on its circle.
+        most = UNIFORM_TURN**2 if self.plant.unit == "rad" else math.inf
+        error = self.residual / math.sqrt(np.minimum(moved, most).mean())
+        wrong = error > DOUBTFUL_ERROR and self.residual > DEFAULTS.model_error_ratio * noise
+        far = (
+            f"the residual is {100 * error:.2g} % of the motion's standard deviation, and "
+            f"{self.residual / noise:.0f} times the measurement noise"
         )
-        far = f"the residual is {self.residual / noise.residual:.0f} times the measurement noise"
         if self.mistakes:
             return "do not use", f"a mistake in the data is likely: {self.mistakes[0]}"
         if not self.converged and wrong:

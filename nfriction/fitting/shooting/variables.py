@@ -12,7 +12,7 @@ from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.plant_parameters import PlantParameter
 from nfriction.friction.coefficients import Schedule
-from nfriction.friction.memory import slipping_state
+from nfriction.friction.memory import reference_coefficients, slipping_state
 from nfriction.friction.models import FrictionModel
 
 
@@ -32,7 +32,7 @@ def deflected(model: FrictionModel, shares: Tensor) -> tuple[Tensor | None, Tens
     memory = model.law.memory
     if memory is None:
         return None, None
-    coefficients = model.schedule.rest_coefficients().detach().clone().requires_grad_()
+    coefficients = reference_coefficients(model).requires_grad_()
     with torch.enable_grad():
         slipping = slipping_state(memory, coefficients)
         # A law is elementwise, so the sum's gradient is each joint's own.
@@ -47,7 +47,12 @@ def deflected(model: FrictionModel, shares: Tensor) -> tuple[Tensor | None, Tens
     own = torch.eye(joints, dtype=torch.float64)[:, None, :, None]
     by_coefficient = own * (share[..., None] * torch.stack(rows, 1))[..., None, :]
     by_share = torch.diag(slipping.flatten()).expand(len(shares), -1, -1)
-    slope = torch.cat([by_coefficient.flatten(1, 2).flatten(2), by_share], -1)
+    by_parameter = by_coefficient.flatten(1, 2).flatten(2)
+    if model.schedule.follows_motion:
+        # The constants from which a network deviates are not among its parameters.
+        count = model.schedule.parameter_vector().numel()
+        by_parameter = by_parameter.new_zeros((*by_parameter.shape[:2], count))
+    slope = torch.cat([by_parameter, by_share], -1)
     return share * slipping, slope
 
 

@@ -81,6 +81,8 @@ def holdout_rmse(
     diverges, None where the search was interrupted. The problem is of other windows with the same
     friction model and plant, whose parameters are given.
     """
+    if problem.friction.law.memory:
+        test = test.deflected(problem.jacobian.plant, problem.friction)
     judged = replace(problem, windows=test)
     x, stopped = settle_states(judged, judged.variables.start(plant, friction=friction))
     if stopped:
