@@ -92,7 +92,7 @@ def test_inputs_have_to_win_for_the_law_and_for_its_network(monkeypatch, rival, 
     monkeypatch.setattr(neurofuzzy, "chosen_inputs", lambda task, start: gains)
     monkeypatch.setattr(neurofuzzy, "widened_start", lambda task, start, names: start)
     monkeypatch.setattr(neurofuzzy, "_Contest", contest)
-    plain = Contest(task, None)
+    plain = Contest(task, "law")
     chosen, best = neurofuzzy._with_chosen_inputs(plain)
     (found,) = made
     assert (best is found, chosen == gains, found.trained) == (wins, wins, trained)
