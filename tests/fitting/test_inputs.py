@@ -71,6 +71,12 @@ class Contest:
         self.halted = True
 
 
+@pytest.fixture(scope="module")
+def task():
+    recording = swing(pendulum(), truth("nothing"), seconds=1.0)
+    return prepare_task(NFCVFM(2), pendulum(), recording, FitOptions(**BRIEF))
+
+
 @pytest.mark.parametrize(
     ("rival", "wins", "trained"),
     [
@@ -80,15 +86,15 @@ class Contest:
         ({"of_law": 0.5, "error": 0.5, "stopped": True}, False, True),
     ],
 )
-def test_inputs_have_to_win_for_the_law_and_for_its_network(monkeypatch, rival, wins, trained):
+def test_inputs_have_to_win_for_the_law_and_for_its_network(
+    task, monkeypatch, rival, wins, trained
+):
     gains, made = (InputGain("direction", 0.5, (0.5, 0.1)),), []
 
     def contest(task, start):
         made.append(Contest(task, start, **rival))
         return made[-1]
 
-    recording = swing(pendulum(), truth("nothing"), seconds=1.0)
-    task = prepare_task(NFCVFM(2), pendulum(), recording, FitOptions(**BRIEF))
     monkeypatch.setattr(neurofuzzy, "chosen_inputs", lambda task, start: gains)
     monkeypatch.setattr(neurofuzzy, "widened_start", lambda task, start, names: start)
     monkeypatch.setattr(neurofuzzy, "_Contest", contest)
