@@ -6,6 +6,8 @@ BIN := .venv/bin
 # As many tests at a time as this process has cores; neighbours mostly share a process, which then makes
 # their fixtures and kernels once.
 WORKERS ?= $(shell nproc 2>/dev/null || echo auto)
+# Else each of some fifty processes would compile all of torch and this package anew (3 s).
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo reproduce test lint clean
 

@@ -7,6 +7,7 @@
     python benchmarks/identification.py intervals DATA [--only triple ...] [--models CFM]
                                                       [--seconds 5]
     python benchmarks/identification.py own-rigs [--seeds 10] [--rigs 10]
+    python benchmarks/identification.py within-limit [--releases 100]
     python benchmarks/identification.py presliding [--seeds 20] [--torque-noise 0] [--substeps 1]
 
 Run from the repository's root, on one thread. `recovery` simulates the papers' three links with
@@ -28,7 +29,8 @@ are kept apart. A model that is twice as bad as one named before it is marked as
 DATA holds a folder to each set, with a `recordings.csv` of initial states.
 
 `intervals` fits pieces of recordings, each alone, and prints how often the difference of what two
-of them say lies within its 95 % interval.
+of them say lies within its 95 % interval; and how often the intervals hold the truth where each
+piece is simulated by its own fit, so that law and plant are right.
 
 `own-rigs` fits rigs as a new user brings them, two recordings of 10 s at 500 Hz with 4096 counts
 each, by default settings and on a plant that is off by as much as a fit expects: a driven flywheel
@@ -36,6 +38,10 @@ with Stribeck friction as an axis and as a chain, and random links, driven and f
 laws. It prints each coefficient's error, half its 95 % interval, and whether the error is within
 3 %, or the fit said that it cannot tell (not identifiable, at a bound, not converged, or an
 interval wider than 3 % that holds the truth), or neither: MISSED.
+
+`within-limit` scores the true law on the true rig, on a recording each of as many of these random
+rigs: 95 of 100 should be within the limit of their data. It prints errors and limits of the free
+run and of windows of 1, 2 and 5 s.
 
 `presliding` fits LuGre's six coefficients on a driven axis to a recording below breakaway and one
 that slides, 10 s at 1 kHz with encoders of 14 bits; every seed has coefficients of its own. The
@@ -49,7 +55,7 @@ from pathlib import Path
 
 import torch
 from left_out import SETS, real
-from own_rigs import own_rigs, presliding
+from own_rigs import own_rigs, presliding, within_limit
 from pieces import intervals
 from recovery import RELEASES, recovery
 
@@ -80,6 +86,8 @@ def main() -> int:
     own = commands.add_parser("own-rigs", help="rigs of new users")
     own.add_argument("--seeds", type=int, default=10)
     own.add_argument("--rigs", type=int, default=10)
+    limit = commands.add_parser("within-limit", help="scores of the truth against their limit")
+    limit.add_argument("--releases", type=int, default=100)
     memory = commands.add_parser("presliding", help="LuGre friction found again")
     memory.add_argument("--seeds", type=int, default=20)
     memory.add_argument("--torque-noise", type=float, default=0.0)
@@ -92,6 +100,8 @@ def main() -> int:
         intervals(arguments.data, arguments.only, arguments.models, arguments.seconds)
     elif arguments.command == "own-rigs":
         own_rigs(arguments.seeds, arguments.rigs)
+    elif arguments.command == "within-limit":
+        within_limit(arguments.releases)
     elif arguments.command == "presliding":
         presliding(arguments.seeds, arguments.torque_noise, arguments.substeps)
     else:

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from nfriction import FrictionModel, LinearAxis, PendulumChain, Plant, Recording, rollout
+from nfriction.evaluation.score import score
 from nfriction.fitting.fit import fit
 from nfriction.fitting.plant_parameters import adjusted_buffers, plant_parameters
 from nfriction.fitting.result.fit_result import FitResult
@@ -68,6 +69,30 @@ def own_rigs(seeds: int, rigs: int) -> None:
             flush=True,
         )
     print(", ".join(f"{count} {verdict}" for verdict, count in counts.items()))
+
+
+def within_limit(releases: int) -> None:
+    """Print how often the true law on the true rig scores within the limit of the data."""
+    names = ("free run", "1", "2", "5")
+    held = []
+    for number in range(releases):
+        of = random_rig(number)
+        friction = model_by_name(of.law)(of.plant.joints, of.truth)
+        begun = time.perf_counter()
+        found = score(of.plant, friction, recorded(of, number)[0])
+        assert found.limit is not None
+        errors, limits = (
+            np.array([x.free_run.all, *(x.windows[name].all for name in names[1:])])
+            for x in (found, found.limit)
+        )
+        held.append(errors <= limits)
+        print(
+            f"{of.name:28} " + "  ".join(f"{1e3 * e:9.3g} of {1e3 * m:7.3g}"
+                                         for e, m in zip(errors, limits, strict=True))
+            + f"  ({time.perf_counter() - begun:.1f} s)", flush=True,
+        )  # fmt: skip
+    for name, share in zip(names, 100 * np.mean(held, axis=0), strict=True):
+        print(f"{name}: {share:.0f} % within the limit")
 
 
 def presliding(seeds: int, torque_noise: float, substeps: int) -> None:

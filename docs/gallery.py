@@ -1,4 +1,4 @@
-"""Take the figures of the gallery from runs: `python docs/gallery.py runs/demo runs/wheel`."""
+"""Take the figures of the gallery from runs: `python docs/gallery.py runs/demo runs/wheel runs/contact`."""
 
 import sys
 from pathlib import Path
@@ -14,8 +14,11 @@ FIGURES = (
         "horizons_test": "horizons",
         "sections_NFCVFM": "sections",
         "coefficients_NFCVFM": "maps",
+        "mechanism": "mechanism",
+        "memberships_NFCVFM": "memberships",
     },
     {"torque_over_velocity": "motor"},
+    {"friction": "loops"},
 )
 
 

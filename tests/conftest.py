@@ -1,5 +1,6 @@
 """Settings for every test: one thread, float64 by default where a test does not say."""
 
+import gc
 import os
 import re
 from pathlib import Path
@@ -47,3 +48,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         named = LEFT_TO_THE_SLOW_RUN.intersection(re.split(r"\W+", item.name))
         if named and item.path.parent.name in ("export", "simulation", "codegen"):
             item.add_marker(pytest.mark.slow)
+
+
+def pytest_collection_finish() -> None:
+    """Let garbage collection pass over libraries and collected tests, which all stay."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(20_000)

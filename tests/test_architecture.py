@@ -2,9 +2,13 @@
 
 import ast
 import re
+import subprocess
+import sys
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -43,8 +47,12 @@ MAY_SCRIPT = {"export"}
 
 
 @cache
-def tree(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+def nodes(path: Path) -> dict[type, list[Any]]:
+    """Nodes of a module's syntax by their type."""
+    found = defaultdict(list)
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"), filename=str(path))):
+        found[type(node)].append(node)
+    return found
 
 
 def modules() -> list[Path]:
@@ -65,12 +73,11 @@ def part_of(names: Sequence[str]) -> str:
 
 def imported(path: Path) -> Iterator[str]:
     """Full names of all that a file imports, wherever it does."""
-    for node in ast.walk(tree(path)):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path}: relative import"
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+    for node in nodes(path)[ast.Import]:
+        yield from (alias.name for alias in node.names)
+    for node in nodes(path)[ast.ImportFrom]:
+        assert node.level == 0, f"{path}: relative import"
+        yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
 def parts_imported(path: Path) -> set[str]:
@@ -149,7 +156,8 @@ def package(path: Path) -> tuple[str, ...]:
 
 
 def test_every_module_says_what_it_is_for() -> None:
-    report([str(p.relative_to(ROOT)) for p in modules() if ast.get_docstring(tree(p)) is None])
+    whole = {path: nodes(path)[ast.Module][0] for path in modules()}
+    report([str(p.relative_to(ROOT)) for p, tree in whole.items() if not ast.get_docstring(tree)])
 
 
 def test_every_public_name_is_there_and_says_what_it_is_for() -> None:
@@ -159,14 +167,37 @@ def test_every_public_name_is_there_and_says_what_it_is_for() -> None:
         assert isinstance(thing, str) or thing.__doc__, name
 
 
+WITHOUT_EXTRAS = """
+import sys
+extras = "asammdf distributed h5py joblib mujoco onnx onnxruntime pyarrow sklearn"
+sys.modules |= dict.fromkeys(extras.split())
+import nfriction
+for name in nfriction.__all__:
+    getattr(nfriction, name)
+model = nfriction.LFM(1)
+for call in (nfriction.FrictionEstimator, lambda: nfriction.export.onnx(model, "m.onnx")):
+    try:
+        call()
+    except ImportError as error:
+        print(error)
+"""
+
+
+def test_without_extras_the_library_loads_and_says_what_to_install() -> None:
+    command = [sys.executable, "-c", WITHOUT_EXTRAS]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert "pip install nfriction[sklearn]" in said
+    assert "pip install nfriction[onnx]" in said
+
+
 def test_only_command_lines_print() -> None:
     report(
         [
             f"{path.relative_to(ROOT)}:{node.lineno}"
             for path in modules()
             if not path.relative_to(PACKAGE).as_posix().startswith(MAY_PRINT)
-            for node in ast.walk(tree(path))
-            if isinstance(node, ast.Call) and dotted(node.func) in ("print", "sys.stdout.write")
+            for node in nodes(path)[ast.Call]
+            if dotted(node.func) in ("print", "sys.stdout.write")
         ]
     )
 
@@ -180,9 +211,7 @@ def test_nothing_is_pickled_evaluated_or_given_to_a_shell() -> None:
         found += [
             f"{where} imports {n}" for n in imported(path) if n.split(".")[0] in modules_refused
         ]
-        for node in ast.walk(tree(path)):
-            if not isinstance(node, ast.Call):
-                continue
+        for node in nodes(path)[ast.Call]:
             given = {k.arg: k.value for k in node.keywords}
             true = {n for n, v in given.items() if isinstance(v, ast.Constant) and v.value is True}
             if "shell" in given or "allow_pickle" in true:
@@ -198,10 +227,8 @@ def test_torchscript_has_one_home() -> None:
             f"{path.relative_to(ROOT)}:{node.lineno} {dotted(node)}"
             for path in modules()
             if part(path) not in MAY_SCRIPT
-            for node in ast.walk(tree(path))
-            if isinstance(node, ast.Attribute)
-            and dotted(node).startswith("torch.jit.")
-            and dotted(node) != "torch.jit.is_scripting"
+            for node in nodes(path)[ast.Attribute]
+            if dotted(node).startswith("torch.jit.") and dotted(node) != "torch.jit.is_scripting"
         ]
         + [
             f"{path.relative_to(ROOT)} imports {name}"
@@ -219,9 +246,8 @@ def test_errors_are_caught_by_name() -> None:
         [
             f"{path.relative_to(ROOT)}:{node.lineno}"
             for path in modules()
-            for node in ast.walk(tree(path))
-            if isinstance(node, ast.ExceptHandler)
-            and (node.type is None or broad & {dotted(n) for n in ast.walk(node.type)})
+            for node in nodes(path)[ast.ExceptHandler]
+            if node.type is None or broad & {dotted(n) for n in ast.walk(node.type)}
         ]
     )
 
@@ -304,19 +330,18 @@ def test_fitting_has_few_floors() -> None:
 def test_functions_take_few_arguments() -> None:
     found = []
     for path in modules():
-        for node in ast.walk(tree(path)):
-            if isinstance(node, ast.FunctionDef):
-                given = node.args.posonlyargs + node.args.args + node.args.kwonlyargs
-                count = sum(a.arg not in ("self", "cls") for a in given)
-                if count > MOST_ARGUMENTS:
-                    found.append(f"{path.relative_to(ROOT)}:{node.lineno} {node.name}: {count}")
+        for node in nodes(path)[ast.FunctionDef]:
+            given = node.args.posonlyargs + node.args.args + node.args.kwonlyargs
+            count = sum(a.arg not in ("self", "cls") for a in given)
+            if count > MOST_ARGUMENTS:
+                found.append(f"{path.relative_to(ROOT)}:{node.lineno} {node.name}: {count}")
     assert len(found) <= MAY_TAKE_MORE, "\n" + "\n".join(found)
 
 
 def type_tests(path: Path) -> Iterator[tuple[int, set[str]]]:
     """Lines of `isinstance`, each with the names of the classes asked for."""
-    for node in ast.walk(tree(path)):
-        if isinstance(node, ast.Call) and dotted(node.func) == "isinstance":
+    for node in nodes(path)[ast.Call]:
+        if dotted(node.func) == "isinstance":
             named = (dotted(n) for n in ast.walk(node.args[1]))
             yield node.lineno, {name.rsplit(".", 1)[-1] for name in named if name}
 

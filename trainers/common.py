@@ -140,15 +140,17 @@ def write(
 def draw_losses(losses: Mapping[str, Sequence[float]], path: Path) -> None:
     """Draw the loss over the steps of a training, a line a part of it.
 
-    Parts differ in what they sum over, so that each is shown relative to its first loss.
+    Parts differ in what they sum over, so that each is shown relative to its first loss. Where the
+    evidence weighs the data anew between steps, a line may rise.
     """
     figure, axes = style.panels(1, 1, style.PAGE, 2.4)
     looks, ax = style.looks(losses), axes[0, 0]
     for part, values in losses.items():
         steps = np.arange(1, len(values) + 1)
         ax.plot(steps, np.array(values) / values[0], **looks[part].line | {"marker": "."})
-    if min(min(values) / values[0] for values in losses.values()) < 0.1:
-        ax.set_yscale("log")
+    ratios = np.concatenate([np.array(values) / values[0] for values in losses.values()])
+    if ratios.min() < 0.1:
+        style.log_axis(ax, 0.9 * float(ratios.min()), 1.1 * float(ratios.max()))
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlabel("step")
     ax.set_ylabel("loss over the first [-]")

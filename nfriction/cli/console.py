@@ -65,6 +65,7 @@ _OPTIONS: tuple[tuple[re.Pattern[str], str | Callable[[re.Match[str]], str]], ..
         lambda found: '--columns "' + found[1].replace('": "', "=").replace('", "', ",")[1:],
     ),
     (re.compile(r"`degrees=True`"), "--degrees"),
+    (re.compile(r"`fit_delay=True`(, or `recording\.advance_torque\([\d.]+\)`)?"), "--fit-delay"),
     (re.compile(r"`columns`"), "--columns"),
     (
         re.compile("create the model yourself and pass it as `into`"),
@@ -152,8 +153,8 @@ class Progress:
         from tqdm import tqdm
 
         self._what, self._logger = "start", logger
-        self._begun = self._shown = time.monotonic()
-        self._ended = self._expected = self._steps = 0
+        self._begun = self._shown = self._last_end = time.monotonic()
+        self._ended = self._expected = self._long = self._steps = 0
         self._bar = tqdm(disable=not sys.stderr.isatty(), leave=False, bar_format="{desc} {bar:20}")
 
     def __enter__(self) -> "Progress":
@@ -173,14 +174,16 @@ class Progress:
         self._what, self._steps = what, 0
         self._show(what)
 
-    def expect(self, stages: int) -> None:
-        """So many further stages are to come."""
+    def expect(self, stages: int, *, brief: bool = False) -> None:
+        """So many further stages are to come; brief ones after all others."""
         self._expected += stages
+        self._long += 0 if brief else stages
         self._bar.total = self._expected
 
     def done(self) -> None:
         """A stage has ended."""
         self._ended += 1
+        self._last_end = time.monotonic()
         self._bar.update()
 
     def step(self, stage: str) -> None:
@@ -202,10 +205,12 @@ class Progress:
         return f"{self._ended + 1} of {self._expected}: " if self._expected else ""
 
     def _times(self, passed: float) -> str:
-        """Time passed, and time left by the mean of the stages that have ended."""
+        """Time passed, and time left by the mean of the long stages that have ended."""
         text = f"{passed:.0f} s"
-        if 0 < self._ended < self._expected:
-            left = passed / self._ended * (self._expected - self._ended)
+        ended = self._last_end - self._begun
+        # No estimate once the running stage alone has taken longer.
+        left = ended / max(1, self._ended) * (self._long - self._ended) - (passed - ended)
+        if self._ended and left > 0:
             rest = f"{left:.0f} s" if left < 120 else f"{left / 60:.0f} min"
             text += f", about {rest} left"
         return text

@@ -110,7 +110,7 @@ def run_fit(arguments: argparse.Namespace) -> int:
     if intervals := interval_table(found):
         print(intervals)
     print(f"wrote {arguments.out}")
-    if found.converged:
+    if found.converged and found.usability[0] != "do not use":
         further = ["nfriction", "export", str(arguments.out), "--format", "torchscript"]
         print(f"next: {shlex.join(further)}")
     return 0
@@ -145,7 +145,7 @@ def compare_and_report(
     selection = None
     with exclusive(arguments.out), _log(arguments.log_file) as logger, Progress(logger) as progress:
         settings = settings | {"progress": progress, "jobs": arguments.jobs}
-        progress.expect(1)
+        progress.expect(1, brief=True)
         logger.info(arguments.command_line)
         if arguments.select:
             selection = select(plant, arguments.models, train, **settings)
@@ -212,10 +212,10 @@ def _conclusion(comparison: Comparison) -> str:
     end = f"with the friction learnt ({plain_name(best)}) they miss it by {shown[1]}"
     if not math.isfinite(without):
         return f"Without friction, simulations of the test recordings diverge;\n{end}."
-    less = 100 * (1 - learnt / without)
+    less = math.floor(1e4 * (1 - learnt / without)) / 100  # rounded down: never quite all
     return (
         f"Without friction, simulations of the test recordings miss the measured motion by "
-        f"{shown[0]};\n{end}, {less:.{3 if less < 99.95 else 4}g} % less."  # never quite all
+        f"{shown[0]};\n{end}, {less:.{3 if less < 99.9 else 4}g} % less."
     )
 
 

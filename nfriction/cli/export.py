@@ -58,13 +58,7 @@ def add_export(commands: "argparse._SubParsersAction[Parser]", common: Parser) -
                        help="rig file or name (default: the one in the model file)")  # fmt: skip
     group.add_argument("--patch", type=inputs.file, metavar="ROBOT",
                        help="robot description whose joints of these names get them")  # fmt: skip
-    group.add_argument("--angles", metavar="HOW,ZERO",
-                       help="how the recordings write angles, e.g. absolute,hanging "
-                       "(default: as file or rig say)")  # fmt: skip
-    group.add_argument("--degrees", action="store_true", help="the recordings are in degrees")
-    group.add_argument("--columns", type=inputs.columns, metavar="OURS=THEIRS,...",
-                       help="the recordings' names of time, q1, ..., tau1, ... where they differ, "
-                       "e.g. time=t,q1=enc_1,q2=enc_2")  # fmt: skip
+    inputs.add_reading_options(group)
     inputs.add_law_option(parser)
     parser.set_defaults(run=run_export)
 

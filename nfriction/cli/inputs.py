@@ -176,14 +176,7 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
     add("--rig", required=True, type=rig,
         help="a rig file (.json, .toml), a robot description (.urdf, MuJoCo's .xml), or one of "
         f"{', '.join(RIGS)}")  # fmt: skip
-    add("--angles", metavar="HOW,ZERO",
-        help="angle convention of the files: relative or absolute, from upright or hanging, e.g. "
-        "absolute,hanging (default: of the file or the rig)")  # fmt: skip
-    add("--degrees", action="store_true", help="the files are in degrees")
-    add("--columns", type=columns, metavar="OURS=THEIRS,...",
-        help="the files' names of time, q1, ..., tau1, ... (of a motor: motor1, current1) where "
-        "they differ, each perhaps with its unit, e.g. time=t:ms,q1=enc_1:deg,q2=enc_2:counts/8192"
-        )  # fmt: skip
+    add_reading_options(parser)
     add("--windows", type=_windows, metavar="SECONDS",
         help="lengths of the shooting windows, in the order of their use [s] (default: 0.5,2,5)"
         )  # fmt: skip
@@ -206,6 +199,19 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
         "and name them (default: linear)")  # fmt: skip
     add("--fit-delay", action="store_true",
         help="estimate by how much torques are recorded later than positions")  # fmt: skip
+
+
+def add_reading_options(parser: argparse._ActionsContainer) -> None:
+    """Options that say how recordings are written."""
+    add = parser.add_argument
+    add("--angles", metavar="HOW,ZERO",
+        help="angle convention of the recordings: relative or absolute, from upright or hanging, "
+        "e.g. absolute,hanging (default: of the file or the rig)")  # fmt: skip
+    add("--degrees", action="store_true", help="the recordings are in degrees")
+    add("--columns", type=columns, metavar="OURS=THEIRS,...",
+        help="the files' names of time, q1, ..., tau1, ... (of a motor: motor1, current1) where "
+        "they differ, each perhaps with its unit, e.g. time=t:ms,q1=enc_1:deg,q2=enc_2:counts/8192"
+        )  # fmt: skip
 
 
 def fit_settings(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -253,8 +259,12 @@ def read_recordings(
     warnings.simplefilter("ignore", RecordingWarning)
     if in_degrees:
         # If the option is missing for one file, it is missing for all.
+        pairs = {"q1": "q1"} | (arguments.columns or {})
+        ours = "motor1" if "motor1" in pairs else "q1"
+        theirs, _, _ = pairs[ours].partition(":")
         warn(
             f"{', '.join(in_degrees)}: positions look like degrees or encoder counts; if so, add "
-            "--degrees, or state the counts of a turn, as in --columns q1=q1:counts/8192."
+            f"--degrees, or state the counts of a turn, as in --columns {ours}={theirs}"
+            ":counts/8192."
         )
     return recordings

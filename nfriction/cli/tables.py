@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from nfriction.cli.console import one_line
 from nfriction.evaluation import tables
 from nfriction.evaluation.compare import NO_FRICTION, Comparison, coefficients_by_set
 from nfriction.evaluation.cross_validation import Selection
@@ -38,7 +39,8 @@ def fit_lines(name: str, fit: FitResult) -> str:
     verdict, reason = fit.usability
     note = f"; at a bound: {', '.join(fit.at_bounds)}" if fit.at_bounds else ""
     head = f"{verdict} ({reason})" if reason else verdict
-    return "\n  - ".join([f"{name}: {head}. {fit.status.rstrip('.')}{note}", *fit.warnings])
+    lines = [f"{name}: {head}. {fit.status.rstrip('.')}{note}", *fit.warnings]
+    return "\n  - ".join(map(one_line, lines))
 
 
 def interval_table(fit: FitResult) -> str:

@@ -115,5 +115,9 @@ def _read(arguments: argparse.Namespace, unit: str) -> TorqueTable:
 
 
 def _printed(frame: pd.DataFrame) -> str:
-    text = frame.reset_index().to_string(index=False, float_format=lambda x: f"{x:.4g}", na_rep="")
+    from nfriction.evaluation.tables import Table
+
+    form = Table("", (), ()).text
+    frame = frame.assign(model=frame["model"].map(plain_name))
+    text = frame.reset_index().to_string(index=False, float_format=form, na_rep="")
     return "\n".join(line.rstrip() for line in text.splitlines())

@@ -6,7 +6,6 @@ Knows nothing of plants or friction beyond the methods it calls.
 from nfriction.codegen.errors import (
     CodegenError,
     Incomparable,
-    NoBackend,
     SelfCheckFailed,
     UnsupportedOperation,
 )
@@ -17,7 +16,6 @@ from nfriction.codegen.rollout import (
     CompiledRollout,
     RolloutSignals,
     Trajectories,
-    compile_rollout,
     trace_rollout,
 )
 from nfriction.codegen.staleness import content, fingerprint
@@ -27,14 +25,12 @@ __all__ = [
     "CompiledFunction",
     "CompiledRollout",
     "Incomparable",
-    "NoBackend",
     "RolloutSignals",
     "SelfCheckFailed",
     "Trajectories",
     "UnsupportedOperation",
     "cache_folder",
     "compile_function",
-    "compile_rollout",
     "content",
     "fingerprint",
     "supported_operations",

@@ -20,10 +20,6 @@ class UnsupportedOperation(CodegenError):  # noqa: N818
         self.operation = operation
 
 
-class NoBackend(CodegenError):  # noqa: N818
-    """llvmlite, which makes machine code, cannot be loaded."""
-
-
 class SelfCheckFailed(CodegenError):  # noqa: N818
     """A compiled model disagrees with eager torch and must not be used."""
 

@@ -20,7 +20,6 @@ from nfriction.codegen.batch import (
 )
 from nfriction.codegen.errors import SelfCheckFailed
 from nfriction.codegen.graph import FunctionalModule, Method, Program
-from nfriction.codegen.llvm import jit
 from nfriction.codegen.llvm.emit import write_function
 from nfriction.codegen.transform import hoist, with_jacobian
 
@@ -50,9 +49,9 @@ def compile_function(
         A callable on NumPy arrays whose first axis is a batch.
 
     Raises:
-        NoBackend, UnsupportedOperation, SelfCheckFailed: see `compile_rollout`.
+        UnsupportedOperation: it uses an operation that has no scalar form here.
+        SelfCheckFailed: compiled values are not the eager ones.
     """
-    jit.require_backend()
     return CompiledFunction(function, example_inputs, jacobian)
 
 

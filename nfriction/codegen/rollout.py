@@ -19,7 +19,6 @@ from nfriction.codegen.batch import (
 )
 from nfriction.codegen.errors import SelfCheckFailed
 from nfriction.codegen.graph import FunctionalModule
-from nfriction.codegen.llvm import jit
 from nfriction.codegen.rollout_program import LAYOUT, ForcedSystem, RolloutDriver, arrange
 
 # Of accelerations over steps of 0.1 ms: velocities of 10 rad/s round to 2e-15, rates to 2e-11.
@@ -74,8 +73,8 @@ class Trajectories(NamedTuple):
     law_state: Any = None
 
 
-def compile_rollout(plant: Any, friction: Any, step: Callable[..., Any]) -> "CompiledRollout":
-    """Compile rollouts of a plant with friction from their torch definition.
+def trace_rollout(plant: Any, friction: Any, step: Callable[..., Any]) -> "CompiledRollout":
+    """Trace rollouts of a plant with friction; compiled at their first call or by `check`.
 
     Parameters and floating-point buffers stay inputs: they are read at every call, so a fit may
     change them, and may differ from candidate to candidate. Everything else (Python numbers,
@@ -89,22 +88,9 @@ def compile_rollout(plant: Any, friction: Any, step: Callable[..., Any]) -> "Com
             repeated; for instance `nfriction.simulation.rk4.rk4_step`.
 
     Raises:
-        NoBackend: llvmlite cannot be loaded.
         UnsupportedOperation: the modules use an operation that has no scalar form here.
-        SelfCheckFailed: a compiled step is not the eager one.
+        TypeError: one of them is no module.
     """
-    compiled = trace_rollout(plant, friction, step)
-    compiled.check()
-    return compiled
-
-
-def trace_rollout(plant: Any, friction: Any, step: Callable[..., Any]) -> "CompiledRollout":
-    """The same, neither compiled nor checked before its first call.
-
-    Raises:
-        NoBackend, UnsupportedOperation: see `compile_rollout`.
-    """
-    jit.require_backend()
     for name, module in (("plant", plant), ("friction", friction)):
         if not isinstance(module, nn.Module):
             raise TypeError(f"`{name}` must be a torch module, got {type(module).__name__}.")
@@ -112,7 +98,7 @@ def trace_rollout(plant: Any, friction: Any, step: Callable[..., Any]) -> "Compi
 
 
 class CompiledRollout:
-    """Rollouts of one plant and friction model; made by `compile_rollout`.
+    """Rollouts of one plant and friction model; made by `trace_rollout`.
 
     Attributes:
         parameter_names: names under which `parameters` may be given.

@@ -345,7 +345,7 @@ def compare(
     warn_of_undriven([*train, *test])
     progress = progress or Progress()
     joint = [recording.joint_coordinates(plant) for recording in train]
-    progress.expect(1 + len(set(map(model_name, models))))  # scores, besides fits
+    progress.expect(1 + len(set(map(model_name, models))), brief=True)  # scores, besides fits
     # Smoothed once for all fits.
     data = Data(train, [kalman_smoother(r.time, r.q) for r in joint])
     fits, failed = fit_models(

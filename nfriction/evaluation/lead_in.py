@@ -19,7 +19,7 @@ from nfriction.friction.memory import states_along
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
-from nfriction.signals import Motion, causal_motion
+from nfriction.signals import Motion, causal_motion, count_seen
 from nfriction.simulation.rollout import Scheme, rollout
 from nfriction.simulation.validate import required_substeps
 
@@ -127,6 +127,10 @@ class Simulator:
         self.substeps: int | None = math.ceil(recording.longest_step / STOP_STEP)
         if scheme != "time_stepping":
             self.substeps = _substeps(plant, friction, recording)
+        # One count of each encoder, 0 where neither plant nor recording show it.
+        self.quantum = np.nan_to_num(count_seen(recording.q))
+        if plant.position_quantum is not None:
+            self.quantum = np.full(plant.joints, plant.position_quantum)
         self.torque_sd = torch.zeros(plant.joints, dtype=torch.float64)
         if recording.tau is not None:
             self.torque_sd = white_noise(torch.tensor(recording.tau)[None])
@@ -187,7 +191,7 @@ class Simulator:
         measured = self.recording.q[samples]
         starts = estimate_starts(
             lambda states: self.simulate(states, lead_in)[0],
-            self.time[lead_in], measured[:, : self.lead], self.plant.position_quantum, self.draws,
+            self.time[lead_in], measured[:, : self.lead], self.quantum, self.draws,
         )  # fmt: skip
         scored = slice(self.lead if state is None else 0, None)
         state = starts.state if state is None else state
@@ -206,13 +210,12 @@ class Simulator:
 
     def _as_read(self, q: Array, measured: Array) -> Array:
         """Positions as the encoder reads them, its counts in line with the measured ones."""
-        quantum = self.plant.position_quantum
-        return q if quantum is None else measured + quantum * np.rint((q - measured) / quantum)
+        unit = np.where(self.quantum > 0, self.quantum, 1.0)
+        return np.where(self.quantum > 0, measured + unit * np.rint((q - measured) / unit), q)
 
     def _noise_beyond_rounding(self, starts: Starts) -> Array:
         """Variance of a measured position beside the rounding error, (joint,)."""
-        rounding = (self.plant.position_quantum or 0.0) ** 2 / 12
-        return np.mean(np.maximum(starts.noise**2 - rounding, 0.0), axis=0)
+        return np.mean(np.maximum(starts.noise**2 - self.quantum**2 / 12, 0.0), axis=0)
 
     def simulate(
         self, states: Array, samples: NDArray[np.intp], noise: int | None = None
@@ -256,7 +259,7 @@ def estimate_starts(
     simulate: Callable[[Array], Array],
     time: Array,
     y: Array,
-    quantum: float | None,
+    quantum: float | Array = 0.0,
     draws: int = 0,
 ) -> Starts:
     """States from which simulations follow the measured positions of lead-ins best.
@@ -269,7 +272,7 @@ def estimate_starts(
         simulate: positions (*batch, window, sample, joint) from states (*batch, window, 2 joint).
         time: of the samples [s], (window, sample).
         y: measured positions, (window, sample, joint).
-        quantum: one count of the encoder; None where unknown.
+        quantum: one count of the encoders, a number or (joint,); 0 where unknown.
         draws: number of deviations.
     """
     count = y.shape[1]
@@ -346,13 +349,13 @@ def _cubic(time: Array, y: Array, noise: Array, distinct: Array) -> tuple[Array,
     return state, whole.reshape(len(y), 2 * joints, 2 * joints)
 
 
-def _noise(y: Array, quantum: float | None) -> Array:
+def _noise(y: Array, quantum: float | Array) -> Array:
     """Standard deviation of a measured position, (window, joint), at least the rounding error."""
     # Fourth differences see noise, and of a smooth motion nothing; their weights squared sum to 70.
     seen = np.sqrt(np.mean(np.diff(y, n=4, axis=1) ** 2, axis=1) / 70)
     # Joints that rest show none: theirs is that of the others.
     seen = np.where(seen > 0, seen, seen.max(axis=-1, keepdims=True))
-    least = 0.0 if quantum is None else quantum / math.sqrt(12)
+    least = quantum / math.sqrt(12)
     return np.maximum(seen, np.maximum(least, 1e-12 * np.maximum(np.abs(y).max(axis=1), 1.0)))
 
 

@@ -41,8 +41,8 @@ _PACKAGE = logging.getLogger("nfriction")
 class Progress:
     """Receives what is being done; this one ignores it."""
 
-    def expect(self, stages: int) -> None:
-        """So many further stages are to come."""
+    def expect(self, stages: int, *, brief: bool = False) -> None:
+        """So many further stages are to come; brief ones after all others."""
 
     def stage(self, what: str) -> None:
         """Begin a stage, or several at the same time."""

@@ -10,6 +10,7 @@ error of its start more than that of the model. The next step is
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,8 @@ from numpy.typing import NDArray
 
 from nfriction.evaluation.lead_in import DRAWS, LEAD_IN, Runs, Simulator
 from nfriction.friction.models import FrictionModel
-from nfriction.plant import Plant
-from nfriction.recording import Recording
+from nfriction.plant import Plant, rigs
+from nfriction.recording import Recording, RecordingLike
 from nfriction.simulation.rollout import Scheme
 
 Array = NDArray[np.float64]
@@ -104,9 +105,9 @@ class Score(Errors):
 
 
 def score(
-    plant: Plant,
+    plant: Plant | str | Path,
     friction: FrictionModel | None,
-    recording: Recording,
+    recording: RecordingLike,
     *,
     initial_state: tuple[Array, Array] | None = None,
     horizons: Sequence[float] = HORIZONS,
@@ -116,9 +117,10 @@ def score(
     """Simulate a recording and measure the position error.
 
     Args:
-        plant: the mechanism.
+        plant: the mechanism, its name, or the path of a rig file.
         friction: friction model, or None for no friction.
-        recording: the measured motion; the plant's angle convention applies where it has none.
+        recording: the measured motion, or the path of a file or a table, see `Recording.of`; the
+            plant's angle convention applies where it has none.
         initial_state: q0 and qd0 of the free run in the recording's convention, (joint,) each,
             taken as they are and scored from; by default estimated from a lead-in.
         horizons: lengths of windows [s]; those longer than the recording are skipped.
@@ -132,6 +134,8 @@ def score(
     Raises:
         ValueError: if the recording is too short for a lead-in.
     """
+    plant = rigs.of(plant)
+    recording = Recording.of(recording, plant=plant)
     simulator = Simulator(plant, friction, recording, scheme, DRAWS if limit else 0)
     runs = simulator.free_runs(initial_state)
     if not runs:

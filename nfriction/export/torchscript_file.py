@@ -21,6 +21,7 @@ from nfriction.export.contract import (
     verify,
 )
 from nfriction.export.controller import Controller, controller_of, run_in_order
+from nfriction.export.test_vectors import draw_motion
 from nfriction.export.torch_archive import METADATA, check_script, check_source, contents, repacked
 from nfriction.friction.models import FrictionModel
 from nfriction.io.files import atomic_write
@@ -171,17 +172,6 @@ class _Filtering(_Host):
         return self.controller.filtered_start(q)
 
 
-def sample_inputs(model: FrictionModel, count: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Velocities, accelerations and loads that cover and exceed what a rig does."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def normal(spread: float) -> Tensor:
-        shape = (count, model.joints)
-        return spread * torch.randn(shape, dtype=torch.float64, generator=generator)
-
-    return normal(10.0), normal(100.0), normal(1.0).abs()
-
-
 @contextmanager
 def _silent() -> Iterator[None]:
     """torch.jit is deprecated upstream; this is the one place that still needs it."""
@@ -204,7 +194,7 @@ def _compile(controller: Controller) -> Any:
     model = controller.model
     try:
         # Tried apart from the model, so that the message is about the law's own lines.
-        qd, qdd, load = sample_inputs(model, 1, seed=0)
+        qd, qdd, load = draw_motion(controller, 1)
         torch.jit.script(model.law.torque)(qd, load, model.schedule(qd, qdd), model.v_smooth)
     except refusals as error:
         raise ExportError(
@@ -229,7 +219,7 @@ def _methods(module: Any) -> list[str]:
 
 def _check(controller: Controller, loaded: Any, contract: Contract) -> None:
     """Refuse an artefact that is not the model."""
-    inputs = sample_inputs(controller.model, 1000, seed=0)
+    inputs = draw_motion(controller, 1000)
     with torch.no_grad():
         expected, got = controller.torque(*inputs), loaded(*inputs)
         scale = torch.maximum(expected.abs().amax(0), contract.scales["tau_f"]).clamp_min(1e-300)

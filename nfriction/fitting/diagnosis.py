@@ -394,29 +394,24 @@ def _unexplained(plant: Plant, data: _Data) -> float:
 
 def _balance(plant: Plant, data: _Data, extra: Tensor | None = None) -> tuple[Tensor, float]:
     """Mean square of the unexplained torque, (joint,), and the factor of an `extra` torque."""
-    from scipy.optimize import lsq_linear  # slow to import
+    from scipy.optimize import nnls  # slow to import
 
     torque = data.tau - plant.inverse_dynamics(data.q, data.qd, data.qdd)
     moving = data.moving()
     left = moving * data.mean(torque)
     weight = left.square().mean(0).sqrt()
     weight = torch.where(weight > 0, weight, 1.0)
-    columns, lower = [], []
+    # Friction that adds energy is excluded; a drive may have an offset.
+    signed, free = [], [] if extra is None else [-moving * data.mean(extra)]
+    own = torch.eye(plant.joints, dtype=left.dtype)
     for j in range(plant.joints):
-        # Friction that adds energy is excluded; a drive may have an offset.
-        shapes = [(torch.sign(data.qd[:, j]), 0.0), (data.qd[:, j], 0.0)]
+        shapes = torch.sign(data.qd[:, j]), data.qd[:, j]
+        signed += [own[j] * (moving[:, j] * data.mean(shape))[:, None] for shape in shapes]
         if data.tau[:, j].any():
-            shapes.append((torch.ones_like(torque[:, j]), -np.inf))
-        for shape, bound in shapes:
-            column = torch.zeros_like(left)
-            column[:, j] = moving[:, j] * data.mean(shape)
-            columns.append(column)
-            lower.append(bound)
-    if extra is not None:
-        columns.append(-moving * data.mean(extra))
-        lower.append(-np.inf)
-    design = torch.stack(columns, -1)
-    scaled = (design / weight[:, None]).reshape(-1, len(columns)).numpy()
+            free.append(own[j] * moving)
+    # A factor of either sign is the difference of two that are positive.
+    design = torch.stack([*free, *signed, *(-column for column in free)], -1)
+    scaled = (design / weight[:, None]).reshape(-1, design.shape[-1]).numpy()
     norm = np.linalg.norm(scaled, axis=0)
     norm[norm == 0] = 1.0
     rows = np.column_stack([scaled / norm, (left / weight).flatten().numpy()])
@@ -424,8 +419,7 @@ def _balance(plant: Plant, data: _Data, extra: Tensor | None = None) -> tuple[Te
         return torch.full_like(weight, math.inf), math.nan
     # The triangular factor has the same normal equations.
     _, factor = np.linalg.qr(rows)
-    bounds = (lower, np.inf)
-    with np.errstate(all="ignore"):  # a wrong hypothesis may be far from any number
-        found = lsq_linear(factor[:, :-1], factor[:, -1], bounds=bounds, tol=1e-12).x / norm
+    found = nnls(factor[:, :-1], factor[:, -1], maxiter=50 * len(norm))[0] / norm
     residual = left - design @ torch.as_tensor(found)
-    return residual.square().mean(0), float(found[-1])
+    factor_of_extra = found[0] - found[len(free) + len(signed)] if free else 0.0
+    return residual.square().mean(0), float(factor_of_extra)

@@ -123,7 +123,7 @@ def model_name(text: str) -> str:
     asked = str(text).strip().lower().replace("_", "-")
     if asked not in _BY_TEXT:
         near = difflib.get_close_matches(asked, _BY_TEXT, 1)
-        hint = f" (did you mean {_both_names(_BY_TEXT[near[0]])}?)" if near else ""
+        hint = f" (did you mean {both_names(_BY_TEXT[near[0]])}?)" if near else ""
         raise ValueError(f"no friction model is called {text!r}{hint}; there are {model_list()}.")
     return _BY_TEXT[asked]
 
@@ -131,7 +131,7 @@ def model_name(text: str) -> str:
 def model_list() -> str:
     """All models in a phrase: the laws by both names, and what may precede them."""
     plain, *others = _KINDS
-    laws = ", ".join(_both_names(plain.letters + short) for short in _LAWS.values())
+    laws = ", ".join(both_names(plain.letters + short) for short in _LAWS.values())
     first = next(iter(_LAWS.values()))
     before = " or ".join(f"{kind.prefix} ({kind.letters}{first}, ...)" for kind in others)
     return (
@@ -141,8 +141,15 @@ def model_list() -> str:
     )
 
 
-def _both_names(name: str) -> str:
-    """The plain name, and the abbreviation where it is another word."""
+def both_names(name: str) -> str:
+    """The plain name and, where it is another word, the abbreviation; a text of no model as it is.
+
+    Examples:
+        >>> both_names("CVFM"), both_names("Stribeck"), both_names("no friction")
+        ('coulomb-viscous (CVFM)', 'stribeck', 'no friction')
+    """
+    if name not in _ALL:
+        return name
     plain = plain_name(name)
     return plain if plain == name.lower() else f"{plain} ({name})"
 

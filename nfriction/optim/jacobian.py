@@ -108,8 +108,7 @@ def jacobian_pieces(
     function, vector = _function(model), flatten(parameters).detach()
 
     def one(vector: Tensor, sample: Tensor) -> tuple[Tensor, list[Tensor]]:
-        # vjp's stub claims a third value that it returns for has_aux=True only.
-        output, pull = vjp(  # type: ignore[misc]
+        output, pull = vjp(
             lambda given: function(unflatten(given, parameters), sample[None])[0], vector
         )
         units = torch.eye(output.numel(), dtype=output.dtype, device=output.device)

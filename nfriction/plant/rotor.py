@@ -50,6 +50,11 @@ class Rotor(PendulumChain):
         inertia, mass, com = given.values()
         if mass < 0 or inertia < 0:
             raise ValueError(f"`mass` and `inertia` must not be negative, got {mass}, {inertia}.")
+        if bool(mass) != bool(com):
+            raise ValueError(
+                f"`mass` and `com` belong together, got {mass} and {com}: a pendulum needs both; "
+                "leave both out of a balanced wheel."
+            )
         # Rounding: a point mass on a rod without one has just this inertia.
         if inertia < (1 - 1e-9) * mass * com**2:
             raise ValueError(

@@ -19,12 +19,11 @@ from nfriction.plots.comparison import (
 from nfriction.plots.drawing import animate, mechanism
 from nfriction.plots.fuzzy import controller_surface, memberships
 from nfriction.plots.saving import save_all
-from nfriction.plots.style import for_dark_screen
 from nfriction.plots.torque_table import friction_curves
 
 __all__ = [
     "animate", "coefficient_intervals", "coefficient_sections", "coefficient_surfaces",
-    "coefficients_over_time", "controller_surface", "for_dark_screen", "friction_curves",
+    "coefficients_over_time", "controller_surface", "friction_curves",
     "horizon_curve", "mechanism", "memberships", "motion", "positions", "rmse_bars", "save_all",
     "torque_over_velocity",
 ]  # fmt: skip

@@ -29,7 +29,7 @@ VAGUE = 0.5
 """Standard deviation, as a share of the coefficient's mean size, at which a map is half faded."""
 _FIRST, _BESIDE, _APART = 2, 2, 10  # cells, of error bars
 _LEAST = 0.15  # opacity of seen but uncertain cells; nothing is drawn where nothing was seen
-_UNDER, _OVER = "#101010", "#fefefe"  # none of the palette's, which turn for a dark screen
+_UNDER, _OVER = "#101010", "#fefefe"
 _UNSEEN: dict[str, Any] = {"linewidth": 0.6, "alpha": 0.5}
 
 

@@ -6,9 +6,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pandas as pd
 import torch
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
@@ -18,6 +20,7 @@ from nfriction.fitting.equation_error import friction_torque
 from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.identifiability import NORMAL_95, CoefficientUncertainty
+from nfriction.friction import both_names
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.plots import style
@@ -260,7 +263,7 @@ def torque_over_velocity(
     )
     looks = style.looks(models)
     for k, ax in enumerate(axes):
-        grid = _velocities(qd[:, k])
+        grid = velocities(qd[:, k])
         lines = {name: _torque(model, grid, k) for name, model in models.items()}
         seen = np.flatnonzero(np.isfinite(torque[:, k]))
         # Dots may scatter far beyond any friction; the laws and most dots set the limits.
@@ -285,13 +288,15 @@ def torque_over_velocity(
         ax.set_ylabel(f"friction {'torque' if plant.unit == 'rad' else 'force'} [{unit}]")
         if k + columns >= plant.joints:
             ax.set_xlabel(f"joint velocity [{plant.unit}/s]")
-    handles = [
+    handles: list[Artist] = [
         Line2D([], [], linestyle="", marker=".", color=style.FAINT),
         *(looks[name].handle for name in models),
     ]
-    band = ", with 95 % band"
-    labels = [f"{name}{band if name in known else ''}" for name in models]
-    style.legend(figure, handles, ["from the motion", *labels])
+    labels = ["from the motion", *models]
+    if any(name in known for name in models):
+        handles.append(Patch(facecolor=style.FAINT, alpha=0.4))
+        labels.append("95 % bands")
+    style.legend(figure, handles, labels)
     return figure
 
 
@@ -366,7 +371,7 @@ def _largest(error: np.ndarray) -> float:
 
 def _label(name: str, score: Score) -> str:
     at = score.diverged_at
-    return f"{name} (diverged at {at:.2g} s)" if np.isfinite(at) else name
+    return f"{both_names(name)}, diverged at {at:.2g} s" if np.isfinite(at) else name
 
 
 def _name_bar(ax: Axes, x: float, value: float, top: float, bottom: float) -> None:
@@ -384,7 +389,7 @@ def _digits(value: float) -> str:
     return f"{value:.0f}" if value >= 100 else f"{value:#.3g}"
 
 
-def _velocities(qd: Array) -> Array:
+def velocities(qd: Array) -> Array:
     """The range of the data, dense about zero, where laws turn over a few thousandths."""
     low, high = float(qd.min()), float(qd.max())
     # Evenly spaced velocities would draw the step at zero as a slope.

@@ -20,6 +20,7 @@ from nfriction.plots import style
 Array = NDArray[np.float64]
 MEASURED = "measured"
 _FRAMES_A_SECOND, _DPI = 25, 80
+_MOTOR = {"gear_ratio": "", "rotor_inertia": "kg m²", "torque_constant": "N m/A"}
 _BENT = 0.5  # between links of the drawing, so that none hides another [rad]
 
 
@@ -162,8 +163,9 @@ def _frame(ax: Axes, view: _View, plant: Plant) -> None:
         ax.axhline(0, color=style.FAINT, linewidth=1.0)
         ax.set_yticks([])
     elif isinstance(plant, Rotor) and not plant.to_dict()["mass"]:
-        ax.add_patch(Circle((0, 0), view.reach, fill=False, edgecolor=style.FAINT))
-        ax.set(xticks=[], yticks=[], xlabel="not to scale")
+        ax.set(xticks=[], yticks=[], xlabel="")  # of a flywheel no size is known
+        ax.set_axis_off()
+        ax.add_patch(Circle((0, 0), view.reach, facecolor=style.UNSEEN, edgecolor=style.FAINT))
 
 
 def _line(colour: str) -> dict[str, object]:
@@ -172,12 +174,14 @@ def _line(colour: str) -> dict[str, object]:
 
 def _data(plant: Plant) -> list[str]:
     """The plant's numbers in words, a line each."""
-    lines, given = [plant.name or "unnamed", ""], plant.to_dict()
+    given = plant.to_dict()
+    lines = [plant.name or f"{given['kind']} without a name", ""]
     if isinstance(plant, LinearAxis):
         lines.append(f"moving mass {given['mass']:.4g} kg")
     elif isinstance(plant, Rotor):
         units = {"inertia": "kg m² about the axis", "mass": "kg", "com": "m to the mass centre"}
         lines += [f"{key} {given[key]:.4g} {unit}" for key, unit in units.items() if given[key]]
+        lines += [] if given["mass"] else ["", "flywheel, not to scale"]
     elif isinstance(plant, PendulumChain):
         if plant.first_link:
             lines.append(f"arm: {given['arm']['length']:.4g} m")
@@ -188,4 +192,11 @@ def _data(plant: Plant) -> list[str]:
                 f"    length {length:.4g} m, mass centre at {com:.4g} m",
             ]
         lines += ["", "× mass centres"]
+    if "motor" in given:
+        lines.append("")
+    for key, unit in _MOTOR.items():
+        value = given.get("motor", {}).get(key)
+        if value is not None:
+            values = ", ".join(f"{x:.4g}" for x in (value if isinstance(value, list) else [value]))
+            lines.append(f"{key.replace('_', ' ')} {values} {unit}")
     return lines

@@ -19,7 +19,6 @@ from nfriction.plots.coefficients import (
 from nfriction.plots.comparison import horizon_curve, positions, rmse_bars, torque_over_velocity
 from nfriction.plots.drawing import mechanism
 from nfriction.plots.fuzzy import memberships
-from nfriction.plots.style import DARK_GROUND, for_dark_screen
 from nfriction.recording import Recording
 
 DPI = 150
@@ -35,7 +34,7 @@ def save_all(
     run: str = "",
     formats: Sequence[str] = (),
 ) -> list[Path]:
-    """Write every figure of a comparison as PNG, and as `NAME.dark.png` for a dark screen.
+    """Write every figure of a comparison as PNG.
 
     `mechanism`, `rmse_*` and `horizons_*` for test and training recordings, `positions_*` for each
     recording given, `torque_over_velocity`, `over_time_*` for each law of which a model follows the
@@ -82,10 +81,8 @@ def save_all(
         for ending in set(formats) - {"gif"}:
             figure.savefig(path.with_suffix(f".{ending}"))
             written.append(path.with_suffix(f".{ending}"))
-        shade = path.with_suffix(".dark.png")
-        for_dark_screen(figure, ground=DARK_GROUND).savefig(shade, dpi=DPI, metadata=kept)
         figure.clear()
-        written += [path, shade]
+        written.append(path)
     if "gif" in formats and comparison.fits:
         tested = {s.recording for of in comparison.test.values() for s in of}
         for k, recording in enumerate(r for r in recordings if r.name in tested):
@@ -99,7 +96,10 @@ def _figures(
     """Name and figure, one after the other, so that only one is in memory."""
     for part in comparison.parts:
         scores = comparison.scores(part)
-        yield f"rmse_{part}", rmse_bars(comparison.table(part=part), comparison.unit)
+        table = comparison.table(part=part)
+        if len(comparison.joint_names) == 1:
+            table = table.drop(columns="all")  # it would repeat the joint's bars
+        yield f"rmse_{part}", rmse_bars(table, comparison.unit)
         yield f"horizons_{part}", horizon_curve(comparison, part=part)
         for recording in recordings:
             of = {m: s for m, many in scores.items() for s in many if s.recording == recording.name}

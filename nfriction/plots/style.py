@@ -8,15 +8,13 @@ from typing import Any
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.collections import Collection
-from matplotlib.colors import to_hex, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
 from nfriction.evaluation.compare import NO_FRICTION
+from nfriction.friction import both_names
 from nfriction.friction.laws import Coefficient
 
 COLUMN, PAGE = 3.5, 7.0
@@ -35,23 +33,6 @@ _HATCHES = ("", "////", "....", "\\\\\\\\")
 MAP = "viridis"
 LOG_FROM = 30.0
 """Ratio of the largest value to the smallest beyond which an axis is logarithmic."""
-DARK_GROUND = "#14171b"
-# Each keeps its hue and is light enough on the dark ground; white grounds become clear.
-_ON_DARK = {
-    "#ffffff": "none",
-    INK: "#e7eaee",
-    GRID: "#39414b",
-    FAINT: "#8f98a3",
-    str(MEASURED["color"]): "#6b7480",
-    "#000000": "#e7eaee",
-    "#0072b2": "#4aa8e0",
-    "#d55e00": "#ff8a3d",
-    "#009e73": "#2fc79a",
-    "#5d3a9b": "#b79bef",
-    BAND: "#5a626d",
-    UNSEEN: "#1e2329",
-    HATCH: "#454d58",
-}
 
 
 def panels(
@@ -90,7 +71,11 @@ def dress(ax: Axes) -> None:
 
 
 def legend(figure: Figure, handles: Iterable[Artist], labels: Sequence[str]) -> None:
-    """A legend above all panels, in as many columns as fit; the figure grows by its height."""
+    """A legend above all panels, in as many columns as fit; the figure grows by its height.
+
+    Models are labelled by their plain names and abbreviations, other labels stay.
+    """
+    labels = [both_names(label) for label in labels]
     longest = max(len(label) for label in labels)
     columns = min(len(labels), max(1, int(figure.get_figwidth() / (0.5 + 0.05 * longest))))
     rows = -(-len(labels) // columns)
@@ -207,47 +192,3 @@ def padded(low: float, high: float, share: float = 0.05) -> tuple[float, float]:
     # Equal limits have no range to take a share of.
     margin = share * (high - low) or 0.05 * abs(high) or 1.0
     return low - margin, high + margin
-
-
-def for_dark_screen(figure: Figure, *, ground: str = "none") -> Figure:
-    """Change a figure's colours, in place, to be read on a dark screen.
-
-    Colours of models keep their hue, maps stay as they are.
-
-    Args:
-        figure: one of ours; colours outside our palette stay.
-        ground: behind it, clear by default (`style.DARK_GROUND` fits the report's page).
-
-    Returns:
-        The same figure; save it with `figure.savefig(path)`.
-    """
-    for artist in figure.findobj():
-        if isinstance(artist, Collection):
-            if artist.get_array() is None:
-                artist.set_facecolor([_on_dark(c) for c in artist.get_facecolor()])
-                artist.set_edgecolor([_on_dark(c) for c in artist.get_edgecolor()])
-        elif isinstance(artist, Patch):
-            face, edge = artist.get_facecolor(), artist.get_edgecolor()
-            artist.set_facecolor(_on_dark(face))
-            # The white seams of hatched bars stay visible as seams of the ground.
-            seam = to_hex(edge) == "#ffffff" and artist.get_hatch()
-            artist.set_edgecolor(DARK_GROUND if seam else _on_dark(edge))
-        else:
-            for part in ("color", "markerfacecolor", "markeredgecolor"):
-                colour = getattr(artist, f"get_{part}", lambda: "none")()
-                if not (isinstance(colour, str) and colour in ("none", "auto")):
-                    getattr(artist, f"set_{part}")(_on_dark(colour))
-    for ax in figure.axes:
-        # Ticks that are drawn later take their colours from here.
-        ax.tick_params(which="both", colors=_ON_DARK[INK], grid_color=_ON_DARK[GRID])
-    figure.patch.set_facecolor(ground)
-    return figure
-
-
-def _on_dark(colour: Any) -> Any:
-    """The colour for a dark ground, as opaque as it was; unknown ones stay."""
-    rgba = to_rgba(colour)
-    if rgba[3] == 0:
-        return "none"
-    found = _ON_DARK.get(to_hex(rgba))
-    return colour if found is None else (found if found == "none" else to_rgba(found, rgba[3]))

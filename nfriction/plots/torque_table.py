@@ -16,6 +16,7 @@ from nfriction.fitting.result.identifiability import NORMAL_95
 from nfriction.fitting.torque_table import predict
 from nfriction.friction import model_by_name, plain_name
 from nfriction.plots import style
+from nfriction.plots.comparison import velocities
 
 if TYPE_CHECKING:
     from nfriction.evaluation.torque_tables import TorqueFits
@@ -103,7 +104,7 @@ def _loops(ax: Axes, fits: "TorqueFits", k: int, lines: list[tuple[str, dict[str
 def _curves(ax: Axes, fits: "TorqueFits", k: int, lines: list[tuple[str, dict[str, Any]]]) -> str:
     """Torque over velocity; returns its unit."""
     joint = fits.table.joints[k]
-    grid = _velocities(joint.qd)
+    grid = velocities(joint.qd)
     found = {name: _steady(fits.fits[name][k], joint, grid) for name, _ in lines}
     middle, low, median, high = _binned(joint)
     extremes = np.concatenate([low, high, *(line for line, _ in found.values())])
@@ -128,14 +129,6 @@ def _curves(ax: Axes, fits: "TorqueFits", k: int, lines: list[tuple[str, dict[st
     )  # fmt: skip
     ax.set_ylim(style.padded(factor * extremes.min(), factor * extremes.max(), 0.1))
     return unit
-
-
-def _velocities(qd: Array) -> Array:
-    """The range of the rows, dense about zero, where friction turns."""
-    low, high = float(qd.min()), float(qd.max())
-    near = np.geomspace(1e-5, 1.0, 100) * max(abs(low), abs(high))
-    grid = np.unique(np.concatenate([np.linspace(low, high, 300), -near, [0.0], near]))
-    return grid[(grid >= low) & (grid <= high)]
 
 
 def _steady(found: "JointFit", joint: "JointTorque", qd: Array) -> tuple[Array, Array]:

@@ -28,7 +28,7 @@ from nfriction.evaluation.tables import (
     interval_table,
     selection_table,
 )
-from nfriction.friction import model_names, plain_name
+from nfriction.friction import both_names
 from nfriction.friction.models import FrictionModel
 from nfriction.io.files import write_atomically
 from nfriction.io.model_file import ModelInfo
@@ -153,8 +153,6 @@ def _in_order(centres: Sequence[float], names: Sequence[str]) -> list[str]:
     return [named[k] for k in range(len(centres))]
 
 
-# A figure's twin for a dark screen.
-_DARK = ".dark"
 # In the order of the page: friction and errors first, then motions, then the models' insides.
 _CAPTIONS = {
     "torque_over_velocity": "Friction torque over velocity: the models' laws with their 95 % bands "
@@ -165,6 +163,7 @@ _CAPTIONS = {
     "rmse_train": "Position error by model and joint, training recordings",
     "horizons_train": "Position error over the length of the simulation, training recordings",
     "mechanism": "The mechanism as the rig file describes it",
+    "motion_": "Measured (grey) and simulated motion of the best model, test recording ",
     "positions_test_": "Measured and simulated position with the error below, test: ",
     "positions_train_": "Measured and simulated position with the error below, training: ",
     "friction": "Friction torque over velocity: rows, their medians with quartiles in bins of "
@@ -186,9 +185,7 @@ _JINJA = jinja2.Environment(
     lstrip_blocks=True,
 )
 _JINJA.filters["four"] = lambda value: f"{value:.0f}" if 1e3 <= value < 1e7 else f"{value:.4g}"
-_JINJA.filters["plain"] = lambda name: (
-    f" ({plain_name(name)})" if name in model_names() and plain_name(name) != name.lower() else ""
-)
+_JINJA.filters["both"] = both_names
 # JavaScript reads Infinity where Python writes inf.
 _JINJA.filters["sortable"] = lambda value: (
     "Infinity" if math.isnan(value) else str(value).replace("inf", "Infinity")
@@ -259,21 +256,19 @@ def write_report(folder: str | Path, path: str | Path) -> Run:
 
 
 def pictures(figures: Sequence[Figure]) -> list[dict[str, Any]]:
-    """Figures in the order of the page as URLs, each with its twin for a dark screen if any."""
-    by_name, found = {figure.name: figure for figure in figures}, []
+    """Figures as URLs, in the order of the page."""
+    found = []
     for figure in figures:
         name = figure.name
-        if name.removesuffix(_DARK) in by_name.keys() - {name}:
-            continue  # shown with the other
         rank, caption = len(_CAPTIONS), name.replace("_", " ")
         for k, (prefix, words) in enumerate(_CAPTIONS.items()):
             if name == prefix or (prefix.endswith("_") and name.startswith(prefix)):
                 rank, caption = k, words + name.removeprefix(prefix)
-        picture = {"caption": caption, "width": figure.width, "height": figure.height}
-        for screen, of in (("light", figure), ("dark", by_name.get(name + _DARK))):
-            data = of and base64.b64encode(of.png).decode()
-            picture[screen] = data and f"data:image/png;base64,{data}"
-        found.append((rank, picture))
+        # The first bytes name the format: \x89PNG or GIF89a.
+        kind = "gif" if figure.data.startswith(b"GIF") else "png"
+        url = f"data:image/{kind};base64,{base64.b64encode(figure.data).decode()}"
+        size = {"width": figure.width, "height": figure.height}
+        found.append((rank, {"caption": caption, "url": url, **size}))
     return [picture for _, picture in sorted(found, key=lambda pair: pair[0])]
 
 

@@ -22,7 +22,7 @@ from nfriction.io.model_file import ModelFileError, ModelInfo, load, load_info
 
 # Far above any run of ours; larger files are none of it.
 LARGEST_RESULTS, LARGEST_FIGURE, MOST_FIGURES = 64 * 2**20, 16 * 2**20, 100
-_PNG = b"\x89PNG\r\n\x1a\n"
+_PNG, _GIF = b"\x89PNG\r\n\x1a\n", b"GIF8"
 # Text that `plots.save_all` puts before the picture.
 _RUN = re.compile(rb"tEXtnfriction run\0([0-9a-f]{16})")
 # Squares of smaller numbers are finite.
@@ -63,10 +63,10 @@ class FitRecord:
 
 @dataclass(frozen=True)
 class Figure:
-    """A PNG file with its size in pixels, and the id of its run if it bears one."""
+    """A PNG or GIF file with its size in pixels, and the id of its run if it bears one."""
 
     name: str
-    png: bytes
+    data: bytes
     width: int
     height: int
     run: str = ""
@@ -278,17 +278,20 @@ def _figures(folder: Path) -> tuple[tuple[Figure, ...], list[str]]:
     """Those in the order of their names, and a sentence on each that could not be read."""
     found: list[Figure] = []
     notes = []
-    for path in sorted(folder.glob("*.png"))[:MOST_FIGURES]:
+    for path in sorted([*folder.glob("*.png"), *folder.glob("*.gif")])[:MOST_FIGURES]:
         if not path.is_file() or path.stat().st_size > LARGEST_FIGURE:
             notes.append(f"figure {path.name}: no file, or too large")
             continue
-        png = path.read_bytes()
-        if not png.startswith(_PNG) or len(png) < 24:
-            notes.append(f"figure {path.name}: not a PNG file")
+        data = path.read_bytes()
+        if not data.startswith((_PNG, _GIF)) or len(data) < 24:
+            notes.append(f"figure {path.name}: not a PNG or GIF file")
             continue
-        width, height = (int.from_bytes(png[k : k + 4], "big") for k in (16, 20))
-        run = _RUN.search(png[:4096])
-        found.append(Figure(path.stem, png, width, height, run[1].decode() if run else ""))
+        if data.startswith(_PNG):
+            width, height = (int.from_bytes(data[k : k + 4], "big") for k in (16, 20))
+        else:
+            width, height = (int.from_bytes(data[k : k + 2], "little") for k in (6, 8))
+        run = _RUN.search(data[:4096])
+        found.append(Figure(path.stem, data, width, height, run[1].decode() if run else ""))
     return tuple(found), notes
 
 

@@ -12,7 +12,6 @@ from nfriction.friction import plain_name
 from nfriction.io.files import write_atomically
 from nfriction.io.model_file import save
 from nfriction.plots.saving import DPI
-from nfriction.plots.style import DARK_GROUND, for_dark_screen
 from nfriction.report.page import document, pictures
 from nfriction.report.run import Figure
 
@@ -80,12 +79,10 @@ def write_torque_fits(
             (folder / "figures").mkdir(exist_ok=True)
             figure = fits.plot()
             width, height = (round(DPI * x) for x in figure.get_size_inches())
-            for name in (FIGURE, f"{FIGURE}.dark"):
-                path = folder / "figures" / f"{name}.png"
-                figure.savefig(path, dpi=DPI)
-                drawn.append(Figure(name, path.read_bytes(), width, height))
-                written.append(path)
-                for_dark_screen(figure, ground=DARK_GROUND)
+            path = folder / "figures" / f"{FIGURE}.png"
+            figure.savefig(path, dpi=DPI)
+            drawn.append(Figure(FIGURE, path.read_bytes(), width, height))
+            written.append(path)
         page = to_html(fits, folder, drawn, command)
         written.append(write_atomically(folder / REPORT, page.encode(errors="backslashreplace")))
         results = fits.to_dict() | {"command": command}

@@ -20,18 +20,17 @@ ALIKE = 0.05
 ROUNDING = 1e-9
 
 
-def quantise(q: ArrayLike, counts_per_revolution: float, *, offset: float = 0.0) -> Array:
+def quantise(q: ArrayLike, counts_per_revolution: float) -> Array:
     """Position of an incremental encoder: the nearest of its evenly spaced counts.
 
     Args:
         q: position [rad], any shape.
         counts_per_revolution: counts after quadrature; an encoder of 2048 lines has 8192.
-        offset: position of one count's centre [rad].
     Returns:
         Quantised position [rad], shape like `q`.
     """
     quantum = _quantum(counts_per_revolution)
-    return offset + quantum * np.rint((np.asarray(q, dtype=np.float64) - offset) / quantum)
+    return np.asarray(quantum * np.rint(np.asarray(q, dtype=np.float64) / quantum))
 
 
 def count_seen(q: ArrayLike) -> Array:
@@ -54,13 +53,7 @@ def count_seen(q: ArrayLike) -> Array:
     return found
 
 
-def period_counting(
-    time: ArrayLike,
-    q: ArrayLike,
-    counts_per_revolution: float,
-    *,
-    offset: float = 0.0,
-) -> Array:
+def period_counting(time: ArrayLike, q: ArrayLike, counts_per_revolution: float) -> Array:
     """Causal velocity from the time between encoder edges, accurate at low speed.
 
     The velocity is the distance between the last two edges over the time between them. Without a
@@ -72,13 +65,12 @@ def period_counting(
         time: sample times [s], shape (time,).
         q: position [rad], shape (time, joint); quantised here, which leaves counts as they are.
         counts_per_revolution: counts after quadrature.
-        offset: position of one count's centre [rad].
     Returns:
         Velocity [rad/s], shape (time, joint).
     """
     time, q = check_motion(time, q)
     quantum = _quantum(counts_per_revolution)
-    counts = np.rint((q - offset) / quantum)
+    counts = np.rint(q / quantum)
     velocity = np.zeros_like(q)
     for joint in range(q.shape[1]):
         step = np.diff(counts[:, joint])
@@ -166,9 +158,6 @@ def causal_motion(
     q: ArrayLike,
     counts_per_revolution: float,
     cutoff_hz: float = 20.0,
-    *,
-    offset: float = 0.0,
-    damping: float = math.sqrt(0.5),
 ) -> Motion:
     """Motion from past and present samples alone, as in a controller.
 
@@ -181,8 +170,6 @@ def causal_motion(
         q: position [rad], shape (time, joint).
         counts_per_revolution: counts after quadrature.
         cutoff_hz: cut-off of both filters [Hz].
-        offset: position of one count's centre [rad].
-        damping: damping ratio of the filters [-].
     Returns:
         The quantised position with velocity and acceleration.
     References:
@@ -190,12 +177,12 @@ def causal_motion(
             coarse at low speed, so edges are timed here.
     """
     time, q = check_motion(time, q)
-    low_pass = SecondOrderLowPass(cutoff_hz, float(np.median(np.diff(time))), damping)
-    qd = low_pass(period_counting(time, q, counts_per_revolution, offset=offset))
+    low_pass = SecondOrderLowPass(cutoff_hz, float(np.median(np.diff(time))))
+    qd = low_pass(period_counting(time, q, counts_per_revolution))
     # A difference needs a past sample; the first has none.
     rate = np.zeros_like(qd)
     rate[1:] = np.diff(qd, axis=0) / np.diff(time)[:, None]
-    measured = quantise(q, counts_per_revolution, offset=offset)
+    measured = quantise(q, counts_per_revolution)
     return Motion(time, measured, qd, low_pass(rate))
 
 
@@ -205,7 +192,6 @@ def frequency_counting(
     counts_per_revolution: float,
     *,
     interval: float = 0.01,
-    offset: float = 0.0,
 ) -> Array:
     """Causal velocity from the counts within a fixed interval, poor at low speed.
 
@@ -217,7 +203,6 @@ def frequency_counting(
         q: position [rad], shape (time, joint); quantised here, which leaves counts as they are.
         counts_per_revolution: counts after quadrature.
         interval: over which counts are taken [s]; at the start, the time since the first sample.
-        offset: position of one count's centre [rad].
     Returns:
         Velocity [rad/s], shape (time, joint); zero at the first sample.
     Raises:
@@ -229,7 +214,7 @@ def frequency_counting(
     if not interval > 0:
         raise ValueError(f"`interval` must be positive [s], got {interval}.")
     quantum = _quantum(counts_per_revolution)
-    counts = np.rint((q - offset) / quantum)
+    counts = np.rint(q / quantum)
     # Stamps are rounded: a sample that begins the interval exactly must not be missed.
     begins = time - (1.0 - 1e-6) * interval
     first = np.maximum(np.searchsorted(time, begins, side="right") - 1, 0)

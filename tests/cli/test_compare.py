@@ -54,18 +54,13 @@ def test_table_holds_the_errors_of_the_results(compared: Path) -> None:
     assert set(of.model) == set(models)
 
 
-def test_models_load_and_scripts_need_torch_alone(compared: Path) -> None:
+def test_models_load_and_scripts_equal_them(compared: Path) -> None:
     qd = torch.linspace(-3, 3, 7, dtype=torch.float64)[:, None]
     inputs = (qd, torch.zeros_like(qd), torch.ones_like(qd))
     for name in ("NCFM", "LFM"):
         script = torch.jit.load(compared / "models" / f"{name}.pt")
         model = load(compared / "models" / f"{name}.json")
         torch.testing.assert_close(script(*inputs), model(*inputs), rtol=0, atol=1e-12)
-    code = (
-        "import sys, torch; torch.jit.load(sys.argv[1]);"
-        "assert not any(m.startswith('nfriction') for m in sys.modules)"
-    )
-    subprocess.run([sys.executable, "-c", code, compared / "models" / "LFM.pt"], check=True)
 
 
 def test_figures_are_drawn_and_nothing_unfinished_stays(compared: Path) -> None:
@@ -113,7 +108,9 @@ def test_a_comparison_ends_with_the_gain_and_commands_for_what_comes_next(
     none, best = free["no friction"], free["LFM"]
     assert without.endswith(f" miss the measured motion by {1e3 * none:.3g} mrad;")
     assert "(load-coulomb)" in learnt
-    assert learnt.endswith(f" by {1e3 * best:.3g} mrad, {100 * (1 - best / none):.4g} % less.")
+    less = float(learnt.split()[-3])
+    assert learnt.endswith(f" by {1e3 * best:.3g} mrad, {less:g} % less.")
+    assert less < 100 * (1 - best / none) < less + 0.01
     assert 100 * (1 - best / none) > 99.95  # "100 % less" would be wrong
     monkeypatch.chdir(tmp_path)
     for line in (report, export):
@@ -325,7 +322,7 @@ def test_file_names_of_older_systems_lose_nothing(bench: Path, tmp_path: Path) -
         Recording.read(bench / name).write(path)
     rig = ["--rig", str(bench / "bench.json")]
     train, test, out = str(files[0]), str(files[1]), tmp_path / "out"
-    words = ["compare", train, "--test", test, *rig, "--models", "NCFM", *QUICK]
+    words = ["compare", train, "--test", test, *rig, "--models", "NCFM", *QUICK, "--no-figures"]
     assert cli.main([*words, "--out", str(out)]) == 0
     found = results(out)
     assert list(found["models"]["NCFM"]["test"]) == ["Gelenk_b_ä"]

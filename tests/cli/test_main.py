@@ -11,6 +11,7 @@ import pytest
 
 from nfriction import cli, rigs
 from nfriction.cli import demo, inputs
+from nfriction.cli.console import one_line
 from nfriction.friction.models import NCFM
 from nfriction.io.model_file import save
 from nfriction.papers import twin
@@ -96,6 +97,11 @@ def test_installed_command_fails_in_one_line() -> None:
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert re.fullmatch(r"nfriction: error: .*absent\.csv.*\n", done.stderr)
+
+
+def test_advice_for_python_becomes_that_for_the_command_line() -> None:
+    told = "torques are late (`fit_delay=True`, or `recording.advance_torque(0.0300)`). Corrected"
+    assert one_line(told) == "torques are late (--fit-delay). Corrected"
 
 
 def test_debug_shows_the_error_itself(bench: Path) -> None:

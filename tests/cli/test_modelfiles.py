@@ -2,10 +2,11 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
-from nfriction import LFM, NFLFM, ModelInfo, cli, load, save
+from nfriction import LFM, NFLFM, ModelInfo, Recording, cli, load, save
 from nfriction.friction import model_by_name
 from tests.cli.benches import QUICK
 
@@ -50,6 +51,21 @@ def test_a_fit_that_did_not_converge_is_not_told_to_be_exported(
     said = capsys.readouterr().out
     assert "LFM: doubtful (the search did not converge). Not converged" in said
     assert f"wrote {tmp_path / 'm.json'}" in said
+    assert "next:" not in said
+
+
+def test_a_fit_that_is_not_to_be_used_is_not_told_to_be_exported(
+    bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    time = 0.01 * np.arange(200)
+    driven = Recording(time, 0.5 * time[:, None] ** 2, convention="absolute,hanging")
+    driven.write(tmp_path / "driven.csv")
+    words = ["--rig", str(bench / "bench.json"), "--model", "LFM", *QUICK]
+    out = ["--out", str(tmp_path / "m.json")]
+    assert cli.main(["fit", str(tmp_path / "driven.csv"), *words, *out]) == 0
+    said = capsys.readouterr().out
+    assert "do not use (a mistake in the data is likely" in said
+    assert "gains energy" in said
     assert "next:" not in said
 
 

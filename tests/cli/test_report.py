@@ -5,7 +5,7 @@ from pathlib import Path
 
 from nfriction import cli
 from nfriction.evaluation.results import COMPLETE
-from nfriction.friction import plain_name
+from nfriction.friction import both_names
 from tests.cli.benches import compare, results
 
 
@@ -17,7 +17,7 @@ def test_a_comparison_becomes_a_page(compared: Path, tmp_path: Path, capsys) -> 
     figures = list((compared / "figures").glob("*.png"))
     assert html.count("data:image/png;base64,") == len(figures) > 0
     best = results(compared)["best"]["model"]
-    assert f"<strong>{best}</strong> ({plain_name(best)}) predicts" in html
+    assert f"<strong>{both_names(best)}</strong> predicts" in html
     assert "nfriction compare" in html
 
 
@@ -53,7 +53,8 @@ def test_a_rerun_refreshes_the_page_in_its_folder(bench: Path, tmp_path: Path) -
             assert cli.main(["report", str(out)]) == 0
     html = (out / "report.html").read_text(encoding="utf-8")
     assert f'content="{results(out)["run"]}"' in html
-    assert "<h3>NCFM</h3>" not in html
+    assert "<h3>load-coulomb (LFM)</h3>" in html
+    assert "NCFM" not in html
 
 
 def test_files_of_two_runs_are_refused(

@@ -36,7 +36,7 @@ def test_a_table_is_fitted_scored_and_exported(
     for model in (out, out / "models" / "CVFM.json"):
         assert main(["score-torque", str(model), str(csv), "--columns", "qd=speed"]) == 0
         row = capsys.readouterr().out.splitlines()[-1].split()
-        assert row[:2] == ["joint1", "CVFM"]
+        assert row[:2] == ["joint1", "coulomb-viscous"]
         assert float(row[3]) < 0.05
     file = str(out / "models" / "CVFM.json")
     assert main(["info", file]) == 0

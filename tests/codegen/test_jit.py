@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction.codegen import NoBackend, compile_function
 from nfriction.codegen.llvm import jit
 from nfriction.export.c_code.export import find_compiler
 
@@ -164,13 +163,6 @@ def test_two_processes_may_build_at_once(cache):
         worker.join()
     assert all(worker.exitcode == 0 for worker in workers)
     assert not list(cache.glob("building-*"))
-
-
-def test_without_llvmlite_the_error_says_what_to_do(monkeypatch):
-    monkeypatch.setitem(sys.modules, "llvmlite", None)
-    monkeypatch.setitem(sys.modules, "llvmlite.binding", None)
-    with pytest.raises(NoBackend, match=r'install it, or use `backend="torch"`'):
-        compile_function(torch.sin, [torch.ones(1, dtype=F64)])
 
 
 def test_neither_a_compiler_nor_numba_is_needed(cache, tmp_path):

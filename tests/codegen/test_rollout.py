@@ -21,7 +21,9 @@ def run(compiled, q0, qd0, *, parameters=None, threads=1, **signals):
 
 
 def compile_rollout(plant, friction, **settings):
-    return codegen.compile_rollout(plant, friction, rk4_step, **settings)
+    compiled = codegen.trace_rollout(plant, friction, rk4_step, **settings)
+    compiled.check()
+    return compiled
 
 
 def start(joints=3, batch=1, seed=0):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction import CVFM, LFM, LinearAxis, PendulumChain, Recording, rollout, score
+from nfriction import CVFM, LFM, LinearAxis, PendulumChain, Recording, rigs, rollout, score
 from nfriction.evaluation.compare import Comparison
 from nfriction.evaluation.lead_in import Simulator, estimate_starts, lead_in_samples
 from nfriction.evaluation.score import RMSE, Score
@@ -207,6 +207,17 @@ def test_the_limit_knows_the_noise_of_the_torque():
     assert within >= 5
 
 
+def test_the_limit_knows_the_rounding_that_only_the_recording_shows():
+    """A joint held by friction reads a constant, up to half a count off."""
+    friction = CVFM(2, [[5e-2, 2e-3], [2e-2, 2e-3]], v_smooth=0.01).requires_grad_(False)
+    recording = swing(plant(), friction, **SETTINGS | {"start": (2.8, 0.3)})
+    stated, shown = (
+        score(plant(count), friction, recording, horizons=[1.0]).limit for count in (QUANTUM, None)
+    )
+    assert shown.free_run.all == pytest.approx(stated.free_run.all, rel=0.001)
+    assert shown.windows["1"].all == pytest.approx(stated.windows["1"].all, rel=0.001)
+
+
 def below_the_limit(seeds: Iterable[int]) -> int:
     """Number of random releases whose score by the true model is within the limit."""
     scores = (score(rig, MODEL, r, horizons=()) for rig, r, _ in map(release, seeds))
@@ -273,3 +284,12 @@ def test_tables_are_root_mean_squares_and_percentages():
     np.testing.assert_allclose(saved[0], 0.0, atol=1e-12)
     assert saved[1, -1] == pytest.approx(100 * (1 - table[1, -1] / table[0, -1]))
     assert not torch.is_grad_enabled() or MODEL.schedule.raw.grad is None
+
+
+def test_a_path_and_the_name_of_a_rig_do(tmp_path):
+    time = np.arange(300) * 2e-3
+    recording = Recording(time, 0.01 * np.sin(time)[:, None], convention="relative,hanging")
+    recording.write(tmp_path / "run.csv")
+    named = score("multiarm-single", None, tmp_path / "run.csv", limit=False)
+    given = score(rigs.of("multiarm-single"), None, recording, limit=False)
+    assert named.free_run == given.free_run

@@ -13,9 +13,9 @@ from torch import Tensor
 from nfriction.export import ExportError, torchscript
 from nfriction.export.contract import compare, verify
 from nfriction.export.controller import controller_of
-from nfriction.export.test_vectors import draw
+from nfriction.export.test_vectors import draw, draw_motion
 from nfriction.export.torch_archive import METADATA
-from nfriction.export.torchscript_file import open_torchscript, sample_inputs
+from nfriction.export.torchscript_file import open_torchscript
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law, TorqueFunction
 from nfriction.friction.models import LFM, FrictionModel
@@ -32,6 +32,10 @@ def load(path: Path) -> torch.nn.Module:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return torch.jit.load(str(path))
+
+
+def sample_inputs(model: FrictionModel, count: int, seed: int) -> tuple[torch.Tensor, ...]:
+    return draw_motion(controller_of(model), count, seed)
 
 
 def assert_equal(model: FrictionModel, path: Path) -> None:

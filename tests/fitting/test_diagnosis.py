@@ -2,6 +2,7 @@
 
 import functools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -245,9 +246,13 @@ def test_a_fit_says_whether_it_is_usable():
     settings = {"windows": (1.0,), "fit_plant": False}
     assert fit(CVFM(1), plant, recording, **settings).usability == ("good", "")
     # Viscous friction alone is far from dry friction.
-    verdict, reason = fit(NCFM(1), plant, recording, **settings).usability
+    wrong = fit(NCFM(1), plant, recording, **settings)
+    verdict, reason = wrong.usability
     assert verdict == "doubtful"
     assert "times the measurement noise" in reason
+    # Turns in plenty excuse no error of the angle.
+    turning = tuple(replace(m, q=50 * m.q) for m in wrong.motions)
+    assert replace(wrong, motions=turning).usability[0] == "doubtful"
 
 
 def test_noise_of_the_torque_is_no_error_of_the_law():
@@ -257,11 +262,22 @@ def test_noise_of_the_torque_is_no_error_of_the_law():
     settings = {"windows": (2.0,), "fit_plant": False}
     right = fit(CVFM(1), plant, recording, **settings)
     # Far above the rounding, and just what the noise of the torque explains.
-    assert right.residual > 50 * right.noise.rounding
-    assert right.residual == pytest.approx(right.noise.residual, rel=0.5)
+    assert right.residual > 50 * (COUNT / 16) / 12**0.5
+    assert right.residual == pytest.approx(right.noise, rel=0.5)
     assert right.usability == ("good", "")
     assert not any("missing something" in warning for warning in right.warnings)
     assert fit(NCFM(1), plant, recording, **settings).usability[0] == "doubtful"
+
+
+@pytest.mark.parametrize(("factor", "verdict"), [(0.15, "good"), (0.3, "doubtful")])
+def test_a_fine_encoder_calls_no_small_error_doubtful(factor, verdict):
+    """An error of the law is judged by the motion, however fine the encoder is."""
+    plant, fine, tau = measured("wheel", COUNT / 1024)
+    # A driver whose gain grows with its torque, which no term of the plant is.
+    recording = Recording(STEP * np.arange(len(fine)), fine, np.sinh(factor * tau) / factor)
+    found = fit(CVFM(1), plant, recording, windows=(1.0,), fit_plant=False)
+    assert found.residual > 30 * found.noise
+    assert found.usability[0] == verdict
 
 
 def test_an_encoder_without_visible_count_excuses_no_law():

@@ -63,7 +63,7 @@ def test_coefficients_that_follow_the_motion_are_given_where_they_apply(
 
 def test_a_summary_names_model_status_numbers_and_warnings(found: FitResult) -> None:
     told = replace(found, warnings=("Too short: 1 < 2.",)).summary()
-    assert told.startswith("LFM (load-coulomb): good. Converged")
+    assert told.startswith("load-coulomb (LFM): good. Converged")
     assert " mN RMS" in told
     assert f"{found.intervals[0].value:.4g}" in told
     assert told.endswith("- Too short: 1 < 2.")
@@ -72,7 +72,7 @@ def test_a_summary_names_model_status_numbers_and_warnings(found: FitResult) -> 
 
 def test_a_notebook_shows_the_same_with_text_escaped(found: FitResult) -> None:
     page = replace(found, warnings=("Too short: 1 < 2.",))._repr_html_()
-    assert "LFM (load-coulomb): good" in page
+    assert "load-coulomb (LFM): good" in page
     assert "<table" in page
     assert "<li>Too short: 1 &lt; 2.</li>" in page
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from nfriction import LFM, LinearAxis
-from nfriction.codegen import NoBackend
+from nfriction.codegen import CodegenError
 from nfriction.fitting.plant_parameters import adjusted_buffers, plant_parameters
 from nfriction.fitting.shooting.sensitivity import CHUNK, StepJacobian, Trajectory, propagate
 from nfriction.friction import model_by_name
@@ -30,7 +30,7 @@ def samples(joints, k, parameters, count=5, seed=0, memory=0):
 
 def without_compiler(monkeypatch, plant, model, terms):
     def nothing(*_, **__):
-        raise NoBackend("none")
+        raise CodegenError("none")
 
     with monkeypatch.context() as patch:
         patch.setattr("nfriction.codegen.compile_function", nothing)

@@ -2,6 +2,7 @@
 
 import struct
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,27 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
 
+from nfriction.io.formats import matlab
 from nfriction.io.formats.matlab import read_mat
 from nfriction.recording import Recording
 
 TIME = np.arange(40) / 1000
 Q = np.random.default_rng(0).normal(size=(40, 2)) / 7
+
+
+@pytest.fixture(autouse=True)
+def _in_this_process(request: pytest.FixtureRequest, without_worker: Callable[[Any], None]) -> None:
+    if request.function.__name__ not in IN_A_WORKER:
+        without_worker(matlab)
+
+
+# The process is part of what these tests are of.
+IN_A_WORKER = {
+    "test_plain_variables_either_way_round",
+    "test_what_cannot_be_a_recording_is_named",
+    "test_shapes_that_are_none_are_refused",
+    "test_damaged_files_are_read_or_refused",
+}
 
 
 def read(folder: Path, content: dict[str, Any], **settings: Any) -> Recording:
@@ -181,7 +198,7 @@ def refused(folder: Path, content: bytes) -> None:
 
 
 @settings(
-    max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=5, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(
     compressed=st.booleans(),

@@ -94,6 +94,13 @@ def test_lengths_make_a_sliding_axis(tmp_path: Path) -> None:
         read(tmp_path, text, columns={"q1": "x:mm", "q2": "y:m"}, unit="rad")
 
 
+def test_a_unit_at_the_end_of_a_name_holds_unless_another_is_stated(tmp_path: Path) -> None:
+    text = written(",", False, "t_ms{0}x_mm{0}y_mm")
+    back = read(tmp_path, text, columns={"time": "t_ms", "q1": "x_mm", "q2": "y_mm:m"})
+    np.testing.assert_allclose(back.q, Q * [1e-3, 1.0], rtol=4e-16)
+    np.testing.assert_allclose(back.time, TIME / 1000, rtol=1e-15)
+
+
 @pytest.mark.parametrize("separator", [",", ";", " "])
 def test_only_whole_lines_are_comments(tmp_path: Path, separator: str) -> None:
     text = written(separator, False, "time{0}enc#1{0}enc#2").replace("\n", "\n  # noted\n", 4)

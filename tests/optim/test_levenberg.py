@@ -143,7 +143,7 @@ def test_strongly_coupled_bounds_satisfy_kuhn_tucker() -> None:
 def test_on_coupled_bounds_no_search_ends_short_of_the_minimum() -> None:
     """From corners of the box, against an exact solver of bounded linear least squares."""
     generator = torch.Generator().manual_seed(5)
-    for _ in range(200):
+    for _ in range(100):
         weak, common, loads = (
             torch.randn(*shape, generator=generator, dtype=F64)
             for shape in ((12, 6), (12, 2), (2, 6))
@@ -166,7 +166,7 @@ def test_a_parameter_a_rounding_off_its_bound_is_on_it(lower: float) -> None:
     """No step in other units ends exactly on a bound, but the verdict must name it."""
     generator = torch.Generator().manual_seed(2)
     pinned = 0
-    for _ in range(200):
+    for _ in range(70):
         J = torch.randn(12, 5, generator=generator, dtype=F64)
         J = J * 10 ** torch.randn(5, generator=generator, dtype=F64)
         y = torch.randn(12, generator=generator, dtype=F64)
@@ -179,7 +179,7 @@ def test_a_parameter_a_rounding_off_its_bound_is_on_it(lower: float) -> None:
         near = torch.minimum(result.x - lower, 0.2 - result.x) < 1e-15
         assert torch.equal(near, result.at_lower | result.at_upper)
         pinned += int(near.sum())
-    assert pinned > 100
+    assert pinned > 35
 
 
 def test_start_on_a_bound_leaves_it_when_the_minimum_is_inside() -> None:

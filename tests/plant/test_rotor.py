@@ -78,6 +78,7 @@ def test_a_rotor_inertia_is_seen_at_the_joint() -> None:
         ({"kind": "rotor"}, "a rotor needs `inertia`"),
         ({"kind": "rotor", "inertia": 0.01, "mass": 1, "com": 0.2}, "at least mass com"),
         ({"kind": "rotor", "inertia": -1}, "must not be negative"),
+        ({"kind": "rotor", "inertia": 1, "mass": 0.5}, "belong together, got 0.5 and 0.0"),
         ({"kind": "rotor", "inertia": 1, "gear": 50}, "unknown keys"),
         ({"kind": "rotor", "inertia": 1, "motor": {"ratio": 5}}, "did you mean gear_ratio"),
         ({"kind": "rotor", "inertia": 1, "motor": {"gear_ratio": 0}}, "must not be zero"),

@@ -26,8 +26,8 @@ from nfriction.friction import model_names
 from nfriction.friction.models import CVFM, LFM, NCFM, NLFM
 from nfriction.friction.neurofuzzy import NFLFM, NFNCFM, NFNLFM
 from nfriction.papers.controller.mamdani import paper_controller
-from nfriction.plant import LinearAxis, Rotor, rigs
-from nfriction.plots import style
+from nfriction.plant import LinearAxis, Motor, Rotor, rigs
+from nfriction.plots import saving, style
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
@@ -357,7 +357,8 @@ def rc_params() -> dict:
     return {key: mpl.rcParams[key] for key in mpl.rcParams if key != "backend"}
 
 
-def test_save_all_writes_every_figure_and_leaves_matplotlib_alone(tmp_path):
+def test_save_all_writes_every_figure_and_leaves_matplotlib_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr(saving, "DPI", 40)
     plant, recording, motion = axis_data(NCFM(1, [3.0]))
     unseen = swing(1, "m", name="unseen")
     found = fit(NCFM(1), plant, recording, method="equation_error", motions=[motion])
@@ -378,7 +379,7 @@ def test_save_all_writes_every_figure_and_leaves_matplotlib_alone(tmp_path):
         "mechanism", "over_time_viscous",
         "coefficients_NFNCFM", "sections_NFNCFM", "memberships_NFNCFM",
     }  # fmt: skip
-    assert {f.name for f in files} == {f"{n}{of}.png" for n in expected for of in ("", ".dark")}
+    assert {f.name for f in files} == {f"{n}.png" for n in expected}
     assert all(f.read_bytes().startswith(b"\x89PNG") for f in files)
     assert rc_params() == before
     assert (tmp_path / "figures" / "rmse_test.png").is_file()
@@ -387,7 +388,7 @@ def test_save_all_writes_every_figure_and_leaves_matplotlib_alone(tmp_path):
     names = {f.name for f in plots.save_all(rejected, [recording], tmp_path / "fewer")}
     assert "torque_over_velocity.png" in names
     assert not any("NFNCFM" in name or "over_time" in name for name in names)
-    law = replace(comparison, fits={"NCFM": found}, test={})
+    law = replace(comparison, fits={}, test={})  # read from a file: scores alone
     paper = plots.save_all(law, [], tmp_path / "paper", formats=("svg", "pdf"))
     assert {f.suffix for f in paper} == {".png", ".svg", ".pdf"}
     assert (tmp_path / "paper" / "rmse_train.pdf").read_bytes().startswith(b"%PDF")
@@ -442,3 +443,18 @@ def test_all_models_are_told_apart_by_marker_and_by_dashes():
     assert len({(look.line["color"], str(look.line["linestyle"])) for look in looks}) == len(
         model_names()
     )
+
+
+def test_a_motor_is_drawn_with_its_data_in_no_frame():
+    figure = plots.mechanism(Rotor(0.02, motor=Motor(50, 1.2e-5, 0.03), name="wheel"))
+    wheel, words = figure.axes
+    assert not wheel.axison
+    (text,) = words.texts
+    for line in ("wheel", "gear ratio 50", "rotor inertia 1.2e-05 kg m²", "N m/A"):
+        assert line in text.get_text()
+
+
+def test_legends_name_models_as_papers_and_in_plain_words():
+    figure = comparison_of(swing(1)).plot()
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert {"no friction", "viscous (NCFM)", "neuro-fuzzy:load-coulomb (NFLFM)"} < set(labels)

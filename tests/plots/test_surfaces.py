@@ -47,7 +47,6 @@ def test_maps_fade_as_they_become_uncertain(known):
     sure = CoefficientUncertainty(model.schedule, torch.zeros_like(uncertainty.root))
     plain = plots.coefficient_surfaces(model, uncertainty=sure)
     assert (mesh_of(plain.axes[0]).get_alpha() == 1.0).all()
-    figure.draw_without_rendering()
 
 
 def test_what_is_wholly_unknown_can_be_drawn(known):

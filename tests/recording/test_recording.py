@@ -253,6 +253,7 @@ def test_pickled_objects_are_never_loaded(tmp_path: Path) -> None:
         ("t,q1\n0,0\n", "column time is missing; found t, q1.*columns="),
         ("time,q1,q3\n0,0,0\n", "column q2 is missing"),
         ("time,angle\n0,0\n", "column q1 is missing; found time, angle"),
+        ("Zeit,Motorwinkel,Strom\n0,0,0\n", '"motor1": "Motorwinkel", "current1": "Strom"'),
         ("time,q1\n0,0\n1,zero\n", "column q1, row 1 .*got 'zero'"),
         ("time,q1\n0,0\n1,2,3\n", "ragged"),
         ("time,q1\n0,0,1\n1,2,3\n", "more cells than its header"),

@@ -42,6 +42,12 @@ def test_units_and_names_of_a_german_file_are_followed(tmp_path: Path) -> None:
     np.testing.assert_allclose(degrees.joints[0].qd, QD)
 
 
+def test_a_speed_named_by_its_unit_is_read_in_it() -> None:
+    given = pd.DataFrame({"speed_rpm": QD * 30 / np.pi, "torque": QD})
+    found = TorqueTable.from_pandas(given, columns={"qd": "speed_rpm"})
+    np.testing.assert_allclose(found.joints[0].qd, QD)
+
+
 def test_velocity_comes_from_positions_in_time() -> None:
     time = np.arange(400) * 0.01
     given = pd.DataFrame({"time": time, "position": np.sin(time), "friction": np.cos(time)})

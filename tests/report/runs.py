@@ -84,7 +84,7 @@ def neuro_fuzzy() -> NFLFM:
 
 
 def write(folder: Path, content: dict[str, Any] | None = None) -> Path:
-    """A run's folder with two model files and two figures, one with its twin for the dark."""
+    """A run's folder with two model files and two figures."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "results.json").write_text(json.dumps(results() if content is None else content))
     ranges = {"qd": [[-10.0, 10.0], [-5, 5]], "qdd": [[-60.0, 60], [-30, 30]]}
@@ -92,9 +92,8 @@ def write(folder: Path, content: dict[str, Any] | None = None) -> Path:
     save(LFM(2, [2e-3, 1e-2]), folder / "models" / "LFM.json", info)
     save(neuro_fuzzy(), folder / "models" / "NFLFM.json", info)
     (folder / "figures").mkdir(exist_ok=True)
-    for name, size in (("rmse_test", (4, 2)), ("rmse_test.dark", (4, 2)),
-                       ("positions_train_calm", (8, 2))):  # fmt: skip
-        figure = Figure(figsize=size, facecolor="black" if "dark" in name else "white")
+    for name, size in (("rmse_test", (4, 2)), ("positions_train_calm", (8, 2))):
+        figure = Figure(figsize=size)
         figure.subplots().plot([0, 1])
         figure.savefig(folder / "figures" / f"{name}.png")
     return folder

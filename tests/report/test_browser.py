@@ -64,18 +64,15 @@ addEventListener("load", async () => {
 });
 """
 
-# What a figure looks like once it is enlarged.
+# How a figure is shown, small and enlarged.
 DARK = """
 addEventListener("load", async () => {
   const page = document.querySelector("iframe").contentDocument;
   page.querySelector(".zoom").click();
-  const large = page.querySelector("dialog img");
-  await large.decode();
-  const canvas = document.createElement("canvas").getContext("2d");
-  canvas.drawImage(large, 0, 0);
-  const corner = [...canvas.getImageData(0, 0, 1, 1).data].slice(0, 3);
-  const ground = page.defaultView.getComputedStyle(page.body).backgroundColor;
-  await fetch("/found", {method: "POST", body: JSON.stringify({corner, ground})});
+  const style = (of) => page.defaultView.getComputedStyle(page.querySelector(of));
+  const filters = ["figure img", "dialog img"].map((of) => style(of).filter);
+  const ground = style("body").backgroundColor;
+  await fetch("/found", {method: "POST", body: JSON.stringify({filters, ground})});
 });
 """
 
@@ -136,11 +133,13 @@ def test_names_from_files_run_no_script(looks):
 
 def test_headings_sort_their_table(looks):
     for look in looks:
-        assert look["before"] == ["no friction", "LFM", "NLFM", "NFLFM"]
-        by_error = ["LFM", "NFLFM", "no friction", "NLFM"]  # NLFM diverged
+        linear, arctan = "load-coulomb (LFM)", "arctan (NLFM)"
+        fuzzy, none = "neuro-fuzzy:load-coulomb (NFLFM)", "no friction"
+        assert look["before"] == [none, linear, arctan, fuzzy]
+        by_error = [linear, fuzzy, none, arctan]  # arctan diverged
         assert look["ascending"] == [by_error, "ascending"]
         assert look["descending"] == [by_error[::-1], "descending"]
-        assert look["words"] == [["LFM", "NFLFM", "NLFM", "no friction"], "none"]
+        assert look["words"] == [[arctan, linear, fuzzy, none], "none"]
 
 
 def test_figures_open_grow_and_close(looks):
@@ -169,4 +168,4 @@ def test_a_dark_screen_shows_dark_figures_small_and_large(tmp_path):
     option = "--blink-settings=preferredColorScheme=0"
     look = found_in_browser(outer, tmp_path / "profile", option)
     assert look["ground"] == "rgb(20, 23, 27)"
-    assert look["corner"] == [0, 0, 0]  # of the twin for the dark; the other's is white
+    assert look["filters"] == ["invert(0.92) hue-rotate(180deg)"] * 2

@@ -4,11 +4,16 @@ import itertools
 import math
 import re
 from html.parser import HTMLParser
+from importlib import resources
 
+import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
+from PIL import Image
 
 from nfriction import LFM, NFLFM, ModelInfo, save
 from nfriction.evaluation.tables import Table, error_table
+from nfriction.plots import style
 from nfriction.report import read_run, to_html
 from tests.report.runs import EVIL, JOINTS, results, write
 
@@ -73,17 +78,41 @@ def test_the_policy_lets_only_the_pages_own_script_run(page):
     assert "unsafe" not in policy
 
 
-def test_a_dark_screen_gets_the_dark_twin(page, tmp_path):
-    (dark,) = page.all("source")
-    assert dark["media"] == "(prefers-color-scheme: dark)"
-    assert dark["srcset"] not in {image.get("src") for image in page.all("img")}
-    assert len(page.all("figure")) == 2  # the twin is no figure of its own
+def test_wide_figures_get_the_width_of_the_page(page):
     assert [figure.get("class") for figure in page.all("figure")] == [None, "wide"]
+
+
+def luminance(rgb: np.ndarray) -> float:
+    """Relative luminance (WCAG 2)."""
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+def test_on_a_dark_screen_text_and_lines_of_figures_stand_out():
+    """Colours as the style's filter shows them (W3C Filter Effects: invert, hue-rotate)."""
+    css = (resources.files("nfriction.report") / "templates" / "page.css").read_text()
+    (inverted,) = re.findall(r"filter: invert\(([\d.]+)\) hue-rotate\(180deg\)", css)
+    grey = np.array([0.213, 0.715, 0.072])
+
+    def shown(colour: str) -> float:
+        rgb = np.array(to_rgb(colour))
+        rgb = float(inverted) * (1 - 2 * rgb) + rgb
+        return luminance(np.clip(2 * (grey @ rgb) - rgb, 0, 1))
+
+    ground = shown("#ffffff") + 0.05
+    assert (shown(style.INK) + 0.05) / ground > 7.0
+    for colour in (*style.COLOURS, style.FAINT):
+        assert (shown(colour) + 0.05) / ground > 3.0, colour
+
+
+def test_an_animation_moves_on_the_page(tmp_path):
     folder = write(tmp_path)
-    (folder / "figures" / "rmse_test.png").unlink()
-    alone = Page(to_html(read_run(folder)))
-    assert len(alone.all("figure")) == 2
-    assert not alone.all("source")
+    still = Image.new("P", (30, 20))
+    still.save(folder / "figures" / "motion_1.gif", save_all=True, append_images=[still])
+    page = Page(to_html(read_run(folder)))
+    (shown,) = (i for i in page.all("img") if i.get("src", "").startswith("data:image/gif"))
+    assert (shown["width"], shown["height"]) == ("30", "20")
+    assert "simulated motion of the best model" in shown["alt"]
 
 
 def test_what_a_reader_of_the_screen_needs(page):
@@ -102,9 +131,9 @@ def test_what_a_reader_of_the_screen_needs(page):
 def test_verdicts_warnings_and_rules_are_told(page):
     text = " ".join("".join(page.text).split())
     for said in (
-        "LFM (load-coulomb) predicts the test recordings best: 100 mrad, where no friction leaves "
+        "load-coulomb (LFM) predicts the test recordings best: 100 mrad, where no friction leaves "
         "2000.",
-        "Fit of LFM: good",
+        "Fit of load-coulomb (LFM): good",
         "0.002 N m s/rad",
         f"it is statistically tied with {EVIL}; the simplest of them is {EVIL}.",
         "Doubtful.",

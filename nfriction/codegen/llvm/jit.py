@@ -16,8 +16,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from nfriction.codegen.errors import NoBackend
-
 logger = logging.getLogger(__name__)
 
 _KEPT = ".object"
@@ -55,20 +53,6 @@ def _user_cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
 
 
-def require_backend() -> None:
-    """Load llvmlite.
-
-    Raises:
-        NoBackend: if it cannot be loaded.
-    """
-    try:
-        import llvmlite.binding  # noqa: F401
-    except (ImportError, OSError) as error:
-        raise NoBackend(
-            f'llvmlite cannot be loaded ({error}); install it, or use `backend="torch"`.'
-        ) from error
-
-
 def build(source: str, name: str) -> Callable[..., None]:
     """A function of a module of LLVM IR, which lets go of the GIL.
 
@@ -77,12 +61,8 @@ def build(source: str, name: str) -> Callable[..., None]:
     Args:
         source: the module.
         name: of the function, which returns nothing.
-
-    Raises:
-        NoBackend: if llvmlite cannot be loaded.
     """
-    require_backend()
-    from llvmlite import binding as llvm
+    from llvmlite import binding as llvm  # slow to import
 
     recipe = (source, llvm.get_process_triple(), *_processor(), _version())
     key = hashlib.sha256("\0".join(recipe).encode()).hexdigest()[:32]

@@ -3,17 +3,18 @@
 import html
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
 from torch import Tensor
 
 from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.plant_parameters import TORQUE_DELAY
 from nfriction.fitting.result.identifiability import CoefficientUncertainty, Interval
 from nfriction.fitting.robust_loss import Outliers
-from nfriction.friction import model_names, plain_name
+from nfriction.friction import both_names
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
@@ -24,16 +25,37 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Usability = Literal["good", "doubtful", "do not use"]
-# Residuals above so many times the encoder's rounding are mostly the model's error, unless noise of
-# the torque explains them. A well-fitted law on a real bench has up to ten times.
-DOUBTFUL_RATIO = 20.0
+# Normalised root mean square error that makes a fit doubtful: a fit of less than 99 % as system
+# identification counts it (L. Ljung, System Identification, 2nd ed. 1999, section 16.3).
+DOUBTFUL_ERROR = 0.01
+# Standard deviation of an angle of which nothing is known [rad].
+UNIFORM_TURN = math.pi / 3**0.5
 
 
-class Noise(NamedTuple):
-    """Root mean square of the encoders' rounding, and residual of a right law [rad; m]."""
+@dataclass(frozen=True)
+class InputGain:
+    """Share of the squared error of blocks left out that an input explains.
 
-    rounding: float
-    residual: float
+    Attributes:
+        name: of the input.
+        share: by all joints.
+        by_joint: by each joint's coefficient alone, (joint,).
+    """
+
+    name: str
+    share: float
+    by_joint: tuple[float, ...]
+
+    def words(self, joint_names: Sequence[str]) -> str:
+        """A sentence about the input."""
+        alone = ", ".join(
+            f"{joint} {100 * share:.0f} %"
+            for joint, share in zip(joint_names, self.by_joint, strict=True)
+        )
+        return (
+            f"Input {self.name}: {-100 * self.share:.0f} % unexplained motion on blocks left out "
+            f"(by one joint alone: {alone})."
+        )
 
 
 @dataclass(frozen=True)
@@ -65,13 +87,15 @@ class FitResult:
             equation-error fit.
         data_warnings: warnings about the data; inherited by fits warm-started from this one.
         mistakes: likely mistakes in recordings or rig, see `fitting.diagnosis`; inherited, too.
-        noise: of encoders and torque; None after an equation-error fit.
+        noise: root mean square residual of a right law, by the noise of encoders and torque
+            [rad; m]; None after an equation-error fit.
         stages: length of the windows of each stage that was kept [s], and its residual in
             `residual_unit`; of constant coefficients.
         skipped_horizons: lengths of windows that the constant law could not follow [s].
         outliers: stretches of samples that a robust loss counts less than half.
         effective_parameters: of a network: name of each group of its parameters, how many of them
             the data determine (MacKay's gamma), and how many there are.
+        inputs: of a network: further inputs that the fit chose, and what each explains.
     """
 
     model: FrictionModel
@@ -91,11 +115,12 @@ class FitResult:
     uncertainty: CoefficientUncertainty | None = None
     data_warnings: tuple[str, ...] = ()
     mistakes: tuple[str, ...] = ()
-    noise: Noise | None = None
+    noise: float | None = None
     stages: tuple[tuple[float, float], ...] = ()
     skipped_horizons: tuple[float, ...] = ()
     outliers: tuple[Outliers, ...] = ()
     effective_parameters: tuple[tuple[str, float, int], ...] = ()
+    inputs: tuple[InputGain, ...] = ()
 
     def longest_usable_horizon(self, windows: Sequence[float]) -> float:
         """The last of growing window lengths that the constant law could follow [s]."""
@@ -113,12 +138,21 @@ class FitResult:
 
     @property
     def usability(self) -> tuple[Usability, str]:
-        """Fitness for simulation and control, and the reason in a clause."""
-        noise = self.noise or Noise(math.inf, math.inf)
-        wrong = self.residual > max(
-            DOUBTFUL_RATIO * noise.rounding, DEFAULTS.model_error_ratio * noise.residual
+        """Fitness for simulation and control, and the reason in a clause.
+
+        The residual is judged by how far the joints move: a fine encoder shows errors that hardly
+        matter, and noise is no error of the model.
+        """
+        noise = math.inf if self.noise is None else self.noise
+        moved = np.concatenate([m.q.var(axis=0) for m in self.motions] or [[math.inf]])
+        # A joint that turns over and over is somewhere on its circle.
+        most = UNIFORM_TURN**2 if self.plant.unit == "rad" else math.inf
+        error = self.residual / math.sqrt(np.minimum(moved, most).mean())
+        wrong = error > DOUBTFUL_ERROR and self.residual > DEFAULTS.model_error_ratio * noise
+        far = (
+            f"the residual is {100 * error:.2g} % of the motion's standard deviation, and "
+            f"{self.residual / noise:.0f} times the measurement noise"
         )
-        far = f"the residual is {self.residual / noise.residual:.0f} times the measurement noise"
         if self.mistakes:
             return "do not use", f"a mistake in the data is likely: {self.mistakes[0]}"
         if not self.converged and wrong:
@@ -172,6 +206,7 @@ class FitResult:
             **(offsets if self.encoder_offsets else {}),
             **({"outliers": [o._asdict() for o in self.outliers]} if self.outliers else {}),
             **({"effective_parameters": gamma} if gamma else {}),
+            **({"inputs": [asdict(gain) for gain in self.inputs]} if self.inputs else {}),
         }
 
     def to_pandas(self) -> "pd.DataFrame":
@@ -200,12 +235,11 @@ class FitResult:
 
     def _head(self) -> str:
         """Model, usability, status and residual in a line."""
-        name, (verdict, reason) = type(self.model).__name__, self.usability
-        known = f" ({plain_name(name)})" if name in model_names() else ""
+        name, (verdict, reason) = both_names(type(self.model).__name__), self.usability
         why = f" ({reason})" if reason else ""
         unit = self.residual_unit
         return (
-            f"{name}{known}: {verdict}{why}. {self.status.rstrip('.')}. Residual "
+            f"{name}: {verdict}{why}. {self.status.rstrip('.')}. Residual "
             f"{1e3 * self.residual:.3g} m{unit} RMS over the training data."
         )
 

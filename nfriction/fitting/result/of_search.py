@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.equation_error import TorqueFit, peak_dynamics_torque
-from nfriction.fitting.result.fit_result import FitResult, Noise
+from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.identifiability import (
     CoefficientUncertainty,
     Information,
@@ -158,7 +158,7 @@ def result_from_shooting(
             at_zero=at_zero,
         )
         + model_error_warning(
-            residual, effective_noise(counted), noise.residual, plant.unit, problem.options
+            residual, effective_noise(counted), noise, plant.unit, problem.options
         )
         + outlier_warning(outliers),
         outliers=outliers,
@@ -272,17 +272,17 @@ def rounding(problem: ShootingProblem) -> float:
     return count / math.sqrt(12)
 
 
-def measurement_noise(problem: ShootingProblem, x: Tensor, residual: float) -> Noise:
-    """Noise of a solution with this root mean square residual.
+def measurement_noise(problem: ShootingProblem, x: Tensor, residual: float) -> float:
+    """Residual of a right law [rad; m], given that of a solution, both root mean square.
 
     Only a residual far above the rounding is worth the simulation of the torque's noise.
     """
     least = rounding(problem)
     if residual <= problem.options.model_error_ratio * least:
-        return Noise(least, least)
+        return least
     errors = problem.errors(x)
     encoder = float(white_noise(errors).clamp(min=least).square().mean().sqrt())
-    return Noise(least, math.hypot(encoder, _by_torque(problem, x, errors)))
+    return math.hypot(encoder, _by_torque(problem, x, errors))
 
 
 def _by_torque(problem: ShootingProblem, x: Tensor, errors: Tensor, seed: int = 0) -> float:

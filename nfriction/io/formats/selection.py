@@ -29,7 +29,7 @@ _LIKE_TORQUE = re.compile(
 )
 _LIKE_TIME = re.compile(r"^(t|time|zeit|timestamp|zeitstempel)\b", re.IGNORECASE)
 _LIKE_POSITION = re.compile(
-    r"^(pos|ang|winkel|gelenk|joint|enc|geber|theta|phi|q(?!d))\w*[\W_]*\d*\s*([\[(].*)?$",
+    r"^(pos|ang|winkel|gelenk|joint|motor|enc|geber|theta|phi|q(?!d))\w*[\W_]*\d*\s*([\[(].*)?$",
     re.IGNORECASE,
 )
 _LIKE_CURRENT = re.compile("strom|current", re.IGNORECASE)
@@ -52,6 +52,10 @@ _SPELLINGS = {
     "1/min": "rpm", "U/min": "rpm", "Nm": "N m", "N*m": "N m", "N.m": "N m", "mNm": "mN m",
     "sec": "s", "msec": "ms", "μs": "us",
 }  # fmt: skip
+
+
+# Those that mean nothing else: "rev" may be a direction, and SI needs no word.
+_UNIT_IN_NAME = re.compile(r"_(ms|us|ns|mrad|deg|mm|rpm|mNm|mA)$")
 
 
 class Source(NamedTuple):
@@ -140,10 +144,14 @@ def table_arrays(
 
 
 def parse_source(spec: str, names: set[str]) -> Source | None:
-    """The column that a specification such as "enc_1" or "enc_1:deg" names, None if not there."""
+    """The column that a specification such as "enc_1" or "enc_1:deg" names, None if not there.
+
+    A unit at the end of a column's name, as in "speed_rpm", holds unless another one is stated.
+    """
     stem, _, unit = spec.rpartition(":")
     if spec in names:
-        return Source(spec, None)
+        in_name = _UNIT_IN_NAME.search(spec)
+        return Source(spec, in_name and canonical_unit(in_name[1]))
     return Source(stem, unit) if stem in names and is_unit(unit) else None
 
 
@@ -376,16 +384,27 @@ def _missing(table: pd.DataFrame, columns: dict[str, str], missing: list[str]) -
 
 
 def _guessed(found: Sequence[str]) -> dict[str, str]:
-    """Our names with a file's, by usual words for time and positions; empty unless both are there.
+    """Our names with a file's, by usual words; empty unless time and positions are among them.
 
     For an error's advice only: what is read is always named by the user.
     """
     plain = [name for name in found if not set(name) & set('",=:') and len(name) <= 60]
     times = [name for name in plain if _LIKE_TIME.search(name)]
-    positions = [name for name in plain if _LIKE_POSITION.search(name)][:10]
+    torques = [name for name in plain if _LIKE_TORQUE.search(name)]
+    positions = [name for name in plain if _LIKE_POSITION.search(name) and name not in torques][:10]
     if len(times) != 1 or not positions:
         return {}
-    pairs = {"time": times[0]} | {f"q{k}": name for k, name in enumerate(positions, 1)}
+    pairs = {"time": times[0]}
+    pairs |= {
+        f"{'motor' if name.lower().startswith('motor') else 'q'}{k}": name
+        for k, name in enumerate(positions, 1)
+    }
+    # Fewer than joints: it is not known which are driven.
+    if len(torques) == len(positions):
+        pairs |= {
+            f"{'current' if _LIKE_CURRENT.search(name) else 'tau'}{k}": name
+            for k, name in enumerate(torques, 1)
+        }
     return {key: name for key, name in pairs.items() if key != name}
 
 

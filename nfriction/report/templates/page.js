@@ -59,7 +59,7 @@ for (const button of document.querySelectorAll(".zoom")) {
     const small = button.querySelector("img");
     picture.style.width = "0"; // until its size is known
     picture.alt = small.alt;
-    picture.src = small.currentSrc; // the one for this screen
+    picture.src = small.src;
     dialog.setAttribute("aria-label", small.alt);
     dialog.showModal();
     await picture.decode();

@@ -31,6 +31,11 @@ def two_seconds(request: pytest.FixtureRequest) -> tuple[str, list[TrueMotion]]:
 
 
 @pytest.fixture(scope="module")
+def plain() -> list[TrueMotion]:
+    return motions(family.PLAIN, 2000)
+
+
+@pytest.fixture(scope="module")
 def drawn() -> twin.Twin:
     return twin.draw("shear+ripple", seed=1, duration=0.5)
 
@@ -60,16 +65,17 @@ def test_friction_is_passive(two_seconds: tuple[str, list[TrueMotion]]) -> None:
         assert np.diff((kinetic + potential).numpy()).max() <= 1e-9
 
 
-def test_every_effect_changes_the_motion(two_seconds: tuple[str, list[TrueMotion]]) -> None:
+def test_every_effect_changes_the_motion(
+    two_seconds: tuple[str, list[TrueMotion]], plain: list[TrueMotion]
+) -> None:
     truth, found = two_seconds
-    plain = motions(family.PLAIN, 2000)
     apart = max(np.abs(a.q - b.q).max() for a, b in zip(found, plain, strict=True))
     assert (apart > 10 * family.COUNT) == (truth != family.PLAIN)
 
 
-@pytest.mark.parametrize("truth", [family.PLAIN, TOGETHER])
-def test_steps_are_short_enough(truth: str) -> None:
-    for coarse, fine in zip(motions(truth, 1000), motions(truth, 4000, step=2.5e-4), strict=True):
+def test_steps_are_short_enough() -> None:
+    coarse_and_fine = motions(TOGETHER, 1000), motions(TOGETHER, 4000, step=2.5e-4)
+    for coarse, fine in zip(*coarse_and_fine, strict=True):
         assert np.abs(coarse.q - fine.q[::4]).max() < 0.1 * family.COUNT
 
 
@@ -124,10 +130,10 @@ def test_encoders_count(drawn: twin.Twin) -> None:
 
 
 def test_judged_releases_are_predictable() -> None:
-    made = twin.draw("direction", seed=0, duration=3.0)
+    made = twin.draw("direction", seed=0, duration=2.0)
     motion = family._Motion(Links.of(made.plant), family.parameters("direction", 0))
     starts = np.degrees([made.initial_states[r.name][0] for r in made.part("test")])
-    _, growth = motion.simulate([tuple(row) for row in starts.tolist()], 3000)
+    _, growth = motion.simulate([tuple(row) for row in starts.tolist()], 2000)
     assert growth.max() <= family.PREDICTABLE * family.COUNT
 
 

@@ -6,7 +6,7 @@
 {% for coefficient in about.coefficients %}
  *     {{ safe(coefficient.name) }} [{{ safe(coefficient.unit) }}]
 {% endfor %}
- * Sample time: {{ "any" if about.sample_time is none else "%r s" % about.sample_time }}.
+ * Sample time: {{ "any" if about.sample_time is none else "%.9g s" % about.sample_time }}.
  * Joints, in order:
 {% for name in about.joint_names or range(1, joints + 1) %}
  *     {{ safe(name) if about.joint_names else "joint %d" % name }}
@@ -18,8 +18,8 @@
  * Outside them (OUTSIDE): {{ safe(about.edges.outside_input_ranges) }}.
  * NaN or infinity gives NaN for that joint (NOT_FINITE), under -ffast-math too.
  * SATURATED: the torque limit.
- * Torque limit: {{ safe(about.torque_limit) }}.
- * Filter: {{ safe(about.filter) }}.
+ * Torque limit: {{ "none" if about.torque_limit is none else safe(about.torque_limit) }}.
+ * Filter: {{ "none" if about.filter is none else safe(about.filter) }}.
  * Parameters: {{ safe(about.parameter_hash) }}.
 {% for name, value in about.training_data | dictsort %}
  * Training data: {{ safe(name) }}: {{ safe(value) }}
