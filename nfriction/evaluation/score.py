@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from nfriction.evaluation.lead_in import DRAWS, LEAD_IN, Runs, Simulator
 from nfriction.friction.models import FrictionModel
-from nfriction.plant import Plant
+from nfriction.plant import Plant, rigs
 from nfriction.recording import Recording, RecordingLike
 from nfriction.simulation.rollout import Scheme
 
@@ -104,7 +104,7 @@ class Score(Errors):
 
 
 def score(
-    plant: Plant,
+    plant: Plant | str,
     friction: FrictionModel | None,
     recording: RecordingLike,
     *,
@@ -116,7 +116,7 @@ def score(
     """Simulate a recording and measure the position error.
 
     Args:
-        plant: the mechanism.
+        plant: the mechanism, its name, or the path of a rig file.
         friction: friction model, or None for no friction.
         recording: or its path or table; the plant's angle convention applies where it has none.
         initial_state: q0 and qd0 of the free run in the recording's convention, (joint,) each,
@@ -132,6 +132,7 @@ def score(
     Raises:
         ValueError: if the recording is too short for a lead-in.
     """
+    plant = rigs.of(plant)
     recording = Recording.of(recording, plant=plant)
     simulator = Simulator(plant, friction, recording, scheme, DRAWS if limit else 0)
     runs = simulator.free_runs(initial_state)
@@ -140,7 +141,6 @@ def score(
             f"{recording.name or 'the recording'} is too short to be scored: its longest stretch "
             f"without a gap must be longer than the lead-in of {LEAD_IN:g} s."
         )
-    # Short windows show the torque law, long ones how its errors add up.
     windows = {f"{h:g}": run for h in horizons if (run := simulator.windows(h)) is not None}
     simulated = np.full_like(recording.q, np.nan)
     for run in runs:

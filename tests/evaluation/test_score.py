@@ -286,10 +286,10 @@ def test_tables_are_root_mean_squares_and_percentages():
     assert not torch.is_grad_enabled() or MODEL.schedule.raw.grad is None
 
 
-def test_the_path_of_a_recording_does(tmp_path):
+def test_a_path_and_the_name_of_a_rig_do(tmp_path):
     time = np.arange(300) * 2e-3
     recording = Recording(time, 0.01 * np.sin(time)[:, None], convention="relative,hanging")
     recording.write(tmp_path / "run.csv")
-    plant = rigs.of("multiarm-single")
-    of_file = score(plant, None, tmp_path / "run.csv", limit=False)
-    assert of_file.free_run == score(plant, None, recording, limit=False).free_run
+    named = score("multiarm-single", None, tmp_path / "run.csv", limit=False)
+    given = score(rigs.of("multiarm-single"), None, recording, limit=False)
+    assert named.free_run == given.free_run
