@@ -2,6 +2,8 @@
 
 import ast
 import re
+import subprocess
+import sys
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from functools import cache
@@ -163,6 +165,29 @@ def test_every_public_name_is_there_and_says_what_it_is_for() -> None:
     for name in nfriction.__all__:
         thing = getattr(nfriction, name)
         assert isinstance(thing, str) or thing.__doc__, name
+
+
+WITHOUT_EXTRAS = """
+import sys
+extras = "asammdf distributed h5py joblib mujoco onnx onnxruntime pyarrow sklearn"
+sys.modules |= dict.fromkeys(extras.split())
+import nfriction
+for name in nfriction.__all__:
+    getattr(nfriction, name)
+model = nfriction.LFM(1)
+for call in (nfriction.FrictionEstimator, lambda: nfriction.export.onnx(model, "m.onnx")):
+    try:
+        call()
+    except ImportError as error:
+        print(error)
+"""
+
+
+def test_without_extras_the_library_loads_and_says_what_to_install() -> None:
+    command = [sys.executable, "-c", WITHOUT_EXTRAS]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert "pip install nfriction[sklearn]" in said
+    assert "pip install nfriction[onnx]" in said
 
 
 def test_only_command_lines_print() -> None:

@@ -49,8 +49,9 @@ def fit(
     warning. Laws with several minima are also started from their grid of initial values and from
     the simpler law that they contain (`Law.nested_law`); the lowest residual wins. A neuro-fuzzy
     model starts at the constant fit of its law and is kept only if its hold-out RMSE is 20 % below
-    the law's; its plant prior is relaxed, and its sets move, only for a further 20 %. An adaptive
-    model starts at the constant fit, too; `fit_adaptive` has its further settings.
+    the law's; its plant prior is relaxed, its sets move, and its friction depends on further inputs
+    (`FitResult.inputs`: the direction of turning, the load of the bearings), only for a further
+    20 %. An adaptive model starts at the constant fit, too; `fit_adaptive` has more settings.
 
     Args:
         model: the model to fit, changed in place; or the name of one, such as "coulomb-viscous".

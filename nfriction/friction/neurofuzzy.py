@@ -11,8 +11,9 @@ from torch import Tensor, nn
 
 from nfriction.friction import laws
 from nfriction.friction.coefficients import Constant, Schedule
+from nfriction.friction.inputs import with_inputs
 from nfriction.friction.laws import Law
-from nfriction.friction.models import NamedModel
+from nfriction.friction.models import V_SMOOTH, FrictionModel, NamedModel
 from nfriction.friction.parameters import Sensitivity, positive_number
 from nfriction.fuzzy import AnfisRBF
 from nfriction.fuzzy.membership import FuzzyRules
@@ -447,8 +448,33 @@ class NeuroFuzzyModel(NamedModel):
         joints, initial, v_smooth: see `NamedModel`; training starts from constants `initial`.
         network: `"anfis"`; `"rbf"`: the papers' network alone, see `RBFCoefficients`; `"by_class"`:
             a network that corrects coefficients by class, see `AdaptiveNeuroFuzzy`.
+        inputs: what friction depends on besides speed and acceleration: `"direction"` of turning,
+            `"load"` of the bearing, each by a coefficient of its own (`with_inputs`); None
+            lets a fit choose those that pay.
         options: of the coefficients, e.g. `terms=(7, 5)`.
     """
+
+    def __init__(
+        self,
+        joints: int,
+        initial: Tensor | Sequence | None = None,
+        *,
+        v_smooth: float = V_SMOOTH,
+        inputs: Sequence[str] | None = None,
+        **options: Any,
+    ) -> None:
+        law = with_inputs(self.definition, inputs or ())
+        schedule = self.make_schedule(law, joints, initial, **options)
+        FrictionModel.__init__(self, law, schedule, v_smooth)
+        self.inputs = None if inputs is None else list(inputs)
+
+    def see(self, inputs: Sequence[str]) -> None:
+        """Take further inputs, with fresh coefficients."""
+        options = {**self.options(), "inputs": inputs}
+        self.__init__(self.joints, v_smooth=self.v_smooth, **options)  # type: ignore[misc]
+
+    def options(self) -> dict[str, Any]:
+        return super().options() | ({"inputs": self.inputs} if self.inputs else {})
 
     @staticmethod
     def make_schedule(*args: Any, network: str = "anfis", **options: Any) -> Schedule:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -70,6 +70,8 @@ class PendulumChain(Plant):
         gravity: [m/s^2].
         arm: the rotating arm; None where it is fixed.
         armature: rotor inertia seen at each joint [kg m^2]; None for that of `motor`, if any.
+        normal_load: `"link"` for |N|/(m g) of the joint's own link, as in the paper; `"bearing"`
+            for the whole force that the joint carries, of all links beyond it; see `load`.
         motor: motors and gears of the joints; a rotor's inertia there is seen at its joint.
         convention: of the recordings' columns, see `Plant`.
         joint_names, name, position_quantum: see `Plant`.
@@ -87,7 +89,7 @@ class PendulumChain(Plant):
     kind = "chain"
     required: ClassVar[tuple[str, ...]] = ("mass", "length")
     optional: ClassVar[tuple[str, ...]] = (
-        *("com", "inertia", "gravity", "arm", "armature", "motor"),
+        *("com", "inertia", "gravity", "arm", "armature", "normal_load", "motor"),
         *("convention", "joint_names", "name", "position_quantum"),
     )
 
@@ -96,7 +98,7 @@ class PendulumChain(Plant):
     gravity_moment: Tensor  # g b_i, (links,) [N m]
     armature: Tensor  # (joints,) [kg m^2]
     length: Tensor  # (links,) [m]
-    load_lever: Tensor  # l_i / g, (links,) [s^2]
+    load_lever: Tensor  # l_i / g, (links,) [s^2]; see `dynamics.bearing_lever` of bearing loads
     # With an arm only: J0, the arm with the links' masses at its end, () [kg m^2], and L1 / g,
     # () [s^2], so that L1 b_i follows `gravity_moment`.
     arm_inertia: Tensor
@@ -123,6 +125,7 @@ class PendulumChain(Plant):
         gravity: float = 9.81,
         arm: Arm | None = None,
         armature: Sequence[float] | Tensor | None = None,
+        normal_load: Literal["link", "bearing"] = "link",
         motor: Motor | None = None,
         convention: Sequence[str] = ("relative", "upright"),
         joint_names: Sequence[str] | None = None,
@@ -135,6 +138,11 @@ class PendulumChain(Plant):
             raise ValueError(f"`gravity` must be at least {WEIGHTLESS:g} m/s^2, got {gravity:g}.")
         if not isinstance(arm, Arm | None):
             raise TypeError(f"`arm` must be an Arm(inertia, length) or None, got {arm!r}.")
+        if normal_load not in ("link", "bearing") or (normal_load == "bearing" and arm):
+            raise ValueError(
+                '`normal_load` must be "link" or, of a chain on a fixed pivot, "bearing", got '
+                f"{normal_load!r}."
+            )
         links, first = len(m), int(arm is not None)
         super().__init__(
             first + links,
@@ -167,6 +175,9 @@ class PendulumChain(Plant):
             "length": size,
             "load_lever": centre / gravity,
         }
+        self.bearing_load = normal_load == "bearing"
+        if self.bearing_load:
+            buffers["load_lever"] = dynamics.bearing_lever(m, size, centre) / gravity
         if arm:
             buffers["arm_inertia"] = m.sum() * arm.length**2 + arm.inertia
             buffers["arm_lever"] = m.new_tensor(arm.length / gravity)
@@ -193,6 +204,7 @@ class PendulumChain(Plant):
             "gravity": gravity,
             "arm": asdict(arm) if arm else None,
             "armature": None if armature is None or not self.has_armature else rotor.tolist(),
+            "normal_load": normal_load if self.bearing_load else None,
         }
         aligned = self.mass_matrix(rotor.new_zeros(self.joints))
         require_positive_definite(self.inertia_coupling, aligned[first:, first:])
@@ -278,10 +290,12 @@ class PendulumChain(Plant):
         return kinetic, dynamics.dot(self.gravity_moment.unbind(-1), height)
 
     def load(self, q: Tensor, qd: Tensor) -> Tensor:
-        """Normal load of each joint over its link's weight, |N_i| / (m_i g) [-].
+        """Normal load of each joint over its load at rest [-].
 
-        N_i = m_i l_i qd_i^2 - m_i g cos phi_i with the joint's own rate qd_i and the link's
-        absolute angle phi_i from upright; 1 for the arm, whose axis is vertical.
+        Of links |N_i| / (m_i g), N_i = m_i l_i qd_i^2 - m_i g cos phi_i with the joint's own rate
+        qd_i and the link's absolute angle phi_i from upright; 1 for the arm, whose axis is
+        vertical. Of bearings the force that the hinge carries over the weight beyond it, at the
+        acceleration that the motion has without friction and torque.
 
         References:
             TLRIP paper, eqs. (26)-(29), with - m g cos phi for + m g cos theta: the printed sign
@@ -289,6 +303,11 @@ class PendulumChain(Plant):
         """
         self._check(q=q, qd=qd)
         q, qd = self._true(q, qd)
+        if self.bearing_load:
+            pose = self._geometry(q).pose
+            free = self._accelerate(q, qd, torch.zeros_like(q))
+            speed, turn = (dynamics.absolute(x.unbind(-1), 0) for x in (qd, free))
+            return dynamics.bearing_load(pose, speed, turn, dynamics.entries(self.load_lever))
         angle = (q + self.angle_offset)[..., self.first_link :].cumsum(-1)
         # The paper's normal force takes the joint's own rate, not the link's absolute one.
         rate = qd[..., self.first_link :]

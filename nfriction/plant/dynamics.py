@@ -215,6 +215,29 @@ def _mass_beyond(mass: Tensor) -> Tensor:
     return mass.sum() - mass.cumsum(0)
 
 
+def bearing_lever(mass: Tensor, length: Tensor, com: Tensor) -> Tensor:
+    """Reach [m] by which each link's turning accelerates what a joint carries, (joint, link)."""
+    carried = mass.flip(0).cumsum(0).flip(0)
+    own = (static_moment(mass, length, com) / carried[:, None]).triu()
+    return own + length.expand_as(own).tril(-1)
+
+
+def bearing_load(
+    pose: Pose, rate: Sequence[Tensor], acceleration: Sequence[Tensor], lever: Matrix
+) -> Tensor:
+    """Force at each joint over the weight beyond it [-], (*batch, joint).
+
+    By absolute rates and accelerations; `lever` is `bearing_lever` over gravity [s^2].
+    """
+    cos = [angle.cos() for angle in pose.angle]
+    motion = list(zip(rate, acceleration, pose.sin, cos, strict=True))
+    across = [a * c - r * r * s for r, a, s, c in motion]
+    along = [-(a * s + r * r * c) for r, a, s, c in motion]
+    # The root has no slope at zero, where a joint falls freely.
+    squares = [dot(row, across) ** 2 + (1.0 + dot(row, along)) ** 2 + _TINY for row in lever]
+    return stack([square.sqrt() for square in squares])
+
+
 class ArmTerms(NamedTuple):
     """Mass entries M11, M1i, gradient e_i and factors of phi_i'^2 in h1 of an arm [kg m^2]."""
 

@@ -254,7 +254,7 @@ _KINDS: dict[str, type[PendulumChain] | type[LinearAxis]] = {
 }
 # Far beyond any rig; the memory of a chain's matrices grows with the square of its links.
 LARGEST_FILE, MOST_LINKS, LARGEST_NUMBER = 2**20, 100, 1e30
-_TEXTS = ("kind", "name", "convention", "joint_names")
+_TEXTS = ("kind", "name", "convention", "joint_names", "normal_load")
 
 
 def of(rig: Plant | str | Path) -> Plant:

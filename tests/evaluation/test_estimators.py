@@ -2,8 +2,6 @@
 
 import dataclasses
 import inspect
-import subprocess
-import sys
 
 import numpy as np
 import pandas as pd
@@ -165,24 +163,6 @@ def test_misuse_is_told(recordings: list[Recording]) -> None:
         FrictionEstimator(pendulum()).fit("a.csv")
     with pytest.raises(ValueError, match="no rig 'penduluum'"):
         FrictionEstimator("penduluum").fit(recordings)
-
-
-def test_without_scikit_learn_the_library_works_and_the_estimator_says_what_it_needs() -> None:
-    code = """
-import sys
-import nfriction
-nfriction.compare
-assert "sklearn" not in sys.modules
-sys.modules["sklearn"] = None
-nfriction.FrictionEstimator
-try:
-    nfriction.FrictionEstimator()
-except ImportError as error:
-    assert "pip install nfriction[sklearn]" in str(error), error
-else:
-    raise AssertionError
-"""
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_clones_search_grids_and_are_cross_validated(recordings: list[Recording]) -> None:

@@ -6,12 +6,15 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
 
 from nfriction.export import ExportError, pt2, torchscript, verification, verify_artefact
+from nfriction.export.controller import controller_of
 from nfriction.export.pt2_file import open_pt2
+from nfriction.export.test_vectors import draw
 from nfriction.export.torch_archive import METADATA, check_program, check_source
 from nfriction.export.torchscript_file import open_torchscript
 from nfriction.friction.models import LFM
@@ -204,15 +207,19 @@ def test_views_of_memory_beyond_a_tensor_are_refused() -> None:
 
 
 def test_a_script_without_an_end_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(verification, "STARTING", 4.0)
+    monkeypatch.setattr(verification, "STARTING", 3.0)
     monkeypatch.setattr(verification, "BY_SAMPLE", 0.0)
     with pytest.raises(ExportError, match="does not come to an end"):
         verify_artefact(scripted(Endless(), tmp_path / "bad.pt"), MODEL, INFO)
 
 
 def test_outputs_that_would_fill_the_disk_are_refused(tmp_path: Path) -> None:
+    path = scripted(Swollen(), tmp_path / "bad.pt")
+    inputs = draw(controller_of(MODEL, INFO), 50)
+    np.savez(tmp_path / "inputs.npz", **{f"0_{i}": x.numpy() for i, x in enumerate(inputs)})
     with pytest.raises(ExportError, match="too large"):
-        verify_artefact(scripted(Swollen(), tmp_path / "bad.pt"), MODEL, INFO)
+        verification.work({"path": str(path), "batches": [len(inputs)]}, tmp_path)
+    assert not (tmp_path / "outputs.npz").exists()
 
 
 def test_what_verification_refuses_is_told_across_the_process(tmp_path: Path) -> None:

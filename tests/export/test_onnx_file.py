@@ -1,7 +1,6 @@
 """ONNX: equal to the model in double, as close as single precision allows, and refusals."""
 
 import importlib.util
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -177,23 +176,3 @@ def test_a_filter_in_single_precision_is_refused(tmp_path: Path) -> None:
         pytest.skip("the extra onnx is not installed")
     with pytest.raises(ValueError, match="filter needs"):
         onnx(LFM(3), tmp_path / "m.onnx", INFO, dtype="float32", with_filter=True)
-
-
-WITHOUT = """
-import sys
-sys.modules["onnx"] = None
-from nfriction import LFM
-from nfriction.export import onnx
-try:
-    onnx(LFM(1), sys.argv[1])
-except ImportError as error:
-    print(error)
-"""
-
-
-def test_without_the_package_the_mend_is_told(tmp_path: Path) -> None:
-    run = subprocess.run(
-        [sys.executable, "-c", WITHOUT, tmp_path / "m.onnx"],
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    assert "pip install nfriction[onnx]" in run.stdout

@@ -25,7 +25,7 @@ from tests.fitting.recordings import F64, pendulum, swing
 
 V_SMOOTH = 0.05
 TRUTH = [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]]
-SMALL = {"terms": (2, 2), "head_units": 2}
+SMALL = {"terms": (2, 2), "head_units": 2, "inputs": ()}
 FOLDS = DEFAULTS.folds
 NONE = torch.zeros(0, dtype=F64)
 

@@ -27,7 +27,7 @@ from tests.fitting.recordings import pendulum, swing
 
 V_SMOOTH = 0.05
 PRIOR_SHARES = DEFAULTS.prior_shares
-SMALL = {"terms": (2, 2), "head_units": 2}
+SMALL = {"terms": (2, 2), "head_units": 2, "inputs": ()}
 BRIEF = {"windows": (0.5,), "max_steps": 2}
 
 
@@ -241,3 +241,21 @@ def test_sets_move_and_the_evidence_rises_where_even_sets_are_wrong(
     gamma = found.to_dict()["effective_parameters"]
     assert set(gamma) >= {"set centres", "set widths", "head centres", "head widths"}
     assert all(0 <= value <= size for _, value, size in found.effective_parameters)
+
+
+def test_a_stop_while_a_network_trains_on_keeps_the_one_accepted(where_even_sets_are_wrong):
+    names = []
+
+    def stop(name, step):
+        names.append(name)
+        return name == "network's sets, hold-out"
+
+    model = NFNCFM(1, terms=(3, 1), head_units=1)
+    found = fit(
+        model, ARM, where_even_sets_are_wrong, windows=(0.5,), fit_plant=False, drag=False,
+        callback=stop,
+    )  # fmt: skip
+    assert names.count("network's sets, hold-out") == 1
+    assert not found.converged
+    assert "constant law is kept" not in found.status
+    assert model.schedule.parameter_vector().abs().max() > 0.01

@@ -1,5 +1,7 @@
 """Neuro-fuzzy coefficients: a constant law until trained, and beyond what it was trained on."""
 
+import copy
+import pickle
 from collections.abc import Callable
 
 import pytest
@@ -12,7 +14,7 @@ from torch.func import functional_call, jacrev
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import LINEAR, NONLINEAR, STRIBECK, VISCOUS
 from nfriction.friction.models import FrictionModel
-from nfriction.friction.neurofuzzy import LEAST_RATIO, LOGIT_SD, NeuroFuzzy
+from nfriction.friction.neurofuzzy import LEAST_RATIO, LOGIT_SD, NFCVFM, NeuroFuzzy
 from tests.friction.samples import LAWS, QUADRATIC, motion, normal, randomise
 
 every_law = pytest.mark.parametrize("law", [*LAWS, QUADRATIC], ids=lambda law: law.name)
@@ -358,3 +360,23 @@ def test_slopes_are_those_of_automatic_differentiation(law, acceleration: str, i
     one = schedule.slopes(qd[2, 3], qdd[2, 3], held[2, 3])
     for single, batch in zip(one, found, strict=True):
         torch.testing.assert_close(single, batch[2, 3], rtol=1e-12, atol=1e-14)
+
+
+def test_inputs_add_terms_that_leave_the_law_as_it_was() -> None:
+    plain = NFCVFM(2, [0.1, 0.2])
+    model = NFCVFM(2, [0.1, 0.2, 0.03, 0.04], inputs=["direction", "load"])
+    qd, qdd = torch.tensor([[-2.0, 3.0]]).double(), torch.zeros(1, 2).double()
+    load = torch.tensor([[0.5, 1.5]]).double()
+    added = model(qd, qdd, load) - plain(qd, qdd, load)
+    expected = 0.03 + 0.04 * load * qd.sign()
+    torch.testing.assert_close(added, expected, rtol=1e-6, atol=1e-9)
+    assert not model(0 * qd, qdd, load).any()
+    copied = pickle.loads(pickle.dumps(model))
+    assert copied.law == copy.deepcopy(model).law == model.law
+    assert torch.equal(copied(qd, qdd, load), model(qd, qdd, load))
+
+
+@pytest.mark.parametrize("inputs", [["colour"], ["load", "load"]])
+def test_inputs_are_refused_by_name(inputs: list[str]) -> None:
+    with pytest.raises(ValueError, match="direction, load"):
+        NFCVFM(2, inputs=inputs)

@@ -80,10 +80,9 @@ def test_a_file_cut_short_is_refused(asammdf: Any, tmp_path: Path) -> None:
     path = tmp_path / "run.mf4"
     write(asammdf, path, [("q1", Q[:, 0], "rad")])
     content = path.read_bytes()
-    for length in (10, len(content) // 2):
-        path.write_bytes(content[:length])
-        with pytest.raises(ValueError, match=r"run\.mf4"):
-            Recording.read(path)
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(ValueError, match=r"run\.mf4"):
+        Recording.read(path)
 
 
 def test_a_reader_that_perishes_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -354,3 +354,29 @@ def test_impossible_inertia_warns_and_wrong_shapes_are_refused() -> None:
         rig.mass_matrix(torch.tensor(1.0))
     with pytest.raises(ValueError, match="arm's inertia"):
         Arm(inertia=0.0, length=1.0)
+
+
+def test_a_bearing_carries_all_links_beyond_it() -> None:
+    """Newton's law of the mass centres, at the accelerations of the frictionless motion."""
+    mass, length, com = [0.5, 0.4, 0.2], [0.3, 0.25, 0.2], [0.1, 0.2, 0.05]
+    rig = PendulumChain(mass, length, com, [1e-3] * 3, normal_load="bearing")
+    random = torch.Generator().manual_seed(3)
+    q, qd = (torch.randn(3, generator=random, dtype=torch.float64) for _ in range(2))
+    qdd = rig.forward_dynamics(q, qd, torch.zeros_like(q))
+
+    def centres(time: torch.Tensor) -> torch.Tensor:
+        angle = (q + time * qd + 0.5 * time**2 * qdd).cumsum(0)
+        along = torch.stack([angle.sin(), angle.cos()], -1)
+        reach = along * torch.tensor(length)[:, None]
+        return reach.cumsum(0) - reach + along * torch.tensor(com)[:, None]
+
+    turning = torch.func.jacfwd(torch.func.jacfwd(centres))(torch.zeros((), dtype=torch.float64))
+    force = torch.tensor(mass)[:, None] * (turning + torch.tensor([0.0, 9.81]))
+    carried, weight = (x.flip(0).cumsum(0).flip(0) for x in (force, 9.81 * torch.tensor(mass)))
+    torch.testing.assert_close(rig.load(q, qd), carried.norm(dim=-1) / weight)
+    still, hanging = torch.zeros(3).double(), torch.tensor([torch.pi, 0.0, 0.0]).double()
+    torch.testing.assert_close(rig.load(hanging, still), torch.ones(3).double())
+    again = PendulumChain.from_dict(json.loads(json.dumps(rig.to_dict())))
+    assert torch.equal(again.load(q, qd), rig.load(q, qd))
+    with pytest.raises(ValueError, match="normal_load"):
+        PendulumChain([1.0], [1.0], arm=Arm(0.1, 0.2), normal_load="bearing")

@@ -3,7 +3,7 @@
 import html
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -30,6 +30,32 @@ Usability = Literal["good", "doubtful", "do not use"]
 DOUBTFUL_ERROR = 0.01
 # Standard deviation of an angle of which nothing is known [rad].
 UNIFORM_TURN = math.pi / 3**0.5
+
+
+@dataclass(frozen=True)
+class InputGain:
+    """Share of the squared error of blocks left out that an input explains.
+
+    Attributes:
+        name: of the input.
+        share: by all joints.
+        by_joint: by each joint's coefficient alone, (joint,).
+    """
+
+    name: str
+    share: float
+    by_joint: tuple[float, ...]
+
+    def words(self, joint_names: Sequence[str]) -> str:
+        """A sentence about the input."""
+        alone = ", ".join(
+            f"{joint} {100 * share:.0f} %"
+            for joint, share in zip(joint_names, self.by_joint, strict=True)
+        )
+        return (
+            f"Input {self.name}: {-100 * self.share:.0f} % unexplained motion on blocks left out "
+            f"(by one joint alone: {alone})."
+        )
 
 
 @dataclass(frozen=True)
@@ -69,6 +95,7 @@ class FitResult:
         outliers: stretches of samples that a robust loss counts less than half.
         effective_parameters: of a network: name of each group of its parameters, how many of them
             the data determine (MacKay's gamma), and how many there are.
+        inputs: of a network: further inputs that the fit chose, and what each explains.
     """
 
     model: FrictionModel
@@ -93,6 +120,7 @@ class FitResult:
     skipped_horizons: tuple[float, ...] = ()
     outliers: tuple[Outliers, ...] = ()
     effective_parameters: tuple[tuple[str, float, int], ...] = ()
+    inputs: tuple[InputGain, ...] = ()
 
     def longest_usable_horizon(self, windows: Sequence[float]) -> float:
         """The last of growing window lengths that the constant law could follow [s]."""
@@ -178,6 +206,7 @@ class FitResult:
             **(offsets if self.encoder_offsets else {}),
             **({"outliers": [o._asdict() for o in self.outliers]} if self.outliers else {}),
             **({"effective_parameters": gamma} if gamma else {}),
+            **({"inputs": [asdict(gain) for gain in self.inputs]} if self.inputs else {}),
         }
 
     def to_pandas(self) -> "pd.DataFrame":

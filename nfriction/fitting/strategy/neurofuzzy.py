@@ -2,7 +2,8 @@
 
 First its sets stay where they are, and windows held out choose the priors. Then it trains on at the
 noise that it left, with a prior for each group of parameters by evidence, and moves its sets if the
-evidence favours that; as long as the windows held out gain by it, at ever less noise.
+evidence favours that; as long as the windows held out gain by it, at ever less noise. Further
+inputs (`inputs`) are a rival that has to win on the windows held out.
 """
 
 import copy
@@ -40,9 +41,15 @@ from nfriction.fitting.strategy.continuation import (
 )
 from nfriction.fitting.strategy.extrapolation_prior import prior_on_unvisited_cells
 from nfriction.fitting.strategy.holdout import HoldoutScore, holdout_rmse, holdout_split
+from nfriction.fitting.strategy.inputs import (
+    InputGain,
+    chosen_inputs,
+    seeing_plant,
+    widened_start,
+)
 from nfriction.fitting.task import FitTask
 from nfriction.friction.models import FrictionModel
-from nfriction.friction.neurofuzzy import NeuroFuzzy
+from nfriction.friction.neurofuzzy import NeuroFuzzy, NeuroFuzzyModel
 from nfriction.optim.evidence import GroupEvidence, group_evidence
 from nfriction.recording import Recording
 from nfriction.signals import Motion
@@ -53,52 +60,129 @@ INTERRUPTED = "Stopped before the network was found; its constant law is kept."
 def fit_neurofuzzy(task: FitTask) -> FitResult:
     """Fit a neuro-fuzzy model from the constant fit of its law, see `fit`."""
     require_motion(task.plant, task.recordings)
-    options, start = task.options, constant_start(task)
-    law_prior = constant_prior(start.model, regression(task, start.model, task.plant), options)
+    start = constant_start(task)
     recordings, motions = apply_encoder_offsets(
         start.encoder_offsets, task.plant, task.recordings, task.motions
     )
-    network = initialise_from_constant(task.model, start, recordings, motions, options)
-    schedule = cast("NeuroFuzzy", network.schedule)
-    terms = adjustable_terms(
-        task.plant, recordings, options, eccentric=fits_eccentricity(options, start),
-        per_recording=bool(start.encoder_offsets),
+    aligned = replace(task, recordings=recordings, motions=motions)
+    contest = _Contest(aligned, start)
+    contest.train()
+    chosen: tuple[InputGain, ...] = ()
+    model = task.model
+    if isinstance(model, NeuroFuzzyModel) and model.inputs is None and not contest.stopped:
+        chosen, contest = _with_chosen_inputs(contest)
+    model = task.model
+    if chosen:
+        cast("NeuroFuzzyModel", model).see([gain.name for gain in chosen])
+    found = replace(
+        contest.result(model), motions=task.motions, encoder_offsets=start.encoder_offsets,
+        skipped_horizons=start.skipped_horizons, inputs=chosen,
     )  # fmt: skip
-    plant_sd = torch.tensor([t.prior_sd for t in terms], dtype=torch.float64)
-    free = ShootingFitter(
-        StepJacobian(task.plant, network, terms), network, recordings, task.measurement, options,
-        task.callback, plant_prior=(known_terms(start, terms), plant_sd),
-        extrapolation=prior_on_unvisited_cells(schedule, motions, options),
-    )  # fmt: skip
-    law = replace(free, friction=start.model, friction_prior=law_prior, extrapolation=None)
-    validation = _Validation(law, start, motions, start.longest_usable_horizon(options.windows))
-    best = validation.best_trial(_with_narrowed_priors(free, start))
-    if best is not None and best.finite:
-        before = None
-        while best is not None and best is not before:
-            before, best = best, validation.trained_on(best)
-    if best is None:
-        found = _constant_kept(task, network, start, INTERRUPTED, converged=False)
-    elif best.score.score > 1:
-        found = _constant_kept(task, network, start, str(best.score))
-    else:
-        end = validation.fit_all(best)
-        model = copy.deepcopy(end.problem.friction)
-        found = result_from_shooting(model, end.problem, end.result, motions)
-        task.model.load_state_dict(model.state_dict())
-        cast("NeuroFuzzy", task.model.schedule).prior_sd = best.prior_sd
-        moved = " Its sets moved." if cast("NeuroFuzzy", model.schedule).learn_sets else ""
-        found = replace(
-            found,
-            model=task.model.requires_grad_(False),
-            status=found.status + moved,
+    said = [gain.words(found.plant.joint_names) for gain in chosen]
+    found = replace(found, status=" ".join([found.status, *said]))
+    return found.with_warnings(start.data_warnings)
+
+
+def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[InputGain, ...], "_Contest"]:
+    """The inputs that pay and the contest with them, or none and the one without.
+
+    They have to win on the windows held out, first for the law and then for its network, by as much
+    as a network has to win over its law.
+    """
+    task = plain.task
+    chosen = chosen_inputs(task, plain.start)
+    names = [gain.name for gain in chosen]
+    if not names:
+        return (), plain
+    start = widened_start(task, plain.start, names)
+    if start is None:
+        return (), plain
+    model = copy.deepcopy(task.model)
+    cast("NeuroFuzzyModel", model).see(names)
+    seeing = replace(task, model=model, plant=seeing_plant(task.plant, names))
+    rival = _Contest(seeing, start)
+    if not rival.validation.judge_law() or rival.error >= plain.error_of_law:
+        return (), plain
+    rival.train()
+    # A stop before the rival's network is found leaves what was accepted before.
+    if rival.stopped or rival.error >= task.options.max_ratio_same * plain.error:
+        return (), plain
+    return chosen, rival
+
+
+class _Contest:
+    """A network and the constant law that it has to beat.
+
+    Recordings and motions of the task are free of encoder offsets.
+    """
+
+    def __init__(self, task: FitTask, start: FitResult) -> None:
+        self.task, self.start, options = task, start, task.options
+        law_prior = constant_prior(start.model, regression(task, start.model, task.plant), options)
+        self.network = initialise_from_constant(
+            task.model, start, task.recordings, task.motions, options
+        )
+        terms = adjustable_terms(
+            task.plant, task.recordings, options, eccentric=fits_eccentricity(options, start),
+            per_recording=bool(start.encoder_offsets),
+        )  # fmt: skip
+        plant_sd = torch.tensor([t.prior_sd for t in terms], dtype=torch.float64)
+        schedule = cast("NeuroFuzzy", self.network.schedule)
+        self.free = ShootingFitter(
+            StepJacobian(task.plant, self.network, terms), self.network, task.recordings,
+            task.measurement, options, task.callback,
+            plant_prior=(known_terms(start, terms), plant_sd),
+            extrapolation=prior_on_unvisited_cells(schedule, task.motions, options),
+        )  # fmt: skip
+        law = replace(self.free, friction=start.model, friction_prior=law_prior, extrapolation=None)
+        length = start.longest_usable_horizon(options.windows)
+        self.validation = _Validation(law, start, task.motions, length)
+        self.best: _Trial | None = None
+
+    @property
+    def stopped(self) -> bool:
+        """True if the search was stopped before a network was found."""
+        return self.best is None
+
+    @property
+    def error_of_law(self) -> float:
+        """Hold-out RMSE of the law, trained on the same windows as its network."""
+        return self.validation.of_law[0]
+
+    @property
+    def error(self) -> float:
+        """Hold-out RMSE of the network where it is accepted, else of the law."""
+        accepted = self.best is not None and self.best.score.score <= 1
+        ratio = self.best.score.same if self.best is not None and accepted else 1.0
+        return ratio * self.error_of_law
+
+    def train(self) -> None:
+        """Find the best network."""
+        self.best = self.validation.best_trial(_with_narrowed_priors(self.free, self.start))
+
+    def result(self, model: FrictionModel) -> FitResult:
+        """The network trained on, or its law, written into a model of the same kind."""
+        task, best, validation = self.task, self.best, self.validation
+        if best is None:
+            return _constant_kept(model, self, INTERRUPTED, converged=False)
+        if best.finite:
+            before = None
+            while best is not before and not best.end.stopped:
+                before, best = best, validation.trained_on(best)
+        if best.score.score > 1:
+            return _constant_kept(model, self, str(best.score))
+        end = best.end if best.end.stopped else validation.fit_all(best)
+        found = copy.deepcopy(end.problem.friction)
+        result = result_from_shooting(found, end.problem, end.result, task.motions)
+        model.load_state_dict(found.state_dict())
+        cast("NeuroFuzzy", model.schedule).prior_sd = best.prior_sd
+        moved = " Its sets moved." if cast("NeuroFuzzy", found.schedule).learn_sets else ""
+        return replace(
+            result,
+            model=model.requires_grad_(False),
+            status=result.status + moved,
             effective_parameters=effective_parameters(end),
         )
-    found = replace(
-        found, motions=task.motions, encoder_offsets=start.encoder_offsets,
-        skipped_horizons=start.skipped_horizons,
-    )  # fmt: skip
-    return found.with_warnings(start.data_warnings)
 
 
 def input_range(
@@ -232,6 +316,8 @@ class _Validation:
     ) -> None:
         assert law.plant_prior is not None
         self.law, self.motions, self.length, self.options = law, motions, length, law.options
+        # Of the law trained on the same windows, and on all.
+        self.of_law: tuple[float, ...] = ()
         self.plant = law.plant_prior[0]
         self.train, self.test = holdout_split(law.recordings, motions, length, self.options.folds)
         # The noise against which the priors weigh is the residual of the constant law at the same
@@ -241,17 +327,23 @@ class _Validation:
         cost = weighted_cost(start.residuals, self.noise)
         self.tolerance = loglik_tolerance(cost, self.options)
 
-    def best_trial(self, fitters: Sequence[ShootingFitter]) -> _Trial | None:
-        """The best of all priors; wider plant priors must earn their place. None if stopped."""
+    def judge_law(self) -> bool:
+        """Find the errors of the law; False if stopped."""
+        if self.of_law:
+            return True
         values = self.law.friction.schedule.parameter_vector()
         same = self._search(self.law, values, "constant law, hold-out")
         of_same = self._error(same)
         if of_same is None:
-            return None
+            return False
         of_all = holdout_rmse(self.test, same.problem, values, self.plant)
-        if of_all is None:
+        self.of_law = () if of_all is None else (of_same, of_all)
+        return of_all is not None
+
+    def best_trial(self, fitters: Sequence[ShootingFitter]) -> _Trial | None:
+        """The best of all priors; wider plant priors must earn their place. None if stopped."""
+        if not self.judge_law():
             return None
-        self.of_law = of_same, of_all
         best: _Trial | None = None
         for fitter in fitters:
             trials = []
@@ -266,23 +358,24 @@ class _Validation:
                 best = trial
         return best
 
-    def trained_on(self, trial: _Trial) -> _Trial | None:
+    def trained_on(self, trial: _Trial) -> _Trial:
         """A trial trained on at the noise that it left, or itself where that gains too little.
 
         Beside the law's error as noise, sets could hardly move. They move if the evidence favours
         it. The windows held out are few, so the gain there has to be as large as that of a network
-        on its law. None if stopped.
+        on its law. A stop leaves the trial as it was, and its end says so.
         """
         noise = min(effective_noise(trial.end.residuals), self.noise)
         held = self._adapted(trial, noise, learn_sets=False)
         moved = held and self._adapted(held, noise, learn_sets=True)
+        stopped = replace(trial, end=trial.end.as_stopped())
         if held is None or moved is None:
-            return None
+            return stopped
         gained = moved.log_evidence - held.log_evidence
         better = moved if gained > self.options.evidence_gain else held
         error = self._error(better.end)
         if error is None:
-            return None
+            return stopped
         better = replace(better, score=self._score(error))
         limit = self.options.max_ratio_same * trial.score.score
         return better if better.score.score < limit else trial
@@ -355,14 +448,15 @@ class _Validation:
 
 
 def _constant_kept(
-    task: FitTask, network: FrictionModel, start: FitResult, note: str, *, converged: bool = True
+    model: FrictionModel, contest: _Contest, note: str, *, converged: bool = True
 ) -> FitResult:
     """The constant fit as the neuro-fuzzy model's."""
-    revert_to_constant(network, start, task.options)
-    task.model.load_state_dict(network.state_dict())
+    network, start = contest.network, contest.start
+    revert_to_constant(network, start, contest.task.options)
+    model.load_state_dict(network.state_dict())
     return replace(
         start,
-        model=task.model.requires_grad_(False),
+        model=model.requires_grad_(False),
         status=f"{start.status} {note}" if converged else f"Not converged: {note}",
         converged=start.converged and converged,
         warnings=(*start.warnings, note),

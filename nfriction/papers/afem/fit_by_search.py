@@ -187,7 +187,11 @@ Callback = Callable[[SearchState], "bool | None"]
 
 
 def search(
-    cost: Cost, box: Box, options: SearchOptions, callback: Callback | None = None
+    cost: Cost,
+    box: Box,
+    options: SearchOptions,
+    callback: Callback | None = None,
+    shape: Tensor | None = None,
 ) -> SearchResult:
     """Minimise a cost within bounds by pattern search or sequential quadratic programming.
 
@@ -196,6 +200,7 @@ def search(
         box: start, bounds and scales.
         options: method, limits and the state to resume.
         callback: called after every iteration; True stops.
+        shape: of a pattern search's polls, see `poll_shape`; round by default.
 
     Raises:
         ValueError: if the state is another search's.
@@ -206,17 +211,51 @@ def search(
             f"`state` is of {state.method!r} with {len(state.point)} variables, the search is "
             f"{options.method!r} with {size}."
         )
-    method = _sqp if options.method == "sqp" else _pattern
-    return method(cost, box, options, callback or (lambda _: None))
+    callback = callback or (lambda _: None)
+    if options.method == "sqp":
+        return _sqp(cost, box, options, callback)
+    shape = torch.eye(size, dtype=torch.float64) if shape is None else shape
+    return _pattern(cost, box, options, callback, shape)
 
 
-def _pattern(cost: Cost, box: Box, options: SearchOptions, callback: Callback) -> SearchResult:
+def poll_shape(residuals: Callable[[Tensor], Tensor], box: Box, weight: Tensor) -> Tensor:
+    """Matrix (free, free) that maps the unit ball into an ellipsoid of about equal cost.
+
+    Along a valley of the cost a poll then steps far, across it as little as it must.
+
+    Args:
+        residuals: of a vector (parameter,), scaled so that half the sum of squares is the data's
+            part of the cost.
+        box: variables of the search.
+        weight: second derivatives of the rest of the cost by the vector, (parameter,).
+    """
+    at = box.to_unit(box.start.clamp(box.lower, box.upper))
+    upper, free = box.ends[1], box.free
+    # Backward at an upper bound, where forward would not move.
+    steps = torch.where(at + DIFFERENCE > upper, -DIFFERENCE, DIFFERENCE)
+    points = box.from_unit(torch.cat([at[None], at + torch.diag(steps)]))
+    first, *moved = [residuals(point).reshape(-1) for point in points]
+    slopes = torch.stack([m - first for m in moved], -1) / steps
+    change = (points[1:, free] - points[0, free]).diagonal() / steps
+    curvature = slopes.mT @ slopes + torch.diag(weight[free] * change.square())
+    if not torch.isfinite(curvature).all():  # the start diverges
+        return torch.eye(len(at), dtype=torch.float64)
+    values, axes = torch.linalg.eigh(curvature)
+    # By the curvature no step needs to reach further than where the start's errors double.
+    reach = (first.square().sum() / values.clamp_min(TINY)).sqrt().clamp_max(1.0)
+    return axes * reach @ axes.mT
+
+
+def _pattern(
+    cost: Cost, box: Box, options: SearchOptions, callback: Callback, shape: Tensor
+) -> SearchResult:
     """Generalised pattern search, every poll one batch of candidates.
 
     An iteration polls x ± mesh along every axis and one point beyond x along the last successful
     step. It moves to the best of these and doubles the mesh if that is better than x, else it
     contracts the mesh. Points outside the bounds are moved onto them. The axes are turned at random
-    in every iteration, so that a ridge or a kink askew to them cannot stop the search.
+    in every iteration, so that a ridge or a kink askew to them cannot stop the search, and then
+    stretched by `shape`.
 
     References:
         V. Torczon, SIAM J. Optim. 7 (1997); C. Audet and J. E. Dennis, SIAM J. Optim. 17 (2006).
@@ -237,7 +276,7 @@ def _pattern(cost: Cost, box: Box, options: SearchOptions, callback: Callback) -
             if state.evaluations + poll > options.max_evaluations:
                 message = LIMIT
                 break
-            state = _polled(cost, box, state, options.seed)
+            state = _polled(cost, box, state, options.seed, shape)
             if callback(state):
                 message = STOPPED
                 break
@@ -249,7 +288,7 @@ def _pattern(cost: Cost, box: Box, options: SearchOptions, callback: Callback) -
     return SearchResult(vector, state.value, message == CONVERGED, message, state.iterations)
 
 
-def _polled(cost: Cost, box: Box, state: SearchState, seed: int) -> SearchState:
+def _polled(cost: Cost, box: Box, state: SearchState, seed: int, shape: Tensor) -> SearchState:
     x, last = box.tensor(state.point), box.tensor(state.step)
     # A generator of its own per iteration: a resumed search needs no generator state.
     random = torch.Generator().manual_seed(seed * 1_000_003 + state.iterations)
@@ -258,7 +297,7 @@ def _polled(cost: Cost, box: Box, state: SearchState, seed: int) -> SearchState:
     )
     # The sign makes the factorisation unique, and so the rotations uniform.
     axes = axes * triangle.diagonal().sign()
-    steps = state.mesh * torch.cat([axes, -axes])
+    steps = state.mesh * torch.cat([axes, -axes]) @ shape
     # The direction of the last success comes first: ties then keep going the same way.
     steps = steps[(steps @ last).argsort(descending=True, stable=True)]
     # Projected, not rejected: a minimum at a bound is approached along it.
@@ -409,7 +448,10 @@ def fit_by_search(
         data = error.mean_square(vectors) * (error.values / noise**2)
         return 0.5 * (data + ((vectors - mean) / sd).square().sum(-1))
 
-    result = search(cost, box, options, callback)
+    shape = None
+    if options.method == "pattern":
+        shape = poll_shape(lambda x: error.residuals(x) / noise, box, sd**-2)
+    result = search(cost, box, options, callback, shape)
     table.set_parameter_vector(result.vector)
     names = table.parameter_names(plant.joint_names)
     hit = box.free & ((result.vector <= box.lower) | (result.vector >= box.upper))

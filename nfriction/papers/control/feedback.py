@@ -1,9 +1,10 @@
-"""State feedback for pendulums on a driven arm: LQR, Kalman filter, swing-up, compensation."""
+"""State feedback for pendulums on a driven arm: LQR, Kalman filter, friction compensation."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,223 +20,221 @@ Compensation = Callable[[Array, Array, Array], Array]
 
 @dataclass(frozen=True, eq=False)
 class LinearPlant:
-    """A plant near an equilibrium, sampled: x[k + 1] = A x[k] + B tau[k], x = (q - q0, qd).
+    """A plant near a motion, sampled: x[k + 1] = A x[k] + B dtau[k], x = (q - q0, qd - qd0).
 
     Attributes:
-        a: (2 joint, 2 joint).
-        b: (2 joint, joint).
-        q0: the equilibrium [rad], (joint,).
-        acceleration: slopes of qdd by x and by tau, (joint, 2 joint) and (joint, joint).
+        a: (*batch, 2 joint, 2 joint).
+        b: (*batch, 2 joint, joint).
+        q0, qd0: the motion [rad, rad/s], (*batch, joint).
+        acceleration: qdd of the motion, (*batch, joint), and its slopes by x and by tau, (*batch,
+            joint, 2 joint) and (*batch, joint, joint).
     """
 
     a: Array
     b: Array
     q0: Array
-    acceleration: tuple[Array, Array]
+    qd0: Array
+    acceleration: tuple[Array, Array, Array]
+
+    def __getitem__(self, k: int) -> LinearPlant:
+        qdd, by_state, by_tau = self.acceleration
+        return LinearPlant(
+            self.a[k], self.b[k], self.q0[k], self.qd0[k], (qdd[k], by_state[k], by_tau[k])
+        )
 
 
-def linearise(plant: PendulumChain, q0: Tensor, sample_time: float) -> LinearPlant:
-    """The plant without friction near an equilibrium, exactly discretised with the torque held.
+def linearise(
+    plant: PendulumChain, q: Tensor, qd: Tensor, tau: Tensor, sample_time: float
+) -> LinearPlant:
+    """The plant without friction near a motion, exactly discretised with the torque held.
 
     Args:
         plant: the mechanism.
-        q0: equilibrium [rad], (joint,).
+        q, qd, tau: of the motion [rad, rad/s, N m], (*batch, joint).
         sample_time: [s].
-
-    Raises:
-        ValueError: if the plant does not stay there at rest.
     """
     from scipy.linalg import expm  # slow to import
 
-    n, still = plant.joints, torch.zeros_like(q0)
-    if plant.forward_dynamics(q0, still, still).abs().max() > 1e-9:
-        raise ValueError(f"the plant is not in equilibrium at {q0.tolist()} rad.")
-    by_q, by_qd, by_tau = torch.autograd.functional.jacobian(
-        lambda *given: plant.forward_dynamics(*given), (q0, still, still)
-    )
-    by_state = torch.cat([by_q, by_qd], -1).numpy()
-    flow = np.zeros((3 * n, 3 * n))
-    flow[:n, n : 2 * n] = np.eye(n)
-    flow[n : 2 * n, : 2 * n] = by_state
-    flow[n : 2 * n, 2 * n :] = by_tau.numpy()
-    sampled = expm(sample_time * flow)
-    return LinearPlant(
-        sampled[: 2 * n, : 2 * n],
-        sampled[: 2 * n, 2 * n :],
-        q0.numpy(),
-        (by_state, by_tau.numpy()),
-    )
+    n = plant.joints
+    with torch.enable_grad():
+        given = [x.detach().clone().requires_grad_() for x in (q, qd, tau)]
+        qdd = plant.forward_dynamics(*given)
+        rows = [torch.autograd.grad(qdd[..., k].sum(), given, retain_graph=True) for k in range(n)]
+    by_q, by_qd, by_tau = (torch.stack(by, -2).numpy() for by in zip(*rows, strict=True))
+    by_state = np.concatenate([by_q, by_qd], -1)
+    flow = np.zeros((*q.shape[:-1], 3 * n, 3 * n))
+    flow[..., :n, n : 2 * n] = np.eye(n)
+    flow[..., n : 2 * n, : 2 * n] = by_state
+    flow[..., n : 2 * n, 2 * n :] = by_tau
+    sampled = expm(sample_time * flow)[..., : 2 * n, :]
+    a, b = sampled[..., : 2 * n], sampled[..., 2 * n :]
+    accelerations = qdd.detach().numpy(), by_state, by_tau
+    return LinearPlant(a, b, q.numpy(), qd.numpy(), accelerations)
 
 
-def lqr(plant: LinearPlant, state_weight: Array, torque_weight: float) -> Array:
-    """Gain K of tau_1 = -K x, the only torque, that minimises sum x'Qx + r tau_1^2.
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """Weights of a linear-quadratic regulator and of its Kalman filter.
 
-    Args:
-        plant: sampled.
-        state_weight: diagonal of Q, (2 joint,).
-        torque_weight: r.
+    Attributes:
+        state: diagonal of Q in the cost sum x'Qx + tau_1^2, (2 joint,).
+        torque_noise: standard deviation of unknown torques at every joint, a sample each [N m].
+        position_noise: of the encoders [rad].
+    """
+
+    state: Array
+    torque_noise: float
+    position_noise: float
+
+
+@dataclass(frozen=True, eq=False)
+class Gains:
+    """Gains of feedback and of the Kalman filter at one sample.
+
+    Attributes:
+        linear: the plant there.
+        feedback: K of dtau_1 = -K x, (2 joint,).
+        observer: L of x += L (q_measured - q_predicted), (2 joint, joint).
+        torque: of the first joint without feedback [N m].
+    """
+
+    linear: LinearPlant
+    feedback: Array
+    observer: Array
+    torque: float = 0.0
+
+
+def balance_gains(linear: LinearPlant, weights: Weights) -> Gains:
+    """Steady gains at an equilibrium; the first joint alone has a drive.
+
+    Raises:
+        ValueError: if the plant does not stay there at rest.
 
     References:
         Discrete algebraic Riccati equation (`scipy.linalg.solve_discrete_are`).
     """
     from scipy.linalg import solve_discrete_are
 
-    b = plant.b[:, :1]
-    p = solve_discrete_are(plant.a, b, np.diag(state_weight), np.array([[torque_weight]]))
-    gain = np.linalg.solve(b.T @ p @ b + torque_weight, b.T @ p @ plant.a)
-    return np.asarray(gain[0], dtype=np.float64)
+    if np.abs(linear.acceleration[0]).max() > 1e-9:
+        raise ValueError(f"the plant is not in equilibrium at {linear.q0.tolist()} rad.")
+    n, b = len(linear.q0), linear.b[:, :1]
+    p = solve_discrete_are(linear.a, b, np.diag(weights.state), np.eye(1))
+    process, noise, c = _noise(linear, weights)
+    # The floor keeps the equation regular.
+    e = solve_discrete_are(linear.a.T, c.T, process + 1e-18 * np.eye(2 * n), noise)
+    return Gains(linear, _feedback(linear, p), _observer(e, c, noise))
 
 
-def kalman_gain(plant: LinearPlant, torque_noise: float, position_noise: float) -> Array:
-    """Steady gain L of x += L (q_measured - q_predicted), (2 joint, joint).
+def gains_along(way: LinearPlant, torque: Array, top: LinearPlant, weights: Weights) -> list[Gains]:
+    """Gains at every sample of a motion that starts at rest and ends at an equilibrium.
 
     Args:
-        plant: sampled.
-        torque_noise: standard deviation of unknown torques at every joint, a sample each [N m].
-        position_noise: of the encoders [rad].
+        way: the plant along the motion, (sample, ...).
+        torque: of the first joint along it [N m], (sample,).
+        top: the plant at its end.
+        weights: of both filters.
+
+    References:
+        Riccati recursions, backward for the feedback, forward for the Kalman filter.
     """
     from scipy.linalg import solve_discrete_are
 
-    n = len(plant.q0)
-    c = np.hstack([np.eye(n), np.zeros((n, n))])
-    process = torque_noise**2 * plant.b @ plant.b.T + 1e-18 * np.eye(2 * n)
-    noise = position_noise**2 * np.eye(n)
-    p = solve_discrete_are(plant.a.T, c.T, process, noise)
-    return np.asarray(np.linalg.solve(c @ p @ c.T + noise, c @ p).T, dtype=np.float64)
+    p = solve_discrete_are(top.a, top.b[:, :1], np.diag(weights.state), np.eye(1))
+    feedback, observer = [], []
+    for k in reversed(range(len(torque))):
+        at = way[k]
+        feedback.append(_feedback(at, p))
+        p = np.diag(weights.state) + at.a.T @ p @ (at.a - np.outer(at.b[:, 0], feedback[-1]))
+        # Rounding would grow over thousands of samples.
+        p = 0.5 * (p + p.T)
+    e = weights.position_noise**2 * np.eye(len(p))
+    for k in range(len(torque)):
+        at = way[k]
+        process, noise, c = _noise(at, weights)
+        e = at.a @ e @ at.a.T + process
+        observer.append(_observer(e, c, noise))
+        e = e - observer[-1] @ c @ e
+        e = 0.5 * (e + e.T)
+    rows = zip(reversed(feedback), observer, torque.tolist(), strict=True)
+    return [Gains(way[k], *row) for k, row in enumerate(rows)]
 
 
-class Balance:
-    """Linear-quadratic balance about an equilibrium, with friction compensation at the driven arm.
+def _feedback(linear: LinearPlant, cost_to_go: NDArray[Any]) -> Array:
+    b = linear.b[:, 0]
+    return np.asarray(b @ cost_to_go @ linear.a / (b @ cost_to_go @ b + 1.0))
 
-    A Kalman filter estimates the state from encoder positions; the arm follows a reference. The
-    torque is tau_1 = -K (x - x_ref) + g tau_f, with the friction torque tau_f that a model gives
-    at the estimated motion. Joints after the first have no drive, so their friction stays.
+
+def _observer(covariance: NDArray[Any], c: Array, noise: Array) -> Array:
+    of_error = c @ covariance @ c.T + noise
+    return np.asarray(np.linalg.solve(of_error, c @ covariance).T)
+
+
+def _noise(linear: LinearPlant, weights: Weights) -> tuple[Array, Array, Array]:
+    """Covariances of the state's unknown change and of the encoders, and the matrix between."""
+    n = len(linear.q0)
+    process = weights.torque_noise**2 * linear.b @ linear.b.T
+    return process, weights.position_noise**2 * np.eye(n), np.eye(n, 2 * n)
+
+
+class Feedback:
+    """Linear-quadratic feedback to an equilibrium, from afar along a planned motion.
+
+    A Kalman filter estimates the state from encoder positions; at the equilibrium the arm follows a
+    reference. The torque is tau_1 = tau_plan - K (x - x_ref) + g tau_f, with the friction torque
+    tau_f that a model gives at the estimated motion. Joints after the first have no drive, so their
+    friction remains.
 
     Args:
         plant: the mechanism, its first joint driven.
-        linear: the same near the equilibrium.
-        gain: K, see `lqr`.
-        observer: L, see `kalman_gain`.
+        top: gains at the equilibrium.
+        way: gains along the motion that leads there, one a sample; none starts at the equilibrium.
         reference: angle of the arm and its rate over time [rad, rad/s].
         compensation: gives the friction torque; None for none.
-        share: g, a number or (*batch,).
+        share: g.
     """
 
     def __init__(
         self,
         plant: PendulumChain,
-        linear: LinearPlant,
-        gain: Array,
-        observer: Array,
+        top: Gains,
+        way: Sequence[Gains] = (),
+        *,
         reference: Callable[[float], tuple[float, float]] = lambda _: (0.0, 0.0),
         compensation: Compensation | None = None,
-        share: float | Array = 1.0,
+        share: float = 1.0,
     ) -> None:
-        self.plant, self.linear, self.gain, self.observer = plant, linear, gain, observer
+        self.plant, self.top, self.way = plant, top, way
         self.reference, self.compensation = reference, compensation
-        self.share = np.asarray(share, dtype=np.float64)
-        self.state: Array | None = None
+        self.share = share
+        self.sample = 0
+        self.before: Gains | None = None
+        self.state: Array = np.zeros(0)
         self.net: Array = np.zeros(0)
 
     def __call__(self, time: float, q: Array) -> Array:
-        linear, joints = self.linear, self.plant.joints
-        if self.state is None:
+        joints = self.plant.joints
+        now = self.way[self.sample] if self.sample < len(self.way) else self.top
+        linear = now.linear
+        if self.before is None:
             self.state = np.concatenate([q - linear.q0, np.zeros_like(q)], -1)
-            self.net = np.zeros(q.shape)
         else:
-            self.state = self.state @ linear.a.T + self.net @ linear.b.T
+            known = self.before.linear
+            self.state = self.state @ known.a.T + self.net @ known.b.T
             error = q - linear.q0 - self.state[..., :joints]
-            self.state = self.state + error @ self.observer.T
-        angle, rate = self.reference(time)
+            self.state = self.state + error @ now.observer.T
+        self.sample, self.before = self.sample + 1, now
         wanted = np.zeros(2 * joints)
-        wanted[0], wanted[joints] = angle, rate
-        feedback = -(self.state - wanted) @ self.gain
+        wanted[0], wanted[joints] = self.reference(time)
+        torque, self.net = np.zeros(q.shape), np.zeros(q.shape)
+        feedback = -(self.state - wanted) @ now.feedback
         friction = np.zeros(q.shape[:-1])
         if self.compensation is not None:
-            qd = self.state[..., joints:]
-            by_state, by_tau = linear.acceleration
-            qdd = self.state @ by_state.T + self.net @ by_tau.T
+            qd = linear.qd0 + self.state[..., joints:]
+            planned, by_state, by_tau = linear.acceleration
+            qdd = planned + self.state @ by_state.T + self.net @ by_tau.T
             load = self.plant.load(torch.as_tensor(q), torch.as_tensor(qd)).numpy()
             friction = self.compensation(qd, qdd, load)[..., 0]
-        torque = np.zeros(q.shape)
-        torque[..., 0] = feedback + self.share * friction
+        torque[..., 0] = now.torque + feedback + self.share * friction
         # Compensation is there to cancel friction: the filter predicts what is left.
-        self.net = torque.copy()
         self.net[..., 0] = feedback + (self.share - 1.0) * friction
-        return torque
-
-
-class SwingUp:
-    """Energy swing-up of a single link on a driven arm, then balance.
-
-    The arm's acceleration pumps energy into the link, k (E_top - E) along the sign of the pumping
-    rate, and pulls the arm back to its middle; the torque follows from the equation of motion.
-    Within `catch` of the top and slow enough it is `Balance`'s, for good.
-
-    Args:
-        balance: takes over at the top; its friction compensation is used below as well.
-        pump: k [rad/s^2/J].
-        most: largest acceleration of the arm [rad/s^2].
-        catch: distance from the top [rad] at which `balance` takes over.
-        sample_time: [s].
-
-    References:
-        K. J. Astrom and K. Furuta, Automatica 36 (2000) 287.
-    """
-
-    def __init__(
-        self,
-        balance: Balance,
-        *,
-        pump: float = 100.0,
-        most: float = 12.0,
-        catch: float = 0.3,
-        sample_time: float = 1e-3,
-    ) -> None:
-        if balance.plant.joints != 2:
-            raise ValueError(f"one link on an arm is swung up, got {balance.plant.joints} joints.")
-        self.balance, self.pump, self.most, self.catch = balance, pump, most, catch
-        self.sample_time = sample_time
-        self.caught = False
-        self.before: Array | None = None
-        self.qd = np.zeros(2)
-
-    def __call__(self, time: float, q: Array) -> Array:
-        if self.before is not None:
-            # A low pass of 20 samples over the encoders' differences.
-            self.qd = self.qd + 0.05 * ((q - self.before) / self.sample_time - self.qd)
-        self.before = q
-        from_top = np.angle(np.exp(1j * q[1]))
-        if self.caught or (abs(from_top) < self.catch and abs(self.qd[1]) < 3.0):
-            if not self.caught:
-                self.caught = True
-                turned = np.array([0.0, q[1] - from_top])
-                self.turned = turned
-                start = q - turned
-                self.balance.state = np.concatenate([start, self.qd])
-                self.balance.net = np.zeros(2)
-            return self.balance(time, q - self.turned)
-        return self._pumped(q)
-
-    def _pumped(self, q: Array) -> Array:
-        plant, qd = self.balance.plant, self.qd
-        given, rate = torch.as_tensor(q), torch.as_tensor(qd)
-        mass = plant.mass_matrix(given).numpy()
-        bias = plant.bias(given, rate).numpy()
-        still = torch.zeros_like(rate)
-        top = float(plant.energy(still, still)[1])
-        # Energy of the link about its joint alone: the arm's is not what lifts it.
-        energy = 0.5 * mass[1, 1] * qd[1] ** 2 + float(plant.energy(given, still)[1])
-        rise = -mass[0, 1] * qd[1]  # of the energy by the arm's acceleration
-        # At rest at the bottom nothing would ever move.
-        along = np.sign(rise) if abs(rise) > 1e-6 else 1.0
-        wanted = np.clip(self.pump * (top - energy), 0.0, self.most) * along
-        wanted = np.clip(wanted - 4.0 * q[0] - 2.0 * qd[0], -self.most, self.most)
-        link = -(bias[1] + mass[1, 0] * wanted) / mass[1, 1]
-        torque = np.zeros(2)
-        torque[0] = mass[0, 0] * wanted + mass[0, 1] * link + bias[0]
-        if self.balance.compensation is not None:
-            load = plant.load(given, rate).numpy()
-            friction = self.balance.compensation(qd, np.array([wanted, link]), load)
-            torque[0] += float(self.balance.share) * friction[0]
         return torque

@@ -1,9 +1,8 @@
 """Control of the papers' rig on its driven arm with friction compensation by each class of model.
 
-A single link is swung up and balanced upright; models are fitted to driven recordings of it
-hanging, then compensate the friction of the arm, the only joint with a motor. All three links are
+A single link is balanced upright; models are fitted to driven recordings of it hanging, then
+compensate the friction of the arm, the only joint with a motor. All three links are swung up and
 balanced as well: there the noise of encoder counts moves the arm by more than friction does.
-Swinging up all three is not attempted.
 
 The rig is the RTIP twin's with its arm free and ball bearings at all links: with the twin's bushing
 at the last one, linear feedback on encoder counts loses the links. The true friction belongs to no
@@ -12,6 +11,7 @@ class that is fitted.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -32,14 +32,15 @@ from nfriction.friction.models import FrictionModel
 from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.afem.fit_adaptive import fit_adaptive
 from nfriction.papers.control.feedback import (
-    Balance,
     Compensation,
-    LinearPlant,
-    SwingUp,
-    kalman_gain,
+    Feedback,
+    Gains,
+    Weights,
+    balance_gains,
+    gains_along,
     linearise,
-    lqr,
 )
+from nfriction.papers.control.swing_up import plan_swing_up
 from nfriction.papers.twin.dataset import SPECIFICATIONS, Encoder
 from nfriction.plant import PendulumChain, rigs
 from nfriction.plant.chain import Arm
@@ -49,6 +50,7 @@ from nfriction.recording.angles import AngleConvention
 from nfriction.simulation.closed_loop import ControlledMotion, Electronics, control
 from nfriction.simulation.rollout import rollout
 
+logger = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 MODELS = ("NCFM", "LFM", "NLFM", "Stribeck", "ALFM", "NFLFM")
@@ -192,19 +194,6 @@ def _rows(x: Array) -> Array:
     return np.ascontiguousarray(x).reshape(-1, x.shape[-1])
 
 
-def side_by_side(compensations: Sequence[Compensation | None]) -> Compensation:
-    """Compensations of the rows of a batch, one each along the first axis; None for none."""
-
-    def torque(qd: Array, qdd: Array, load: Array) -> Array:
-        rows = [
-            np.zeros_like(row[0]) if each is None else each(*row)
-            for each, *row in zip(compensations, qd, qdd, load, strict=True)
-        ]
-        return np.stack(rows)
-
-    return torque
-
-
 def reference(time: float) -> tuple[float, float]:
     """Angle and rate of the arm that the balance follows: slow, so that friction matters most."""
     w = 2.0 * math.pi * FREQUENCY
@@ -216,50 +205,91 @@ def still(_: float) -> tuple[float, float]:
     return 0.0, 0.0
 
 
-def balance_gains(plant: PendulumChain) -> tuple[LinearPlant, Array, Array]:
-    """The plant near the top, and the gains of feedback and of the Kalman filter there."""
-    linear = linearise(plant, torch.zeros(plant.joints, dtype=torch.float64), SAMPLE_TIME)
-    angles, rates = np.array([ARM_WEIGHT, *[LINK_WEIGHT] * (plant.joints - 1)]).T
-    quantum = 2.0 * math.pi / (4 * Encoder().lines)
-    gain = lqr(linear, np.concatenate([angles, rates]), 1.0)
-    return linear, gain, kalman_gain(linear, TORQUE_NOISE, quantum / math.sqrt(12.0))
+def weights(joints: int) -> Weights:
+    """Weights of both filters; the encoders' noise is that of their counts."""
+    state = np.array([ARM_WEIGHT, *[LINK_WEIGHT] * (joints - 1)]).T.reshape(-1)
+    return Weights(state, TORQUE_NOISE, 2.0 * math.pi / (4 * Encoder().lines) / math.sqrt(12.0))
 
 
-def balanced(
+def top_gains(plant: PendulumChain) -> Gains:
+    """Gains that keep the plant upright."""
+    still = torch.zeros(plant.joints, dtype=torch.float64)
+    return balance_gains(linearise(plant, still, still, still, SAMPLE_TIME), weights(plant.joints))
+
+
+def way_up(plant: PendulumChain, friction: FrictionModel | None) -> list[Gains]:
+    """Gains along a swing-up from hanging that is planned with a model's friction.
+
+    Their torque lacks the friction of the arm, which is compensated as it moves.
+    """
+    plan = plan_swing_up(plant, friction, sample_time=SAMPLE_TIME)
+    q, qd = torch.tensor(plan.q), torch.tensor(plan.qd)
+    tau = torch.zeros_like(q)
+    tau[:, 0] = torch.tensor(plan.tau)
+    if friction is not None:
+        opposing = compensation_of(friction)
+        load = plant.load(q, qd).numpy()
+        qdd = np.gradient(plan.qd, SAMPLE_TIME, axis=0)
+        rows = zip(plan.qd, qdd, load, strict=True)
+        tau -= torch.tensor(np.stack([opposing(*row) for row in rows]))
+    along = linearise(plant, q, qd, tau, SAMPLE_TIME)
+    top = top_gains(plant).linear
+    return gains_along(along, tau[:, 0].numpy(), top, weights(plant.joints))
+
+
+def feedback(
+    plant: PendulumChain,
+    compensation: Compensation | None = None,
+    *,
+    share: float = 1.0,
+    follow: bool = False,
+    way: Sequence[Gains] = (),
+) -> Feedback:
+    """A controller of the rig.
+
+    Args:
+        plant: the rig.
+        compensation: of the arm's friction; None for none.
+        share: of that torque.
+        follow: let the arm follow `reference`, or keep it still.
+        way: the swing-up before it, see `way_up`; without one it starts near upright.
+    """
+    return Feedback(
+        plant, top_gains(plant), way, reference=reference if follow else still,
+        compensation=compensation, share=share,
+    )  # fmt: skip
+
+
+def controlled(
     plant: PendulumChain,
     friction: FrictionModel,
-    compensations: Mapping[str, Compensation | None],
+    controllers: Mapping[str, Feedback],
     *,
     seconds: float,
-    follow: bool,
-    shares: Mapping[str, float] | None = None,
 ) -> dict[str, ControlledMotion]:
-    """Motions of the rig balanced upright, one for each compensation, side by side.
+    """Motions of the rig with its true friction, one for each controller, side by side.
 
     Args:
         plant, friction: the rig and its true friction.
-        compensations: by name; None for none.
-        seconds: length of the motion.
-        follow: let the arm follow `reference`, or keep it still.
-        shares: of the friction torque that is compensated, by name; by default all of it.
+        controllers: by name; all with a swing-up of the same length, or all without.
+        seconds: length of the motion upright.
     """
-    shares = shares or {}
-    linear, gain, observer = balance_gains(plant)
-    controller = Balance(
-        plant, linear, gain, observer, reference if follow else still,
-        side_by_side(list(compensations.values())),
-        np.array([shares.get(name, 1.0) for name in compensations]),
-    )  # fmt: skip
-    tilted = torch.zeros(len(compensations), plant.joints, dtype=torch.float64)
-    tilted[:, 1] = math.radians(TILT)
-    run = control(plant, friction, controller, tilted, torch.zeros_like(tilted),
-                  steps=round(seconds / SAMPLE_TIME), electronics=ELECTRONICS)  # fmt: skip
+    each = list(controllers.values())
+
+    def torque(time: float, q: Array) -> Array:
+        return np.stack([one(time, row) for one, row in zip(each, q, strict=True)])
+
+    way = len(each[0].way)
+    start = torch.zeros(len(each), plant.joints, dtype=torch.float64)
+    start[:, 1] = math.pi if way else math.radians(TILT)
+    run = control(plant, friction, torque, start, torch.zeros_like(start),
+                  steps=way + round(seconds / SAMPLE_TIME), electronics=ELECTRONICS)  # fmt: skip
     return {
         name: ControlledMotion(
             run.step, run.q[k], run.qd[k], run.qdd[k], run.diverged_at[k],
             tau=run.tau[k], measured=run.measured[k],
         )
-        for k, name in enumerate(compensations)
+        for k, name in enumerate(controllers)
     }  # fmt: skip
 
 
@@ -267,7 +297,7 @@ def performance(run: ControlledMotion, *, follow: bool, settled: float) -> dict[
     """Figures of a balanced motion after it has settled.
 
     Args:
-        run: of `balanced`.
+        run: of `controlled`.
         follow: its arm follows `reference`.
         settled: from here on [s].
 
@@ -294,75 +324,76 @@ def performance(run: ControlledMotion, *, follow: bool, settled: float) -> dict[
 
 
 def run_study(
-    models: Mapping[str, FrictionModel], *, seconds: float, settled: float
+    single: Mapping[str, FrictionModel],
+    three: Mapping[str, FrictionModel],
+    *,
+    seconds: float,
+    settled: float,
 ) -> tuple[dict[str, dict[str, dict[str, float | None]]], dict[str, Array]]:
     """Balance, tracking and swing-up with the friction compensation of each model.
 
     Args:
-        models: fitted to the rig of `true_friction`, by name; of the first law with load also
-            shares of the torque are tried.
-        seconds, settled: length of each motion, and from where on it counts [s].
+        single, three: models fitted to the rig of `true_friction` with one link and with three, by
+            name; for a single link shares of the torque of `SHARED` are tried as well.
+        seconds, settled: length of each motion upright, and from where on it counts [s].
 
     Returns:
-        `performance` by task ("still", "follow", "three links") and compensation, None for
-        infinity; and thinned motions for figures.
+        `performance` by task ("still", "follow", "swing-up", "three links") and compensation, None
+        for infinity; and thinned motions for figures. With the swing-up, which is planned with the
+        friction of the model, also the largest deviation of a link from the plan; a model with
+        which no plan is found has no row.
     """
-    plant = single_link()
-    friction = true_friction(plant)
-    rows: dict[str, tuple[FrictionModel | None, float]] = {NONE: (None, 0.0)}
-    rows |= {name: (model, 1.0) for name, model in models.items()}
-    rows |= {f"{SHARED}, {g:g} of it": (models[SHARED], g) for g in SHARES if SHARED in models}
-    rows[TRUTH] = (friction, 1.0)
     found: dict[str, dict[str, dict[str, float | None]]] = {}
     kept: dict[str, Array] = {}
+    for task, models in (("still", single), ("follow", single), ("swing-up", three),
+                         ("three links", three)):  # fmt: skip
+        plant = single_link() if models is single else rigs.rtip("free")
+        follow, rows = task in ("follow", "three links"), {}
+        friction = true_friction(plant)
+        for name, (model, share) in _compensated(models, friction, shares=models is single).items():
+            # Made anew: an adaptive model's remembers the motion before.
+            given = model and compensation_of(model)
+            way: Sequence[Gains] = ()
+            if task == "swing-up":
+                try:
+                    way = way_up(plant, model)
+                except ValueError as error:
+                    logger.warning("%s, %s: %s", task, name, error)
+                    continue
+            rows[name] = feedback(plant, given, share=share, follow=follow, way=way)
+        found[task] = {}
+        for name, run in controlled(plant, friction, rows, seconds=seconds).items():
+            way = rows[name].way
+            start = SAMPLE_TIME * len(way)
+            row = performance(run, follow=follow, settled=start + settled)
+            if way:
+                planned = np.stack([gains.linear.q0 for gains in way])
+                off = (run.q[: len(way)].numpy() - planned)[:, 1:].cumsum(-1)
+                row = {"off the plan [mrad]": 1e3 * float(np.abs(off).max())} | row
+            found[task][name] = {k: v if math.isfinite(v) else None for k, v in row.items()}
+            kept[f"{task}, {name}"] = run.q[::THINNED].numpy()
+    return found, kept
 
-    def judge(task: str, runs: Mapping[str, ControlledMotion], follow: bool) -> None:
-        found[task] = {
-            name: {
-                key: value if math.isfinite(value) else None
-                for key, value in performance(run, follow=follow, settled=settled).items()
-            }
-            for name, run in runs.items()
-        }
-        kept.update({f"{task}, {name}": run.q[::THINNED].numpy() for name, run in runs.items()})
 
-    shares = {name: share for name, (_, share) in rows.items()}
-    for task, follow in (("still", False), ("follow", True)):
-        # Made anew: an adaptive model's remembers the motion before.
-        given = {n: model and compensation_of(model) for n, (model, _) in rows.items()}
-        judge(task, balanced(plant, friction, given, seconds=seconds, follow=follow, shares=shares),
-              follow)  # fmt: skip
-    whole = rigs.rtip("free")
-    friction = true_friction(whole)
-    given = {NONE: None, TRUTH: compensation_of(friction)}
-    judge("three links", balanced(whole, friction, given, seconds=seconds, follow=True), True)
-    _, lifted, success = swung_up(None)
-    found["swing-up"] = {NONE: {"caught": float(success)}}
-    return found, kept | {"swing-up": lifted.q[::THINNED].numpy()}
+def _compensated(
+    models: Mapping[str, FrictionModel], friction: FrictionModel, *, shares: bool
+) -> dict[str, tuple[FrictionModel | None, float]]:
+    """Models and shares of their torque that are compensated, by name."""
+    rows: dict[str, tuple[FrictionModel | None, float]] = {NONE: (None, 0.0)}
+    rows |= {name: (model, 1.0) for name, model in models.items()}
+    if shares and SHARED in models:
+        rows |= {f"{SHARED}, {g:g} of it": (models[SHARED], g) for g in SHARES}
+    return rows | {TRUTH: (friction, 1.0)}
 
 
 def single_link() -> PendulumChain:
-    """The rig with its first link alone, which an energy swing-up can lift."""
+    """The rig with its first link alone."""
     whole = rigs.rtip("free").to_dict()
     first = {key: whole[key][:1] for key in ("mass", "length", "com", "inertia")}
     return PendulumChain(
         **first, arm=Arm(**whole["arm"]), gravity=whole["gravity"], name="rtip_single",
         joint_names=whole["joint_names"][:2], convention=("relative", "upright"),
     )  # fmt: skip
-
-
-def swung_up(
-    compensation: Compensation | None = None, *, seconds: float = 12.0
-) -> tuple[PendulumChain, ControlledMotion, bool]:
-    """Swing-up of a single link from hanging, and balance: the rig, its motion, and success."""
-    plant = single_link()
-    friction = true_friction(plant)
-    balance = Balance(plant, *balance_gains(plant), still, compensation)
-    hanging = torch.tensor([0.0, math.pi], dtype=torch.float64)
-    run = control(plant, friction, SwingUp(balance), hanging, torch.zeros_like(hanging),
-                  steps=round(seconds / SAMPLE_TIME), electronics=ELECTRONICS)  # fmt: skip
-    late = run.q[run.time >= seconds - 1.0, 1].numpy()
-    return plant, run, bool(np.abs(np.angle(np.exp(1j * late))).max() < 0.1)
 
 
 def balance_figure(motions: Mapping[str, Array]) -> Figure:

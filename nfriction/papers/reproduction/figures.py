@@ -17,7 +17,7 @@ from tqdm import tqdm
 from nfriction.evaluation.score import RMSE, Score
 from nfriction.io.files import atomic_write
 from nfriction.io.model_file import load
-from nfriction.papers.control.study import SAMPLE_TIME, THINNED, balance_figure, single_link
+from nfriction.papers.control.study import SAMPLE_TIME, SHARED, THINNED, balance_figure
 from nfriction.papers.controller.mamdani import paper_controller
 from nfriction.papers.controller.rules import Variable
 from nfriction.papers.reproduction import tables
@@ -76,11 +76,11 @@ def draw_all(workspace: Workspace, *, progress: bool = False) -> list[Path]:
             figure.savefig(temporary, dpi=DPI, format="png")
         figure.clear()
         written.append(path)
-    lifted = workspace.arrays("control")["swing-up"]
+    lifted = workspace.arrays("control")[f"swing-up, {SHARED}"]
     time = THINNED * SAMPLE_TIME * np.arange(len(lifted), dtype=np.float64)
     gif = workspace.folder / "figures" / "control_swing_up.gif"
-    motion = {"swing-up of one link": lifted}
-    return [*written, animate(single_link(), time, motion, gif, seconds=np.inf)]
+    motion = {f"swing-up, {SHARED} compensated": lifted}
+    return [*written, animate(rigs.rtip("free"), time, motion, gif, seconds=8.0)]
 
 
 def figures(workspace: Workspace) -> dict[str, Callable[[], Figure]]:

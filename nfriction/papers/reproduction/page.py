@@ -10,6 +10,7 @@ import jinja2
 import pandas as pd
 
 from nfriction.io.files import write_atomically
+from nfriction.papers.reproduction.stages import NEURO_FUZZY
 from nfriction.papers.reproduction.tables import all_tables, conclusion, fit_ends, order
 from nfriction.papers.reproduction.workspace import Workspace
 from nfriction.version import __version__
@@ -27,11 +28,13 @@ class Item:
         title: its number and caption's content.
         files: names of tables and figures here, without ending.
         differs: how ours differs from the paper's, if it does.
+        models: whose fits ended as the page then says.
     """
 
     title: str
     files: tuple[str, ...]
     differs: str = ""
+    models: tuple[str, ...] = ()
 
 
 FIRST = (
@@ -52,7 +55,8 @@ FIRST = (
     Item("Figs. 11, 12, 13: coefficients of the neuro-fuzzy models in the experiment",
          ("fig_11_coefficients_NFNCFM", "fig_12_coefficients_NFLFM",
           "fig_13_coefficients_NFNLFM"),
-         "A joint whose correction did not pass its hold-out windows has the classes' steps."),
+         "Where the network's correction did not pass its hold-out windows, a joint has the steps "
+         "of the classes alone.", NEURO_FUZZY),
     Item("Fig. 14: measured and simulated position", ("fig_14_positions_NFNLFM",),
          "On a recording that no model was fitted to."),
     Item("Table 10: position error of every model",
@@ -77,7 +81,7 @@ FUTURE = (
     Item("Control of the rig with the friction models",
          ("control_still", "control_follow", "control_balance", "control_swing_up",
           "control_three_links"),
-         "In simulation; three links are balanced, one is swung up."),
+         "In simulation."),
 )  # fmt: skip
 OTHERS = (
     Item("Positions by kind of model", tuple(f"positions_joint_{joint}" for joint in (2, 3, 4))),
@@ -93,10 +97,7 @@ PARTS = (
 def write_page(workspace: Workspace) -> Path:
     """Write `reproduction.html` with the tables, and the figures that were drawn."""
     tables = all_tables(workspace)
-    parts = [
-        (title, [_shown(workspace.folder / "figures", tables, item) for item in items])
-        for title, items in PARTS
-    ]
+    parts = [(title, [_shown(workspace, tables, item) for item in items]) for title, items in PARTS]
     made = jinja2.Environment(autoescape=True).from_string(_TEMPLATE.read_text(encoding="utf-8"))
     text = made.render(
         parts=parts, style=_STYLE.read_text(encoding="utf-8"), version=__version__,
@@ -107,10 +108,12 @@ def write_page(workspace: Workspace) -> Path:
 
 
 def _shown(
-    figures: Path, tables: dict[str, tuple[str, pd.DataFrame]], item: Item
+    workspace: Workspace, tables: dict[str, tuple[str, pd.DataFrame]], item: Item
 ) -> dict[str, Any]:
     """An item's tables as headings and rows of text, and its pictures as URLs."""
-    shown: dict[str, Any] = {"item": item, "tables": [], "pictures": []}
+    ends = [f"{name}: {workspace.found(name)['fit']['status']}" for name in item.models]
+    differs = " ".join([item.differs, *ends]).strip()
+    shown: dict[str, Any] = {"item": item, "differs": differs, "tables": [], "pictures": []}
     for name in item.files:
         if name in tables:
             caption, table = tables[name]
@@ -121,7 +124,7 @@ def _shown(
                     zip(table.index, table.to_numpy(), strict=True)]  # fmt: skip
             shown["tables"].append((caption, columns, rows))
         for suffix, kind in ((".png", "png"), (".gif", "gif")):
-            path = figures / f"{name}{suffix}"
+            path = workspace.folder / "figures" / f"{name}{suffix}"
             if path.exists():
                 data = base64.b64encode(path.read_bytes()).decode()
                 shown["pictures"].append((name, f"data:image/{kind};base64,{data}"))

@@ -46,6 +46,7 @@ from nfriction.papers.reproduction.workspace import (
     Workspace,
     smoothed,
 )
+from nfriction.plant import rigs
 from nfriction.recording import Recording
 from nfriction.signals import causal_motion
 from nfriction.simulation.rollout import rollout
@@ -344,15 +345,17 @@ def papers_way(workspace: Workspace, law: str) -> dict[str, Any]:
 def controlled(workspace: Workspace) -> dict[str, Any]:
     """Result of the control study: the papers' future work."""
     settings = workspace.settings
-    plant = study.single_link()
-    recordings = study.driven_recordings(
-        plant, study.true_friction(plant), count=1, seconds=12.0, seed=settings.seed
-    )
-    models = {n: study.fitted_model(plant, recordings, n) for n in settings.control_models}
-    for name, model in models.items():
-        save(model, workspace.model(f"control-{name}"))
+    fitted: list[dict[str, FrictionModel]] = []
+    for rig, plant in (("one", study.single_link()), ("three", rigs.rtip("free"))):
+        recordings = study.driven_recordings(
+            plant, study.true_friction(plant), count=1, seconds=12.0, seed=settings.seed
+        )
+        names = settings.control_models
+        fitted.append({n: study.fitted_model(plant, recordings, n) for n in names})
+        for name, model in fitted[-1].items():
+            save(model, workspace.model(f"control-{rig}-{name}"))
     tables, motions = study.run_study(
-        models, seconds=settings.control_seconds, settled=0.375 * settings.control_seconds
+        *fitted, seconds=settings.control_seconds, settled=0.375 * settings.control_seconds
     )
     workspace.write_arrays("control", motions)
     return {"tables": tables}

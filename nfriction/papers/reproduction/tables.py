@@ -389,9 +389,10 @@ def all_tables(workspace: Workspace) -> dict[str, tuple[str, pd.DataFrame]]:
     for task, what in (
         ("still", "a link balanced upright, the arm to stay still"),
         ("follow", "a link balanced upright while the arm follows a slow sine"),
+        ("swing-up", "three links swung up in 5 s and balanced, planned with the same friction"),
         ("three links", "three links balanced upright while the arm follows a slow sine"),
     ):
-        found[f"control_{task.replace(' ', '_')}"] = (
+        found[f"control_{task.replace(' ', '_').replace('-', '_')}"] = (
             f"future work, control: {what}, by the model whose friction torque is compensated "
             "(inf: fallen)",
             control_table(workspace, task),

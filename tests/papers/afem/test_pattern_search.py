@@ -15,6 +15,7 @@ from nfriction.papers.afem.fit_by_search import (
     SearchOptions,
     SearchResult,
     SearchState,
+    poll_shape,
     search,
 )
 
@@ -247,3 +248,25 @@ def test_a_logarithmic_variable_at_its_bound_is_exactly_there() -> None:
     low, high = decades.ends
     assert torch.equal(decades.from_unit(high), decades.upper)
     assert torch.equal(decades.from_unit(low), decades.lower)
+
+
+def test_polls_shaped_by_the_curvature_follow_a_narrow_valley() -> None:
+    random = torch.Generator().manual_seed(0)
+    turned = torch.linalg.qr(torch.randn(4, 4, generator=random, dtype=F64))[0]
+    stiffness = vector(1.0, 30.0, 300.0, 1000.0)
+    slopes = torch.diag(stiffness) @ turned
+    least = turned.mT @ (0.3 / stiffness)
+
+    def residuals(x: Tensor) -> Tensor:
+        return slopes @ (x - least)
+
+    def cost(x: Tensor) -> Tensor:
+        return 0.5 * ((x - least) @ slopes.mT).square().sum(-1)
+
+    variables = box(torch.zeros(4, dtype=F64), scale=1.0)
+    options = SearchOptions(tolerance=1e-3, max_evaluations=1000)
+    shape = poll_shape(residuals, variables, torch.zeros(4, dtype=F64))
+    shaped, round_ = (search(cost, variables, options, None, s) for s in (shape, None))
+    assert shaped.converged
+    torch.testing.assert_close(shaped.vector, least, rtol=0, atol=0.01)
+    assert shaped.value < 1e-2 * round_.value

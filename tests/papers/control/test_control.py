@@ -13,12 +13,13 @@ import torch
 from nfriction import LFM, NFLFM, export, rigs
 from nfriction.friction.models import FrictionModel
 from nfriction.papers.control import study
-from nfriction.papers.control.feedback import Compensation, linearise
+from nfriction.papers.control.feedback import Compensation, balance_gains, gains_along, linearise
+from nfriction.papers.control.swing_up import plan_swing_up
 from nfriction.simulation.rollout import rollout
 
 PLANT = rigs.rtip("free")
 UPRIGHT = torch.zeros(4, dtype=torch.float64)
-LINEAR = linearise(PLANT, UPRIGHT, 1e-3)
+LINEAR = linearise(PLANT, UPRIGHT, UPRIGHT, UPRIGHT, 1e-3)
 
 
 def test_the_linear_plant_moves_as_the_plant_near_the_top() -> None:
@@ -32,17 +33,20 @@ def test_the_linear_plant_moves_as_the_plant_near_the_top() -> None:
 
 
 def test_the_upright_rig_is_unstable_and_its_loops_are_not() -> None:
-    _, gain, observer = study.balance_gains(PLANT)
+    gains = study.top_gains(PLANT)
     joints = np.hstack([np.eye(4), np.zeros((4, 4))])
     assert np.abs(np.linalg.eigvals(LINEAR.a)).max() > 1.003
-    assert np.abs(np.linalg.eigvals(LINEAR.a - np.outer(LINEAR.b[:, 0], gain))).max() < 1.0
-    kept = np.eye(8) - observer @ joints
+    assert (
+        np.abs(np.linalg.eigvals(LINEAR.a - np.outer(LINEAR.b[:, 0], gains.feedback))).max() < 1.0
+    )
+    kept = np.eye(8) - gains.observer @ joints
     assert np.abs(np.linalg.eigvals(kept @ LINEAR.a)).max() < 1.0
 
 
 def test_a_pose_that_is_no_equilibrium_is_refused() -> None:
+    leaning = linearise(PLANT, UPRIGHT + 0.1, UPRIGHT, UPRIGHT, 1e-3)
     with pytest.raises(ValueError, match="not in equilibrium"):
-        linearise(PLANT, UPRIGHT + 0.1, 1e-3)
+        balance_gains(leaning, study.weights(4))
 
 
 def test_true_friction_is_passive() -> None:
@@ -53,8 +57,8 @@ def test_true_friction_is_passive() -> None:
 
 
 def test_three_links_stay_upright() -> None:
-    runs = study.balanced(
-        PLANT, study.true_friction(PLANT), {study.NONE: None}, seconds=2.0, follow=False
+    runs = study.controlled(
+        PLANT, study.true_friction(PLANT), {study.NONE: study.feedback(PLANT)}, seconds=2.0
     )
     found = study.performance(runs[study.NONE], follow=False, settled=1.0)
     assert found["largest tilt [mrad]"] < 200
@@ -64,11 +68,11 @@ def test_three_links_stay_upright() -> None:
 def test_compensation_shrinks_the_limit_cycle_of_a_balanced_link() -> None:
     plant = study.single_link()
     friction = study.true_friction(plant)
-    runs = study.balanced(
-        plant, friction,
-        {study.NONE: None, study.TRUTH: study.compensation_of(friction)},
-        seconds=12.0, follow=False,
-    )  # fmt: skip
+    controllers = {
+        study.NONE: study.feedback(plant),
+        study.TRUTH: study.feedback(plant, study.compensation_of(friction)),
+    }
+    runs = study.controlled(plant, friction, controllers, seconds=12.0)
     found = {n: study.performance(run, follow=False, settled=4.0) for n, run in runs.items()}
     key = "limit cycle [mrad]"
     assert found[study.TRUTH][key] < 0.6 * found[study.NONE][key]
@@ -76,17 +80,38 @@ def test_compensation_shrinks_the_limit_cycle_of_a_balanced_link() -> None:
 
 def test_a_fallen_rig_has_no_tracking_error() -> None:
     friction = study.true_friction(PLANT)
-    runs = study.balanced(PLANT, friction, {study.NONE: None}, seconds=0.5, follow=False)
+    controllers = {study.NONE: study.feedback(PLANT)}
+    runs = study.controlled(PLANT, friction, controllers, seconds=0.5)
     run = runs[study.NONE]
     run.q[-1, 1] = 2.0
     assert set(study.performance(run, follow=False, settled=0.1).values()) == {math.inf}
 
 
+def test_gains_along_a_motion_that_stays_at_the_top_become_those_of_the_top() -> None:
+    still = torch.zeros(3000, 4, dtype=torch.float64)
+    way = linearise(PLANT, still, still, still, 1e-3)
+    found = gains_along(way, still[:, 0].numpy(), LINEAR, study.weights(4))
+    top = study.top_gains(PLANT)
+    np.testing.assert_allclose(found[0].feedback, top.feedback, rtol=1e-6)
+    np.testing.assert_allclose(found[-1].observer, top.observer, rtol=1e-3, atol=1e-6)
+
+
+def test_a_swing_up_without_time_is_refused() -> None:
+    with pytest.raises(ValueError, match="no swing-up within"):
+        plan_swing_up(PLANT, None, seconds=0.5, windows=5, max_steps=5)
+
+
 @pytest.mark.slow
-def test_a_single_link_swings_up_and_stays() -> None:
-    plant, run, success = study.swung_up(seconds=8.0)
-    assert success
-    assert plant.joints == 2
+def test_three_links_swing_up_and_stay() -> None:
+    """The plan knows the links' friction roughly; the arm's is compensated by a true model."""
+    friction = study.true_friction(PLANT)
+    guess = LFM(4, [0.01, 0.002]).requires_grad_(False)
+    way = study.way_up(PLANT, guess)
+    controller = study.feedback(PLANT, study.compensation_of(friction), way=way)
+    (run,) = study.controlled(PLANT, friction, {"": controller}, seconds=2.0).values()
+    assert float(run.q[0, 1]) == math.pi
+    upright = run.q[run.time > 6.0, 1:].cumsum(-1).abs()
+    assert upright.max() < 0.2
     assert run.tau.abs().max() <= study.ELECTRONICS.torque_limit
 
 
@@ -119,15 +144,9 @@ def compiled(model: FrictionModel, folder: Path) -> Compensation:
 def test_exported_c_in_the_loop_gives_the_same_motion(kind: type, tmp_path: Path) -> None:
     model = kind(4, [0.05, 0.17]).requires_grad_(False)
     friction = study.true_friction(PLANT)
-    runs = study.balanced(
-        PLANT, friction,
-        {
-            "none": None,
-            "torch": study.compensation_of(model),
-            "C": compiled(model, tmp_path),
-        },
-        seconds=0.4, follow=True,
-    )  # fmt: skip
+    given = {"torch": study.compensation_of(model), "C": compiled(model, tmp_path), "none": None}
+    controllers = {n: study.feedback(PLANT, one, follow=True) for n, one in given.items()}
+    runs = study.controlled(PLANT, friction, controllers, seconds=0.4)
     # Torques pass a converter of 16 bits, which removes what the last bits of exp differ by.
     assert torch.equal(runs["torch"].tau, runs["C"].tau)
     assert torch.equal(runs["torch"].q, runs["C"].q)

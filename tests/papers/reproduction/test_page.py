@@ -37,6 +37,8 @@ def test_the_page_is_self_contained_and_in_the_papers_order(tmp_path) -> None:
     assert "data:image/png;base64," in page
     assert "http" not in page.replace("http-equiv", "")
     assert "NOT reproduced" in page
+    # How the fit behind a figure ended is said beside it.
+    assert "NFNLFM: ended" in page
     assert "0.1397" not in page  # printed errors are shown in mrad, as ours
     assert "139.7" in page
 

@@ -13,7 +13,7 @@ from nfriction.papers.reproduction import tables
 from nfriction.papers.reproduction.stages import LAWS, SECOND_PAPER, stages
 from nfriction.papers.reproduction.workspace import QUICK, Workspace
 
-CONTROL = ("still", "follow", "three links")
+CONTROL = ("still", "follow", "swing-up", "three links")
 EVERY = [name for name in stages() if name != "control" and not name.startswith("twin")]
 
 

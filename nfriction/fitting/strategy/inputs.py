@@ -1,0 +1,230 @@
+"""Inputs of friction besides the speed, chosen by what a law leaves unexplained.
+
+A candidate is a term of the law with a coefficient of its own (`friction.inputs`). Its gain is that
+of one Gauss-Newton step from the fitted law, on contiguous blocks of the recordings that took no
+part in the step: one linearisation of each block gives the gain of every candidate.
+"""
+
+import copy
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from nfriction.fitting.data.inputs import adjustable_terms
+from nfriction.fitting.data.windows import Windows
+from nfriction.fitting.result.fit_result import FitResult, InputGain
+from nfriction.fitting.result.of_search import result_from_shooting
+from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
+from nfriction.fitting.shooting.sensitivity import StepJacobian
+from nfriction.fitting.strategy.constant import (
+    constant_prior,
+    fits_eccentricity,
+    known_terms,
+    regression,
+)
+from nfriction.fitting.strategy.continuation import (
+    ShootingFitter,
+    loglik_tolerance,
+    settle_states,
+    weighted_cost,
+)
+from nfriction.fitting.task import FitTask
+from nfriction.friction.coefficients import Constant
+from nfriction.friction.inputs import INPUTS, with_inputs
+from nfriction.friction.models import FrictionModel
+from nfriction.optim.least_squares import Quadratic
+from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
+from nfriction.plant import PendulumChain, Plant
+from nfriction.plant.rigs import from_dict
+
+
+def seeing_plant(plant: Plant, inputs: Sequence[str]) -> Plant:
+    """The plant with the loads of its bearings where the load is an input."""
+    if "load" not in inputs:
+        return plant
+    return from_dict({**plant.to_dict(), "normal_load": "bearing"})
+
+
+def candidates(task: FitTask) -> tuple[str, ...]:
+    """Inputs that a law and a plant can take."""
+    plant, law = task.plant, task.model.law
+    one = torch.ones(1, 1, dtype=torch.float64)
+    coefficients = one.expand(1, 1, len(law.names))
+    torques = [law.torque(one, load * one, coefficients, 1.0) for load in (1.0, 2.0)]
+    # A bearing's load is known of chains on a fixed pivot; a law of the load has seen one.
+    chain = isinstance(plant, PendulumChain) and not plant.first_link
+    loaded = chain and torch.equal(*torques)
+    return tuple(name for name in INPUTS if name != "load" or loaded)
+
+
+def widened_fitter(task: FitTask, start: FitResult, inputs: Sequence[str]) -> ShootingFitter:
+    """Fitter of a law's constant coefficients and those of inputs, from a fit of the law."""
+    law, plant = with_inputs(start.model.law, inputs), seeing_plant(task.plant, inputs)
+    known = start.model.schedule.coefficient_sets()["always"]
+    initial = torch.cat([known, known.new_zeros(len(known), len(inputs))], 1)
+    model = FrictionModel(law, Constant(law, start.model.joints, initial), start.model.v_smooth)
+    terms = adjustable_terms(
+        plant, task.recordings, task.options, eccentric=fits_eccentricity(task.options, start),
+        per_recording=bool(start.encoder_offsets),
+    )  # fmt: skip
+    torque = regression(task, model, seeing_plant(start.plant, inputs))
+    return ShootingFitter(
+        StepJacobian(plant, model, terms), model, task.recordings, task.measurement, task.options,
+        task.callback, friction_prior=constant_prior(model, torque, task.options),
+    )  # fmt: skip
+
+
+def widened_start(task: FitTask, start: FitResult, inputs: Sequence[str]) -> FitResult | None:
+    """Constant fit of a law with inputs, from that without; None if stopped."""
+    fitter = widened_fitter(task, start, inputs)
+    windows = fitter.cut(task.motions, start.longest_usable_horizon(task.options.windows))
+    noise = max(effective_noise(start.residuals), task.options.min_noise)
+    problem = fitter.problem(windows, noise, fitter.friction.schedule.parameter_vector())
+    known = known_terms(start, fitter.jacobian.terms)
+    x, stopped = settle_states(problem, problem.variables.start(known))
+    if stopped:
+        return None
+    tolerance = loglik_tolerance(weighted_cost(start.residuals, noise), task.options)
+    end = fitter.search(problem, x, tolerance, "law with further inputs")
+    if end.stopped or not math.isfinite(end.rms):
+        return None
+    model = copy.deepcopy(fitter.friction)
+    found = result_from_shooting(model, end.problem, end.result, task.motions)
+    return replace(
+        found, encoder_offsets=start.encoder_offsets, skipped_horizons=start.skipped_horizons
+    )
+
+
+def chosen_inputs(task: FitTask, start: FitResult) -> tuple[InputGain, ...]:
+    """Inputs that explain motion on blocks left out, the best first; each beside those before.
+
+    Args:
+        task: with recordings and motions free of encoder offsets.
+        start: constant fit of the law.
+    """
+    names = candidates(task)
+    fitter = widened_fitter(task, start, names)
+    choice = _Choice.of(fitter, task, start, names)
+    return () if choice is None else tuple(choice.forward())
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """Local models of blocks over the shared variables, states at their best, and the prior's."""
+
+    blocks: Sequence[Quadratic]
+    prior: Quadratic
+    lower: Tensor
+    columns: dict[str, list[int]]  # of each candidate, a coefficient a joint
+
+    @classmethod
+    def of(
+        cls, fitter: ShootingFitter, task: FitTask, start: FitResult, names: Sequence[str]
+    ) -> "_Choice | None":
+        windows = fitter.cut(task.motions, start.longest_usable_horizon(task.options.windows))
+        noise, model = effective_noise(start.residuals), fitter.friction
+        stride = decimation(start.residuals, task.options)
+        known = known_terms(start, fitter.jacobian.terms)
+        found = []
+        for block in contiguous_blocks(windows, task.options.folds):
+            problem = fitter.problem(
+                windows.subset(block), noise, model.schedule.parameter_vector(), stride=stride
+            )
+            x, stopped = settle_states(problem, problem.variables.start(known))
+            local = problem.linearise(x)
+            if stopped or not local.finite:
+                return None
+            variables = problem.variables
+            shared, (precision, mean) = variables.shared_count, variables.prior()
+            pull = (precision * (x - mean))[:shared]
+            found.append(_of_errors(local, precision[:shared], pull))
+        prior = Quadratic(0.0, pull, torch.diag(precision[:shared]))
+        lower, _ = variables.bounds()
+        rows = torch.arange(variables.friction_count).reshape(model.joints, -1)
+        own = rows.shape[1] - len(names)
+        columns = {name: rows[:, own + k].tolist() for k, name in enumerate(names)}
+        return cls(found, prior, (lower - x)[:shared].clamp(max=0.0), columns)
+
+    def forward(self) -> list[InputGain]:
+        """Inputs one after the other, as long as one gains by more than its scatter over blocks."""
+        chosen: list[InputGain] = []
+        held: list[int] = []
+        while len(chosen) < len(self.columns):
+            before = self.left_out(held)
+            gains = {}
+            for name, columns in self.columns.items():
+                if columns[0] in held:
+                    continue
+                gain = before - self.left_out([*held, *columns])
+                if float(gain.mean()) > float(gain.std() / len(gain) ** 0.5):
+                    gains[name] = float(gain.sum() / before.sum())
+            if not gains:
+                break
+            best = max(gains, key=lambda name: gains[name])
+            by_joint = tuple(
+                float(1.0 - self.left_out([*held, column]).sum() / before.sum())
+                for column in self.columns[best]
+            )
+            chosen.append(InputGain(best, gains[best], by_joint))
+            held += self.columns[best]
+        return chosen
+
+    def left_out(self, held: Sequence[int]) -> Tensor:
+        """Cost of each block after a step by the others, (block,), with the columns `held`."""
+        every = {c for columns in self.columns.values() for c in columns}
+        free = [k for k in range(len(self.lower)) if k not in every or k in held]
+        costs = []
+        for place, block in enumerate(self.blocks):
+            others = [b for k, b in enumerate(self.blocks) if k != place]
+            parts = [_subset(q, free) for q in (self.prior, *others)]
+            gradient = torch.stack([p.gradient for p in parts]).sum(0)
+            hessian = torch.stack([p.hessian for p in parts]).sum(0)
+
+            cost = sum(float(p.cost) for p in parts)
+
+            def model(
+                x: Tensor, c: float = cost, g: Tensor = gradient, H: Tensor = hessian
+            ) -> Quadratic:
+                return Quadratic(c + g @ x + 0.5 * x @ H @ x, g + H @ x, H)
+
+            start = torch.zeros(len(free), dtype=torch.float64)
+            step = LevenbergMarquardt().minimise(model, start, lower=self.lower[free]).x
+            own = _subset(block, free)
+            costs.append(own.cost + own.gradient @ step + 0.5 * step @ own.hessian @ step)
+        return torch.stack([torch.as_tensor(c) for c in costs])
+
+
+def contiguous_blocks(windows: Windows, folds: int) -> list[Tensor]:
+    """Masks (window,) of contiguous stretches, up to `folds` of each recording."""
+    place = torch.tensor([span[0] for span in windows.spans])
+    blocks = []
+    for recording in place.unique().tolist():
+        own = (place == recording).nonzero().flatten()
+        for part in own.tensor_split(min(folds, len(own))):
+            mask = torch.zeros(len(windows), dtype=torch.bool)
+            mask[part] = True
+            blocks.append(mask)
+    return blocks
+
+
+def _of_errors(local: Quadratic, precision: Tensor, pull: Tensor) -> Quadratic:
+    """Local model over the shared variables by the errors alone, the others at their best."""
+    shared = len(precision)
+    H, g = local.hessian, local.gradient
+    solved = torch.linalg.solve(
+        H[shared:, shared:], torch.cat([H[shared:, :shared], g[shared:, None]], 1)
+    )
+    across = H[:shared, shared:]
+    return Quadratic(
+        local.cost,
+        g[:shared] - pull - across @ solved[:, -1],
+        H[:shared, :shared] - torch.diag(precision) - across @ solved[:, :-1],
+    )
+
+
+def _subset(local: Quadratic, index: Sequence[int]) -> Quadratic:
+    rows = list(index)
+    return Quadratic(local.cost, local.gradient[rows], local.hessian[rows][:, rows])

@@ -1,0 +1,63 @@
+"""Laws whose friction depends on more than the speed: on the direction of turning, on the load."""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, Final
+
+import torch
+from torch import Tensor, nn
+
+from nfriction.friction.laws import Coefficient, Law, TorqueFunction
+
+# A coefficient for each input, behind the law's own.
+INPUTS = {
+    # Friction that is larger in one direction than in the other; it vanishes at rest.
+    "direction": Coefficient("F_t", "N m", positive=False, prior_scale=1.0),
+    "load": Coefficient("F_n", "N m", prior_scale=1.0),
+}
+
+
+def with_inputs(law: Law, inputs: Sequence[str]) -> Law:
+    """A law with further inputs: `f + F_t sgn(qd)^2` by direction, `f + F_n load sgn(qd)` by load.
+
+    Raises:
+        ValueError: for an input that does not exist or is repeated.
+    """
+    chosen = tuple(name for name in INPUTS if name in inputs)
+    if len(chosen) != len(inputs):
+        raise ValueError(f"`inputs` must be different ones of {', '.join(INPUTS)}, got {inputs!r}.")
+    if not chosen:
+        return law
+    own = (*law.coefficients, *(INPUTS[name] for name in chosen))
+    torque = _torque_with_inputs(law.torque, len(law.names), chosen)
+    return Law(f"{law.name}_by_{'_'.join(chosen)}", own, torque)
+
+
+# One object for equal arguments: laws with the same inputs are equal.
+@lru_cache
+def _torque_with_inputs(torque: TorqueFunction, own: int, inputs: tuple[str, ...]) -> "_WithInputs":
+    return _WithInputs(torque, own, inputs)
+
+
+# A module and no closure, which TorchScript would not compile.
+class _WithInputs(nn.Module):
+    own: Final[int]
+    turns: Final[bool]
+    loaded: Final[bool]
+
+    def __init__(self, torque: TorqueFunction, own: int, inputs: tuple[str, ...]) -> None:
+        super().__init__()
+        self.torque, self.own, self.given = torque, own, inputs
+        self.turns, self.loaded = "direction" in inputs, "load" in inputs
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _torque_with_inputs, (self.torque, self.own, self.given)
+
+    def forward(self, qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
+        tau_f = self.torque(qd, load, coefficients[..., : self.own], v_smooth)
+        sign = torch.tanh(qd / v_smooth)
+        if self.turns:
+            tau_f = tau_f + coefficients.select(-1, self.own) * sign * sign
+        if self.loaded:
+            tau_f = tau_f + coefficients.select(-1, -1) * load * sign
+        return tau_f

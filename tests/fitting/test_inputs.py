@@ -1,0 +1,92 @@
+"""Inputs of friction besides the speed are chosen by blocks left out, and have to win."""
+
+import pytest
+import torch
+
+from nfriction import CVFM, NFCVFM, fit
+from nfriction.fitting.options import FitOptions
+from nfriction.fitting.strategy.inputs import chosen_inputs, contiguous_blocks
+from nfriction.fitting.task import prepare_task
+from nfriction.friction.coefficients import Constant
+from nfriction.friction.inputs import with_inputs
+from nfriction.friction.laws import COULOMB_VISCOUS
+from nfriction.friction.models import FrictionModel
+from tests.fitting.recordings import pendulum, swing
+
+V_SMOOTH = 0.05
+BRIEF = {"windows": (0.5,), "fit_plant": False, "drag": False}
+TRUTHS = {
+    "nothing": ([], [[5e-3, 1e-3], [2e-3, 5e-4]]),
+    "direction": (["direction"], [[5e-3, 1e-3, 2e-3], [2e-3, 5e-4, -1e-3]]),
+    "load": (["load"], [[1e-3, 1e-3, 4e-3], [5e-4, 5e-4, 2e-3]]),
+}
+
+
+def truth(name: str) -> FrictionModel:
+    inputs, values = TRUTHS[name]
+    law = with_inputs(COULOMB_VISCOUS, inputs)
+    return FrictionModel(law, Constant(law, 2, values), V_SMOOTH).requires_grad_(False)
+
+
+@pytest.fixture(scope="module", params=TRUTHS)
+def recorded(request):
+    recording = swing(pendulum(normal_load="bearing"), truth(request.param), seconds=3.0)
+    return request.param, recording, fit(CVFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **BRIEF)
+
+
+def test_an_input_is_chosen_where_friction_depends_on_it(recorded) -> None:
+    name, recording, law = recorded
+    model = NFCVFM(2, v_smooth=V_SMOOTH)
+    task = prepare_task(model, pendulum(), [recording], FitOptions(**BRIEF))
+    found = chosen_inputs(task, law)
+    if name == "nothing":
+        assert all(gain.share < 0.2 for gain in found)
+    else:
+        assert found[0].name == name
+        assert found[0].share > 0.5
+        assert "unexplained" in found[0].words(("a", "b"))
+
+
+@pytest.mark.parametrize(
+    "recorded",
+    ["load", *(pytest.param(name, marks=pytest.mark.slow) for name in ("nothing", "direction"))],
+    indirect=True,
+)
+def test_a_chosen_input_wins_or_leaves_the_model_as_it_was(recorded) -> None:
+    name, recording, law = recorded
+    model = NFCVFM(2, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2)
+    found = fit(model, pendulum(), recording, start=law, max_steps=3, **BRIEF)
+    assert found.model is model
+    if name == "nothing":
+        assert model.inputs is None
+        assert not found.inputs
+        return
+    assert model.inputs == [name]
+    assert f"Input {name}: -" in found.status
+    assert found.to_dict()["inputs"][0]["name"] == name
+    still = torch.zeros(1, 2, dtype=torch.float64)
+    expected = torch.tensor(TRUTHS[name][1], dtype=torch.float64)[:, -1]
+    term = model.coefficients(still, still)[0, :, -1]
+    torch.testing.assert_close(term, expected, rtol=0.3, atol=0)
+    loads = found.plant.load(still + 1.0, still + 4.0)
+    bearing = pendulum(normal_load="bearing").load(still + 1.0, still + 4.0)
+    assert torch.equal(loads, bearing) == (name == "load")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("recorded", ["load"], indirect=True)
+def test_inputs_that_are_given_stay(recorded) -> None:
+    _, recording, _ = recorded
+    model = NFCVFM(2, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2, inputs=())
+    assert not fit(model, pendulum(), recording, max_steps=2, **BRIEF).inputs
+
+
+def test_blocks_are_contiguous_and_share_out_each_recording() -> None:
+    class Spans:
+        spans = ((0, 0, 9), (0, 9, 18), (0, 18, 27), (0, 27, 36), (1, 0, 9))
+
+        def __len__(self) -> int:
+            return 5
+
+    blocks = contiguous_blocks(Spans(), 3)
+    assert [b.nonzero().flatten().tolist() for b in blocks] == [[0, 1], [2], [3], [4]]
