@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from numbers import Integral
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from nfriction.evaluation.lead_in import longest_window
 from nfriction.evaluation.parallel import Data, Fits, Progress, fit_models
 from nfriction.evaluation.score import score
 from nfriction.fitting.data.inputs import apply_encoder_offsets, looks_zeroed_per_recording
-from nfriction.fitting.options import DEFAULTS, checked_lengths
+from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction import model_by_name, model_name
 from nfriction.plant import Plant, rigs
@@ -144,7 +144,9 @@ def select(
         ValueError: if there are fewer than two folds, no model or no recording, or a recording is
             too short to be cut.
     """
-    plant, (horizon,) = rigs.of(plant), checked_lengths("horizon", [horizon])
+    plant = rigs.of(plant)
+    if not isinstance(horizon, Real) or not 0 < horizon < math.inf:
+        raise ValueError(f"`horizon` must be a positive length [s] such as 5.0, got {horizon!r}.")
     models = [models] if isinstance(models, str) else models
     recordings = Recording.many(recordings, plant=plant)
     if not isinstance(folds, Integral) or folds < 2 or not models or not recordings:

@@ -198,6 +198,11 @@ def _torque(model: FrictionModel, motion: Motion, load: Load | None) -> Tensor:
         raise ValueError(
             f"the motion must be (time, joint) with {model.joints} joints, got {motion.qd.shape}."
         )
+    if model.law.memory is not None:
+        raise ValueError(
+            f"damping and friction loss have no memory, and the law {model.law.name!r} has: export "
+            "a model without, such as coulomb-viscous."
+        )
     q, qd, qdd = (torch.as_tensor(x) for x in (motion.q, motion.qd, motion.qdd))
     weight = torch.ones_like(qd) if load is None else load(q, qd)
     schedule = model.schedule

@@ -175,6 +175,11 @@ def fit_memory(
         ValueError: if the rows have no time, or the law needs a load that the table lacks.
     """
     model = model_by_name(name)(1, v_smooth=v_smooth)
+    if model.schedule.follows_motion:
+        raise ValueError(
+            f"{plain_name(name)} is fitted to recordings of motion, not to tables; use its law, or "
+            "slip."
+        )
     if joint.time is None:
         raise ValueError(
             f"{plain_name(name)} remembers the motion before, and {joint.name} has no column time; "
@@ -182,11 +187,6 @@ def fit_memory(
         )
     require_load(name, joint)
     unknown: tuple[str, ...] = ()
-    if model.schedule.follows_motion:
-        raise ValueError(
-            f"{plain_name(name)} is fitted to recordings of motion, not to tables; use its law, or "
-            "slip."
-        )
     if "sigma_0" in model.law.names:
         found = fit_bristles(model.law, joint, blocks)
         if not found.presliding:

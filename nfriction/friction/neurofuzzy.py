@@ -474,7 +474,7 @@ class NeuroFuzzyModel(NamedModel):
         self.__init__(self.joints, v_smooth=self.v_smooth, **options)  # type: ignore[misc]
 
     def options(self) -> dict[str, Any]:
-        return super().options() | ({"inputs": self.inputs} if self.inputs else {})
+        return super().options() | ({} if self.inputs is None else {"inputs": self.inputs})
 
     @staticmethod
     def make_schedule(*args: Any, network: str = "anfis", **options: Any) -> Schedule:

@@ -163,7 +163,7 @@ def test_bad_input_is_refused():
         models, recordings, folds = arguments
         with pytest.raises(ValueError, match=message):
             select(pendulum(), models, recordings, folds=folds)
-    with pytest.raises(ValueError, match="`horizon` must be positive"):
+    with pytest.raises(ValueError, match=r"`horizon` must be a positive length .* got -1\.0"):
         select(pendulum(), "NCFM", recording, folds=2, horizon=-1.0)
 
 

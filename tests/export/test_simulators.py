@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from nfriction.export import fit_damping_frictionloss, mjcf, urdf
+from nfriction.friction.memory import Dahl
 from nfriction.friction.models import LFM, NCFM, NLFM
 from nfriction.friction.neurofuzzy import NFLFM
 from nfriction.io.model_file import ModelInfo
@@ -87,6 +88,8 @@ def test_a_motion_that_says_nothing_is_refused() -> None:
     still = Motion(TIME, *(np.zeros((len(TIME), 2)) for _ in range(3)))
     with pytest.raises(ValueError, match="stands still"):
         fit_damping_frictionloss(LFM(2), still)
+    with pytest.raises(ValueError, match="the law 'dahl' has: export a model without"):
+        fit_damping_frictionloss(Dahl(2), still)
     with pytest.raises(ValueError, match="with 2 joints"):
         fit_damping_frictionloss(LFM(2), swing(3))
 

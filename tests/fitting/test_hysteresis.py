@@ -146,6 +146,8 @@ def test_files_of_a_law_with_memory_predict_as_the_fit_does(
 
 def test_rows_in_no_order_have_no_memory() -> None:
     table = slip_table().drop(columns="time")[::5]
+    with pytest.raises(ValueError, match="fitted to recordings of motion, not to tables"):
+        fit_torque(table, "neuro-fuzzy:lugre")
     with pytest.raises(ValueError, match="has no column time"):
         fit_torque(table, "slip")
     assert "Slip" not in fit_torque(table, folds=2).fits

@@ -86,3 +86,11 @@ def test_a_law_of_ones_own_has_a_summary_too(found: FitResult) -> None:
 def test_constants_are_drawn_with_their_intervals(found: FitResult) -> None:
     assert len(found.plot().axes) == 2
     assert replace(found, model=NCFM(1, [2.0]), intervals=()).plot().axes
+
+
+def test_a_recording_at_rest_has_no_motion_to_judge_by(found: FitResult) -> None:
+    motions = tuple(replace(m, q=0.0 * m.q) for m in found.motions)
+    for noise in (0.0, 1e-9):
+        verdict, reason = replace(found, motions=motions, noise=noise, residual=1e-3).usability
+        assert verdict == "doubtful"
+        assert "the residual is larger than the motion" in reason

@@ -15,6 +15,7 @@ from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import LINEAR, NONLINEAR, STRIBECK, VISCOUS
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import LEAST_RATIO, LOGIT_SD, NFCVFM, NeuroFuzzy
+from nfriction.io.model_file import load, save
 from tests.friction.samples import LAWS, QUADRATIC, motion, normal, randomise
 
 every_law = pytest.mark.parametrize("law", [*LAWS, QUADRATIC], ids=lambda law: law.name)
@@ -380,3 +381,8 @@ def test_inputs_add_terms_that_leave_the_law_as_it_was() -> None:
 def test_inputs_are_refused_by_name(inputs: list[str]) -> None:
     with pytest.raises(ValueError, match="direction, load"):
         NFCVFM(2, inputs=inputs)
+
+
+def test_a_choice_of_no_inputs_outlasts_a_file(tmp_path) -> None:
+    assert load(save(NFCVFM(1, inputs=()), tmp_path / "m.json")).inputs == []
+    assert load(save(NFCVFM(1), tmp_path / "m.json")).inputs is None

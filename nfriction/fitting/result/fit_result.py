@@ -148,12 +148,16 @@ class FitResult:
         moved = np.concatenate([m.q.var(axis=0) for m in self.motions] or [[math.inf]])
         # A joint that turns over and over is somewhere on its circle.
         most = UNIFORM_TURN**2 if self.plant.unit == "rad" else math.inf
-        error = self.residual / math.sqrt(np.minimum(moved, most).mean())
-        wrong = error > DOUBTFUL_ERROR and self.residual > DEFAULTS.model_error_ratio * noise
-        far = (
-            f"the residual is {100 * error:.2g} % of the motion's standard deviation, and "
-            f"{self.residual / noise:.0f} times the measurement noise"
-        )
+        motion = math.sqrt(np.minimum(moved, most).mean())
+        above = self.residual > DEFAULTS.model_error_ratio * noise
+        wrong = above and self.residual > DOUBTFUL_ERROR * motion
+        # A recording at rest has no motion to compare with.
+        far = "the residual is larger than the motion"
+        if wrong and self.residual < motion:
+            far = (
+                f"the residual is {100 * self.residual / motion:.2g} % of the motion's standard "
+                f"deviation, and {self.residual / noise:.0f} times the measurement noise"
+            )
         if self.mistakes:
             return "do not use", f"a mistake in the data is likely: {self.mistakes[0]}"
         if not self.converged and wrong:
