@@ -118,6 +118,15 @@ class Simulator:
         scheme: Scheme,
         draws: int,
     ) -> None:
+        if friction is not None and not hasattr(friction, "law"):
+            raise TypeError(
+                "`friction` must be a friction model, such as that of a fit, or None, got "
+                f"{type(friction).__name__} {friction!r}."
+            )
+        if friction is not None and friction.joints != plant.joints:
+            raise ValueError(
+                f"the plant has {plant.joints} joints, the friction model {friction.joints}."
+            )
         self.plant, self.friction, self.recording = plant, friction, recording
         self.scheme, self.draws = scheme, draws
         self.convention = recording.resolve_convention(plant)
@@ -148,12 +157,18 @@ class Simulator:
 
     def free_runs(self, initial_state: tuple[Array, Array] | None) -> list[Runs]:
         """One run of each segment that is longer than a lead-in."""
-        runs = []
+        runs, given = [], None
+        if initial_state is not None:
+            shapes = [np.shape(part) for part in initial_state]
+            if shapes != [(self.plant.joints,)] * 2:
+                raise ValueError(
+                    f"`initial_state` must be q0 and qd0 of shape ({self.plant.joints},) each, "
+                    f"got {initial_state!r}."
+                )
+            given = np.concatenate(initial_state)[None]
         for first, last in self.recording.segments:
             if last - first >= self.lead:
-                state = None
-                if initial_state is not None and first == 0:
-                    state = np.concatenate(initial_state)[None]
+                state = given if first == 0 else None
                 runs.append(self._score(np.arange(first, last + 1)[None], state))
         return runs
 
