@@ -153,6 +153,18 @@ def score_covariance(
     return total
 
 
+def drawn_score(
+    rows: Iterable[Rows], kept: Kept, response: Tensor, precision: Tensor, errors: Tensor
+) -> Tensor:
+    """The same by drawn errors (window, sample, joint, draw), scaled like the rows."""
+    total = kept.squares(precision.sqrt()[..., None] * response)
+    sums = total.new_zeros(len(total), errors.shape[-1])
+    for part, scaled in rows:
+        own, others = kept.split(scaled)
+        sums += torch.einsum("wrc,wrd->cd", others + own @ response, errors[:, part].flatten(1, 2))
+    return total + sums @ sums.T / sums.shape[1]
+
+
 def _discard_roundoff(data: Tensor, sizes: Tensor) -> Tensor:
     """Curvature above the round-off of rows with these sums of squares (kept,), (kept, kept).
 

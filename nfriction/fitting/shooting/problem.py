@@ -36,6 +36,7 @@ from nfriction.fitting.robust_loss import SQUARES, RobustLoss
 from nfriction.fitting.shooting.normal_equations import (
     Kept,
     Rows,
+    drawn_score,
     marginalize_states,
     normal_equations,
     scaled_rows,
@@ -163,10 +164,11 @@ class ShootingProblem:
         precision, _ = self.variables.prior()
         return standard_deviations(information(hessian, precision, self.variables.shared_count))
 
-    def information(self, x: Tensor, sd: Tensor) -> Information:
+    def information(self, x: Tensor, sd: Tensor, count: float | None = None) -> Information:
         """Information about the shared variables, given the sd of each error times its weight.
 
-        `sd` is inflated for autocorrelation, (window, step + 1, joint).
+        `sd` is inflated for autocorrelation, (window, step + 1, joint). If the errors are the
+        rounding of encoders to a `count` [rad; m], their covariance is that of rounding instead.
         """
         variables, run = self.variables, self._simulate(x, with_memory=True)
         shared, (precision, _) = variables.shared_count, variables.prior()
@@ -174,10 +176,26 @@ class ShootingProblem:
         kept = Kept(variables.indices(), variables.state_count, len(x))
         scale = self._scale * self.loss.weight(self._deviation(x, run)).sqrt()
         data, response = marginalize_states(self._rows(run, scale), kept, of_states)
-        rows = self._rows(run, self._scale * sd / self.noise_sd)
-        score = score_covariance(rows, kept, response, of_states)
+        if count and self.loss is SQUARES and not variables.offset_count:
+            drawn = self._rounded(run, count) * self._scale[..., None]
+            score = drawn_score(self._rows(run, scale), kept, response, of_states, drawn)
+        else:
+            rows = self._rows(run, self._scale * sd / self.noise_sd)
+            score = score_covariance(rows, kept, response, of_states)
         prior = torch.cat([precision[:shared], of_offsets.flatten()])
         return information(data + torch.diag(prior), prior, shared, score)
+
+    def _rounded(self, run: Trajectory, count: float, draws: int = 100) -> Tensor:
+        """Rounding of the motion by encoders with any zero, (window, step + 1, joint, draw).
+
+        Positions to which a joint returns are rounded alike, at any time later.
+        """
+        q = (run.motion.q[:, :: self.substeps] @ self.measurement.T)[..., None] / count
+        random = torch.Generator().manual_seed(0)
+        shape = (len(self.windows.recordings), 1, q.shape[-2], draws)
+        zeros = torch.rand(shape, generator=random, dtype=torch.float64)
+        q = q + zeros[[place for place, *_ in self.windows.spans]]
+        return count * (q - q.round())
 
     @cached_property
     def _scale(self) -> Tensor:
