@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from nfriction.fitting.result.of_search import white_noise
-from nfriction.friction.memory import states_along
+from nfriction.friction.memory import deflections
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import require_model
 from nfriction.plant import Plant
@@ -150,13 +150,8 @@ class Simulator:
             if friction.state_size:
                 self.states = friction.schedule.states(qd, qdd)
             if friction.law.memory:
-                # Not deflected before the first sample.
-                step = torch.tensor(np.diff(self.time, prepend=0.0))
-                start = friction.law.initial_state(qd[0])
-                held = friction.coefficients(qd, qdd).expand(*qd.shape, -1)
-                self.law_states = states_along(
-                    friction.law.memory, start, qd, plant.load(q, qd), held, step
-                )
+                time = torch.tensor(self.time)
+                self.law_states, _ = deflections(friction, time, qd, qdd, plant.load(q, qd))
 
     def free_runs(self, initial_state: tuple[Array, Array] | None) -> list[Runs]:
         """One run of each segment that is longer than a lead-in."""
