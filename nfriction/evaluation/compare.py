@@ -11,8 +11,9 @@ import pandas as pd
 from nfriction.evaluation.parallel import Data, Progress, fit_models
 from nfriction.evaluation.score import HORIZONS, RMSE, Score, score
 from nfriction.fitting.data.inputs import warn_of_undriven
+from nfriction.fitting.options import checked_lengths
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction import model_name
+from nfriction.friction import both_names, model_name
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant, rigs
 from nfriction.recording import Recording, RecordingLike
@@ -36,12 +37,22 @@ Part = Literal["train", "test"]
 PART_NAMES: dict[Part, str] = {"test": "test recordings", "train": "training recordings"}
 
 
+class Fits(dict[str, FitResult]):
+    """Fits by the model's name, which may be the plain one: `fits["coulomb-viscous"]`."""
+
+    def __missing__(self, name: str) -> FitResult:
+        known = model_name(name)
+        if known in self:
+            return self[known]
+        raise KeyError(f"{name}; there are {', '.join(map(both_names, self))}")
+
+
 @dataclass(frozen=True, repr=False)
 class Comparison:
     """Fits and scores of several models on the same recordings.
 
     Attributes:
-        fits: by model name.
+        fits: by model name, see `Fits`.
         train, test: scores by model name, then recording, `"no friction"` among them.
         unit: of the errors, `"rad"` or `"m"`.
         joint_names: columns of the tables.
@@ -66,6 +77,13 @@ class Comparison:
         lines += table.to_string(float_format=lambda x: f"{x:.4g}").splitlines()
         lines += [f"not fitted: {name}: {why}" for name, why in self.failed.items()]
         return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        """The same for a notebook."""
+        head, _, _ = repr(self).partition("\n")
+        table = 1e3 * self.table(part="test" if self.test else "train").rename(index=both_names)
+        table.index.name = f"[m{self.unit}]"
+        return f"<p>{head}</p>{table.to_html(float_format=lambda x: f'{x:.4g}')}"
 
     @property
     def parts(self) -> tuple[Part, ...]:
@@ -336,6 +354,7 @@ def compare(
             could not, `failed` has the reasons.
     """
     models = [models] if isinstance(models, str) else models
+    horizons = checked_lengths("horizons", horizons, 0)
     plant = rigs.of(plant)
     train = Recording.many(train, plant=plant, name="train")
     test = Recording.many(test, plant=plant, name="test")
@@ -368,7 +387,7 @@ def compare(
                 ]  # fmt: skip
         progress.done()
     return Comparison(
-        fits, **scores, unit=plant.unit, joint_names=tuple(plant.joint_names),
+        Fits(fits), **scores, unit=plant.unit, joint_names=tuple(plant.joint_names),
         horizons_asked=tuple(horizons), failed=failed,
     )  # fmt: skip
 

@@ -10,13 +10,13 @@ error of its start more than that of the model. The next step is
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nfriction.evaluation.lead_in import DRAWS, LEAD_IN, Runs, Simulator
+from nfriction.fitting.options import checked_lengths
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant, rigs
 from nfriction.recording import Recording, RecordingLike
@@ -105,7 +105,7 @@ class Score(Errors):
 
 
 def score(
-    plant: Plant | str | Path,
+    plant: Plant | str,
     friction: FrictionModel | None,
     recording: RecordingLike,
     *,
@@ -119,8 +119,7 @@ def score(
     Args:
         plant: the mechanism, its name, or the path of a rig file.
         friction: friction model, or None for no friction.
-        recording: the measured motion, or the path of a file or a table, see `Recording.of`; the
-            plant's angle convention applies where it has none.
+        recording: or its path or table; the plant's angle convention applies where it has none.
         initial_state: q0 and qd0 of the free run in the recording's convention, (joint,) each,
             taken as they are and scored from; by default estimated from a lead-in.
         horizons: lengths of windows [s]; those longer than the recording are skipped.
@@ -136,6 +135,7 @@ def score(
     """
     plant = rigs.of(plant)
     recording = Recording.of(recording, plant=plant)
+    horizons = checked_lengths("horizons", horizons, 0)
     simulator = Simulator(plant, friction, recording, scheme, DRAWS if limit else 0)
     runs = simulator.free_runs(initial_state)
     if not runs:
@@ -143,9 +143,7 @@ def score(
             f"{recording.name or 'the recording'} is too short to be scored: its longest stretch "
             f"without a gap must be longer than the lead-in of {LEAD_IN:g} s."
         )
-    # Short windows show the torque law, long ones how its errors add up.
-    found = {f"{horizon:g}": simulator.windows(horizon) for horizon in horizons}
-    windows = {horizon: run for horizon, run in found.items() if run is not None}
+    windows = {f"{h:g}": run for h in horizons if (run := simulator.windows(h)) is not None}
     simulated = np.full_like(recording.q, np.nan)
     for run in runs:
         simulated[run.samples] = run.q

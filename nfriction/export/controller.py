@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.sampled import sampled
 from nfriction.io.files import numbers
-from nfriction.io.model_file import ModelInfo
+from nfriction.io.model_file import ModelInfo, require_model
 from nfriction.signals import SecondOrderLowPass
 
 # Bits of the status.
@@ -55,6 +55,7 @@ def controller_of(
             its sample time.
     """
     info = info or ModelInfo()
+    require_model(model)
     if model.law.memory is not None:
         if info.sample_time is None:
             raise ValueError(

@@ -152,6 +152,15 @@ class ModelFileError(ValueError):
     """A model file is absent, damaged or no model file."""
 
 
+def require_model(model: object) -> None:
+    """Raise TypeError for what is no friction model."""
+    if not isinstance(model, FrictionModel):
+        raise TypeError(
+            f"a friction model is needed, got {type(model).__name__}; that of a fit is "
+            "`result.model`."
+        )
+
+
 def save(model: FrictionModel, path: str | Path, info: ModelInfo | None = None) -> Path:
     """Write a model to one JSON file, whole or not at all.
 
@@ -164,9 +173,11 @@ def save(model: FrictionModel, path: str | Path, info: ModelInfo | None = None) 
         The path.
 
     Raises:
+        TypeError: it is no friction model.
         ValueError: a parameter is not finite, or `info` is not plain JSON.
         OSError: the file cannot be written.
     """
+    require_model(model)
     state = model.state_dict()
     for name, value in state.items():
         if not torch.isfinite(value).all():

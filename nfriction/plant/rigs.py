@@ -35,7 +35,6 @@ from nfriction.plant.chain import Arm, PendulumChain
 from nfriction.plant.rotor import Rotor
 
 _HANGING = ("relative", "hanging")
-_STEEL = 7850.0  # density [kg/m^3]
 _PAPER_QUANTUM = math.tau / 8192  # 2048 pulses per revolution, counted on all four edges
 
 InertiaCase = Literal["none", "izz"] | Sequence[Sequence[float]] | Tensor
@@ -310,32 +309,11 @@ def read(path: str | Path) -> Plant:
         if path.is_file() and path.stat().st_size > LARGEST_FILE:
             # Before it is read into memory.
             raise ValueError(f"rig files are at most {LARGEST_FILE} bytes.")
-        plant = from_dict(_parse(path.read_bytes().decode(), path.suffix.lower()))
-        _warn_of_grams(plant)
-        return plant
+        return from_dict(_parse(path.read_bytes().decode(), path.suffix.lower()))
     except RecursionError:
         raise ValueError(f"{path}: nested too deeply for a rig.") from None
     except ValueError as error:  # those of JSON, TOML and Unicode too
         raise ValueError(f"{path}: {str(error)[:600]}") from error
-
-
-def _warn_of_grams(plant: Plant) -> None:
-    """Warn of links heavier than a block of steel as long, wide and high as the link.
-
-    Without a torque column a free pendulum cannot show it: all torques scale with its masses.
-    """
-    if not isinstance(plant, PendulumChain) or isinstance(plant, Rotor):
-        return
-    for name, mass, length in zip(
-        plant.joint_names[plant.first_link :], plant.to_dict()["mass"], plant.length.tolist(),
-        strict=True,
-    ):  # fmt: skip
-        if mass > _STEEL * length**3:
-            warnings.warn(
-                f"the link of {name} would weigh {mass:g} kg at a length of {length:g} m; is "
-                "`mass` in g? It must be in kg.",
-                stacklevel=3,
-            )
 
 
 def write(plant: Plant, path: str | Path) -> None:

@@ -66,6 +66,16 @@ def test_it_tells_in_a_few_lines_who_is_best(comparison):
     assert told.endswith("not fitted: ALFM: no classes")
 
 
+def test_fits_are_found_by_plain_names_and_a_notebook_shows_them(comparison):
+    found, _ = comparison
+    assert found.fits["load-coulomb"] is found.fits["LFM"]
+    with pytest.raises(KeyError, match=r"stribeck; there are viscous \(NCFM\)"):
+        found.fits["stribeck"]
+    page = found._repr_html_()
+    assert "load-coulomb (LFM)" in page
+    assert f"{1e3 * found.table()['all']['LFM']:.4g}" in page
+
+
 def test_one_name_and_one_recording_need_no_list():
     settings = {"horizons": (0.5,), "windows": (0.5,), "max_steps": 1}
     one = compare(pendulum(), "viscous", A, B, **settings)

@@ -142,7 +142,7 @@ def test_mistakes_in_torques(name, change, finding):
         ("motor", {"mass": [1e3], "inertia": [7.5]}, "masses are in g"),
         ("driven", {"length": [300, 250], "com": [150, 120]}, "lengths are in mm"),
         ("free", {"length": [300, 250], "com": [150, 120]}, "lengths are in mm"),
-        ("free", {"mass": [500, 300], "inertia": [3.75, 1.56]}, "heavier than a cube of lead"),
+        ("free", {"mass": [500, 300], "inertia": [3.75, 1.56]}, "heavier than a cube of steel"),
     ],
 )
 def test_mistakes_in_rigs(name, rig, finding):

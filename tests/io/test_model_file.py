@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from nfriction import PendulumChain, __version__, rollout, score
+from nfriction import LinearAxis, PendulumChain, __version__, rollout, score
 from nfriction.friction import model_by_name
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
@@ -68,6 +68,12 @@ def test_a_model_comes_back_bit_for_bit(name: str, tmp_path: Path) -> None:
     assert all(torch.equal(found[key], value) for key, value in expected.items())
     inputs = motion(50, 3)
     assert torch.equal(loaded(*inputs), model(*inputs))
+
+
+def test_what_is_no_model_is_named_with_the_place_of_one(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match=r"got LinearAxis; that of a fit is `result.model`"):
+        save(LinearAxis(2.0), tmp_path / "m.json")  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
 
 
 def test_every_constructor_argument_of_the_named_models_is_kept(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 import json
 import math
 import sys
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -218,13 +217,3 @@ def test_an_arm_is_one_and_keeps_plain_numbers() -> None:
     for wrong in (None, [1.0], "rig"):
         with pytest.raises(ValueError, match="a rig is one table"):
             rigs.from_dict(wrong)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(("mass", "count"), [(0.4, 0), (400, 1)])
-def test_grams_are_suspected_in_a_file(tmp_path: Path, mass: float, count: int) -> None:
-    path = tmp_path / "rig.json"
-    path.write_text(json.dumps({"mass": [mass, 0.1], "length": [0.35, 0.3], "inertia": [4, 0.1]}))
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        rigs.read(path)
-    assert ["400 kg at a length of 0.35 m" in str(w.message) for w in caught] == [True] * count

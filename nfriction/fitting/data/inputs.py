@@ -234,8 +234,8 @@ ZEROED_PER_RECORDING = (
     "Every recording begins at rest with all encoders at zero; assumed that they were zeroed "
     'there, in whatever pose. If not: `encoder_reference="shared"`.'
 )
-# Density of lead [kg/m^3].
-LEAD = 11_340.0
+# Density of steel [kg/m^3].
+STEEL = 7_850.0
 # Error of angles from one conversion to the next, with room.
 ROUNDING = 1e-9
 
@@ -336,9 +336,9 @@ def _implausible_masses(plant: Plant) -> Iterator[str]:
     if "length" not in data:
         return  # a rotor: its size is not known
     for k, (mass, length) in enumerate(zip(data["mass"], data["length"], strict=True)):
-        if mass > LEAD * length**3:
+        if mass > STEEL * length**3:
             yield (
                 f"Link {k + 1} of {mass:g} kg and {length:g} m would be heavier than a cube of "
-                "lead that long; a free swing does not show the scale of masses, so friction is "
+                "steel that long; a free swing does not show the scale of masses, so friction is "
                 "too large by the same factor if they are in g."
             )
