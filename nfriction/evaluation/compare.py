@@ -11,6 +11,7 @@ import pandas as pd
 from nfriction.evaluation.parallel import Data, Progress, fit_models
 from nfriction.evaluation.score import HORIZONS, RMSE, Score, score
 from nfriction.fitting.data.inputs import warn_of_undriven
+from nfriction.fitting.options import checked_lengths
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction import both_names, model_name
 from nfriction.friction.models import FrictionModel
@@ -353,6 +354,7 @@ def compare(
             could not, `failed` has the reasons.
     """
     models = [models] if isinstance(models, str) else models
+    horizons = checked_lengths("horizons", horizons, 0)
     plant = rigs.of(plant)
     train = Recording.many(train, plant=plant, name="train")
     test = Recording.many(test, plant=plant, name="test")

@@ -4,6 +4,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from numbers import Integral
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,11 +16,11 @@ from nfriction.evaluation.lead_in import longest_window
 from nfriction.evaluation.parallel import Data, Fits, Progress, fit_models
 from nfriction.evaluation.score import score
 from nfriction.fitting.data.inputs import apply_encoder_offsets, looks_zeroed_per_recording
-from nfriction.fitting.options import DEFAULTS
+from nfriction.fitting.options import DEFAULTS, checked_lengths
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction import model_by_name, model_name
-from nfriction.plant import Plant
-from nfriction.recording import Recording
+from nfriction.plant import Plant, rigs
+from nfriction.recording import Recording, RecordingLike
 from nfriction.signals import Motion, kalman_smoother
 
 # Relative difference of errors that counts as none.
@@ -112,9 +114,9 @@ class Selection:
 
 
 def select(
-    plant: Plant,
-    models: Sequence[str],
-    recordings: Sequence[Recording],
+    plant: Plant | str | Path,
+    models: str | Sequence[str],
+    recordings: RecordingLike | Sequence[RecordingLike],
     *,
     folds: int = 3,
     horizon: float = 5.0,
@@ -142,10 +144,13 @@ def select(
         ValueError: if there are fewer than two folds, no model or no recording, or a recording is
             too short to be cut.
     """
-    if folds < 2 or not models or not recordings:
+    plant, (horizon,) = rigs.of(plant), checked_lengths("horizon", [horizon])
+    models = [models] if isinstance(models, str) else models
+    recordings = Recording.many(recordings, plant=plant)
+    if not isinstance(folds, Integral) or folds < 2 or not models or not recordings:
         raise ValueError(
-            "a choice needs models, recordings and at least 2 folds, got "
-            f"{len(models)} models, {len(recordings)} recordings and {folds} folds."
+            "a choice needs models, recordings and a whole number of at least 2 folds, got "
+            f"{len(models)} models, {len(recordings)} recordings and {folds!r} folds."
         )
     names = list(dict.fromkeys(map(model_name, models)))
     by_recording = [blocked_k_fold(plant, recording, folds) for recording in recordings]

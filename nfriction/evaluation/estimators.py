@@ -17,6 +17,7 @@ from nfriction.evaluation.lead_in import longest_window
 from nfriction.evaluation.score import score
 from nfriction.fitting.fit import fit
 from nfriction.fitting.result.fit_result import FitResult
+from nfriction.friction.memory import deflections
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant, rigs
 from nfriction.recording import Recording, RecordingLike
@@ -156,10 +157,12 @@ class FrictionEstimator(BaseEstimator):
 
         Returns:
             The torque of `M(q) qdd + bias(q, qd) + tau_f = tau` [N m; N of a sliding axis],
-            (sample, joint). Coefficients with a state follow the samples in their order.
+            (sample, joint). Coefficients with a state follow the samples in their order, and so
+            does a law with memory, not deflected before the first.
 
         Raises:
-            ValueError: if it is not fitted, or shapes do not fit.
+            ValueError: if it is not fitted, shapes do not fit, or a law with memory gets no
+                recording, whose time moves it.
         """
         model, plant = self._fitted.model, self._fitted.plant
         with torch.no_grad():
@@ -169,6 +172,10 @@ class FrictionEstimator(BaseEstimator):
                 motion = kalman_smoother(joint.time, joint.q)
                 q, velocity, acceleration = map(torch.tensor, (motion.q, motion.qd, motion.qdd))
                 loads = plant.load(q, velocity)
+                if model.law.memory:
+                    time = torch.tensor(joint.time)
+                    states, held = deflections(model, time, velocity, acceleration, loads)
+                    return model.law.memory.torque(states, velocity, loads, held).numpy()
             else:
                 velocity = self._rows(X, "X")
                 acceleration, loads = (

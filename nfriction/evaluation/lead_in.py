@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from nfriction.fitting.result.of_search import white_noise
-from nfriction.friction.memory import states_along
+from nfriction.friction.memory import deflections
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
 from nfriction.recording import Recording
@@ -118,6 +118,15 @@ class Simulator:
         scheme: Scheme,
         draws: int,
     ) -> None:
+        if friction is not None and not hasattr(friction, "law"):
+            raise TypeError(
+                "`friction` must be a friction model, such as that of a fit, or None, got "
+                f"{type(friction).__name__} {friction!r}."
+            )
+        if friction is not None and friction.joints != plant.joints:
+            raise ValueError(
+                f"the plant has {plant.joints} joints, the friction model {friction.joints}."
+            )
         self.plant, self.friction, self.recording = plant, friction, recording
         self.scheme, self.draws = scheme, draws
         self.convention = recording.resolve_convention(plant)
@@ -143,22 +152,23 @@ class Simulator:
             if friction.state_size:
                 self.states = friction.schedule.states(qd, qdd)
             if friction.law.memory:
-                # Not deflected before the first sample.
-                step = torch.tensor(np.diff(self.time, prepend=0.0))
-                start = friction.law.initial_state(qd[0])
-                held = friction.coefficients(qd, qdd).expand(*qd.shape, -1)
-                self.law_states = states_along(
-                    friction.law.memory, start, qd, plant.load(q, qd), held, step
-                )
+                time = torch.tensor(self.time)
+                self.law_states, _ = deflections(friction, time, qd, qdd, plant.load(q, qd))
 
     def free_runs(self, initial_state: tuple[Array, Array] | None) -> list[Runs]:
         """One run of each segment that is longer than a lead-in."""
-        runs = []
+        runs, given = [], None
+        if initial_state is not None:
+            shapes = [np.shape(part) for part in initial_state]
+            if shapes != [(self.plant.joints,)] * 2:
+                raise ValueError(
+                    f"`initial_state` must be q0 and qd0 of shape ({self.plant.joints},) each, "
+                    f"got {initial_state!r}."
+                )
+            given = np.concatenate(initial_state)[None]
         for first, last in self.recording.segments:
             if last - first >= self.lead:
-                state = None
-                if initial_state is not None and first == 0:
-                    state = np.concatenate(initial_state)[None]
+                state = given if first == 0 else None
                 runs.append(self._score(np.arange(first, last + 1)[None], state))
         return runs
 

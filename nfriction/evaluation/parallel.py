@@ -17,6 +17,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
+from numbers import Integral
 from queue import SimpleQueue
 from typing import Any, NamedTuple, TypeVar
 
@@ -175,8 +176,8 @@ def _fit(
 
 def check_jobs(jobs: int) -> None:
     """Require at least one process, and joblib where there are several."""
-    if jobs == 0:
-        raise ValueError("`jobs` must be at least 1, or -1 for one to each core, got 0.")
+    if not isinstance(jobs, Integral) or jobs == 0:
+        raise ValueError(f"`jobs` must be at least 1, or -1 for one to each core, got {jobs!r}.")
     if jobs != 1:
         try:
             import joblib  # noqa: F401

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nfriction.evaluation.lead_in import DRAWS, LEAD_IN, Runs, Simulator
+from nfriction.fitting.options import checked_lengths
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant, rigs
 from nfriction.recording import Recording, RecordingLike
@@ -133,6 +134,7 @@ def score(
     """
     plant = rigs.of(plant)
     recording = Recording.of(recording, plant=plant)
+    horizons = checked_lengths("horizons", horizons, 0)
     simulator = Simulator(plant, friction, recording, scheme, DRAWS if limit else 0)
     runs = simulator.free_runs(initial_state)
     if not runs:

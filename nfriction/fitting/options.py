@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Literal, get_args
 
 Method = Literal["equation_error", "output_error"]
@@ -208,7 +209,16 @@ class FitOptions:
             value = getattr(self, name)
             if value not in allowed:
                 raise ValueError(f"`{name}` must be one of {allowed}, got {value!r}.")
-        object.__setattr__(self, "windows", _checked_lengths(self.windows))
+        object.__setattr__(self, "windows", checked_lengths("windows", self.windows))
+        # Any text would count as true.
+        for name in ("fit_plant", "drag", "fit_delay"):
+            value = getattr(self, name)
+            if value not in ((True, False, None) if name == "drag" else (True, False)):
+                raise ValueError(f"`{name}` must be True or False, got {value!r}.")
+        if not isinstance(self.max_steps, Integral) or self.max_steps < 0:
+            raise ValueError(
+                f"`max_steps` must be a whole number of at least 0, got {self.max_steps!r}."
+            )
         if self.method == "equation_error":
             if self.encoder_reference == "per_recording":
                 raise ValueError(
@@ -218,16 +228,16 @@ class FitOptions:
                 raise ValueError('`fit_delay=True` needs `method="output_error"`.')
 
 
-def _checked_lengths(windows: object) -> tuple[float, ...]:
-    """Window lengths [s]: at least one, finite and positive."""
+def checked_lengths(name: str, given: object, least: int = 1) -> tuple[float, ...]:
+    """Lengths of windows [s]: so many at least, finite and positive."""
     try:
         # Texts are no lengths, though Python converts some to numbers.
-        lengths = tuple(float(1.0 * w) for w in windows)  # type: ignore[attr-defined]
+        lengths = tuple(float(1.0 * w) for w in given)  # type: ignore[attr-defined]
     except TypeError:
-        lengths = ()
-    if not lengths or not all(0 < w < math.inf for w in lengths):
+        lengths = (math.nan,)
+    if len(lengths) < least or not all(0 < w < math.inf for w in lengths):
         raise ValueError(
-            f"`windows` must be positive lengths [s] such as (0.5, 2.0), got {windows!r}; a single "
+            f"`{name}` must be positive lengths [s] such as (0.5, 2.0), got {given!r}; a single "
             f"one is (2.0,)."
         )
     return lengths

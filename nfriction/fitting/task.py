@@ -74,6 +74,8 @@ def prepare_task(
 ) -> FitTask:
     """Check and convert the arguments of a fit; see `fit`."""
     plant = rigs.of(plant)
+    if not isinstance(start, FitResult | None):
+        raise TypeError(f"`start` must be the result of a fit, got a {type(start).__name__}.")
     model = as_model(model, plant.joints)
     given = as_recording_list(recordings, plant)
     if "p_0" in model.law.names:

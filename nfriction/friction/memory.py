@@ -80,6 +80,19 @@ def states_along(
     return torch.stack(states)
 
 
+def deflections(
+    model: FrictionModel, time: Tensor, qd: Tensor, qdd: Tensor, load: Tensor
+) -> tuple[Tensor, Tensor]:
+    """States of a law with memory along a motion, and its coefficients, not deflected before.
+
+    `time` is (sample,), the motion (sample, joint); the results are (sample, joint, any).
+    """
+    assert model.law.memory is not None
+    held = model.coefficients(qd, qdd).expand(*qd.shape, -1)
+    step, start = torch.diff(time, prepend=time[:1]), model.law.initial_state(qd[0])
+    return states_along(model.law.memory, start, qd, load, held, step), held
+
+
 def reference_coefficients(model: FrictionModel) -> Tensor:
     """Constants that deflections are measured by: a network's are those from which it deviates."""
     return [*model.schedule.coefficient_sets().values()][-1].clone()

@@ -212,3 +212,20 @@ class FuzzyRules:
         held = x.clamp(self.lower[joint, variable], self.upper[joint, variable])[:, None]
         z = (held - self.centres[variable][joint]) / self.widths[variable][joint]
         return torch.exp(-0.5 * z * z)
+
+    def seconds(self, step: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+        """Time for which a motion fired each rule [s], (joint, rule).
+
+        A sample is shared out among the rules by their strengths.
+
+        Args:
+            step: time that each sample counts for [s], (sample,).
+            qd, qdd: velocity and acceleration, (sample, joint).
+        """
+        along = qdd * qd.sign() if self.along_motion else qdd
+        found = []
+        for j in range(qd.shape[1]):
+            v, a = (self.memberships(i, j, x[:, j]) for i, x in enumerate((qd.abs(), along)))
+            v, a = v / v.sum(1, keepdim=True), a / a.sum(1, keepdim=True)
+            found.append(((step[:, None] * v).T @ a).flatten())
+        return torch.stack(found)

@@ -373,9 +373,12 @@ def _fuzzy_models(run: Run) -> Iterator[dict[str, Any]]:
         if np.allclose([[rule.values for rule in of.rules] for of in in_words], first, 1e-9, 0.0):
             yield {"name": name, "constant": True}
             continue
-        for of in in_words:
+        fired = run.fits[name].rule_seconds
+        for j, of in enumerate(in_words):
+            seconds = fired[j] if len(fired) == len(in_words) else ()
             rows: tuple[tuple[Value, ...], ...] = tuple(
-                (f"{rule.condition} THEN", *rule.values) for rule in of.rules
+                (f"{rule.condition} THEN", *rule.values, *seconds[k : k + 1])
+                for k, rule in enumerate(of.rules)
             )
             terms: tuple[tuple[Value, ...], ...] = tuple(
                 (f"{quantity}: {term.name}", term.centre, term.width, u)
@@ -387,7 +390,10 @@ def _fuzzy_models(run: Run) -> Iterator[dict[str, Any]]:
             )
             head, columns = f"{name}, {of.joint}", ("word", "middle", "standard deviation", "unit")
             joints.append({
-                "rules": Table(f"{head}: {len(rows)} rules", ("rule", *heads), rows),
+                "rules": Table(
+                    f"{head}: {len(rows)} rules",
+                    ("rule", *heads, *(["recorded [s]"] if seconds else [])), rows,
+                ),
                 "terms": Table(f"{head}: meaning of the words", columns, terms),
             })  # fmt: skip
         yield {

@@ -47,6 +47,7 @@ class FitRecord:
         usability: "good", "doubtful" or "do not use", and why.
         intervals: 95 % interval by parameter, infinity for an open end.
         plant: adjusted terms of the plant by name.
+        rule_seconds: how long the recordings fired each rule of a network [s], by joint.
     """
 
     status: str = "unknown"
@@ -59,6 +60,7 @@ class FitRecord:
     unidentifiable: tuple[str, ...] = ()
     plant: dict[str, float] = field(default_factory=dict)
     intervals: dict[str, tuple[float, float]] = field(default_factory=dict)
+    rule_seconds: tuple[tuple[float, ...], ...] = ()
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from nfriction.codegen.rollout_program import SPEED_LIMIT
 from nfriction.simulation.protocols import (
@@ -83,7 +82,6 @@ def simulate_eager(
     plant: Plant,
     friction: Friction,
     inputs: RolloutInputs,
-    progress: bool = False,
     step_function: StepFunction = rk4_step,
 ) -> tuple[Tensor, ...]:
     """States at every sample in eager torch: q, qd, qdd, each (*batch, steps + 1, joint).
@@ -97,7 +95,7 @@ def simulate_eager(
     internal = [] if inputs.law_state is None else [inputs.law_state]
     states = [(q, qd, qdd, *internal)]
     stateful, hidden = as_stateful(friction), inputs.hidden_state
-    for k in tqdm(range(step.shape[-1]), disable=not progress, unit="step", leave=False):
+    for k in range(step.shape[-1]):
         measured = None
         if inputs.measured is not None:
             measured = inputs.measured[0][..., k, :], inputs.measured[1][..., k, :]

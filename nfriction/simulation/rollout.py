@@ -57,7 +57,6 @@ def rollout(
     gradients: bool | None = None,
     backend: Backend = "auto",
     threads: int = 1,
-    progress: bool = False,
 ) -> Rollout:
     """Simulate a plant with friction from an initial state.
 
@@ -95,7 +94,6 @@ def rollout(
             sweep, which gives first derivatives only; for higher ones, or within `torch.func`,
             `"torch"` records every step.
         threads: number of threads that share a compiled batch.
-        progress: show a progress bar (eager torch only; compiled rollouts take milliseconds).
 
     Returns:
         Rollout with `q` and `qd` of shape (*batch, steps + 1, joint). A motion that diverges is no
@@ -114,13 +112,13 @@ def rollout(
     if scheme not in get_args(Scheme):
         raise ValueError(f"`scheme` must be one of {get_args(Scheme)}, got {scheme!r}.")
     if scheme == "time_stepping":
-        return Rollout.of(inputs, simulate_stiction(plant, model, inputs, progress, gradients))
+        return Rollout.of(inputs, simulate_stiction(plant, model, inputs, gradients))
     system = System.of(plant, model)
     require_stability(system, inputs)
     warn_of_sample_time(model, inputs)
     if gradients is None:
         gradients = backend != "compiled" and wants_gradients(inputs, system.tensors.values())
-    states = simulate(system, inputs, gradients, backend, threads, progress)
+    states = simulate(system, inputs, gradients, backend, threads)
     return Rollout.of(inputs, states)
 
 
@@ -137,7 +135,6 @@ def simulate(
     gradients: bool = False,
     backend: Backend = "auto",
     threads: int = 1,
-    progress: bool = False,
 ) -> tuple[Tensor, ...]:
     """States q, qd, qdd, each (*batch, steps + 1, joint), by the backend that can compute them."""
     compiled = wants_compiled(backend, inputs.q0, gradients)
@@ -146,12 +143,11 @@ def simulate(
     # With gradients the motion itself may still be compiled: the adjoint sweep adds them.
     if gradients and backend == "auto":
         states = adjoint_rollout(
-            lambda: simulate(system, inputs, threads=threads, progress=progress),
-            system.plant, system.friction, inputs,
-        )  # fmt: skip
+            lambda: simulate(system, inputs, threads=threads), system.plant, system.friction, inputs
+        )
     elif compiled:
         states = integrate_compiled(system, inputs, backend, threads, step_function=step_function)
     if states is None:
         with torch.set_grad_enabled(gradients and torch.is_grad_enabled()):
-            states = simulate_eager(system.plant, system.friction, inputs, progress, step_function)
+            states = simulate_eager(system.plant, system.friction, inputs, step_function)
     return states

@@ -83,7 +83,7 @@ def moreau_step(
 
 @torch.no_grad()
 def simulate_stiction(
-    plant: Plant, friction: Friction, inputs: RolloutInputs, progress: bool, gradients: bool | None
+    plant: Plant, friction: Friction, inputs: RolloutInputs, gradients: bool | None
 ) -> tuple[Tensor, ...]:
     """States at every sample: q, qd, qdd, each (*batch, steps + 1, joint).
 
@@ -112,5 +112,5 @@ def simulate_stiction(
         System.of(plant, friction), double, "auto", 1, step_function=moreau_step
     )
     if states is None:
-        states = simulate_eager(plant, friction, double, progress, moreau_step)
+        states = simulate_eager(plant, friction, double, moreau_step)
     return tuple(x.to(inputs.q0) for x in states)

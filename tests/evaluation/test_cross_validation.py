@@ -156,12 +156,15 @@ def test_bad_input_is_refused():
     recording = swing(pendulum(), NCFM(2, [[1e-3]] * 2), seconds=0.4)
     for arguments, message in (
         ((["NCFM"], [recording], 1), "2 folds"),
+        (("NCFM", recording, 2.5), "1 models, 1 recordings and 2.5 folds"),
         (([], [recording], 2), "0 models"),
         ((["NCFM"], [recording], 3), "too few"),
     ):
         models, recordings, folds = arguments
         with pytest.raises(ValueError, match=message):
             select(pendulum(), models, recordings, folds=folds)
+    with pytest.raises(ValueError, match="`horizon` must be positive"):
+        select(pendulum(), "NCFM", recording, folds=2, horizon=-1.0)
 
 
 @pytest.mark.slow

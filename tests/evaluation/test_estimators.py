@@ -8,9 +8,10 @@ import pandas as pd
 import pytest
 import torch
 
-from nfriction import ALFM, LFM, NCFM, LinearAxis, Recording, fit, score
+from nfriction import ALFM, LFM, NCFM, LinearAxis, Recording, fit, rollout, score
 from nfriction.evaluation.estimators import FrictionEstimator
 from nfriction.evaluation.lead_in import lead_in_samples
+from nfriction.friction.memory import LuGre
 from tests.fitting.recordings import driven_axis, pendulum, swing
 
 pytest.importorskip("sklearn")
@@ -90,6 +91,23 @@ def test_a_memory_follows_the_samples(fitted: FrictionEstimator) -> None:
     np.testing.assert_allclose(estimator.predict(qd, qdd), expected, rtol=1e-12)
     with pytest.raises(AttributeError, match="follow the motion"):
         _ = estimator.coef_
+
+
+def test_a_law_with_memory_follows_a_recording(fitted: FrictionEstimator) -> None:
+    """Torques in it, below breakaway and sliding, are those of the rollout that made it."""
+    model = LuGre(1, [1.0, 0.5, 0.05, 300.0, 5.0, 0.4]).requires_grad_(False)
+    time = np.arange(3001) * 1e-3
+    tau = (np.array([0.7, 2.0])[(time > 1.5).astype(int)] * np.sin(6 * time))[:, None]
+    zero, axis = torch.zeros(1, dtype=torch.float64), LinearAxis(0.5)
+    run = rollout(axis, model, zero, zero, torch.tensor(tau[:-1]), sample_time=1e-3)
+    recording = Recording(time, run.q.numpy(), tau=tau, unit="m")
+    estimator = FrictionEstimator(axis, "lugre")
+    estimator.fit_ = dataclasses.replace(fitted.fit_, model=model, plant=axis)
+    found = estimator.predict(recording)[10:-10]
+    true = (tau - 0.5 * np.gradient(run.qd.numpy(), time, axis=0))[10:-10]
+    assert np.sqrt(np.mean((found - true) ** 2)) < 0.02 * true.std()
+    with pytest.raises(ValueError, match="has an internal state"):
+        estimator.predict(run.qd.numpy())
 
 
 def test_simulates_into_a_table_like_that_of_the_recording(

@@ -95,6 +95,21 @@ def test_friction_too_steep_to_simulate_is_diverged_and_said(caplog):
         assert re.search(told, caplog.text)
 
 
+@pytest.mark.parametrize(
+    ("model", "settings", "error", "message"),
+    [
+        (CVFM(1), {}, ValueError, "the plant has 2 joints, the friction model 1"),
+        ("LFM", {}, TypeError, "`friction` must be a friction model, .* got str 'LFM'"),
+        (MODEL, {"horizons": 1.0}, ValueError, r"`horizons` must be positive lengths \[s\]"),
+        (MODEL, {"horizons": (0.5, -1.0)}, ValueError, r"`horizons` must be positive lengths"),
+        (MODEL, {"initial_state": (3.0, 0.0)}, ValueError, r"q0 and qd0 of shape \(2,\) each"),
+    ],
+)
+def test_bad_input_is_refused(model, settings, error, message):
+    with pytest.raises(error, match=message):
+        score(plant(), model, swing(plant(), MODEL, seconds=0.5), **settings)
+
+
 def test_joints_and_all_are_one_sum_of_squares():
     error = np.random.default_rng(0).normal(size=(3, 50, 2)) * [1.0, 3.0]
     rmse = RMSE.of(error)

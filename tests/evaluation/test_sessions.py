@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction import CVFM, NFCVFM, PendulumChain, Recording, fit_sessions, rollout
+from nfriction import CVFM, NFCVFM, LinearAxis, PendulumChain, Recording, fit_sessions, rollout
 from nfriction.evaluation.sessions import random_effects
+from nfriction.friction.memory import Dahl
 
 COUNT = 2 * math.pi / 8192
 PLANT = PendulumChain([0.4], [0.4], position_quantum=COUNT)
@@ -49,6 +50,22 @@ def test_a_session_that_fails_is_listed(tmp_path):
     with pytest.raises(ValueError, match=r"1 of 3 sessions could not be fitted.*missing.csv"):
         fit_sessions(CVFM(1), PLANT, {k: sessions[k] for k in ("day 0", "day 1", "lost")},
                      windows=(0.5,), drag=False)  # fmt: skip
+
+
+@pytest.mark.slow
+def test_the_stiffness_of_contacts_has_a_spread() -> None:
+    axis, sessions, truth = LinearAxis(0.5), {}, {"a": 250.0, "b": 280.0, "c": 380.0}
+    time = 2e-3 * np.arange(2001)
+    tau = ((0.7 + 2.0 * np.sin(math.pi * time / 4) ** 2) * np.sin(7 * time))[:, None]
+    for name, stiffness in truth.items():
+        model = Dahl(1, [1.0, 0.4, stiffness]).requires_grad_(False)
+        rest = torch.zeros(1, dtype=torch.float64)
+        run = rollout(axis, model, rest, rest, torch.tensor(tau[:-1]), sample_time=2e-3)
+        sessions[name] = Recording(time, COUNT * np.round(run.q.numpy() / COUNT), tau=tau, unit="m")
+    found = fit_sessions(Dahl(1), axis, sessions, windows=(0.5,), fit_plant=False)
+    spread = next(s for s in found.spreads if s.name == "sigma_0 of joint1")
+    assert spread.mean == pytest.approx(303.3, rel=0.02)
+    assert spread.between == pytest.approx(68.1, rel=0.1)
 
 
 def test_what_cannot_have_a_spread_is_refused():

@@ -319,6 +319,16 @@ def test_what_does_not_match_is_refused():
                 fit(model(2), pendulum(), recording, windows=windows)
 
 
+@pytest.mark.parametrize(
+    "setting", [{"fit_plant": "no"}, {"drag": "no"}, {"fit_delay": 2}, {"max_steps": 2.5}]
+)
+def test_a_setting_of_another_kind_is_refused(setting):
+    """Not taken for true, or for the whole number below."""
+    (name,) = setting
+    with pytest.raises(ValueError, match=rf"`{name}` must be .*, got "):
+        fit(LFM(2), pendulum(), swing(pendulum(), true_model(), seconds=0.5), **setting)
+
+
 def test_a_constant_fit_that_others_ask_for_has_the_defaults_of_fit():
     offered = inspect.signature(fit).parameters
     defaults = {f.name: f.default for f in fields(FitOptions)}
@@ -412,6 +422,8 @@ def test_what_is_something_else_is_told(arguments, told):
     recording = swing(pendulum(), LFM(2, v_smooth=0.05), seconds=0.2)
     with pytest.raises(TypeError, match=told):
         fit(*arguments(LFM(2), pendulum(), recording))
+    with pytest.raises(TypeError, match="`start` must be the result of a fit, got a LFM"):
+        fit(LFM(2), pendulum(), recording, start=LFM(2))
 
 
 def test_names_paths_and_tables_are_taken_as_what_they_name(tmp_path):

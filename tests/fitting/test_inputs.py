@@ -5,6 +5,8 @@ import torch
 
 from nfriction import CVFM, NFCVFM, fit
 from nfriction.fitting.options import FitOptions
+from nfriction.fitting.result.fit_result import InputGain
+from nfriction.fitting.strategy import neurofuzzy
 from nfriction.fitting.strategy.inputs import chosen_inputs, contiguous_blocks
 from nfriction.fitting.task import prepare_task
 from nfriction.friction.coefficients import Constant
@@ -47,11 +49,65 @@ def test_an_input_is_chosen_where_friction_depends_on_it(recorded) -> None:
         assert "unexplained" in found[0].words(("a", "b"))
 
 
+class Contest:
+    """A rival whose law and network leave these errors; without inputs they leave 1.0."""
+
+    def __init__(self, task, start, of_law=1.0, error=1.0, stopped=False) -> None:
+        self.task, self.start, self.validation = task, start, self
+        self.error_of_law, self.final, self.stopped = of_law, error, stopped
+        self.trained = self.halted = False
+
+    @property
+    def error(self) -> float:
+        return self.final if self.trained else self.error_of_law
+
+    def judge_law(self) -> bool:
+        return True
+
+    def train(self) -> None:
+        self.trained = True
+
+    def halt(self) -> None:
+        self.halted = True
+
+
+@pytest.fixture(scope="module")
+def task():
+    recording = swing(pendulum(), truth("nothing"), seconds=1.0)
+    return prepare_task(NFCVFM(2), pendulum(), recording, FitOptions(**BRIEF))
+
+
 @pytest.mark.parametrize(
-    "recorded",
-    ["load", *(pytest.param(name, marks=pytest.mark.slow) for name in ("nothing", "direction"))],
-    indirect=True,
+    ("rival", "wins", "trained"),
+    [
+        ({"of_law": 0.9, "error": 0.7}, True, True),
+        ({"of_law": 0.9, "error": 0.85}, False, True),
+        ({"of_law": 1.1, "error": 0.1}, False, False),
+        ({"of_law": 0.5, "error": 0.5, "stopped": True}, False, True),
+    ],
 )
+def test_inputs_have_to_win_for_the_law_and_for_its_network(
+    task, monkeypatch, rival, wins, trained
+):
+    gains, made = (InputGain("direction", 0.5, (0.5, 0.1)),), []
+
+    def contest(task, start):
+        made.append(Contest(task, start, **rival))
+        return made[-1]
+
+    monkeypatch.setattr(neurofuzzy, "chosen_inputs", lambda task, start: gains)
+    monkeypatch.setattr(neurofuzzy, "widened_start", lambda task, start, names: start)
+    monkeypatch.setattr(neurofuzzy, "_Contest", contest)
+    plain = Contest(task, "law")
+    chosen, best = neurofuzzy._with_chosen_inputs(plain)
+    (found,) = made
+    assert (best is found, chosen == gains, found.trained) == (wins, wins, trained)
+    assert found.task.model.inputs == ["direction"]
+    assert task.model.inputs is None
+    assert plain.halted is rival.get("stopped", False)
+
+
+@pytest.mark.slow
 def test_a_chosen_input_wins_or_leaves_the_model_as_it_was(recorded) -> None:
     name, recording, law = recorded
     model = NFCVFM(2, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2)

@@ -118,6 +118,15 @@ def short():
     return recording, fit("lugre", AXIS, recording, windows=(0.5,), fit_plant=False)
 
 
+def test_searches_start_with_the_rise_of_friction_that_torques_of_a_stuck_joint_hide() -> None:
+    recording = recorded((1.0, 0.33, 0.15, 1600.0, 19.4, 0.3), 0, 5.0, 500)
+    begun = fit("lugre", AXIS, recording, windows=(0.5,), fit_plant=False, max_steps=0)
+    _, rise, _, stiffness, *_ = begun.model.schedule.values[0].tolist()
+    # By least squares of the torques the rise is zero.
+    assert 0.16 < rise < 0.66
+    assert 800 < stiffness < 3200
+
+
 def test_presliding_and_sliding_give_all_coefficients(short) -> None:
     _, found = short
     assert found.model.schedule.values[0].tolist() == pytest.approx(SOFT, rel=0.03)

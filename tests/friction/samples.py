@@ -52,8 +52,8 @@ def named_models(joints: int = 3) -> dict[str, FrictionModel]:
     """Every named model, moved off its start, and the neuro-fuzzy one with every option."""
     models: dict[str, FrictionModel] = {name: model_by_name(name)(joints) for name in model_names()}
     models["NFLFM, other options"] = model_by_name("NFLFM")(
-        joints, [1e-3, 2e-3], v_smooth=1e-2, terms=(3, 2), head_units=4, acceleration="signed",
-        interpretable=True, prior_sd=0.1,
+        joints, [1e-3, 2e-3, 1e-3], v_smooth=1e-2, terms=(3, 2), head_units=4,
+        acceleration="signed", interpretable=True, prior_sd=0.1, inputs=["load"],
     )  # fmt: skip
     for seed, model in enumerate(models.values()):
         randomise(model, 0.3, seed)

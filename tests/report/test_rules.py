@@ -72,3 +72,16 @@ def test_models_without_rules_have_none_and_names_must_fit():
     assert rules_in_words(LFM(2)) == []
     with pytest.raises(ValueError, match="2 names"):
         rules_in_words(NFLFM(2), ["one"])
+
+
+def test_every_second_of_a_motion_fires_some_rule() -> None:
+    model = NFLFM(1, terms=(3, 3))
+    model.schedule.set_range(10.0, [-50.0, 50.0])
+    step = torch.tensor([0.5, 1.5, 1.0]).double()
+    qd, qdd = torch.tensor([[0.0, 0.0], [10.0, 50.0], [-10.0, 50.0]]).double().T[..., None]
+    seconds = model.schedule.fuzzy_rules().seconds(step, qd, qdd)[0].reshape(3, 3)
+    assert seconds.sum().item() == pytest.approx(3.0)
+    # Fastest and speeding up, fastest and braking, at rest.
+    assert seconds[2, 2] > 0.85 * 1.5
+    assert seconds[2, 0] > 0.85 * 1.0
+    assert seconds[0, 1] > 0.8 * 0.5

@@ -8,6 +8,7 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from nfriction.fitting.options import DEFAULTS
@@ -184,8 +185,22 @@ class FitResult:
             return self.plant.unit
         return "N" if self.plant.unit == "m" else "N m"
 
+    def rule_seconds(self) -> list[list[float]]:
+        """Seconds of the recordings that fired each rule of a network, by joint; none without."""
+        rules = self.model.schedule.fuzzy_rules()
+        if rules is None:
+            return []
+        total: Tensor | float = 0.0
+        for motion in self.motions:
+            # No sample counts for a gap.
+            step = np.gradient(motion.time)
+            step = torch.as_tensor(np.where(step > 10 * np.median(step), 0.0, step))
+            total = total + rules.seconds(step, *map(torch.as_tensor, (motion.qd, motion.qdd)))
+        return [] if isinstance(total, float) else total.tolist()
+
     def to_dict(self) -> dict[str, Any]:
         """Summary for JSON."""
+        seconds = self.rule_seconds()
         offsets = {"encoder_offsets": [list(row) for row in self.encoder_offsets]}
         gamma = {name: value for name, value, _ in self.effective_parameters}
         return {
@@ -206,6 +221,7 @@ class FitResult:
             **(offsets if self.encoder_offsets else {}),
             **({"outliers": [o._asdict() for o in self.outliers]} if self.outliers else {}),
             **({"effective_parameters": gamma} if gamma else {}),
+            **({"rule_seconds": seconds} if seconds else {}),
             **({"inputs": [asdict(gain) for gain in self.inputs]} if self.inputs else {}),
         }
 

@@ -3,6 +3,7 @@
 A nonlinear law has several starts: its own, and two from the law that it contains.
 """
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -48,6 +49,8 @@ from nfriction.signals import Motion
 # stiffness [s]: from what hardly shows to what would be no presliding.
 PRESLIDING = tuple(np.geomspace(1e-5, 1.0, 11).tolist())
 BRISTLE_TIMES = (1e-4, 1e-3, 1e-2, 1e-1)
+# Rises of friction at rest over that at high speed: torques of joints that stick do not show them.
+PEAKS = (0.1, 0.3, 1.0)
 # Displacements that are searched from where the first leaves more than the encoder's rounding.
 MOST_STARTS = 4
 
@@ -135,10 +138,13 @@ def presliding_starts(
 
     `sliding` are sets of coefficients that torques imply, (set, joint, coefficient), which show how
     a joint slides alone. The displacement over which its contact yields is sought among shares of
-    the joint's range, its damping among times, by the cost of short windows. Several displacements
-    of the first set follow, and the best of every other one.
+    the joint's range, its damping among times, by the cost of short windows; the rise of friction
+    at rest and its velocity likewise, in turn. Several displacements of the first set follow, and
+    the best of every other one where the law has no such rise.
     """
     for place, coefficients in enumerate(sliding):
+        if place and peaked(fitter.friction.law, coefficients):
+            return
         found = _yielding_alike(fitter, coefficients, plant, motions)
         yield from found[: 1 if place else MOST_STARTS]
 
@@ -150,19 +156,28 @@ def _yielding_alike(
     law, windows = fitter.friction.law, fitter.cut(motions, fitter.options.windows[0])
     ranges = np.max([np.ptp(m.q, axis=0) for m in motions], axis=0)
 
-    def tried(share: float, time: float, base: Tensor, joints: Sequence[int]) -> _Start:
+    def yields(share: float, time: float, base: Tensor, joints: Sequence[int]) -> _Start:
         trial = base.clone()
         for j in joints:
-            trial[j] = yielding(law, coefficients[j], share * float(ranges[j]), time)
+            trial[j] = yielding(law, base[j], share * float(ranges[j]), time)
+        return tried(trial)
+
+    def tried(trial: Tensor) -> _Start:
         problem = fitter.problem(windows, fitter.options.first_noise, trial.reshape(-1))
         return _Start(float(problem.cost(problem.variables.start(plant))), trial)
 
     def best(joints: Sequence[int], base: Tensor) -> list[_Start]:
-        rows = ([tried(s, t, base, joints) for t in BRISTLE_TIMES] for s in PRESLIDING)
+        rows = ([yields(s, t, base, joints) for t in BRISTLE_TIMES] for s in PRESLIDING)
         return sorted((min(row, key=_Start.rank) for row in rows), key=_Start.rank)
 
     # All joints alike first, then each by itself.
-    found = best(range(len(coefficients)), coefficients)
+    everyone = range(len(coefficients))
+    found = best(everyone, coefficients)
+    while peaks := [tried(trial) for trial in peaked(law, found[0].coefficients)]:
+        peak = min(peaks, key=_Start.rank)
+        if not peak.rank() < found[0].rank():
+            break
+        found = best(everyone, peak.coefficients)
     for j in range(len(coefficients)) if len(coefficients) > 1 else ():
         found = [*best([j], found[0].coefficients)[:1], *found]
     return [start.coefficients for start in sorted(found, key=_Start.rank)]
@@ -213,6 +228,19 @@ def ambiguous_stiffness(
         names[j * table.shape[1] + k]
         for j in range(len(table)) if apart[j, places[0]] > math.log(2.0) for k in places
     ]  # fmt: skip
+
+
+def peaked(law: Law, coefficients: Tensor) -> list[Tensor]:
+    """Coefficients (joint, coefficient) with other rises of the friction at rest."""
+    if not {"F_c", "F_d", "v_s"} <= set(law.names):
+        return []
+    found = []
+    coulomb, rise, velocity = (law.names.index(name) for name in ("F_c", "F_d", "v_s"))
+    for share, v_s in itertools.product(PEAKS, law.coefficients[velocity].initial_grid):
+        trial = coefficients.clone()
+        trial[:, rise], trial[:, velocity] = share * trial[:, coulomb], v_s
+        found.append(trial)
+    return found
 
 
 def yielding(law: Law, coefficients: Tensor, displacement: float, time: float) -> Tensor:

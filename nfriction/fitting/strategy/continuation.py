@@ -205,7 +205,10 @@ class StallMonitor:
         # Of chaotic windows the curvature is round-off, by which nothing would ever move.
         if torch.isinf(sd).all():
             return torch.inf
-        return float(((x - before)[:count] / sd).abs().max())
+        # The noise of a first stage is a guess; too large a one makes moves look small.
+        samples = float(self.problem.windows.weight.sum()) * self.problem.windows.q.shape[-1]
+        noise = min(1.0, math.sqrt(2.0 * float(local.cost) / samples))
+        return float(((x - before)[:count] / sd).abs().max()) / max(noise, 1e-9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,6 +289,9 @@ def horizon_continuation(
         if not kept:
             return Continuation(tuple(stages), rest, lossy=True)
         found = kept[0]
+        if fitter.friction.law.memory and not (found.stopped or found.result.converged):
+            # Contacts that react strongly at the start leave a damping that makes steps short.
+            found = fitter.search(found.problem, found.result.x, tolerance, name)
         stages.append(found)
         noise = max(found.noise, options.min_noise)
         friction, plant, _, offsets = found.parts

@@ -71,9 +71,8 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     model = task.model
     if isinstance(model, NeuroFuzzyModel) and model.inputs is None and not contest.stopped:
         chosen, contest = _with_chosen_inputs(contest)
-    model = task.model
-    if chosen:
-        cast("NeuroFuzzyModel", model).see([gain.name for gain in chosen])
+        if chosen:
+            model.see([gain.name for gain in chosen])
     found = replace(
         contest.result(model), motions=task.motions, encoder_offsets=start.encoder_offsets,
         skipped_horizons=start.skipped_horizons, inputs=chosen,
@@ -101,11 +100,13 @@ def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[InputGain, ...], "_Con
     cast("NeuroFuzzyModel", model).see(names)
     seeing = replace(task, model=model, plant=seeing_plant(task.plant, names))
     rival = _Contest(seeing, start)
-    if not rival.validation.judge_law() or rival.error >= plain.error_of_law:
+    if rival.validation.judge_law() and rival.error >= plain.error_of_law:
         return (), plain
     rival.train()
-    # A stop before the rival's network is found leaves what was accepted before.
-    if rival.stopped or rival.error >= task.options.max_ratio_same * plain.error:
+    if rival.stopped:
+        plain.halt()
+        return (), plain
+    if rival.error >= task.options.max_ratio_same * plain.error:
         return (), plain
     return chosen, rival
 
@@ -160,6 +161,11 @@ class _Contest:
         """Find the best network."""
         self.best = self.validation.best_trial(_with_narrowed_priors(self.free, self.start))
 
+    def halt(self) -> None:
+        """Keep the network as it is: the caller stopped what was to come."""
+        if self.best is not None:
+            self.best = replace(self.best, end=self.best.end.as_stopped())
+
     def result(self, model: FrictionModel) -> FitResult:
         """The network trained on, or its law, written into a model of the same kind."""
         task, best, validation = self.task, self.best, self.validation
@@ -170,7 +176,8 @@ class _Contest:
             while best is not before and not best.end.stopped:
                 before, best = best, validation.trained_on(best)
         if best.score.score > 1:
-            return _constant_kept(model, self, str(best.score))
+            note, stopped = str(best.score), best.end.stopped
+            return _constant_kept(model, self, note, converged=not stopped)
         end = best.end if best.end.stopped else validation.fit_all(best)
         found = copy.deepcopy(end.problem.friction)
         result = result_from_shooting(found, end.problem, end.result, task.motions)

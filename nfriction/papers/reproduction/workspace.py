@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from nfriction.evaluation.results import model_info
-from nfriction.fitting.result.fit_result import FitResult
+from nfriction.fitting.result.fit_result import FitResult, InputGain
 from nfriction.fitting.result.identifiability import Interval
+from nfriction.fitting.robust_loss import Outliers
 from nfriction.io.files import atomic_write, write_atomically
 from nfriction.io.model_file import load, load_plant, save
 from nfriction.papers.afem.fit_by_search import SearchState
@@ -221,6 +222,7 @@ class Workspace:
         self.write_arrays(name, _tables(found))
         save(found.model, path, model_info(found, bench.train))
         plain = {f.name: getattr(found, f.name) for f in fields(found) if f.name not in _APART}
+        plain["inputs"] = [astuple(gain) for gain in found.inputs]
         self.finish(name, plain)
         return found
 
@@ -279,6 +281,8 @@ def _restored(
     kept: Mapping[str, Any], path: Path, arrays: Mapping[str, NDArray[Any]], bench: Bench
 ) -> FitResult:
     plain = {name: _tuples(value) for name, value in kept.items()}
+    plain["outliers"] = tuple(Outliers(*row) for row in plain["outliers"])
+    plain["inputs"] = tuple(InputGain(*row) for row in plain["inputs"])
     return FitResult(
         model=load(path),
         plant=load_plant(path),

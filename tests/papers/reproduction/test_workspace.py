@@ -6,7 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nfriction.papers.reproduction.workspace import FULL, QUICK, Workspace
+from nfriction import LFM, fit
+from nfriction.fitting.result.fit_result import InputGain
+from nfriction.fitting.robust_loss import Outliers
+from nfriction.papers.reproduction.workspace import FULL, QUICK, Bench, Workspace, smoothed
+from tests.fitting.recordings import pendulum, swing
 
 
 def test_a_finished_stage_is_found_again(tmp_path: Path) -> None:
@@ -44,3 +48,18 @@ def test_a_result_that_is_not_json_is_refused_and_leaves_nothing(tmp_path: Path)
     with pytest.raises(ValueError, match="JSON"):
         workspace.finish("NCFM", {"value": float("nan")})
     assert not list(tmp_path.rglob("NCFM*"))
+
+
+def test_a_fit_is_read_back_as_it_was_kept(tmp_path: Path) -> None:
+    """Its parts keep their types, as its summary asks for their names."""
+    recording = swing(pendulum(), LFM(2), seconds=1.0)
+    bench = Bench(pendulum(), [recording], [], smoothed(pendulum(), [recording]), {})
+    found = replace(
+        fit(LFM(2), bench.plant, bench.train, method="equation_error", fit_plant=False),
+        outliers=(Outliers("run", "joint1", 0.1, 0.2, 0.3),),
+        inputs=(InputGain("direction", -0.1, (0.1, 0.2)),),
+    )
+    workspace = Workspace(tmp_path, QUICK)
+    workspace.fit("LFM", bench, lambda step: found)
+    kept = workspace.fit("LFM", bench, lambda step: pytest.fail("fitted again"))
+    assert kept.to_dict() == found.to_dict()
