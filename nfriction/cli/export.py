@@ -165,6 +165,7 @@ def _write_simulator(
         plant = rigs.from_dict(info.rig)
     else:
         raise UsageError("the model file has no rig; give --rig, whose loads friction needs.")
+    model.check_loads(plant)
     recordings = inputs.read_recordings(arguments.recording, plant, arguments)
     moved = (recording.joint_coordinates(plant) for recording in recordings)
     motions = [kalman_smoother(recording.time, recording.q) for recording in moved]

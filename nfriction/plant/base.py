@@ -91,6 +91,8 @@ class Plant(nn.Module, ABC):
     torque_offset: Tensor
     has_drag: bool = False
     first_link: int = 0
+    # True where `load` is that of each joint's own link, and could be that of its bearing.
+    has_link_load: bool = False
     _given: dict[str, Any]  # constructor arguments as plain numbers
 
     def __init__(

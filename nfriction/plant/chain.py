@@ -176,6 +176,7 @@ class PendulumChain(Plant):
             "load_lever": centre / gravity,
         }
         self.bearing_load = normal_load == "bearing"
+        self.has_link_load = not self.bearing_load and not arm and "normal_load" in self.optional
         if self.bearing_load:
             buffers["load_lever"] = dynamics.bearing_lever(m, size, centre) / gravity
         if arm:

@@ -1,18 +1,26 @@
 """Inputs of friction besides the speed are chosen by blocks left out, and have to win."""
 
+import numpy as np
 import pytest
 import torch
 
-from nfriction import CVFM, NFCVFM, fit
+from nfriction import CVFM, NFCVFM, Recording, Rotor, fit, rollout
+from nfriction.export import c
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.fit_result import InputGain
 from nfriction.fitting.strategy import neurofuzzy
-from nfriction.fitting.strategy.inputs import _Choice, chosen_inputs, contiguous_blocks
+from nfriction.fitting.strategy.inputs import (
+    _Choice,
+    candidates,
+    chosen_inputs,
+    contiguous_blocks,
+)
 from nfriction.fitting.task import prepare_task
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.inputs import with_inputs
 from nfriction.friction.laws import COULOMB_VISCOUS
 from nfriction.friction.models import FrictionModel
+from nfriction.io.model_file import ModelInfo
 from nfriction.optim.least_squares import Quadratic
 from tests.fitting.recordings import pendulum, swing
 
@@ -155,3 +163,32 @@ def test_blocks_are_contiguous_and_share_out_each_recording() -> None:
 
     blocks = contiguous_blocks(Spans(), 3)
     assert [b.nonzero().flatten().tolist() for b in blocks] == [[0, 1], [2], [3], [4]]
+
+
+def test_the_load_of_a_motor_is_no_candidate() -> None:
+    rotor = Rotor(inertia=0.02, mass=0.5, com=0.1)
+    time = torch.arange(300).double().numpy() * 2e-3
+    recording = Recording(time, 0.1 * np.sin(9.0 * time)[:, None])
+    task = prepare_task(NFCVFM(1), rotor, [recording], FitOptions(**BRIEF))
+    assert candidates(task) == ("direction",)
+
+
+def test_a_friction_of_the_load_is_simulated_with_the_loads_it_was_fitted_to(tmp_path) -> None:
+    start = torch.tensor([1.0, 0.5], dtype=torch.float64)
+    given = {"steps": 3, "sample_time": 1e-3, "gradients": False}
+    rollout(pendulum(normal_load="bearing"), truth("load"), start, 0 * start, **given)
+    with pytest.raises(ValueError, match="loads of the bearings"):
+        rollout(pendulum(), truth("load"), start, 0 * start, **given)
+    with pytest.raises(ValueError, match="loads of the bearings"):
+        c(truth("load"), tmp_path, ModelInfo(rig=pendulum().to_dict()))
+
+
+def test_a_given_load_is_that_of_the_bearings(monkeypatch) -> None:
+    def begun(task):
+        raise RuntimeError(task.plant.to_dict()["normal_load"])
+
+    monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.constant_start", begun)
+    time = torch.arange(300).double().numpy() * 2e-3
+    recording = Recording(time, 0.1 * np.sin(9.0 * time)[:, None].repeat(2, 1))
+    with pytest.raises(RuntimeError, match="bearing"):
+        fit(NFCVFM(2, inputs=["load"]), pendulum(), recording, **BRIEF)

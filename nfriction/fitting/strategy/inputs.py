@@ -43,7 +43,7 @@ from nfriction.plant.rigs import from_dict
 
 def seeing_plant(plant: Plant, inputs: Sequence[str]) -> Plant:
     """The plant with the loads of its bearings where the load is an input."""
-    if "load" not in inputs:
+    if "load" not in inputs or not plant.has_link_load:
         return plant
     return from_dict({**plant.to_dict(), "normal_load": "bearing"})
 
@@ -55,8 +55,8 @@ def candidates(task: FitTask) -> tuple[str, ...]:
     coefficients = one.expand(1, 1, len(law.names))
     torques = [law.torque(one, load * one, coefficients, 1.0) for load in (1.0, 2.0)]
     # A bearing's load is known of chains on a fixed pivot; a law of the load has seen one.
-    chain = isinstance(plant, PendulumChain) and not plant.first_link
-    loaded = chain and torch.equal(*torques)
+    known = plant.has_link_load or (isinstance(plant, PendulumChain) and plant.bearing_load)
+    loaded = known and torch.equal(*torques)
     return tuple(name for name in INPUTS if name != "load" or loaded)
 
 

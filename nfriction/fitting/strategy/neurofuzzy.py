@@ -60,6 +60,8 @@ INTERRUPTED = "Stopped before the network was found; its constant law is kept."
 def fit_neurofuzzy(task: FitTask) -> FitResult:
     """Fit a neuro-fuzzy model from the constant fit of its law, see `fit`."""
     require_motion(task.plant, task.recordings)
+    if isinstance(task.model, NeuroFuzzyModel):
+        task = replace(task, plant=seeing_plant(task.plant, task.model.inputs or ()))
     start = constant_start(task)
     recordings, motions = apply_encoder_offsets(
         start.encoder_offsets, task.plant, task.recordings, task.motions
