@@ -39,6 +39,7 @@ from nfriction.fitting.shooting.normal_equations import (
     drawn_score,
     marginalize_states,
     normal_equations,
+    rounding_of,
     scaled_rows,
     score_covariance,
 )
@@ -177,25 +178,14 @@ class ShootingProblem:
         scale = self._scale * self.loss.weight(self._deviation(x, run)).sqrt()
         data, response = marginalize_states(self._rows(run, scale), kept, of_states)
         if count and self.loss is SQUARES and not variables.offset_count:
-            drawn = self._rounded(run, count) * self._scale[..., None]
+            q = run.motion.q[:, :: self.substeps] @ self.measurement.T
+            drawn = rounding_of(q, count, self.windows.spans) * self._scale[..., None]
             score = drawn_score(self._rows(run, scale), kept, response, of_states, drawn)
         else:
             rows = self._rows(run, self._scale * sd / self.noise_sd)
             score = score_covariance(rows, kept, response, of_states)
         prior = torch.cat([precision[:shared], of_offsets.flatten()])
         return information(data + torch.diag(prior), prior, shared, score)
-
-    def _rounded(self, run: Trajectory, count: float, draws: int = 100) -> Tensor:
-        """Rounding of the motion by encoders with any zero, (window, step + 1, joint, draw).
-
-        Positions to which a joint returns are rounded alike, at any time later.
-        """
-        q = (run.motion.q[:, :: self.substeps] @ self.measurement.T)[..., None] / count
-        random = torch.Generator().manual_seed(0)
-        shape = (len(self.windows.recordings), 1, q.shape[-2], draws)
-        zeros = torch.rand(shape, generator=random, dtype=torch.float64)
-        q = q + zeros[[place for place, *_ in self.windows.spans]]
-        return count * (q - q.round())
 
     @cached_property
     def _scale(self) -> Tensor:
