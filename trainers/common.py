@@ -152,7 +152,9 @@ def draw_losses(losses: Mapping[str, Sequence[float]], path: Path) -> None:
     if ratios.min() < 0.1:
         style.log_axis(ax, 0.9 * float(ratios.min()), 1.1 * float(ratios.max()))
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.set_xlabel("step")
+    rises = any((np.diff(values) > 0).any() for values in losses.values())
+    note = " (a line rises where the evidence weighs the data anew)" if rises else ""
+    ax.set_xlabel(f"step{note}")
     ax.set_ylabel("loss over the first [-]")
     style.legend(figure, [looks[part].handle for part in losses], list(losses))
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from nfriction.fitting.result.of_search import white_noise
 from nfriction.friction.memory import deflections
 from nfriction.friction.models import FrictionModel
+from nfriction.io.model_file import require_model
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion, causal_motion, count_seen
@@ -118,15 +119,12 @@ class Simulator:
         scheme: Scheme,
         draws: int,
     ) -> None:
-        if friction is not None and not hasattr(friction, "law"):
-            raise TypeError(
-                "`friction` must be a friction model, such as that of a fit, or None, got "
-                f"{type(friction).__name__} {friction!r}."
-            )
-        if friction is not None and friction.joints != plant.joints:
-            raise ValueError(
-                f"the plant has {plant.joints} joints, the friction model {friction.joints}."
-            )
+        if friction is not None:
+            require_model(friction)
+            if friction.joints != plant.joints:
+                raise ValueError(
+                    f"the plant has {plant.joints} joints, the friction model {friction.joints}."
+                )
         self.plant, self.friction, self.recording = plant, friction, recording
         self.scheme, self.draws = scheme, draws
         self.convention = recording.resolve_convention(plant)

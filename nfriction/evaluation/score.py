@@ -1,11 +1,10 @@
 """Score a model: simulate a recording with it and measure the position error.
 
 A model that was fitted to some recordings is judged by others, simulated from nothing but their
-torques and a start: the state that the model itself estimates from a short lead-in, which is not
-scored (`nfriction.evaluation.lead_in`). One simulation over the whole recording is the *free run*;
-*windows* are simulations of 1, 2 and 5 s, because in a chaotic mechanism the free run amplifies the
-error of its start more than that of the model. The next step is
-`nfriction.evaluation.compare`: the scores of several models on the same recordings.
+torques and a start: the state that it estimates from a short lead-in, which is not scored
+(`nfriction.evaluation.lead_in`). One simulation over the whole recording is the *free run*;
+*windows* are simulations of 1, 2 and 5 s, because a chaotic free run amplifies the error of its
+start more than that of the model. The next step is `nfriction.evaluation.compare`.
 """
 
 from collections.abc import Sequence

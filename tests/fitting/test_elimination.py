@@ -20,8 +20,10 @@ from nfriction.fitting.result.identifiability import (
 from nfriction.fitting.result.of_search import result_from_shooting
 from nfriction.fitting.shooting.normal_equations import (
     Kept,
+    drawn_score,
     marginalize_states,
     normal_equations,
+    score_covariance,
 )
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
@@ -225,3 +227,24 @@ def test_a_chaotic_window_loses_nothing_that_it_tells():
 
     assert error(told) < 1e-3
     assert error(squares) > 0.1
+
+
+def test_drawn_errors_give_the_covariance_of_the_gradient() -> None:
+    """That of independent errors, and twice that if those of two windows are the same."""
+    generator = torch.Generator().manual_seed(0)
+    one = torch.randn(1, 60, 5, generator=generator, dtype=F64)
+    rows = one.expand(2, -1, -1)
+    kept = Kept(torch.tensor([[3, 4], [5, 6]]), 2, 7)
+    precision = torch.full((2, 2), 1e-9, dtype=F64)
+    _, response = marginalize_states([(slice(None), rows)], kept, precision)
+
+    def drawn(errors: torch.Tensor) -> torch.Tensor:
+        return drawn_score([(slice(None), rows)], kept, response, precision, errors[..., None, :])
+
+    expected = score_covariance([(slice(None), rows)], kept, response, precision)
+    errors = torch.randn(2, 60, 4000, generator=generator, dtype=F64)
+    scale = expected.diagonal().sqrt()
+    apart = (drawn(errors) - expected) / (scale[:, None] * scale)
+    assert float(apart.abs().max()) < 0.1
+    torch.testing.assert_close(drawn(errors[:1].expand(2, -1, -1)).diagonal() / scale.square(),
+                               torch.full((3,), 2.0, dtype=F64), rtol=0.1, atol=0)  # fmt: skip

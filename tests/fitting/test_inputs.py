@@ -9,13 +9,19 @@ from nfriction.export import c
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.fit_result import InputGain
 from nfriction.fitting.strategy import neurofuzzy
-from nfriction.fitting.strategy.inputs import candidates, chosen_inputs, contiguous_blocks
+from nfriction.fitting.strategy.inputs import (
+    _Choice,
+    candidates,
+    chosen_inputs,
+    contiguous_blocks,
+)
 from nfriction.fitting.task import prepare_task
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.inputs import with_inputs
 from nfriction.friction.laws import COULOMB_VISCOUS
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import ModelInfo
+from nfriction.optim.least_squares import Quadratic
 from tests.fitting.recordings import pendulum, swing
 
 V_SMOOTH = 0.05
@@ -138,6 +144,14 @@ def test_inputs_that_are_given_stay(recorded) -> None:
     _, recording, _ = recorded
     model = NFCVFM(2, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2, inputs=())
     assert not fit(model, pendulum(), recording, max_steps=2, **BRIEF).inputs
+
+
+def test_what_is_not_fitted_does_not_move() -> None:
+    one, zero = torch.eye(2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
+    block = Quadratic(10.0, torch.tensor([-2.0, -2.0]).double(), one)
+    held = (torch.tensor([0.0, -9.0]).double(), torch.tensor([0.0, 9.0]).double())
+    choice = _Choice([block, block], Quadratic(0.0, zero, 0 * one), held, {})
+    torch.testing.assert_close(choice.left_out([]), torch.tensor([8.0, 8.0]).double())
 
 
 def test_blocks_are_contiguous_and_share_out_each_recording() -> None:

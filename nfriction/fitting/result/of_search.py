@@ -203,7 +203,11 @@ def _identifiability(
         return (), tuple(fitted_names) if constant else (), None
     # Without the extrapolation prior: where that alone holds a network, the data do not.
     sd = hac_sd(residuals, bandwidth(problem.windows.q, options), options)
-    known = problem.information(result.x, sd).subset(fitted)
+    # A contact below breakaway returns to its places, and the rounding there with it, at any lag.
+    quantum = encoder_count(problem) if problem.friction.law.memory else None
+    rms = float(residuals.square().mean().sqrt())
+    rounded = quantum and rms <= options.explained_ratio * quantum / 12**0.5
+    known = problem.information(result.x, sd, quantum if rounded else None).subset(fitted)
     root = torch.zeros(count, len(fitted), dtype=torch.float64)
     root[fitted] = covariance_root(known)
     root[[names.index(name) for name in ambiguous]] = torch.inf
@@ -263,13 +267,18 @@ def rounding(problem: ShootingProblem) -> float:
     A count that neither the plant states nor the positions show is taken for a 4096th of the motion
     within a window.
     """
-    windows, plant = problem.windows, problem.jacobian.plant
-    recorded = windows.q @ problem.measurement.T
-    count = plant.position_quantum or observed_count(recorded)
+    count = encoder_count(problem)
     if not count:
+        recorded = problem.windows.q @ problem.measurement.T
         moved = recorded.amax(1) - recorded.amin(1)
         count = float(moved.square().mean().sqrt()) / USUAL_COUNTS
     return count / math.sqrt(12)
+
+
+def encoder_count(problem: ShootingProblem) -> float | None:
+    """Count of the encoders that the plant states or the positions show [rad; m]."""
+    recorded = problem.windows.q @ problem.measurement.T
+    return problem.jacobian.plant.position_quantum or observed_count(recorded)
 
 
 def measurement_noise(problem: ShootingProblem, x: Tensor, residual: float) -> float:

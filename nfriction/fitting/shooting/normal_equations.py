@@ -10,7 +10,7 @@ References:
     G. J. Bierman, Factorization Methods for Discrete Sequential Estimation (1977), ch. 5.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -151,6 +151,33 @@ def score_covariance(
         own, others = kept.split(scaled)
         total += kept.squares(others + own @ response)
     return total
+
+
+def drawn_score(
+    rows: Iterable[Rows], kept: Kept, response: Tensor, precision: Tensor, errors: Tensor
+) -> Tensor:
+    """The same by drawn errors (window, sample, joint, draw), scaled like the rows."""
+    total = kept.squares(precision.sqrt()[..., None] * response)
+    sums = total.new_zeros(len(total), errors.shape[-1])
+    for part, scaled in rows:
+        own, others = kept.split(scaled)
+        sums += torch.einsum("wrc,wrd->cd", others + own @ response, errors[:, part].flatten(1, 2))
+    return total + sums @ sums.T / sums.shape[1]
+
+
+def rounding_of(
+    q: Tensor, count: float, spans: Sequence[tuple[int, int, int]], draws: int = 100
+) -> Tensor:
+    """Rounding of windows (window, sample, joint) by encoders with any zero, (*, draw).
+
+    Each recording (see `Windows.spans`) has a zero. Positions to which a joint returns are rounded
+    alike, at any time later.
+    """
+    random = torch.Generator().manual_seed(0)
+    shape = (1 + max(place for place, *_ in spans), 1, q.shape[-1], draws)
+    zeros = torch.rand(shape, generator=random, dtype=torch.float64)
+    counts = q[..., None] / count + zeros[[place for place, *_ in spans]]
+    return count * (counts - counts.round())
 
 
 def _discard_roundoff(data: Tensor, sizes: Tensor) -> Tensor:

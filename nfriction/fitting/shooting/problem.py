@@ -36,8 +36,10 @@ from nfriction.fitting.robust_loss import SQUARES, RobustLoss
 from nfriction.fitting.shooting.normal_equations import (
     Kept,
     Rows,
+    drawn_score,
     marginalize_states,
     normal_equations,
+    rounding_of,
     scaled_rows,
     score_covariance,
 )
@@ -163,10 +165,11 @@ class ShootingProblem:
         precision, _ = self.variables.prior()
         return standard_deviations(information(hessian, precision, self.variables.shared_count))
 
-    def information(self, x: Tensor, sd: Tensor) -> Information:
+    def information(self, x: Tensor, sd: Tensor, count: float | None = None) -> Information:
         """Information about the shared variables, given the sd of each error times its weight.
 
-        `sd` is inflated for autocorrelation, (window, step + 1, joint).
+        `sd` is inflated for autocorrelation, (window, step + 1, joint). If the errors are the
+        rounding of encoders to a `count` [rad; m], their covariance is that of rounding instead.
         """
         variables, run = self.variables, self._simulate(x, with_memory=True)
         shared, (precision, _) = variables.shared_count, variables.prior()
@@ -174,8 +177,13 @@ class ShootingProblem:
         kept = Kept(variables.indices(), variables.state_count, len(x))
         scale = self._scale * self.loss.weight(self._deviation(x, run)).sqrt()
         data, response = marginalize_states(self._rows(run, scale), kept, of_states)
-        rows = self._rows(run, self._scale * sd / self.noise_sd)
-        score = score_covariance(rows, kept, response, of_states)
+        if count and self.loss is SQUARES and not variables.offset_count:
+            q = run.motion.q[:, :: self.substeps] @ self.measurement.T
+            drawn = rounding_of(q, count, self.windows.spans) * self._scale[..., None]
+            score = drawn_score(self._rows(run, scale), kept, response, of_states, drawn)
+        else:
+            rows = self._rows(run, self._scale * sd / self.noise_sd)
+            score = score_covariance(rows, kept, response, of_states)
         prior = torch.cat([precision[:shared], of_offsets.flatten()])
         return information(data + torch.diag(prior), prior, shared, score)
 

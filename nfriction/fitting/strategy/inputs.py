@@ -117,7 +117,7 @@ class _Choice:
 
     blocks: Sequence[Quadratic]
     prior: Quadratic
-    lower: Tensor
+    bounds: tuple[Tensor, Tensor]  # of a step
     columns: dict[str, list[int]]  # of each candidate, a coefficient a joint
 
     @classmethod
@@ -142,11 +142,11 @@ class _Choice:
             pull = (precision * (x - mean))[:shared]
             found.append(_of_errors(local, precision[:shared], pull))
         prior = Quadratic(0.0, pull, torch.diag(precision[:shared]))
-        lower, _ = variables.bounds()
+        lower, upper = ((bound - x)[:shared] for bound in variables.bounds())
         rows = torch.arange(variables.friction_count).reshape(model.joints, -1)
         own = rows.shape[1] - len(names)
         columns = {name: rows[:, own + k].tolist() for k, name in enumerate(names)}
-        return cls(found, prior, (lower - x)[:shared].clamp(max=0.0), columns)
+        return cls(found, prior, (lower.clamp(max=0.0), upper.clamp(min=0.0)), columns)
 
     def forward(self) -> list[InputGain]:
         """Inputs one after the other, as long as one gains by more than its scatter over blocks."""
@@ -175,14 +175,14 @@ class _Choice:
     def left_out(self, held: Sequence[int]) -> Tensor:
         """Cost of each block after a step by the others, (block,), with the columns `held`."""
         every = {c for columns in self.columns.values() for c in columns}
-        free = [k for k in range(len(self.lower)) if k not in every or k in held]
+        free = [k for k in range(len(self.prior.gradient)) if k not in every or k in held]
+        lower, upper = (bound[free] for bound in self.bounds)
         costs = []
         for place, block in enumerate(self.blocks):
             others = [b for k, b in enumerate(self.blocks) if k != place]
             parts = [_subset(q, free) for q in (self.prior, *others)]
             gradient = torch.stack([p.gradient for p in parts]).sum(0)
             hessian = torch.stack([p.hessian for p in parts]).sum(0)
-
             cost = sum(float(p.cost) for p in parts)
 
             def model(
@@ -191,7 +191,7 @@ class _Choice:
                 return Quadratic(c + g @ x + 0.5 * x @ H @ x, g + H @ x, H)
 
             start = torch.zeros(len(free), dtype=torch.float64)
-            step = LevenbergMarquardt().minimise(model, start, lower=self.lower[free]).x
+            step = LevenbergMarquardt().minimise(model, start, lower=lower, upper=upper).x
             own = _subset(block, free)
             costs.append(own.cost + own.gradient @ step + 0.5 * step @ own.hessian @ step)
         return torch.stack([torch.as_tensor(c) for c in costs])
