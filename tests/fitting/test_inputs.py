@@ -1,5 +1,7 @@
 """Inputs of friction besides the speed are chosen by blocks left out, and have to win."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -14,6 +16,7 @@ from nfriction.fitting.strategy.inputs import (
     candidates,
     chosen_inputs,
     contiguous_blocks,
+    drives,
 )
 from nfriction.fitting.task import prepare_task
 from nfriction.friction.coefficients import Constant
@@ -22,6 +25,7 @@ from nfriction.friction.laws import COULOMB_VISCOUS
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import ModelInfo
 from nfriction.optim.least_squares import Quadratic
+from nfriction.signals import Motion
 from tests.fitting.recordings import pendulum, swing
 
 V_SMOOTH = 0.05
@@ -163,6 +167,17 @@ def test_blocks_are_contiguous_and_share_out_each_recording() -> None:
 
     blocks = contiguous_blocks(Spans(), 3)
     assert [b.nonzero().flatten().tolist() for b in blocks] == [[0, 1], [2], [3], [4]]
+
+
+@pytest.mark.parametrize(("by_direction", "driving"), [(2e-3, False), (-9e-3, True)])
+def test_a_constant_torque_is_no_friction_by_direction(by_direction, driving) -> None:
+    law = with_inputs(COULOMB_VISCOUS, ["direction"])
+    model = FrictionModel(law, Constant(law, 1, [5e-3, 1e-4, by_direction]), V_SMOOTH)
+    time = 2e-3 * np.arange(500)
+    q = np.sin(9.0 * time)[:, None]
+    motion = Motion(time, q, 9.0 * np.cos(9.0 * time)[:, None], -81.0 * q)
+    found = SimpleNamespace(model=model, plant=Rotor(0.01), motions=(motion,))
+    assert drives(found, 2) is driving
 
 
 def test_the_load_of_a_motor_is_no_candidate() -> None:
