@@ -337,11 +337,13 @@ def _choose(candidates: Sequence[Candidate]) -> tuple[str, str]:
     """
     least = min(candidates, key=lambda c: c.error)
     near = [c for c in candidates if c.error <= (1 + TOLERANCE) * least.error]
-    chosen = min(near, key=lambda c: (c.parameters, c.error))
+    # Of a law and its network that was dropped, equal but for rounding, the law.
+    chosen = min(near, key=lambda c: (c.parameters, ":" in plain_name(c.name), c.error))
     if chosen is not least:
+        number = "fewer" if chosen.parameters < least.parameters else "no more"
         return chosen.name, (
-            f"within {100 * TOLERANCE:g} % of the least, of {plain_name(least.name)}, with fewer "
-            "parameters"
+            f"within {100 * TOLERANCE:g} % of the least, of {plain_name(least.name)}, with "
+            f"{number} parameters"
         )
     others = sorted(c.error for c in candidates if c is not least)
     if not others:

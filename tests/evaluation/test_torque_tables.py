@@ -8,7 +8,9 @@ import pytest
 import torch
 
 import nfriction
+from nfriction.evaluation.cross_validation import Candidate
 from nfriction.evaluation.torque_tables import (
+    _choose,
     fit_torque,
     read_models,
     score_models,
@@ -199,3 +201,10 @@ def test_summary_and_notebook_show_choice_and_intervals() -> None:
         assert "stribeck" in text
         assert "F_d of joint1" in text
     assert found.plot().axes[0].get_title() == "joint1: stribeck"
+
+
+def test_a_network_that_was_dropped_is_not_chosen_over_its_law() -> None:
+    law = Candidate("CVFM", (1.0, 1.0), 2, True)
+    network = Candidate("NFCVFM", (1.0, 1.0 - 1e-12), 2, True)
+    assert _choose([network, law])[0] == _choose([law, network])[0] == "CVFM"
+    assert _choose([law, network])[1].endswith("with no more parameters")
