@@ -1,6 +1,7 @@
 """Compare friction models: fit each to training recordings, score it on test recordings."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -41,9 +42,10 @@ class Fits(dict[str, FitResult]):
     """Fits by the model's name, which may be the plain one: `fits["coulomb-viscous"]`."""
 
     def __missing__(self, name: str) -> FitResult:
-        known = model_name(name)
-        if known in self:
-            return self[known]
+        with suppress(ValueError):  # of a text that names no model
+            known = model_name(name)
+            if known in self:
+                return self[known]
         raise KeyError(f"{name}; there are {', '.join(map(both_names, self))}")
 
 

@@ -71,6 +71,8 @@ def test_fits_are_found_by_plain_names_and_a_notebook_shows_them(comparison):
     assert found.fits["load-coulomb"] is found.fits["LFM"]
     with pytest.raises(KeyError, match=r"stribeck; there are viscous \(NCFM\)"):
         found.fits["stribeck"]
+    with pytest.raises(KeyError, match="no friction; there are viscous"):
+        found.fits["no friction"]
     page = found._repr_html_()
     assert "load-coulomb (LFM)" in page
     assert f"{1e3 * found.table()['all']['LFM']:.4g}" in page
