@@ -61,3 +61,18 @@ class _WithInputs(nn.Module):
         if self.loaded:
             tau_f = tau_f + coefficients.select(-1, -1) * load * sign
         return tau_f
+
+
+def require_bearing_loads(law: Law, plant: object) -> None:
+    """Refuse a plant whose loads are not those that a law depends on.
+
+    Raises:
+        ValueError: if the law has the input `"load"` and the plant gives the loads of links.
+    """
+    loaded = isinstance(law.torque, _WithInputs) and law.torque.loaded
+    if loaded and getattr(plant, "has_link_load", False):
+        raise ValueError(
+            "the friction depends on the loads of the bearings, and this plant gives those of "
+            "single links: take the plant of the fit (`FitResult.plant`, `nfriction.load_plant`), "
+            'or one with `normal_load` "bearing".'
+        )

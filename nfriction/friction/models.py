@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from nfriction.friction import laws
 from nfriction.friction.coefficients import Constant, Schedule
+from nfriction.friction.inputs import require_bearing_loads
 from nfriction.friction.laws import Law
 from nfriction.friction.parameters import as_tensor, positive_number
 
@@ -115,18 +116,8 @@ class FrictionModel(nn.Module):
         return self.law_torque(qd, load, coefficients, self.v_smooth)
 
     def check_loads(self, plant: object) -> None:
-        """Refuse a plant whose loads are not those that the friction depends on.
-
-        Raises:
-            ValueError: if the law has the input `"load"` and the plant gives the loads of links.
-        """
-        loaded = getattr(self.law.torque, "loaded", False)
-        if loaded and getattr(plant, "has_link_load", False):
-            raise ValueError(
-                "the friction depends on the loads of the bearings, and this plant gives those of "
-                "single links: take the plant of the fit (`FitResult.plant`, "
-                '`nfriction.load_plant`), or one with `normal_load` "bearing".'
-            )
+        """Refuse a plant with other loads than the friction's, see `require_bearing_loads`."""
+        require_bearing_loads(self.law, plant)
 
     def zero_velocity_damping(self) -> Tensor:
         """Slope of the torque over velocity at rest under unit load [N m s/rad], (joint,).

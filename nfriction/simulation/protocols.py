@@ -4,7 +4,7 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, cast, runtime_checkable
+from typing import Protocol, cast
 
 import torch
 from torch import Tensor, nn
@@ -40,13 +40,6 @@ class StatefulFriction(Friction, Protocol):
     def initial_state(self, qd: Tensor, qdd: Tensor) -> Tensor: ...
     def advance(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor: ...
     def coefficients_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor: ...
-
-
-@runtime_checkable
-class FrictionWithLoads(Protocol):
-    """Friction model that knows which loads it depends on."""
-
-    def check_loads(self, plant: object) -> None: ...
 
 
 class NoFriction(nn.Module):

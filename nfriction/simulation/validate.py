@@ -15,13 +15,7 @@ from torch import Tensor
 from nfriction import codegen
 from nfriction.simulation.compiled import System
 from nfriction.simulation.memory_step import memory_of
-from nfriction.simulation.protocols import (
-    Friction,
-    FrictionWithLoads,
-    NoFriction,
-    Plant,
-    RolloutInputs,
-)
+from nfriction.simulation.protocols import Friction, NoFriction, Plant, RolloutInputs
 
 logger = logging.getLogger(__name__)
 
@@ -100,8 +94,8 @@ def validate_inputs(
     joints = plant.joints
     if friction.joints != joints:
         raise ValueError(f"the plant has {joints} joints, the friction model {friction.joints}.")
-    if isinstance(friction, FrictionWithLoads):
-        friction.check_loads(plant)
+    if check := getattr(friction, "check_loads", None):  # other frictions have none
+        check(plant)
     for name, value in (("q0", q0), ("qd0", qd0)):
         if value.ndim == 0 or value.shape[-1] != joints:
             raise ValueError(
