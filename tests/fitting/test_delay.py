@@ -1,5 +1,7 @@
 """The delay of the torque is fitted beside the friction, with its interval."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -89,3 +91,17 @@ def test_a_delay_needs_torques_and_simulated_windows():
         fit(CVFM(2), plant, swing(plant, CVFM(2)), fit_delay=True)
     with pytest.raises(ValueError, match='fit_delay=True` needs `method="output_error"`'):
         FitOptions(method="equation_error", fit_delay=True)
+
+
+def test_a_measured_torque_acts_half_a_sample_late_and_the_fit_says_so():
+    """A torque that changes within samples; the log holds what was measured at each."""
+    fine = driven_axis(LinearAxis(2.0), CVFM(1, [TRUTH], v_smooth=0.05), seconds=3.0)
+    measured, settings = fine[::10], {"windows": (0.5, 1.5)}
+    found = fit(CVFM(1, v_smooth=0.05), LinearAxis(2.0), measured, **settings)
+    (said,) = (text for text in found.warnings if "`fit_delay=True`" in text)
+    # Held over a sample of the simulation, it is early by half of that.
+    late = 0.5 * (measured.sample_time - fine.sample_time)
+    (milliseconds,) = re.findall(r"Torques seem to be recorded ([\d.]+) ms later", said)
+    assert float(milliseconds) == pytest.approx(1e3 * late, rel=0.05)
+    held = fit(CVFM(1, v_smooth=0.05), LinearAxis(2.0), fine, **settings)
+    assert not any("delay" in text for text in held.warnings)

@@ -6,7 +6,7 @@ A nonlinear law has several starts: its own, and two from the law that it contai
 import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeGuard
 
 import numpy as np
@@ -26,6 +26,7 @@ from nfriction.fitting.plant_parameters import TORQUE_DELAY, PlantParameter
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.of_search import result_from_equation_error, result_from_shooting
 from nfriction.fitting.robust_loss import RobustLoss
+from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.continuation import (
     Continuation,
@@ -60,6 +61,11 @@ STIFFER = (10.0, 0.01)
 TOO_LONG = (
     "Windows of {:g} s were skipped: the motion forgets its start within them, or law or plant are "
     "wrong."
+)
+
+LATE = (
+    "{} seem to be recorded {:.2g} ms later than {}: with that delay the residual would fall by "
+    "about {:.0f} %, and coefficients may move by more than their intervals (`fit_delay=True`)."
 )
 
 LOSSY = (
@@ -120,7 +126,13 @@ def fit_constant(task: FitTask) -> FitResult:
         skipped_horizons=search.skipped,
     )
     reason = LOSSY if search.lossy else TOO_LONG
-    return fitted.with_warnings([reason.format(length) for length in search.skipped])
+    said = [reason.format(length) for length in search.skipped]
+    driven = bool(found.problem.windows.tau.any())
+    if driven and not (options.fit_delay or found.stopped or task.mistakes):
+        with_delay = replace(task, options=replace(options, fit_delay=True))
+        rich = len(found.problem.jacobian.terms) > len(fitter.jacobian.terms)
+        said += delay_warning(found, _fitter(with_delay, model, torque, eccentric or rich))
+    return fitted.with_warnings(said)
 
 
 def regression(task: FitTask, model: FrictionModel, plant: Plant) -> TorqueFit:
@@ -318,40 +330,93 @@ def richer_by_evidence(
     References:
         D. J. C. MacKay, Neural Computation 4 (1992), 415-447.
     """
-    extra = len(richer.jacobian.terms) - len(base.problem.jacobian.terms)
-    if not base.noise > 0 or extra < 1:
-        return None
-    problem = richer.problem(base.problem.windows, base.noise, base.parts.friction)
-    variables = problem.variables
-    shared, old = variables.shared_count, base.problem.variables.shared_count
-    zeros = torch.zeros(extra, dtype=torch.float64)
-    at_base = torch.cat([base.result.x[:old], zeros, base.result.x[old:]])
-    before = problem.linearise(at_base)
-    lower, upper = variables.bounds()
-    known = (at_base > lower) & (at_base < upper)
-    # Variables at a bound cannot move, so they take no volume of the posterior.
-    known[old:shared] = False
-    both = known.clone()
-    both[old:shared] = True
-    log_prior = 0.5 * float(variables.prior()[0][old:shared].log().sum())
-
-    def occam(after: Quadratic) -> float:
-        return log_prior - 0.5 * (_log_volume(after, both) - _log_volume(before, known))
-
+    further = _FurtherTerms.of(base, richer)
     # The prediction costs one step, the search it may save costs a whole fit.
-    if _newton_decrease(before, both) - _newton_decrease(before, known) + occam(before) <= 0:
+    if further is None or further.predicted_gain() <= 0:
         return None
-    start = variables.start(torch.cat([base.parts.plant, zeros]), base.parts.offsets)
+    problem, before = further.problem, further.before
+    zeros = torch.zeros(further.count, dtype=torch.float64)
+    start = problem.variables.start(torch.cat([base.parts.plant, zeros]), base.parts.offsets)
     found = richer.search(problem, start, tolerance, "eccentric encoders")
     end = found.result
     gain = float(before.cost) - float(end.cost)
-    return found if gain + occam(Quadratic(end.cost, end.gradient, end.hessian)) > 0 else None
+    better = gain + further.occam(Quadratic(end.cost, end.gradient, end.hessian)) > 0
+    return found if better else None
+
+
+def delay_warning(found: HorizonResult, delayed: ShootingFitter) -> list[str]:
+    """A sentence on the delay between torques and positions that the data ask for, if any.
+
+    By derivatives alone: a delay below a sample hardly shows in the balance of torques, but it
+    biases coefficients by more than their intervals.
+    """
+    further = _FurtherTerms.of(found, delayed)
+    if further is None or further.predicted_gain() <= 0:
+        return []
+    delay = float(further.step()[further.first])
+    first, second = ("Torques", "positions") if delay > 0 else ("Positions", "torques")
+    fall = 1.0 - max(0.0, 1.0 - further.decrease() / float(further.before.cost)) ** 0.5
+    return [LATE.format(first, 1e3 * abs(delay), second, 100 * fall)]
+
+
+@dataclass(frozen=True)
+class _FurtherTerms:
+    """Local model of a stage with further plant terms, which begin at 0 behind its own."""
+
+    problem: ShootingProblem
+    before: Quadratic
+    first: int
+    count: int
+    # Variables that may move, without and with the further terms.
+    known: Tensor
+    both: Tensor
+
+    @classmethod
+    def of(cls, base: HorizonResult, richer: ShootingFitter) -> "_FurtherTerms | None":
+        count = len(richer.jacobian.terms) - len(base.problem.jacobian.terms)
+        if not base.noise > 0 or count < 1:
+            return None
+        problem = richer.problem(base.problem.windows, base.noise, base.parts.friction)
+        first = base.problem.variables.shared_count
+        zeros = torch.zeros(count, dtype=torch.float64)
+        at_base = torch.cat([base.result.x[:first], zeros, base.result.x[first:]])
+        lower, upper = problem.variables.bounds()
+        # Variables at a bound cannot move, so they take no volume of the posterior.
+        known = (at_base > lower) & (at_base < upper)
+        known[first : first + count] = False
+        both = known.clone()
+        both[first : first + count] = True
+        return cls(problem, problem.linearise(at_base), first, count, known, both)
+
+    def occam(self, after: Quadratic) -> float:
+        """Logarithm of the Occam factor of the further terms."""
+        precision = self.problem.variables.prior()[0][self.first : self.first + self.count]
+        volume = _log_volume(after, self.both) - _log_volume(self.before, self.known)
+        return 0.5 * (float(precision.log().sum()) - volume)
+
+    def step(self) -> Tensor:
+        """Gauss-Newton step with the further terms, (variable,)."""
+        step = torch.zeros_like(self.before.gradient)
+        step[self.both] = -_newton_step(self.before, self.both)
+        return step
+
+    def decrease(self) -> float:
+        """Decrease of the cost by the further terms that derivatives predict."""
+        return _newton_decrease(self.before, self.both) - _newton_decrease(self.before, self.known)
+
+    def predicted_gain(self) -> float:
+        """Gain of the log evidence that derivatives predict."""
+        return self.decrease() + self.occam(self.before)
+
+
+def _newton_step(local: Quadratic, chosen: Tensor) -> Tensor:
+    slope = local.gradient[chosen]
+    return torch.linalg.lstsq(local.hessian[chosen][:, chosen], slope).solution
 
 
 def _newton_decrease(local: Quadratic, chosen: Tensor) -> float:
     """Decrease of the cost that its quadratic model predicts when the chosen variables move."""
-    slope = local.gradient[chosen]
-    return 0.5 * float(slope @ torch.linalg.lstsq(local.hessian[chosen][:, chosen], slope).solution)
+    return 0.5 * float(local.gradient[chosen] @ _newton_step(local, chosen))
 
 
 def _log_volume(local: Quadratic, chosen: Tensor) -> float:
