@@ -4,8 +4,7 @@ A schedule is a module c = c(qd, qdd; theta) from joint velocity and acceleratio
 (*batch, joint), to the coefficients of a law, (*batch, joint, coefficient). Its parameters theta
 are what a fit estimates; a fit sees them as one flat vector with bounds, a prior and the
 derivatives dc/dtheta. The simplest schedule, `Constant`, ignores the motion and has the
-coefficients themselves for parameters. The next step is `nfriction.friction.models`, which joins a
-law and a schedule.
+coefficients themselves for parameters. The next step is `nfriction.friction.models`.
 """
 
 import math

@@ -45,9 +45,8 @@ class Coefficient:
         linear: the torque is linear in it, so linear least squares estimates it.
         initial_grid: start values to try where the torque is not linear in it.
         fitted: estimated by default; otherwise kept at its initial value.
-        prior_scale: standard deviation of a prior around zero, relative to the root mean square of
-            the joint's friction torque; infinite for no prior. Use it where most joints have little
-            of an effect that short recordings seem to show.
+        prior_scale: standard deviation of a prior around zero, relative to the RMS of the joint's
+            friction torque; infinite for none. For effects that most joints have little of.
         stores: scales the energy of a law's memory, so that networks leave it constant.
 
     Raises:

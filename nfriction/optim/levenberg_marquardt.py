@@ -9,8 +9,7 @@ Gauss-Newton Hessian H = J^T J. One iteration
 3. lowers the damping where the quadratic predicted the fall well, else raises it.
 
 The solver asks for cost, gradient and Hessian instead of a residual Jacobian, so that callers may
-accumulate 40,000 samples in pieces and never hold one. The next step is
-`nfriction.evaluation.score`, which tests the fitted model on other recordings.
+accumulate 40,000 samples in pieces and never hold one. The next step is `nfriction.evaluation.score`.
 """
 
 from __future__ import annotations

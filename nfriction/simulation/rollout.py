@@ -69,8 +69,7 @@ def rollout(
         friction: friction model, or None for no friction.
         q0, qd0: initial state [rad, rad/s] in joint coordinates, shape (*batch, joint); like all
             tensors here also NumPy arrays or lists, which are float64 unless an array says else.
-        tau: joint torque [N m], held over each step, shape (steps, joint) or
-            (*batch, steps, joint); None for none.
+        tau: joint torque [N m] held over each step, (steps, joint) or (*batch, steps, joint).
         sample_time: sample time [s], a number, (steps,) or (*batch, steps).
         steps: number of samples after the first; optional where `tau` or `sample_time` gives it.
         substeps: integration steps to each sample. A hidden state advances once a sample; other
@@ -79,20 +78,17 @@ def rollout(
             where they ought to rest. `"time_stepping"` takes semi-implicit steps of first order
             in which dry friction stops a joint and holds it, however steep; it needs shorter
             steps, and has no gradients, measured drive or hidden state.
-        drive: motion that drives the coefficients: the `"simulated"` one, or the `"measured"` one,
-            as in the papers.
+        drive: motion that drives the coefficients: `"simulated"`, or `"measured"` as in the papers.
         measured: velocity and acceleration for `drive="measured"`, each (*batch, steps, joint).
-        hidden_state: of the coefficients after the first sample, (*batch, joint, state_size), to
-            continue an earlier motion (see `Schedule.states`); by default that of the first
-            sample alone.
+        hidden_state: of the coefficients after the first sample (see `Schedule.states`), (*batch,
+            joint, state_size), to continue an earlier motion; by default that of the sample alone.
         law_state: internal state of a friction law with memory at the start, (*batch, joint,
             state), to continue an earlier motion; by default nothing is deflected.
-        gradients: make the motion differentiable; None does so where any input requires it, no
-            compiled backend is named, and there are at most 10,000 steps.
-        backend: `"torch"` steps in eager torch; `"compiled"` compiles the same definition
-            (no gradients); `"auto"` compiles where it can. Its gradients come from an adjoint
-            sweep, which gives first derivatives only; for higher ones, or within `torch.func`,
-            `"torch"` records every step.
+        gradients: make the motion differentiable; by default where any input requires it, `backend`
+            is not `"compiled"`, and there are at most 10,000 steps.
+        backend: `"torch"` steps in eager torch; `"compiled"` compiles the same definition (no
+            gradients); `"auto"` compiles where it can. Its gradients come from an adjoint sweep, of
+            first order only; for higher ones, or in `torch.func`, `"torch"` records every step.
         threads: number of threads that share a compiled batch.
 
     Returns:

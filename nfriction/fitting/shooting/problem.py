@@ -5,12 +5,11 @@ light mechanism forgets its start within seconds; of a law with memory the defle
 that state. The decision variables x are the friction parameters, the plant terms, each window's
 initial state and the encoders' offsets, and the cost is
 
-    J(x) = 1/2 sum |C (q_sim(t; x) - q(t))|^2 / noise_sd^2      over windows and samples, or a
-                                                                robust loss of these errors
+    J(x) = 1/2 sum |C (q_sim(t; x) - q(t))|^2 / noise_sd^2      samples (or a robust loss)
          + 1/2 sum (x - mean)^2 / sd^2                          priors
 
-with C the matrix from joint to recorded coordinates. Every method takes x; plant and friction model
-stay as they are. The next step is `nfriction.optim.levenberg_marquardt`, which minimises J.
+with C the matrix from joint to recorded coordinates. Plant and friction model stay as they are. The
+next step is `nfriction.optim.levenberg_marquardt`, which minimises J.
 
 References:
     H. G. Bock, in: Modelling of Chemical Reaction Systems, Springer (1981), 102-125.
@@ -63,8 +62,7 @@ class ShootingProblem:
         friction: the friction model at the start, which a search leaves as it is.
         windows: what was measured.
         noise_sd: standard deviation of a position error [rad; m], scale of the priors.
-        measurement: matrix (joint, joint) from joint coordinates to the recorded ones, in which
-            errors count.
+        measurement: matrix (joint, joint) from joint to recorded coordinates, where errors count.
         substeps: integration steps per sample.
         stride: every so many samples one counts, with that weight: model errors last far longer
             than a sample, and sums over many parameters dominate the time of a step.
