@@ -1,4 +1,4 @@
-"""Take the gallery's figures from runs: `python docs/gallery.py runs/demo runs/wheel runs/contact`."""
+"""Take the figures of the gallery: `python docs/gallery.py runs/demo runs/wheel runs/contact`."""
 
 import sys
 from pathlib import Path

@@ -8,8 +8,8 @@ Gauss-Newton Hessian H = J^T J. One iteration
 2. evaluates the cost at x + p, and takes the step only if the cost falls;
 3. lowers the damping where the quadratic predicted the fall well, else raises it.
 
-The solver asks for cost, gradient and Hessian instead of a residual Jacobian, so that callers may
-accumulate 40,000 samples in pieces and never hold one. The next step is `nfriction.evaluation.score`.
+The solver asks for cost, gradient and Hessian, not for a residual Jacobian, so that callers may add
+up 40,000 samples in pieces and never hold one. The next step is `nfriction.evaluation.score`.
 """
 
 from __future__ import annotations
