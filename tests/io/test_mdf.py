@@ -76,11 +76,14 @@ def test_channels_of_arrays_are_refused() -> None:
         mdf.choose_channels(file, ())
 
 
-def test_a_file_cut_short_is_refused(asammdf: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "part", [0.5, *(pytest.param(part, marks=pytest.mark.slow) for part in (0.25, 64, 10))]
+)
+def test_a_file_cut_short_is_refused(asammdf: Any, tmp_path: Path, part: float) -> None:
     path = tmp_path / "run.mf4"
     write(asammdf, path, [("q1", Q[:, 0], "rad")])
     content = path.read_bytes()
-    path.write_bytes(content[: len(content) // 2])
+    path.write_bytes(content[: int(part * len(content) if part < 1 else part)])
     with pytest.raises(ValueError, match=r"run\.mf4"):
         Recording.read(path)
 
