@@ -54,6 +54,8 @@ def test_scores_use_the_fitted_delay():
     late = compare(LinearAxis(2.0), "CVFM", train, test, **settings)
     found = compare(LinearAxis(2.0), "CVFM", train, test, fit_delay=True, **settings)
     assert found.table().loc["CVFM", "all"] < 0.1 * late.table().loc["CVFM", "all"]
+    # A figure shows the recording, of which every sample is simulated.
+    assert found.scores()["CVFM"][0].simulated.shape == test.q.shape
 
 
 def test_gradient_by_the_delay_is_that_of_the_cost():

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nfriction.fitting.data.inputs import advanced_torques
 from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.plant_parameters import TORQUE_DELAY
 from nfriction.fitting.result.identifiability import CoefficientUncertainty, Interval
@@ -178,9 +179,9 @@ class FitResult:
         return next((value for name, value, _ in self.plant_terms if name == TORQUE_DELAY), 0.0)
 
     def aligned(self, recording: Recording) -> Recording:
-        """A recording with its torque advanced by the fitted delay, as simulations need it."""
-        delay = self.torque_delay
-        return recording.advance_torque(delay) if delay and recording.tau is not None else recording
+        """A recording with its torque advanced by the fitted delay, and held at the ends."""
+        (advanced,) = advanced_torques([recording], self.torque_delay)
+        return advanced
 
     @property
     def residual_unit(self) -> str:
