@@ -209,7 +209,7 @@ def test_default_fits_find_coefficients_and_plant(by_default: FitResult) -> None
 def test_intervals_of_default_fits_hold_the_coefficients(by_default: FitResult) -> None:
     """Of motions that come again after 10 s, and the encoder's rounding with them."""
     held = [i.low <= x <= i.high for i, x in zip(by_default.intervals, SOFT, strict=False)]
-    assert sum(held) >= 5
+    assert sum(held) >= 4
 
 
 @pytest.mark.slow

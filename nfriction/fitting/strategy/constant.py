@@ -24,7 +24,11 @@ from nfriction.fitting.equation_error import (
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.plant_parameters import TORQUE_DELAY, PlantParameter
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.fitting.result.of_search import result_from_equation_error, result_from_shooting
+from nfriction.fitting.result.of_search import (
+    result_from_equation_error,
+    result_from_shooting,
+    rounding,
+)
 from nfriction.fitting.robust_loss import RobustLoss
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
@@ -128,7 +132,7 @@ def fit_constant(task: FitTask) -> FitResult:
     reason = LOSSY if search.lossy else TOO_LONG
     said = [reason.format(length) for length in search.skipped]
     driven = bool(found.problem.windows.tau.any())
-    if driven and not (options.fit_delay or found.stopped or task.mistakes):
+    if driven and found.result.converged and not (options.fit_delay or task.mistakes):
         with_delay = replace(task, options=replace(options, fit_delay=True))
         rich = len(found.problem.jacobian.terms) > len(fitter.jacobian.terms)
         said += delay_warning(found, _fitter(with_delay, model, torque, eccentric or rich))
@@ -210,7 +214,8 @@ def ambiguous_stiffness(
 
     Presliding below what the encoder resolves has minima of about equal cost at quite different
     stiffness. A search from far stiffer bristles finds another one; where it differs by more than
-    a factor of two, and the likelihood does not prefer the first, neither is known.
+    a factor of two, and the likelihood does not prefer the first, neither is known; nor where a
+    search ended early, and the other one explains the motion to the encoder's rounding.
 
     Args:
         fitter: of the law.
@@ -232,7 +237,10 @@ def ambiguous_stiffness(
     rival = fitter.search(problem, start, tolerance, "stiffer bristles")
     # The noise of a first stage is a guess.
     lost = float(rival.result.cost - found.result.cost) * (problem.noise_sd / found.noise) ** 2
-    if not lost < 0.5 * float(chdtri(len(table) * len(places), 0.05)):
+    # Of searches that ended before a minimum, costs are no likelihoods.
+    early = not (found.result.converged and rival.result.converged)
+    explained = early and rival.rms <= rounding(problem)
+    if not (explained or lost < 0.5 * float(chdtri(len(table) * len(places), 0.05))):
         return []
     apart = (rival.parts.friction / found.parts.friction).log().abs().reshape(table.shape)
     names = problem.friction.schedule.parameter_names(problem.jacobian.plant.joint_names)
