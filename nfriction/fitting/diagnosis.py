@@ -152,7 +152,7 @@ def _tested(
         delay, share = balanced_delay(plant, recordings, motions, options)
         # A torque that is held until the next sample acts late by up to a step.
         if not -max(r.sample_time for r in recordings) <= delay <= 0:
-            yield _delay_in_words(delay), share
+            yield delay_in_words(delay), share
     for text, rig in _corrected_terms(plant, given, options):
         yield text, _unexplained(rig, given)
     if len(recordings) > 1:
@@ -359,7 +359,8 @@ def balanced_delay(
     return float(found.x), float(found.fun)
 
 
-def _delay_in_words(delay: float) -> str:
+def delay_in_words(delay: float) -> str:
+    """A delay of torques after positions [s], and how to remove it, as a clause."""
     words = ("torques", "positions") if delay > 0 else ("positions", "torques")
     return (
         f"{words[0]} are recorded {1e3 * abs(delay):.1f} ms later than {words[1]} "

@@ -103,7 +103,7 @@ def test_a_measured_torque_acts_half_a_sample_late_and_the_fit_says_so():
     (said,) = (text for text in found.warnings if "`fit_delay=True`" in text)
     # Held over a sample of the simulation, it is early by half of that.
     late = 0.5 * (measured.sample_time - fine.sample_time)
-    (milliseconds,) = re.findall(r"Torques seem to be recorded ([\d.]+) ms later", said)
+    (milliseconds,) = re.findall(r"Perhaps torques are recorded ([\d.]+) ms later", said)
     assert float(milliseconds) == pytest.approx(1e3 * late, rel=0.05)
     held = fit(CVFM(1, v_smooth=0.05), LinearAxis(2.0), fine, **settings)
     assert not any("delay" in text for text in held.warnings)

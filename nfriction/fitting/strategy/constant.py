@@ -15,6 +15,7 @@ from torch import Tensor
 
 from nfriction.fitting.data.inputs import adjustable_terms, advanced_torques
 from nfriction.fitting.data.windows import Windows
+from nfriction.fitting.diagnosis import delay_in_words
 from nfriction.fitting.equation_error import (
     TorqueFit,
     fit_equation_error,
@@ -68,8 +69,8 @@ TOO_LONG = (
 )
 
 LATE = (
-    "{} seem to be recorded {:.2g} ms later than {}: with that delay the residual would fall by "
-    "about {:.0f} %, and coefficients may move by more than their intervals (`fit_delay=True`)."
+    "Perhaps {}: with that delay the residual would fall by about {:.0f} %, and coefficients may "
+    "move by more than their intervals."
 )
 
 LOSSY = (
@@ -362,9 +363,8 @@ def delay_warning(found: HorizonResult, delayed: ShootingFitter) -> list[str]:
     if further is None or further.predicted_gain() <= 0:
         return []
     delay = float(further.step()[further.first])
-    first, second = ("Torques", "positions") if delay > 0 else ("Positions", "torques")
     fall = 1.0 - max(0.0, 1.0 - further.decrease() / float(further.before.cost)) ** 0.5
-    return [LATE.format(first, 1e3 * abs(delay), second, 100 * fall)]
+    return [LATE.format(delay_in_words(delay), 100 * fall)]
 
 
 @dataclass(frozen=True)
