@@ -101,6 +101,18 @@ def test_a_driven_axis_gives_mass_and_offset():
     assert values == pytest.approx([3.0, 1.0], rel=0.05)
 
 
+def test_the_sign_of_a_named_model_turns_within_a_share_of_the_slowest_joints_speed():
+    """An axis that reaches 6 cm/s would creep at the speed at which a wheel's sign turns."""
+    axis, ideal = LinearAxis(20.0), CVFM(1, [4.0, 20.0], v_smooth=2e-5)
+    recording = driven_axis(axis, ideal, substeps=32)
+    found, usual = (
+        fit(model, axis, recording, windows=(1.0,), fit_plant=False) for model in ("CVFM", CVFM(1))
+    )
+    assert found.model.v_smooth < 1e-4 < usual.model.v_smooth
+    assert found.residual < 0.2 * usual.residual
+    assert found.model.schedule.values[0].tolist() == pytest.approx([4.0, 20.0], rel=0.01)
+
+
 def test_viscous_and_coulomb_friction_at_one_speed_are_named_as_lost():
     """Only their sum shows; either alone may be anything, and the verdict says so."""
     axis, truth = LinearAxis(2.0), LFM(1, [3.0, 1.0], v_smooth=V_SMOOTH)

@@ -15,6 +15,7 @@ References:
     H. G. Bock, in: Modelling of Chemical Reaction Systems, Springer (1981), 102-125.
 """
 
+import copy
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -43,7 +44,7 @@ from nfriction.fitting.shooting.normal_equations import (
     score_covariance,
 )
 from nfriction.fitting.shooting.sensitivity import StepJacobian, Trajectory, propagate
-from nfriction.fitting.shooting.variables import DecisionVariables, deflected, model_at
+from nfriction.fitting.shooting.variables import DecisionVariables, deflected
 from nfriction.fitting.strategy.extrapolation_prior import ExtrapolationPrior
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Quadratic
@@ -192,10 +193,16 @@ class ShootingProblem:
         counted[:, :: self.stride] = self.windows.weight[:, :: self.stride] * self.stride**0.5
         return counted[..., None] / self.noise_sd
 
+    @cached_property
+    def _moving(self) -> FrictionModel:
+        """A copy of the friction model, which every simulation moves to its parameters."""
+        return copy.deepcopy(self.friction)
+
     def _simulate(self, x: Tensor, *, with_memory: bool = False) -> Trajectory:
-        """The windows' motion at `x`; the memory of its coefficients only for derivatives."""
+        """The windows' motion at `x`, valid until the next; memory only for derivatives."""
         friction, plant, states, _ = self.variables.split(x)
-        model, joints = model_at(self.friction, friction), self.windows.q0.shape[-1]
+        model, joints = self._moving, self.windows.q0.shape[-1]
+        model.schedule.set_parameter_vector(friction)
         q0, qd0, shares = states.tensor_split([joints, 2 * joints], -1)
         law_state, law_slope = deflected(model, shares)
         held, linearised = (t.repeat_interleave(self.substeps, 1) for t in self._torques(plant))
