@@ -23,7 +23,7 @@ from limit import hand_written
 from timing import Contestant, verdict
 
 from nfriction import CVFM, FrictionModel, PendulumChain, Stribeck, rollout
-from nfriction.codegen import RolloutSignals, trace_rollout
+from nfriction.codegen import CompiledRollout, RolloutSignals
 from nfriction.friction.memory import LuGre, MaxwellSlip
 from nfriction.simulation.rk4 import rk4_step
 
@@ -55,7 +55,7 @@ def ours(
 
 def bare(plant: PendulumChain, friction: FrictionModel, q0: Any, qd0: Any) -> Callable:
     """The compiled code without the public call's checks, as hand-written C has none."""
-    compiled = trace_rollout(plant, friction, rk4_step)
+    compiled = CompiledRollout(plant, friction, rk4_step)
     q, qd = q0[None].numpy(), qd0[None].numpy()
 
     def run() -> np.ndarray:

@@ -109,7 +109,7 @@ def _write_controller(
 ) -> list[Path]:
     """Write an artefact; returns its files."""
     from nfriction import export
-    from nfriction.export.c_code.dialect import is_identifier
+    from nfriction.export.c_dialect import is_identifier
 
     options: dict[str, Any] = {
         "torque_limit": _limit(arguments.torque_limit),
@@ -219,7 +219,7 @@ def _targets(text: str) -> list[str]:
 
 def _identifier(text: str) -> str:
     """A name that C takes, for argparse."""
-    from nfriction.export.c_code.dialect import is_identifier
+    from nfriction.export.c_dialect import is_identifier
 
     if not is_identifier(text):
         raise argparse.ArgumentTypeError(

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from nfriction.codegen import jit
 from nfriction.codegen.graph import FunctionalModule
-from nfriction.codegen.llvm import jit
-from nfriction.codegen.llvm.ir import Body
+from nfriction.codegen.ir import Body
 
 Array = np.ndarray
 
@@ -47,11 +47,7 @@ def to_array(value: Any) -> Array:
 
 
 def series(name: str, value: Any, steps: int, width: tuple[int, ...]) -> Series:
-    """`value` of shape width, (steps, *width) or (candidate, steps, *width), which is not copied.
-
-    Raises:
-        ValueError: for any other shape.
-    """
+    """`value` of shape width, (steps, *width) or (candidate, steps, *width), not copied."""
     array = to_array(value)
     full = (steps, *width)
     if array.shape == width:
@@ -65,11 +61,7 @@ def series(name: str, value: Any, steps: int, width: tuple[int, ...]) -> Series:
 
 
 def rows_of(name: str, value: Any, shape: tuple[int, ...]) -> Series:
-    """`value` of shape (row, *shape), the same in all steps.
-
-    Raises:
-        ValueError: for any other shape.
-    """
+    """`value` of shape (row, *shape), the same in all steps."""
     array = to_array(value)
     if not array.ndim or array.shape[1:] != shape:
         shown = ", ".join(map(str, shape))
@@ -86,11 +78,7 @@ def _strided(array: Array) -> Series:
 
 
 def common_rows(rows: Mapping[str, int]) -> int:
-    """The one number of rows that all arguments agree on; single rows are for all.
-
-    Raises:
-        ValueError: if they disagree.
-    """
+    """The one number of rows that all arguments agree on; single rows are for all."""
     counts = {count for count in rows.values() if count != 1} or {1}
     if len(counts) > 1:
         shown = ", ".join(f"`{name}` {count}" for name, count in rows.items() if count != 1)
@@ -106,9 +94,6 @@ def parameter_rows(
     Args:
         module: has the values that are not overridden.
         overrides: values by name, of the parameter's shape or (candidate, *shape).
-
-    Raises:
-        ValueError: for an unknown name or a shape that does not fit.
     """
     unknown = [name for name in overrides if name not in module.shapes]
     if unknown:

@@ -19,9 +19,8 @@ from torch import Tensor, nn
 from torch.utils._mode_utils import no_dispatch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from nfriction.codegen.errors import UnsupportedOperation
 from nfriction.codegen.operations import OPERATIONS, constants
-from nfriction.codegen.scalar import Graph, Node, UpdateRate, reachable
+from nfriction.codegen.scalar import Graph, Node, UnsupportedOperation, UpdateRate, reachable
 
 # Most elements a traced tensor, and most scalar operations a traced function, may have.
 LIMIT = 50_000
@@ -238,10 +237,6 @@ def trace(
         function: takes the inputs by keyword; returns a tensor or a tuple of tensors.
         inputs: example tensors, float64; each becomes an input of its own.
         parameters: names of the inputs that stay the same over many calls.
-
-    Raises:
-        UnsupportedOperation: an operation without scalar form, named.
-        ValueError: an example that is not float64.
     """
     graph, ports, arguments = Graph(), [], {}
     for name, example in inputs.items():

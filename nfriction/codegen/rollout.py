@@ -17,9 +17,9 @@ from nfriction.codegen.batch import (
     series,
     to_array,
 )
-from nfriction.codegen.errors import SelfCheckFailed
 from nfriction.codegen.graph import FunctionalModule
 from nfriction.codegen.rollout_program import LAYOUT, ForcedSystem, RolloutDriver, arrange
+from nfriction.codegen.scalar import SelfCheckFailed
 
 # Of accelerations over steps of 0.1 ms: velocities of 10 rad/s round to 2e-15, rates to 2e-11.
 _CHECK_TOLERANCE = 1e-9
@@ -73,8 +73,8 @@ class Trajectories(NamedTuple):
     law_state: Any = None
 
 
-def trace_rollout(plant: Any, friction: Any, step: Callable[..., Any]) -> "CompiledRollout":
-    """Trace rollouts of a plant with friction; compiled at their first call or by `check`.
+class CompiledRollout:
+    """Rollouts of a plant with friction, traced at once and compiled at the first call.
 
     Parameters and floating-point buffers stay inputs: they are read at every call, so a fit may
     change them, and may differ from candidate to candidate. Everything else (Python numbers,
@@ -87,26 +87,21 @@ def trace_rollout(plant: Any, friction: Any, step: Callable[..., Any]) -> "Compi
         step: `(plant, friction, q, qd, tau, coefficients, step) -> (q, qd, qdd)`, which is
             repeated; for instance `nfriction.simulation.rk4.rk4_step`.
 
-    Raises:
-        UnsupportedOperation: the modules use an operation that has no scalar form here.
-        TypeError: one of them is no module.
-    """
-    for name, module in (("plant", plant), ("friction", friction)):
-        if not isinstance(module, nn.Module):
-            raise TypeError(f"`{name}` must be a torch module, got {type(module).__name__}.")
-    return CompiledRollout(ForcedSystem(plant, friction, step))
-
-
-class CompiledRollout:
-    """Rollouts of one plant and friction model; made by `trace_rollout`.
-
     Attributes:
         parameter_names: names under which `parameters` may be given.
         digest: a hash of all that is computed; code of another plant and friction model with the
             same digest computes the same, given the same parameters.
+
+    Raises:
+        UnsupportedOperation: the modules use an operation that has no scalar form here.
+        TypeError: one of them is no module.
     """
 
-    def __init__(self, system: ForcedSystem) -> None:
+    def __init__(self, plant: Any, friction: Any, step: Callable[..., Any]) -> None:
+        for name, module in (("plant", plant), ("friction", friction)):
+            if not isinstance(module, nn.Module):
+                raise TypeError(f"`{name}` must be a torch module, got {type(module).__name__}.")
+        system = ForcedSystem(plant, friction, step)
         self._system = system
         self.joints = int(system.plant.joints)
         self._module = FunctionalModule(system)

@@ -7,9 +7,9 @@ from typing import Any
 from torch import Tensor, nn
 
 from nfriction.codegen.batch import Driver, Layout
+from nfriction.codegen.emit import write_function
 from nfriction.codegen.graph import Program
-from nfriction.codegen.llvm.emit import write_function
-from nfriction.codegen.llvm.ir import real
+from nfriction.codegen.ir import real
 from nfriction.codegen.scalar import Graph, Node
 from nfriction.codegen.transform import hoist
 

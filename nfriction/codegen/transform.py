@@ -7,9 +7,15 @@ of the steps.
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial, reduce
 
-from nfriction.codegen.errors import UnsupportedOperation
 from nfriction.codegen.graph import Port, Program
-from nfriction.codegen.scalar import Graph, Node, UpdateRate, is_predicate, reachable
+from nfriction.codegen.scalar import (
+    Graph,
+    Node,
+    UnsupportedOperation,
+    UpdateRate,
+    is_predicate,
+    reachable,
+)
 
 Tangents = Mapping[int, Node]
 Rule = Callable[..., Node]
@@ -25,9 +31,6 @@ def with_jacobian(program: Program, wrt: Sequence[str]) -> Program:
     Returns:
         The program with an output of shape (elements of all outputs, elements of all `wrt`), both
         flat and in order.
-
-    Raises:
-        UnsupportedOperation: see `tangents`.
     """
     graph = program.graph
     outputs = [node for port in program.outputs for node in port.nodes]
@@ -54,9 +57,6 @@ def tangents(graph: Graph, nodes: Iterable[Node], seed: Tangents) -> dict[int, N
 
     Returns:
         Derivative by node number.
-
-    Raises:
-        UnsupportedOperation: an operation without a rule lies on the way, named.
     """
     found = dict(seed)
     for node in nodes:

@@ -25,8 +25,8 @@ from nfriction.export.contract import (
     write_verified,
 )
 from nfriction.export.controller import controller_of, for_single_precision
-from nfriction.export.pt2_file import exported, run_from_nan, silent
 from nfriction.export.torch_archive import METADATA
+from nfriction.export.torch_files import exported, run_from_nan, silent
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import ModelInfo
 
@@ -58,9 +58,6 @@ class OnnxGraph:
     Attributes:
         nodes: ONNX nodes, in order.
         constants: arrays that they read, by name.
-
-    Raises:
-        ExportError: an operation has no translation; it is named.
     """
 
     def __init__(
@@ -336,13 +333,7 @@ def onnx(
 
 
 def open_onnx(path: str | Path) -> tuple[Contract, Runner]:
-    """Load an artefact; returns its contract, and how to run it.
-
-    Raises:
-        ImportError: if the package `onnx` is missing.
-        ExportError: if it is no ONNX graph, or not one with these inputs.
-        ContractError: if its metadata are absent or damaged.
-    """
+    """Load an artefact; returns its contract, and how to run it."""
     package = _package()
     file, contract = read_onnx(path)
     try:
@@ -361,10 +352,7 @@ def open_onnx(path: str | Path) -> tuple[Contract, Runner]:
 
 
 def read_onnx(path: str | Path) -> tuple[Any, Contract]:
-    """Read a file as a protocol buffer, and its contract.
-
-    Raises: as `open_onnx`.
-    """
+    """Read a file as a protocol buffer, and its contract."""
     package = _package()
     if Path(path).stat().st_size > LARGEST_FILE:
         raise ExportError(f"{path}: too large for a graph of nfriction.")

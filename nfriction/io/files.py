@@ -20,9 +20,6 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
     Missing folders are made. Readers see the old file or the new one, never half of one; only a
     killed process leaves its temporary file, hidden and ending in `.part`.
-
-    Raises:
-        OSError: the file cannot be written; the message names folder, reason and remedy.
     """
     path = Path(path)
     temporary = path.parent / f".{uuid.uuid4().hex}.part"
@@ -66,10 +63,6 @@ def parse_json(
     Args:
         text: JSON.
         pairs_hook: as `object_pairs_hook` of `json.loads`.
-
-    Raises:
-        ValueError: no JSON, cut short, or with a number that is not finite or beyond all floats.
-        RecursionError: nested too deeply.
     """
     return json.loads(
         text, parse_constant=_finite, parse_float=_finite, parse_int=_whole,
@@ -84,9 +77,6 @@ def numbers(name: str, given: Any, words: Sequence[str] = ()) -> Any:
         name: of the entry, for errors.
         given: parsed JSON.
         words: that count as numbers too, such as "nan".
-
-    Raises:
-        ValueError: anything else is among them, such as true and false.
     """
     if isinstance(given, (list, tuple)):
         return [numbers(name, x, words) for x in given]

@@ -89,11 +89,7 @@ def parameter_hash(state: Mapping[str, Tensor]) -> str:
 
 
 def describe(model: FrictionModel, info: ModelInfo) -> dict[str, Any]:
-    """Everything a model file holds except the parameters, as plain JSON.
-
-    Raises:
-        ValueError: not one name for each joint.
-    """
+    """Everything a model file holds except the parameters, as plain JSON."""
     if info.joint_names and len(info.joint_names) != model.joints:
         raise ValueError(
             f"`joint_names` must name {model.joints} joints, got {list(info.joint_names)}."
@@ -262,11 +258,7 @@ def load_plant(path: str | Path) -> Plant:
 
 
 def read_model_file(path: str | Path) -> dict[str, Any]:
-    """Content of a model file, checked for form, size and damage.
-
-    Raises:
-        ModelFileError: it is no sound model file.
-    """
+    """Content of a model file, checked for form, size and damage."""
     path = Path(path)
     with _naming(path):
         if path.exists() and not path.is_file():

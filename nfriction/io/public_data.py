@@ -84,10 +84,6 @@ def fetch(name: str, folder: Path) -> Fetched:
         name: of one of `public_sets()`.
         folder: of the set. Gets `originals`, a table of each recording, and `recordings.csv`, which
             has initial states where the set gives them.
-
-    Raises:
-        ValueError: for an unknown name, or an original that is not what it should be.
-        OSError: if an original cannot be fetched; names its address and where to put it.
     """
     sets = public_sets()
     if name not in sets:

@@ -316,11 +316,7 @@ def _require_one_run(run: Run) -> None:
 
 
 def _read(kind: Any, value: Any, where: str) -> Any:
-    """A JSON value as a type, such as `dict[str, float]`; null is an infinite number.
-
-    Raises:
-        _EntryError: if it is of another type.
-    """
+    """A JSON value as a type, such as `dict[str, float]`; null is an infinite number."""
     origin, of = typing.get_origin(kind), typing.get_args(kind)
     if kind is Any:
         return value

@@ -66,11 +66,7 @@ class System:
 
 
 def wants_compiled(backend: Backend, q: Tensor, gradients: bool) -> bool:
-    """Return true if compiled code should be tried.
-
-    Raises:
-        ValueError: if compiled code is asked for together with gradients or off the CPU.
-    """
+    """Return true if compiled code should be tried."""
     if backend not in get_args(Backend):
         raise ValueError(f"`backend` must be one of {get_args(Backend)}, got {backend!r}.")
     able = not gradients and q.dtype == torch.float64 and q.device.type == "cpu"
@@ -102,9 +98,6 @@ def integrate_compiled(
 
     Returns:
         None where `backend="auto"` finds no way to compile, so that eager torch has to do it.
-
-    Raises:
-        CodegenError: if compiled code is asked for and cannot be made.
     """
     compiled = _compiled(system, backend, step_function)
     if compiled is None:
@@ -184,7 +177,7 @@ def _attempt(
     """A compiled rollout, or the reason why there is none."""
     try:
         _check_compilable(plant, friction)
-        traced = codegen.trace_rollout(plant, friction, step_function)
+        traced = codegen.CompiledRollout(plant, friction, step_function)
         found = _compiled_graphs.get(traced.digest)
         if found is None:
             traced.check()

@@ -85,11 +85,7 @@ def moreau_step(
 def simulate_stiction(
     plant: Plant, friction: Friction, inputs: RolloutInputs, gradients: bool | None
 ) -> tuple[Tensor, ...]:
-    """States at every sample: q, qd, qdd, each (*batch, steps + 1, joint).
-
-    Raises:
-        ValueError: for what this scheme does not have.
-    """
+    """States at every sample: q, qd, qdd, each (*batch, steps + 1, joint)."""
     given = gradients or inputs.measured is not None or inputs.hidden_state is not None
     if memory_of(friction) is not None:
         raise ValueError(

@@ -54,11 +54,7 @@ def all_finite(x: Tensor) -> bool:
 
 
 def as_tensor(name: str, value: Any) -> Tensor:
-    """Tensors as they are; arrays keep their precision, whole numbers and lists become float64.
-
-    Raises:
-        ValueError: if it is no array of real numbers.
-    """
+    """Tensors as they are; arrays keep their precision, whole numbers and lists become float64."""
     if isinstance(value, Tensor):
         found = value
     else:

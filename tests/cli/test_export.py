@@ -13,8 +13,8 @@ import pytest
 from nfriction import LFM, NFLFM, ModelInfo, Recording, cli, rigs, save
 from nfriction.cli import export
 from nfriction.cli.console import Parser
-from nfriction.export.c_code.dialect import ControllerC
-from nfriction.export.c_code.export import find_compiler
+from nfriction.export.c_dialect import ControllerC
+from nfriction.export.c_file import find_compiler
 from tests.friction.samples import randomise
 
 RIG = rigs.tlrip()

@@ -6,8 +6,7 @@ import torch
 from torch import nn
 
 from nfriction import codegen
-from nfriction.codegen import SelfCheckFailed, UnsupportedOperation
-from nfriction.codegen.llvm import ir
+from nfriction.codegen import SelfCheckFailed, UnsupportedOperation, ir
 from nfriction.simulation.rk4 import rk4_step
 from tests.codegen.mechanisms import F64, Coulomb, NeuroFuzzy, Pendulum, reference
 
@@ -21,7 +20,7 @@ def run(compiled, q0, qd0, *, parameters=None, threads=1, **signals):
 
 
 def compile_rollout(plant, friction, **settings):
-    compiled = codegen.trace_rollout(plant, friction, rk4_step, **settings)
+    compiled = codegen.CompiledRollout(plant, friction, rk4_step, **settings)
     compiled.check()
     return compiled
 

@@ -35,8 +35,7 @@ from nfriction.export.contract import (
 )
 from nfriction.export.controller import controller_of
 from nfriction.export.onnx_file import open_onnx
-from nfriction.export.pt2_file import open_pt2
-from nfriction.export.torchscript_file import open_torchscript
+from nfriction.export.torch_files import open_pt2, open_torchscript
 from nfriction.io.formats import matlab, mdf
 from nfriction.io.formats.signals import load_signals, save_signals
 from nfriction.io.model_file import ModelFileError, load, load_info, load_plant, parameter_hash

@@ -32,12 +32,7 @@ _HEADER, _COMPRESSED = 128, 15
 
 
 def read_mat(path: Path, sources: Sequence[str] = ()) -> pd.DataFrame:
-    """Table of the signals asked for; variables and fields by name, see `signals`.
-
-    Raises:
-        ImportError: a file of version 7.3 and no h5py.
-        ValueError: a damaged file, or one of another version.
-    """
+    """Table of the signals asked for; variables and fields by name, see `signals`."""
     with path.open("rb") as file:
         start = file.read(1024)
     if SIGNATURE in start:
@@ -91,12 +86,7 @@ def _check_unpacked_size(content: bytes) -> None:
 
 
 def read_hdf5(path: Path, sources: Sequence[str] = ()) -> pd.DataFrame:
-    """Table of the signals asked for; groups and data sets by name, see `signals`.
-
-    Raises:
-        ImportError: h5py is not installed.
-        ValueError: no HDF5 file.
-    """
+    """Table of the signals asked for; groups and data sets by name, see `signals`."""
     try:
         import h5py
     except ImportError as error:

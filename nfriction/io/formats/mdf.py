@@ -17,13 +17,7 @@ if TYPE_CHECKING:
 
 
 def read_mdf(path: Path, sources: Sequence[str] = ()) -> pd.DataFrame:
-    """Table of the channels asked for, with their units; `time` is their common time.
-
-    Raises:
-        ImportError: asammdf is not installed.
-        ValueError: no MDF file, one that asammdf cannot read, or channels that were not sampled
-            together.
-    """
+    """Table of the channels asked for, with their units; `time` is their common time."""
     if find_spec("asammdf") is None:
         raise ImportError(
             "MDF files need asammdf: pip install nfriction[mdf]; or export them as .csv or .mat."
@@ -45,11 +39,7 @@ def read_signals(path: Path, sources: Sequence[str]) -> Signals:
 
 
 def choose_channels(file: Any, sources: Sequence[str]) -> Signals:
-    """Channels of an open file that were sampled together.
-
-    Raises:
-        ValueError: channels that make no recording.
-    """
+    """Channels of an open file that were sampled together."""
     places = dict(file.channels_db)
     columns: dict[str, Any] = {}
     units: dict[str, str] = {}

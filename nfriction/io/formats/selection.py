@@ -179,8 +179,6 @@ def to_si(kind: str, values: Array, unit: str) -> Array:
         values: any shape.
         unit: s, ms, us, ns; rad, mrad, deg, rev, counts/8192 (any count a revolution), m, mm; those
             per second, rpm; N m, mN m, N, mN; A, mA.
-    Raises:
-        ValueError: no unit of that kind.
     """
     per = _per_si(kind, unit)
     if per is None:

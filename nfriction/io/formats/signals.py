@@ -51,11 +51,7 @@ class Signals(NamedTuple):
     units: dict[str, str]
 
     def table(self) -> pd.DataFrame:
-        """The columns as a table.
-
-        Raises:
-            ValueError: signals of different lengths.
-        """
+        """The columns as a table."""
         import pandas as pd
 
         lengths = {name: len(values) for name, values in self.columns.items()}
@@ -76,8 +72,6 @@ def choose_signals(
         content: dicts, lists and arrays within each other.
         sources: names, perhaps with a unit after a colon.
         slashes: paths may also be written `data/Y/q1` and `/data/Y/q1`.
-    Raises:
-        ValueError: too many signals, or nested too deeply.
     """
     signals: Columns = {}
     for path, values in _walk(content, "", 0):
@@ -166,12 +160,7 @@ def _named_data(entries: Any) -> list[tuple[str, NDArray[Any]]]:
 def read_in_worker(
     module: str, library: str, path: Path, sources: Sequence[str] = ()
 ) -> pd.DataFrame:
-    """Table of signals that a module's `main` reads in a process of its own.
-
-    Raises:
-        ValueError: the file is too large, the worker refused it or died of it, or its signals make
-            no table.
-    """
+    """Table of signals that a module's `main` reads in a process of its own."""
     size = path.stat().st_size
     refuse_size(size)
     task = {"path": str(path.absolute()), "sources": list(sources)}

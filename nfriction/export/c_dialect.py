@@ -143,7 +143,7 @@ class ControllerC:
 
 @cache
 def _templates(dialect: ControllerC) -> jinja2.Environment:
-    folder = resources.files("nfriction.export.c_code").joinpath("templates")
+    folder = resources.files("nfriction.export").joinpath("templates")
 
     def load(name: str) -> str:
         return dialect.own(folder.joinpath(name).read_text("ascii"))
