@@ -150,7 +150,7 @@ def open_torchscript(path: str | Path) -> tuple[Contract, Runner]:
 def _opened(
     path: str | Path, ours: re.Pattern[str], what: str, load: Callable[[dict[str, bytes]], Any]
 ) -> tuple[Any, Contract]:
-    """What `load` makes of an archive's files, and its contract."""
+    """The loaded files of an archive, and its contract."""
     files = contents(path, ours, what)
     try:
         contract = Contract.from_json(files.get(f"extra/{METADATA}", b""))

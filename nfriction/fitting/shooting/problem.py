@@ -30,7 +30,6 @@ from nfriction.fitting.result.identifiability import (
     Information,
     information,
     observed_count,
-    standard_deviations,
 )
 from nfriction.fitting.robust_loss import SQUARES, RobustLoss
 from nfriction.fitting.shooting.normal_equations import (
@@ -136,10 +135,6 @@ class ShootingProblem:
         least = max(count / 12**0.5, self.options.min_noise)
         return replace(self, loss=RobustLoss.of_errors(self.options.loss, errors, least))
 
-    def residuals(self, x: Tensor) -> Tensor:
-        """Errors of the counted samples over the noise, (window, step + 1, joint)."""
-        return self._deviation(x, self._simulate(x)) * self._scale
-
     def plant_at(self, vector: Tensor) -> Plant:
         """The plant with its adjustable terms at a parameter vector."""
         return adjusted_plant(self.jacobian.plant, self.jacobian.terms, vector)
@@ -158,11 +153,6 @@ class ShootingProblem:
             for kept, found in zip(states[place], (run.q, run.qd), strict=True):
                 kept[first : last + 1] = found[w, : n : self.substeps].numpy()
         return tuple(replace(m, q=q, qd=qd) for m, (q, qd) in zip(motions, states, strict=True))
-
-    def posterior_sd(self, hessian: Tensor) -> Tensor:
-        """Standard deviation of every shared variable by a Gauss-Newton Hessian."""
-        precision, _ = self.variables.prior()
-        return standard_deviations(information(hessian, precision, self.variables.shared_count))
 
     def information(self, x: Tensor, sd: Tensor, count: float | None = None) -> Information:
         """Information about the shared variables, given the sd of each error times its weight.

@@ -11,7 +11,11 @@ from torch import Tensor
 from nfriction.fitting.data.inputs import integration_substeps
 from nfriction.fitting.data.windows import Windows, cut_windows
 from nfriction.fitting.options import FitOptions
-from nfriction.fitting.result.identifiability import observed_count
+from nfriction.fitting.result.identifiability import (
+    information,
+    observed_count,
+    standard_deviations,
+)
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
@@ -201,7 +205,8 @@ class StallMonitor:
         # A step that damping cut short shows no convergence.
         if before is None or step.damping > WEAK_DAMPING:
             return torch.inf
-        sd = self.problem.posterior_sd(local.hessian)
+        precision, _ = self.problem.variables.prior()
+        sd = standard_deviations(information(local.hessian, precision, count))
         # Of chaotic windows the curvature is round-off, by which nothing would ever move.
         if torch.isinf(sd).all():
             return torch.inf
