@@ -150,7 +150,7 @@ def open_torchscript(path: str | Path) -> tuple[Contract, Runner]:
 def _opened(
     path: str | Path, ours: re.Pattern[str], what: str, load: Callable[[dict[str, bytes]], Any]
 ) -> tuple[Any, Contract]:
-    """The loaded files of an archive, and its contract."""
+    """Read an archive: the result of `load` for its files, and its contract."""
     files = contents(path, ours, what)
     try:
         contract = Contract.from_json(files.get(f"extra/{METADATA}", b""))
@@ -164,7 +164,8 @@ def _opened(
         raise ExportError(f"{path}: nested without end.") from None
     except (RuntimeError, ArithmeticError, AttributeError, AssertionError, LookupError, TypeError,
             ValueError) as error:  # fmt: skip
-        raise ExportError(f"{path}: no {what} of nfriction ({first_line(error)}).") from error
+        reason = first_line(error)
+        raise ExportError(f"{path}: damaged, or no {what} of nfriction ({reason}).") from error
 
 
 class _Host(nn.Module):

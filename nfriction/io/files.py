@@ -1,11 +1,12 @@
-"""Files written whole or not at all, by which alone the package writes, and strict JSON."""
+"""Files written whole or not at all, by which alone the package writes; strict JSON, checked."""
 
 import errno
+import hashlib
 import json
 import math
 import os
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -68,6 +69,28 @@ def parse_json(
         text, parse_constant=_finite, parse_float=_finite, parse_int=_whole,
         object_pairs_hook=pairs_hook,
     )  # fmt: skip
+
+
+def checked_json(content: Mapping[str, Any]) -> dict[str, Any]:
+    """The content as JSON has it, with a checksum by which `is_intact` finds it unchanged.
+
+    Raises:
+        TypeError, ValueError: it is no plain JSON, or has numbers that are not finite.
+    """
+    # Through JSON, so that the checksum is of what a reader will see.
+    plain: dict[str, Any] = json.loads(json.dumps(content, allow_nan=False))
+    return plain | {"checksum": _checksum(plain)}
+
+
+def is_intact(content: dict[str, Any]) -> bool:
+    """True for content as `checked_json` made it; takes its checksum out."""
+    return content.pop("checksum", None) == _checksum(content)
+
+
+def _checksum(content: Mapping[str, Any]) -> str:
+    """SHA-256 of JSON content in any layout."""
+    canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(canonical.encode()).hexdigest()
 
 
 def numbers(name: str, given: Any, words: Sequence[str] = ()) -> Any:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from nfriction.friction import memory_names, model_by_name, model_names
 from nfriction.friction.models import FrictionModel
-from nfriction.io.files import numbers, parse_json, write_atomically
+from nfriction.io.files import checked_json, is_intact, numbers, parse_json, write_atomically
 from nfriction.plant import Plant
 from nfriction.plant.rigs import from_dict
 from nfriction.version import __version__
@@ -181,11 +181,9 @@ def save(model: FrictionModel, path: str | Path, info: ModelInfo | None = None) 
     content = describe(model, info or ModelInfo())
     content["state"] = {name: value.tolist() for name, value in state.items()}
     try:
-        # Through JSON, so that the checksum is of what a reader will see.
-        content = json.loads(json.dumps(content, allow_nan=False))
+        content = checked_json(content)
     except (TypeError, ValueError) as error:
         raise ValueError(f"`info` must be plain JSON with finite numbers: {error}.") from error
-    content["checksum"] = _checksum(content)
     return write_atomically(path, json.dumps(content, indent=1).encode())
 
 
@@ -281,7 +279,7 @@ def read_model_file(path: str | Path) -> dict[str, Any]:
             # JSON's true is an int to Python.
             if key not in content or not isinstance(value, kind) or isinstance(value, bool):
                 raise ValueError(f"`{key}` is missing or of the wrong type.")
-        if content.pop("checksum") != _checksum(content):
+        if not is_intact(content):
             raise ValueError("the checksum does not match; damaged or edited.")
         _check_sizes(content, size)
         info = _info(content)
@@ -370,12 +368,6 @@ def _parameter(name: str, given: Any, expected: Tensor) -> Tensor:
             f"{tuple(value.shape)}."
         )
     return value
-
-
-def _checksum(content: Mapping[str, Any]) -> str:
-    """SHA-256 of JSON content in any layout."""
-    canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(canonical.encode()).hexdigest()
 
 
 def _short(value: object) -> str:
