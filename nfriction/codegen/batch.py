@@ -91,9 +91,7 @@ def parameter_rows(
 ) -> tuple[Array, dict[str, int]]:
     """Parameter vectors, one row a candidate (or one for all), and the rows that each name gave.
 
-    Args:
-        module: has the values that are not overridden.
-        overrides: values by name, of the parameter's shape or (candidate, *shape).
+    Overrides are of the parameter's shape or (candidate, *shape); other values are the module's.
     """
     unknown = [name for name in overrides if name not in module.shapes]
     if unknown:

@@ -300,11 +300,7 @@ class FunctionalModule:
         return value
 
     def trace(self, inputs: Mapping[str, Tensor]) -> Program:
-        """Trace `module(**inputs)`; the program's first inputs are the parameters.
-
-        Args:
-            inputs: example tensors by the names of `forward`'s arguments.
-        """
+        """Trace `module(**inputs)` by examples; the program's first inputs are the parameters."""
         state = self._state()
         parameters = {f"p{i}": state[name] for i, name in enumerate(self.shapes)}
 

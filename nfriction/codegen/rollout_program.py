@@ -92,12 +92,7 @@ class RolloutProgram:
 
 
 def arrange(program: Program, law_size: int = 0) -> RolloutProgram:
-    """Arrange what was traced of a `ForcedSystem`.
-
-    Args:
-        program: with the outputs of its `forward`.
-        law_size: size of the internal state of the friction law.
-    """
+    """Arrange the trace of a `ForcedSystem` whose law has an internal state of that size."""
     graph, outputs = program.graph, [port.nodes for port in program.outputs]
     law = outputs.pop(3) if law_size else ()
     q, qd, qdd, start, held, *remembered = outputs
@@ -129,12 +124,7 @@ def _within(graph: Graph, q: Sequence[Node], qd: Sequence[Node]) -> Node:
 
 
 class RolloutDriver(Driver):
-    """The loops over candidates, samples and substeps.
-
-    Args:
-        program: functions to call in them.
-        width: see `Driver`.
-    """
+    """The loops over candidates, samples and substeps in which a program's functions are called."""
 
     def __init__(self, program: RolloutProgram, width: int) -> None:
         n = program.joints

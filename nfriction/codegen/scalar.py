@@ -190,14 +190,9 @@ def reachable(outputs: Iterable[Node], stop: Iterable[Node] = ()) -> list[Node]:
 
 
 def evaluate(outputs: Sequence[Node], inputs: Mapping[str, np.ndarray]) -> list[np.ndarray]:
-    """Values of `outputs`, computed in NumPy.
+    """Values of `outputs` by NumPy, each of the batch's shape.
 
-    Args:
-        outputs: the wanted nodes.
-        inputs: by name, arrays whose last axis is the flat index; leading axes are a batch.
-
-    Returns:
-        One array of the batch shape per output.
+    The last axis of an input is the flat index, leading axes are a batch.
     """
     values: dict[int, Any] = {}
     with np.errstate(all="ignore"):

@@ -59,12 +59,7 @@ def _message(error: OSError, path: Path) -> str:
 def parse_json(
     text: str | bytes, pairs_hook: Callable[[list[tuple[str, Any]]], dict[str, Any]] | None = None
 ) -> Any:
-    """Parse JSON text.
-
-    Args:
-        text: JSON.
-        pairs_hook: as `object_pairs_hook` of `json.loads`.
-    """
+    """Parse JSON text whose numbers are finite; see `json.loads` for the hook."""
     return json.loads(
         text, parse_constant=_finite, parse_float=_finite, parse_int=_whole,
         object_pairs_hook=pairs_hook,
@@ -74,8 +69,7 @@ def parse_json(
 def checked_json(content: Mapping[str, Any]) -> dict[str, Any]:
     """The content as JSON has it, with a checksum by which `is_intact` finds it unchanged.
 
-    Raises:
-        TypeError, ValueError: it is no plain JSON, or has numbers that are not finite.
+    TypeError or ValueError where it is no plain JSON, or has numbers that are not finite.
     """
     # Through JSON, so that the checksum is of what a reader will see.
     plain: dict[str, Any] = json.loads(json.dumps(content, allow_nan=False))
@@ -94,13 +88,7 @@ def _checksum(content: Mapping[str, Any]) -> str:
 
 
 def numbers(name: str, given: Any, words: Sequence[str] = ()) -> Any:
-    """Nested lists of floats, or one float, of nested lists of numbers.
-
-    Args:
-        name: of the entry, for errors.
-        given: parsed JSON.
-        words: that count as numbers too, such as "nan".
-    """
+    """Floats of parsed JSON, in its nested lists; `words` such as "nan" count as numbers too."""
     if isinstance(given, (list, tuple)):
         return [numbers(name, x, words) for x in given]
     # To Python true is a number.

@@ -88,16 +88,8 @@ def integrate_compiled(
 ) -> tuple[Tensor, ...] | None:
     """States at every sample: q, qd, qdd, each (*batch, steps + 1, joint), and that of the law.
 
-    Args:
-        system, inputs: what moves, and how.
-        backend: `"auto"` or `"compiled"`.
-        threads: number of threads that share a batch.
-        parameters: values of the friction model's parameters by name that differ from its own,
-            each (*batch, *the parameter's shape).
-        step_function: what is repeated, with the arguments of `rk4_step`.
-
-    Returns:
-        None where `backend="auto"` finds no way to compile, so that eager torch has to do it.
+    None where `backend="auto"` finds no way to compile, so that eager torch has to do it. The
+    friction model's parameters that differ from its own come by name, (*batch, *its shape).
     """
     compiled = _compiled(system, backend, step_function)
     if compiled is None:

@@ -208,7 +208,7 @@ def test_a_failed_write_leaves_the_old_file(
     def full(*_: object) -> None:
         raise OSError("no space left on device")
 
-    monkeypatch.setattr("nfriction.io.formats.files.os.replace", full)
+    monkeypatch.setattr("nfriction.io.formats.os.replace", full)
     with pytest.raises(OSError, match="no space"):
         swing(n=30).write(path)
     assert path.read_bytes() == before

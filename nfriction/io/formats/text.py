@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from nfriction.io.formats.files import MOST_COLUMNS, most_unpacked, refuse_bomb, refuse_size
+from nfriction.io.formats import MOST_COLUMNS, most_unpacked, refuse_bomb, refuse_size
 from nfriction.io.formats.numbers import decimal_sign, is_number
 from nfriction.io.formats.selection import is_unit
 
