@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,51 +26,30 @@ _CHECK_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
-class RolloutSignals:
-    """Sample times of rollouts, and all that drives the motion.
+class RolloutInputs:
+    """Initial state and inputs of a rollout.
 
     Attributes:
-        steps: number of samples.
-        time_step: sample time [s]: a number, (steps,) or (candidate, steps).
-        tau: joint torque held over each sample [N m], (steps, joint) or (candidate, steps, joint);
-            zero by default.
-        drive: measured velocity and acceleration that drive the coefficients instead of the
-            simulated ones, each (steps, joint) or (candidate, steps, joint).
-        substeps: steps to each sample. Coefficients with a memory are held over the sample; others
-            are held anew at each of these steps.
-        memory: memory of the coefficients after the first sample, (candidate, joint, state_size),
-            one row is for all; by default that of this sample alone.
-        law_state: of a friction law with memory at the start, (candidate, joint, state), one row is
-            for all; by default zero.
+        q0, qd0: initial state [rad, rad/s], (*batch, joint).
+        tau: torque held over each step [N m], (steps, joint) or (*batch, steps, joint).
+        step: sample times [s], (steps,) or (*batch, steps).
+        substeps: integration steps to each sample.
+        measured: velocity and acceleration that drive the coefficients in place of the simulated
+            ones, each (*batch, steps, joint) or without batch; None for the simulated ones.
+        hidden_state: of the coefficients after the first sample, (*batch, joint, state_size);
+            None for that of the first sample alone.
+        law_state: internal state of the friction law at the start, (*batch, joint, state); None of
+            a law without.
     """
 
-    steps: int
-    time_step: Any
-    tau: Any = None
-    drive: tuple[Any, Any] | None = None
+    q0: Tensor
+    qd0: Tensor
+    tau: Tensor
+    step: Tensor
     substeps: int = 1
-    memory: Any = None
-    law_state: Any = None
-
-
-class Trajectories(NamedTuple):
-    """Simulated motions, NumPy or torch as the initial state was.
-
-    Attributes:
-        q, qd: positions and velocities [rad, rad/s], shape (candidate, sample + 1, joint); NaN
-            from where a candidate diverged.
-        qdd: acceleration known at each sample [rad/s^2]: of the first stage of the step before it,
-            at the start that without friction; same shape.
-        diverged_at: number of the sample at which the state was not finite or too fast, -1 where
-            it never was, shape (candidate,).
-        law_state: of a friction law with memory, (candidate, sample + 1, joint, state); else None.
-    """
-
-    q: Any
-    qd: Any
-    qdd: Any
-    diverged_at: Any
-    law_state: Any = None
+    measured: tuple[Tensor, Tensor] | None = None
+    hidden_state: Tensor | None = None
+    law_state: Tensor | None = None
 
 
 class CompiledRollout:
@@ -138,67 +117,70 @@ class CompiledRollout:
 
     def __call__(
         self,
-        q0: Any,
-        qd0: Any,
-        inputs: RolloutSignals,
-        parameters: Mapping[str, Any] | None = None,
+        inputs: RolloutInputs,
+        parameters: Mapping[str, Tensor] | None = None,
         threads: int = 1,
-    ) -> Trajectories:
-        """Integrate all candidates from their initial states.
+    ) -> tuple[Tensor, ...]:
+        """States at every sample: q, qd, qdd, each (*batch, steps + 1, joint), and that of the law.
+
+        They are NaN from the sample on at which a state is not finite or too fast. The
+        acceleration is that of the first stage of the step before, at the start without friction.
 
         Args:
-            q0, qd0: initial state [rad, rad/s], shape (candidate, joint); one row is for all.
-            inputs: sample times, and all that drives the motion.
+            inputs: initial states, sample times, and all that drives the motion.
             parameters: values that differ from the modules', by name ("plant.…", "friction.…"),
-                shape (candidate, *the parameter's own) or just the parameter's own.
-            threads: candidates are shared out among this many.
-
-        Returns:
-            Trajectories, in NumPy or (where `q0` is one) torch.
+                shape (batch, *the parameter's own) or just the parameter's own.
+            threads: the batch is shared out among this many.
 
         Raises:
             ValueError: for shapes that do not fit, or a name that is not there.
         """
-        steps, substeps, drive, memory = inputs.steps, inputs.substeps, inputs.drive, inputs.memory
-        if steps < 0 or substeps < 1 or threads < 1:
+        steps, substeps, n = inputs.step.shape[-1], inputs.substeps, self.joints
+        if substeps < 1 or threads < 1:
             raise ValueError(
-                "`steps` must be 0 or more, `substeps` and `threads` 1 or more, got "
-                f"{steps}, {substeps} and {threads}."
+                f"`substeps` and `threads` must be 1 or more, got {substeps} and {threads}."
             )
-        n = self.joints
-        step = inputs.time_step if substeps == 1 else to_array(inputs.time_step) / substeps
+        batch = inputs.q0.shape[:-1]
+
+        def rows(x: Tensor, trailing: int) -> Tensor:
+            """Candidates on one leading axis; what all share keeps none."""
+            x = x.detach()
+            own = x.shape[x.ndim - trailing :]
+            if x.ndim > trailing:
+                x = x.expand(*batch, *own).reshape(-1, *own)
+            # An expanded constant needs no value for each step.
+            return x[0] if x.ndim == trailing and not x.stride(0) else x
+
         given = {
-            "q0": rows_of("q0", q0, (n,)),
-            "qd0": rows_of("qd0", qd0, (n,)),
-            "tau": series("tau", np.zeros(n) if inputs.tau is None else inputs.tau, steps, (n,)),
-            "step": series("time_step", step, steps, ()),
+            name: rows_of(name, value.detach().reshape(-1, n), (n,))
+            for name, value in (("q0", inputs.q0), ("qd0", inputs.qd0))
         }
-        if drive is not None:
-            for name, value in zip(("drive_qd", "drive_qdd"), drive, strict=True):
-                given[name] = series("drive", value, steps, (n,))
-        if memory is not None:
-            size = getattr(self._system.friction, "state_size", 0)
-            given["memory"] = rows_of("memory", memory, (n, size))
-        size = self._system.law_size
+        given["tau"] = series("tau", rows(inputs.tau, 2), steps, (n,))
+        given["step"] = series("step", to_array(rows(inputs.step, 1)) / substeps, steps, ())
+        if inputs.measured is not None:
+            for name, value in zip(("drive_qd", "drive_qdd"), inputs.measured, strict=True):
+                given[name] = series("measured", rows(value, 2), steps, (n,))
+        size, law = self._system.law_size, inputs.law_state
         if size:
-            law = np.zeros((1, n, size)) if inputs.law_state is None else inputs.law_state
-            given["law"] = rows_of("law_state", law, (n, size))
-        p, rows = parameter_rows(self._module, parameters or {})
-        count = common_rows(rows | {name: one.rows for name, one in given.items()})
-        outputs: dict[str, np.ndarray] = {
-            name: np.empty((count, steps + 1, n)) for name in LAYOUT.outputs[:3]
-        }
-        outputs["diverged"] = np.empty(count, dtype=np.int64)
-        if size:
-            outputs["law_out"] = np.empty((count, steps + 1, n, size))
-        settings = {"samples": steps, "substeps": substeps, "driven": drive is not None,
-                    "remembered": memory is not None}  # fmt: skip
-        self._kernel(count, p, given, outputs, settings, threads)
-        results: dict[str, Any] = dict(outputs)
-        if isinstance(q0, Tensor):
-            results = {name: torch.from_numpy(x) for name, x in results.items()}
-        q, qd, qdd, diverged = (results[name] for name in LAYOUT.outputs[:4])
-        return Trajectories(q, qd, qdd, diverged, results.get("law_out"))
+            law = inputs.q0.new_zeros(n, size) if law is None else law
+            given["law"] = rows_of(
+                "law_state", rows(law, 2).reshape(-1, *law.shape[-2:]), (n, size)
+            )
+        if (memory := inputs.hidden_state) is not None:
+            own = n, int(getattr(self._system.friction, "state_size", 0))
+            flat = rows(memory, 2).reshape(-1, *memory.shape[-2:])
+            given["memory"] = rows_of("hidden_state", flat, own)
+        p, counts = parameter_rows(self._module, parameters or {})
+        count = common_rows(counts | {name: one.rows for name, one in given.items()})
+        outputs = {name: np.empty((count, steps + 1, n)) for name in LAYOUT.outputs[:3]}
+        outputs |= {"law_out": np.empty((count, steps + 1, n, size))} if size else {}
+        settings = {"samples": steps, "substeps": substeps,
+                    "driven": inputs.measured is not None,
+                    "remembered": inputs.hidden_state is not None}  # fmt: skip
+        lost = {"diverged": np.empty(count, dtype=np.int64)}
+        self._kernel(count, p, given, outputs | lost, settings, threads)
+        found = map(torch.from_numpy, outputs.values())
+        return tuple(x.reshape(*batch, *x.shape[1:]) for x in found)
 
     def check(self) -> None:
         """Compare two steps from random states with the same steps in eager torch.
@@ -216,8 +198,9 @@ class CompiledRollout:
                 for s in scales
             )
             expected = to_array(self._eager(q, qd, tau, steps, dt)) - qd.numpy()
-            ours = self(q[None], qd[None], RolloutSignals(steps, dt, tau.expand(steps, -1)))
-            rate, eager = (ours.qd[0, -1].numpy() - qd.numpy()) / dt, expected / dt
+            step = torch.full((steps,), dt, dtype=torch.float64)
+            inputs = RolloutInputs(q, qd, tau.expand(steps, -1), step)
+            rate, eager = (self(inputs)[1][-1].numpy() - qd.numpy()) / dt, expected / dt
             scale = _CHECK_TOLERANCE * (1.0 + np.abs(eager).max())
             if not np.allclose(rate, eager, rtol=0.0, atol=scale, equal_nan=True):
                 raise SelfCheckFailed(
