@@ -34,18 +34,12 @@ _warned: set[str] = set()
 
 @dataclass(frozen=True)
 class System:
-    """Plant and friction, with a fingerprint by which a later change is noticed.
-
-    Attributes:
-        plant, friction: the mechanism and its friction model.
-        tensors: their floating-point parameters and buffers, by "plant." or "friction." and name.
-        fingerprint: of all else that they read; the error that says why there is none.
-    """
+    """Plant and friction, with a fingerprint by which a later change is noticed."""
 
     plant: Any
     friction: Any
-    tensors: Mapping[str, Tensor]
-    fingerprint: Hashable
+    tensors: Mapping[str, Tensor]  # floating-point ones, by "plant." or "friction." and name
+    fingerprint: Hashable  # of all else that they read; the error that says why there is none
 
     @classmethod
     def of(cls, plant: Any, friction: Any) -> "System":

@@ -319,7 +319,7 @@ def test_a_memory_agrees_with_eager_steps():
         alone = run(compiled, *(x[i : i + 1] for x in start(2, batch=5)), steps=50, time_step=1e-3,
                          substeps=3, memory=memory[1:])  # fmt: skip
         np.testing.assert_array_equal(many.q[i], alone.q[0])
-    with pytest.raises(ValueError, match="hidden_state"):
+    with pytest.raises(ValueError, match="memory"):
         run(compiled, q, qd, steps=5, time_step=1e-3, memory=torch.ones(2, 3, 1))
 
 
