@@ -8,8 +8,7 @@ from nfriction.codegen.jit import cache_folder
 from nfriction.codegen.operations import supported_operations
 from nfriction.codegen.rollout import (
     CompiledRollout,
-    RolloutSignals,
-    Trajectories,
+    RolloutInputs,
 )
 from nfriction.codegen.scalar import (
     CodegenError,
@@ -24,9 +23,8 @@ __all__ = [
     "CompiledFunction",
     "CompiledRollout",
     "Incomparable",
-    "RolloutSignals",
+    "RolloutInputs",
     "SelfCheckFailed",
-    "Trajectories",
     "UnsupportedOperation",
     "cache_folder",
     "content",

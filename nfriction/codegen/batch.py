@@ -26,17 +26,11 @@ FEW = 3
 
 @dataclass(frozen=True)
 class Series:
-    """A quantity over rows, steps and elements; a stride of zero repeats one value.
+    """A quantity over rows, steps and elements; a stride of zero repeats one value."""
 
-    Attributes:
-        values: the array that the strides refer to.
-        rows: number of rows given, 1 where it is the same for all.
-        strides: in numbers, along `AXES`.
-    """
-
-    values: Array
-    rows: int
-    strides: tuple[int, int, int]
+    values: Array  # that the strides refer to
+    rows: int  # given, 1 where it is the same for all
+    strides: tuple[int, int, int]  # in numbers, along `AXES`
 
 
 def to_array(value: Any) -> Array:
@@ -114,17 +108,11 @@ def parameter_rows(
 
 @dataclass(frozen=True)
 class Layout:
-    """Arguments of an entry point, in order.
+    """Arguments of an entry point, in order."""
 
-    Attributes:
-        series: inputs that have strides along `AXES`.
-        outputs: arrays that are written.
-        settings: further whole numbers.
-    """
-
-    series: tuple[str, ...]
-    outputs: tuple[str, ...]
-    settings: tuple[str, ...] = ()
+    series: tuple[str, ...]  # inputs that have strides along `AXES`
+    outputs: tuple[str, ...]  # arrays that are written
+    settings: tuple[str, ...] = ()  # further whole numbers
 
     @property
     def addresses(self) -> tuple[str, ...]:

@@ -54,17 +54,11 @@ class Program:
 
 
 class ScalarTensor(Tensor):
-    """A tensor whose elements are nodes of a scalar graph.
+    """A tensor whose elements are nodes of a scalar graph."""
 
-    Attributes:
-        nodes: object array of `Node`s, shaped like the tensor.
-        example: an ordinary tensor with the same shape, strides and dtype.
-        graph: where the nodes live.
-    """
-
-    nodes: np.ndarray
-    example: Tensor
-    graph: Graph
+    nodes: np.ndarray  # of `Node`s, shaped like the tensor
+    example: Tensor  # an ordinary one with the same shape, strides and dtype
+    graph: Graph  # where the nodes live
 
     @staticmethod
     def __new__(cls, nodes: np.ndarray, example: Tensor, graph: Graph) -> "ScalarTensor":

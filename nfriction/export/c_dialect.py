@@ -40,15 +40,10 @@ _HELPERS = {
 
 @dataclass(frozen=True)
 class ControllerC:
-    """The dialect of exported C.
+    """The dialect of exported C."""
 
-    Attributes:
-        real: type of all numbers.
-        prefix: of every name in the file, for which templates write `nf`.
-    """
-
-    real: Real = "double"
-    prefix: str = "nfriction"
+    real: Real = "double"  # type of all numbers
+    prefix: str = "nfriction"  # of every name in the file, for which templates write `nf`
 
     def literal(self, value: float | bool) -> str:
         """A number as C spells it, in brackets where it is negative."""

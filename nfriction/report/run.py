@@ -33,14 +33,7 @@ class RunError(ValueError):
 
 @dataclass(frozen=True)
 class FitRecord:
-    """End of a fit, from `FitResult.to_dict`.
-
-    Attributes:
-        usability: "good", "doubtful" or "do not use", and why.
-        intervals: 95 % interval by parameter, infinity for an open end.
-        plant: adjusted terms of the plant by name.
-        rule_seconds: how long the recordings fired each rule of a network [s], by joint.
-    """
+    """End of a fit, from `FitResult.to_dict`."""
 
     status: str = "unknown"
     converged: bool = False
@@ -50,7 +43,7 @@ class FitRecord:
     at_bounds: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     unidentifiable: tuple[str, ...] = ()
-    plant: dict[str, float] = field(default_factory=dict)
+    plant: dict[str, float] = field(default_factory=dict)  # adjusted terms by name
     intervals: dict[str, tuple[float, float]] = field(default_factory=dict)
     rule_seconds: tuple[tuple[float, ...], ...] = ()
 

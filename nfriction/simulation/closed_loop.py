@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nfriction.codegen.rollout_program import SPEED_LIMIT
+from nfriction.codegen.rollout import SPEED_LIMIT
 from nfriction.simulation.compiled import System
 from nfriction.simulation.protocols import (
     Friction,

@@ -41,17 +41,11 @@ MOST_COLUMNS = 1000
 
 
 class Signals(NamedTuple):
-    """Signals chosen from a file.
+    """Signals chosen from a file."""
 
-    Attributes:
-        columns: vectors by name.
-        found: names of all signals in the file.
-        units: of the columns, where the file has any.
-    """
-
-    columns: Columns
-    found: list[str]
-    units: dict[str, str]
+    columns: Columns  # vectors by name
+    found: list[str]  # names of all signals in the file
+    units: dict[str, str]  # of the columns, where the file has any
 
     def table(self) -> pd.DataFrame:
         """The columns as a table."""
@@ -69,12 +63,9 @@ class Signals(NamedTuple):
 def choose_signals(
     content: dict[str, Any], sources: Sequence[str], *, slashes: bool = False
 ) -> Signals:
-    """Choose the signals asked for, and those with names of ours.
+    """Choose the signals asked for, and those with names of ours, in dicts, lists and arrays.
 
-    Args:
-        content: dicts, lists and arrays within each other.
-        sources: names, perhaps with a unit after a colon.
-        slashes: paths may also be written `data/Y/q1` and `/data/Y/q1`.
+    With `slashes`, paths may also be written `data/Y/q1` and `/data/Y/q1`.
     """
     signals: Columns = {}
     for path, values in _walk(content, "", 0):

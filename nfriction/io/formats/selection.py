@@ -68,19 +68,13 @@ class Source(NamedTuple):
 
 
 class Arrays(NamedTuple):
-    """Arrays of a recording in SI.
+    """Arrays of a recording in SI."""
 
-    Attributes:
-        values: time, q; qd where every joint has it; tau where any has, zero for the others.
-        slides: whether positions are lengths; None if unknown.
-        remarks: doubts about the choice of columns, and the remedy of each.
-        of_motors: True if positions follow from the angles of motors.
-    """
-
+    # time, q; qd where every joint has it; tau where any has, zero for the others
     values: dict[str, Array]
-    slides: bool | None
-    remarks: tuple[tuple[str, str], ...] = ()
-    of_motors: bool = False
+    slides: bool | None  # whether positions are lengths; None if unknown
+    remarks: tuple[tuple[str, str], ...] = ()  # doubts about the columns, the remedy of each
+    of_motors: bool = False  # positions follow from the angles of motors
 
 
 def table_arrays(
