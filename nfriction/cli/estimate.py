@@ -83,11 +83,9 @@ def run_fit(arguments: argparse.Namespace) -> int:
     from nfriction.cli.tables import coefficient_table, fit_lines, interval_table
     from nfriction.evaluation.results import model_info
     from nfriction.fitting.fit import fit
-    from nfriction.friction import model_by_name
     from nfriction.io.model_file import save
 
     plant = inputs.read_rig(arguments.rig)
-    model = model_by_name(arguments.model)(plant.joints)
     recordings = inputs.read_recordings(arguments.recordings, plant, arguments)
     if arguments.out.is_dir():
         raise UsageError(f"--out of fit is a file, and {arguments.out} is a folder.")
@@ -95,14 +93,14 @@ def run_fit(arguments: argparse.Namespace) -> int:
     with Progress() as progress:
         progress.stage(f"fit {arguments.model}")
         found = fit(
-            model, plant, recordings, callback=lambda stage, _: progress.step(stage),
+            arguments.model, plant, recordings, callback=lambda stage, _: progress.step(stage),
             **inputs.fit_settings(arguments),
         )  # fmt: skip
         progress.stage("write the model")
-    save(model, arguments.out, model_info(found, recordings))
+    save(found.model, arguments.out, model_info(found, recordings))
     print(fit_lines(arguments.model, found))
     print(f"position error over training windows: {1e3 * found.residual:.3g} m{plant.unit}")
-    print(coefficient_table(model, plant.joint_names, plant.unit))
+    print(coefficient_table(found.model, plant.joint_names, plant.unit))
     if intervals := interval_table(found):
         print(intervals)
     print(f"wrote {arguments.out}")

@@ -15,6 +15,7 @@ References:
     H. G. Bock, in: Modelling of Chemical Reaction Systems, Springer (1981), 102-125.
 """
 
+import copy
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -29,7 +30,6 @@ from nfriction.fitting.result.identifiability import (
     Information,
     information,
     observed_count,
-    standard_deviations,
 )
 from nfriction.fitting.robust_loss import SQUARES, RobustLoss
 from nfriction.fitting.shooting.normal_equations import (
@@ -43,7 +43,7 @@ from nfriction.fitting.shooting.normal_equations import (
     score_covariance,
 )
 from nfriction.fitting.shooting.sensitivity import StepJacobian, Trajectory, propagate
-from nfriction.fitting.shooting.variables import DecisionVariables, deflected, model_at
+from nfriction.fitting.shooting.variables import DecisionVariables, deflected
 from nfriction.fitting.strategy.extrapolation_prior import ExtrapolationPrior
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Quadratic
@@ -135,10 +135,6 @@ class ShootingProblem:
         least = max(count / 12**0.5, self.options.min_noise)
         return replace(self, loss=RobustLoss.of_errors(self.options.loss, errors, least))
 
-    def residuals(self, x: Tensor) -> Tensor:
-        """Errors of the counted samples over the noise, (window, step + 1, joint)."""
-        return self._deviation(x, self._simulate(x)) * self._scale
-
     def plant_at(self, vector: Tensor) -> Plant:
         """The plant with its adjustable terms at a parameter vector."""
         return adjusted_plant(self.jacobian.plant, self.jacobian.terms, vector)
@@ -157,11 +153,6 @@ class ShootingProblem:
             for kept, found in zip(states[place], (run.q, run.qd), strict=True):
                 kept[first : last + 1] = found[w, : n : self.substeps].numpy()
         return tuple(replace(m, q=q, qd=qd) for m, (q, qd) in zip(motions, states, strict=True))
-
-    def posterior_sd(self, hessian: Tensor) -> Tensor:
-        """Standard deviation of every shared variable by a Gauss-Newton Hessian."""
-        precision, _ = self.variables.prior()
-        return standard_deviations(information(hessian, precision, self.variables.shared_count))
 
     def information(self, x: Tensor, sd: Tensor, count: float | None = None) -> Information:
         """Information about the shared variables, given the sd of each error times its weight.
@@ -192,10 +183,16 @@ class ShootingProblem:
         counted[:, :: self.stride] = self.windows.weight[:, :: self.stride] * self.stride**0.5
         return counted[..., None] / self.noise_sd
 
+    @cached_property
+    def _moving(self) -> FrictionModel:
+        """A copy of the friction model, which every simulation moves to its parameters."""
+        return copy.deepcopy(self.friction)
+
     def _simulate(self, x: Tensor, *, with_memory: bool = False) -> Trajectory:
-        """The windows' motion at `x`; the memory of its coefficients only for derivatives."""
+        """The windows' motion at `x`, valid until the next; memory only for derivatives."""
         friction, plant, states, _ = self.variables.split(x)
-        model, joints = model_at(self.friction, friction), self.windows.q0.shape[-1]
+        model, joints = self._moving, self.windows.q0.shape[-1]
+        model.schedule.set_parameter_vector(friction)
         q0, qd0, shares = states.tensor_split([joints, 2 * joints], -1)
         law_state, law_slope = deflected(model, shares)
         held, linearised = (t.repeat_interleave(self.substeps, 1) for t in self._torques(plant))
