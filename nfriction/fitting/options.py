@@ -67,6 +67,9 @@ class FitOptions:
     energy_rise: float = 0.5
     # Longest delay between torques and positions: some samples of a slow bus [s].
     largest_delay: float = 0.1
+    # Share of a joint's largest velocity within which its sign turns, in models made by name: the
+    # default of 3 mrad/s, or mm/s, where a joint reaches 3 rad/s, or m/s.
+    turning_share: float = 1e-3
     # More substeps would mean a sign function too steep for the sample time.
     max_substeps: int = 8
 
@@ -147,12 +150,8 @@ class FitOptions:
     settling_tolerance: float = 1e-4
 
     # --- Hold-out of a network.
-    # Every so many-th window is held out, so that all sizes of the motion are represented.
+    # Every so many-th window is held out at once, so that all sizes of the motion are represented.
     folds: int = 3
-    # Maximum hold-out RMSE ratio to the law fitted on the same windows.
-    max_ratio_same: float = 0.8
-    # Maximum hold-out RMSE ratio to the law fitted on all windows, which it would replace.
-    max_ratio_all: float = 1.1
     # Candidate priors, relative to the network's own.
     prior_shares: tuple[float, ...] = (1.0, 1 / 3)
     # Updates of the priors of a network's groups by evidence; each searches on from the last.

@@ -76,14 +76,16 @@ def prepare_task(
     plant = rigs.of(plant)
     if not isinstance(start, FitResult | None):
         raise TypeError(f"`start` must be the result of a fit, got a {type(start).__name__}.")
-    model = as_model(model, plant.joints)
     given = as_recording_list(recordings, plant)
+    modelled = model.joints if isinstance(model, FrictionModel) else plant.joints
+    joint = in_joint_coordinates(plant, given, modelled)
+    moved = smoothed_motions(joint, motions)
+    model = as_model(model, plant.joints, moved)
     if "p_0" in model.law.names:
         raise ValueError(
             f"the law {model.law.name!r} is for tables of torque, see `fit_torque`; to motions fit "
             "maxwell-slip."
         )
-    joint = in_joint_coordinates(plant, model, given)
     if options.eccentricity == "on" and not isinstance(plant, PendulumChain):
         raise ValueError(f"{plant.name or 'the axis'} has no encoders that turn with its joints.")
     # Torques alone do not depend on a constant offset of the encoders enough to estimate one.
@@ -92,7 +94,6 @@ def prepare_task(
     if options.encoder_reference == "auto" and options.method == "output_error":
         per_recording = looks_zeroed_per_recording(plant, given, options)
         found = (ZEROED_PER_RECORDING,) if per_recording else ()
-    moved = smoothed_motions(joint, motions)
     convention = given[0].resolve_convention(plant)
     delay = 0.0
     if options.fit_delay:

@@ -239,7 +239,7 @@ def test_drawn_errors_give_the_covariance_of_the_gradient() -> None:
     _, response = marginalize_states([(slice(None), rows)], kept, precision)
 
     def drawn(errors: torch.Tensor) -> torch.Tensor:
-        return drawn_score([(slice(None), rows)], kept, response, precision, errors[..., None, :])
+        return drawn_score([(slice(None), rows)], kept, response, errors[..., None, :])
 
     expected = score_covariance([(slice(None), rows)], kept, response, precision)
     errors = torch.randn(2, 60, 4000, generator=generator, dtype=F64)

@@ -28,6 +28,7 @@ from nfriction.fitting.equation_error import fit_equation_error
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.fitting.strategy.continuation import HorizonResult
+from nfriction.fitting.strategy.neurofuzzy import _Validation
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import STRIBECK
 from nfriction.friction.models import FrictionModel
@@ -99,6 +100,18 @@ def test_a_driven_axis_gives_mass_and_offset():
     assert float(found.plant.torque_offset) == pytest.approx(0.3, abs=0.03)
     values = found.model.schedule.values[0].tolist()
     assert values == pytest.approx([3.0, 1.0], rel=0.05)
+
+
+def test_the_sign_of_a_named_model_turns_within_a_share_of_the_slowest_joints_speed():
+    """An axis that reaches 6 cm/s would creep at the speed at which a wheel's sign turns."""
+    axis, ideal = LinearAxis(20.0), CVFM(1, [4.0, 20.0], v_smooth=2e-5)
+    recording = driven_axis(axis, ideal, substeps=32)
+    found, usual = (
+        fit(model, axis, recording, windows=(1.0,), fit_plant=False) for model in ("CVFM", CVFM(1))
+    )
+    assert found.model.v_smooth < 1e-4 < usual.model.v_smooth
+    assert found.residual < 0.2 * usual.residual
+    assert found.model.schedule.values[0].tolist() == pytest.approx([4.0, 20.0], rel=0.01)
 
 
 def test_viscous_and_coulomb_friction_at_one_speed_are_named_as_lost():
@@ -188,8 +201,11 @@ def test_windows_that_are_left_out_are_told(monkeypatch):
     assert not any("were skipped" in told for told in alone.warnings)
     assert found.residual == pytest.approx(alone.residual, rel=0.2)
     # Whatever starts there says it, too.
-    for score in (2.0, 0.0):
-        monkeypatch.setattr("nfriction.fitting.strategy.holdout.HoldoutScore.score", score)
+    monkeypatch.setattr(_Validation, "trained_on", lambda self, trial: trial)
+    for kept in (False, True):
+        monkeypatch.setattr(
+            "nfriction.fitting.strategy.neurofuzzy.gains", lambda *_, kept=kept: kept
+        )
         network = NFLFM(2, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2)
         further = fit(network, pendulum(), recording, start=found, windows=(0.5,), max_steps=2)
         assert sum("were skipped" in told for told in further.warnings) == 1

@@ -31,8 +31,13 @@ from nfriction.fitting.result.identifiability import (
     weakly_identified,
 )
 from nfriction.fitting.robust_loss import SQUARES, Outliers, named_outliers, outlier_warning
-from nfriction.fitting.shooting.autocorrelation import bandwidth, effective_noise, hac_sd
-from nfriction.fitting.shooting.problem import ShootingProblem
+from nfriction.fitting.shooting.autocorrelation import (
+    bandwidth,
+    effective_noise,
+    hac_sd,
+    white_noise,
+)
+from nfriction.fitting.shooting.problem import SMALL, ShootingProblem
 from nfriction.fitting.shooting.variables import model_at
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import LeastSquaresResult
@@ -48,10 +53,6 @@ BLURRED = (
 NOTHING = 1e-9
 # Counts of a coarse encoder that is still in use.
 USUAL_COUNTS = 4096
-# Weights of a third difference: smooth motion cancels, white noise of sd 1 has an sd of √20.
-GAIN = 20**0.5
-# Median of the absolute value of a normal variable of sd 1.
-NORMAL_MEDIAN = 0.674490
 
 
 def result_from_equation_error(
@@ -249,18 +250,6 @@ def _torque_scale(
     return slope.flatten(), need[:, None].expand_as(slope).flatten()
 
 
-def white_noise(values: Tensor) -> Tensor:
-    """Standard deviation of the noise in signals (window, sample, joint) by joint, (joint,).
-
-    By the median of third differences, which neither steps nor jumps of the signal's slope raise;
-    zero of a signal that is held over several samples.
-    """
-    if values.shape[1] < 4:
-        return torch.zeros_like(values[0, 0])
-    size = torch.diff(values, n=3, dim=1).abs().flatten(0, 1)
-    return size.median(0).values / (NORMAL_MEDIAN * GAIN)
-
-
 def rounding(problem: ShootingProblem) -> float:
     """Root mean square rounding of the encoders [rad; m], by their count.
 
@@ -281,40 +270,43 @@ def encoder_count(problem: ShootingProblem) -> float | None:
     return problem.jacobian.plant.position_quantum or observed_count(recorded)
 
 
-def measurement_noise(problem: ShootingProblem, x: Tensor, residual: float) -> float:
+def explained(problem: ShootingProblem, x: Tensor, rms: float) -> bool:
+    """True if the noise of encoders and torques explains residuals of this root mean square."""
+    limit = problem.options.explained_ratio
+    return rms <= limit * measurement_noise(problem, x, rms, limit)
+
+
+def measurement_noise(
+    problem: ShootingProblem, x: Tensor, residual: float, enough: float | None = None
+) -> float:
     """Residual of a right law [rad; m], given that of a solution, both root mean square.
 
-    Only a residual far above the rounding is worth the simulation of the torque's noise.
+    The torque's noise is simulated only for residuals of more than `enough` times the rounding, by
+    default those that count as errors of the model.
     """
     least = rounding(problem)
-    if residual <= problem.options.model_error_ratio * least:
+    if residual <= (enough or problem.options.model_error_ratio) * least:
         return least
     errors = problem.errors(x)
     encoder = float(white_noise(errors).clamp(min=least).square().mean().sqrt())
     return math.hypot(encoder, _by_torque(problem, x, errors))
 
 
-def _by_torque(problem: ShootingProblem, x: Tensor, errors: Tensor, seed: int = 0) -> float:
+def _by_torque(problem: ShootingProblem, x: Tensor, errors: Tensor) -> float:
     """Root mean square residual by one realisation of the torque's noise, once fitted [rad; m]."""
-    windows, options = problem.windows, problem.options
-    sd = white_noise(windows.tau)
-    if not sd.any():
+    response = problem.torque_response(x, 1)
+    if response is None:
         return 0.0
-    random = np.random.default_rng(seed)
-    recordings = tuple(
-        r._replace(tau=r.torque_at(r.time) + sd.numpy() * random.standard_normal(r.q.shape))
-        for r in windows.recordings
-    )
-    # Positions as simulated without the noise, and priors around this solution, so that the noise
-    # alone makes the errors.
-    exact = windows.q + torch.linalg.solve(problem.measurement, errors.mT).mT
+    # Positions as if the noise alone made the errors, so small that simulations respond linearly,
+    # and priors around this solution.
+    off = SMALL * response[..., 0]
+    windows, options = problem.windows, problem.options
+    q = windows.q + torch.linalg.solve(problem.measurement, (errors - off).mT).mT
     friction, plant, states, _ = problem.variables.split(x)
     q0, qd0 = states[:, : 2 * windows.q0.shape[-1]].chunk(2, -1)
-    noisy = replace(windows, q=exact, q0=q0, qd0=qd0, recordings=recordings)
-    noisy = replace(noisy, tau=noisy.torque_at(0.0)[0])
     of_friction, of_plant = problem.variables.split(problem.variables.prior()[0])[:2]
     pretended = replace(
-        problem, windows=noisy, loss=SQUARES,
+        problem, windows=replace(windows, q=q, q0=q0, qd0=qd0), loss=SQUARES,
         friction_prior=(friction, of_friction.rsqrt()), plant_prior=(plant, of_plant.rsqrt()),
     )  # fmt: skip
     solver = LevenbergMarquardt(
@@ -324,5 +316,5 @@ def _by_torque(problem: ShootingProblem, x: Tensor, errors: Tensor, seed: int = 
     fitted = solver.minimise(
         pretended.linearise, x, cost=pretended.cost, lower=lower, upper=upper
     ).x
-    found = float(pretended.errors(fitted).square().mean().sqrt())
+    found = float(pretended.errors(fitted).square().mean().sqrt()) / SMALL
     return found if math.isfinite(found) else 0.0

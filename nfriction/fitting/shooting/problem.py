@@ -15,10 +15,12 @@ References:
     H. G. Bock, in: Modelling of Chemical Reaction Systems, Springer (1981), 102-125.
 """
 
+import copy
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,9 +31,9 @@ from nfriction.fitting.result.identifiability import (
     Information,
     information,
     observed_count,
-    standard_deviations,
 )
 from nfriction.fitting.robust_loss import SQUARES, RobustLoss
+from nfriction.fitting.shooting.autocorrelation import white_noise
 from nfriction.fitting.shooting.normal_equations import (
     Kept,
     Rows,
@@ -43,7 +45,7 @@ from nfriction.fitting.shooting.normal_equations import (
     score_covariance,
 )
 from nfriction.fitting.shooting.sensitivity import StepJacobian, Trajectory, propagate
-from nfriction.fitting.shooting.variables import DecisionVariables, deflected, model_at
+from nfriction.fitting.shooting.variables import DecisionVariables, deflected
 from nfriction.fitting.strategy.extrapolation_prior import ExtrapolationPrior
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Quadratic
@@ -51,6 +53,11 @@ from nfriction.plant import Plant
 from nfriction.signals import Motion
 from nfriction.simulation.protocols import Rollout, RolloutInputs
 from nfriction.simulation.rollout import integrate
+
+# Share of a noise at which simulations respond linearly to it.
+SMALL = 1e-3
+# Realisations of the torque's noise for intervals.
+DRAWS = 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,10 +142,6 @@ class ShootingProblem:
         least = max(count / 12**0.5, self.options.min_noise)
         return replace(self, loss=RobustLoss.of_errors(self.options.loss, errors, least))
 
-    def residuals(self, x: Tensor) -> Tensor:
-        """Errors of the counted samples over the noise, (window, step + 1, joint)."""
-        return self._deviation(x, self._simulate(x)) * self._scale
-
     def plant_at(self, vector: Tensor) -> Plant:
         """The plant with its adjustable terms at a parameter vector."""
         return adjusted_plant(self.jacobian.plant, self.jacobian.terms, vector)
@@ -158,16 +161,13 @@ class ShootingProblem:
                 kept[first : last + 1] = found[w, : n : self.substeps].numpy()
         return tuple(replace(m, q=q, qd=qd) for m, (q, qd) in zip(motions, states, strict=True))
 
-    def posterior_sd(self, hessian: Tensor) -> Tensor:
-        """Standard deviation of every shared variable by a Gauss-Newton Hessian."""
-        precision, _ = self.variables.prior()
-        return standard_deviations(information(hessian, precision, self.variables.shared_count))
-
     def information(self, x: Tensor, sd: Tensor, count: float | None = None) -> Information:
         """Information about the shared variables, given the sd of each error times its weight.
 
         `sd` is inflated for autocorrelation, (window, step + 1, joint). If the errors are the
         rounding of encoders to a `count` [rad; m], their covariance is that of rounding instead.
+        Errors by the torque's noise are added: they last longer than a window, whose own start
+        hides most of them, so residuals show too little of their autocorrelation.
         """
         variables, run = self.variables, self._simulate(x, with_memory=True)
         shared, (precision, _) = variables.shared_count, variables.prior()
@@ -175,15 +175,45 @@ class ShootingProblem:
         kept = Kept(variables.indices(), variables.state_count, len(x))
         scale = self._scale * self.loss.weight(self._deviation(x, run)).sqrt()
         data, response = marginalize_states(self._rows(run, scale), kept, of_states)
-        if count and self.loss is SQUARES and not variables.offset_count:
+        if count and self.loss is SQUARES:
             q = run.motion.q[:, :: self.substeps] @ self.measurement.T
             drawn = rounding_of(q, count, self.windows.spans) * self._scale[..., None]
-            score = drawn_score(self._rows(run, scale), kept, response, of_states, drawn)
+            score = kept.by_states(response, of_states)
+            score += drawn_score(self._rows(run, scale), kept, response, drawn)
         else:
             rows = self._rows(run, self._scale * sd / self.noise_sd)
             score = score_covariance(rows, kept, response, of_states)
+        by_torque = self.torque_response(x, DRAWS)
+        if by_torque is not None:
+            drawn = by_torque * self._scale[..., None]
+            score += drawn_score(self._rows(run, scale), kept, response, drawn)
         prior = torch.cat([precision[:shared], of_offsets.flatten()])
         return information(data + torch.diag(prior), prior, shared, score)
+
+    def torque_response(self, x: Tensor, draws: int, seed: int = 0) -> Tensor | None:
+        """Position errors by the noise of the recorded torques, (window, sample, joint, draw).
+
+        The noise is that part of a torque which changes from sample to sample, see `white_noise`;
+        None without any. A torque that is off moves all samples after it, so these errors last.
+        """
+        sd = white_noise(self.windows.tau).numpy()
+        if not sd.any():
+            return None
+        random = np.random.default_rng(seed)
+        exact, found = self._positions(x), []
+        for _ in range(draws):
+            recordings = tuple(
+                r._replace(tau=r.torque_at(r.time) + SMALL * sd * random.standard_normal(r.q.shape))
+                for r in self.windows.recordings
+            )
+            noisy = replace(self.windows, recordings=recordings)
+            noisy = replace(noisy, tau=noisy.torque_at(0.0)[0])
+            found.append((replace(self, windows=noisy)._positions(x) - exact) / SMALL)
+        return torch.stack(found, -1)
+
+    def _positions(self, x: Tensor) -> Tensor:
+        q = self._simulate(x).motion.q[:, :: self.substeps]
+        return q @ self.measurement.T * self.windows.weight[..., None]
 
     @cached_property
     def _scale(self) -> Tensor:
@@ -192,10 +222,16 @@ class ShootingProblem:
         counted[:, :: self.stride] = self.windows.weight[:, :: self.stride] * self.stride**0.5
         return counted[..., None] / self.noise_sd
 
+    @cached_property
+    def _moving(self) -> FrictionModel:
+        """A copy of the friction model, which every simulation moves to its parameters."""
+        return copy.deepcopy(self.friction)
+
     def _simulate(self, x: Tensor, *, with_memory: bool = False) -> Trajectory:
-        """The windows' motion at `x`; the memory of its coefficients only for derivatives."""
+        """The windows' motion at `x`, valid until the next; memory only for derivatives."""
         friction, plant, states, _ = self.variables.split(x)
-        model, joints = model_at(self.friction, friction), self.windows.q0.shape[-1]
+        model, joints = self._moving, self.windows.q0.shape[-1]
+        model.schedule.set_parameter_vector(friction)
         q0, qd0, shares = states.tensor_split([joints, 2 * joints], -1)
         law_state, law_slope = deflected(model, shares)
         held, linearised = (t.repeat_interleave(self.substeps, 1) for t in self._torques(plant))

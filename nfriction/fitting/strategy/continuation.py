@@ -11,7 +11,8 @@ from torch import Tensor
 from nfriction.fitting.data.inputs import integration_substeps
 from nfriction.fitting.data.windows import Windows, cut_windows
 from nfriction.fitting.options import FitOptions
-from nfriction.fitting.result.identifiability import observed_count
+from nfriction.fitting.result.identifiability import information, standard_deviations
+from nfriction.fitting.result.of_search import explained
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
@@ -61,14 +62,10 @@ class HorizonResult:
         """Standard deviation of a residual, inflated for autocorrelation."""
         return effective_noise(self.residuals)
 
-    @property
+    @cached_property
     def explained(self) -> bool:
-        """True if the rounding of the encoder explains the residuals."""
-        problem = self.problem
-        seen = observed_count(problem.windows.q @ problem.measurement.T)
-        quantum = problem.jacobian.plant.position_quantum or seen
-        limit = problem.options.explained_ratio * (quantum or 0.0) / 12**0.5
-        return self.rms <= limit
+        """True if the noise of encoders and torques explains the residuals."""
+        return explained(self.problem, self.result.x, self.rms)
 
     def lost_motion(self, before: "HorizonResult", options: FitOptions) -> bool:
         """True if the longer windows only show that the motion forgets its start within them."""
@@ -201,7 +198,8 @@ class StallMonitor:
         # A step that damping cut short shows no convergence.
         if before is None or step.damping > WEAK_DAMPING:
             return torch.inf
-        sd = self.problem.posterior_sd(local.hessian)
+        precision, _ = self.problem.variables.prior()
+        sd = standard_deviations(information(local.hessian, precision, count))
         # Of chaotic windows the curvature is round-off, by which nothing would ever move.
         if torch.isinf(sd).all():
             return torch.inf
