@@ -16,6 +16,7 @@ from nfriction.fitting.robust_loss import Outliers, RobustLoss, named_outliers
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Law
+from nfriction.friction.memory import load_of
 from nfriction.friction.models import V_SMOOTH, FrictionModel
 from nfriction.optim.least_squares import Quadratic
 from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
@@ -139,14 +140,15 @@ class TorqueBalance:
 
 
 def _balance(
-    plant: Plant, recording: Recording, motion: Motion, options: FitOptions
+    law: Law, plant: Plant, recording: Recording, motion: Motion, options: FitOptions
 ) -> TorqueBalance:
     q, qd, qdd = (torch.as_tensor(x) for x in (motion.q, motion.qd, motion.qdd))
     tau = torch.zeros_like(q) if recording.tau is None else torch.tensor(recording.tau)
     kept = torch.as_tensor(_inside(motion.time, options.edge))[:, None].expand_as(q)
     step = float(np.median(np.diff(motion.time)))
     rate = _smoother_rate(motion)
-    found = TorqueBalance(qd, plant.load(q, qd), tau, kept, rate, step, recording.segments)
+    load = load_of(law, plant, q, qd, tau)
+    found = TorqueBalance(qd, load, tau, kept, rate, step, recording.segments)
     if rate is not None and motion.std is not None:
         # A torque is held until the next sample, so it acts half a sample late.
         held = 0.5 * (tau + torch.cat([tau[:1], tau[:-1]]))
@@ -189,7 +191,7 @@ def fit_equation_error(
         ValueError: if there are too few samples, or the law's torque is not finite along the
         motion.
     """
-    parts = [_balance(plant, r, m, options) for r, m in zip(recordings, motions, strict=True)]
+    parts = [_balance(law, plant, r, m, options) for r, m in zip(recordings, motions, strict=True)]
     count = sum(int(_inside(m.time, options.edge).sum()) for m in motions)
     if count <= len(law.coefficients):
         names = ", ".join(r.name or "a recording" for r in recordings)
