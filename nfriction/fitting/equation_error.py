@@ -158,6 +158,14 @@ def _balance(
     return replace(found, torque=tau - plant.inverse_dynamics(q, qd, qdd), kept=kept)
 
 
+def _travelled(q: Tensor) -> Tensor:
+    """Distance of positions (sample, joint) from the last reversal, in ranges of the joint."""
+    row = torch.arange(len(q))[1:-1, None]
+    turned = torch.where(q.diff(dim=0)[1:] * q.diff(dim=0)[:-1] < 0.0, row, 0)
+    last = torch.nn.functional.pad(turned, (0, 0, 1, 1)).cummax(0).values
+    return (q - q.gather(0, last)).abs() / (q.amax(0) - q.amin(0))
+
+
 def _smoother_rate(motion: Motion) -> Tensor | None:
     """Corner frequency of the low-pass filter that `kalman_smoother` is, (joint,) [rad/s].
 
@@ -179,12 +187,14 @@ def fit_equation_error(
     motions: Sequence[Motion],
     v_smooth: float = V_SMOOTH,
     options: FitOptions = DEFAULTS,
+    beyond: float = 0.0,
 ) -> TorqueFit:
     """Least squares of the friction torque, joint by joint.
 
     Linear least squares within bounds where the torque is linear in the coefficients, for every
     combination of the law's initial values of the others, which are then refined. Samples whose
-    direction of motion is uncertain are left out. A robust loss weighs the squares. Recordings and
+    direction of motion is uncertain are left out, and those that have not travelled `beyond` since
+    the last reversal, in ranges of the joint. A robust loss weighs the squares. Recordings and
     motions are in joint coordinates.
 
     Raises:
@@ -200,6 +210,8 @@ def fit_equation_error(
             f"for {len(law.coefficients)} coefficients a joint; record for longer."
         )
     kept = torch.cat([p.kept for p in parts])
+    if beyond:
+        kept = kept & torch.cat([_travelled(torch.as_tensor(m.q)) > beyond for m in motions])
     # A joint that hardly ever moved has to do with what there is.
     inside = torch.cat([torch.as_tensor(_inside(m.time, options.edge)) for m in motions])
     kept = torch.where(kept.sum(0) > len(law.coefficients), kept, inside[:, None])

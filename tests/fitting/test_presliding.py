@@ -14,7 +14,7 @@ from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.constant import yielding
 from nfriction.friction import model_by_name
-from nfriction.friction.memory import DAHL, Gear, LuGre, MaxwellSlip, NFLuGre
+from nfriction.friction.memory import DAHL, Dahl, Gear, LuGre, MaxwellSlip, NFLuGre
 from nfriction.friction.models import FrictionModel
 from nfriction.signals import kalman_smoother, quantise
 from tests.fitting.recordings import F64, pendulum
@@ -126,6 +126,20 @@ def test_searches_start_with_the_rise_of_friction_that_torques_of_a_stuck_joint_
     # By least squares of the torques the rise is zero.
     assert 0.16 < rise < 0.66
     assert 800 < stiffness < 3200
+
+
+def test_rows_near_reversals_do_not_bias_the_friction_of_sliding() -> None:
+    """By all rows F_c is 0.42 and F_v 1.6: a contact that yields balances any torque."""
+    time = 2e-3 * np.arange(2001)
+    tau = ((0.7 + 2.0 * np.sin(np.pi * time / 4) ** 2) * np.sin(7 * time))[:, None]
+    zero = torch.zeros(1, dtype=F64)
+    model = Dahl(1, [1.0, 0.4, 310.0]).requires_grad_(False)
+    run = rollout(AXIS, model, zero, zero, torch.tensor(tau[:-1]), sample_time=2e-3)
+    recording = Recording(time, quantise(run.q.numpy(), 2**13), tau=tau, unit="m")
+    begun = fit("dahl", AXIS, recording, windows=(0.5,), fit_plant=False, max_steps=0)
+    f_c, f_v, _ = begun.model.schedule.values[0].tolist()
+    assert f_c == pytest.approx(1.0, abs=0.05)
+    assert f_v == pytest.approx(0.4, abs=0.1)
 
 
 def test_presliding_and_sliding_give_all_coefficients(short) -> None:
