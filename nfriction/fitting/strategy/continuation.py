@@ -11,10 +11,10 @@ from torch import Tensor
 from nfriction.fitting.data.inputs import integration_substeps
 from nfriction.fitting.data.windows import Windows, cut_windows
 from nfriction.fitting.options import FitOptions
-from nfriction.fitting.result.of_search import explained
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
+from nfriction.fitting.shooting.uncertainty import explained, posterior_sd
 from nfriction.fitting.shooting.variables import Parts, model_at
 from nfriction.fitting.strategy.extrapolation_prior import ExtrapolationPrior
 from nfriction.friction.models import FrictionModel
@@ -197,7 +197,7 @@ class StallMonitor:
         # A step that damping cut short shows no convergence.
         if before is None or step.damping > WEAK_DAMPING:
             return torch.inf
-        sd = self.problem.posterior_sd(local.hessian)
+        sd = posterior_sd(self.problem, local.hessian)
         # Of chaotic windows the curvature is round-off, by which nothing would ever move.
         if torch.isinf(sd).all():
             return torch.inf

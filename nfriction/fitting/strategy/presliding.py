@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.fitting.result.of_search import rounding
+from nfriction.fitting.shooting.uncertainty import rounding
 from nfriction.fitting.strategy.continuation import HorizonResult, ShootingFitter
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Law
