@@ -25,14 +25,14 @@ def train(argv: Sequence[str] | None) -> str:
                         default="gauss-newton")  # fmt: skip
     parser.add_argument("--max-evaluations", type=int, default=5000, help="of a search")
     given = parser.parse_args(argv)
-    workspace, bench = common.start(
-        given, search_horizon=given.windows[-1], search_evaluations=given.max_evaluations
-    )
+    workspace, bench = common.start(given, search_evaluations=given.max_evaluations)
     if given.method == "gauss-newton":
         found = fit_by_class(workspace, bench, given.model)
     else:
         constant = fit_constant(workspace, bench, given.model.removeprefix("A"))
-        found = fit_searched(workspace, bench, given.model, given.method, start=constant)
+        found = fit_searched(
+            workspace, bench, given.model, given.method, given.windows[-1], start=constant
+        )
     return common.finish(given, bench, found)
 
 

@@ -28,13 +28,11 @@ def train(argv: Sequence[str] | None) -> str:
                         help="length of the windows that a search simulates [s]")  # fmt: skip
     parser.add_argument("--max-evaluations", type=int, default=5000, help="of a search")
     given = parser.parse_args(argv)
-    workspace, bench = common.start(
-        given, search_horizon=given.horizon, search_evaluations=given.max_evaluations
-    )
+    workspace, bench = common.start(given, search_evaluations=given.max_evaluations)
     if given.method == "trajectory":
         found = fit_constant(workspace, bench, given.model)
     else:
-        found = fit_searched(workspace, bench, given.model, given.method)
+        found = fit_searched(workspace, bench, given.model, given.method, given.horizon)
     return common.finish(given, bench, found)
 
 

@@ -5,17 +5,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nfriction.cli import inputs
-from nfriction.cli.console import Parser, UsageError, check_writable
+from nfriction.cli.console import Commands, UsageError, check_writable
 from nfriction.cli.inputs import seconds
 
 if TYPE_CHECKING:
     from nfriction.friction.models import FrictionModel
     from nfriction.io.model_file import ModelInfo
-
-EXAMPLE = """example:
-  nfriction export model.json --format torchscript,c --out artefacts"""
-VERIFY_EXAMPLE = """example:
-  nfriction verify artefacts/model.pt model.json"""
 
 # Ending of the file that each target is written to; C is a folder of files.
 CONTROLLERS = {"torchscript": ".pt", "c": ".c", "pt2": ".pt2", "onnx": ".onnx"}
@@ -25,12 +20,13 @@ TARGETS = (*CONTROLLERS, *SIMULATORS)
 IN_SINGLE = ("c", "onnx")
 
 
-def add_export(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
+def add_export(commands: Commands) -> None:
     """Register `export`."""
-    parser = commands.add_parser(
-        "export", parents=[common], help="write artefacts for controllers and simulators",
+    parser = commands.add(
+        "export", run_export, "write artefacts for controllers and simulators",
         description="Write a fitted model as artefacts for controllers, proven equal to it, or as "
-        "the nearest joint parameters of a simulator.", epilog=EXAMPLE,
+        "the nearest joint parameters of a simulator.",
+        example="nfriction export model.json --format torchscript,c --out artefacts",
     )  # fmt: skip
     parser.add_argument("model", type=inputs.file, metavar="MODEL", help="model file")
     parser.add_argument("--format", type=_targets, default="torchscript", metavar="FORMATS",
@@ -60,24 +56,22 @@ def add_export(commands: "argparse._SubParsersAction[Parser]", common: Parser) -
                        help="robot description whose joints of these names get them")  # fmt: skip
     inputs.add_reading_options(group)
     inputs.add_law_option(parser)
-    parser.set_defaults(run=run_export)
 
 
-def add_verify(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
+def add_verify(commands: Commands) -> None:
     """Register `verify`."""
-    parser = commands.add_parser(
-        "verify", parents=[common], epilog=VERIFY_EXAMPLE,
-        help="prove that an artefact is its model",
+    parser = commands.add(
+        "verify", run_verify, "prove that an artefact is its model",
         description="Run an artefact (.pt, .pt2, .onnx, or .c with its .contract.json beside it) "
         "over its test vectors and over many points beside the model. Exit status 1 if they "
         "differ. C is compiled and run as it is: verify it from hands that you trust.",
+        example="nfriction verify artefacts/model.pt model.json",
     )  # fmt: skip
     parser.add_argument("artefact", type=Path, metavar="ARTEFACT", help="what export wrote")
     parser.add_argument("model", type=inputs.file, metavar="MODEL", help="model file")
     parser.add_argument("--points", type=inputs.count, default=5000, metavar="N",
                         help="points to draw, to 10 %% beyond the range")  # fmt: skip
     inputs.add_law_option(parser)
-    parser.set_defaults(run=run_verify)
 
 
 def run_export(arguments: argparse.Namespace) -> int:
@@ -109,7 +103,7 @@ def _write_controller(
 ) -> list[Path]:
     """Write an artefact; returns its files."""
     from nfriction import export
-    from nfriction.export.c_code.dialect import is_identifier
+    from nfriction.export.c_dialect import is_identifier
 
     options: dict[str, Any] = {
         "torque_limit": _limit(arguments.torque_limit),
@@ -219,7 +213,7 @@ def _targets(text: str) -> list[str]:
 
 def _identifier(text: str) -> str:
     """A name that C takes, for argparse."""
-    from nfriction.export.c_code.dialect import is_identifier
+    from nfriction.export.c_dialect import is_identifier
 
     if not is_identifier(text):
         raise argparse.ArgumentTypeError(

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from nfriction.codegen.errors import UnsupportedOperation
-from nfriction.codegen.scalar import Graph, Node, is_predicate
+from nfriction.codegen.scalar import Graph, Node, UnsupportedOperation, is_predicate
 
 Nodes = np.ndarray
 Operation = Callable[..., Any]
@@ -230,18 +229,6 @@ _amax = OPERATIONS["amax"] = OPERATIONS["max"] = _extreme("max")
 OPERATIONS["amin"] = OPERATIONS["min"] = _extreme("min")
 
 
-@handles("logsumexp")
-def _logsumexp(g: Graph, a: Nodes, dim: Any, keepdim: bool = False) -> Nodes:
-    def logsumexp(xs: list[Node]) -> Node:
-        top = g.total(xs, "max")
-        infinite = g.apply("eq", g.apply("abs", top), g.constant(math.inf))
-        top = g.apply("where", infinite, g.constant(0.0), top)
-        exps = [g.apply("exp", g.apply("sub", x, top)) for x in xs]
-        return g.apply("add", g.apply("log", g.total(exps)), top)
-
-    return _reduce(g, logsumexp, a, dim, keepdim)
-
-
 @handles("_softmax")
 def _softmax(g: Graph, a: Nodes, dim: int, half_to_float: bool) -> Nodes:
     exps = numbers(g, "exp", sub(g, a, _amax(g, a, [dim], True)))
@@ -255,19 +242,6 @@ def _cumsum(g: Graph, a: Nodes, dim: int, dtype: Any = None) -> Nodes:
     for i in range(1, len(rows)):
         rows[i : i + 1] = add(g, rows[i - 1 : i], rows[i : i + 1])
     return out
-
-
-@handles("linalg_vector_norm")
-def _vector_norm(
-    g: Graph, a: Nodes, ord: float = 2, dim: Any = None, keepdim: bool = False, dtype: Any = None
-) -> Nodes:
-    if ord == 2:
-        return numbers(g, "sqrt", _sum(g, numbers(g, "mul", a, a), dim, keepdim))
-    if ord == 1:
-        return _sum(g, numbers(g, "abs", a), dim, keepdim)
-    if ord == math.inf:
-        return _amax(g, numbers(g, "abs", a), None if dim is None else [*dim], keepdim)
-    raise UnsupportedOperation("linalg_vector_norm", f"is not known for ord={ord}")
 
 
 @handles("mm", "mv", "dot", "bmm")
@@ -367,12 +341,6 @@ def _unbind(g: Graph, a: Nodes, dim: int = 0) -> list[Nodes]:
     return [_select(g, a, dim, i) for i in range(a.shape[dim])]
 
 
-@handles("split")
-def _split(g: Graph, a: Nodes, size: int, dim: int = 0) -> list[Nodes]:
-    length = a.shape[dim]
-    return [_slice(g, a, dim, i, i + size) for i in range(0, max(length, 1), size)]
-
-
 @handles("split_with_sizes")
 def _split_with_sizes(g: Graph, a: Nodes, sizes: Sequence[int], dim: int = 0) -> list[Nodes]:
     stops = np.cumsum(sizes)
@@ -382,11 +350,6 @@ def _split_with_sizes(g: Graph, a: Nodes, sizes: Sequence[int], dim: int = 0) ->
 @handles("diagonal")
 def _diagonal(g: Graph, a: Nodes, offset: int = 0, dim1: int = 0, dim2: int = 1) -> Nodes:
     return np.diagonal(a, offset, dim1, dim2)  # read-only: writing through it is refused
-
-
-@handles("roll")
-def _roll(g: Graph, a: Nodes, shifts: Sequence[int], dims: Sequence[int] = ()) -> Nodes:
-    return np.roll(a, tuple(shifts), tuple(dims)) if dims else np.roll(a, shifts[0])
 
 
 @handles("constant_pad_nd")
@@ -436,8 +399,6 @@ def _cat(g: Graph, tensors: Sequence[Nodes], dim: int = 0) -> Nodes:
 
 # All that is one expression.
 OPERATIONS |= {
-    "addcmul": lambda g, a, b, c, value=1: add(g, a, numbers(g, "mul", b, c), value),
-    "clamp_max": lambda g, a, max: _clamp(g, a, max=max),
     "full_like": lambda g, a, value, **_: _full(g, a, None, value),
     "ge": lambda g, a, b: numbers(g, "le", b, a),
     "gt": lambda g, a, b: numbers(g, "lt", b, a),
@@ -445,14 +406,11 @@ OPERATIONS |= {
         g, "sqrt", add(g, numbers(g, "mul", a, a), numbers(g, "mul", b, b))
     ),
     "isnan": lambda g, a: numbers(g, "ne", a, a),
-    "masked_fill": lambda g, a, mask, value: where(g, mask, value, a),
     "reciprocal": lambda g, a: div(g, 1.0, a),
     "relu": lambda g, a: numbers(g, "max", a, 0.0),
     "rsqrt": lambda g, a: div(g, 1.0, numbers(g, "sqrt", a)),
-    "rsub": lambda g, a, b, alpha=1: sub(g, b, a, alpha),
     "cat": _cat,
     "flip": lambda g, a, dims: np.flip(a, tuple(dims)).copy(),
-    "index_select": lambda g, a, dim, index: np.take(a, _static("index_select", index), axis=dim),
     "permute": lambda g, a, dims: a.transpose([d % a.ndim for d in dims]),
     "repeat": lambda g, a, repeats: np.tile(a, tuple(repeats)),
     "stack": lambda g, tensors, dim=0: np.stack(tensors, axis=dim),

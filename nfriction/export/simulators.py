@@ -229,13 +229,7 @@ def patched(
     damping: Sequence[float],
     frictionloss: Sequence[float],
 ) -> bytes:
-    """A robot description with that root element, and the friction of the named joints replaced.
-
-    Raises:
-        ValueError: if the file is of another kind, declares entities, or a joint is missing or
-            there twice.
-        OSError: if it cannot be read.
-    """
+    """A robot description with that root element, and the friction of the named joints replaced."""
     try:
         tree = parse_xml(Path(path), comments=True)
     except ValueError as error:

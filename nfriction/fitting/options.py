@@ -150,12 +150,8 @@ class FitOptions:
     settling_tolerance: float = 1e-4
 
     # --- Hold-out of a network.
-    # Every so many-th window is held out, so that all sizes of the motion are represented.
+    # Every so many-th window is held out at once, so that all sizes of the motion are represented.
     folds: int = 3
-    # Maximum hold-out RMSE ratio to the law fitted on the same windows.
-    max_ratio_same: float = 0.8
-    # Maximum hold-out RMSE ratio to the law fitted on all windows, which it would replace.
-    max_ratio_all: float = 1.1
     # Candidate priors, relative to the network's own.
     prior_shares: tuple[float, ...] = (1.0, 1 / 3)
     # Updates of the priors of a network's groups by evidence; each searches on from the last.

@@ -37,6 +37,7 @@ def sampled(model: FrictionModel, sample_time: float) -> FrictionModel:
             "only a law with memory can be sampled, with coefficients that have no hidden state; "
             f"got {law.name!r} with {type(model.schedule).__name__}."
         )
+    model.check_loads(None)
     _refuse_load(model, step)
     # Signed and without bounds: no fit varies them.
     states = tuple(Coefficient(f"state_{k + 1}", "-", False) for k in range(law.state_size))

@@ -3,11 +3,6 @@
 They are as wide as one or both columns of a paper; `figure.set_figwidth(inches)` changes that.
 """
 
-from nfriction.plots.coefficients import (
-    coefficient_sections,
-    coefficient_surfaces,
-    coefficients_over_time,
-)
 from nfriction.plots.comparison import (
     coefficient_intervals,
     horizon_curve,
@@ -17,7 +12,13 @@ from nfriction.plots.comparison import (
     torque_over_velocity,
 )
 from nfriction.plots.drawing import animate, mechanism
-from nfriction.plots.fuzzy import controller_surface, memberships
+from nfriction.plots.neurofuzzy import (
+    coefficient_sections,
+    coefficient_surfaces,
+    coefficients_over_time,
+    controller_surface,
+    memberships,
+)
 from nfriction.plots.saving import save_all
 from nfriction.plots.torque_table import friction_curves
 

@@ -11,14 +11,14 @@ from matplotlib.figure import Figure
 
 from nfriction.evaluation.compare import Comparison
 from nfriction.friction.models import FrictionModel
-from nfriction.plots.coefficients import (
+from nfriction.plots.comparison import horizon_curve, positions, rmse_bars, torque_over_velocity
+from nfriction.plots.drawing import mechanism
+from nfriction.plots.neurofuzzy import (
     coefficient_sections,
     coefficient_surfaces,
     coefficients_over_time,
+    memberships,
 )
-from nfriction.plots.comparison import horizon_curve, positions, rmse_bars, torque_over_velocity
-from nfriction.plots.drawing import mechanism
-from nfriction.plots.fuzzy import memberships
 from nfriction.recording import Recording
 
 DPI = 150

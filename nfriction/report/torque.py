@@ -63,9 +63,6 @@ def write_torque_fits(
         folder: made where it does not exist; files of these names are replaced.
         command: reproduces the results.
         figures: draw friction over velocity.
-
-    Raises:
-        OSError: another process is writing a run into the folder, or it cannot be written.
     """
     folder = Path(folder)
     written, drawn = [], []

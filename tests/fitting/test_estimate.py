@@ -28,6 +28,7 @@ from nfriction.fitting.equation_error import fit_equation_error
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.fitting.strategy.continuation import HorizonResult
+from nfriction.fitting.strategy.neurofuzzy import _Validation
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import STRIBECK
 from nfriction.friction.models import FrictionModel
@@ -200,8 +201,11 @@ def test_windows_that_are_left_out_are_told(monkeypatch):
     assert not any("were skipped" in told for told in alone.warnings)
     assert found.residual == pytest.approx(alone.residual, rel=0.2)
     # Whatever starts there says it, too.
-    for score in (2.0, 0.0):
-        monkeypatch.setattr("nfriction.fitting.strategy.holdout.HoldoutScore.score", score)
+    monkeypatch.setattr(_Validation, "trained_on", lambda self, trial: trial)
+    for kept in (False, True):
+        monkeypatch.setattr(
+            "nfriction.fitting.strategy.neurofuzzy.gains", lambda *_, kept=kept: kept
+        )
         network = NFLFM(2, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2)
         further = fit(network, pendulum(), recording, start=found, windows=(0.5,), max_steps=2)
         assert sum("were skipped" in told for told in further.warnings) == 1

@@ -13,9 +13,10 @@ from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.continuation import ShootingFitter
 from nfriction.fitting.strategy.holdout import (
-    HoldoutScore,
-    holdout_rmse,
-    holdout_split,
+    cut_for_folds,
+    gains,
+    holdout_splits,
+    holdout_squares,
 )
 from nfriction.fitting.strategy.neurofuzzy import initialise_from_constant, revert_to_constant
 from nfriction.friction.neurofuzzy import NeuroFuzzy
@@ -47,21 +48,27 @@ def refinement(constant):
     return ShootingFitter(jacobian, model, [joint], measurement, DEFAULTS)
 
 
-def split(fitter, motions, length):
-    return holdout_split(fitter.recordings, motions, length, FOLDS)
+def splits(fitter, motions, length):
+    return holdout_splits(cut_for_folds(fitter.recordings, motions, length, FOLDS), FOLDS)
+
+
+def rmse(*args):
+    return float(holdout_squares(*args).mean().sqrt())
 
 
 def vector(fitter):
     return fitter.friction.schedule.parameter_vector()
 
 
-def test_windows_are_shared_out_once(constant):
+def test_every_window_is_held_out_once(constant):
     search, motions = refinement(constant), constant[1].motions
     for length in (0.5, 100.0):
-        seen, held_back = split(search, motions, length)
-        assert len(held_back) == (len(seen) + len(held_back)) // FOLDS > 0
-        spans = sorted((*seen.spans, *held_back.spans))
-        samples = [np.arange(first, last) for _, first, last in spans]
+        held_back = []
+        for seen, judged in splits(search, motions, length):
+            assert len(judged) == (len(seen) + len(judged)) // FOLDS > 0
+            assert not set(seen.spans) & set(judged.spans)
+            held_back += judged.spans
+        samples = [np.arange(first, last) for _, first, last in sorted(held_back)]
         np.testing.assert_array_equal(np.concatenate(samples), np.arange(len(constant[0]) - 1))
 
 
@@ -72,51 +79,59 @@ def test_a_short_recording_with_a_gap_still_has_windows_to_hold_out(constant):
     gapped = Recording(time=joint.time[samples], q=joint.q[samples])
     assert len(gapped.segments) == 2
     motion = kalman_smoother(gapped.time, gapped.q)
-    seen, held_back = holdout_split([gapped], [motion], 100.0, FOLDS)
-    assert len(seen) >= 2
-    assert len(held_back) >= 1
+    found = holdout_splits(cut_for_folds([gapped], [motion], 100.0, FOLDS), FOLDS)
+    assert all(len(seen) >= 2 and len(held_back) >= 1 for seen, held_back in found)
 
 
 def test_a_network_errs_as_its_law_and_by_more_where_it_talks_nonsense(constant):
     search, motions = refinement(constant), constant[1].motions
-    seen, held_back = split(search, motions, 0.5)
+    seen, held_back = splits(search, motions, 0.5)[0]
     law = replace(search, friction=constant[1].model)
-    of_law = holdout_rmse(held_back, law.problem(seen, 1e-3, vector(law)), vector(law), NONE)
+    of_law = rmse(held_back, law.problem(seen, 1e-3, vector(law)), vector(law), NONE)
     for value, least, most in ((0.0, 1 - 1e-9, 1 + 1e-9), (1.0, 1.5, np.inf)):
         network = torch.full_like(vector(search), value)
         by_network = search.problem(seen, 1e-3, network)
-        assert least <= holdout_rmse(held_back, by_network, network, NONE) / of_law <= most
+        assert least <= rmse(held_back, by_network, network, NONE) / of_law <= most
     assert not vector(search).any()
 
 
 def test_a_window_is_judged_from_the_state_that_suits_the_fit(constant):
     """A smoother's error at the start says nothing of a law."""
     search, motions = refinement(constant), constant[1].motions
-    seen, held_back = split(search, motions, 0.5)
+    seen, held_back = splits(search, motions, 0.5)[0]
     law = replace(search, friction=constant[1].model)
     problem = law.problem(seen, 1e-4, vector(law))
     off = replace(held_back, q0=held_back.q0 + 1e-3, qd0=held_back.qd0 - 0.01)
     from_off = replace(problem, windows=off)
     unsettled = from_off.errors(from_off.variables.start()).square().mean().sqrt()
-    settled = holdout_rmse(off, problem, vector(law), NONE)
+    settled = rmse(off, problem, vector(law), NONE)
     assert settled < 0.1 * float(unsettled)
-    assert settled == pytest.approx(holdout_rmse(held_back, problem, vector(law), NONE), rel=0.05)
+    assert settled == pytest.approx(rmse(held_back, problem, vector(law), NONE), rel=0.05)
 
 
 def test_a_network_that_diverges_errs_without_end(constant):
     search, motions = refinement(constant), constant[1].motions
-    seen, held_back = split(search, motions, 0.5)
+    seen, held_back = splits(search, motions, 0.5)[0]
     wild = torch.full_like(vector(search), 1e6)
-    assert holdout_rmse(held_back, search.problem(seen, 1e-3, wild), wild, NONE) == np.inf
+    assert rmse(held_back, search.problem(seen, 1e-3, wild), wild, NONE) == np.inf
 
 
 @pytest.mark.parametrize(
-    ("same", "of_all", "kept"), [(0.8, 1.1, True), (0.81, 1.0, False), (0.5, 1.11, False)]
+    ("ratios", "gained"),
+    [
+        ((0.9, 0.9, 0.9, 0.9), True),
+        ((0.6, 0.9, 0.8, 0.9), True),
+        ((0.2, 1.2, 1.1, 1.2), False),
+        ((1.0, 1.0, 1.0, 1.0), False),
+        ((0.1, 0.1, 0.1, np.inf), False),
+    ],
 )
-def test_a_network_beats_the_law_that_saw_as_much_and_nears_the_one_that_saw_all(
-    same, of_all, kept
-):
-    assert (HoldoutScore(same, of_all).score <= 1) is kept
+def test_a_gain_is_larger_than_its_scatter_over_windows(ratios, gained):
+    law = torch.tensor([4.0, 1.0, 2.0, 3.0], dtype=F64)
+    network = law * torch.tensor(ratios, dtype=F64).square()
+    assert gains(network, law) is gained
+    # A law that diverges loses to what does not.
+    assert gains(law, torch.where(law > 3, torch.inf, law))
 
 
 def test_a_model_settles_on_a_coefficient_of_zero(constant):
@@ -130,15 +145,20 @@ def test_a_model_settles_on_a_coefficient_of_zero(constant):
 
 
 @pytest.mark.parametrize(
-    ("ratio", "told"), [(1.3, "30 % worse"), (0.95, "5 % better"), (np.inf, "diverges")]
+    ("ratio", "told"),
+    [(1.3, "30 % worse"), (0.95, "5 % better than its constant law, with"), (np.inf, "diverges")],
 )
 def test_a_network_that_does_not_win_is_put_back(constant, monkeypatch, ratio, told):
     joint, found = constant
 
-    def error(test, problem, *_):
-        return ratio if isinstance(problem.friction.schedule, NeuroFuzzy) else 1.0
+    def squares(test, problem, *_):
+        law = torch.ones(len(test), dtype=F64)
+        if not isinstance(problem.friction.schedule, NeuroFuzzy):
+            return law
+        # On half of the windows it is better, on half of them worse.
+        return ratio**2 * (law + 0.8 * torch.arange(len(test)).remainder(2).mul(2).sub(1))
 
-    monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.holdout_rmse", error)
+    monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.holdout_squares", squares)
     model = NFLFM(2, v_smooth=V_SMOOTH, **SMALL)
     kept = fit(model, pendulum(), joint, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
     assert kept.model is model
@@ -181,7 +201,7 @@ def test_an_interrupt_while_windows_judge_keeps_the_constant_law(constant, monke
         return cost(problem, x)
 
     search = refinement(constant)
-    held_back = len(split(search, found.motions, 0.5)[1])
+    held_back = len(splits(search, found.motions, 0.5)[0][1])
     monkeypatch.setattr(ShootingProblem, "cost", interrupted)
     model = NFLFM(2, v_smooth=V_SMOOTH, **SMALL)
     kept = fit(model, pendulum(), joint, start=found, windows=(0.5,), fit_plant=False, max_steps=2)

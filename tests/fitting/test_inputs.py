@@ -62,26 +62,23 @@ def test_an_input_is_chosen_where_friction_depends_on_it(recorded) -> None:
         assert "unexplained" in found[0].words(("a", "b"))
 
 
+ONE = torch.ones(6, dtype=torch.float64)
+
+
 class Contest:
     """A rival whose law and network leave these errors; without inputs they leave 1.0."""
 
-    def __init__(self, task, start, of_law=1.0, error=1.0, stopped=False) -> None:
+    def __init__(self, task, start, of_law=ONE, error=ONE) -> None:
         self.task, self.start, self.validation = task, start, self
-        self.error_of_law, self.final, self.stopped = of_law, error, stopped
-        self.trained = self.halted = False
+        self.of_law, self.final = of_law, error
+        self.trained = False
 
     @property
-    def error(self) -> float:
-        return self.final if self.trained else self.error_of_law
-
-    def judge_law(self) -> bool:
-        return True
+    def squares(self) -> torch.Tensor:
+        return self.final if self.trained else self.of_law
 
     def train(self) -> None:
         self.trained = True
-
-    def halt(self) -> None:
-        self.halted = True
 
 
 @pytest.fixture(scope="module")
@@ -93,10 +90,10 @@ def task():
 @pytest.mark.parametrize(
     ("rival", "wins", "trained"),
     [
-        ({"of_law": 0.9, "error": 0.7}, True, True),
-        ({"of_law": 0.9, "error": 0.85}, False, True),
-        ({"of_law": 1.1, "error": 0.1}, False, False),
-        ({"of_law": 0.5, "error": 0.5, "stopped": True}, False, True),
+        ({"of_law": 0.9 * ONE, "error": 0.7 * ONE}, True, True),
+        ({"of_law": 0.9 * ONE, "error": torch.linspace(0.2, 1.6, 6)}, False, True),
+        ({"of_law": 1.1 * ONE, "error": 0.1 * ONE}, False, False),
+        ({"of_law": torch.linspace(0.2, 1.6, 6), "error": 0.1 * ONE}, False, False),
     ],
 )
 def test_inputs_have_to_win_for_the_law_and_for_its_network(
@@ -117,7 +114,6 @@ def test_inputs_have_to_win_for_the_law_and_for_its_network(
     assert (best is found, chosen == gains, found.trained) == (wins, wins, trained)
     assert found.task.model.inputs == ["direction"]
     assert task.model.inputs is None
-    assert plain.halted is rival.get("stopped", False)
 
 
 @pytest.mark.slow

@@ -34,7 +34,7 @@ def without_compiler(monkeypatch, plant, model, terms):
         raise CodegenError("none")
 
     with monkeypatch.context() as patch:
-        patch.setattr("nfriction.codegen.compile_function", nothing)
+        patch.setattr("nfriction.codegen.CompiledFunction", nothing)
         return StepJacobian(plant, model, terms)
 
 

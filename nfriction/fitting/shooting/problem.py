@@ -128,10 +128,6 @@ class ShootingProblem:
         least = max(count / 12**0.5, self.options.min_noise)
         return replace(self, loss=RobustLoss.of_errors(self.options.loss, errors, least))
 
-    def residuals(self, x: Tensor) -> Tensor:
-        """Errors of the counted samples over the noise, (window, step + 1, joint)."""
-        return self.deviation(x, self.simulate(x)) * self.scale
-
     def plant_at(self, vector: Tensor) -> Plant:
         """The plant with its adjustable terms at a parameter vector."""
         return adjusted_plant(self.jacobian.plant, self.jacobian.terms, vector)

@@ -113,7 +113,7 @@ def _jacobian(
 ) -> Callable[..., Tensor]:
     """The Jacobian of a function by some inputs, over batches of all of them but the last."""
     try:
-        compiled = codegen.compile_function(function, example, jacobian=by)
+        compiled = codegen.CompiledFunction(function, example, jacobian=by)
     except codegen.CodegenError as error:
         logger.warning("fits run slowly, as steps are linearised in eager torch: %s", error)
         axes = (*[0] * (len(example) - 1), None)

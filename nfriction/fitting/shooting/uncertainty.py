@@ -17,7 +17,6 @@ from nfriction.fitting.result.identifiability import (
     Information,
     information,
     observed_count,
-    standard_deviations,
 )
 from nfriction.fitting.robust_loss import SQUARES
 from nfriction.fitting.shooting.autocorrelation import white_noise
@@ -107,12 +106,6 @@ def _by_torque(problem: ShootingProblem, x: Tensor, errors: Tensor) -> float:
     ).x
     found = float(pretended.errors(fitted).square().mean().sqrt()) / SMALL
     return found if math.isfinite(found) else 0.0
-
-
-def posterior_sd(problem: ShootingProblem, hessian: Tensor) -> Tensor:
-    """Standard deviation of every shared variable by a Gauss-Newton Hessian."""
-    precision, _ = problem.variables.prior()
-    return standard_deviations(information(hessian, precision, problem.variables.shared_count))
 
 
 def gathered_information(

@@ -1,18 +1,21 @@
-"""Hold-out validation of a network: trained on some windows, judged on the others."""
+"""Hold-out validation: trained on some windows, judged on the others, each of them in turn."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from nfriction.fitting.data.windows import Windows, cut_windows
-from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.shooting.problem import ShootingProblem
-from nfriction.fitting.strategy.continuation import settle_states
+from nfriction.fitting.strategy.continuation import log_ratio, settle_states
 from nfriction.recording import Recording
 from nfriction.signals import Motion
+
+
+class StoppedError(Exception):
+    """The caller stopped a search whose result was to be judged."""
 
 
 def cut_for_folds(
@@ -31,61 +34,50 @@ def cut_for_folds(
     return cut_windows(joint, motions, longest / folds)
 
 
-def holdout_split(
-    joint: Sequence[Recording], motions: Sequence[Motion], length: float, folds: int
-) -> tuple[Windows, Windows]:
-    """Windows to train on, and every `folds`-th one to test on."""
-    cut = cut_for_folds(joint, motions, length, folds)
-    test = torch.arange(len(cut)) % folds == folds - 1
-    return cut.subset(~test), cut.subset(test)
+def holdout_splits(windows: Windows, folds: int) -> list[tuple[Windows, Windows]]:
+    """Windows to train on and those to test on: every `folds`-th, each of them in one split."""
+    fold = torch.arange(len(windows)) % folds
+    return [(windows.subset(fold != k), windows.subset(fold == k)) for k in reversed(range(folds))]
 
 
-@dataclass(frozen=True)
-class HoldoutScore:
-    """Hold-out RMSE of a network over that of its constant law.
-
-    `same` is the ratio to the law fitted to the same windows, `all` to the law fitted to all.
-    """
-
-    same: float
-    all: float
-    options: FitOptions = DEFAULTS
-
-    @property
-    def score(self) -> float:
-        """At most 1 if the network is worth keeping."""
-        return max(self.same / self.options.max_ratio_same, self.all / self.options.max_ratio_all)
-
-    def __str__(self) -> str:
-        if math.isinf(self.score):
-            return "Network rejected: it diverges on hold-out windows; its constant law is kept."
-        ratio, limit, data = self.all, self.options.max_ratio_all, "all data"
-        if self.same / self.options.max_ratio_same > self.all / self.options.max_ratio_all:
-            ratio, limit, data = self.same, self.options.max_ratio_same, "the same windows"
-        return (
-            f"Network rejected: on hold-out windows it was {_change(ratio)} than the constant law "
-            f"fitted to {data} (limit: {_change(limit)}); the constant law is kept."
-        )
+def gains(new: Tensor, old: Tensor) -> bool:
+    """True if squared errors on windows (window,) fell by more than the standard error of that."""
+    if not old.isfinite().all():
+        return bool(new.isfinite().all())
+    ratio, spread = log_ratio(new, old)
+    return ratio + spread < 0
 
 
-def _change(ratio: float) -> str:
-    return f"{100 * abs(ratio - 1):.3g} % {'worse' if ratio > 1 else 'better'}"
+def verdict(network: Tensor, law: Tensor) -> str:
+    """Sentence that rejects a network by squared errors on windows, (window,)."""
+    ratio, spread = log_ratio(network, law)
+    if math.isinf(ratio):
+        return "Network rejected: it diverges on hold-out windows; its constant law is kept."
+    change = 100 * math.expm1(ratio)
+    return (
+        f"Network rejected: on hold-out windows it was {abs(change):.3g} % "
+        f"{'worse' if change > 0 else 'better'} than its constant law, with a standard error of "
+        f"{100 * spread:.2g} %; the constant law is kept."
+    )
 
 
-def holdout_rmse(
+def holdout_squares(
     test: Windows, problem: ShootingProblem, friction: Tensor, plant: Tensor
-) -> float | None:
-    """Root mean square error on windows [rad; m], each simulated from its best initial state.
+) -> Tensor:
+    """Mean squared error on each window [rad^2; m^2], (window,), from its best initial state.
 
     Smoothed states err by more than the difference between two laws. Infinite where the motion
-    diverges, None where the search was interrupted. The problem is of other windows with the same
-    friction model and plant, whose parameters are given.
+    diverges. The problem is of other windows with the same friction model and plant, whose
+    parameters are given.
+
+    Raises:
+        StoppedError: if the search of the initial states was interrupted.
     """
     if problem.friction.law.memory:
         test = test.deflected(problem.jacobian.plant, problem.friction)
     judged = replace(problem, windows=test)
     x, stopped = settle_states(judged, judged.variables.start(plant, friction=friction))
     if stopped:
-        return None
-    error = float(judged.counted_errors(x).square().mean().sqrt())
-    return max(error, problem.options.min_noise) if math.isfinite(error) else math.inf
+        raise StoppedError
+    squares = judged.counted_errors(x).square().mean((1, 2))
+    return squares.nan_to_num(nan=math.inf).clamp_min(problem.options.min_noise**2)

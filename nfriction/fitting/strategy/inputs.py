@@ -25,6 +25,7 @@ from nfriction.fitting.strategy.continuation import (
     settle_states,
     weighted_cost,
 )
+from nfriction.fitting.strategy.holdout import gains
 from nfriction.fitting.task import (
     FitTask,
     constant_prior,
@@ -174,21 +175,21 @@ class _Choice:
         held: list[int] = []
         while len(chosen) < len(self.columns):
             before = self.left_out(held)
-            gains = {}
+            shares = {}
             for name, columns in self.columns.items():
                 if columns[0] in held:
                     continue
-                gain = before - self.left_out([*held, *columns])
-                if float(gain.mean()) > float(gain.std() / len(gain) ** 0.5):
-                    gains[name] = float(gain.sum() / before.sum())
-            if not gains:
+                after = self.left_out([*held, *columns])
+                if gains(after, before):
+                    shares[name] = float(1.0 - after.sum() / before.sum())
+            if not shares:
                 break
-            best = max(gains, key=lambda name: gains[name])
+            best = max(shares, key=lambda name: shares[name])
             by_joint = tuple(
                 float(1.0 - self.left_out([*held, column]).sum() / before.sum())
                 for column in self.columns[best]
             )
-            chosen.append(InputGain(best, gains[best], by_joint))
+            chosen.append(InputGain(best, shares[best], by_joint))
             held += self.columns[best]
         return chosen
 

@@ -3,7 +3,8 @@
 First its sets stay where they are, and windows held out choose the priors. Then it trains on at the
 noise that it left, with a prior for each group of parameters by evidence, and moves its sets if the
 evidence favours that; as long as the windows held out gain by it, at ever less noise. Further
-inputs (`inputs`) are a rival that has to win on the windows held out.
+inputs (`inputs`) are a rival that has to win on the windows held out. Every window is held out in
+turn, and a gain has to be larger than its standard error over the windows.
 """
 
 import copy
@@ -18,6 +19,7 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.data.inputs import adjustable_terms, apply_encoder_offsets, require_motion
+from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.equation_error import coefficient_scale
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.result.fit_result import FitResult
@@ -34,7 +36,14 @@ from nfriction.fitting.strategy.continuation import (
     weighted_cost,
 )
 from nfriction.fitting.strategy.extrapolation_prior import prior_on_unvisited_cells
-from nfriction.fitting.strategy.holdout import HoldoutScore, holdout_rmse, holdout_split
+from nfriction.fitting.strategy.holdout import (
+    StoppedError,
+    cut_for_folds,
+    gains,
+    holdout_splits,
+    holdout_squares,
+    verdict,
+)
 from nfriction.fitting.strategy.inputs import (
     InputGain,
     chosen_inputs,
@@ -68,13 +77,16 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
     )
     aligned = replace(task, recordings=recordings, motions=motions)
     contest = _Contest(aligned, start)
-    contest.train()
     chosen: tuple[InputGain, ...] = ()
     model = task.model
-    if isinstance(model, NeuroFuzzyModel) and model.inputs is None and not contest.stopped:
-        chosen, contest = _with_chosen_inputs(contest)
-        if chosen:
-            model.see([gain.name for gain in chosen])
+    try:
+        contest.train()
+        if isinstance(model, NeuroFuzzyModel) and model.inputs is None:
+            chosen, contest = _with_chosen_inputs(contest)
+    except StoppedError:
+        contest.halt()
+    if chosen:
+        cast("NeuroFuzzyModel", model).see([gain.name for gain in chosen])
     found = replace(
         contest.result(model), motions=task.motions, encoder_offsets=start.encoder_offsets,
         skipped_horizons=start.skipped_horizons, inputs=chosen,
@@ -87,8 +99,8 @@ def fit_neurofuzzy(task: FitTask) -> FitResult:
 def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[InputGain, ...], "_Contest"]:
     """The inputs that pay and the contest with them, or none and the one without.
 
-    They have to win on the windows held out, first for the law and then for its network, by as much
-    as a network has to win over its law.
+    They have to win on the windows held out, first for the law and then for what is kept of its
+    network.
     """
     task = plain.task
     chosen = chosen_inputs(task, plain.start)
@@ -102,15 +114,10 @@ def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[InputGain, ...], "_Con
     cast("NeuroFuzzyModel", model).see(names)
     seeing = replace(task, model=model, plant=seeing_plant(task.plant, names))
     rival = _Contest(seeing, start)
-    if rival.validation.judge_law() and rival.error >= plain.error_of_law:
+    if not gains(rival.validation.of_law, plain.validation.of_law):
         return (), plain
     rival.train()
-    if rival.stopped:
-        plain.halt()
-        return (), plain
-    if rival.error >= task.options.max_ratio_same * plain.error:
-        return (), plain
-    return chosen, rival
+    return (chosen, rival) if gains(rival.squares, plain.squares) else ((), plain)
 
 
 class _Contest:
@@ -143,24 +150,14 @@ class _Contest:
         self.best: _Trial | None = None
 
     @property
-    def stopped(self) -> bool:
-        """True if the search was stopped before a network was found."""
-        return self.best is None
-
-    @property
-    def error_of_law(self) -> float:
-        """Hold-out RMSE of the law, trained on the same windows as its network."""
-        return self.validation.of_law[0]
-
-    @property
-    def error(self) -> float:
-        """Hold-out RMSE of the network where it is accepted, else of the law."""
-        accepted = self.best is not None and self.best.score.score <= 1
-        ratio = self.best.score.same if self.best is not None and accepted else 1.0
-        return ratio * self.error_of_law
+    def squares(self) -> Tensor:
+        """Squared errors of the network where it is accepted, else of the law, (window,)."""
+        assert self.best is not None
+        of_law = self.validation.of_law
+        return self.best.squares if gains(self.best.squares, of_law) else of_law
 
     def train(self) -> None:
-        """Find the best network."""
+        """Find the best network; raises `StoppedError`."""
         self.best = self.validation.best_trial(_with_narrowed_priors(self.free, self.start))
 
     def halt(self) -> None:
@@ -173,12 +170,14 @@ class _Contest:
         task, best, validation = self.task, self.best, self.validation
         if best is None:
             return _constant_kept(model, self, INTERRUPTED, converged=False)
-        if best.finite:
-            before = None
-            while best is not before and not best.end.stopped:
+        before = None
+        try:
+            while best.finite and best is not before:
                 before, best = best, validation.trained_on(best)
-        if best.score.score > 1:
-            note, stopped = str(best.score), best.end.stopped
+        except StoppedError:
+            best = replace(best, end=best.end.as_stopped())
+        if not gains(best.squares, validation.of_law):
+            note, stopped = verdict(best.squares, validation.of_law), best.end.stopped
             return _constant_kept(model, self, note, converged=not stopped)
         end = best.end if best.end.stopped else validation.fit_all(best)
         found = copy.deepcopy(end.problem.friction)
@@ -296,18 +295,21 @@ def effective_parameters(end: HorizonResult) -> tuple[tuple[str, float, int], ..
 
 @dataclass(frozen=True)
 class _Trial:
-    """A network trained on some windows, its score on the others, and its priors."""
+    """A model trained on the windows of the first split, and its priors.
 
-    score: HoldoutScore
+    Its squared errors are those on windows held out: of the first split, or of all once judged.
+    """
+
+    squares: Tensor
     fitter: ShootingFitter
-    prior_sd: float
     end: HorizonResult
     tolerance: float
+    prior_sd: float = math.nan
 
     @property
     def finite(self) -> bool:
         """False where the motion diverges."""
-        return math.isfinite(self.score.score) and bool(self.end.result.hessian.isfinite().all())
+        return bool(self.squares.isfinite().all() and self.end.result.hessian.isfinite().all())
 
     @cached_property
     def log_evidence(self) -> float:
@@ -324,11 +326,10 @@ class _Validation:
         self, law: ShootingFitter, start: FitResult, motions: tuple[Motion, ...], length: float
     ) -> None:
         assert law.plant_prior is not None
-        self.law, self.motions, self.length, self.options = law, motions, length, law.options
-        # Of the law trained on the same windows, and on all.
-        self.of_law: tuple[float, ...] = ()
+        self.law, self.length, self.options = law, length, law.options
         self.plant = law.plant_prior[0]
-        self.train, self.test = holdout_split(law.recordings, motions, length, self.options.folds)
+        self.windows = cut_for_folds(law.recordings, motions, length, self.options.folds)
+        self.splits = holdout_splits(self.windows, self.options.folds)
         # The noise against which the priors weigh is the residual of the constant law at the same
         # horizon; its cost scales the tolerance.
         self.noise = effective_noise(start.residuals)
@@ -336,60 +337,47 @@ class _Validation:
         cost = weighted_cost(start.residuals, self.noise)
         self.tolerance = loglik_tolerance(cost, self.options)
 
-    def judge_law(self) -> bool:
-        """Find the errors of the law; False if stopped."""
-        if self.of_law:
-            return True
+    @cached_property
+    def of_law(self) -> Tensor:
+        """Squared errors of the law on each window held out, (window,)."""
         values = self.law.friction.schedule.parameter_vector()
-        same = self._search(self.law, values, "constant law, hold-out")
-        of_same = self._error(same)
-        if of_same is None:
-            return False
-        of_all = holdout_rmse(self.test, same.problem, values, self.plant)
-        self.of_law = () if of_all is None else (of_same, of_all)
-        return of_all is not None
+        return self._judged(self._trial(self.law, values, "constant law, hold-out")).squares
 
-    def best_trial(self, fitters: Sequence[ShootingFitter]) -> _Trial | None:
-        """The best of all priors; wider plant priors must earn their place. None if stopped."""
-        if not self.judge_law():
-            return None
+    def best_trial(self, fitters: Sequence[ShootingFitter]) -> _Trial:
+        """The best of all priors; wider plant priors must earn their place."""
+        assert len(self.of_law)  # the law first: a network cannot be judged without it
         best: _Trial | None = None
         for fitter in fitters:
+            schedule = cast("NeuroFuzzy", fitter.friction.schedule)
+            # From zero: from another prior's end a network would stay there.
+            zeros = torch.zeros_like(schedule.parameter_vector())
             trials = []
             for share in self.options.prior_shares:
-                trial = self._trial(fitter, share)
-                if trial is None:
-                    return None
-                trials.append(trial)
-            trial = min(trials, key=lambda trial: trial.score.score)
-            limit = math.inf if best is None else self.options.max_ratio_same * best.score.score
-            if best is None or trial.score.score < limit:
-                best = trial
+                sd = share * schedule.prior_sd
+                under = replace(fitter, friction_prior=(zeros, torch.full_like(zeros, sd)))
+                trial = self._trial(under, zeros, "network, hold-out")
+                trials.append(replace(trial, prior_sd=sd))
+            found = self._judged(min(trials, key=lambda trial: float(trial.squares.sum())))
+            if best is None or gains(found.squares, best.squares):
+                best = found
+        assert best is not None
         return best
 
     def trained_on(self, trial: _Trial) -> _Trial:
         """A trial trained on at the noise that it left, or itself where that gains too little.
 
         Beside the law's error as noise, sets could hardly move. They move if the evidence favours
-        it. The windows held out are few, so the gain there has to be as large as that of a network
-        on its law. A stop leaves the trial as it was, and its end says so.
+        it.
         """
         noise = min(effective_noise(trial.end.residuals), self.noise)
         held = self._adapted(trial, noise, learn_sets=False)
-        moved = held and self._adapted(held, noise, learn_sets=True)
-        stopped = replace(trial, end=trial.end.as_stopped())
-        if held is None or moved is None:
-            return stopped
+        moved = self._adapted(held, noise, learn_sets=True)
         gained = moved.log_evidence - held.log_evidence
         better = moved if gained > self.options.evidence_gain else held
-        error = self._error(better.end)
-        if error is None:
-            return stopped
-        better = replace(better, score=self._score(error))
-        limit = self.options.max_ratio_same * trial.score.score
-        return better if better.score.score < limit else trial
+        judged = self._judged(replace(better, squares=self._errors(better.end)))
+        return judged if gains(judged.squares, trial.squares) else trial
 
-    def _adapted(self, trial: _Trial, noise: float, *, learn_sets: bool) -> _Trial | None:
+    def _adapted(self, trial: _Trial, noise: float, *, learn_sets: bool) -> _Trial:
         """A trial trained on, the prior of each group tightened as far as evidence favours it.
 
         It is never widened: beyond it the model of the errors is not quadratic in the sets.
@@ -406,11 +394,11 @@ class _Validation:
         best, groups = None, schedule.groups()
         for _ in range(self.options.evidence_updates + 1):
             fitter = replace(trial.fitter, friction=model, friction_prior=(mean, sd))
-            problem = fitter.problem(self.train, noise, x[: len(mean)], stride=self.stride)
+            problem = fitter.problem(self.splits[0][0], noise, x[: len(mean)], stride=self.stride)
             tolerance = self.options.evidence_gain / max(float(problem.cost(x)), 1.0)
             end = fitter.search(problem, x, tolerance, "network's sets, hold-out")
             if end.stopped:
-                return None
+                raise StoppedError
             found = replace(trial, fitter=fitter, end=end, tolerance=tolerance)
             gain = found.log_evidence - (best.log_evidence if best else -math.inf)
             if not gain > self.options.evidence_gain:
@@ -421,39 +409,34 @@ class _Validation:
 
     def fit_all(self, trial: _Trial) -> HorizonResult:
         """The network of a trial, fitted to all windows."""
-        windows, noise = trial.fitter.cut(self.motions, self.length), trial.end.problem.noise_sd
-        problem = trial.fitter.problem(windows, noise, trial.end.parts.friction, stride=self.stride)
-        start = problem.variables.start(trial.end.parts.plant)
-        return trial.fitter.search(problem, start, trial.tolerance, f"{self.length:g} s windows")
+        return self._further(trial, self.windows, f"{self.length:g} s windows")
 
-    def _trial(self, fitter: ShootingFitter, share: float) -> _Trial | None:
-        """A network under a prior, from zero: from another prior's end it would stay there."""
-        widest = cast("NeuroFuzzy", fitter.friction.schedule).prior_sd
-        zeros = torch.zeros_like(fitter.friction.schedule.parameter_vector())
-        prior = (zeros, torch.full_like(zeros, share * widest))
-        fitter = replace(fitter, friction_prior=prior)
-        end = self._search(fitter, zeros, "network, hold-out")
-        error = self._error(end)
-        if error is None:
-            return None
-        return _Trial(self._score(error), fitter, share * widest, end, self.tolerance)
+    def _further(self, trial: _Trial, windows: Windows, name: str) -> HorizonResult:
+        """The network of a trial, fitted to other windows from where it is."""
+        friction, plant, noise = *trial.end.parts[:2], trial.end.problem.noise_sd
+        problem = trial.fitter.problem(windows, noise, friction, stride=self.stride)
+        return trial.fitter.search(problem, problem.variables.start(plant), trial.tolerance, name)
 
-    def _score(self, error: float) -> HoldoutScore:
-        """Score of an error on the windows held out."""
-        ratios = [error / law if math.isfinite(error) else math.inf for law in self.of_law]
-        return HoldoutScore(ratios[0], ratios[1], self.options)
+    def _trial(self, fitter: ShootingFitter, friction: Tensor, name: str) -> _Trial:
+        """A search of the first split."""
+        problem = fitter.problem(self.splits[0][0], self.noise, friction, stride=self.stride)
+        end = fitter.search(problem, problem.variables.start(self.plant), self.tolerance, name)
+        return _Trial(self._errors(end), fitter, end, self.tolerance)
 
-    def _search(self, fitter: ShootingFitter, friction: Tensor, name: str) -> HorizonResult:
-        """Search of the training windows."""
-        problem = fitter.problem(self.train, self.noise, friction, stride=self.stride)
-        start = problem.variables.start(self.plant)
-        return fitter.search(problem, start, self.tolerance, name)
+    def _judged(self, trial: _Trial) -> _Trial:
+        """A trial with its errors on each window, by searches of the others."""
+        found = [trial.squares]
+        for place, (train, _) in enumerate(self.splits[1:], 1):
+            end = self._further(trial, train, "other windows, hold-out")
+            found.append(self._errors(end, place))
+        return replace(trial, squares=torch.cat(found))
 
-    def _error(self, end: HorizonResult) -> float | None:
-        """Hold-out RMSE of a search; None if it was stopped, half trained and unjudged."""
+    def _errors(self, end: HorizonResult, place: int = 0) -> Tensor:
+        """Squared errors of a search on the windows that a split holds out, (window,)."""
         if end.stopped:
-            return None
-        return holdout_rmse(self.test, end.problem, end.parts.friction, end.parts.plant)
+            raise StoppedError
+        friction, plant, *_ = end.parts
+        return holdout_squares(self.splits[place][1], end.problem, friction, plant)
 
 
 def _constant_kept(

@@ -53,7 +53,7 @@ def test_the_conclusion_follows_the_errors(tmp_path) -> None:
     assert held == ["reproduced", "reproduced for 2 of 3", "NOT reproduced", "reproduced"]
     assert lines[5].startswith("Why: ")
     assert "misses 25.0%" in lines[5]
-    assert "12.5%; 1 of 16 fits" in lines[5]
+    assert "12.5%; 1 of 19 fits" in lines[5]
 
 
 @pytest.mark.parametrize("effect", [0.0, 1.0])
