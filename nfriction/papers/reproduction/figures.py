@@ -41,7 +41,7 @@ from nfriction.plots import (
     style,
     torque_over_velocity,
 )
-from nfriction.plots.fuzzy import draw_map
+from nfriction.plots.neurofuzzy import draw_map
 from nfriction.recording import Recording
 from nfriction.recording.angles import AngleConvention
 from nfriction.signals import Motion
