@@ -5,33 +5,23 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
-import torch
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from nfriction.evaluation.compare import LIMIT, NO_FRICTION, Comparison, Part
 from nfriction.evaluation.score import Score
-from nfriction.fitting.equation_error import friction_torque
-from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.fitting.result.identifiability import NORMAL_95, CoefficientUncertainty
 from nfriction.friction import both_names
-from nfriction.friction.models import FrictionModel
-from nfriction.plant import Plant
 from nfriction.plots import style
 from nfriction.recording import Recording
-from nfriction.signals import Motion, kalman_smoother
 
 Array = NDArray[np.float64]
 
 # Room that a bar and its number need side by side with others [in].
 _BAR = 0.13
-_POINTS = 3000  # of the scatter of torques, a joint
 
 
 def motion(
@@ -228,89 +218,6 @@ def horizon_curve(
     return figure
 
 
-def torque_over_velocity(
-    plant: Plant,
-    models: Mapping[str, FrictionModel],
-    recordings: Sequence[Recording],
-    motions: Sequence[Motion] | None = None,
-    *,
-    uncertainty: Mapping[str, CoefficientUncertainty] | None = None,
-) -> Figure:
-    """Friction torque of each law over velocity, a panel a joint, over that of the motion.
-
-    Lines are at the load at rest and without acceleration, with 95 % bands; dots are
-    `tau - M qdd - bias` along the recordings, averaged over 30 ms in which the joint turns one way.
-
-    Args:
-        plant: the mechanism, with its fitted terms where there are any.
-        models: friction models by name.
-        recordings: in any convention.
-        motions: their smoothed motion in joint coordinates; computed where not given.
-        uncertainty: of the models' fits by name (`FitResult.uncertainty`), for the bands.
-    """
-    joint = [r.joint_coordinates(plant) for r in recordings]
-    motions = motions or [kalman_smoother(r.time, r.q) for r in joint]
-    known = uncertainty or {}
-    with torch.no_grad():
-        parts = [
-            _averaged(*friction_torque(plant, r, m)[::2], r.sample_time)
-            for r, m in zip(joint, motions, strict=True)
-        ]
-    qd, torque = (np.concatenate(x) for x in zip(*parts, strict=True))
-    columns = min(plant.joints, 3) if plant.joints != 4 else 2
-    figure, axes = style.panel_each(
-        plant.joints, columns, style.PAGE if columns > 1 else style.COLUMN, 2.0
-    )
-    looks = style.looks(models)
-    for k, ax in enumerate(axes):
-        grid = velocities(qd[:, k])
-        lines = {name: _torque(model, grid, k) for name, model in models.items()}
-        seen = np.flatnonzero(np.isfinite(torque[:, k]))
-        # Dots may scatter far beyond any friction; the laws and most dots set the limits.
-        most = np.quantile(torque[seen, k], [0.05, 0.95]) if len(seen) else np.zeros(0)
-        extremes = np.concatenate([*lines.values(), most])
-        factor, unit = style.scaled(style.sliding("N m", plant.unit), extremes)
-        some = seen[np.linspace(0, len(seen) - 1, min(_POINTS, len(seen))).astype(int)]
-        ax.plot(
-            qd[some, k], factor * torque[some, k], ".", color=style.FAINT, markersize=2.5,
-            alpha=0.5, markeredgewidth=0, rasterized=True,
-        )  # fmt: skip
-        for name, line in lines.items():
-            ax.plot(grid, factor * line, **looks[name].line)
-            if name in known:
-                reach = NORMAL_95 * _torque_sd(known[name], models[name], grid, k)
-                low, high = (factor * (line + sign * reach) for sign in (-1, 1))
-                colour = looks[name].line["color"]
-                ax.fill_between(grid, low, high, color=colour, alpha=0.25, linewidth=0)
-        ax.set_ylim(style.padded(factor * extremes.min(), factor * extremes.max(), 0.15))
-        ax.margins(x=0.02)
-        style.title(ax, plant.joint_names[k])
-        ax.set_ylabel(f"friction {'torque' if plant.unit == 'rad' else 'force'} [{unit}]")
-        if k + columns >= plant.joints:
-            ax.set_xlabel(f"joint velocity [{plant.unit}/s]")
-    handles: list[Artist] = [
-        Line2D([], [], linestyle="", marker=".", color=style.FAINT),
-        *(looks[name].handle for name in models),
-    ]
-    labels = ["from the motion", *models]
-    if any(name in known for name in models):
-        handles.append(Patch(facecolor=style.FAINT, alpha=0.4))
-        labels.append("95 % bands")
-    style.legend(figure, handles, labels)
-    return figure
-
-
-def _averaged(qd: torch.Tensor, torque: torch.Tensor, step: float) -> tuple[Array, Array]:
-    """Means over blocks of samples, NaN where a joint does not turn one way throughout."""
-    size = max(1, round(DEFAULTS.diagnosis_block / step))
-    size = min(size, max(1, len(qd)))
-    whole = len(qd) // size * size
-    speeds, torques = (x[:whole].reshape(-1, size, x.shape[-1]) for x in (qd, torque))
-    one_way = torch.sign(speeds).mean(1).abs() == 1
-    # Dry friction takes any value at rest.
-    return speeds.mean(1).numpy(), torch.where(one_way, torques.mean(1), torch.nan).numpy()
-
-
 def coefficient_intervals(fits: Mapping[str, FitResult]) -> Figure:
     """Fitted coefficients with their 95 % intervals, a panel a coefficient; joints side by side.
 
@@ -387,30 +294,6 @@ def _name_bar(ax: Axes, x: float, value: float, top: float, bottom: float) -> No
 
 def _digits(value: float) -> str:
     return f"{value:.0f}" if value >= 100 else f"{value:#.3g}"
-
-
-def velocities(qd: Array) -> Array:
-    """The range of the data, dense about zero, where laws turn over a few thousandths."""
-    low, high = float(qd.min()), float(qd.max())
-    # Evenly spaced velocities would draw the step at zero as a slope.
-    near = np.geomspace(1e-5, 1.0, 100) * max(abs(low), abs(high))
-    grid = np.unique(np.concatenate([np.linspace(low, high, 300), -near, [0.0], near]))
-    return grid[(grid >= low) & (grid <= high)]
-
-
-def _torque(model: FrictionModel, qd: Array, joint: int) -> Array:
-    """Torque of one joint over its velocity, at the load at rest and without acceleration."""
-    velocity = torch.as_tensor(qd)[:, None].expand(-1, model.joints)
-    with torch.no_grad():
-        held = model.coefficients(velocity, torch.zeros_like(velocity))
-        torque = model.steady_torque(velocity, torch.ones_like(velocity), held)
-    return torque[:, joint].numpy()
-
-
-def _torque_sd(known: CoefficientUncertainty, model: FrictionModel, qd: Array, joint: int) -> Array:
-    """Standard deviation of one joint's torque over its velocity."""
-    velocity = torch.as_tensor(qd)[:, None].expand(-1, model.joints).contiguous()
-    return known.torque_sd(model, velocity)[:, joint].numpy()
 
 
 def _intervals(found: FitResult, name: str, k: int) -> Array:

@@ -11,8 +11,9 @@ from matplotlib.figure import Figure
 
 from nfriction.evaluation.compare import Comparison
 from nfriction.friction.models import FrictionModel
-from nfriction.plots.comparison import horizon_curve, positions, rmse_bars, torque_over_velocity
+from nfriction.plots.comparison import horizon_curve, positions, rmse_bars
 from nfriction.plots.drawing import mechanism
+from nfriction.plots.friction_torque import torque_over_velocity
 from nfriction.plots.neurofuzzy import (
     coefficient_sections,
     coefficient_surfaces,
