@@ -9,6 +9,7 @@ from nfriction.plots.comparison import (
     motion,
     positions,
     rmse_bars,
+    save_all,
 )
 from nfriction.plots.drawing import animate, mechanism
 from nfriction.plots.friction_torque import friction_curves, torque_over_velocity
@@ -19,7 +20,6 @@ from nfriction.plots.neurofuzzy import (
     controller_surface,
     memberships,
 )
-from nfriction.plots.saving import save_all
 
 __all__ = [
     "animate", "coefficient_intervals", "coefficient_sections", "coefficient_surfaces",
