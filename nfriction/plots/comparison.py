@@ -367,14 +367,7 @@ def save_all(
     folder.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
     for name, figure in _figures(comparison, recordings):
-        # Names come from recordings, which may hold any character.
-        stem = re.sub(r"[^\w-]+", "_", name)
-        path = folder / f"{stem}.png"
-        # Two names may differ only in characters that were replaced.
-        for count in range(2, 2 + len(written)):
-            if path not in written:
-                break
-            path = folder / f"{stem}_{count}.png"
+        path = _free(folder, name, written)
         kept = {RUN_KEY: run} if run else {}
         figure.savefig(path, dpi=DPI, metadata=kept)
         for ending in set(formats) - {"gif"}:
@@ -387,6 +380,13 @@ def save_all(
         for k, recording in enumerate(r for r in recordings if r.name in tested):
             written.append(comparison.animate(recording, folder / f"motion_{k + 1}.gif"))
     return written
+
+
+def _free(folder: Path, name: str, taken: Sequence[Path]) -> Path:
+    """A path that is not taken: names of recordings may differ only in characters replaced here."""
+    stem = re.sub(r"[^\w-]+", "_", name)
+    ends = ("", *(f"_{k}" for k in range(2, 3 + len(taken))))
+    return next(path for end in ends if (path := folder / f"{stem}{end}.png") not in taken)
 
 
 def _figures(
