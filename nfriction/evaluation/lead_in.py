@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from nfriction.fitting.result.of_search import white_noise
+from nfriction.fitting.shooting.autocorrelation import white_noise
 from nfriction.friction.memory import deflections
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import require_model

@@ -8,6 +8,7 @@ The next step is `nfriction.simulation.rk4`, the motion of a mechanism with fric
 """
 
 from collections.abc import Callable, Sequence
+from inspect import signature
 from typing import Any, ClassVar
 
 import torch
@@ -154,6 +155,9 @@ class NamedModel(FrictionModel):
         initial: start values in SI, shape (joint, coefficient) or (coefficient,).
         v_smooth: see `FrictionModel`.
         options: of the schedule, see its class.
+
+    Raises:
+        ValueError: for options that the schedule does not have.
     """
 
     definition: Law
@@ -167,6 +171,13 @@ class NamedModel(FrictionModel):
         v_smooth: float = V_SMOOTH,
         **options: Any,
     ) -> None:
+        # Behind the law, the joints and the initial values.
+        known = list(signature(self.make_schedule).parameters)[3:]
+        if unknown := [name for name in options if name not in known]:
+            raise ValueError(
+                f"{type(self).__name__} has no option {', '.join(unknown)}; "
+                f"it has {', '.join(known) or 'none'}."
+            )
         schedule = self.make_schedule(self.definition, joints, initial, **options)
         super().__init__(self.definition, schedule, v_smooth)
 

@@ -12,7 +12,7 @@ from nfriction.evaluation.score import score
 from nfriction.fitting.data.windows import cut_windows
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
-from nfriction.fitting.strategy.constant import yielding
+from nfriction.fitting.strategy.presliding import yielding
 from nfriction.friction import model_by_name
 from nfriction.friction.memory import DAHL, LuGre, MaxwellSlip, NFLuGre
 from nfriction.friction.models import FrictionModel

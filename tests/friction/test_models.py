@@ -148,6 +148,12 @@ def test_nan_in_nan_out() -> None:
             assert torch.equal(torch.isnan(model(*inputs)), torch.isnan(expected)), (name, which)
 
 
+@pytest.mark.parametrize("name", ["NFLuGre", "NFDahl", "LFM"])
+def test_an_option_that_a_model_lacks_is_named(name) -> None:
+    with pytest.raises(ValueError, match=f"{name} has no option inputs; it has"):
+        model_by_name(name)(2, inputs=["direction"])
+
+
 def test_options_are_those_given() -> None:
     options = {
         "terms": [3, 2],

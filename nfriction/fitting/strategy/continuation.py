@@ -11,14 +11,11 @@ from torch import Tensor
 from nfriction.fitting.data.inputs import integration_substeps
 from nfriction.fitting.data.windows import Windows, cut_windows
 from nfriction.fitting.options import FitOptions
-from nfriction.fitting.result.identifiability import (
-    information,
-    observed_count,
-    standard_deviations,
-)
+from nfriction.fitting.result.identifiability import information, standard_deviations
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
+from nfriction.fitting.shooting.uncertainty import explained
 from nfriction.fitting.shooting.variables import Parts, model_at
 from nfriction.fitting.strategy.extrapolation_prior import ExtrapolationPrior
 from nfriction.friction.models import FrictionModel
@@ -65,14 +62,10 @@ class HorizonResult:
         """Standard deviation of a residual, inflated for autocorrelation."""
         return effective_noise(self.residuals)
 
-    @property
+    @cached_property
     def explained(self) -> bool:
-        """True if the rounding of the encoder explains the residuals."""
-        problem = self.problem
-        seen = observed_count(problem.windows.q @ problem.measurement.T)
-        quantum = problem.jacobian.plant.position_quantum or seen
-        limit = problem.options.explained_ratio * (quantum or 0.0) / 12**0.5
-        return self.rms <= limit
+        """True if the noise of encoders and torques explains the residuals."""
+        return explained(self.problem, self.result.x, self.rms)
 
     def lost_motion(self, before: "HorizonResult", options: FitOptions) -> bool:
         """True if the longer windows only show that the motion forgets its start within them."""
