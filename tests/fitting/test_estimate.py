@@ -475,7 +475,7 @@ def misled(monkeypatch):
         poor = torch.tensor(POOR, dtype=F64)[:, : found.coefficients.shape[1]]
         return replace(found, coefficients=poor)
 
-    monkeypatch.setattr("nfriction.fitting.strategy.constant.fit_equation_error", by_torque)
+    monkeypatch.setattr("nfriction.fitting.task.fit_equation_error", by_torque)
     return asked
 
 
@@ -553,7 +553,7 @@ def test_a_search_in_vain_from_the_simpler_law_leaves_the_model_as_it_was(monkey
             return found
         return replace(found, coefficients=torch.tensor(POOR, dtype=F64))
 
-    monkeypatch.setattr("nfriction.fitting.strategy.constant.fit_equation_error", by_torque)
+    monkeypatch.setattr("nfriction.fitting.task.fit_equation_error", by_torque)
     found = fit(Stribeck(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
     assert simpler
     monkeypatch.setattr(
@@ -576,7 +576,7 @@ def test_a_law_leaves_no_more_over_than_the_simpler_one_in_it(law, monkeypatch):
             return found
         return replace(found, coefficients=0 * found.coefficients + 10.0)
 
-    monkeypatch.setattr("nfriction.fitting.strategy.constant.fit_equation_error", by_torque)
+    monkeypatch.setattr("nfriction.fitting.task.fit_equation_error", by_torque)
     recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH), seconds=2.0)
     simpler, found = (
         fit(of(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5, 1.0), max_steps=8)

@@ -1,14 +1,6 @@
-"""The result of a search or a regression: intervals, warnings, and the noise of its data.
+"""The result of a search or a regression: intervals and warnings."""
 
-A right law on a right plant leaves the encoder's rounding, and the motion by which a simulation
-with the recorded torque departs from the true one. The noise of the torque is that part of the
-record which changes from sample to sample; its effect is found by simulation. Noise that lasts for
-many samples is not counted, since it looks like an error of the law.
-"""
-
-import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -25,23 +17,25 @@ from nfriction.fitting.result.identifiability import (
     exceeds_drive_torque,
     model_error_warning,
     null_directions,
-    observed_count,
     standard_deviations,
     warnings_of,
     weakly_identified,
 )
-from nfriction.fitting.robust_loss import SQUARES, Outliers, named_outliers, outlier_warning
+from nfriction.fitting.robust_loss import Outliers, named_outliers, outlier_warning
 from nfriction.fitting.shooting.autocorrelation import (
     bandwidth,
     effective_noise,
     hac_sd,
-    white_noise,
 )
-from nfriction.fitting.shooting.problem import SMALL, ShootingProblem
+from nfriction.fitting.shooting.problem import ShootingProblem
+from nfriction.fitting.shooting.uncertainty import (
+    encoder_count,
+    gathered_information,
+    measurement_noise,
+)
 from nfriction.fitting.shooting.variables import model_at
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import LeastSquaresResult
-from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
 from nfriction.plant import Plant
 from nfriction.signals import Motion
 
@@ -51,8 +45,6 @@ BLURRED = (
 )
 # A lower bound no larger exists only for the logarithm of a positive coefficient, in SI.
 NOTHING = 1e-9
-# Counts of a coarse encoder that is still in use.
-USUAL_COUNTS = 4096
 
 
 def result_from_equation_error(
@@ -208,7 +200,8 @@ def _identifiability(
     quantum = encoder_count(problem) if problem.friction.law.memory else None
     rms = float(residuals.square().mean().sqrt())
     rounded = quantum and rms <= options.explained_ratio * quantum / 12**0.5
-    known = problem.information(result.x, sd, quantum if rounded else None).subset(fitted)
+    known = gathered_information(problem, result.x, sd, quantum if rounded else None)
+    known = known.subset(fitted)
     root = torch.zeros(count, len(fitted), dtype=torch.float64)
     root[fitted] = covariance_root(known)
     root[[names.index(name) for name in ambiguous]] = torch.inf
@@ -248,73 +241,3 @@ def _torque_scale(
         torque = problem.friction.steady_torque(speed, torch.ones_like(speed), table)
         (slope,) = torch.autograd.grad(torque.sum(), table)
     return slope.flatten(), need[:, None].expand_as(slope).flatten()
-
-
-def rounding(problem: ShootingProblem) -> float:
-    """Root mean square rounding of the encoders [rad; m], by their count.
-
-    A count that neither the plant states nor the positions show is taken for a 4096th of the motion
-    within a window.
-    """
-    count = encoder_count(problem)
-    if not count:
-        recorded = problem.windows.q @ problem.measurement.T
-        moved = recorded.amax(1) - recorded.amin(1)
-        count = float(moved.square().mean().sqrt()) / USUAL_COUNTS
-    return count / math.sqrt(12)
-
-
-def encoder_count(problem: ShootingProblem) -> float | None:
-    """Count of the encoders that the plant states or the positions show [rad; m]."""
-    recorded = problem.windows.q @ problem.measurement.T
-    return problem.jacobian.plant.position_quantum or observed_count(recorded)
-
-
-def explained(problem: ShootingProblem, x: Tensor, rms: float) -> bool:
-    """True if the noise of encoders and torques explains residuals of this root mean square."""
-    limit = problem.options.explained_ratio
-    return rms <= limit * measurement_noise(problem, x, rms, limit)
-
-
-def measurement_noise(
-    problem: ShootingProblem, x: Tensor, residual: float, enough: float | None = None
-) -> float:
-    """Residual of a right law [rad; m], given that of a solution, both root mean square.
-
-    The torque's noise is simulated only for residuals of more than `enough` times the rounding, by
-    default those that count as errors of the model.
-    """
-    least = rounding(problem)
-    if residual <= (enough or problem.options.model_error_ratio) * least:
-        return least
-    errors = problem.errors(x)
-    encoder = float(white_noise(errors).clamp(min=least).square().mean().sqrt())
-    return math.hypot(encoder, _by_torque(problem, x, errors))
-
-
-def _by_torque(problem: ShootingProblem, x: Tensor, errors: Tensor) -> float:
-    """Root mean square residual by one realisation of the torque's noise, once fitted [rad; m]."""
-    response = problem.torque_response(x, 1)
-    if response is None:
-        return 0.0
-    # Positions as if the noise alone made the errors, so small that simulations respond linearly,
-    # and priors around this solution.
-    off = SMALL * response[..., 0]
-    windows, options = problem.windows, problem.options
-    q = windows.q + torch.linalg.solve(problem.measurement, (errors - off).mT).mT
-    friction, plant, states, _ = problem.variables.split(x)
-    q0, qd0 = states[:, : 2 * windows.q0.shape[-1]].chunk(2, -1)
-    of_friction, of_plant = problem.variables.split(problem.variables.prior()[0])[:2]
-    pretended = replace(
-        problem, windows=replace(windows, q=q, q0=q0, qd0=qd0), loss=SQUARES,
-        friction_prior=(friction, of_friction.rsqrt()), plant_prior=(plant, of_plant.rsqrt()),
-    )  # fmt: skip
-    solver = LevenbergMarquardt(
-        max_steps=options.settling_steps, cost_tolerance=options.settling_tolerance
-    )
-    lower, upper = pretended.variables.bounds()
-    fitted = solver.minimise(
-        pretended.linearise, x, cost=pretended.cost, lower=lower, upper=upper
-    ).x
-    found = float(pretended.errors(fitted).square().mean().sqrt()) / SMALL
-    return found if math.isfinite(found) else 0.0

@@ -20,29 +20,20 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from nfriction.fitting.adjusted_plant import adjusted_plant
 from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.options import DEFAULTS, FitOptions
-from nfriction.fitting.plant_parameters import adjusted_plant
 from nfriction.fitting.result.identifiability import (
-    Information,
-    information,
     observed_count,
 )
 from nfriction.fitting.robust_loss import SQUARES, RobustLoss
-from nfriction.fitting.shooting.autocorrelation import white_noise
 from nfriction.fitting.shooting.normal_equations import (
-    Kept,
     Rows,
-    drawn_score,
-    marginalize_states,
     normal_equations,
-    rounding_of,
     scaled_rows,
-    score_covariance,
 )
 from nfriction.fitting.shooting.sensitivity import StepJacobian, Trajectory, propagate
 from nfriction.fitting.shooting.variables import DecisionVariables, deflected
@@ -53,11 +44,6 @@ from nfriction.plant import Plant
 from nfriction.signals import Motion
 from nfriction.simulation.protocols import Rollout, RolloutInputs
 from nfriction.simulation.rollout import integrate
-
-# Share of a noise at which simulations respond linearly to it.
-SMALL = 1e-3
-# Realisations of the torque's noise for intervals.
-DRAWS = 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,14 +92,14 @@ class ShootingProblem:
 
     def cost(self, x: Tensor) -> Tensor:
         """Half the sum of squares of errors and priors."""
-        return self._cost(x, self._simulate(x))
+        return self._cost(x, self.simulate(x))
 
     def linearise(self, x: Tensor) -> Quadratic:
         """Cost, gradient and Gauss-Newton Hessian at `x` from one simulation."""
-        run = self._simulate(x, with_memory=True)
-        errors = self._deviation(x, run)
-        scale = self._scale * self.loss.weight(errors).sqrt()
-        rows = self._rows(run, scale)
+        run = self.simulate(x, with_memory=True)
+        errors = self.deviation(x, run)
+        scale = self.scale * self.loss.weight(errors).sqrt()
+        rows = self.rows(run, scale)
         gradient, hessian = normal_equations(rows, errors * scale, self.variables.indices(), len(x))
         if self.extrapolation is not None:
             slope, curvature = self.extrapolation.normal_equations(run.friction.schedule)
@@ -129,7 +115,7 @@ class ShootingProblem:
 
     def errors(self, x: Tensor) -> Tensor:
         """Position error at every sample [rad; m], (window, step + 1, joint)."""
-        return self._deviation(x, self._simulate(x)) * self.windows.weight[..., None]
+        return self.deviation(x, self.simulate(x)) * self.windows.weight[..., None]
 
     def counted_errors(self, x: Tensor) -> Tensor:
         """Errors whose squares are what the loss counts; `errors` where it is the square."""
@@ -151,7 +137,7 @@ class ShootingProblem:
 
         Longer windows then start from fitted states instead of a smoother's.
         """
-        run, offsets = self._simulate(x).motion, self.variables.window_offsets(x)
+        run, offsets = self.simulate(x).motion, self.variables.window_offsets(x)
         run = replace(run, q=run.q - offsets[:, None])
         states = [(m.q.copy(), m.qd.copy()) for m in motions]
         # A sample that two windows share is taken from the later one's fitted start.
@@ -161,62 +147,8 @@ class ShootingProblem:
                 kept[first : last + 1] = found[w, : n : self.substeps].numpy()
         return tuple(replace(m, q=q, qd=qd) for m, (q, qd) in zip(motions, states, strict=True))
 
-    def information(self, x: Tensor, sd: Tensor, count: float | None = None) -> Information:
-        """Information about the shared variables, given the sd of each error times its weight.
-
-        `sd` is inflated for autocorrelation, (window, step + 1, joint). If the errors are the
-        rounding of encoders to a `count` [rad; m], their covariance is that of rounding instead.
-        Errors by the torque's noise are added: they last longer than a window, whose own start
-        hides most of them, so residuals show too little of their autocorrelation.
-        """
-        variables, run = self.variables, self._simulate(x, with_memory=True)
-        shared, (precision, _) = variables.shared_count, variables.prior()
-        of_states, of_offsets = variables.split(precision)[2:]
-        kept = Kept(variables.indices(), variables.state_count, len(x))
-        scale = self._scale * self.loss.weight(self._deviation(x, run)).sqrt()
-        data, response = marginalize_states(self._rows(run, scale), kept, of_states)
-        if count and self.loss is SQUARES:
-            q = run.motion.q[:, :: self.substeps] @ self.measurement.T
-            drawn = rounding_of(q, count, self.windows.spans) * self._scale[..., None]
-            score = kept.by_states(response, of_states)
-            score += drawn_score(self._rows(run, scale), kept, response, drawn)
-        else:
-            rows = self._rows(run, self._scale * sd / self.noise_sd)
-            score = score_covariance(rows, kept, response, of_states)
-        by_torque = self.torque_response(x, DRAWS)
-        if by_torque is not None:
-            drawn = by_torque * self._scale[..., None]
-            score += drawn_score(self._rows(run, scale), kept, response, drawn)
-        prior = torch.cat([precision[:shared], of_offsets.flatten()])
-        return information(data + torch.diag(prior), prior, shared, score)
-
-    def torque_response(self, x: Tensor, draws: int, seed: int = 0) -> Tensor | None:
-        """Position errors by the noise of the recorded torques, (window, sample, joint, draw).
-
-        The noise is that part of a torque which changes from sample to sample, see `white_noise`;
-        None without any. A torque that is off moves all samples after it, so these errors last.
-        """
-        sd = white_noise(self.windows.tau).numpy()
-        if not sd.any():
-            return None
-        random = np.random.default_rng(seed)
-        exact, found = self._positions(x), []
-        for _ in range(draws):
-            recordings = tuple(
-                r._replace(tau=r.torque_at(r.time) + SMALL * sd * random.standard_normal(r.q.shape))
-                for r in self.windows.recordings
-            )
-            noisy = replace(self.windows, recordings=recordings)
-            noisy = replace(noisy, tau=noisy.torque_at(0.0)[0])
-            found.append((replace(self, windows=noisy)._positions(x) - exact) / SMALL)
-        return torch.stack(found, -1)
-
-    def _positions(self, x: Tensor) -> Tensor:
-        q = self._simulate(x).motion.q[:, :: self.substeps]
-        return q @ self.measurement.T * self.windows.weight[..., None]
-
     @cached_property
-    def _scale(self) -> Tensor:
+    def scale(self) -> Tensor:
         """Weight of each sample over the noise, (window, step + 1, 1)."""
         counted = torch.zeros_like(self.windows.weight)
         counted[:, :: self.stride] = self.windows.weight[:, :: self.stride] * self.stride**0.5
@@ -227,7 +159,7 @@ class ShootingProblem:
         """A copy of the friction model, which every simulation moves to its parameters."""
         return copy.deepcopy(self.friction)
 
-    def _simulate(self, x: Tensor, *, with_memory: bool = False) -> Trajectory:
+    def simulate(self, x: Tensor, *, with_memory: bool = False) -> Trajectory:
         """The windows' motion at `x`, valid until the next; memory only for derivatives."""
         friction, plant, states, _ = self.variables.split(x)
         model, joints = self._moving, self.windows.q0.shape[-1]
@@ -265,18 +197,18 @@ class ShootingProblem:
             rows.append(model.schedule.advance(qd, qdd, rows[-1]))
         return torch.stack(rows, 1)
 
-    def _deviation(self, x: Tensor, run: Trajectory) -> Tensor:
+    def deviation(self, x: Tensor, run: Trajectory) -> Tensor:
         q = run.motion.q[:, :: self.substeps] - self.variables.window_offsets(x)[:, None]
         return (q - self.windows.q) @ self.measurement.T
 
     def _cost(self, x: Tensor, run: Trajectory) -> Tensor:
-        misfit = (self.loss.counted(self._deviation(x, run)) * self._scale).square().sum()
+        misfit = (self.loss.counted(self.deviation(x, run)) * self.scale).square().sum()
         if self.extrapolation is not None:
             misfit = misfit + self.extrapolation.residuals(run.friction.schedule).square().sum()
         precision, mean = self.variables.prior()
         return 0.5 * (misfit + (precision * (x - mean) ** 2).sum())
 
-    def _rows(self, run: Trajectory, scale: Tensor) -> Iterator[Rows]:
+    def rows(self, run: Trajectory, scale: Tensor) -> Iterator[Rows]:
         """Rows of the Jacobian, some samples at a time."""
         pieces = propagate(self.jacobian, run, self.substeps, self.stride)
         return scaled_rows(pieces, scale, self.measurement, self.variables.indices())

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from nfriction import codegen
-from nfriction.fitting.plant_parameters import PlantParameter, adjusted_plant, delay_index
+from nfriction.fitting.adjusted_plant import PlantParameter, adjusted_plant, delay_index
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.parameters import Sensitivity
 from nfriction.plant import Plant

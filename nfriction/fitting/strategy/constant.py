@@ -4,7 +4,7 @@ A nonlinear law has several starts: its own, and two from the law that it contai
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import TypeGuard
 
@@ -12,16 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.fitting.data.inputs import adjustable_terms, advanced_torques
+from nfriction.fitting.data.inputs import adjustable_terms
 from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.equation_error import (
     TorqueFit,
-    fit_equation_error,
-    prior_sd,
-    steady_law,
 )
-from nfriction.fitting.options import FitOptions
-from nfriction.fitting.plant_parameters import TORQUE_DELAY, PlantParameter
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.of_search import (
     result_from_equation_error,
@@ -40,8 +35,18 @@ from nfriction.fitting.strategy.continuation import (
     weighted_cost,
 )
 from nfriction.fitting.strategy.further_terms import delay_warning, richer_by_evidence
-from nfriction.fitting.strategy.presliding import ambiguous_stiffness, presliding_starts
-from nfriction.fitting.task import FitTask
+from nfriction.fitting.strategy.presliding import (
+    TRAVELLED,
+    ambiguous_stiffness,
+    presliding_starts,
+)
+from nfriction.fitting.task import (
+    FitTask,
+    constant_prior,
+    fits_eccentricity,
+    known_terms,
+    regression,
+)
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Law
 from nfriction.friction.models import FrictionModel
@@ -69,17 +74,19 @@ def fit_constant(task: FitTask) -> FitResult:
 
     def equation_error(plant: Plant) -> Iterable[Tensor]:
         implied = regression(task, model, plant)
-        return with_presliding(torch.cat([implied.coefficients[None], implied.starts]))
+        return with_presliding(torch.cat([implied.coefficients[None], implied.starts]), plant)
 
-    def with_presliding(sliding: Tensor) -> Iterable[Tensor]:
+    def with_presliding(sliding: Tensor, rig: Plant) -> Iterable[Tensor]:
         if not model.law.memory:
             return sliding
-        return presliding_starts(fitter, sliding, plant, task.motions)
+        # Rows of a contact that yields would be taken for sliding, at a smaller friction.
+        apart = regression(task, model, rig, TRAVELLED).coefficients
+        return presliding_starts(fitter, sliding, apart, plant, task.motions)
 
     eccentric = fits_eccentricity(options, start)
     fitter = _fitter(task, model, torque, eccentric)
     plant = known_terms(start, fitter.jacobian.terms, task.delay)
-    friction = next(iter(with_presliding(torque.coefficients[None]))).reshape(-1)
+    friction = next(iter(with_presliding(torque.coefficients[None], begun))).reshape(-1)
     linear = all(c.linear or not c.fitted for c in model.law.coefficients)
     search = horizon_continuation(
         fitter, friction, plant, task.motions,
@@ -120,14 +127,6 @@ def fit_constant(task: FitTask) -> FitResult:
     return fitted.with_warnings(said)
 
 
-def regression(task: FitTask, model: FrictionModel, plant: Plant) -> TorqueFit:
-    """Constant coefficients that torques imply on a plant."""
-    recordings = advanced_torques(task.recordings, task.delay)
-    return fit_equation_error(
-        steady_law(model.law), plant, recordings, task.motions, model.v_smooth, task.options
-    )
-
-
 def _fitter(
     task: FitTask, model: FrictionModel, torque: TorqueFit, eccentric: bool
 ) -> ShootingFitter:
@@ -142,31 +141,6 @@ def _fitter(
         task.callback, friction_prior=constant_prior(model, torque, options),
         offset_sd=torch.full(shape, sd, dtype=torch.float64) if task.per_recording else None,
     )  # fmt: skip
-
-
-def constant_prior(
-    model: FrictionModel, torque: TorqueFit, options: FitOptions
-) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of a law's constant coefficients, each (parameter,)."""
-    sd = prior_sd(model.law, torque, options).reshape(-1)
-    return torch.zeros_like(sd), sd
-
-
-def known_terms(
-    start: FitResult | None, terms: Sequence[PlantParameter], delay: float = 0.0
-) -> Tensor:
-    """Plant terms of an earlier fit by name, 0 where it has none but for the delay, (term,)."""
-    known = {TORQUE_DELAY: delay}
-    if start is not None:
-        known |= {name: value for name, value, _ in start.plant_terms}
-    return torch.tensor([known.get(t.name, 0.0) for t in terms], dtype=torch.float64)
-
-
-def fits_eccentricity(options: FitOptions, start: FitResult | None) -> bool:
-    """True if a search has encoder terms: `"on"`, or `"auto"` after a fit that has them."""
-    terms = start.plant_terms if start else ()
-    found = any(name.startswith("encoder ") for name, _, _ in terms)
-    return options.eccentricity == "on" or (options.eccentricity == "auto" and found)
 
 
 def is_constant_fit(start: FitResult | None, model: FrictionModel) -> TypeGuard[FitResult]:

@@ -12,10 +12,10 @@ from nfriction.fitting.data.inputs import integration_substeps
 from nfriction.fitting.data.windows import Windows, cut_windows
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.identifiability import information, standard_deviations
-from nfriction.fitting.result.of_search import explained
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
+from nfriction.fitting.shooting.uncertainty import explained
 from nfriction.fitting.shooting.variables import Parts, model_at
 from nfriction.fitting.strategy.extrapolation_prior import ExtrapolationPrior
 from nfriction.friction.models import FrictionModel

@@ -25,9 +25,9 @@ from nfriction.fitting.result.of_search import result_from_shooting
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
-from nfriction.fitting.strategy.constant import constant_start, known_terms
+from nfriction.fitting.strategy.constant import constant_start
 from nfriction.fitting.strategy.continuation import ShootingFitter
-from nfriction.fitting.task import Callback, FitTask, prepare_task
+from nfriction.fitting.task import Callback, FitTask, known_terms, prepare_task
 from nfriction.friction.models import FrictionModel
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
 from nfriction.papers.afem.classes import (
