@@ -32,8 +32,9 @@ from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
 
 # Counts of a coarse encoder that is still in use.
 USUAL_COUNTS = 4096
-# Share of a noise at which simulations respond linearly to it.
-SMALL = 1e-3
+# Share of a noise at which simulations respond nearly linearly to it; a smaller one would drown in
+# the priors of encoder offsets, which are not around a solution.
+SMALL = 0.1
 # Realisations of the torque's noise for intervals.
 DRAWS = 30
 
