@@ -130,6 +130,8 @@ def test_a_gain_is_larger_than_its_scatter_over_windows(ratios, gained):
     law = torch.tensor([4.0, 1.0, 2.0, 3.0], dtype=F64)
     network = law * torch.tensor(ratios, dtype=F64).square()
     assert gains(network, law) is gained
+    # The less chance is left to scatter, the larger has a gain to be.
+    assert gains(network, law, 1e-6) is (gained and len(set(ratios)) == 1)
     # A law that diverges loses to what does not.
     assert gains(law, torch.where(law > 3, torch.inf, law))
 

@@ -8,8 +8,13 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.data.windows import Windows, cut_windows
+from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.shooting.problem import ShootingProblem
-from nfriction.fitting.strategy.continuation import log_ratio, settle_states
+from nfriction.fitting.strategy.continuation import (
+    log_ratio,
+    settle_states,
+    student_quantile,
+)
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
@@ -40,12 +45,15 @@ def holdout_splits(windows: Windows, folds: int) -> list[tuple[Windows, Windows]
     return [(windows.subset(fold != k), windows.subset(fold == k)) for k in reversed(range(folds))]
 
 
-def gains(new: Tensor, old: Tensor) -> bool:
-    """True if squared errors on windows (window,) fell by more than the standard error of that."""
+def gains(new: Tensor, old: Tensor, chance: float = DEFAULTS.network_chance) -> bool:
+    """True if squared errors on windows (window,) fell by more than their scatter would by chance.
+
+    By Student's distribution, as windows may be few.
+    """
     if not old.isfinite().all():
         return bool(new.isfinite().all())
     ratio, spread = log_ratio(new, old)
-    return ratio + spread < 0
+    return ratio + spread * student_quantile(len(new) - 1, 1 - chance) < 0
 
 
 def verdict(network: Tensor, law: Tensor) -> str:

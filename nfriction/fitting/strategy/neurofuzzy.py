@@ -4,7 +4,7 @@ First its sets stay where they are, and windows held out choose the priors. Then
 noise that it left, with a prior for each group of parameters by evidence, and moves its sets if the
 evidence favours that; as long as the windows held out gain by it, at ever less noise. Further
 inputs (`inputs`) are a rival that has to win on the windows held out. Every window is held out in
-turn, and a gain has to be larger than its standard error over the windows.
+turn, and a gain has to be larger than its scatter over the windows explains.
 """
 
 import copy
@@ -113,11 +113,11 @@ def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[InputGain, ...], "_Con
     model = copy.deepcopy(task.model)
     cast("NeuroFuzzyModel", model).see(names)
     seeing = replace(task, model=model, plant=seeing_plant(task.plant, names))
-    rival = _Contest(seeing, start)
-    if not gains(rival.validation.of_law, plain.validation.of_law):
+    rival, chance = _Contest(seeing, start), task.options.input_chance
+    if not gains(rival.validation.of_law, plain.validation.of_law, chance):
         return (), plain
     rival.train()
-    return (chosen, rival) if gains(rival.squares, plain.squares) else ((), plain)
+    return (chosen, rival) if gains(rival.squares, plain.squares, chance) else ((), plain)
 
 
 class _Contest:
