@@ -15,7 +15,6 @@ from torch import Tensor
 
 from nfriction.fitting.data.inputs import adjustable_terms
 from nfriction.fitting.data.windows import Windows
-from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.fit_result import FitResult, InputGain
 from nfriction.fitting.result.of_search import result_from_shooting
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
@@ -141,7 +140,6 @@ class _Choice:
     prior: Quadratic
     bounds: tuple[Tensor, Tensor]  # of a step
     columns: dict[str, list[int]]  # of each candidate, a coefficient a joint
-    chance: float = DEFAULTS.input_chance
 
     @classmethod
     def of(
@@ -169,8 +167,7 @@ class _Choice:
         rows = torch.arange(variables.friction_count).reshape(model.joints, -1)
         own = rows.shape[1] - len(names)
         columns = {name: rows[:, own + k].tolist() for k, name in enumerate(names)}
-        bounds = lower.clamp(max=0.0), upper.clamp(min=0.0)
-        return cls(found, prior, bounds, columns, task.options.input_chance)
+        return cls(found, prior, (lower.clamp(max=0.0), upper.clamp(min=0.0)), columns)
 
     def forward(self) -> list[InputGain]:
         """Inputs one after the other, as long as one gains by more than its scatter over blocks."""
@@ -183,7 +180,7 @@ class _Choice:
                 if columns[0] in held:
                     continue
                 after = self.left_out([*held, *columns])
-                if gains(after, before, self.chance):
+                if gains(after, before):
                     shares[name] = float(1.0 - after.sum() / before.sum())
             if not shares:
                 break

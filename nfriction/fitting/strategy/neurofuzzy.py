@@ -44,10 +44,10 @@ from nfriction.fitting.strategy.continuation import (
 from nfriction.fitting.strategy.extrapolation_prior import prior_on_unvisited_cells
 from nfriction.fitting.strategy.holdout import (
     StoppedError,
-    cut_for_folds,
     gains,
     holdout_splits,
     holdout_squares,
+    holdout_windows,
     verdict,
 )
 from nfriction.fitting.strategy.inputs import (
@@ -113,11 +113,11 @@ def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[InputGain, ...], "_Con
     model = copy.deepcopy(task.model)
     cast("NeuroFuzzyModel", model).see(names)
     seeing = replace(task, model=model, plant=seeing_plant(task.plant, names))
-    rival, chance = _Contest(seeing, start), task.options.input_chance
-    if not gains(rival.validation.of_law, plain.validation.of_law, chance):
+    rival = _Contest(seeing, start)
+    if not gains(rival.validation.of_law, plain.validation.of_law):
         return (), plain
     rival.train()
-    return (chosen, rival) if gains(rival.squares, plain.squares, chance) else ((), plain)
+    return (chosen, rival) if gains(rival.squares, plain.squares) else ((), plain)
 
 
 class _Contest:
@@ -328,7 +328,7 @@ class _Validation:
         assert law.plant_prior is not None
         self.law, self.length, self.options = law, length, law.options
         self.plant = law.plant_prior[0]
-        self.windows = cut_for_folds(law.recordings, motions, length, self.options.folds)
+        self.windows = holdout_windows(law.recordings, motions, length, self.options.folds)
         self.splits = holdout_splits(self.windows, self.options.folds)
         # The noise against which the priors weigh is the residual of the constant law at the same
         # horizon; its cost scales the tolerance.
