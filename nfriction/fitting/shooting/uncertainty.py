@@ -24,17 +24,16 @@ from nfriction.fitting.shooting.normal_equations import (
     Kept,
     drawn_score,
     marginalize_states,
+    normal_equations,
     rounding_of,
     score_covariance,
 )
 from nfriction.fitting.shooting.problem import ShootingProblem
-from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
 
 # Counts of a coarse encoder that is still in use.
 USUAL_COUNTS = 4096
-# Share of a noise at which simulations respond nearly linearly to it; a smaller one would drown in
-# the priors of encoder offsets, which are not around a solution.
-SMALL = 0.1
+# Share of a noise at which simulations respond linearly to it.
+SMALL = 1e-3
 # Realisations of the torque's noise for intervals.
 DRAWS = 30
 
@@ -78,35 +77,27 @@ def measurement_noise(
         return least
     errors = problem.errors(x)
     encoder = float(white_noise(errors).clamp(min=least).square().mean().sqrt())
-    return math.hypot(encoder, _by_torque(problem, x, errors))
+    return math.hypot(encoder, _by_torque(problem, x))
 
 
-def _by_torque(problem: ShootingProblem, x: Tensor, errors: Tensor) -> float:
+def _by_torque(problem: ShootingProblem, x: Tensor) -> float:
     """Root mean square residual by one realisation of the torque's noise, once fitted [rad; m]."""
     response = torque_response(problem, x, 1)
     if response is None:
         return 0.0
-    # Positions as if the noise alone made the errors, so small that simulations respond linearly,
-    # and priors around this solution.
-    off = SMALL * response[..., 0]
-    windows, options = problem.windows, problem.options
-    q = windows.q + torch.linalg.solve(problem.measurement, (errors - off).mT).mT
-    friction, plant, states, _ = problem.variables.split(x)
-    q0, qd0 = states[:, : 2 * windows.q0.shape[-1]].chunk(2, -1)
-    of_friction, of_plant = problem.variables.split(problem.variables.prior()[0])[:2]
-    pretended = replace(
-        problem, windows=replace(windows, q=q, q0=q0, qd0=qd0), loss=SQUARES,
-        friction_prior=(friction, of_friction.rsqrt()), plant_prior=(plant, of_plant.rsqrt()),
-    )  # fmt: skip
-    solver = LevenbergMarquardt(
-        max_steps=options.settling_steps, cost_tolerance=options.settling_tolerance
-    )
-    lower, upper = pretended.variables.bounds()
-    fitted = solver.minimise(
-        pretended.linearise, x, cost=pretended.cost, lower=lower, upper=upper
-    ).x
-    found = float(pretended.errors(fitted).square().mean().sqrt()) / SMALL
-    return found if math.isfinite(found) else 0.0
+    variables, off = problem.variables, response[..., 0] * problem.scale
+    lower, upper = variables.bounds()
+    free = (lower < upper).nonzero().flatten()
+    rows = problem.rows(problem.simulate(x, with_memory=True), problem.scale)
+    gradient, hessian = normal_equations(rows, off, variables.indices(), len(x))
+    gradient, hessian = gradient[free], hessian[free][:, free]
+    hessian.diagonal().add_(variables.prior()[0][free])
+    step, failed = torch.linalg.solve_ex(hessian, gradient)
+    left = float(off.square().sum() - gradient @ step)
+    if failed or not math.isfinite(left):
+        return 0.0
+    counted = float(problem.scale.square().sum()) * off.shape[-1]
+    return math.sqrt(max(left, 0.0) / counted)
 
 
 def gathered_information(
