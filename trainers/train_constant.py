@@ -10,7 +10,6 @@ continues a pattern search from its last iteration; the other methods, which tak
 minutes, start again. The result is that of an uninterrupted run.
 """
 
-import sys
 from collections.abc import Sequence
 
 import common
@@ -36,10 +35,5 @@ def train(argv: Sequence[str] | None) -> str:
     return common.finish(given, bench, found)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    print(common.run(train, argv))
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    common.run(train)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from nfriction.cli.console import Commands, check_writable
 from nfriction.cli.estimate import add_comparison_options, compare_and_report
-from nfriction.cli.inputs import count, seconds
+from nfriction.cli.inputs import count, positive
 
 # Held equal to the twins' own by a test; the twins themselves load torch.
 DURATION, TWIN_DURATION = 10.0, 20.0
@@ -26,7 +26,7 @@ def add_demo(commands: Commands) -> None:
         example="nfriction demo --models viscous,neuro-fuzzy:load-coulomb --out runs/demo",
     )  # fmt: skip
     parser.add_argument("--seed", type=count, default=0, help="of encoder errors and jitter")
-    parser.add_argument("--seconds", type=seconds, default=DURATION,
+    parser.add_argument("--seconds", type=positive, default=DURATION,
                         help="length of each recording [s]")  # fmt: skip
     add_comparison_options(parser)
     parser.set_defaults(out=Path("runs/demo"), models=MODELS, degrees=False)
@@ -64,7 +64,7 @@ def add_twin(commands: Commands) -> None:
                         "and viscous friction alone")  # fmt: skip
     parser.add_argument("--seed", type=count, default=0,
                         help="of releases, friction, encoder errors and jitter")  # fmt: skip
-    parser.add_argument("--seconds", type=seconds, default=TWIN_DURATION,
+    parser.add_argument("--seconds", type=positive, default=TWIN_DURATION,
                         help="length of each recording [s]")  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path("runs/twin"), help="folder to write")
 

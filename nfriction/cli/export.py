@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 from nfriction.cli import inputs
 from nfriction.cli.console import Commands, UsageError, check_writable
-from nfriction.cli.inputs import seconds
 
 if TYPE_CHECKING:
     from nfriction.friction.models import FrictionModel
@@ -37,13 +36,13 @@ def add_export(commands: Commands) -> None:
                         "the model file)")  # fmt: skip
     parser.add_argument("--dtype", choices=("float64", "float32"), default="float64",
                         help=f"precision of {' and '.join(IN_SINGLE)}")  # fmt: skip
-    parser.add_argument("--torque-limit", type=_numbers, metavar="LIMIT,...",
+    parser.add_argument("--torque-limit", type=inputs.positives, metavar="LIMIT,...",
                         help="largest torque given out, one number or one a joint")  # fmt: skip
     parser.add_argument("--with-filter", action="store_true",
                         help="take raw positions, with the causal filter inside")  # fmt: skip
-    parser.add_argument("--cutoff", type=_numbers, default="20", metavar="HZ",
+    parser.add_argument("--cutoff", type=inputs.positive, default=20.0, metavar="HZ",
                         help="cut-off of that filter [Hz]")  # fmt: skip
-    parser.add_argument("--online", type=_numbers, metavar="NOISE",
+    parser.add_argument("--online", type=inputs.positive, metavar="NOISE",
                         help="C of a model with the papers' network that also learns while it "
                         "runs, from a friction torque measured to this [N m]")  # fmt: skip
     group = parser.add_argument_group("mjcf and urdf")
@@ -83,9 +82,7 @@ def run_export(arguments: argparse.Namespace) -> int:
         raise UsageError(f"{wanted[0]} needs a motion: give --recording FILE.")
     if arguments.patch and len(wanted) != 1:
         raise UsageError("--patch takes one of mjcf and urdf in --format.")
-    if len(arguments.cutoff) != 1:
-        raise UsageError("--cutoff takes one number.")
-    if arguments.online and (len(arguments.online) != 1 or "c" not in arguments.format):
+    if arguments.online and "c" not in arguments.format:
         raise UsageError("--online takes one number, with c in --format.")
     model, info = load(arguments.model), load_info(arguments.model)
     check_writable(arguments.out)
@@ -105,10 +102,12 @@ def _write_controller(
     from nfriction import export
     from nfriction.export.c_dialect import is_identifier
 
+    limit = arguments.torque_limit
     options: dict[str, Any] = {
-        "torque_limit": _limit(arguments.torque_limit),
+        # One number is for all joints.
+        "torque_limit": limit[0] if limit and len(limit) == 1 else limit,
         "with_filter": arguments.with_filter,
-        "cutoff_hz": arguments.cutoff[0],
+        "cutoff_hz": arguments.cutoff,
     }
     if target in IN_SINGLE:
         options["dtype"] = arguments.dtype
@@ -121,7 +120,7 @@ def _write_controller(
         if arguments.online:
             from nfriction.papers.nffem.online import OnlineOptions, write_online
 
-            learning = OnlineOptions(arguments.online[0], sample_time=info.sample_time or 1e-3)
+            learning = OnlineOptions(arguments.online, sample_time=info.sample_time or 1e-3)
             paths += write_online(model, arguments.out, learning, name=f"{name}_online")
         return paths
     writer = getattr(export, target)
@@ -194,10 +193,6 @@ def run_verify(arguments: argparse.Namespace) -> int:
     return 0 if verdict.passed else 1
 
 
-def _limit(numbers: list[float] | None) -> float | list[float] | None:
-    return numbers[0] if numbers and len(numbers) == 1 else numbers
-
-
 def _targets(text: str) -> list[str]:
     """Names of targets with commas between them, for argparse."""
     targets = [name.strip() for name in text.split(",") if name.strip()]
@@ -220,12 +215,3 @@ def _identifier(text: str) -> str:
             f"must be letters, digits and _ with a letter first and no word of C, got {text!r}"
         )
     return text
-
-
-def _numbers(text: str) -> list[float]:
-    """Positive numbers with commas between them, for argparse."""
-    try:
-        # Positive and finite, as durations are.
-        return [seconds(part) for part in text.split(",")]
-    except argparse.ArgumentTypeError:
-        raise argparse.ArgumentTypeError(f"takes positive numbers, got {text!r}") from None

@@ -48,7 +48,7 @@ class Rules:
     """Fuzzy rules of a joint, to be fitted beside its law.
 
     Args:
-        schedule: of one joint; its ranges are set.
+        schedule: of one joint; it gets the ranges of its inputs, and the rules by `set`.
         joint: rows in order of time.
         found: the law's fit to them.
         blocks: rows that are left out in turn.

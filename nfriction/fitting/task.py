@@ -129,11 +129,11 @@ def prepare_task(
     )
 
 
-def regression(task: FitTask, model: FrictionModel, plant: Plant) -> TorqueFit:
-    """Constant coefficients that torques imply on a plant."""
+def regression(task: FitTask, model: FrictionModel, plant: Plant, beyond: float = 0.0) -> TorqueFit:
+    """Constant coefficients that torques imply on a plant; see `fit_equation_error`."""
     recordings = advanced_torques(task.recordings, task.delay)
     return fit_equation_error(
-        steady_law(model.law), plant, recordings, task.motions, model.v_smooth, task.options
+        steady_law(model.law), plant, recordings, task.motions, model.v_smooth, task.options, beyond
     )
 
 

@@ -31,7 +31,7 @@ _LAWS = {
 # Laws with memory: of bristles, whose Coulomb and Stribeck friction a network may correct, and of
 # elements that slip.
 _BRISTLES = {"dahl": "Dahl", "lugre": "LuGre", "elasto-plastic": "ElastoPlastic"}
-_MEMORY = _BRISTLES | {"maxwell-slip": "MaxwellSlip"}
+_MEMORY = _BRISTLES | {"gear": "Gear", "maxwell-slip": "MaxwellSlip"}
 # Slip elements beside terms of the velocity, for tables of torque.
 _HYSTERESIS = {"slip": "Slip", "load-slip": "LoadSlip"}
 # Classes are resolved only when asked for: a command line then starts quickly, and the core does

@@ -53,8 +53,8 @@ def _refuse_load(model: FrictionModel, step: float) -> None:
     loaded, unloaded = (law.memory.advance(start, qd, x, c, step) for x in (qd + 2.0, qd * 0.0))
     if not torch.equal(loaded, unloaded):
         raise ValueError(
-            f"the state of law {law.name!r} depends on the load, which coefficients cannot follow; "
-            "let its torque alone depend on it."
+            f"the state of law {law.name!r} depends on the load, which an export's coefficients "
+            "cannot follow; take a law whose torque alone depends on it, or none."
         )
 
 

@@ -9,9 +9,10 @@ from nfriction.plots.comparison import (
     motion,
     positions,
     rmse_bars,
-    torque_over_velocity,
+    save_all,
 )
 from nfriction.plots.drawing import animate, mechanism
+from nfriction.plots.friction_torque import friction_curves, torque_over_velocity
 from nfriction.plots.neurofuzzy import (
     coefficient_sections,
     coefficient_surfaces,
@@ -19,8 +20,6 @@ from nfriction.plots.neurofuzzy import (
     controller_surface,
     memberships,
 )
-from nfriction.plots.saving import save_all
-from nfriction.plots.torque_table import friction_curves
 
 __all__ = [
     "animate", "coefficient_intervals", "coefficient_sections", "coefficient_surfaces",

@@ -224,10 +224,7 @@ def _along(model: FrictionModel, motion: Motion) -> Array:
     """Coefficients at every sample, (sample, joint, coefficient)."""
     qd, qdd = torch.tensor(motion.qd), torch.tensor(motion.qdd)
     with torch.no_grad():
-        if model.state_size:
-            found = model.coefficients_from(qd, qdd, model.schedule.states(qd, qdd))
-        else:
-            found = model.coefficients(qd, qdd)
+        found = model.coefficients_from(qd, qdd, model.schedule.states(qd, qdd))
     return found.expand(len(qd), -1, -1).numpy()
 
 

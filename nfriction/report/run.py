@@ -133,8 +133,8 @@ def read_run(folder: str | Path) -> Run:
         raise RunError(f"{path}: not results of schema {SCHEMA}; run the comparison again.")
     if not is_intact(content):
         raise RunError(
-            f"{path}: the checksum does not match, so it was damaged or edited; run the comparison "
-            "again."
+            f"{path}: the checksum is missing or does not match, so it was damaged or edited, or "
+            "written by an older version; run the comparison again."
         )
     try:
         run = _run(folder, content)

@@ -11,7 +11,7 @@ from nfriction.evaluation.torque_tables import TorqueFits
 from nfriction.friction import plain_name
 from nfriction.io.files import write_atomically
 from nfriction.io.model_file import save
-from nfriction.plots.saving import DPI
+from nfriction.plots.comparison import DPI
 from nfriction.report.page import document, pictures
 from nfriction.report.run import Figure
 

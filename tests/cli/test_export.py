@@ -170,7 +170,7 @@ def test_a_recording_in_degrees_with_names_of_its_own_gives_the_same(
         (["--cutoff", "1,2"], "takes one number"),
         (["--with-filter", "--cutoff", "900"], "cutoff_hz"),
         (["--online", "0.1"], "--online takes one number, with c in"),
-        (["--online", "0.1,0.2", "--format", "c"], "--online takes one number"),
+        (["--online", "0.1,0.2", "--format", "c"], "--online: takes one number"),
     ],
 )
 def test_what_cannot_be_done_is_said(

@@ -27,7 +27,7 @@ from nfriction import (
 from nfriction.fitting.equation_error import fit_equation_error
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.shooting.autocorrelation import effective_noise
-from nfriction.fitting.strategy.continuation import HorizonResult
+from nfriction.fitting.strategy.continuation import HorizonResult, ShootingFitter
 from nfriction.fitting.strategy.neurofuzzy import _Validation
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import STRIBECK
@@ -486,6 +486,23 @@ def test_stribeck_friction_is_found_again():
     assert found.residual == pytest.approx(2 * np.pi / 8192 / 12**0.5, rel=0.02)
     truth = torch.tensor(FALLING, dtype=F64)
     torch.testing.assert_close(found.model.schedule.values, truth, rtol=0.05, atol=0)
+
+
+def test_no_search_is_made_twice(monkeypatch):
+    """On a plant that is not fitted, torques lead again to where the search began."""
+    begun, search = [], ShootingFitter.search
+
+    def counted(fitter, problem, start, *rest):
+        begun.append(start)
+        return search(fitter, problem, start, *rest)
+
+    monkeypatch.setattr(ShootingFitter, "search", counted)
+    # Another law's friction, so that the encoder's rounding does not end the restarts.
+    recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH), seconds=1.0)
+    settings = {"windows": (0.5,), "fit_plant": False, "max_steps": 1}
+    fit(NLFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
+    assert len(begun) > 3
+    assert not any(torch.equal(a, b) for k, a in enumerate(begun) for b in begun[:k])
 
 
 @pytest.mark.slow

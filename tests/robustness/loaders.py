@@ -36,6 +36,7 @@ from nfriction.export.contract import (
 from nfriction.export.controller import controller_of
 from nfriction.export.onnx_file import open_onnx
 from nfriction.export.torch_files import open_pt2, open_torchscript
+from nfriction.io.files import checked_json
 from nfriction.io.formats import measurements
 from nfriction.io.model_file import ModelFileError, load, load_info, load_plant, parameter_hash
 from nfriction.papers.controller.fis import load_fis
@@ -547,7 +548,7 @@ def _read_figure(path: Path) -> None:
     folder = path.with_suffix("")
     if not folder.exists():
         (folder / "figures").mkdir(parents=True)
-        (folder / "results.json").write_text(json.dumps(results()))
+        (folder / "results.json").write_text(json.dumps(checked_json(results())))
     (folder / "figures" / "damaged.png").write_bytes(path.read_bytes())
     run = read_run(folder)
     assert len(run.figures) + len(run.notes) > 0

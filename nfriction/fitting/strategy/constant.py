@@ -35,7 +35,11 @@ from nfriction.fitting.strategy.continuation import (
     weighted_cost,
 )
 from nfriction.fitting.strategy.further_terms import delay_warning, richer_by_evidence
-from nfriction.fitting.strategy.presliding import ambiguous_stiffness, presliding_starts
+from nfriction.fitting.strategy.presliding import (
+    TRAVELLED,
+    ambiguous_stiffness,
+    presliding_starts,
+)
 from nfriction.fitting.task import (
     FitTask,
     constant_prior,
@@ -70,17 +74,19 @@ def fit_constant(task: FitTask) -> FitResult:
 
     def equation_error(plant: Plant) -> Iterable[Tensor]:
         implied = regression(task, model, plant)
-        return with_presliding(torch.cat([implied.coefficients[None], implied.starts]))
+        return with_presliding(torch.cat([implied.coefficients[None], implied.starts]), plant)
 
-    def with_presliding(sliding: Tensor) -> Iterable[Tensor]:
+    def with_presliding(sliding: Tensor, rig: Plant) -> Iterable[Tensor]:
         if not model.law.memory:
             return sliding
-        return presliding_starts(fitter, sliding, plant, task.motions)
+        # Rows of a contact that yields would be taken for sliding, at a smaller friction.
+        apart = regression(task, model, rig, TRAVELLED).coefficients
+        return presliding_starts(fitter, sliding, apart, plant, task.motions)
 
     eccentric = fits_eccentricity(options, start)
     fitter = _fitter(task, model, torque, eccentric)
     plant = known_terms(start, fitter.jacobian.terms, task.delay)
-    friction = next(iter(with_presliding(torque.coefficients[None]))).reshape(-1)
+    friction = next(iter(with_presliding(torque.coefficients[None], begun))).reshape(-1)
     linear = all(c.linear or not c.fitted for c in model.law.coefficients)
     search = horizon_continuation(
         fitter, friction, plant, task.motions,

@@ -8,8 +8,13 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.data.windows import Windows, cut_windows
+from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.shooting.problem import ShootingProblem
-from nfriction.fitting.strategy.continuation import log_ratio, settle_states
+from nfriction.fitting.strategy.continuation import (
+    log_ratio,
+    settle_states,
+    student_quantile,
+)
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
@@ -34,18 +39,33 @@ def cut_for_folds(
     return cut_windows(joint, motions, longest / folds)
 
 
+def holdout_windows(
+    joint: Sequence[Recording], motions: Sequence[Motion], length: float, folds: int
+) -> Windows:
+    """Windows of a length [s] for `holdout_splits`, or so short that each split holds out several.
+
+    Those held out then lie between others of a similar motion: of a swing that decays, the largest
+    third would be judged by what the smaller ones taught.
+    """
+    total = sum(float(r.time[last] - r.time[first]) for r in joint for first, last in r.segments)
+    return cut_for_folds(joint, motions, min(length, total / folds**2), folds)
+
+
 def holdout_splits(windows: Windows, folds: int) -> list[tuple[Windows, Windows]]:
     """Windows to train on and those to test on: every `folds`-th, each of them in one split."""
     fold = torch.arange(len(windows)) % folds
     return [(windows.subset(fold != k), windows.subset(fold == k)) for k in reversed(range(folds))]
 
 
-def gains(new: Tensor, old: Tensor) -> bool:
-    """True if squared errors on windows (window,) fell by more than the standard error of that."""
+def gains(new: Tensor, old: Tensor, chance: float = DEFAULTS.gain_chance) -> bool:
+    """True if squared errors on windows (window,) fell by more than their scatter would by chance.
+
+    By Student's distribution, as windows may be few.
+    """
     if not old.isfinite().all():
         return bool(new.isfinite().all())
     ratio, spread = log_ratio(new, old)
-    return ratio + spread < 0
+    return ratio + spread * student_quantile(len(new) - 1, 1 - chance) < 0
 
 
 def verdict(network: Tensor, law: Tensor) -> str:

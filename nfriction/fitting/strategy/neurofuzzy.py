@@ -4,7 +4,7 @@ First its sets stay where they are, and windows held out choose the priors. Then
 noise that it left, with a prior for each group of parameters by evidence, and moves its sets if the
 evidence favours that; as long as the windows held out gain by it, at ever less noise. Further
 inputs (`inputs`) are a rival that has to win on the windows held out. Every window is held out in
-turn, and a gain has to be larger than its standard error over the windows.
+turn, and a gain has to be larger than its scatter over the windows explains.
 """
 
 import copy
@@ -38,10 +38,10 @@ from nfriction.fitting.strategy.continuation import (
 from nfriction.fitting.strategy.extrapolation_prior import prior_on_unvisited_cells
 from nfriction.fitting.strategy.holdout import (
     StoppedError,
-    cut_for_folds,
     gains,
     holdout_splits,
     holdout_squares,
+    holdout_windows,
     verdict,
 )
 from nfriction.fitting.strategy.inputs import (
@@ -328,7 +328,7 @@ class _Validation:
         assert law.plant_prior is not None
         self.law, self.length, self.options = law, length, law.options
         self.plant = law.plant_prior[0]
-        self.windows = cut_for_folds(law.recordings, motions, length, self.options.folds)
+        self.windows = holdout_windows(law.recordings, motions, length, self.options.folds)
         self.splits = holdout_splits(self.windows, self.options.folds)
         # The noise against which the priors weigh is the residual of the constant law at the same
         # horizon; its cost scales the tolerance.

@@ -23,6 +23,8 @@ from nfriction.signals import Motion
 # stiffness [s]: from what hardly shows to what would be no presliding.
 PRESLIDING = tuple(np.geomspace(1e-5, 1.0, 11).tolist())
 BRISTLE_TIMES = (1e-4, 1e-3, 1e-2, 1e-1)
+# Distance from a reversal, over that range, from where on a contact surely slides.
+TRAVELLED = 0.1
 # Rises of friction at rest over that at high speed: torques of joints that stick do not show them.
 PEAKS = (0.1, 0.3, 1.0)
 # Displacements that are searched from where the first leaves more than the encoder's rounding.
@@ -33,26 +35,32 @@ STIFFER = (10.0, 0.01)
 
 
 def presliding_starts(
-    fitter: ShootingFitter, sliding: Tensor, plant: Tensor, motions: tuple[Motion, ...]
-) -> Iterator[Tensor]:
+    fitter: ShootingFitter, sliding: Tensor, apart: Tensor, plant: Tensor,
+    motions: tuple[Motion, ...],
+) -> Iterator[Tensor]:  # fmt: skip
     """Coefficients of a law with memory to start from, (joint, coefficient), the best first.
 
     `sliding` are sets of coefficients that torques imply, (set, joint, coefficient), which show how
-    a joint slides alone. The displacement over which its contact yields is sought among shares of
-    the joint's range, its damping among times, by the cost of short windows; the rise of friction
-    at rest and its velocity likewise, in turn. Several displacements of the first set follow, and
-    the best of every other one where the law has no such rise.
+    a joint slides alone; `apart`, (joint, coefficient), is the first by the torques far from
+    reversals, and takes its place where short windows agree better with it. The displacement over
+    which its contact yields is sought among shares of the joint's range, its damping among times,
+    by the cost of short windows; the rise of friction at rest and its velocity likewise, in turn.
+    Several displacements of the first set follow, and the best of every other one where the law has
+    no such rise.
     """
     for place, coefficients in enumerate(sliding):
         if place and peaked(fitter.friction.law, coefficients):
             return
         found = _yielding_alike(fitter, coefficients, plant, motions)
-        yield from found[: 1 if place else MOST_STARTS]
+        if not place:
+            rivals = found, _yielding_alike(fitter, apart, plant, motions)
+            found = min(rivals, key=lambda starts: starts[0].rank())
+        yield from (start.coefficients for start in found[: 1 if place else MOST_STARTS])
 
 
 def _yielding_alike(
     fitter: ShootingFitter, coefficients: Tensor, plant: Tensor, motions: tuple[Motion, ...]
-) -> list[Tensor]:
+) -> "list[_Start]":
     """The best coefficients of every share of the range, least cost of short windows first."""
     law, windows = fitter.friction.law, fitter.cut(motions, fitter.options.windows[0])
     ranges = np.max([np.ptp(m.q, axis=0) for m in motions], axis=0)
@@ -81,7 +89,7 @@ def _yielding_alike(
         found = best(everyone, peak.coefficients)
     for j in range(len(coefficients)) if len(coefficients) > 1 else ():
         found = [*best([j], found[0].coefficients)[:1], *found]
-    return [start.coefficients for start in sorted(found, key=_Start.rank)]
+    return sorted(found, key=_Start.rank)
 
 
 class _Start(NamedTuple):

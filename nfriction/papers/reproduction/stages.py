@@ -36,7 +36,7 @@ from nfriction.papers.afem.fit_by_search import SearchMethod, SearchOptions, fit
 from nfriction.papers.control import study
 from nfriction.papers.nffem.refine_adaptive import refine_adaptive
 from nfriction.papers.nffem.train_network import TrainingOptions
-from nfriction.papers.reproduction.missed_torque import missed_torque
+from nfriction.papers.reproduction.agreement import missed_torque
 from nfriction.papers.reproduction.procedure import papers_neuro_fuzzy
 from nfriction.papers.reproduction.workspace import (
     FULL,

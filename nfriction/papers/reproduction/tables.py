@@ -303,8 +303,8 @@ def conclusion(workspace: Workspace) -> str:
             NEURO_FUZZY, ADAPTIVE,
         ),
         claim(
-            "so do networks taught by a fuzzy controller, the papers' own way, "
-            f"{said(PAPERS_WAY)}",
+            "networks taught by a fuzzy controller, the papers' own way, err less than "
+            f"coefficients by class, {said(PAPERS_WAY)}",
             PAPERS_WAY, ADAPTIVE,
         ),
         claim(

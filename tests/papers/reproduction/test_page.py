@@ -7,9 +7,8 @@ import pytest
 
 from nfriction import rigs
 from nfriction.papers.reproduction import tables
-from nfriction.papers.reproduction.agreement import MUJOCO, TWIN, agreement
+from nfriction.papers.reproduction.agreement import MUJOCO, TWIN, agreement, missed_torque
 from nfriction.papers.reproduction.figures import figures, second_swing
-from nfriction.papers.reproduction.missed_torque import missed_torque
 from nfriction.papers.reproduction.page import PARTS, write_page
 from nfriction.papers.reproduction.workspace import QUICK, Workspace
 from nfriction.papers.twin.dataset import make
