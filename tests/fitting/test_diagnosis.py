@@ -27,6 +27,7 @@ from nfriction.signals import kalman_smoother
 COUNT = 2 * math.pi / 4096
 WHEEL = {"inertia": 0.02, "motor": Motor(50, rotor_inertia=1.2e-5)}
 STEP, SAMPLES = 2e-3, 3001
+LATER = (np.arange(SAMPLES) >= 1000)[:, None]
 DOUBLE = {"mass": [0.5, 0.3], "length": [0.3, 0.25], "com": [0.15, 0.12],
           "inertia": [3.75e-3, 1.56e-3]}  # fmt: skip
 MOTOR = {"mass": [1.0], "length": [0.3], "com": [0.15], "inertia": [0.0075], "armature": [0.05]}
@@ -48,12 +49,18 @@ def measured(name: str, count: float | None = COUNT) -> tuple[Plant, np.ndarray,
     """Rig, positions in joint coordinates as encoders round them, and torques."""
     plants = {"free": PendulumChain(**DOUBLE), "driven": PendulumChain(**DOUBLE),
               "motor": PendulumChain(**MOTOR), "axis": LinearAxis(0.13),
+              "direct": PendulumChain(**MOTOR | {"armature": [0.0], "inertia": [0.0575]}),
               "wheel": Rotor(**WHEEL)}  # fmt: skip
     plant, joints = plants[name], 2 if name in ("free", "driven") else 1
     friction = {"free": [[0.02, 0.004], [0.008, 0.003]], "driven": [[0.1, 0.05], [0.02, 0.01]]}
     model = CVFM(joints, friction.get(name, [[0.3, 0.12]])).requires_grad_(False)
     tau = {"free": None, "driven": torque([1.5, 0.3], 1)}.get(name, torque([3.0], 2))
-    start = {"free": [math.pi + 1.2, -0.5], "driven": [math.pi, 0.0], "motor": [math.pi]}
+    start = {
+        "free": [math.pi + 1.2, -0.5],
+        "driven": [math.pi, 0.0],
+        "motor": [math.pi],
+        "direct": [math.pi],
+    }
     q0 = torch.tensor(start.get(name, [0.0]), dtype=torch.float64)
     found = rollout(
         plant, model, q0, torch.zeros_like(q0), sample_time=STEP, steps=SAMPLES - 1, substeps=8,
@@ -223,12 +230,31 @@ def test_a_spike_is_named_with_its_time(rounded):
     assert "joint2 jumps for one sample at 2 s;" in found
 
 
+def test_lost_counts_and_missing_samples_are_named_with_their_time():
+    plant, q, tau = measured("driven")
+    (found,) = (w for w in warnings_of(plant, q + (q * 0 + [0, 0.3]) * LATER, tau) if "good" in w)
+    assert "joint2 jumps for good at 2 s:" in found
+    # A logger writes the nominal time.
+    kept = np.r_[0:1000, 1030 : len(q)]
+    found = warnings_of(plant, q[kept], tau[kept], time=STEP * np.arange(len(kept)))
+    assert any("jumps for good at 2 s:" in warning for warning in found)
+    assert not any("jumps" in warning for warning in warnings_of(plant, q, tau))
+
+
+def test_torques_of_a_wrong_scale_are_named():
+    """They fit a rig that is heavier throughout, within what is allowed."""
+    plant, q, tau = measured("direct")
+    recording = Recording(STEP * np.arange(len(q)), q, 1.2 * tau, convention="relative,upright")
+    found = fit(CVFM(1), plant, recording, windows=(0.5,))
+    assert any("as if torques were recorded 1.2 times too large" in w for w in found.warnings)
+
+
 def test_a_step_at_a_gap_is_no_spike():
     plant, q, tau = measured("driven")
     kept = np.r_[0:1000, 1600 : len(q)]
     with pytest.warns(UserWarning, match="gaps"):
         found = warnings_of(plant, q[kept], tau[kept], time=STEP * kept)
-    assert not any("one sample" in warning for warning in found)
+    assert not any("jumps" in warning for warning in found)
 
 
 def test_a_fit_names_the_mistake_first():
@@ -253,6 +279,9 @@ def test_a_fit_says_whether_it_is_usable():
     # Turns in plenty excuse no error of the angle.
     turning = tuple(replace(m, q=50 * m.q) for m in wrong.motions)
     assert replace(wrong, motions=turning).usability[0] == "doubtful"
+    lost = replace(wrong, residual=3.0).usability
+    assert lost == ("do not use", "the residual is larger than the motion")
+    assert replace(wrong, residual=math.inf).to_dict()["residual"] is None
 
 
 def test_noise_of_the_torque_is_no_error_of_the_law():

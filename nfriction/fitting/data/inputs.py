@@ -329,7 +329,7 @@ def _still_joints(
 
 
 def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[str]:
-    """Single samples far off both of their neighbours, to the same side."""
+    """Single samples far off both of their neighbours, to the same side, and jumps that last."""
     for recording in recordings:
         q, time = recording.q, recording.time
         before, after = q[1:-1] - q[:-2], q[1:-1] - q[2:]
@@ -339,15 +339,39 @@ def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[st
         curved = np.quantile(np.abs(before + after) / 2, 0.99, axis=0)
         # A joint may show no count.
         far = height > options.spike_ratio * np.fmax(curved, count_seen(q))
-        for name, column in zip(recording.names, far.T, strict=True):
-            peaks = np.flatnonzero(column) + 1
-            if len(peaks):
-                when = ", ".join(f"{time[k]:.6g}" for k in peaks[:3])
-                more = f" and {len(peaks) - 3} more" if len(peaks) > 3 else ""
+        # Steps far above both that enclose them, which are alike; across a gap any is possible.
+        step = np.diff(q, axis=0)
+        before, at, after = step[:-2], step[1:-1], step[2:]
+        height = np.minimum(np.abs(at - before), np.abs(at - after))
+        height[(2 * np.abs(after - before) > height) | _gaps(recording)[1:-1, None]] = 0.0
+        lasting = height > options.spike_ratio * np.fmax(curved, count_seen(q))
+        for name, peak, jump in zip(recording.names, far.T, lasting.T, strict=True):
+            of = f"{recording.name or 'A recording'}: {name} jumps"
+            if peak.any():
                 yield (
-                    f"{recording.name or 'A recording'}: {name} jumps for one sample at {when} s"
-                    f"{more}; such spikes are errors of the sensor, leave these samples out."
+                    f"{of} for one sample at {_times(time[1:-1][peak])}; such spikes are errors of "
+                    "the sensor, leave these samples out."
                 )
+            if jump.any():
+                yield (
+                    f"{of} for good at {_times(time[2:-1][jump])}: samples are missing there "
+                    "without a gap in time, or the encoder lost counts; give samples their own "
+                    "times, or cut the recording there."
+                )
+
+
+def _gaps(recording: Recording) -> NDArray[np.bool_]:
+    """True for steps that lie in no segment, (step,)."""
+    gap = np.ones(len(recording) - 1, dtype=bool)
+    for first, last in recording.segments:
+        gap[first:last] = False
+    return gap
+
+
+def _times(found: Array) -> str:
+    """The first three times [s], and how many more there are."""
+    more = f" and {len(found) - 3} more" if len(found) > 3 else ""
+    return ", ".join(f"{t:.6g}" for t in found[:3]) + f" s{more}"
 
 
 def _implausible_masses(plant: Plant) -> Iterator[str]:

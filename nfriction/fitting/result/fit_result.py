@@ -161,8 +161,10 @@ class FitResult:
             )
         if self.mistakes:
             return "do not use", f"a mistake in the data is likely: {self.mistakes[0]}"
-        if not self.converged and wrong:
+        if wrong and not self.converged:
             return "do not use", f"the search did not converge, and {far}"
+        if wrong and 0 < motion <= self.residual:
+            return "do not use", far
         reasons = []
         if not self.converged:
             reasons.append("the search did not converge")
@@ -212,7 +214,7 @@ class FitResult:
             "status": self.status,
             "converged": self.converged,
             "usability": list(self.usability),
-            "residual": self.residual,
+            "residual": self.residual if math.isfinite(self.residual) else None,
             "residual_unit": self.residual_unit,
             "at_bounds": list(self.at_bounds),
             "plant": {name: value for name, value, _ in self.plant_terms},
@@ -221,7 +223,7 @@ class FitResult:
                 for i in self.intervals
             },
             "unidentifiable": list(self.unidentifiable),
-            "stages": [list(stage) for stage in self.stages],
+            "stages": [[x if math.isfinite(x) else None for x in stage] for stage in self.stages],
             "warnings": list(self.warnings),
             **(offsets if self.encoder_offsets else {}),
             **({"outliers": [o._asdict() for o in self.outliers]} if self.outliers else {}),

@@ -43,6 +43,8 @@ BLURRED = (
     "The torque comes from a smoothed motion, which blurs friction at low speed and knows no error "
     'of the plant; `method="output_error"` gives a better answer, and intervals that cover both.'
 )
+# Relative changes that agree within this share of them are alike.
+ALIKE = 0.1
 # A lower bound no larger exists only for the logarithm of a positive coefficient, in SI.
 NOTHING = 1e-9
 
@@ -153,10 +155,28 @@ def result_from_shooting(
         + model_error_warning(
             residual, effective_noise(counted), noise, plant.unit, problem.options
         )
+        + scale_warning(problem, intervals)
         + outlier_warning(outliers),
         outliers=outliers,
         uncertainty=None if root is None else CoefficientUncertainty(model.schedule, root),
     )  # fmt: skip
+
+
+def scale_warning(problem: ShootingProblem, intervals: Sequence[Interval]) -> tuple[str, ...]:
+    """A sentence if all of a driven rig seems heavier or lighter alike: then torques are wrong."""
+    found = [i for i in intervals if i.name.startswith(("inertia", "gravity"))]
+    if len(found) < 2 or not problem.windows.tau.any():
+        return ()
+    scale = sum(i.value for i in found) / len(found)
+    # One of them alone may be off by so much; their common share is what a torque's scale moves.
+    alike = all(abs(i.value - scale) < ALIKE * abs(scale) and i.low * i.high > 0 for i in found)
+    if not alike or abs(scale) < problem.options.gain_term[1]:
+        return ()
+    return (
+        f"Inertia and gravity are {1 + scale:.3g} times those of the rig alike, as if torques were "
+        f"recorded {1 + scale:.3g} times too large (torque constant, gear ratio, unit); then "
+        "friction is, too.",
+    )
 
 
 def outliers_of(problem: ShootingProblem, weights: Tensor) -> Iterator[Outliers]:

@@ -54,7 +54,8 @@ def delay_warning(found: HorizonResult, delayed: ShootingFitter) -> list[str]:
         return []
     delay = float(further.step()[further.first])
     fall = 1.0 - max(0.0, 1.0 - further.decrease() / float(further.before.cost)) ** 0.5
-    return [LATE.format(delay_in_words(delay), 100 * fall)]
+    # By no whole percent: in chaotic windows evidence counts what residuals do not show.
+    return [] if round(100 * fall) < 1 else [LATE.format(delay_in_words(delay), 100 * fall)]
 
 
 @dataclass(frozen=True)
