@@ -26,9 +26,9 @@ import torch
 
 from nfriction import NFLFM, FrictionModel
 from nfriction.export import c
-from nfriction.export.c_code.export import find_compiler
+from nfriction.export.c_file import find_compiler
+from nfriction.export.contract import draw
 from nfriction.export.controller import controller_of
-from nfriction.export.test_vectors import draw
 from nfriction.friction.memory import LuGre
 from nfriction.io.model_file import ModelInfo
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from cases import DT, STEPS, Numbers
 
-from nfriction.export.c_code.export import find_compiler
+from nfriction.export.c_file import find_compiler
 
 
 def hand_written(

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from nfriction import FrictionModel, LinearAxis, PendulumChain, Plant, Recording, rollout
 from nfriction.evaluation.score import score
+from nfriction.fitting.adjusted_plant import adjusted_buffers
 from nfriction.fitting.fit import fit
-from nfriction.fitting.plant_parameters import adjusted_buffers, plant_parameters
+from nfriction.fitting.plant_parameters import plant_parameters
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction import model_by_name
 from nfriction.signals import quantise

@@ -12,8 +12,9 @@ import torch
 from numpy.typing import NDArray
 
 from nfriction import FrictionModel, PendulumChain, Recording, rollout
+from nfriction.fitting.adjusted_plant import adjusted_buffers
 from nfriction.fitting.fit import fit
-from nfriction.fitting.plant_parameters import adjusted_buffers, plant_parameters
+from nfriction.fitting.plant_parameters import plant_parameters
 from nfriction.friction.coefficients import Constant
 from nfriction.signals import kalman_smoother, quantise
 

@@ -23,7 +23,7 @@ from limit import hand_written
 from timing import Contestant, verdict
 
 from nfriction import CVFM, FrictionModel, PendulumChain, Stribeck, rollout
-from nfriction.codegen import RolloutSignals, trace_rollout
+from nfriction.codegen import CompiledRollout, RolloutInputs
 from nfriction.friction.memory import LuGre, MaxwellSlip
 from nfriction.simulation.rk4 import rk4_step
 
@@ -55,12 +55,13 @@ def ours(
 
 def bare(plant: PendulumChain, friction: FrictionModel, q0: Any, qd0: Any) -> Callable:
     """The compiled code without the public call's checks, as hand-written C has none."""
-    compiled = trace_rollout(plant, friction, rk4_step)
-    q, qd = q0[None].numpy(), qd0[None].numpy()
+    compiled = CompiledRollout(plant, friction, rk4_step)
+    step = torch.tensor(DT, dtype=q0.dtype).expand(STEPS)
+    inputs = RolloutInputs(q0, qd0, torch.zeros_like(q0).expand(STEPS, -1), step)
 
     def run() -> np.ndarray:
-        motion = compiled(q, qd, RolloutSignals(STEPS, DT))
-        return np.concatenate([motion.q[0, -1], motion.qd[0, -1]])
+        q, qd, _ = compiled(inputs)
+        return np.concatenate([q[-1], qd[-1]])
 
     return run
 

@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory
 
 from filelock import FileLock
 
-from nfriction.codegen.llvm.jit import cache_folder
+from nfriction.codegen.jit import cache_folder
 from nfriction.papers import twin
 from nfriction.papers.controller.samples import ControllerSamples, build_samples, read_samples
 from nfriction.papers.twin import Twin, family

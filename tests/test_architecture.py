@@ -26,7 +26,7 @@ ALLOWED: dict[str, set[str]] = {
     "fuzzy": set(),
     "io": set(),
     "recording": {"io"},
-    "plant": {"io"},
+    "plant": {"io", "recording"},
     "signals": {"recording"},
     "friction": {"fuzzy"},
     "io.model": {"io", "version", "plant", "friction"},

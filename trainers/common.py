@@ -167,12 +167,12 @@ def _end(folder: Path) -> NoReturn:
     sys.exit(INTERRUPTED)
 
 
-def run(train: Callable[[Sequence[str] | None], str], argv: Sequence[str] | None = None) -> str:
-    """The report of a trainer, run on one thread; errors end it with one line."""
+def run(train: Callable[[Sequence[str] | None], str], argv: Sequence[str] | None = None) -> None:
+    """Run a trainer on one thread and print its report; errors end it with one line."""
     # Several threads make small tensors up to 100 times slower.
     torch.set_num_threads(1)
     try:
-        return train(argv)
+        print(train(argv))
     except KeyboardInterrupt:  # before there is a folder
         sys.exit(INTERRUPTED)
     except (ValueError, OSError) as error:

@@ -7,7 +7,6 @@ terms of its rules and leaves rules out. Writes the Pareto front as table and fi
 recordings that took no part. `--resume` goes on after the last finished generation.
 """
 
-import sys
 from collections.abc import Sequence
 
 import common
@@ -112,10 +111,5 @@ def _draw(table: pd.DataFrame) -> "style.Figure":
     return figure
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    print(common.run(train, argv))
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    common.run(train)

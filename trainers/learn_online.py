@@ -11,7 +11,6 @@ true one, and writes the figure, the model and its C.
 """
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -163,10 +162,5 @@ def _draw(table: pd.DataFrame) -> Figure:
     return figure
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    print(common.run(train, argv))
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    common.run(train)

@@ -8,7 +8,6 @@ finished; a pattern search continues from its last iteration, the other methods 
 again. The result is that of an uninterrupted run.
 """
 
-import sys
 from collections.abc import Sequence
 
 import common
@@ -25,21 +24,16 @@ def train(argv: Sequence[str] | None) -> str:
                         default="gauss-newton")  # fmt: skip
     parser.add_argument("--max-evaluations", type=int, default=5000, help="of a search")
     given = parser.parse_args(argv)
-    workspace, bench = common.start(
-        given, search_horizon=given.windows[-1], search_evaluations=given.max_evaluations
-    )
+    workspace, bench = common.start(given, search_evaluations=given.max_evaluations)
     if given.method == "gauss-newton":
         found = fit_by_class(workspace, bench, given.model)
     else:
         constant = fit_constant(workspace, bench, given.model.removeprefix("A"))
-        found = fit_searched(workspace, bench, given.model, given.method, start=constant)
+        found = fit_searched(
+            workspace, bench, given.model, given.method, given.windows[-1], start=constant
+        )
     return common.finish(given, bench, found)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    print(common.run(train, argv))
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    common.run(train)

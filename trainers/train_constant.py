@@ -10,7 +10,6 @@ continues a pattern search from its last iteration; the other methods, which tak
 minutes, start again. The result is that of an uninterrupted run.
 """
 
-import sys
 from collections.abc import Sequence
 
 import common
@@ -28,20 +27,13 @@ def train(argv: Sequence[str] | None) -> str:
                         help="length of the windows that a search simulates [s]")  # fmt: skip
     parser.add_argument("--max-evaluations", type=int, default=5000, help="of a search")
     given = parser.parse_args(argv)
-    workspace, bench = common.start(
-        given, search_horizon=given.horizon, search_evaluations=given.max_evaluations
-    )
+    workspace, bench = common.start(given, search_evaluations=given.max_evaluations)
     if given.method == "trajectory":
         found = fit_constant(workspace, bench, given.model)
     else:
-        found = fit_searched(workspace, bench, given.model, given.method)
+        found = fit_searched(workspace, bench, given.model, given.method, given.horizon)
     return common.finish(given, bench, found)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    print(common.run(train, argv))
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    common.run(train)

@@ -63,10 +63,5 @@ def train(argv: Sequence[str] | None) -> str:
     return common.write(given, bench, model, info, adaptive.plant)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    print(common.run(train, argv))
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    common.run(train)

@@ -11,7 +11,6 @@ the networks learnt. A run takes about a minute and starts again after an interr
 """
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -141,10 +140,5 @@ def _outputs(samples: ControllerSamples, learnt: torch.Tensor) -> Figure:
     return figure
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    print(common.run(train, argv))
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    common.run(train)

@@ -1,8 +1,7 @@
 """Command line: fit, compare, inspect and export friction models.
 
-A function `add(commands, common)` registers a command's parser, whose default `run(arguments)`
-returns the exit status. Only `run` imports what is slow to load (torch, pandas, matplotlib), so
-that help and usage errors come at once.
+Functions `add...(commands)` register commands. Only what runs them imports what is slow to load
+(torch, pandas, matplotlib), so that help and usage errors come at once.
 """
 
 import argparse
@@ -12,8 +11,9 @@ import shlex
 import sys
 from collections.abc import Sequence
 
-from nfriction.cli import data, demo, estimate, export, inspect, reproduce, torque
+from nfriction.cli import demo, estimate, export, inspect, torque
 from nfriction.cli.console import (
+    Commands,
     Parser,
     UsageError,
     drop_output,
@@ -25,9 +25,9 @@ from nfriction.version import __version__
 
 # They register the commands, in the order in which the help lists them.
 COMMANDS = (
-    estimate.add_fit, estimate.add_compare, torque.add_fit, torque.add_score, demo.add,
-    inspect.add_report, inspect.add_info, export.add_export, export.add_verify, data.add,
-    reproduce.add, demo.add_twin,
+    estimate.add_fit, estimate.add_compare, torque.add_fit, torque.add_score, demo.add_demo,
+    inspect.add_report, inspect.add_info, export.add_export, export.add_verify, inspect.add_data,
+    demo.add_reproduce, demo.add_twin,
 )  # fmt: skip
 
 
@@ -83,11 +83,9 @@ def make_parser() -> argparse.ArgumentParser:
         "recordings the fit never saw.",
     )
     parser.add_argument("--version", action="version", version=f"nfriction {__version__}")
-    commands = parser.add_subparsers(metavar="COMMAND")
-    common = Parser(add_help=False)
-    common.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    commands = Commands(parser)
     for add in COMMANDS:
-        add(commands, common)
+        add(commands)
     return parser
 
 

@@ -46,6 +46,25 @@ class Parser(argparse.ArgumentParser):
         raise UsageError(f"{message}; see {self.prog} --help.")
 
 
+class Commands:
+    """The commands of a parser."""
+
+    def __init__(self, parser: Parser) -> None:
+        self._parsers = parser.add_subparsers(metavar="COMMAND")
+
+    def add(
+        self, name: str, run: Callable[[argparse.Namespace], int], help: str, *,
+        description: str, example: str,
+    ) -> Parser:  # fmt: skip
+        """Register a command, whose `run` returns the exit status, and give its parser."""
+        parser: Parser = self._parsers.add_parser(
+            name, help=help, description=description, epilog=f"example:\n  {example}"
+        )
+        parser.set_defaults(run=run)
+        parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+        return parser
+
+
 def check_writable(folder: Path) -> None:
     """Refuse an unwritable folder before the work rather than after it."""
     try:

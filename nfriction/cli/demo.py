@@ -1,13 +1,13 @@
-"""`nfriction demo` and `nfriction twin`: simulated rigs with hidden friction."""
+"""Simulated rigs with hidden friction: `nfriction demo`, `twin`, and the papers' `reproduce`."""
 
 import argparse
 import shlex
 import sys
 from pathlib import Path
 
-from nfriction.cli.console import Parser, check_writable
+from nfriction.cli.console import Commands, check_writable
 from nfriction.cli.estimate import add_comparison_options, compare_and_report
-from nfriction.cli.inputs import count, seconds
+from nfriction.cli.inputs import count, positive
 
 # Held equal to the twins' own by a test; the twins themselves load torch.
 DURATION, TWIN_DURATION = 10.0, 20.0
@@ -16,28 +16,23 @@ TRUTHS = ("load", "direction", "shear", "warming", "bristle", "ripple", "lag")
 # Three steps that a stranger can follow; others are fitted in the same way.
 MODELS = "viscous,coulomb-viscous,neuro-fuzzy:coulomb-viscous"
 
-EXAMPLE = """example:
-  nfriction demo --models viscous,neuro-fuzzy:load-coulomb --out runs/demo"""
-TWIN_EXAMPLE = """example:
-  nfriction twin --truth load+warming --seed 1 --out runs/twin"""
 
-
-def add(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
-    """Register the command."""
-    parser = commands.add_parser(
-        "demo", parents=[common], epilog=EXAMPLE,
-        help="simulate a rig with hidden friction, then compare models",
+def add_demo(commands: Commands) -> None:
+    """Register `demo`."""
+    parser = commands.add(
+        "demo", run_demo, "simulate a rig with hidden friction, then compare models",
         description="Simulate a triple pendulum (the papers' rig) with friction unknown to every "
         "model, then compare models on recordings as its encoders would give them.",
+        example="nfriction demo --models viscous,neuro-fuzzy:load-coulomb --out runs/demo",
     )  # fmt: skip
     parser.add_argument("--seed", type=count, default=0, help="of encoder errors and jitter")
-    parser.add_argument("--seconds", type=seconds, default=DURATION,
+    parser.add_argument("--seconds", type=positive, default=DURATION,
                         help="length of each recording [s]")  # fmt: skip
     add_comparison_options(parser)
-    parser.set_defaults(run=run, out=Path("runs/demo"), models=MODELS, degrees=False)
+    parser.set_defaults(out=Path("runs/demo"), models=MODELS, degrees=False)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run_demo(arguments: argparse.Namespace) -> int:
     """Simulate, then compare."""
     from nfriction.papers import twin
 
@@ -56,23 +51,22 @@ def run(arguments: argparse.Namespace) -> int:
     return compare_and_report(plant, train, test, arguments, {"fit_plant": False})
 
 
-def add_twin(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
+def add_twin(commands: Commands) -> None:
     """Register `twin`."""
-    parser = commands.add_parser(
-        "twin", parents=[common], epilog=TWIN_EXAMPLE,
-        help="simulate recordings of a rig whose friction a seed draws",
+    parser = commands.add(
+        "twin", run_twin, "simulate recordings of a rig whose friction a seed draws",
         description="Write recordings of a simulated triple pendulum: two to train on, ten to "
         "judge by, the rig and a card with the true friction.",
+        example="nfriction twin --truth load+warming --seed 1 --out runs/twin",
     )  # fmt: skip
     parser.add_argument("--truth", default="load", metavar="NAME",
                         help=f"of {', '.join(TRUTHS)}, several with + between them, or plain: dry "
                         "and viscous friction alone")  # fmt: skip
     parser.add_argument("--seed", type=count, default=0,
                         help="of releases, friction, encoder errors and jitter")  # fmt: skip
-    parser.add_argument("--seconds", type=seconds, default=TWIN_DURATION,
+    parser.add_argument("--seconds", type=positive, default=TWIN_DURATION,
                         help="length of each recording [s]")  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path("runs/twin"), help="folder to write")
-    parser.set_defaults(run=run_twin)
 
 
 def run_twin(arguments: argparse.Namespace) -> int:
@@ -98,4 +92,51 @@ def run_twin(arguments: argparse.Namespace) -> int:
         f"next: nfriction compare {folder}/train_*.csv.gz --test {folder}/test_*.csv.gz "
         f"--rig {folder}/rig.json --no-fit-plant --initial-states {folder}/recordings.csv"
     )
+    return 0
+
+
+def add_reproduce(commands: Commands) -> None:
+    """Register `reproduce`."""
+    parser = commands.add(
+        "reproduce", run_reproduce, "reproduce the papers' tables and figures on simulated twins",
+        description="Simulate the rigs of both papers with friction unknown to every model, train "
+        "all their models, and set tables and figures beside the printed ones.",
+        example="nfriction reproduce --quick --out runs/papers\n\nAn interrupted run resumes where "
+        "it left off when it is started again with the same options.",
+    )  # fmt: skip
+    parser.add_argument("--out", type=Path, default=Path("runs/papers"), help="folder to write")
+    parser.add_argument("--quick", action="store_true",
+                        help="recordings of 10 s and shorter searches: a few minutes on two "
+                        "cores")  # fmt: skip
+    parser.add_argument("--seed", type=count, default=0,
+                        help="of the encoders' errors and of the searches")  # fmt: skip
+    parser.add_argument("--jobs", type=count, default=2, help="models trained at a time")
+    parser.add_argument("--no-figures", action="store_true", help="draw no figures")
+
+
+def run_reproduce(arguments: argparse.Namespace) -> int:
+    """Run what is not finished, then print and write everything."""
+    from dataclasses import replace
+
+    from nfriction.evaluation.results import exclusive
+    from nfriction.papers.reproduction import tables
+    from nfriction.papers.reproduction.page import write_page
+    from nfriction.papers.reproduction.stages import reproduce
+    from nfriction.papers.reproduction.workspace import FULL, QUICK
+
+    check_writable(arguments.out)
+    settings = replace(QUICK if arguments.quick else FULL, seed=arguments.seed)
+    progress = sys.stderr.isatty()
+    # Two runs in one folder would take each other's stages for their own.
+    with exclusive(arguments.out):
+        workspace = reproduce(arguments.out, settings, jobs=arguments.jobs, progress=progress)
+        tables.write_tables(workspace, command=arguments.command_line)
+        print(tables.text(workspace))
+        if not arguments.no_figures:
+            from nfriction.papers.reproduction.figures import draw_all
+
+            draw_all(workspace, progress=progress)
+        page = write_page(workspace)
+    print(f"\ntables, models and figures are in {arguments.out}, all on one page: {page}\n")
+    print(tables.conclusion(workspace))
     return 0

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nfriction.cli import inputs
-from nfriction.cli.console import Parser, Progress, UsageError, check_writable, warn
+from nfriction.cli.console import Commands, Progress, UsageError, check_writable, warn
 from nfriction.friction import plain_name
 
 if TYPE_CHECKING:
@@ -21,18 +21,14 @@ if TYPE_CHECKING:
     from nfriction.plant import Plant
     from nfriction.recording import Recording
 
-FIT_EXAMPLE = """example:
-  nfriction fit run1.csv run2.csv --rig rig.json --model load-coulomb --out lfm.json"""
-COMPARE_EXAMPLE = """example:
-  nfriction compare run1.csv run2.csv --test run3.csv --rig rig.json \\
-      --models viscous,load-coulomb,neuro-fuzzy:load-coulomb --out runs/mine"""
 
-
-def add_fit(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
+def add_fit(commands: Commands) -> None:
     """Register `fit`."""
-    parser = commands.add_parser(
-        "fit", parents=[common], help="fit one model", epilog=FIT_EXAMPLE,
+    parser = commands.add(
+        "fit", run_fit, "fit one model",
         description="Fit one friction model to recordings and write it as a model file.",
+        example="nfriction fit run1.csv run2.csv --rig rig.json --model load-coulomb "
+        "--out lfm.json",
     )  # fmt: skip
     parser.add_argument("recordings", nargs="+", type=inputs.file, metavar="RECORDING",
                         help=f"with columns time, q1, ... ({inputs.FORMATS})")  # fmt: skip
@@ -40,15 +36,16 @@ def add_fit(commands: argparse._SubParsersAction[Parser], common: Parser) -> Non
                         help=f"{inputs.MODELS}; or my.py:LAW, a law of your own")  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path("model.json"), help="model file to write")
     inputs.add_fit_options(parser)
-    parser.set_defaults(run=run_fit)
 
 
-def add_compare(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
+def add_compare(commands: Commands) -> None:
     """Register `compare`."""
-    parser = commands.add_parser(
-        "compare", parents=[common], help="fit models and score them", epilog=COMPARE_EXAMPLE,
+    parser = commands.add(
+        "compare", run_compare, "fit models and score them",
         description="Fit friction models to recordings and score each by simulating recordings "
         "that no fit has seen.",
+        example="nfriction compare run1.csv run2.csv --test run3.csv --rig rig.json \\\n"
+        "      --models viscous,load-coulomb,neuro-fuzzy:load-coulomb --out runs/mine",
     )  # fmt: skip
     parser.add_argument("train", nargs="+", type=inputs.file, metavar="TRAIN", help="recordings to "
                         f"fit, with columns time, q1, ... ({inputs.FORMATS})")  # fmt: skip
@@ -56,7 +53,6 @@ def add_compare(commands: argparse._SubParsersAction[Parser], common: Parser) ->
                         help="recordings to judge by, which no fit sees")  # fmt: skip
     add_comparison_options(parser)
     inputs.add_fit_options(parser)
-    parser.set_defaults(run=run_compare)
 
 
 def add_comparison_options(parser: argparse.ArgumentParser) -> None:
@@ -87,11 +83,9 @@ def run_fit(arguments: argparse.Namespace) -> int:
     from nfriction.cli.tables import coefficient_table, fit_lines, interval_table
     from nfriction.evaluation.results import model_info
     from nfriction.fitting.fit import fit
-    from nfriction.friction import model_by_name
     from nfriction.io.model_file import save
 
     plant = inputs.read_rig(arguments.rig)
-    model = model_by_name(arguments.model)(plant.joints)
     recordings = inputs.read_recordings(arguments.recordings, plant, arguments)
     if arguments.out.is_dir():
         raise UsageError(f"--out of fit is a file, and {arguments.out} is a folder.")
@@ -99,14 +93,14 @@ def run_fit(arguments: argparse.Namespace) -> int:
     with Progress() as progress:
         progress.stage(f"fit {arguments.model}")
         found = fit(
-            model, plant, recordings, callback=lambda stage, _: progress.step(stage),
+            arguments.model, plant, recordings, callback=lambda stage, _: progress.step(stage),
             **inputs.fit_settings(arguments),
         )  # fmt: skip
         progress.stage("write the model")
-    save(model, arguments.out, model_info(found, recordings))
+    save(found.model, arguments.out, model_info(found, recordings))
     print(fit_lines(arguments.model, found))
     print(f"position error over training windows: {1e3 * found.residual:.3g} m{plant.unit}")
-    print(coefficient_table(model, plant.joint_names, plant.unit))
+    print(coefficient_table(found.model, plant.joint_names, plant.unit))
     if intervals := interval_table(found):
         print(intervals)
     print(f"wrote {arguments.out}")

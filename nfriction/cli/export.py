@@ -5,17 +5,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nfriction.cli import inputs
-from nfriction.cli.console import Parser, UsageError, check_writable
-from nfriction.cli.inputs import seconds
+from nfriction.cli.console import Commands, UsageError, check_writable
 
 if TYPE_CHECKING:
     from nfriction.friction.models import FrictionModel
     from nfriction.io.model_file import ModelInfo
-
-EXAMPLE = """example:
-  nfriction export model.json --format torchscript,c --out artefacts"""
-VERIFY_EXAMPLE = """example:
-  nfriction verify artefacts/model.pt model.json"""
 
 # Ending of the file that each target is written to; C is a folder of files.
 CONTROLLERS = {"torchscript": ".pt", "c": ".c", "pt2": ".pt2", "onnx": ".onnx"}
@@ -25,12 +19,13 @@ TARGETS = (*CONTROLLERS, *SIMULATORS)
 IN_SINGLE = ("c", "onnx")
 
 
-def add_export(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
+def add_export(commands: Commands) -> None:
     """Register `export`."""
-    parser = commands.add_parser(
-        "export", parents=[common], help="write artefacts for controllers and simulators",
+    parser = commands.add(
+        "export", run_export, "write artefacts for controllers and simulators",
         description="Write a fitted model as artefacts for controllers, proven equal to it, or as "
-        "the nearest joint parameters of a simulator.", epilog=EXAMPLE,
+        "the nearest joint parameters of a simulator.",
+        example="nfriction export model.json --format torchscript,c --out artefacts",
     )  # fmt: skip
     parser.add_argument("model", type=inputs.file, metavar="MODEL", help="model file")
     parser.add_argument("--format", type=_targets, default="torchscript", metavar="FORMATS",
@@ -41,13 +36,13 @@ def add_export(commands: "argparse._SubParsersAction[Parser]", common: Parser) -
                         "the model file)")  # fmt: skip
     parser.add_argument("--dtype", choices=("float64", "float32"), default="float64",
                         help=f"precision of {' and '.join(IN_SINGLE)}")  # fmt: skip
-    parser.add_argument("--torque-limit", type=_numbers, metavar="LIMIT,...",
+    parser.add_argument("--torque-limit", type=inputs.positives, metavar="LIMIT,...",
                         help="largest torque given out, one number or one a joint")  # fmt: skip
     parser.add_argument("--with-filter", action="store_true",
                         help="take raw positions, with the causal filter inside")  # fmt: skip
-    parser.add_argument("--cutoff", type=_numbers, default="20", metavar="HZ",
+    parser.add_argument("--cutoff", type=inputs.positive, default=20.0, metavar="HZ",
                         help="cut-off of that filter [Hz]")  # fmt: skip
-    parser.add_argument("--online", type=_numbers, metavar="NOISE",
+    parser.add_argument("--online", type=inputs.positive, metavar="NOISE",
                         help="C of a model with the papers' network that also learns while it "
                         "runs, from a friction torque measured to this [N m]")  # fmt: skip
     group = parser.add_argument_group("mjcf and urdf")
@@ -60,24 +55,22 @@ def add_export(commands: "argparse._SubParsersAction[Parser]", common: Parser) -
                        help="robot description whose joints of these names get them")  # fmt: skip
     inputs.add_reading_options(group)
     inputs.add_law_option(parser)
-    parser.set_defaults(run=run_export)
 
 
-def add_verify(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
+def add_verify(commands: Commands) -> None:
     """Register `verify`."""
-    parser = commands.add_parser(
-        "verify", parents=[common], epilog=VERIFY_EXAMPLE,
-        help="prove that an artefact is its model",
+    parser = commands.add(
+        "verify", run_verify, "prove that an artefact is its model",
         description="Run an artefact (.pt, .pt2, .onnx, or .c with its .contract.json beside it) "
         "over its test vectors and over many points beside the model. Exit status 1 if they "
         "differ. C is compiled and run as it is: verify it from hands that you trust.",
+        example="nfriction verify artefacts/model.pt model.json",
     )  # fmt: skip
     parser.add_argument("artefact", type=Path, metavar="ARTEFACT", help="what export wrote")
     parser.add_argument("model", type=inputs.file, metavar="MODEL", help="model file")
     parser.add_argument("--points", type=inputs.count, default=5000, metavar="N",
                         help="points to draw, to 10 %% beyond the range")  # fmt: skip
     inputs.add_law_option(parser)
-    parser.set_defaults(run=run_verify)
 
 
 def run_export(arguments: argparse.Namespace) -> int:
@@ -89,9 +82,7 @@ def run_export(arguments: argparse.Namespace) -> int:
         raise UsageError(f"{wanted[0]} needs a motion: give --recording FILE.")
     if arguments.patch and len(wanted) != 1:
         raise UsageError("--patch takes one of mjcf and urdf in --format.")
-    if len(arguments.cutoff) != 1:
-        raise UsageError("--cutoff takes one number.")
-    if arguments.online and (len(arguments.online) != 1 or "c" not in arguments.format):
+    if arguments.online and "c" not in arguments.format:
         raise UsageError("--online takes one number, with c in --format.")
     model, info = load(arguments.model), load_info(arguments.model)
     check_writable(arguments.out)
@@ -109,12 +100,14 @@ def _write_controller(
 ) -> list[Path]:
     """Write an artefact; returns its files."""
     from nfriction import export
-    from nfriction.export.c_code.dialect import is_identifier
+    from nfriction.export.c_dialect import is_identifier
 
+    limit = arguments.torque_limit
     options: dict[str, Any] = {
-        "torque_limit": _limit(arguments.torque_limit),
+        # One number is for all joints.
+        "torque_limit": limit[0] if limit and len(limit) == 1 else limit,
         "with_filter": arguments.with_filter,
-        "cutoff_hz": arguments.cutoff[0],
+        "cutoff_hz": arguments.cutoff,
     }
     if target in IN_SINGLE:
         options["dtype"] = arguments.dtype
@@ -127,7 +120,7 @@ def _write_controller(
         if arguments.online:
             from nfriction.papers.nffem.online import OnlineOptions, write_online
 
-            learning = OnlineOptions(arguments.online[0], sample_time=info.sample_time or 1e-3)
+            learning = OnlineOptions(arguments.online, sample_time=info.sample_time or 1e-3)
             paths += write_online(model, arguments.out, learning, name=f"{name}_online")
         return paths
     writer = getattr(export, target)
@@ -200,10 +193,6 @@ def run_verify(arguments: argparse.Namespace) -> int:
     return 0 if verdict.passed else 1
 
 
-def _limit(numbers: list[float] | None) -> float | list[float] | None:
-    return numbers[0] if numbers and len(numbers) == 1 else numbers
-
-
 def _targets(text: str) -> list[str]:
     """Names of targets with commas between them, for argparse."""
     targets = [name.strip() for name in text.split(",") if name.strip()]
@@ -219,19 +208,10 @@ def _targets(text: str) -> list[str]:
 
 def _identifier(text: str) -> str:
     """A name that C takes, for argparse."""
-    from nfriction.export.c_code.dialect import is_identifier
+    from nfriction.export.c_dialect import is_identifier
 
     if not is_identifier(text):
         raise argparse.ArgumentTypeError(
             f"must be letters, digits and _ with a letter first and no word of C, got {text!r}"
         )
     return text
-
-
-def _numbers(text: str) -> list[float]:
-    """Positive numbers with commas between them, for argparse."""
-    try:
-        # Positive and finite, as durations are.
-        return [seconds(part) for part in text.split(",")]
-    except argparse.ArgumentTypeError:
-        raise argparse.ArgumentTypeError(f"takes positive numbers, got {text!r}") from None

@@ -136,15 +136,25 @@ def jobs(text: str) -> int:
     return int(text)
 
 
-def seconds(text: str) -> float:
-    """A positive duration, for argparse."""
+def positive(text: str) -> float:
+    """A positive number, for argparse."""
     try:
         value = float(text)
     except ValueError:
         value = math.nan
     if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"must be positive seconds, got {text!r}")
+        raise argparse.ArgumentTypeError(f"takes one number above 0, got {text!r}")
     return value
+
+
+def positives(text: str) -> tuple[float, ...]:
+    """Positive numbers with commas between them, for argparse."""
+    try:
+        return tuple(map(positive, text.split(",")))
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(
+            f"takes positive numbers like 0.5,2, got {text!r}"
+        ) from None
 
 
 def columns(text: str) -> dict[str, str]:
@@ -153,15 +163,6 @@ def columns(text: str) -> dict[str, str]:
     if any(len(pair) < 2 or not all(map(str.strip, pair)) for pair in pairs):
         raise argparse.ArgumentTypeError(f"takes pairs like time=t,q1=enc_1, got {text!r}")
     return {ours.strip(): theirs.strip() for ours, theirs in pairs}
-
-
-def _windows(text: str) -> tuple[float, ...]:
-    try:
-        return tuple(seconds(part) for part in text.split(","))
-    except argparse.ArgumentTypeError:
-        raise argparse.ArgumentTypeError(
-            f"takes positive seconds like 0.5,2, got {text!r}"
-        ) from None
 
 
 def add_law_option(parser: argparse.ArgumentParser) -> None:
@@ -177,7 +178,7 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
         help="a rig file (.json, .toml), a robot description (.urdf, MuJoCo's .xml), or one of "
         f"{', '.join(RIGS)}")  # fmt: skip
     add_reading_options(parser)
-    add("--windows", type=_windows, metavar="SECONDS",
+    add("--windows", type=positives, metavar="SECONDS",
         help="lengths of the shooting windows, in the order of their use [s] (default: 0.5,2,5)"
         )  # fmt: skip
     add("--fit-plant", action=argparse.BooleanOptionalAction, default=True,

@@ -1,4 +1,4 @@
-"""`nfriction info` and `nfriction report`: describe a model file, a comparison's folder."""
+"""`nfriction info`, `report` and `data`: model files, folders of comparisons, public recordings."""
 
 import argparse
 from collections.abc import Iterator, Mapping
@@ -6,43 +6,26 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nfriction.cli import inputs
-from nfriction.cli.console import Parser, UsageError, warn
+from nfriction.cli.console import Commands, UsageError, warn
 from nfriction.friction import memory_names, model_names, plain_name
 
 if TYPE_CHECKING:
     from nfriction.friction.models import FrictionModel
     from nfriction.io.model_file import ModelInfo
 
-INFO_EXAMPLE = """example:
-  nfriction info runs/mine/models/LFM.json"""
-REPORT_EXAMPLE = """example:
-  nfriction report runs/mine --out mine.html"""
 
-
-def add_report(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
+def add_report(commands: Commands) -> None:
     """Register `report`."""
-    parser = commands.add_parser(
-        "report", parents=[common], help="write a page of a comparison's folder",
+    parser = commands.add(
+        "report", run_report, "write a page of a comparison's folder",
         description="Write the folder of compare or demo as one self-contained HTML file: tables "
-        "that sort, figures that zoom, fuzzy rules, verdicts.", epilog=REPORT_EXAMPLE,
+        "that sort, figures that zoom, fuzzy rules, verdicts.",
+        example="nfriction report runs/mine --out mine.html",
     )  # fmt: skip
     parser.add_argument("folder", type=Path, metavar="RUN", help="folder of compare or demo")
     parser.add_argument("--out", type=Path, metavar="FILE",
                         help="file to write (default: report.html in the folder)")  # fmt: skip
     inputs.add_law_option(parser)
-    parser.set_defaults(run=run_report)
-
-
-def add_info(commands: "argparse._SubParsersAction[Parser]", common: Parser) -> None:
-    """Register `info`."""
-    parser = commands.add_parser(
-        "info", parents=[common], help="describe a model file", epilog=INFO_EXAMPLE,
-        description="Describe a model file: model, joints, coefficients, trained ranges, status of "
-        "the fit, rig.",
-    )  # fmt: skip
-    parser.add_argument("model", type=inputs.file, metavar="MODEL", help="model file")
-    inputs.add_law_option(parser)
-    parser.set_defaults(run=run_info)
 
 
 def run_report(arguments: argparse.Namespace) -> int:
@@ -58,6 +41,18 @@ def run_report(arguments: argparse.Namespace) -> int:
         warn(note)
     print(f"wrote {out}")
     return 0
+
+
+def add_info(commands: Commands) -> None:
+    """Register `info`."""
+    parser = commands.add(
+        "info", run_info, "describe a model file",
+        description="Describe a model file: model, joints, coefficients, trained ranges, status of "
+        "the fit, rig.",
+        example="nfriction info runs/mine/models/LFM.json",
+    )  # fmt: skip
+    parser.add_argument("model", type=inputs.file, metavar="MODEL", help="model file")
+    inputs.add_law_option(parser)
 
 
 def run_info(arguments: argparse.Namespace) -> int:
@@ -100,3 +95,43 @@ def _fit(fit: Mapping[str, object], unit: str) -> str:
     if isinstance(bounds, list) and bounds:
         said += f"; at a bound: {', '.join(map(str, bounds))}"
     return said
+
+
+def add_data(commands: Commands) -> None:
+    """Register `data`."""
+    parser = commands.add(
+        "data", run_data, "list or fetch public recordings",
+        description="List public recordings of real mechanisms, or fetch their originals from "
+        "GitHub and convert them to tables in SI. Originals that are in the folder are not "
+        "fetched again.",
+        example="nfriction data get multiarm-triple",
+    )  # fmt: skip
+    parser.add_argument("action", choices=("list", "get"), help="list the sets, or get some")
+    parser.add_argument("names", nargs="*", metavar="NAME", help="sets to get")
+    parser.add_argument("--out", type=Path, default=Path("data"), help="folder to write")
+
+
+def run_data(arguments: argparse.Namespace) -> int:
+    """List or fetch; the status is 1 where a table is not that of the documentation."""
+    from nfriction.io.public_data import fetch, public_sets
+
+    sets = public_sets()
+    if arguments.action == "list":
+        width = max(map(len, sets))
+        for name, chosen in sets.items():
+            print(f"{name:<{width}}  {chosen.about}")
+            print(f"{'':<{width}}  {chosen.repository}, licence: {chosen.licence}")
+        return 0
+    if not arguments.names:
+        raise UsageError(f"name sets to get: {', '.join(sets)}.")
+    status = 0
+    for name in arguments.names:
+        folder = arguments.out / name
+        fetched = fetch(name, folder)
+        if fetched.differing:
+            status = 1
+            warn(f"{', '.join(fetched.differing)}: not the table that the documentation used "
+                 "(SHA-256 differs); results may differ, too")  # fmt: skip
+        print(f"{name}: {len(fetched.tables)} recordings and recordings.csv are in {folder} "
+              f"({sets[name].repository}, licence: {sets[name].licence})")  # fmt: skip
+    return status

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nfriction.cli import inputs
-from nfriction.cli.console import Parser, Progress, UsageError, check_writable, one_line, warn
+from nfriction.cli.console import Commands, Progress, UsageError, check_writable, one_line, warn
 from nfriction.friction import plain_name
 
 if TYPE_CHECKING:
@@ -15,21 +15,18 @@ if TYPE_CHECKING:
 
     from nfriction.recording.torque_table import TorqueTable
 
-FIT_EXAMPLE = """example:
-  nfriction fit-torque table.csv --models viscous,coulomb-viscous,stribeck --out runs/joint"""
-SCORE_EXAMPLE = """example:
-  nfriction score-torque runs/joint other_table.csv"""
 COLUMNS = "columns qd and tau, perhaps time, q, qdd, load, temperature and joint; or qd1, tau1, ..."
 
 
-def add_fit(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
+def add_fit(commands: Commands) -> None:
     """Register `fit-torque`."""
-    parser = commands.add_parser(
-        "fit-torque", parents=[common], help="fit models to friction torque over velocity",
-        epilog=FIT_EXAMPLE,
+    parser = commands.add(
+        "fit-torque", run_fit, "fit models to friction torque over velocity",
         description="Fit friction models to a table of friction torque over velocity, of "
         "constant-velocity tests or the residual torque of an inverse dynamics, and compare them "
         "on blocks left out.",
+        example="nfriction fit-torque table.csv --models viscous,coulomb-viscous,stribeck "
+        "--out runs/joint",
     )  # fmt: skip
     add = parser.add_argument
     add("table", type=inputs.file, metavar="TABLE", help=f"{COLUMNS} ({inputs.FORMATS})")
@@ -42,22 +39,20 @@ def add_fit(commands: argparse._SubParsersAction[Parser], common: Parser) -> Non
     add("--no-figures", action="store_true", help="draw no figure")
     _add_reading(parser)
     add("--unit", choices=("rad", "m"), default="rad", help="of positions: m for a sliding axis")
-    parser.set_defaults(run=run_fit)
 
 
-def add_score(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
+def add_score(commands: Commands) -> None:
     """Register `score-torque`."""
-    parser = commands.add_parser(
-        "score-torque", parents=[common], help="score models on friction torque over velocity",
-        epilog=SCORE_EXAMPLE,
+    parser = commands.add(
+        "score-torque", run_score, "score models on friction torque over velocity",
         description="Predict the friction torque of a table by a model file, or by the models that "
         "fit-torque chose, and print the error of each joint.",
+        example="nfriction score-torque runs/joint other_table.csv",
     )  # fmt: skip
     add = parser.add_argument
     add("model", type=Path, metavar="MODEL", help="model file, or folder that fit-torque wrote")
     add("table", type=inputs.file, metavar="TABLE", help=f"{COLUMNS} ({inputs.FORMATS})")
     _add_reading(parser)
-    parser.set_defaults(run=run_score)
 
 
 def _add_reading(parser: argparse.ArgumentParser) -> None:
@@ -115,9 +110,8 @@ def _read(arguments: argparse.Namespace, unit: str) -> TorqueTable:
 
 
 def _printed(frame: pd.DataFrame) -> str:
-    from nfriction.evaluation.tables import Table
+    from nfriction.evaluation.tables import four_digits
 
-    form = Table("", (), ()).text
     frame = frame.assign(model=frame["model"].map(plain_name))
-    text = frame.reset_index().to_string(index=False, float_format=form, na_rep="")
+    text = frame.reset_index().to_string(index=False, float_format=four_digits, na_rep="")
     return "\n".join(line.rstrip() for line in text.splitlines())

@@ -3,20 +3,18 @@
 Knows nothing of plants or friction beyond the methods it calls.
 """
 
-from nfriction.codegen.errors import (
+from nfriction.codegen.function import CompiledFunction
+from nfriction.codegen.jit import cache_folder
+from nfriction.codegen.operations import supported_operations
+from nfriction.codegen.rollout import (
+    CompiledRollout,
+    RolloutInputs,
+)
+from nfriction.codegen.scalar import (
     CodegenError,
     Incomparable,
     SelfCheckFailed,
     UnsupportedOperation,
-)
-from nfriction.codegen.function import CompiledFunction, compile_function
-from nfriction.codegen.llvm.jit import cache_folder
-from nfriction.codegen.operations import supported_operations
-from nfriction.codegen.rollout import (
-    CompiledRollout,
-    RolloutSignals,
-    Trajectories,
-    trace_rollout,
 )
 from nfriction.codegen.staleness import content, fingerprint
 
@@ -25,14 +23,11 @@ __all__ = [
     "CompiledFunction",
     "CompiledRollout",
     "Incomparable",
-    "RolloutSignals",
+    "RolloutInputs",
     "SelfCheckFailed",
-    "Trajectories",
     "UnsupportedOperation",
     "cache_folder",
-    "compile_function",
     "content",
     "fingerprint",
     "supported_operations",
-    "trace_rollout",
 ]

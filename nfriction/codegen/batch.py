@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from nfriction.codegen import jit
 from nfriction.codegen.graph import FunctionalModule
-from nfriction.codegen.llvm import jit
-from nfriction.codegen.llvm.ir import Body
+from nfriction.codegen.ir import Body
 
 Array = np.ndarray
 
@@ -26,17 +26,11 @@ FEW = 3
 
 @dataclass(frozen=True)
 class Series:
-    """A quantity over rows, steps and elements; a stride of zero repeats one value.
+    """A quantity over rows, steps and elements; a stride of zero repeats one value."""
 
-    Attributes:
-        values: the array that the strides refer to.
-        rows: number of rows given, 1 where it is the same for all.
-        strides: in numbers, along `AXES`.
-    """
-
-    values: Array
-    rows: int
-    strides: tuple[int, int, int]
+    values: Array  # that the strides refer to
+    rows: int  # given, 1 where it is the same for all
+    strides: tuple[int, int, int]  # in numbers, along `AXES`
 
 
 def to_array(value: Any) -> Array:
@@ -47,11 +41,7 @@ def to_array(value: Any) -> Array:
 
 
 def series(name: str, value: Any, steps: int, width: tuple[int, ...]) -> Series:
-    """`value` of shape width, (steps, *width) or (candidate, steps, *width), which is not copied.
-
-    Raises:
-        ValueError: for any other shape.
-    """
+    """`value` of shape width, (steps, *width) or (candidate, steps, *width), not copied."""
     array = to_array(value)
     full = (steps, *width)
     if array.shape == width:
@@ -65,11 +55,7 @@ def series(name: str, value: Any, steps: int, width: tuple[int, ...]) -> Series:
 
 
 def rows_of(name: str, value: Any, shape: tuple[int, ...]) -> Series:
-    """`value` of shape (row, *shape), the same in all steps.
-
-    Raises:
-        ValueError: for any other shape.
-    """
+    """`value` of shape (row, *shape), the same in all steps."""
     array = to_array(value)
     if not array.ndim or array.shape[1:] != shape:
         shown = ", ".join(map(str, shape))
@@ -86,11 +72,7 @@ def _strided(array: Array) -> Series:
 
 
 def common_rows(rows: Mapping[str, int]) -> int:
-    """The one number of rows that all arguments agree on; single rows are for all.
-
-    Raises:
-        ValueError: if they disagree.
-    """
+    """The one number of rows that all arguments agree on; single rows are for all."""
     counts = {count for count in rows.values() if count != 1} or {1}
     if len(counts) > 1:
         shown = ", ".join(f"`{name}` {count}" for name, count in rows.items() if count != 1)
@@ -103,12 +85,7 @@ def parameter_rows(
 ) -> tuple[Array, dict[str, int]]:
     """Parameter vectors, one row a candidate (or one for all), and the rows that each name gave.
 
-    Args:
-        module: has the values that are not overridden.
-        overrides: values by name, of the parameter's shape or (candidate, *shape).
-
-    Raises:
-        ValueError: for an unknown name or a shape that does not fit.
+    Overrides are of the parameter's shape or (candidate, *shape); other values are the module's.
     """
     unknown = [name for name in overrides if name not in module.shapes]
     if unknown:
@@ -131,17 +108,11 @@ def parameter_rows(
 
 @dataclass(frozen=True)
 class Layout:
-    """Arguments of an entry point, in order.
+    """Arguments of an entry point, in order."""
 
-    Attributes:
-        series: inputs that have strides along `AXES`.
-        outputs: arrays that are written.
-        settings: further whole numbers.
-    """
-
-    series: tuple[str, ...]
-    outputs: tuple[str, ...]
-    settings: tuple[str, ...] = ()
+    series: tuple[str, ...]  # inputs that have strides along `AXES`
+    outputs: tuple[str, ...]  # arrays that are written
+    settings: tuple[str, ...] = ()  # further whole numbers
 
     @property
     def addresses(self) -> tuple[str, ...]:

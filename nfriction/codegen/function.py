@@ -18,9 +18,9 @@ from nfriction.codegen.batch import (
     rows_of,
     to_array,
 )
-from nfriction.codegen.errors import SelfCheckFailed
+from nfriction.codegen.emit import write_function
 from nfriction.codegen.graph import FunctionalModule, Method, Program
-from nfriction.codegen.llvm.emit import write_function
+from nfriction.codegen.scalar import SelfCheckFailed
 from nfriction.codegen.transform import hoist, with_jacobian
 
 _CHECK_TOLERANCE = 1e-10
@@ -30,13 +30,8 @@ _KEPT = 16
 _known: OrderedDict[Hashable, tuple[Kernel, dict[str, tuple[int, ...]]]] = OrderedDict()
 
 
-def compile_function(
-    function: Callable[..., Any],
-    example_inputs: Sequence[Tensor],
-    *,
-    jacobian: Sequence[int] = (),
-) -> "CompiledFunction":
-    """Compile a function of tensors.
+class CompiledFunction:
+    """A compiled function of tensors, on NumPy arrays whose first axis is a batch.
 
     Args:
         function: a module, a bound method of one (its parameters stay inputs, read at every
@@ -45,23 +40,16 @@ def compile_function(
         jacobian: positions of the inputs by which to differentiate; the exact Jacobian, (elements
             of all outputs, elements of these inputs), is then returned last.
 
-    Returns:
-        A callable on NumPy arrays whose first axis is a batch.
-
     Raises:
         UnsupportedOperation: it uses an operation that has no scalar form here.
         SelfCheckFailed: compiled values are not the eager ones.
     """
-    return CompiledFunction(function, example_inputs, jacobian)
-
-
-class CompiledFunction:
-    """A compiled function; made by `compile_function`."""
 
     def __init__(
         self,
         function: Callable[..., Any],
         example_inputs: Sequence[Tensor],
+        *,
         jacobian: Sequence[int] = (),
     ) -> None:
         self._function = function

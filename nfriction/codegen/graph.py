@@ -19,9 +19,8 @@ from torch import Tensor, nn
 from torch.utils._mode_utils import no_dispatch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from nfriction.codegen.errors import UnsupportedOperation
 from nfriction.codegen.operations import OPERATIONS, constants
-from nfriction.codegen.scalar import Graph, Node, UpdateRate, reachable
+from nfriction.codegen.scalar import Graph, Node, UnsupportedOperation, UpdateRate, reachable
 
 # Most elements a traced tensor, and most scalar operations a traced function, may have.
 LIMIT = 50_000
@@ -55,17 +54,11 @@ class Program:
 
 
 class ScalarTensor(Tensor):
-    """A tensor whose elements are nodes of a scalar graph.
+    """A tensor whose elements are nodes of a scalar graph."""
 
-    Attributes:
-        nodes: object array of `Node`s, shaped like the tensor.
-        example: an ordinary tensor with the same shape, strides and dtype.
-        graph: where the nodes live.
-    """
-
-    nodes: np.ndarray
-    example: Tensor
-    graph: Graph
+    nodes: np.ndarray  # of `Node`s, shaped like the tensor
+    example: Tensor  # an ordinary one with the same shape, strides and dtype
+    graph: Graph  # where the nodes live
 
     @staticmethod
     def __new__(cls, nodes: np.ndarray, example: Tensor, graph: Graph) -> "ScalarTensor":
@@ -238,10 +231,6 @@ def trace(
         function: takes the inputs by keyword; returns a tensor or a tuple of tensors.
         inputs: example tensors, float64; each becomes an input of its own.
         parameters: names of the inputs that stay the same over many calls.
-
-    Raises:
-        UnsupportedOperation: an operation without scalar form, named.
-        ValueError: an example that is not float64.
     """
     graph, ports, arguments = Graph(), [], {}
     for name, example in inputs.items():
@@ -305,11 +294,7 @@ class FunctionalModule:
         return value
 
     def trace(self, inputs: Mapping[str, Tensor]) -> Program:
-        """Trace `module(**inputs)`; the program's first inputs are the parameters.
-
-        Args:
-            inputs: example tensors by the names of `forward`'s arguments.
-        """
+        """Trace `module(**inputs)` by examples; the program's first inputs are the parameters."""
         state = self._state()
         parameters = {f"p{i}": state[name] for i, name in enumerate(self.shapes)}
 

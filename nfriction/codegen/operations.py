@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from nfriction.codegen.errors import UnsupportedOperation
-from nfriction.codegen.scalar import Graph, Node, is_predicate
+from nfriction.codegen.scalar import Graph, Node, UnsupportedOperation, is_predicate
 
 Nodes = np.ndarray
 Operation = Callable[..., Any]
@@ -113,21 +112,11 @@ def div(g: Graph, a: Any, b: Any, rounding_mode: str | None = None) -> Nodes:
     return quotient if rounding_mode is None else numbers(g, rounding_mode, quotient)
 
 
-@handles("sigmoid")
-def _sigmoid(g: Graph, a: Nodes) -> Nodes:
-    return div(g, 1.0, add(g, 1.0, numbers(g, "exp", numbers(g, "neg", a))))
-
-
 @handles("softplus")
 def _softplus(g: Graph, a: Nodes, beta: float = 1, threshold: float = 20) -> Nodes:
     scaled = numbers(g, "mul", a, beta)
     soft = div(g, numbers(g, "log1p", numbers(g, "exp", scaled)), beta)
     return where(g, numbers(g, "lt", threshold, scaled), a, soft)
-
-
-@handles("sign", "sgn")
-def _sign(g: Graph, a: Nodes) -> Nodes:
-    return where(g, numbers(g, "lt", 0.0, a), 1.0, where(g, numbers(g, "lt", a, 0.0), -1.0, 0.0))
 
 
 @handles("remainder")
@@ -210,11 +199,6 @@ def _mean(g: Graph, a: Nodes, dim: Any = None, keepdim: bool = False, **_: Any) 
     return _reduce(g, lambda xs: g.apply("div", g.total(xs), g.constant(len(xs))), a, dim, keepdim)
 
 
-@handles("prod")
-def _prod(g: Graph, a: Nodes, dim: Any = None, keepdim: bool = False, **_: Any) -> Nodes:
-    return _reduce(g, lambda xs: g.total(xs, "mul"), a, dim, keepdim)
-
-
 def _extreme(op: str) -> Operation:
     def extreme(g: Graph, a: Nodes, dim: Any = None, keepdim: bool = False) -> Nodes:
         if isinstance(dim, int):
@@ -228,18 +212,6 @@ def _extreme(op: str) -> Operation:
 
 _amax = OPERATIONS["amax"] = OPERATIONS["max"] = _extreme("max")
 OPERATIONS["amin"] = OPERATIONS["min"] = _extreme("min")
-
-
-@handles("logsumexp")
-def _logsumexp(g: Graph, a: Nodes, dim: Any, keepdim: bool = False) -> Nodes:
-    def logsumexp(xs: list[Node]) -> Node:
-        top = g.total(xs, "max")
-        infinite = g.apply("eq", g.apply("abs", top), g.constant(math.inf))
-        top = g.apply("where", infinite, g.constant(0.0), top)
-        exps = [g.apply("exp", g.apply("sub", x, top)) for x in xs]
-        return g.apply("add", g.apply("log", g.total(exps)), top)
-
-    return _reduce(g, logsumexp, a, dim, keepdim)
 
 
 @handles("_softmax")
@@ -257,19 +229,6 @@ def _cumsum(g: Graph, a: Nodes, dim: int, dtype: Any = None) -> Nodes:
     return out
 
 
-@handles("linalg_vector_norm")
-def _vector_norm(
-    g: Graph, a: Nodes, ord: float = 2, dim: Any = None, keepdim: bool = False, dtype: Any = None
-) -> Nodes:
-    if ord == 2:
-        return numbers(g, "sqrt", _sum(g, numbers(g, "mul", a, a), dim, keepdim))
-    if ord == 1:
-        return _sum(g, numbers(g, "abs", a), dim, keepdim)
-    if ord == math.inf:
-        return _amax(g, numbers(g, "abs", a), None if dim is None else [*dim], keepdim)
-    raise UnsupportedOperation("linalg_vector_norm", f"is not known for ord={ord}")
-
-
 @handles("mm", "mv", "dot", "bmm")
 def _matmul(g: Graph, a: Nodes, b: Nodes) -> Nodes:
     """Contract the last axis of `a` with the first (after the batch) of `b`."""
@@ -279,11 +238,6 @@ def _matmul(g: Graph, a: Nodes, b: Nodes) -> Nodes:
     out = np.empty(len(left) * len(right), dtype=object)
     out[:] = [g.total([g.apply("mul", *p) for p in zip(x, y)]) for x in left for y in right]  # noqa: B905
     return out.reshape(a.shape[:-1] + b.shape[1:])
-
-
-@handles("addmm", "addmv", "baddbmm", "addbmm")
-def _addmm(g: Graph, c: Nodes, a: Nodes, b: Nodes, beta: float = 1, alpha: float = 1) -> Nodes:
-    return add(g, numbers(g, "mul", c, beta), _matmul(g, a, b), alpha)
 
 
 # Copies, creation, views, joining and indexing compute nothing.
@@ -302,26 +256,10 @@ def _to_copy(g: Graph, a: Nodes, dtype: Any = None, **_: Any) -> Nodes:
     return numbers(g, "trunc", a)
 
 
-@handles("copy", "fill")
-def _copy(g: Graph, a: Nodes, source: Any, non_blocking: bool = False) -> Nodes:
-    return np.broadcast_to(elementwise(g, lambda x: number(g, x), source), a.shape)
-
-
 @handles("new_full")
 def _full(g: Graph, a: Nodes, size: Sequence[int] | None, value: Any, **_: Any) -> Nodes:
     shape = a.shape if size is None else size
     return elementwise(g, lambda x: x, np.broadcast_to(as_nodes(g, value), shape))
-
-
-# Memory that torch leaves uninitialised is zero, so that a trace does not depend on chance.
-@handles("zero", "zeros_like", "new_zeros", "empty_like", "new_empty")
-def _zeros(g: Graph, a: Nodes, size: Sequence[int] | None = None, **_: Any) -> Nodes:
-    return _full(g, a, size, 0.0)
-
-
-@handles("ones_like", "new_ones")
-def _ones(g: Graph, a: Nodes, size: Sequence[int] | None = None, **_: Any) -> Nodes:
-    return _full(g, a, size, 1.0)
 
 
 @handles("view", "_unsafe_view", "reshape", "_reshape_alias")
@@ -330,11 +268,6 @@ def _view(g: Graph, a: Nodes, size: Sequence[int], *_: Any) -> Nodes:
     if out.size and not np.shares_memory(out, a):
         a.flags.writeable = out.flags.writeable = False  # torch may alias here, NumPy did not
     return out
-
-
-@handles("transpose")
-def _transpose(g: Graph, a: Nodes, dim0: int, dim1: int) -> Nodes:
-    return a.swapaxes(dim0, dim1) if a.ndim else a
 
 
 @handles("expand")
@@ -362,31 +295,10 @@ def _squeeze(g: Graph, a: Nodes, dim: Any = None) -> Nodes:
     return a.squeeze(axes)
 
 
-@handles("unbind")
-def _unbind(g: Graph, a: Nodes, dim: int = 0) -> list[Nodes]:
-    return [_select(g, a, dim, i) for i in range(a.shape[dim])]
-
-
-@handles("split")
-def _split(g: Graph, a: Nodes, size: int, dim: int = 0) -> list[Nodes]:
-    length = a.shape[dim]
-    return [_slice(g, a, dim, i, i + size) for i in range(0, max(length, 1), size)]
-
-
 @handles("split_with_sizes")
 def _split_with_sizes(g: Graph, a: Nodes, sizes: Sequence[int], dim: int = 0) -> list[Nodes]:
     stops = np.cumsum(sizes)
     return [_slice(g, a, dim, s - n, s) for s, n in zip(stops, sizes, strict=True)]
-
-
-@handles("diagonal")
-def _diagonal(g: Graph, a: Nodes, offset: int = 0, dim1: int = 0, dim2: int = 1) -> Nodes:
-    return np.diagonal(a, offset, dim1, dim2)  # read-only: writing through it is refused
-
-
-@handles("roll")
-def _roll(g: Graph, a: Nodes, shifts: Sequence[int], dims: Sequence[int] = ()) -> Nodes:
-    return np.roll(a, tuple(shifts), tuple(dims)) if dims else np.roll(a, shifts[0])
 
 
 @handles("constant_pad_nd")
@@ -436,8 +348,6 @@ def _cat(g: Graph, tensors: Sequence[Nodes], dim: int = 0) -> Nodes:
 
 # All that is one expression.
 OPERATIONS |= {
-    "addcmul": lambda g, a, b, c, value=1: add(g, a, numbers(g, "mul", b, c), value),
-    "clamp_max": lambda g, a, max: _clamp(g, a, max=max),
     "full_like": lambda g, a, value, **_: _full(g, a, None, value),
     "ge": lambda g, a, b: numbers(g, "le", b, a),
     "gt": lambda g, a, b: numbers(g, "lt", b, a),
@@ -445,14 +355,43 @@ OPERATIONS |= {
         g, "sqrt", add(g, numbers(g, "mul", a, a), numbers(g, "mul", b, b))
     ),
     "isnan": lambda g, a: numbers(g, "ne", a, a),
-    "masked_fill": lambda g, a, mask, value: where(g, mask, value, a),
     "reciprocal": lambda g, a: div(g, 1.0, a),
     "relu": lambda g, a: numbers(g, "max", a, 0.0),
     "rsqrt": lambda g, a: div(g, 1.0, numbers(g, "sqrt", a)),
-    "rsub": lambda g, a, b, alpha=1: sub(g, b, a, alpha),
+    "prod": lambda g, a, dim=None, keepdim=False, **_: _reduce(
+        g, lambda xs: g.total(xs, "mul"), a, dim, keepdim
+    ),
+    "sigmoid": lambda g, a: div(g, 1.0, add(g, 1.0, numbers(g, "exp", numbers(g, "neg", a)))),
+    **dict.fromkeys(
+        ("sign", "sgn"),
+        lambda g, a: where(
+            g, numbers(g, "lt", 0.0, a), 1.0, where(g, numbers(g, "lt", a, 0.0), -1.0, 0.0)
+        ),
+    ),
+    **dict.fromkeys(
+        ("addmm", "addmv", "baddbmm", "addbmm"),
+        lambda g, c, a, b, beta=1, alpha=1: add(
+            g, numbers(g, "mul", c, beta), _matmul(g, a, b), alpha
+        ),
+    ),
+    **dict.fromkeys(
+        ("copy", "fill"),
+        lambda g, a, source, non_blocking=False: np.broadcast_to(
+            elementwise(g, lambda x: number(g, x), source), a.shape
+        ),
+    ),
+    # Memory that torch leaves uninitialised is zero, so that a trace does not depend on chance.
+    **dict.fromkeys(
+        ("zero", "zeros_like", "new_zeros", "empty_like", "new_empty"),
+        lambda g, a, size=None, **_: _full(g, a, size, 0.0),
+    ),
+    **dict.fromkeys(("ones_like", "new_ones"), lambda g, a, size=None, **_: _full(g, a, size, 1.0)),
     "cat": _cat,
+    # Read-only: writing through it is refused.
+    "diagonal": lambda g, a, offset=0, dim1=0, dim2=1: np.diagonal(a, offset, dim1, dim2),
+    "transpose": lambda g, a, dim0, dim1: a.swapaxes(dim0, dim1) if a.ndim else a,
+    "unbind": lambda g, a, dim=0: [_select(g, a, dim, i) for i in range(a.shape[dim])],
     "flip": lambda g, a, dims: np.flip(a, tuple(dims)).copy(),
-    "index_select": lambda g, a, dim, index: np.take(a, _static("index_select", index), axis=dim),
     "permute": lambda g, a, dims: a.transpose([d % a.ndim for d in dims]),
     "repeat": lambda g, a, repeats: np.tile(a, tuple(repeats)),
     "stack": lambda g, tensors, dim=0: np.stack(tensors, axis=dim),

@@ -1,80 +1,294 @@
-"""Compile the rollout of a plant with friction, and run many at once."""
+"""Rollouts of a plant with friction: what is traced of them, the loops around it, many at once."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from nfriction.codegen.batch import (
+    Driver,
     Kernel,
+    Layout,
     common_rows,
     parameter_rows,
     rows_of,
     series,
     to_array,
 )
-from nfriction.codegen.errors import SelfCheckFailed
-from nfriction.codegen.graph import FunctionalModule
-from nfriction.codegen.rollout_program import LAYOUT, ForcedSystem, RolloutDriver, arrange
+from nfriction.codegen.emit import write_function
+from nfriction.codegen.graph import FunctionalModule, Program
+from nfriction.codegen.ir import real
+from nfriction.codegen.scalar import Graph, Node, SelfCheckFailed
+from nfriction.codegen.transform import hoist
+
+LAYOUT = Layout(
+    series=("q0", "qd0", "tau", "step", "drive_qd", "drive_qdd", "memory", "law"),
+    outputs=("q_out", "qd_out", "qdd_out", "diverged", "law_out"),
+    settings=("samples", "substeps", "driven", "remembered"),
+)
+# A joint faster than this [rad/s or m/s] has left any mechanism's range: it has diverged.
+SPEED_LIMIT = 1e6
+# Of `ForcedSystem`; all other inputs of its trace are parameters.
+INPUTS = ("q", "qd", "tau", "step", "held", "seen_qd", "seen_qdd", "memory", "law")
+
+
+class ForcedSystem(nn.Module):
+    """Plant and friction as the one function that a rollout repeats, see `CompiledRollout`.
+
+    Of a friction law with memory its state is a last argument of `step`, and the state afterwards a
+    last result.
+    """
+
+    def __init__(self, plant: Any, friction: Any, step: Callable[..., Any]) -> None:
+        super().__init__()
+        self.plant = plant
+        self.friction = friction
+        self.step = step
+        self.remembers = int(getattr(friction, "state_size", 0)) > 0
+        self.law_size = int(getattr(friction, "law_state_size", 0))
+
+    def forward(
+        self,
+        q: Tensor,
+        qd: Tensor,
+        tau: Tensor,
+        step: Tensor,
+        held: Tensor,
+        seen_qd: Tensor,
+        seen_qdd: Tensor,
+        memory: Tensor | None = None,
+        law: Tensor | None = None,
+    ) -> tuple[Tensor, ...]:
+        own = () if law is None else (law,)
+        after = self.step(self.plant, self.friction, q, qd, tau, held, step, *own)
+        start = self.plant.forward_dynamics(q, qd, tau)
+        if memory is None:
+            return *after, start, self.friction.coefficients(seen_qd, seen_qdd)
+        coefficients = self.friction.coefficients_from(seen_qd, seen_qdd, memory)
+        begin = self.friction.initial_state(seen_qd, seen_qdd)
+        return *after, start, coefficients, begin, self.friction.advance(seen_qd, seen_qdd, memory)
+
+
+@dataclass(frozen=True)
+class RolloutProgram:
+    """The functions of a rollout as groups of nodes."""
+
+    joints: int
+    once: tuple[Node, ...]  # computed once a rollout
+    start: tuple[Node, ...]  # acceleration without friction, the one known at the start
+    held: tuple[Node, ...]  # coefficients of a motion, and of a memory where they have one
+    step: tuple[Node, ...]  # q, qd, qdd after a step, and the state of a law with memory
+    within: Node  # whether that state is finite and no joint too fast
+    begin: tuple[Node, ...]  # memory of the coefficients after the first sample, if any
+    advance: tuple[Node, ...]  # that after a sample, from that before
+    places: dict[int, tuple[str, int]]  # array and index of the input nodes
+
+
+def arrange(program: Program, law_size: int = 0) -> RolloutProgram:
+    """Arrange the trace of a `ForcedSystem` whose law has an internal state of that size."""
+    graph, outputs = program.graph, [port.nodes for port in program.outputs]
+    law = outputs.pop(3) if law_size else ()
+    q, qd, qdd, start, held, *remembered = outputs
+    begin, advance = remembered or ((), ())
+    joints = len(q)
+    within = _within(graph, q, qd)
+    groups = [start, held, (*q, *qd, *qdd, *law), (within,), begin, advance]
+    groups, once = hoist(graph, groups)
+    start, held, step, (within,), begin, advance = groups
+    at = {"q": ("state", 0), "qd": ("state", joints), "seen_qdd": ("seen", joints),
+          "seen_qd": ("seen", 0), "law": ("state", 3 * joints)}  # fmt: skip
+    places: dict[int, tuple[str, int]] = {}
+    parameters = 0
+    for port in program.inputs:
+        own = port.name in INPUTS
+        array, offset = at.get(port.name, (port.name, 0)) if own else ("p", parameters)
+        places |= {node.number: (array, offset + i) for i, node in enumerate(port.nodes)}
+        parameters += 0 if own else len(port.nodes)
+    return RolloutProgram(joints, tuple(once), start, held, step, within, begin, advance, places)
+
+
+def _within(graph: Graph, q: Sequence[Node], qd: Sequence[Node]) -> Node:
+    """A test for finite and slow enough states; numbers that are not finite compare false."""
+    zero, limit = graph.constant(0.0), graph.constant(SPEED_LIMIT)
+    # A number minus itself is zero unless it is NaN or infinite.
+    tests = [graph.apply("eq", graph.apply("sub", x, x), zero) for x in q]
+    tests += [graph.apply("le", graph.apply("abs", x), limit) for x in qd]
+    return graph.total(tests, "and")
+
+
+class RolloutDriver(Driver):
+    """The loops over candidates, samples and substeps in which a program's functions are called."""
+
+    def __init__(self, program: RolloutProgram, width: int) -> None:
+        n = program.joints
+        sizes = {"state": len(program.step), "seen": 2 * n, "tau": n, "step": 1,
+                 "held": len(program.held), "memory": len(program.advance), "within": 1,
+                 "alive": 1}  # fmt: skip
+        super().__init__(LAYOUT, width, sizes, len(program.once))
+        self.program = program
+        self._functions()
+        with self.entry():
+            self._candidates()
+
+    def _functions(self) -> None:
+        parts, body = self.program, self.body
+        known = parts.places | {n.number: ("once", i) for i, n in enumerate(parts.once)}
+
+        def function(
+            name: str, inputs: Sequence[str], outputs: dict[str, Any], seldom: bool = False
+        ) -> None:
+            shared = ["p", "once"]
+            write_function(body, name, outputs, known, shared, inputs, self.width, seldom)
+
+        once = {"once": parts.once}
+        write_function(body, "nf_once", once, parts.places, ["p"], [], seldom=True)
+        function("nf_start", ["state", "tau"], {"rate": parts.start}, seldom=True)
+        function("nf_held", ["seen", "memory"], {"held": parts.held})
+        function("nf_begin", ["seen"], {"memory": parts.begin}, seldom=True)
+        function("nf_advance", ["seen", "memory"], {"memory": parts.advance})
+        after = {"state": parts.step, "within": (parts.within,)}
+        function("nf_step", ["state", "tau", "step", "held"], after)
+
+    def _candidates(self) -> None:
+        """The candidates that are computed together."""
+        body, n, value = self.body, self.program.joints, self.value
+        self.call("nf_once", "own_p", "room.once")
+        self.gather("q0", n, value["room.state"])
+        self.gather("qd0", n, self.element("state", n))
+        self.gather("tau", n, value["room.tau"])
+        self.law = len(self.program.step) - 3 * n
+        if self.law:
+            self.gather("law", self.law, self.element("state", 3 * n))
+        value["rate"] = self.element("state", 2 * n)
+        self.call("nf_start", "own_p", "room.once", "room.state", "room.tau", "rate")
+        with self.each() as (candidate, _):
+            body.store("-1", value["diverged"], candidate, "i64")
+        self._record("0")
+        alive = self.element("alive", 0)
+        ahead = body.let(f"sub i64 %last, {value['first']}")
+        body.run(f"store i64 {self.least(ahead, str(self.lanes))}, ptr {alive}")
+        with body.loop("0", value["samples"]) as k:
+            some = body.let(f"icmp sgt i64 {body.let(f'load i64, ptr {alive}')}, 0")
+            with body.when(some):
+                self._sample(k, alive)
+            self._record(body.let(f"add i64 {k}, 1"))
+
+    def _sample(self, k: str, alive: str) -> None:
+        body, n, value = self.body, self.program.joints, self.value
+        self.gather("tau", n, value["room.tau"], k)
+        self.gather("step", 1, value["room.step"], k)
+        driven = body.let(f"icmp ne i64 {value['driven']}, 0")
+        with body.when(driven):
+            self.gather("drive_qd", n, value["room.seen"], k)
+            self.gather("drive_qdd", n, self.element("seen", n), k)
+        moving = self.element("state", n)  # qd, then qdd
+        given = f"ptr {value['room.seen']}, ptr {moving}"
+        value["sees"] = body.let(f"select i1 {driven}, {given}")
+        if self.program.advance:
+            self._remember(k)
+            # A controller at the sample rate holds its coefficients over the whole sample.
+            self.call("nf_held", "own_p", "room.once", "sees", "room.memory", "room.held")
+        with body.loop("0", value["substeps"]):
+            if not self.program.advance:
+                self.call("nf_held", "own_p", "room.once", "sees", "room.memory", "room.held")
+            rooms = ("state", "tau", "step", "held", "within")
+            self.call("nf_step", "own_p", "room.once", *(f"room.{name}" for name in rooms))
+            fine = body.load(value["room.within"], 0, real(self.width))
+            one = body.constant(1.0, self.width)
+            lost = body.let(f"fcmp une {real(self.width)} {fine}, {one}")
+            if self.width:
+                every = body.let(f"bitcast <{self.width} x i1> {lost} to i{self.width}")
+                lost = body.let(f"icmp ne i{self.width} {every}, 0")
+            with body.when(lost):
+                self._stop(k, alive)
+
+    def _remember(self, k: str) -> None:
+        body, size = self.body, len(self.program.advance)
+        later = body.let(f"icmp sgt i64 {k}, 0")
+        first = body.let(f"xor i1 {later}, true")
+        given = body.let(f"icmp ne i64 {self.value['remembered']}, 0")
+        unknown = body.let(f"xor i1 {given}, true")
+        with body.when(later):
+            self.call("nf_advance", "own_p", "room.once", "sees", "room.memory")
+        with body.when(body.let(f"and i1 {first}, {given}")):
+            self.gather("memory", size, self.value["room.memory"])
+        with body.when(body.let(f"and i1 {first}, {unknown}")):
+            self.call("nf_begin", "own_p", "room.once", "sees", "room.memory")
+
+    def _stop(self, k: str, alive: str) -> None:
+        """Note which candidates are lost; their state goes on from zero, unseen."""
+        body = self.body
+        reached = body.let(f"add i64 {k}, 1")
+        with self.each() as (candidate, lane):
+            lost = body.let(f"fcmp une double {body.load(self.value['room.within'], lane)}, 1.0")
+            with body.when(lost):
+                for i in range(len(self.program.step)):
+                    body.store("0.0", self.element("state", i), lane)
+                place = body.at(self.value["diverged"], candidate, "i64")
+                fresh = body.let(f"icmp slt i64 {body.let(f'load i64, ptr {place}')}, 0")
+                with body.when(fresh):
+                    body.run(f"store i64 {reached}, ptr {place}")
+                    left = body.let(f"sub i64 {body.let(f'load i64, ptr {alive}')}, 1")
+                    body.run(f"store i64 {left}, ptr {alive}")
+
+    def _record(self, sample: str) -> None:
+        """Write states; NaN of candidates that are lost."""
+        body, n = self.body, self.program.joints
+        records = body.let(f"add i64 {self.value['samples']}, 1")
+        with self.each() as (candidate, lane):
+            place = body.let(f"add i64 {body.let(f'mul i64 {candidate}, {records}')}, {sample}")
+            diverged = body.load(self.value["diverged"], candidate, "i64")
+            fine = body.let(f"icmp slt i64 {diverged}, 0")
+            nan = body.constant(float("nan"))
+            parts = [("q_out", n), ("qd_out", n), ("qdd_out", n)]
+            parts += [("law_out", self.law)] * bool(self.law)
+            element = 0
+            for name, size in parts:
+                target = body.at(self.value[name], body.let(f"mul i64 {place}, {size}"))
+                for i in range(size):
+                    state = body.load(self.element("state", element), lane)
+                    shown = body.let(f"select i1 {fine}, double {state}, double {nan}")
+                    body.store(shown, target, i)
+                    element += 1
+
 
 # Of accelerations over steps of 0.1 ms: velocities of 10 rad/s round to 2e-15, rates to 2e-11.
 _CHECK_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
-class RolloutSignals:
-    """Sample times of rollouts, and all that drives the motion.
+class RolloutInputs:
+    """Initial state and inputs of a rollout.
 
     Attributes:
-        steps: number of samples.
-        time_step: sample time [s]: a number, (steps,) or (candidate, steps).
-        tau: joint torque held over each sample [N m], (steps, joint) or (candidate, steps, joint);
-            zero by default.
-        drive: measured velocity and acceleration that drive the coefficients instead of the
-            simulated ones, each (steps, joint) or (candidate, steps, joint).
-        substeps: steps to each sample. Coefficients with a memory are held over the sample; others
-            are held anew at each of these steps.
-        memory: memory of the coefficients after the first sample, (candidate, joint, state_size),
-            one row is for all; by default that of this sample alone.
-        law_state: of a friction law with memory at the start, (candidate, joint, state), one row is
-            for all; by default zero.
+        q0, qd0: initial state [rad, rad/s], (*batch, joint).
+        tau: torque held over each step [N m], (steps, joint) or (*batch, steps, joint).
+        step: sample times [s], (steps,) or (*batch, steps).
+        substeps: integration steps to each sample.
+        measured: velocity and acceleration that drive the coefficients in place of the simulated
+            ones, each (*batch, steps, joint) or without batch; None for the simulated ones.
+        hidden_state: of the coefficients after the first sample, (*batch, joint, state_size);
+            None for that of the first sample alone.
+        law_state: internal state of the friction law at the start, (*batch, joint, state); None of
+            a law without.
     """
 
-    steps: int
-    time_step: Any
-    tau: Any = None
-    drive: tuple[Any, Any] | None = None
+    q0: Tensor
+    qd0: Tensor
+    tau: Tensor
+    step: Tensor
     substeps: int = 1
-    memory: Any = None
-    law_state: Any = None
+    measured: tuple[Tensor, Tensor] | None = None
+    hidden_state: Tensor | None = None
+    law_state: Tensor | None = None
 
 
-class Trajectories(NamedTuple):
-    """Simulated motions, NumPy or torch as the initial state was.
-
-    Attributes:
-        q, qd: positions and velocities [rad, rad/s], shape (candidate, sample + 1, joint); NaN
-            from where a candidate diverged.
-        qdd: acceleration known at each sample [rad/s^2]: of the first stage of the step before it,
-            at the start that without friction; same shape.
-        diverged_at: number of the sample at which the state was not finite or too fast, -1 where
-            it never was, shape (candidate,).
-        law_state: of a friction law with memory, (candidate, sample + 1, joint, state); else None.
-    """
-
-    q: Any
-    qd: Any
-    qdd: Any
-    diverged_at: Any
-    law_state: Any = None
-
-
-def trace_rollout(plant: Any, friction: Any, step: Callable[..., Any]) -> "CompiledRollout":
-    """Trace rollouts of a plant with friction; compiled at their first call or by `check`.
+class CompiledRollout:
+    """Rollouts of a plant with friction, traced at once and compiled at the first call.
 
     Parameters and floating-point buffers stay inputs: they are read at every call, so a fit may
     change them, and may differ from candidate to candidate. Everything else (Python numbers,
@@ -87,26 +301,21 @@ def trace_rollout(plant: Any, friction: Any, step: Callable[..., Any]) -> "Compi
         step: `(plant, friction, q, qd, tau, coefficients, step) -> (q, qd, qdd)`, which is
             repeated; for instance `nfriction.simulation.rk4.rk4_step`.
 
-    Raises:
-        UnsupportedOperation: the modules use an operation that has no scalar form here.
-        TypeError: one of them is no module.
-    """
-    for name, module in (("plant", plant), ("friction", friction)):
-        if not isinstance(module, nn.Module):
-            raise TypeError(f"`{name}` must be a torch module, got {type(module).__name__}.")
-    return CompiledRollout(ForcedSystem(plant, friction, step))
-
-
-class CompiledRollout:
-    """Rollouts of one plant and friction model; made by `trace_rollout`.
-
     Attributes:
         parameter_names: names under which `parameters` may be given.
         digest: a hash of all that is computed; code of another plant and friction model with the
             same digest computes the same, given the same parameters.
+
+    Raises:
+        UnsupportedOperation: the modules use an operation that has no scalar form here.
+        TypeError: one of them is no module.
     """
 
-    def __init__(self, system: ForcedSystem) -> None:
+    def __init__(self, plant: Any, friction: Any, step: Callable[..., Any]) -> None:
+        for name, module in (("plant", plant), ("friction", friction)):
+            if not isinstance(module, nn.Module):
+                raise TypeError(f"`{name}` must be a torch module, got {type(module).__name__}.")
+        system = ForcedSystem(plant, friction, step)
         self._system = system
         self.joints = int(system.plant.joints)
         self._module = FunctionalModule(system)
@@ -143,67 +352,68 @@ class CompiledRollout:
 
     def __call__(
         self,
-        q0: Any,
-        qd0: Any,
-        inputs: RolloutSignals,
-        parameters: Mapping[str, Any] | None = None,
+        inputs: RolloutInputs,
+        parameters: Mapping[str, Tensor] | None = None,
         threads: int = 1,
-    ) -> Trajectories:
-        """Integrate all candidates from their initial states.
+    ) -> tuple[Tensor, ...]:
+        """States at every sample: q, qd, qdd, each (*batch, steps + 1, joint), and that of the law.
+
+        They are NaN from the sample on at which a state is not finite or too fast. The
+        acceleration is that of the first stage of the step before, at the start without friction.
 
         Args:
-            q0, qd0: initial state [rad, rad/s], shape (candidate, joint); one row is for all.
-            inputs: sample times, and all that drives the motion.
+            inputs: initial states, sample times, and all that drives the motion.
             parameters: values that differ from the modules', by name ("plant.…", "friction.…"),
-                shape (candidate, *the parameter's own) or just the parameter's own.
-            threads: candidates are shared out among this many.
-
-        Returns:
-            Trajectories, in NumPy or (where `q0` is one) torch.
+                shape (batch, *the parameter's own) or just the parameter's own.
+            threads: the batch is shared out among this many.
 
         Raises:
             ValueError: for shapes that do not fit, or a name that is not there.
         """
-        steps, substeps, drive, memory = inputs.steps, inputs.substeps, inputs.drive, inputs.memory
-        if steps < 0 or substeps < 1 or threads < 1:
+        steps, substeps, n = inputs.step.shape[-1], inputs.substeps, self.joints
+        if substeps < 1 or threads < 1:
             raise ValueError(
-                "`steps` must be 0 or more, `substeps` and `threads` 1 or more, got "
-                f"{steps}, {substeps} and {threads}."
+                f"`substeps` and `threads` must be 1 or more, got {substeps} and {threads}."
             )
-        n = self.joints
-        step = inputs.time_step if substeps == 1 else to_array(inputs.time_step) / substeps
+        batch = inputs.q0.shape[:-1]
+
+        def rows(x: Tensor, trailing: int) -> Tensor:
+            """Candidates on one leading axis; what all share keeps none."""
+            x = x.detach()
+            own = x.shape[x.ndim - trailing :]
+            if x.ndim > trailing:
+                x = x.expand(*batch, *own).reshape(-1, *own)
+            # An expanded constant needs no value for each step.
+            return x[0] if x.ndim == trailing and not x.stride(0) else x
+
         given = {
-            "q0": rows_of("q0", q0, (n,)),
-            "qd0": rows_of("qd0", qd0, (n,)),
-            "tau": series("tau", np.zeros(n) if inputs.tau is None else inputs.tau, steps, (n,)),
-            "step": series("time_step", step, steps, ()),
+            name: rows_of(name, value.detach().reshape(-1, n), (n,))
+            for name, value in (("q0", inputs.q0), ("qd0", inputs.qd0))
         }
-        if drive is not None:
-            for name, value in zip(("drive_qd", "drive_qdd"), drive, strict=True):
-                given[name] = series("drive", value, steps, (n,))
-        if memory is not None:
-            size = getattr(self._system.friction, "state_size", 0)
-            given["memory"] = rows_of("memory", memory, (n, size))
-        size = self._system.law_size
-        if size:
-            law = np.zeros((1, n, size)) if inputs.law_state is None else inputs.law_state
-            given["law"] = rows_of("law_state", law, (n, size))
-        p, rows = parameter_rows(self._module, parameters or {})
-        count = common_rows(rows | {name: one.rows for name, one in given.items()})
-        outputs: dict[str, np.ndarray] = {
-            name: np.empty((count, steps + 1, n)) for name in LAYOUT.outputs[:3]
-        }
-        outputs["diverged"] = np.empty(count, dtype=np.int64)
-        if size:
-            outputs["law_out"] = np.empty((count, steps + 1, n, size))
-        settings = {"samples": steps, "substeps": substeps, "driven": drive is not None,
-                    "remembered": memory is not None}  # fmt: skip
-        self._kernel(count, p, given, outputs, settings, threads)
-        results: dict[str, Any] = dict(outputs)
-        if isinstance(q0, Tensor):
-            results = {name: torch.from_numpy(x) for name, x in results.items()}
-        q, qd, qdd, diverged = (results[name] for name in LAYOUT.outputs[:4])
-        return Trajectories(q, qd, qdd, diverged, results.get("law_out"))
+        given["tau"] = series("tau", rows(inputs.tau, 2), steps, (n,))
+        given["step"] = series("step", to_array(rows(inputs.step, 1)) / substeps, steps, ())
+        if inputs.measured is not None:
+            for name, value in zip(("drive_qd", "drive_qdd"), inputs.measured, strict=True):
+                given[name] = series("measured", rows(value, 2), steps, (n,))
+        size, law = self._system.law_size, inputs.law_state
+        law = inputs.q0.new_zeros(n, size) if size and law is None else law
+        memory_size = int(getattr(self._system.friction, "state_size", 0))
+        kept = {"memory": (inputs.hidden_state, memory_size), "law": (law, size)}
+        for name, (state, numbers) in kept.items():
+            if state is not None:
+                flat = rows(state, 2).reshape(-1, *state.shape[-2:])
+                given[name] = rows_of(name, flat, (n, numbers))
+        p, counts = parameter_rows(self._module, parameters or {})
+        count = common_rows(counts | {name: one.rows for name, one in given.items()})
+        outputs = {name: np.empty((count, steps + 1, n)) for name in LAYOUT.outputs[:3]}
+        outputs |= {"law_out": np.empty((count, steps + 1, n, size))} if size else {}
+        settings = {"samples": steps, "substeps": substeps,
+                    "driven": inputs.measured is not None,
+                    "remembered": inputs.hidden_state is not None}  # fmt: skip
+        lost = {"diverged": np.empty(count, dtype=np.int64)}
+        self._kernel(count, p, given, outputs | lost, settings, threads)
+        found = map(torch.from_numpy, outputs.values())
+        return tuple(x.reshape(*batch, *x.shape[1:]) for x in found)
 
     def check(self) -> None:
         """Compare two steps from random states with the same steps in eager torch.
@@ -221,8 +431,9 @@ class CompiledRollout:
                 for s in scales
             )
             expected = to_array(self._eager(q, qd, tau, steps, dt)) - qd.numpy()
-            ours = self(q[None], qd[None], RolloutSignals(steps, dt, tau.expand(steps, -1)))
-            rate, eager = (ours.qd[0, -1].numpy() - qd.numpy()) / dt, expected / dt
+            step = torch.full((steps,), dt, dtype=torch.float64)
+            inputs = RolloutInputs(q, qd, tau.expand(steps, -1), step)
+            rate, eager = (self(inputs)[1][-1].numpy() - qd.numpy()) / dt, expected / dt
             scale = _CHECK_TOLERANCE * (1.0 + np.abs(eager).max())
             if not np.allclose(rate, eager, rtol=0.0, atol=scale, equal_nan=True):
                 raise SelfCheckFailed(

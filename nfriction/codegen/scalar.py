@@ -12,6 +12,33 @@ from typing import Any
 import numpy as np
 
 
+class CodegenError(RuntimeError):
+    """Base of everything the code generator raises on purpose."""
+
+
+class UnsupportedOperation(CodegenError):  # noqa: N818
+    """A traced module uses an operation that has no scalar form here.
+
+    The torch rollout runs every module; only the compiled one needs this list.
+    """
+
+    def __init__(self, operation: str, reason: str = "has no scalar form here") -> None:
+        super().__init__(
+            f"operation `{operation}` {reason}; rewrite it with the operations listed in "
+            "`nfriction.codegen.supported_operations()`, or use the torch rollout "
+            '(`backend="torch"`), which runs every module.'
+        )
+        self.operation = operation
+
+
+class SelfCheckFailed(CodegenError):  # noqa: N818
+    """A compiled model disagrees with eager torch and must not be used."""
+
+
+class Incomparable(CodegenError):  # noqa: N818
+    """Something that a trace may read cannot be compared with what it was before."""
+
+
 class UpdateRate(IntEnum):
     """Frequency at which a value has to be computed; the lower, the more seldom."""
 
@@ -163,14 +190,9 @@ def reachable(outputs: Iterable[Node], stop: Iterable[Node] = ()) -> list[Node]:
 
 
 def evaluate(outputs: Sequence[Node], inputs: Mapping[str, np.ndarray]) -> list[np.ndarray]:
-    """Values of `outputs`, computed in NumPy.
+    """Values of `outputs` by NumPy, each of the batch's shape.
 
-    Args:
-        outputs: the wanted nodes.
-        inputs: by name, arrays whose last axis is the flat index; leading axes are a batch.
-
-    Returns:
-        One array of the batch shape per output.
+    The last axis of an input is the flat index, leading axes are a batch.
     """
     values: dict[int, Any] = {}
     with np.errstate(all="ignore"):

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from nfriction.codegen.errors import Incomparable
+from nfriction.codegen.scalar import Incomparable
 
 
 class _Read(NamedTuple):

@@ -7,28 +7,22 @@ of the steps.
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial, reduce
 
-from nfriction.codegen.errors import UnsupportedOperation
 from nfriction.codegen.graph import Port, Program
-from nfriction.codegen.scalar import Graph, Node, UpdateRate, is_predicate, reachable
+from nfriction.codegen.scalar import (
+    Graph,
+    Node,
+    UnsupportedOperation,
+    UpdateRate,
+    is_predicate,
+    reachable,
+)
 
 Tangents = Mapping[int, Node]
 Rule = Callable[..., Node]
 
 
 def with_jacobian(program: Program, wrt: Sequence[str]) -> Program:
-    """The program with its Jacobian as a further, last output.
-
-    Args:
-        program: what was traced.
-        wrt: names of the inputs to differentiate by.
-
-    Returns:
-        The program with an output of shape (elements of all outputs, elements of all `wrt`), both
-        flat and in order.
-
-    Raises:
-        UnsupportedOperation: see `tangents`.
-    """
+    """The program with a last output: its Jacobian by the inputs named, (outputs, inputs), flat."""
     graph = program.graph
     outputs = [node for port in program.outputs for node in port.nodes]
     one, zero = graph.constant(1.0), graph.constant(0.0)
@@ -43,20 +37,9 @@ def with_jacobian(program: Program, wrt: Sequence[str]) -> Program:
 
 
 def tangents(graph: Graph, nodes: Iterable[Node], seed: Tangents) -> dict[int, Node]:
-    """Derivatives of nodes along one direction.
+    """Derivatives by node number along the direction of a seed; none where they are zero.
 
-    What does not depend on the direction is left out, so its derivative is zero and costs nothing.
-
-    Args:
-        graph: the graph to extend.
-        nodes: those whose derivatives are wanted, with all that they need, arguments first.
-        seed: derivative of input nodes along the direction, by node number.
-
-    Returns:
-        Derivative by node number.
-
-    Raises:
-        UnsupportedOperation: an operation without a rule lies on the way, named.
+    `nodes` come with all that they need, arguments first.
     """
     found = dict(seed)
     for node in nodes:
@@ -165,15 +148,9 @@ Groups = Sequence[Sequence[Node]]
 
 
 def hoist(graph: Graph, groups: Groups) -> tuple[list[tuple[Node, ...]], list[Node]]:
-    """Find what can be computed less often than the outputs themselves.
+    """The groups to compute in every step, and the nodes in them that parameters alone decide.
 
-    Args:
-        graph: extended where products are regrouped.
-        groups: outputs, in groups that belong together.
-
-    Returns:
-        The groups to compute in every step, and the nodes that these read and parameters decide,
-        arguments first.
+    Those come once, arguments first. The graph is extended where products are regrouped.
     """
     outputs = _regrouped(graph, [node for group in groups for node in group])
     read = {

@@ -17,7 +17,7 @@ from nfriction.evaluation.lead_in import longest_window
 from nfriction.evaluation.score import score
 from nfriction.fitting.fit import fit
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction.memory import deflections
+from nfriction.friction.memory import deflections, load_of
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant, rigs
 from nfriction.recording import Recording, RecordingLike
@@ -171,7 +171,8 @@ class FrictionEstimator(BaseEstimator):
                 joint = recording.joint_coordinates(plant)
                 motion = kalman_smoother(joint.time, joint.q)
                 q, velocity, acceleration = map(torch.tensor, (motion.q, motion.qd, motion.qdd))
-                loads = plant.load(q, velocity)
+                tau = torch.zeros_like(q) if joint.tau is None else torch.tensor(joint.tau)
+                loads = load_of(model.law, plant, q, velocity, tau)
                 if model.law.memory:
                     time = torch.tensor(joint.time)
                     states, held = deflections(model, time, velocity, acceleration, loads)

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from nfriction.fitting.result.of_search import white_noise
-from nfriction.friction.memory import deflections
+from nfriction.fitting.shooting.autocorrelation import white_noise
+from nfriction.friction.memory import deflections, load_of
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import require_model
 from nfriction.plant import Plant
@@ -151,7 +151,9 @@ class Simulator:
                 self.states = friction.schedule.states(qd, qdd)
             if friction.law.memory:
                 time = torch.tensor(self.time)
-                self.law_states, _ = deflections(friction, time, qd, qdd, plant.load(q, qd))
+                tau = torch.zeros_like(q) if recording.tau is None else torch.tensor(recording.tau)
+                load = load_of(friction.law, plant, q, qd, tau)
+                self.law_states, _ = deflections(friction, time, qd, qdd, load)
 
     def free_runs(self, initial_state: tuple[Array, Array] | None) -> list[Runs]:
         """One run of each segment that is longer than a lead-in."""

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import torch
 
+from nfriction.fitting.data.inputs import as_model
 from nfriction.fitting.fit import fit
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction import model_by_name, model_name
@@ -104,7 +105,7 @@ def fit_models(
         tasks = {
             # An instance, as a process elsewhere may not know a law of one's own.
             label: (
-                model_by_name(name)(plant.joints), plant, parts[part],
+                as_model(name, plant.joints, parts[part].motions), plant, parts[part],
                 results[part].found.get(origin[name] or ""), fit_settings,
             )
             for label, (part, name) in labels.items()

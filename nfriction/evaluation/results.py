@@ -21,7 +21,7 @@ from nfriction.evaluation.cross_validation import Selection
 from nfriction.evaluation.score import Score
 from nfriction.export import ExportError, torchscript
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.io.files import write_atomically
+from nfriction.io.files import checked_json, write_atomically
 from nfriction.io.model_file import ModelInfo, parameter_hash, save
 from nfriction.recording import Recording
 
@@ -145,7 +145,7 @@ def write_results(
     unfinished = folder / UNFINISHED
 
     def write_index(place: Path, files: Sequence[str]) -> None:
-        text = json.dumps(results | {"files": sorted(files)}, indent=1, allow_nan=False)
+        text = json.dumps(checked_json(results | {"files": sorted(files)}), indent=1)
         write_atomically(place / RESULTS, text.encode())
 
     with exclusive(folder):

@@ -17,6 +17,19 @@ ZERO = 1.001e-12
 _WIDEST = 8  # coefficients side by side
 
 
+def four_digits(value: Value) -> str:
+    """A number to four digits, "n/a" for NaN; text stays."""
+    if isinstance(value, str):
+        return value
+    if abs(value) <= ZERO:
+        return "0"
+    if math.isnan(value):
+        return "n/a"
+    if math.isinf(value):
+        return "unknown"
+    return f"{value:.0f}" if 1e3 <= abs(value) < 1e7 else f"{value:.4g}"
+
+
 @dataclass(frozen=True)
 class Table:
     """A caption, column headings, and rows whose first value names the row.
@@ -38,16 +51,9 @@ class Table:
     limit: tuple[Value, ...] = ()
 
     def text(self, value: Value) -> str:
-        """A value to four digits; "n/a" for NaN."""
-        if isinstance(value, str):
-            return value
-        if abs(value) <= ZERO:
-            return "0"
-        if math.isnan(value):
-            return "n/a"
-        if math.isinf(value):
-            return self.infinite
-        return f"{value:.0f}" if 1e3 <= abs(value) < 1e7 else f"{value:.4g}"
+        """A value as `four_digits` has it, infinite ones by the table's word."""
+        infinite = isinstance(value, float) and math.isinf(value)
+        return self.infinite if infinite else four_digits(value)
 
     def is_numeric(self, column: int) -> bool:
         """True where every value of a column is a number."""

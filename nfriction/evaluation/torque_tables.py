@@ -45,7 +45,7 @@ Array = NDArray[np.float64]
 FOLDS = 10
 # Laws that are fitted by default: to any table, and to those with columns time, load or both.
 LAWS = ("viscous", "coulomb", "coulomb-viscous", "arctan", "stribeck")
-WITH_TIME = ("slip",)
+WITH_TIME = ("slip", "neuro-fuzzy:slip")
 WITH_LOAD = ("load-coulomb",)
 WITH_BOTH = ("load-slip",)
 
@@ -318,7 +318,10 @@ def fit_torque(
             errors[joint].append(candidate)
     if not fits:
         raise ValueError(" ".join(failed.values()))
-    choices = {joint: _choose(of) for joint, of in errors.items()}
+    choices = {}
+    for k, (joint, of) in enumerate(errors.items()):
+        name, why = _choose(of)
+        choices[joint] = name, f"{why}{fits[name][k].note}"
     return TorqueFits(given, fits, {j: tuple(of) for j, of in errors.items()}, choices, failed)
 
 
@@ -361,7 +364,7 @@ def _fit(
     folds = min(folds, len(joint))
     if model.law.memory is not None:
         fit, left_out = fit_memory(name, joint, blocks(joint, folds), v_smooth)
-        return fit, Candidate(name, left_out, len(fit.intervals), True)
+        return fit, Candidate(name, left_out, len(fit.intervals) + fit.rules, True)
     if form not in ("constant", "neurofuzzy"):
         raise ValueError(
             f"{plain_name(name)} is not fitted to tables, which have no acceleration classes; use "

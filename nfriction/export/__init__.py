@@ -1,6 +1,6 @@
 """Artefacts for controllers, each proven equal to the model that was scored."""
 
-from nfriction.export.c_code.export import c
+from nfriction.export.c_file import c
 from nfriction.export.contract import (
     Contract,
     ContractError,
@@ -11,9 +11,8 @@ from nfriction.export.contract import (
 )
 from nfriction.export.controller import controller_of
 from nfriction.export.onnx_file import onnx
-from nfriction.export.pt2_file import pt2
 from nfriction.export.simulators import DampingFit, fit_damping_frictionloss, mjcf, urdf
-from nfriction.export.torchscript_file import torchscript
+from nfriction.export.torch_files import pt2, torchscript
 from nfriction.export.verification import Verdict, verify_artefact
 
 __all__ = [

@@ -15,11 +15,117 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.export.controller import NOT_FINITE, OUTSIDE, SATURATED, Controller
-from nfriction.export.test_vectors import draw_motion, trials
+from nfriction.export.controller import NOT_FINITE, OUTSIDE, SATURATED, UNBOUNDED, Controller
 from nfriction.friction.models import FrictionModel
 from nfriction.io.files import atomic_write, numbers, parse_json
 from nfriction.io.model_file import ModelInfo, describe
+
+Series = tuple[Tensor, ...]
+
+# How far beyond the trained range targets are compared.
+BEYOND = 0.1
+# Range of a joint for which nobody gave one.
+DEFAULT_RANGE = {"qd": 20.0, "qdd": 200.0}
+LARGEST_LOAD = 3.0
+
+
+def ranges(controller: Controller) -> dict[str, Tensor]:
+    """Lowest and highest velocity and acceleration of every joint, (joint, 2)."""
+    found = {}
+    for name, default in DEFAULT_RANGE.items():
+        edges = torch.stack(
+            [controller.get_buffer(f"{name}_lower"), controller.get_buffer(f"{name}_upper")], -1
+        )
+        spread = torch.tensor([-default, default], dtype=edges.dtype)
+        found[name] = torch.where(edges.abs() < UNBOUNDED, edges, spread)
+    return found
+
+
+def draw(controller: Controller, count: int, seed: int = 0) -> Series:
+    """Finite inputs to 10 % beyond the trained range, (sample, joint) each.
+
+    Motions are drawn by `draw_motion`; positions are those of a swing, in successive samples.
+    """
+    qd, qdd, load = draw_motion(controller, count, seed)
+    return (_sweep(controller, count), load) if controller.filters else (qd, qdd, load)
+
+
+def draw_motion(controller: Controller, count: int, seed: int = 0) -> Series:
+    """Velocity, acceleration and load, evenly drawn; a third of the velocities near rest."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def even(low: Tensor, high: Tensor) -> Tensor:
+        shape = (count, controller.joints)
+        return low + (high - low) * torch.rand(shape, dtype=torch.float64, generator=generator)
+
+    zero = torch.zeros(controller.joints, dtype=torch.float64)
+    load = even(zero, zero + LARGEST_LOAD)
+    qd, qdd = (even(*_widened(edges)) for edges in ranges(controller).values())
+    # Near rest the sign turns and the acceleration along the motion with it.
+    qd[::3] *= 10.0 ** even(zero - 5.0, zero)[::3]
+    return qd, qdd, load
+
+
+def trials(controller: Controller) -> Series:
+    """The inputs of the test vectors: drawn ones, then edges, rest, and broken inputs.
+
+    Broken inputs come last, one joint and one input at a time, with a sound sample after each.
+    """
+    drawn = draw(controller, 200, seed=6)
+    if not controller.filters:
+        special = _special(controller)
+        drawn = tuple(torch.cat(pair) for pair in zip(drawn, special, strict=True))
+    return _with_broken(drawn, controller.joints)
+
+
+def _widened(edges: Tensor) -> tuple[Tensor, Tensor]:
+    """Range of every joint with a tenth of it more on either side."""
+    low, high = edges.unbind(-1)
+    more = BEYOND * (high - low)
+    return low - more, high + more
+
+
+def _sweep(controller: Controller, count: int) -> Tensor:
+    """Positions of a swing whose velocity grows slowly, to beyond its range."""
+    assert controller.filter_options is not None
+    cutoff_hz, sample_time = (controller.filter_options[k] for k in ("cutoff_hz", "sample_time"))
+    _, fastest = _widened(ranges(controller)["qd"])
+    time = sample_time * torch.arange(count, dtype=torch.float64)[:, None]
+    # Below the cut-off, so that it gets through, and in two swings or more to the longest count.
+    rate = math.tau * min(0.2 * cutoff_hz, 8.0 / (count * sample_time))
+    phase = torch.arange(controller.joints, dtype=torch.float64)
+    growth = torch.linspace(0.0, 1.0, count, dtype=torch.float64)[:, None]
+    return 1.2 * growth * fastest.abs() / rate * torch.sin(rate * time + phase)
+
+
+def _special(controller: Controller) -> Series:
+    """Every pair of edges of the range, rest, and creeping."""
+    found = ranges(controller)
+    levels = {}
+    for name, edges in found.items():
+        low, high = edges.unbind(-1)
+        zero = torch.zeros_like(low)
+        tiny = 1e-4 * high.abs()
+        levels[name] = torch.stack([low, high, zero, -zero, tiny, -tiny])
+    qd = levels["qd"].repeat_interleave(len(levels["qdd"]), 0)
+    qdd = levels["qdd"].repeat(len(levels["qd"]), 1)
+    load = torch.ones_like(qd)
+    load[::2] = 0.0
+    return qd, qdd, load
+
+
+def _with_broken(inputs: Series, joints: int) -> Series:
+    """The inputs, followed by every kind of broken one, each among sound ones."""
+    kinds = (math.nan, math.inf, -math.inf)
+    rounds = 2 * max(joints, 2) * len(kinds) * len(inputs)
+    rows = torch.arange(rounds) % len(inputs[0])
+    tails = [x[rows].clone() for x in inputs]
+    for row in range(0, rounds, 2):
+        turn = row // 2
+        which = turn % len(inputs)
+        joint = turn // (len(inputs) * len(kinds)) % joints
+        tails[which][row, joint] = kinds[turn // len(inputs) % len(kinds)]
+    return tuple(torch.cat(pair) for pair in zip(inputs, tails, strict=True))
 
 
 class ExportError(RuntimeError):
@@ -151,11 +257,15 @@ class Contract:
                 {str(name): _tensor(name, x) for name, x in side.items()}
                 for side in (vectors["inputs"], vectors["outputs"], content.pop("scales"))
             )
+            if not _fit_each_other(inputs, outputs, scales) or not 0 < tolerance < 1:
+                raise ValueError("they do not fit each other")
         except (KeyError, TypeError, AttributeError, ValueError, RuntimeError) as error:
             reason = first_line(error)
             raise ContractError(f"the test vectors are missing or damaged ({reason}).") from error
-        _check_vectors(inputs, outputs, scales, tolerance)
-        _check_interface(content, list(inputs))
+        size, dtype = content.get("state_size"), content.get("dtype")
+        sound = type(size) is int and 0 <= size <= MOST_STATES  # true is no size
+        if not sound or str(dtype) not in TOLERANCE or content.get("inputs") != list(inputs):
+            raise ContractError("the metadata lack inputs, type or size of the state.")
         outputs["status"] = outputs["status"].to(torch.int32)
         return cls(content, inputs, outputs, scales, tolerance)
 
@@ -216,15 +326,11 @@ def contract_of(
 
 
 def _scales(controller: Controller, outputs: Sequence[Tensor]) -> dict[str, Tensor]:
-    """Full scales of torque and coefficients; see `Contract`.
-
-    A coefficient that training has driven to zero is a small difference of numbers that are not
-    small, and a steep network passes the roundings of its inputs on. No artefact can then be exact
-    to the last digits of the value. How much is lost shows in the model itself: scales are such
-    that a target in single precision may err twice as much as torch does in single precision over
-    20,000 samples. Roundings of double precision are smaller by a constant factor, so the same
-    scale holds for them.
-    """
+    """Full scales of torque and coefficients; see `Contract`."""
+    # A coefficient that training has driven to zero is a small difference of large numbers, and a
+    # steep network passes on the roundings of its inputs; no artefact can be exact to the last
+    # digits then. So a target in single precision may err twice as much as torch does over 20,000
+    # samples; in double precision roundings are smaller by a constant factor.
     scales = {
         name: values.abs().nan_to_num(0.0).flatten(0, -2).amax(0)
         for name, values in zip(OUTPUTS[:2], outputs, strict=False)
@@ -251,11 +357,8 @@ def _scales(controller: Controller, outputs: Sequence[Tensor]) -> dict[str, Tens
 def verify(run: Runner, contract: Contract) -> Parity:
     """Run an artefact over the contract's test vectors.
 
-    Args:
-        run: takes the inputs in their order, each a float64 tensor (vector, joint), and gives
-            torque, coefficients and status for all of them; a target with a state goes through
-            them in order, from its initial state at the first.
-        contract: of the artefact.
+    `run` takes the inputs in their order, each a float64 tensor (vector, joint), and gives torque,
+    coefficients and status of all, in order from the initial state where there is one.
     """
     found = run(*contract.inputs.values())
     return compare(tuple(contract.outputs.values()), found, contract.tolerance, contract.scales)
@@ -269,14 +372,7 @@ def compare(
 ) -> Parity:
     """Compare torque, coefficients and status with those of the model.
 
-    Args:
-        expected, found: torque (sample, joint), coefficients (sample, joint, coefficient) and
-            status (sample, joint).
-        tolerance: see `Parity`.
-        scales: least full scales, see `Contract`; none where not given.
-
-    Raises:
-        ContractError: if the shapes differ.
+    `scales` are least full scales, see `Contract`; a ContractError is raised if shapes differ.
     """
     model, artefact = ([_array(x) for x in side] for side in (expected, found))
     shapes = [[x.shape for x in side] for side in (model, artefact)]
@@ -311,12 +407,7 @@ def _array(x: Any) -> np.ndarray:
 def write_verified(
     path: str | Path, content: bytes, opener: Callable[[Path], tuple[Contract, Runner]], kind: str
 ) -> Path:
-    """Write an artefact, read it again and compare it with its model before it takes its place.
-
-    Raises:
-        ExportError: if the artefact differs from the model.
-        OSError: if it cannot be written.
-    """
+    """Write an artefact, read it again and compare it with its model before it takes its place."""
     with atomic_write(path) as temporary:
         temporary.write_bytes(content)
         contract, run = opener(temporary)
@@ -342,32 +433,21 @@ def _tensor(name: str, given: Any) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-def _check_interface(content: Mapping[str, Any], names: list[str]) -> None:
-    """Raise `ContractError` where what a host relies on is not there."""
-    size, dtype = content.get("state_size"), content.get("dtype")
-    sound = type(size) is int and 0 <= size <= MOST_STATES  # true is no size
-    if not sound or str(dtype) not in TOLERANCE or content.get("inputs") != names:
-        raise ContractError("the metadata lack inputs, type or size of the state, or are wrong.")
-
-
-def _check_vectors(
-    inputs: Mapping[str, Tensor],
-    outputs: Mapping[str, Tensor],
-    scales: Mapping[str, Tensor],
-    tolerance: float,
-) -> None:
-    """Raise `ContractError` where test vectors do not fit each other."""
-    shapes = {tuple(x.shape) for x in inputs.values()}
-    sound = len(shapes) == 1 and tuple(outputs) == OUTPUTS
-    sound = sound and isinstance(tolerance, float) and 0 < tolerance < 1
-    if sound:
-        shape = shapes.pop()
-        given = [tuple(x.shape) for x in outputs.values()]
-        sound = len(shape) == 2 and given[0] == given[2] == given[1][:2] == shape
-        sound = sound and len(given[1]) == 3 and min(*shape, given[1][2]) > 0
-        sound = sound and bool(((outputs["status"] >= 0) & (outputs["status"] < 8)).all())
-        sizes = {"tau_f": shape[1:], "coefficients": given[1][2:]}
-        sound = sound and {name: tuple(x.shape) for name, x in scales.items()} == sizes
-        sound = sound and all(bool((x >= 0).all() and x.isfinite().all()) for x in scales.values())
-    if not sound:
-        raise ContractError("the test vectors do not fit each other.")
+def _fit_each_other(
+    inputs: Mapping[str, Tensor], outputs: Mapping[str, Tensor], scales: Mapping[str, Tensor]
+) -> bool:
+    """True for test vectors and scales of the shapes and values of a controller."""
+    shapes = {x.shape for x in inputs.values()}
+    if len(shapes) != 1 or tuple(outputs) != OUTPUTS:
+        return False
+    shape = shapes.pop()
+    tau_f, coefficients, status = outputs.values()
+    return (
+        tau_f.shape == status.shape == coefficients.shape[:2] == shape
+        and (len(shape), coefficients.ndim) == (2, 3)
+        and coefficients.numel() > 0
+        and {n: x.shape for n, x in scales.items()}
+        == {"tau_f": shape[1:], "coefficients": coefficients.shape[2:]}
+        and bool(((status >= 0) & (status < 8)).all())
+        and all(bool((x >= 0).all() and x.isfinite().all()) for x in scales.values())
+    )

@@ -25,8 +25,8 @@ from nfriction.export.contract import (
     write_verified,
 )
 from nfriction.export.controller import controller_of, for_single_precision
-from nfriction.export.pt2_file import exported, run_from_nan, silent
 from nfriction.export.torch_archive import METADATA
+from nfriction.export.torch_files import exported, run_from_nan, silent
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import ModelInfo
 
@@ -48,19 +48,12 @@ class Unknown(int):
 
 
 class OnnxGraph:
-    """Nodes and constants of a program.
+    """Nodes, and constants by name, of a decomposed program with a dynamic first axis.
 
     Args:
-        program: of `torch.export`, decomposed, with a dynamic first axis.
+        program: of `torch.export`.
         inputs, outputs: names in the ONNX graph, in the program's order.
         real: type of its floating-point tensors, `np.float64` or `np.float32`.
-
-    Attributes:
-        nodes: ONNX nodes, in order.
-        constants: arrays that they read, by name.
-
-    Raises:
-        ExportError: an operation has no translation; it is named.
     """
 
     def __init__(
@@ -162,10 +155,6 @@ def _integers(*numbers: int) -> Tensor:
     return torch.tensor(numbers, dtype=torch.int64)
 
 
-def _not_equal(g: OnnxGraph, a: Any, b: Any) -> Value:
-    return g.emit("Not", g.emit("Equal", a, b, dtype=torch.bool))
-
-
 def _clamp(g: OnnxGraph, a: Any, low: Any = None, high: Any = None) -> Value:
     raised = a if low is None else g.emit("Max", a, low)
     return raised if high is None else g.emit("Min", raised, high)
@@ -188,15 +177,6 @@ def _onnx_type(g: OnnxGraph, dtype: torch.dtype) -> int:
     return int(g.helper.np_dtype_to_tensor_dtype(kind))
 
 
-def _full_like(g: OnnxGraph, a: Value, value: float, **_: Any) -> Value:
-    shape = g.emit("Shape", a, dtype=torch.int64)
-    return g.emit("Expand", torch.tensor(value, dtype=a.dtype), shape)
-
-
-def _select(g: OnnxGraph, a: Any, dim: int, index: int) -> Value:
-    return g.emit("Gather", a, torch.tensor(index), axis=dim)
-
-
 def _slice(
     g: OnnxGraph, a: Any, dim: int = 0, start: Any = None, end: Any = None, step: int = 1
 ) -> Value:
@@ -204,22 +184,10 @@ def _slice(
     return g.emit("Slice", a, *(_integers(n) for n in (*ends, dim, step)))
 
 
-def _cat(g: OnnxGraph, parts: Sequence[Any], dim: int = 0) -> Value:
-    return g.emit("Concat", *parts, axis=dim)
-
-
 def _view(g: OnnxGraph, a: Any, size: Sequence[int]) -> Value:
     if sum(n == -1 for n in size) > 1:
         raise ExportError("a view with two sizes that are known at run time has no ONNX form here.")
     return g.emit("Reshape", a, _integers(*size))
-
-
-def _softmax(g: OnnxGraph, a: Any, dim: int, _half_to_float: bool = False) -> Value:
-    return g.emit("Softmax", a, axis=dim)
-
-
-def _sum(g: OnnxGraph, a: Any, dim: Sequence[int], keepdim: bool = False, **_: Any) -> Value:
-    return g.emit("ReduceSum", a, _integers(*dim), keepdims=int(keepdim))
 
 
 def _atan(g: OnnxGraph, x: Value) -> Value:
@@ -258,22 +226,26 @@ _RULES: dict[str, Rule] = {
     },
     "add": _scaled("Add"),
     "sub": _scaled("Sub"),
-    "ne": _not_equal,
+    "ne": lambda g, a, b: g.emit("Not", g.emit("Equal", a, b, dtype=torch.bool)),
     "clamp": _clamp,
     "where": _where,
     "_to_copy": _cast,
     "clone": lambda g, a, **_: a,
     "alias": lambda g, a: a,
-    "full_like": _full_like,
-    "select": _select,
+    "full_like": lambda g, a, value, **_: g.emit(
+        "Expand", torch.tensor(value, dtype=a.dtype), g.emit("Shape", a, dtype=torch.int64)
+    ),
+    "select": lambda g, a, dim, index: g.emit("Gather", a, torch.tensor(index), axis=dim),
     "slice": _slice,
     "squeeze": lambda g, a, dim: g.emit("Squeeze", a, _integers(*dim)),
     "unsqueeze": lambda g, a, dim: g.emit("Unsqueeze", a, _integers(dim)),
-    "cat": _cat,
+    "cat": lambda g, parts, dim=0: g.emit("Concat", *parts, axis=dim),
     "view": _view,
     "permute": lambda g, a, dims: g.emit("Transpose", a, perm=list(dims)),
-    "_softmax": _softmax,
-    "sum": _sum,
+    "_softmax": lambda g, a, dim, *_: g.emit("Softmax", a, axis=dim),
+    "sum": lambda g, a, dim, keepdim=False, **_: g.emit(
+        "ReduceSum", a, _integers(*dim), keepdims=int(keepdim)
+    ),
     "atan": _atan,
     "sym_size": lambda g, a, dim: Unknown(-1),
     "_assert_tensor_metadata": lambda g, *_, **__: None,
@@ -336,13 +308,7 @@ def onnx(
 
 
 def open_onnx(path: str | Path) -> tuple[Contract, Runner]:
-    """Load an artefact; returns its contract, and how to run it.
-
-    Raises:
-        ImportError: if the package `onnx` is missing.
-        ExportError: if it is no ONNX graph, or not one with these inputs.
-        ContractError: if its metadata are absent or damaged.
-    """
+    """Load an artefact; returns its contract, and how to run it."""
     package = _package()
     file, contract = read_onnx(path)
     try:
@@ -361,10 +327,7 @@ def open_onnx(path: str | Path) -> tuple[Contract, Runner]:
 
 
 def read_onnx(path: str | Path) -> tuple[Any, Contract]:
-    """Read a file as a protocol buffer, and its contract.
-
-    Raises: as `open_onnx`.
-    """
+    """Read a file as a protocol buffer, and its contract."""
     package = _package()
     if Path(path).stat().st_size > LARGEST_FILE:
         raise ExportError(f"{path}: too large for a graph of nfriction.")

@@ -1,7 +1,8 @@
 """MJCF and URDF: the nearest damping and friction loss of a simulator's joints, and the error.
 
 Simulators know `damping * qd + frictionloss * sgn(qd)`. Of all such pairs the one that comes
-closest along a real motion is written, beside the residual torque error.
+closest along a real motion is written, beside the residual torque error. MuJoCo also has LuGre's
+friction, as a part of its motors, so that LuGre and Dahl are written as they are.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nfriction.friction.memory import DAHL, LUGRE
 from nfriction.friction.models import FrictionModel
 from nfriction.io.files import write_atomically
 from nfriction.io.model_file import ModelInfo
@@ -34,6 +36,8 @@ class DampingFit:
         rms_torque: of the model along the motion [N m], (joint,).
         rms_error: of the torque by these two numbers [N m], (joint,).
         unit: of a joint's position, "rad" or "m".
+        lugre: stiffness, damping, Coulomb and static friction of bristles and Stribeck's velocity,
+            in MuJoCo's order, (joint, 5); empty where damping and friction loss are all.
     """
 
     joint_names: tuple[str, ...]
@@ -42,6 +46,7 @@ class DampingFit:
     rms_torque: tuple[float, ...]
     rms_error: tuple[float, ...]
     unit: str = "rad"
+    lugre: tuple[tuple[float, ...], ...] = ()
 
     @property
     def relative_error(self) -> tuple[float, ...]:
@@ -51,6 +56,13 @@ class DampingFit:
 
     def __str__(self) -> str:
         torque = "N m" if self.unit == "rad" else "N"
+        if self.lugre:
+            bristles = zip(self.joint_names, self.damping, self.lugre, strict=True)
+            return "\n".join(
+                f"{name}: damping {d:.6g} {torque} s/{self.unit}, LuGre friction "
+                f"{' '.join(f'{x:.6g}' for x in own)}, exact"
+                for name, d, own in bristles
+            )
         rows = zip(
             self.joint_names, self.damping, self.frictionloss, self.rms_error,
             self.relative_error, strict=True,
@@ -111,13 +123,16 @@ def mjcf(
 ) -> DampingFit:
     """Write a model as `damping` and `frictionloss` of MuJoCo's joints.
 
+    Constant LuGre and Dahl friction becomes damping, and a motor without input on each joint, whose
+    `lugre` is the friction (MuJoCo 4.0).
+
     Args:
         model: a friction model.
         path: XML file to write; missing folders are made.
         motions, load: see `fit_damping_frictionloss`.
         info: names of the joints, by which they are found in `patch`.
         patch: an MJCF file whose joints are given the numbers; default a file of default classes,
-            one a joint, to be included and named as the joints' `class`.
+            one a joint, to be included and named as the joints' `class`; a motor names its joint.
 
     Returns:
         The numbers and their errors.
@@ -127,7 +142,8 @@ def mjcf(
             that name.
         OSError: if a file cannot be read or written.
     """
-    found = fit_damping_frictionloss(model, motions, load=load, info=info)
+    found = _bristles(model, info or ModelInfo())
+    found = found or fit_damping_frictionloss(model, motions, load=load, info=info)
     return _written(found, path, "mujoco", patch)
 
 
@@ -149,13 +165,40 @@ def urdf(
     return _written(found, path, "robot", patch)
 
 
+def _bristles(model: FrictionModel, info: ModelInfo) -> DampingFit | None:
+    """Parameters of a law that MuJoCo has itself; Dahl's is LuGre's without rise and damping."""
+    if model.law not in (DAHL, LUGRE) or model.schedule.follows_motion:
+        return None
+    values = model.schedule.rest_coefficients().detach().tolist()
+    rows = [{"F_d": 0.0, "v_s": 1.0, "sigma_1": 0.0, **dict(zip(model.law.names, of, strict=True))}
+            for of in values]  # fmt: skip
+    zero = (0.0,) * model.joints
+    return DampingFit(
+        joint_names(model, info),
+        tuple(row.get("sigma_2", row.get("F_v", 0.0)) for row in rows),
+        zero, zero, zero, info.unit,
+        tuple((row["sigma_0"], row["sigma_1"], row["F_c"], row["F_c"] + row["F_d"], row["v_s"])
+              for row in rows),
+    )  # fmt: skip
+
+
+def _motors(found: DampingFit) -> list[dict[str, str]]:
+    """Attributes of MuJoCo's motors, one a joint, that do nothing but rub."""
+    return [
+        {"joint": name, "input": "none", "motorconst": "0", "resistance": "1",
+         "lugre": " ".join(f"{x:.15g}" for x in own)}
+        for name, own in zip(found.joint_names, found.lugre, strict=False)
+    ]  # fmt: skip
+
+
 def _written(
     found: DampingFit, path: str | Path, root: str, patch: str | Path | None
 ) -> DampingFit:
     """Write the numbers as a file of their own, or into a robot of that root element."""
     numbers = found.joint_names, found.damping, found.frictionloss
+    motors = _motors(found)
     if patch is not None:
-        write_atomically(path, patched(patch, root, *numbers))
+        write_atomically(path, patched(patch, root, *numbers, motors))
         return found
     # An XML comment must not hold two hyphens.
     note = "\n".join(f"       {x}" for x in str(found).replace("--", "- -").splitlines())
@@ -164,7 +207,11 @@ def _written(
         row.format(name=quoteattr(name), damping=d, friction=f)
         for name, d, f in zip(*numbers, strict=True)
     )
-    write_atomically(path, whole.format(note=note, rows=rows).encode())
+    actuators = ElementTree.Element("actuator")
+    for motor in motors:
+        ElementTree.SubElement(actuators, "dcmotor", motor)
+    text = f"{ElementTree.tostring(actuators, encoding='unicode')}\n" if motors else ""
+    write_atomically(path, whole.format(note=note, rows=rows, motors=text).encode())
     return found
 
 
@@ -173,13 +220,13 @@ def _written(
 _NOTE = "  <!-- The nearest to the model along a recorded motion:\n{note}\n  -->\n"
 _SNIPPETS = {
     "mujoco": (
-        f"<mujoco>\n{_NOTE}  <default>\n{{rows}}\n  </default>\n</mujoco>\n",
+        f"<mujoco>\n{_NOTE}  <default>\n{{rows}}\n  </default>\n{{motors}}</mujoco>\n",
         "    <default class={name}>\n"
         '      <joint damping="{damping!r}" frictionloss="{friction!r}"/>\n'
         "    </default>",
     ),
     "robot": (
-        f'<robot name="friction">\n{_NOTE}{{rows}}\n</robot>\n',
+        f'<robot name="friction">\n{_NOTE}{{rows}}\n{{motors}}</robot>\n',
         "  <joint name={name}>\n"
         '    <dynamics damping="{damping!r}" friction="{friction!r}"/>\n'
         "  </joint>",
@@ -228,14 +275,9 @@ def patched(
     names: Sequence[str],
     damping: Sequence[float],
     frictionloss: Sequence[float],
+    motors: Sequence[dict[str, str]] = (),
 ) -> bytes:
-    """A robot description with that root element, and the friction of the named joints replaced.
-
-    Raises:
-        ValueError: if the file is of another kind, declares entities, or a joint is missing or
-            there twice.
-        OSError: if it cannot be read.
-    """
+    """A robot description with that root element, and the friction of the named joints replaced."""
     try:
         tree = parse_xml(Path(path), comments=True)
     except ValueError as error:
@@ -259,5 +301,10 @@ def patched(
             target = ElementTree.SubElement(target, "dynamics") if dynamics is None else dynamics
         target.set("damping", repr(d))
         target.set("frictionloss" if root == "mujoco" else "friction", repr(f))
+    if motors:
+        actuators = tree.find("actuator")
+        actuators = ElementTree.SubElement(tree, "actuator") if actuators is None else actuators
+        for motor in motors:
+            ElementTree.SubElement(actuators, "dcmotor", motor)
     text = ElementTree.tostring(tree, encoding="unicode")
     return f'<?xml version="1.0" encoding="utf-8"?>\n{text}\n'.encode()

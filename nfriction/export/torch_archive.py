@@ -26,12 +26,7 @@ _DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, Runti
 
 
 def contents(path: str | Path, ours: re.Pattern[str], what: str) -> dict[str, bytes]:
-    """All files of an archive by their name inside its one folder.
-
-    Raises:
-        ExportError: it is damaged, too large, or holds names other than `ours`.
-        OSError: it cannot be read.
-    """
+    """All files of an archive by their name inside its one folder."""
     found: dict[str, bytes] = {}
     known: set[str] = set()
     if Path(path).stat().st_size > LARGEST:
@@ -66,27 +61,22 @@ def repacked(files: Mapping[str, bytes]) -> io.BytesIO:
 
 
 def contract_of_archive(path: str | Path) -> Contract:
-    """Read the contract of an artefact of torch.
-
-    Raises:
-        ExportError: it is no archive, or too large.
-        ContractError: its metadata are absent or damaged.
-        OSError: it cannot be read.
-    """
+    """Read the contract of an artefact of torch."""
     found = contents(path, re.compile(r"(?s).*"), "artefact")
     return Contract.from_json(found.get(f"extra/{METADATA}", b""))
 
 
 # ATen operations on tensors besides those that can be compiled, without the "_" of in-place forms.
 _MORE = """
-    __and__ __or__ __xor__ _assert_tensor_metadata _log_softmax acosh addcdiv all any arange argmax
-    argmin asinh atanh broadcast_to bucketize concat copysign cummax cummin cumprod deg2rad diff
-    einsum elu empty erf erfc exp2 expand_as eye flatten floor_divide fmax fmin frac full gelu
-    hardtanh heaviside isfinite isinf leaky_relu lerp linalg_norm linear linspace log10 log2
-    log_sigmoid log_softmax logaddexp logit matmul moveaxis movedim nan_to_num narrow norm ones
-    outer positive rad2deg reshape_as round scalar_tensor searchsorted silu sinc size softmax square
-    std swapaxes sym_size take tile to tril triu true_divide type_as unflatten unfold var vdot
-    view_as xlogy zeros
+    __and__ __or__ __xor__ _assert_tensor_metadata _log_softmax acosh addcdiv addcmul all any
+    arange argmax argmin asinh atanh broadcast_to bucketize clamp_max concat copysign cummax
+    cummin cumprod deg2rad diff einsum elu empty erf erfc exp2 expand_as eye flatten
+    floor_divide fmax fmin frac full gelu hardtanh heaviside index_select isfinite isinf
+    leaky_relu lerp linalg_norm linalg_vector_norm linear linspace log10 log2 log_sigmoid
+    log_softmax logaddexp logit logsumexp masked_fill matmul moveaxis movedim nan_to_num narrow
+    norm ones outer positive rad2deg reshape_as roll round rsub scalar_tensor searchsorted silu
+    sinc size softmax split square std swapaxes sym_size take tile to tril triu true_divide
+    type_as unflatten unfold var vdot view_as xlogy zeros
 """
 # One of those that can be compiled sees memory beyond its tensor, unchecked.
 _TENSORS = {*supported_operations(), *_MORE.split()} - {"_reshape_alias"}
@@ -134,11 +124,7 @@ _DETOUR = re.compile(rb"__setstate__|\bgetattr\b|\bops\b(?!\.(?:aten|prim)\.)")
 
 
 def check_program(document: Any) -> None:
-    """Refuse the graph of a `.pt2`, as parsed from JSON, that is more than arithmetic of tensors.
-
-    Raises:
-        ExportError: names what it holds.
-    """
+    """Refuse the graph of a `.pt2`, parsed from JSON, that is more than arithmetic of tensors."""
     for key, value in _strings("", document):
         sound = _STRINGS.get(key, _WORDS).fullmatch(value) is not None
         if key == "target":
@@ -150,11 +136,7 @@ def check_program(document: Any) -> None:
 
 
 def check_source(name: str, content: bytes) -> None:
-    """Refuse a file in a TorchScript that does more than arithmetic of tensors as it is loaded.
-
-    Raises:
-        ExportError: names what it holds.
-    """
+    """Refuse a file in a TorchScript that does more than arithmetic of tensors as it is loaded."""
     # torch evaluates defaults of arguments and constants of classes then, before a graph is there,
     # and lets objects of its own classes restore themselves.
     found: set[bytes] = set()
@@ -175,11 +157,7 @@ def _foreign_words() -> frozenset[bytes]:
 
 
 def check_script(graph: Any) -> None:
-    """Refuse a graph of TorchScript, its calls inlined, that is more than arithmetic of tensors.
-
-    Raises:
-        ExportError: names what it holds.
-    """
+    """Refuse a graph of TorchScript, its calls inlined, that is more than arithmetic of tensors."""
     for node in _nodes(graph):
         if not _is_allowed(node.kind()):
             raise _foreign(node.kind())

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.export.c_code.export import open_c
+from nfriction.export.c_file import open_c
 from nfriction.export.contract import (
     Contract,
     ContractError,
@@ -18,13 +18,12 @@ from nfriction.export.contract import (
     Parity,
     compare,
     contract_of,
+    draw,
 )
 from nfriction.export.controller import Controller, controller_of
 from nfriction.export.onnx_file import open_onnx, read_onnx
-from nfriction.export.pt2_file import open_pt2
-from nfriction.export.test_vectors import draw
 from nfriction.export.torch_archive import contract_of_archive
-from nfriction.export.torchscript_file import open_torchscript
+from nfriction.export.torch_files import open_pt2, open_torchscript
 from nfriction.friction.models import FrictionModel
 from nfriction.io import sandbox
 from nfriction.io.model_file import ModelInfo
@@ -182,11 +181,7 @@ def main() -> None:
 
 
 def work(asked: Mapping[str, Any], folder: Path) -> None:
-    """Run batches of inputs in the folder through the artefact at `path`, and write what comes out.
-
-    Raises:
-        ExportError, ContractError: as the openers do, or if its outputs are none of a controller.
-    """
+    """Run batches of inputs in the folder through an artefact, and write what comes out."""
     path = Path(asked["path"])
     _, run = ISOLATED[path.suffix](path)
     found: dict[str, Any] = {}

@@ -1,9 +1,10 @@
-"""Fits of Dahl, LuGre and elasto-plastic friction to tables of friction torque.
+"""Fits of Dahl, LuGre, elasto-plastic and gear friction to tables of friction torque.
 
 With all forces scaled by one factor the deflections of a bristle stay the same, so they follow from
-the stiffness and the Stribeck excess over the Coulomb friction, and the Stribeck velocity, alone.
-For values of these three on a grid, all simulated at once, the torque is linear in the Coulomb
-friction, damping and viscous friction; the grid is then narrowed around the best.
+the stiffness over the Coulomb friction, and from its Stribeck excess and velocity, or the growth of
+a gear's friction with the load, alone. For values of these on a grid, all simulated at once, the
+torque is linear in the Coulomb friction, damping and viscous friction; the grid is then narrowed
+around the best.
 """
 
 import itertools
@@ -27,7 +28,9 @@ Array = NDArray[np.float64]
 PRESLIDING = (1e-5, 1.0)
 # Excess of the friction at rest over Coulomb friction, and its velocity over the largest one.
 EXCESS, STRIBECK = (0.03, 3.0), (1e-3, 0.5)
-POINTS = {"sigma_0": 9, "F_d": 4, "v_s": 5}
+POINTS = {"sigma_0": 9, "F_d": 4, "v_s": 5, "mu_d": 5, "mu_b": 5}
+# Growth of the friction of a gear over that without load, by the largest load.
+GROWTH = (0.03, 30.0)
 NARROWINGS = 3
 # Steps of the search from the grid's best, and the difference of logarithms for derivatives.
 MOST_STEPS, DIFFERENCE = 15, 1e-4
@@ -39,7 +42,8 @@ def fit_bristles(law: Law, joint: JointTorque, blocks: Sequence[NDArray[np.intp]
     """Fit a law of one bristle to the rows of a joint in order of time.
 
     Args:
-        law: with coefficients F_c and sigma_0, and perhaps F_d, v_s, sigma_1, F_v or sigma_2.
+        law: with coefficients F_c and sigma_0, and perhaps F_d, v_s, sigma_1, F_v or sigma_2, mu_d
+            and mu_b.
         joint: with time.
         blocks: rows that are left out in turn; shapes and forces are fitted to the others.
     """
@@ -49,6 +53,8 @@ def fit_bristles(law: Law, joint: JointTorque, blocks: Sequence[NDArray[np.intp]
         "F_d": np.log(EXCESS),
         "v_s": np.log(np.array(STRIBECK) * fastest),
     }
+    growth = np.log(np.array(GROWTH) / max(float(load_of(joint).abs().max()), 1e-12))
+    limits |= {"mu_d": growth, "mu_b": growth}
     shaping = [name for name in POINTS if name in law.names]
     spans = {name: limits[name] for name in shaping}
     bundle: _Bundle | None = None
@@ -150,6 +156,11 @@ class _Bundle:
         )  # fmt: skip
 
 
+def load_of(joint: JointTorque) -> Tensor:
+    """Load of every row, 1 where the table has none, (row,)."""
+    return torch.tensor(np.ones_like(joint.qd) if joint.load is None else joint.load)
+
+
 def unit_torques(
     law: Law, joint: JointTorque, shaping: list[str], shapes: Array
 ) -> tuple[tuple[int, ...], Array]:
@@ -193,10 +204,10 @@ def _states(law: Law, joint: JointTorque, coefficients: Tensor) -> Tensor:
     assert joint.time is not None
     step = torch.tensor(np.diff(joint.time, prepend=joint.time[0] - joint.step))
     moved = torch.tensor(path_of(joint)) / step
-    one = torch.ones(len(moved), 1).double()
+    load = load_of(joint)[:, None]
     start = coefficients.new_zeros((*coefficients.shape[:-1], law.memory.size))
     along = states_along(
-        law.memory, start, moved[:, None], one, coefficients.expand(len(moved), -1, -1, -1), step
+        law.memory, start, moved[:, None], load, coefficients.expand(len(moved), -1, -1, -1), step
     )
     return along.transpose(0, 1)
 

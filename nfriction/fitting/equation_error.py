@@ -16,6 +16,7 @@ from nfriction.fitting.robust_loss import Outliers, RobustLoss, named_outliers
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Law
+from nfriction.friction.memory import load_of
 from nfriction.friction.models import V_SMOOTH, FrictionModel
 from nfriction.optim.least_squares import Quadratic
 from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
@@ -139,14 +140,15 @@ class TorqueBalance:
 
 
 def _balance(
-    plant: Plant, recording: Recording, motion: Motion, options: FitOptions
+    law: Law, plant: Plant, recording: Recording, motion: Motion, options: FitOptions
 ) -> TorqueBalance:
     q, qd, qdd = (torch.as_tensor(x) for x in (motion.q, motion.qd, motion.qdd))
     tau = torch.zeros_like(q) if recording.tau is None else torch.tensor(recording.tau)
     kept = torch.as_tensor(_inside(motion.time, options.edge))[:, None].expand_as(q)
     step = float(np.median(np.diff(motion.time)))
     rate = _smoother_rate(motion)
-    found = TorqueBalance(qd, plant.load(q, qd), tau, kept, rate, step, recording.segments)
+    load = load_of(law, plant, q, qd, tau)
+    found = TorqueBalance(qd, load, tau, kept, rate, step, recording.segments)
     if rate is not None and motion.std is not None:
         # A torque is held until the next sample, so it acts half a sample late.
         held = 0.5 * (tau + torch.cat([tau[:1], tau[:-1]]))
@@ -154,6 +156,14 @@ def _balance(
         # Stiction balances any torque, and noise around zero is no direction.
         kept = kept & (qd.abs() > NORMAL_95 * torch.as_tensor(motion.std.qd))
     return replace(found, torque=tau - plant.inverse_dynamics(q, qd, qdd), kept=kept)
+
+
+def _travelled(q: Tensor) -> Tensor:
+    """Distance of positions (sample, joint) from the last reversal, in ranges of the joint."""
+    row = torch.arange(len(q))[1:-1, None]
+    turned = torch.where(q.diff(dim=0)[1:] * q.diff(dim=0)[:-1] < 0.0, row, 0)
+    last = torch.nn.functional.pad(turned, (0, 0, 1, 1)).cummax(0).values
+    return (q - q.gather(0, last)).abs() / (q.amax(0) - q.amin(0))
 
 
 def _smoother_rate(motion: Motion) -> Tensor | None:
@@ -177,19 +187,21 @@ def fit_equation_error(
     motions: Sequence[Motion],
     v_smooth: float = V_SMOOTH,
     options: FitOptions = DEFAULTS,
+    beyond: float = 0.0,
 ) -> TorqueFit:
     """Least squares of the friction torque, joint by joint.
 
     Linear least squares within bounds where the torque is linear in the coefficients, for every
     combination of the law's initial values of the others, which are then refined. Samples whose
-    direction of motion is uncertain are left out. A robust loss weighs the squares. Recordings and
+    direction of motion is uncertain are left out, and those that have not travelled `beyond` since
+    the last reversal, in ranges of the joint. A robust loss weighs the squares. Recordings and
     motions are in joint coordinates.
 
     Raises:
         ValueError: if there are too few samples, or the law's torque is not finite along the
         motion.
     """
-    parts = [_balance(plant, r, m, options) for r, m in zip(recordings, motions, strict=True)]
+    parts = [_balance(law, plant, r, m, options) for r, m in zip(recordings, motions, strict=True)]
     count = sum(int(_inside(m.time, options.edge).sum()) for m in motions)
     if count <= len(law.coefficients):
         names = ", ".join(r.name or "a recording" for r in recordings)
@@ -198,6 +210,8 @@ def fit_equation_error(
             f"for {len(law.coefficients)} coefficients a joint; record for longer."
         )
     kept = torch.cat([p.kept for p in parts])
+    if beyond:
+        kept = kept & torch.cat([_travelled(torch.as_tensor(m.q)) > beyond for m in motions])
     # A joint that hardly ever moved has to do with what there is.
     inside = torch.cat([torch.as_tensor(_inside(m.time, options.edge)) for m in motions])
     kept = torch.where(kept.sum(0) > len(law.coefficients), kept, inside[:, None])

@@ -54,7 +54,8 @@ def fit(
     20 %. An adaptive model starts at the constant fit, too; `fit_adaptive` has more settings.
 
     Args:
-        model: the model to fit, changed in place; or the name of one, such as "coulomb-viscous".
+        model: the model to fit, changed in place; or its name, such as "coulomb-viscous": its sign
+            turns within 1/1000 of the slowest joint's largest velocity, at most 3 mrad/s or mm/s.
         plant: the mechanism as given, its name, or the path of a rig file.
         recordings: one or several, paths of files, or tables with columns time, q1, …; all in one
             convention, by default the plant's.

@@ -6,7 +6,7 @@ the velocity are added where they lower the error on blocks left out.
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -58,6 +58,7 @@ class MemoryFit:
         design: torque per unit of each fitted coefficient, (row, fitted).
         fitted: places of these among the coefficients.
         presliding: False where no stiffness explains the rows better than a stiff joint does.
+        without: torque by the fit without each block, at all rows, (block, row), where known.
     """
 
     coefficients: Array
@@ -66,6 +67,7 @@ class MemoryFit:
     design: Array
     fitted: tuple[int, ...]
     presliding: bool = True
+    without: Array | None = None
 
 
 def path_of(joint: JointTorque) -> Array:
@@ -126,6 +128,8 @@ def fit_slip(joint: JointTorque, blocks: Sequence[NDArray[np.intp]], *, loaded: 
     # The simplest that is as accurate as the best but for the tolerance.
     chosen = int(np.flatnonzero(scores <= (1 + TOLERANCE) * scores.min())[0])
     choice, errors = choices[chosen], left_out[chosen]
+    table = tables[choice.shape.positive]
+    without = np.stack([table.without(choice, fold) for fold in folds[choice.shape.positive]])
     widths = grids[choice.shape.positive]
     if choice.shape.positive:
         # The merged elements, with the weights that suit them.
@@ -133,9 +137,7 @@ def fit_slip(joint: JointTorque, blocks: Sequence[NDArray[np.intp]], *, loaded: 
         z = deflections(path, widths, _approached(widths, start))
         table = _Dictionary.of(joint, z, loaded, fading)
         choice = table.at(choice)
-    else:
-        table = tables[False]
-    return table.result(choice, widths, errors, start)
+    return replace(table.result(choice, widths, errors, start), without=without)
 
 
 def _approached(widths: Array, path: float) -> Array:
@@ -285,23 +287,26 @@ class _Dictionary:
         return found
 
     def left_out(self, choice: _Choice, folds: "Sequence[_Fold]") -> list[float]:
-        """Root mean square errors on blocks that are left out in turn.
+        """Root mean square errors on blocks that are left out in turn."""
+        pairs = [(self.without(choice, fold, fold.block), self.tau[fold.block]) for fold in folds]
+        return [float(np.sqrt(np.mean((torque - tau) ** 2))) for torque, tau in pairs]
+
+    def without(
+        self, choice: _Choice, fold: "_Fold", rows: NDArray[np.intp] | slice = slice(None)
+    ) -> Array:
+        """Torque at rows by the same terms fitted without a block.
 
         The excess of a rest before is that of the lead-in, as for any other table.
         """
         used = np.array([p for p in choice.places if p >= 0])
         law = used != REST
-        errors = []
-        for block, gram, right in folds:
-            weights = _weights(gram[np.ix_(used, used)], right[used], choice.shape)
-            error = self.whole[np.ix_(block, used[law])] @ weights[law] - self.tau[block]
-            if choice.shape.rested:
-                torque = self.whole[: self.lead][:, used[law]] @ weights[law]
-                left = self.whole[: self.lead, REST]
-                excess = float(left @ (self.tau[: self.lead] - torque) / (left @ left))
-                error = error + excess * self.whole[block, REST]
-            errors.append(float(np.sqrt(np.mean(error**2))))
-        return errors
+        weights = _weights(fold.gram[np.ix_(used, used)], fold.right[used], choice.shape)
+        torque: Array = self.whole[rows][:, used[law]] @ weights[law]
+        if choice.shape.rested:
+            error = self.tau[: self.lead] - self.whole[: self.lead][:, used[law]] @ weights[law]
+            left = self.whole[: self.lead, REST]
+            torque = torque + left @ error / (left @ left) * self.whole[rows, REST]
+        return torque
 
     def _choice(self, shape: _Shape, places: tuple[int, ...]) -> _Choice:
         used = [p for p in places if p >= 0]

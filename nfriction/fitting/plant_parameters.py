@@ -1,42 +1,12 @@
-"""Terms of a plant that a fit may adjust, with their bounds and priors.
-
-At x = 0 the plant is as given. Ratios are relative changes, `buffer = nominal (1 + x) (1 + x')`
-where two scale an entry; offsets are in SI, `buffer = nominal + x`.
-"""
+"""Terms of a plant that a fit may adjust, with their bounds and priors."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
+from nfriction.fitting.adjusted_plant import TORQUE_DELAY, PlantParameter
 from nfriction.fitting.options import DEFAULTS, FitOptions
-from nfriction.plant import Plant
-
-TORQUE_DELAY = "torque delay [s]"
-
-
-@dataclass(frozen=True)
-class PlantParameter:
-    """One adjustable term.
-
-    Attributes:
-        name: as in reports.
-        change: of the plant's buffers per unit, each in the shape of its buffer; of a ratio, 1 at
-            the entries that it scales. Empty for the delay of the torque.
-        lower, upper: bounds.
-        prior_sd: standard deviation of the prior around 0.
-        ratio: whether it scales its entries, rather than adding to them.
-        to_none: true if the lower bound means that the effect is absent.
-    """
-
-    name: str
-    change: Mapping[str, Tensor]
-    lower: float
-    upper: float
-    prior_sd: float
-    ratio: bool = False
-    to_none: bool = False
 
 
 def plant_parameters(
@@ -110,11 +80,6 @@ def torque_delay_term(options: FitOptions = DEFAULTS) -> PlantParameter:
     return PlantParameter(TORQUE_DELAY, {}, -most, most, options.delay_sd)
 
 
-def delay_index(terms: Sequence[PlantParameter]) -> int | None:
-    """Place of the torque's delay among the terms; None where it is not fitted."""
-    return next((i for i, term in enumerate(terms) if term.name == TORQUE_DELAY), None)
-
-
 def _chain_terms(
     buffers: Mapping[str, Tensor], driven: bool, options: FitOptions
 ) -> Iterator[PlantParameter]:
@@ -185,23 +150,3 @@ def _amount(
     given, (most, sd) = buffers[buffer][unit > 0], term
     low, high = 0.0 - float(given.min()), max(most - float(given.max()), 0.0)
     return PlantParameter(name, change, low, high, sd, to_none=True)
-
-
-def adjusted_buffers(
-    plant: nn.Module, parameters: Sequence[PlantParameter], vector: Tensor
-) -> dict[str, Tensor]:
-    """Buffers of the plant at a parameter vector, shape (*batch, parameter)."""
-    nominal = dict(plant.named_buffers())
-    changed: dict[str, Tensor] = {}
-    for i, parameter in enumerate(parameters):
-        for name, change in parameter.change.items():
-            value = vector[..., i].reshape(*vector.shape[:-1], *[1] * change.ndim)
-            before = changed.get(name, nominal[name])
-            step = value * change
-            changed[name] = before * (1.0 + step) if parameter.ratio else before + step
-    return changed
-
-
-def adjusted_plant(plant: Plant, parameters: Sequence[PlantParameter], vector: Tensor) -> Plant:
-    """A copy of the plant at a parameter vector; the plant itself without parameters."""
-    return plant.replace(**adjusted_buffers(plant, parameters, vector)) if parameters else plant

@@ -4,8 +4,10 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
+from nfriction.fitting.adjusted_plant import TORQUE_DELAY, PlantParameter
 from nfriction.fitting.data.inputs import (
     ZEROED_PER_RECORDING,
     advanced_torques,
@@ -19,6 +21,7 @@ from nfriction.fitting.data.inputs import (
     smoothed_motions,
 )
 from nfriction.fitting.diagnosis import balanced_delay, likely_mistakes, mistake_warning
+from nfriction.fitting.equation_error import TorqueFit, fit_equation_error, prior_sd, steady_law
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction.models import FrictionModel
@@ -76,14 +79,16 @@ def prepare_task(
     plant = rigs.of(plant)
     if not isinstance(start, FitResult | None):
         raise TypeError(f"`start` must be the result of a fit, got a {type(start).__name__}.")
-    model = as_model(model, plant.joints)
     given = as_recording_list(recordings, plant)
+    modelled = model.joints if isinstance(model, FrictionModel) else plant.joints
+    joint = in_joint_coordinates(plant, given, modelled)
+    moved = smoothed_motions(joint, motions)
+    model = as_model(model, plant.joints, moved)
     if "p_0" in model.law.names:
         raise ValueError(
             f"the law {model.law.name!r} is for tables of torque, see `fit_torque`; to motions fit "
             "maxwell-slip."
         )
-    joint = in_joint_coordinates(plant, model, given)
     if options.eccentricity == "on" and not isinstance(plant, PendulumChain):
         raise ValueError(f"{plant.name or 'the axis'} has no encoders that turn with its joints.")
     # Torques alone do not depend on a constant offset of the encoders enough to estimate one.
@@ -92,7 +97,6 @@ def prepare_task(
     if options.encoder_reference == "auto" and options.method == "output_error":
         per_recording = looks_zeroed_per_recording(plant, given, options)
         found = (ZEROED_PER_RECORDING,) if per_recording else ()
-    moved = smoothed_motions(joint, motions)
     convention = given[0].resolve_convention(plant)
     delay = 0.0
     if options.fit_delay:
@@ -123,3 +127,36 @@ def prepare_task(
         found,
         tuple(m.text for m in mistakes),
     )
+
+
+def regression(task: FitTask, model: FrictionModel, plant: Plant, beyond: float = 0.0) -> TorqueFit:
+    """Constant coefficients that torques imply on a plant; see `fit_equation_error`."""
+    recordings = advanced_torques(task.recordings, task.delay)
+    return fit_equation_error(
+        steady_law(model.law), plant, recordings, task.motions, model.v_smooth, task.options, beyond
+    )
+
+
+def constant_prior(
+    model: FrictionModel, torque: TorqueFit, options: FitOptions
+) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation of a law's constant coefficients, each (parameter,)."""
+    sd = prior_sd(model.law, torque, options).reshape(-1)
+    return torch.zeros_like(sd), sd
+
+
+def known_terms(
+    start: FitResult | None, terms: Sequence[PlantParameter], delay: float = 0.0
+) -> Tensor:
+    """Plant terms of an earlier fit by name, 0 where it has none but for the delay, (term,)."""
+    known = {TORQUE_DELAY: delay}
+    if start is not None:
+        known |= {name: value for name, value, _ in start.plant_terms}
+    return torch.tensor([known.get(t.name, 0.0) for t in terms], dtype=torch.float64)
+
+
+def fits_eccentricity(options: FitOptions, start: FitResult | None) -> bool:
+    """True if a search has encoder terms: `"on"`, or `"auto"` after a fit that has them."""
+    terms = start.plant_terms if start else ()
+    found = any(name.startswith("encoder ") for name, _, _ in terms)
+    return options.eccentricity == "on" or (options.eccentricity == "auto" and found)

@@ -20,6 +20,7 @@ from nfriction.fitting.hysteresis import (
     range_of,
 )
 from nfriction.fitting.options import DEFAULTS, FitOptions
+from nfriction.fitting.recorded import fit_recorded, recorded_inputs
 from nfriction.fitting.result.identifiability import (
     Information,
     Interval,
@@ -29,6 +30,7 @@ from nfriction.fitting.result.identifiability import (
 )
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
 from nfriction.friction import model_by_name, plain_name
+from nfriction.friction.hysteresis import Recorded
 from nfriction.friction.laws import Memory
 from nfriction.friction.memory import states_along
 from nfriction.friction.models import V_SMOOTH, FrictionModel
@@ -61,6 +63,23 @@ class JointFit:
     root: Tensor
     residual: float
     converged: bool = True
+
+    @property
+    def rules(self) -> int:
+        """Number of fuzzy rules of recorded inputs."""
+        own = self.model.schedule
+        if not isinstance(own, Recorded):
+            return 0
+        return sum(own.layer(name).consequents.numel() for name in own.followed())
+
+    @property
+    def note(self) -> str:
+        """Recorded inputs that the friction follows, behind a semicolon; empty for none."""
+        own = self.model.schedule
+        if not isinstance(own, Recorded) or not own.followed():
+            return ""
+        ripple = f"ripple with a period of {float(own.period[0]):.4g}"
+        return f"; follows {', '.join(own.followed())}".replace("ripple", ripple)
 
     @torch.no_grad()
     def steady(self, qd: Tensor, qdd: Tensor, load: Tensor) -> tuple[Tensor, Tensor]:
@@ -175,7 +194,8 @@ def fit_memory(
         ValueError: if the rows have no time, or the law needs a load that the table lacks.
     """
     model = model_by_name(name)(1, v_smooth=v_smooth)
-    if model.schedule.follows_motion:
+    schedule: Any = model.schedule
+    if schedule.follows_motion:
         raise ValueError(
             f"{plain_name(name)} is fitted to recordings of motion, not to tables; use its law, or "
             "slip."
@@ -192,11 +212,13 @@ def fit_memory(
         if not found.presliding:
             # A stiff joint explains the rows as well: they hold no presliding.
             unknown = (f"sigma_0 of {joint.name}",)
+    elif isinstance(schedule, Recorded):
+        found = fit_recorded(schedule, joint, blocks, v_smooth)
     elif "f_o" in model.law.names:
-        found = fit_slip(joint, blocks, loaded=joint.load is not None and reads_load(model))
+        loaded = joint.load is not None and reads_load(model)
+        found = fit_slip(joint, blocks, loaded=loaded)
     else:
         raise ValueError(f"{plain_name(name)} is not fitted to tables; use slip.")
-    schedule = model.schedule
     schedule.set_parameter_vector(torch.tensor(found.coefficients))
     error = torch.tensor(found.torque - joint.tau)
     noise = max(effective_noise(error[None, :, None]), 1e-12 * float(np.abs(joint.tau).max()))
@@ -280,7 +302,10 @@ def _remembered(model: FrictionModel, memory: Memory, joint: JointTorque, lead_i
             error = (tau[first] - torque)[:, best]
             still[..., -1] = left @ error / left.square().sum()
     states = along(still, slice(None))[:, 0]
-    return memory.torque(states, qd, load, coefficients)[:, 0]
+    torque = memory.torque(states, qd, load, coefficients)
+    if isinstance(model.schedule, Recorded):
+        torque = model.schedule.corrected(torque, recorded_inputs(joint))
+    return torque[:, 0]
 
 
 def torque_and_slopes(

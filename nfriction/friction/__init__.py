@@ -31,7 +31,7 @@ _LAWS = {
 # Laws with memory: of bristles, whose Coulomb and Stribeck friction a network may correct, and of
 # elements that slip.
 _BRISTLES = {"dahl": "Dahl", "lugre": "LuGre", "elasto-plastic": "ElastoPlastic"}
-_MEMORY = _BRISTLES | {"maxwell-slip": "MaxwellSlip"}
+_MEMORY = _BRISTLES | {"gear": "Gear", "maxwell-slip": "MaxwellSlip"}
 # Slip elements beside terms of the velocity, for tables of torque.
 _HYSTERESIS = {"slip": "Slip", "load-slip": "LoadSlip"}
 # Classes are resolved only when asked for: a command line then starts quickly, and the core does
@@ -52,11 +52,13 @@ _MODELS = {
 _KIND_OF_MEMORY = _Kind("", "", "nfriction.friction.memory")
 _KIND_OF_BRISTLES = _Kind("neuro-fuzzy:", "NF", "nfriction.friction.memory")
 _KIND_OF_HYSTERESIS = _Kind("", "", "nfriction.friction.hysteresis")
+_KIND_OF_RECORDED = _Kind("neuro-fuzzy:", "NF", "nfriction.friction.hysteresis")
 _ALL = (
     _MODELS
     | {name: (_KIND_OF_MEMORY, law) for law, name in _MEMORY.items()}
     | {"NF" + name: (_KIND_OF_BRISTLES, law) for law, name in _BRISTLES.items()}
     | {name: (_KIND_OF_HYSTERESIS, law) for law, name in _HYSTERESIS.items()}
+    | {"NFSlip": (_KIND_OF_RECORDED, "slip")}
 )
 _BY_TEXT = {
     text.lower(): name for name, (kind, law) in _ALL.items() for text in (name, kind.prefix + law)
@@ -137,7 +139,7 @@ def model_list() -> str:
     return (
         f"{laws}; also with {before} before them, except {''.join(_MISSING)}; "
         f"with memory {', '.join((*_MEMORY, *_HYSTERESIS))}; neuro-fuzzy: may precede "
-        f"{', '.join(_BRISTLES)}, too"
+        f"{', '.join(_BRISTLES)} and slip, too"
     )
 
 

@@ -16,22 +16,35 @@ elements it is a law of the velocity alone. It is passive where no force is nega
 asymmetry A_v are zero; a negative force is that of friction which falls over some displacement
 after a breakaway.
 
+`NFSlip` lets it follow what a table records besides the motion,
+
+    (1 + sum_i n_i(x_i)) tau_f + a(qd) cos(2 pi q / P) + b(qd) sin(2 pi q / P),
+
+with x_i load, temperature, position q and direction, and the ripple of a motor or gear over the
+position. n_i, a and b are fuzzy rules, zero where blocks left out do not gain by them.
+
 References:
     F. Al-Bender, V. Lampaert and J. Swevers, IEEE Trans. Automatic Control 50 (2005) 1883-1887
     (Maxwell-slip elements); the drop F_d of the first element is Stribeck's.
 """
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from functools import partial
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law, Memory, smooth_sign
 from nfriction.friction.memory import Duration
-from nfriction.friction.models import ConstantModel
+from nfriction.friction.models import ConstantModel, NamedModel
+from nfriction.fuzzy import Anfis
 
 ELEMENTS = 12
+# Fuzzy sets of each input that friction may follow, and of the velocity, of either direction, that
+# the amplitude of a ripple follows: as many as of other networks.
+TERMS = {"load": 5, "temperature": 5, "position": 5, "direction": 2, "ripple": 9}
 # Places of the coefficients: those of the velocity first, then forces and widths of the elements.
 OFFSET, VISCOUS, ASYMMETRY, SATURATING, TURN, DROP, STRIBECK, FADING, START, FIRST = range(10)
 
@@ -133,3 +146,89 @@ class LoadSlip(ConstantModel):
     """The same with all but the viscous friction and the offset in proportion to the load."""
 
     definition = LOAD_SLIP
+
+
+class Recorded(Constant):
+    """Constant coefficients, and fuzzy rules of what a table records; see this module.
+
+    Attributes:
+        layers: rules of each input: relative change of the torque by its sets, or the ripple's
+            cosine and sine [N m] by sets of the velocity.
+        ranges: of each input, (joint, input, 2), beyond which its outermost set applies.
+        period: of the ripple [rad; m], (joint,).
+    """
+
+    form = "recorded"
+    ranges: Tensor
+    period: Tensor
+
+    def __init__(self, law: Law, joints: int, initial: Tensor | Sequence | None = None) -> None:
+        super().__init__(law, joints, initial)
+        made = {
+            name: Anfis(joints, 1, (count,), 2 if name == "ripple" else 1, order=0)
+            for name, count in TERMS.items()
+        }
+        for layer in made.values():
+            layer.init_grid(0.0, 1.0)
+        self.layers = nn.ModuleDict(made)
+        one = torch.ones(joints, len(TERMS), dtype=torch.float64)
+        self.register_buffer("ranges", torch.stack([-one, one], -1))
+        self.register_buffer("period", one[:, 0].clone())
+
+    def followed(self) -> tuple[str, ...]:
+        """Inputs that the torque follows."""
+        return tuple(name for name in TERMS if self.layer(name).consequents.any())
+
+    def layer(self, name: str) -> Anfis:
+        """Rules of an input."""
+        found = self.layers[name]
+        assert isinstance(found, Anfis)
+        return found
+
+    def within(self, name: str, x: Tensor) -> Tensor:
+        """An input (row, joint) over its range, (row, joint, 1)."""
+        low, high = self.ranges[:, list(TERMS).index(name)].unbind(-1)
+        return ((x - low) / (high - low)).clamp(0.0, 1.0).unsqueeze(-1)
+
+    def corrected(self, torque: Tensor, given: Mapping[str, Tensor]) -> Tensor:
+        """Torque of the law with what it follows, (row, joint) [N m; N].
+
+        Args:
+            torque: of the law alone.
+            given: inputs by name, and `"velocity"`, shaped like `torque`.
+
+        Raises:
+            ValueError: if an input that the torque follows is not given.
+        """
+        change, ripple = torch.ones_like(torque), torch.zeros_like(torque)
+        for name in self.followed():
+            own = "position" if name == "ripple" else name
+            if own not in given:
+                column = "q" if own == "position" else own
+                raise ValueError(
+                    f"this friction follows the {own}, and the table has no column {column}; add "
+                    "one, or take slip."
+                )
+            if name == "ripple":
+                a, b = self.layer(name)(self.within(name, given["velocity"])).unbind(-1)
+                angle = 2.0 * math.pi * given[own] / self.period
+                ripple = a * torch.cos(angle) + b * torch.sin(angle)
+            else:
+                change = change + self.layer(name)(self.within(name, given[own]))[..., 0]
+        return change * torque + ripple
+
+
+class NFSlip(NamedModel):
+    """Slip elements whose friction follows recorded columns by fuzzy rules, for tables alone."""
+
+    definition = SLIP
+    make_schedule = Recorded
+
+    def check_loads(self, plant: object) -> None:
+        """Refuse all that records no such columns: simulations and controllers."""
+        assert isinstance(self.schedule, Recorded)
+        if followed := self.schedule.followed():
+            raise ValueError(
+                f"this friction follows {', '.join(followed)} as a table records them, which a "
+                "simulation or a controller does not give; take slip."
+            )

@@ -88,11 +88,13 @@ class Memory:
         size: numbers a joint.
         advance: `(state, qd, load, coefficients, time_step) -> state` over a sample.
         torque: `(state, qd, load, coefficients) -> tau_f` at the end of a sample.
+        transmitted: the load is the torque that the drive transmits [N m], no normal load.
     """
 
     size: int
     advance: AdvanceFunction
     torque: StateTorqueFunction
+    transmitted: bool = False
 
     def __post_init__(self) -> None:
         if not isinstance(self.size, int) or self.size < 1:

@@ -98,6 +98,13 @@ def reference_coefficients(model: FrictionModel) -> Tensor:
     return [*model.schedule.coefficient_sets().values()][-1].clone()
 
 
+def load_of(law: Law, plant: Any, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
+    """Load that a law reads along a motion: that of a plant, or the drive's torque."""
+    transmitted = law.memory is not None and law.memory.transmitted
+    load: Tensor = tau if transmitted else plant.load(q, qd)
+    return load
+
+
 def slipping_state(memory: Memory, coefficients: Tensor) -> Tensor:
     """Largest state in size: of a contact that slips slowly, (*batch, joint, state)."""
     ahead = torch.ones_like(coefficients[..., 0])
@@ -158,6 +165,37 @@ def steady_dahl(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float)
     """Steady torque of Dahl's law: Coulomb plus viscous friction."""
     f_c, f_v, _ = coefficients.unbind(-1)
     return f_c * smooth_sign(qd, v_smooth) + f_v * qd
+
+
+# Gear loss: dz/dt = qd - sigma_0 |qd| z / g, with g = F_c + mu |load| of the transmitted torque, mu
+# one where it drives the joint and another where the joint drives it back.
+
+
+def advance_gear(
+    state: Tensor, qd: Tensor, load: Tensor, coefficients: Tensor, time_step: Duration
+) -> Tensor:
+    """Deflection after a sample; exponential in the displacement."""
+    return _relaxed(
+        state, qd, gear_friction(qd, load, coefficients), coefficients.select(-1, 4), time_step
+    )
+
+
+def gear_torque(state: Tensor, qd: Tensor, load: Tensor, coefficients: Tensor) -> Tensor:
+    """Torque `sigma_0 z + F_v qd`."""
+    return coefficients.select(-1, 4) * state.select(-1, 0) + coefficients.select(-1, 3) * qd
+
+
+def steady_gear(qd: Tensor, load: Tensor, coefficients: Tensor, v_smooth: float) -> Tensor:
+    """Steady torque `g sgn(qd) + F_v qd` of a gear under load."""
+    viscous = coefficients.select(-1, 3) * qd
+    return gear_friction(qd, load, coefficients) * smooth_sign(qd, v_smooth) + viscous
+
+
+def gear_friction(qd: Tensor, load: Tensor, coefficients: Tensor) -> Tensor:
+    """Friction of teeth that slide, `F_c + mu |load|` without sign [N m]."""
+    f_c, driving, driven = coefficients[..., :3].unbind(-1)
+    share = torch.where(load * qd > 0.0, driving, driven)
+    return (f_c + share * load.abs()).clamp(min=1e-12)
 
 
 # LuGre: dz/dt = qd - sigma_0 |qd| z / g(qd), tau_f = sigma_0 z + sigma_1 dz/dt + sigma_2 qd.
@@ -298,6 +336,19 @@ DAHL = Law(
     memory=Memory(1, advance_dahl, dahl_torque),
 )
 
+GEAR = Law(
+    "gear",
+    (
+        _F_C,
+        Coefficient("mu_d", "-"),
+        Coefficient("mu_b", "-"),
+        Coefficient("F_v", "N m s/rad"),
+        _STIFFNESS,
+    ),
+    steady_gear,
+    memory=Memory(1, advance_gear, gear_torque, transmitted=True),
+)
+
 LUGRE = Law(
     "lugre",
     (_F_C, _F_D, _V_S, _STIFFNESS, _DAMPING, _VISCOUS),
@@ -354,6 +405,16 @@ class Dahl(ConstantModel):
     """Dahl's law: hysteresis of a stiffness sigma_0 below the Coulomb friction F_c, and F_v."""
 
     definition = DAHL
+
+
+class Gear(ConstantModel):
+    """Gear loss with hysteresis, in proportion to the torque that the drive transmits.
+
+    Constants: F_c; shares mu_d and mu_b of the transmitted torque that are lost where the drive
+    moves the joint and where the joint moves the drive; F_v and the stiffness sigma_0.
+    """
+
+    definition = GEAR
 
 
 class LuGre(ConstantModel):

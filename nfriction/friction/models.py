@@ -31,7 +31,7 @@ class FrictionModel(nn.Module):
         law: the friction law.
         schedule: its coefficients as a function of the motion.
         v_smooth: velocity over which the sign of the velocity changes, `sgn(v) = tanh(v/v_smooth)`
-            [rad/s; m/s for a sliding axis].
+            [rad/s; m/s for a sliding axis]; fits of models by name choose it for slow motions.
 
     Shape:
         qd, qdd, load: (*batch, joint); output (*batch, joint).

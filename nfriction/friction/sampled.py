@@ -37,6 +37,7 @@ def sampled(model: FrictionModel, sample_time: float) -> FrictionModel:
             "only a law with memory can be sampled, with coefficients that have no hidden state; "
             f"got {law.name!r} with {type(model.schedule).__name__}."
         )
+    model.check_loads(None)
     _refuse_load(model, step)
     # Signed and without bounds: no fit varies them.
     states = tuple(Coefficient(f"state_{k + 1}", "-", False) for k in range(law.state_size))
@@ -52,8 +53,8 @@ def _refuse_load(model: FrictionModel, step: float) -> None:
     loaded, unloaded = (law.memory.advance(start, qd, x, c, step) for x in (qd + 2.0, qd * 0.0))
     if not torch.equal(loaded, unloaded):
         raise ValueError(
-            f"the state of law {law.name!r} depends on the load, which coefficients cannot follow; "
-            "let its torque alone depend on it."
+            f"the state of law {law.name!r} depends on the load, which an export's coefficients "
+            "cannot follow; take a law whose torque alone depends on it, or none."
         )
 
 

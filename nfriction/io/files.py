@@ -1,11 +1,12 @@
-"""Files written whole or not at all, by which alone the package writes, and strict JSON."""
+"""Files written whole or not at all, by which alone the package writes; strict JSON, checked."""
 
 import errno
+import hashlib
 import json
 import math
 import os
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -20,9 +21,6 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
     Missing folders are made. Readers see the old file or the new one, never half of one; only a
     killed process leaves its temporary file, hidden and ending in `.part`.
-
-    Raises:
-        OSError: the file cannot be written; the message names folder, reason and remedy.
     """
     path = Path(path)
     temporary = path.parent / f".{uuid.uuid4().hex}.part"
@@ -61,33 +59,36 @@ def _message(error: OSError, path: Path) -> str:
 def parse_json(
     text: str | bytes, pairs_hook: Callable[[list[tuple[str, Any]]], dict[str, Any]] | None = None
 ) -> Any:
-    """Parse JSON text.
-
-    Args:
-        text: JSON.
-        pairs_hook: as `object_pairs_hook` of `json.loads`.
-
-    Raises:
-        ValueError: no JSON, cut short, or with a number that is not finite or beyond all floats.
-        RecursionError: nested too deeply.
-    """
+    """Parse JSON text whose numbers are finite; see `json.loads` for the hook."""
     return json.loads(
         text, parse_constant=_finite, parse_float=_finite, parse_int=_whole,
         object_pairs_hook=pairs_hook,
     )  # fmt: skip
 
 
-def numbers(name: str, given: Any, words: Sequence[str] = ()) -> Any:
-    """Nested lists of floats, or one float, of nested lists of numbers.
+def checked_json(content: Mapping[str, Any]) -> dict[str, Any]:
+    """The content as JSON has it, with a checksum by which `is_intact` finds it unchanged.
 
-    Args:
-        name: of the entry, for errors.
-        given: parsed JSON.
-        words: that count as numbers too, such as "nan".
-
-    Raises:
-        ValueError: anything else is among them, such as true and false.
+    TypeError or ValueError where it is no plain JSON, or has numbers that are not finite.
     """
+    # Through JSON, so that the checksum is of what a reader will see.
+    plain: dict[str, Any] = json.loads(json.dumps(content, allow_nan=False))
+    return plain | {"checksum": _checksum(plain)}
+
+
+def is_intact(content: dict[str, Any]) -> bool:
+    """True for content as `checked_json` made it; takes its checksum out."""
+    return content.pop("checksum", None) == _checksum(content)
+
+
+def _checksum(content: Mapping[str, Any]) -> str:
+    """SHA-256 of JSON content in any layout."""
+    canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(canonical.encode()).hexdigest()
+
+
+def numbers(name: str, given: Any, words: Sequence[str] = ()) -> Any:
+    """Floats of parsed JSON, in its nested lists; `words` such as "nan" count as numbers too."""
     if isinstance(given, (list, tuple)):
         return [numbers(name, x, words) for x in given]
     # To Python true is a number.

@@ -5,6 +5,7 @@
 A file is checked for form, size and damage before a model is made of it; no code in it is run.
 """
 
+import copy
 import hashlib
 import json
 import math
@@ -19,7 +20,7 @@ from torch import Tensor
 
 from nfriction.friction import memory_names, model_by_name, model_names
 from nfriction.friction.models import FrictionModel
-from nfriction.io.files import numbers, parse_json, write_atomically
+from nfriction.io.files import checked_json, is_intact, numbers, parse_json, write_atomically
 from nfriction.plant import Plant
 from nfriction.plant.rigs import from_dict
 from nfriction.version import __version__
@@ -89,11 +90,7 @@ def parameter_hash(state: Mapping[str, Tensor]) -> str:
 
 
 def describe(model: FrictionModel, info: ModelInfo) -> dict[str, Any]:
-    """Everything a model file holds except the parameters, as plain JSON.
-
-    Raises:
-        ValueError: not one name for each joint.
-    """
+    """Everything a model file holds except the parameters, as plain JSON."""
     if info.joint_names and len(info.joint_names) != model.joints:
         raise ValueError(
             f"`joint_names` must name {model.joints} joints, got {list(info.joint_names)}."
@@ -185,11 +182,9 @@ def save(model: FrictionModel, path: str | Path, info: ModelInfo | None = None) 
     content = describe(model, info or ModelInfo())
     content["state"] = {name: value.tolist() for name, value in state.items()}
     try:
-        # Through JSON, so that the checksum is of what a reader will see.
-        content = json.loads(json.dumps(content, allow_nan=False))
+        content = checked_json(content)
     except (TypeError, ValueError) as error:
         raise ValueError(f"`info` must be plain JSON with finite numbers: {error}.") from error
-    content["checksum"] = _checksum(content)
     return write_atomically(path, json.dumps(content, indent=1).encode())
 
 
@@ -262,11 +257,7 @@ def load_plant(path: str | Path) -> Plant:
 
 
 def read_model_file(path: str | Path) -> dict[str, Any]:
-    """Content of a model file, checked for form, size and damage.
-
-    Raises:
-        ModelFileError: it is no sound model file.
-    """
+    """Content of a model file, checked for form, size and damage."""
     path = Path(path)
     with _naming(path):
         if path.exists() and not path.is_file():
@@ -289,7 +280,7 @@ def read_model_file(path: str | Path) -> dict[str, Any]:
             # JSON's true is an int to Python.
             if key not in content or not isinstance(value, kind) or isinstance(value, bool):
                 raise ValueError(f"`{key}` is missing or of the wrong type.")
-        if content.pop("checksum") != _checksum(content):
+        if not is_intact(content):
             raise ValueError("the checksum does not match; damaged or edited.")
         _check_sizes(content, size)
         info = _info(content)
@@ -348,23 +339,15 @@ def _check_same_model(content: Mapping[str, Any], model: FrictionModel) -> None:
 
 def _check_torque(model: FrictionModel, state: Mapping[str, Tensor]) -> None:
     """Refuse finite parameters whose exponentials overflow."""
+    trial = copy.deepcopy(model)
+    trial.load_state_dict(dict(state))
     qd, qdd, load = torch.tensor([[0.0, 0.5], [0.0, 0.0], [1.0, 1.0]], dtype=torch.float64)
-    inputs = tuple(x[:, None].expand(-1, model.joints) for x in (qd, qdd, load))
+    qd, qdd, load = (x[:, None].expand(-1, model.joints) for x in (qd, qdd, load))
     with torch.no_grad():
-        if model.law.memory is None:
-            torque = torch.func.functional_call(model, dict(state), inputs)
-        else:
-            c = torch.func.functional_call(model.schedule, _of_schedule(state), inputs[:2])
-            start = model.law.initial_state(inputs[0])
-            after = model.law.memory.advance(start, inputs[0], inputs[2], c, 1e-3)
-            torque = model.law.memory.torque(after, inputs[0], inputs[2], c)
-    if not torque.isfinite().all():
+        coefficients = trial.coefficients(qd, qdd)
+        torque = trial.steady_torque(qd, load, coefficients)
+    if not (coefficients.isfinite().all() and torque.isfinite().all()):
         raise ValueError("with its parameters the model gives no finite torque.")
-
-
-def _of_schedule(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The schedule's part of a model's state."""
-    return {name.removeprefix("schedule."): value for name, value in state.items()}
 
 
 def _parameter(name: str, given: Any, expected: Tensor) -> Tensor:
@@ -378,12 +361,6 @@ def _parameter(name: str, given: Any, expected: Tensor) -> Tensor:
             f"{tuple(value.shape)}."
         )
     return value
-
-
-def _checksum(content: Mapping[str, Any]) -> str:
-    """SHA-256 of JSON content in any layout."""
-    canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(canonical.encode()).hexdigest()
 
 
 def _short(value: object) -> str:

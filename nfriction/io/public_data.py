@@ -35,27 +35,16 @@ _NOT_IT = (
 
 @dataclass(frozen=True)
 class PublicSet:
-    """A set of recordings in a public repository.
+    """A set of recordings in a public repository."""
 
-    Attributes:
-        about: mechanism, sensors, authors.
-        licence: of the originals.
-        repository: owner and name on GitHub.
-        commit: that fixes the content.
-        folder: of the originals in the repository.
-        source: kind of originals, one of `_CONVERT`.
-        digits: printf format of columns, by the first letters of their names.
-        recordings: original and SHA-256 of the table, by recording.
-    """
-
-    about: str
-    licence: str
-    repository: str
-    commit: str
-    folder: str
-    source: str
-    digits: Mapping[str, str]
-    recordings: Mapping[str, tuple[str, str]]
+    about: str  # mechanism, sensors, authors
+    licence: str  # of the originals
+    repository: str  # owner and name on GitHub
+    commit: str  # that fixes the content
+    folder: str  # of the originals in the repository
+    source: str  # kind of originals, one of `_CONVERT`
+    digits: Mapping[str, str]  # printf format of columns, by the first letters of their names
+    recordings: Mapping[str, tuple[str, str]]  # original and SHA-256 of the table, by recording
 
     def address(self, original: str) -> str:
         """Web address of an original."""
@@ -84,10 +73,6 @@ def fetch(name: str, folder: Path) -> Fetched:
         name: of one of `public_sets()`.
         folder: of the set. Gets `originals`, a table of each recording, and `recordings.csv`, which
             has initial states where the set gives them.
-
-    Raises:
-        ValueError: for an unknown name, or an original that is not what it should be.
-        OSError: if an original cannot be fetched; names its address and where to put it.
     """
     sets = public_sets()
     if name not in sets:

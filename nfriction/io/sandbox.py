@@ -46,10 +46,6 @@ def run_isolated(module: str, task: Mapping[str, Any], folder: Path, *, seconds:
         task: plain JSON.
         folder: empty; takes the results and the worker's temporary files.
         seconds: processor time limit [s], imports included.
-
-    Raises:
-        InvalidFile: the worker refused the file.
-        WorkerDied: the worker ended otherwise than by returning.
     """
     # The worker imports from the same places as this process.
     path = os.pathsep.join(place or os.getcwd() for place in sys.path)

@@ -20,11 +20,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from nfriction.recording.angles import AngleConvention
+
 if TYPE_CHECKING:
     from typing_extensions import Self
-
-ANGLES = ("relative", "absolute")
-ZEROS = ("upright", "hanging")
 
 
 @dataclass(frozen=True)
@@ -110,12 +109,7 @@ class Plant(nn.Module, ABC):
         names = _texts("joint_names", joint_names or [f"joint{i + 1}" for i in range(joints)])
         if len(names) != joints or len(set(names)) != joints:
             raise ValueError(f"`joint_names` must be {joints} different names, got {names}.")
-        angles, zero = (*_texts("convention", convention), "", "")[:2]
-        if len(convention) != 2 or angles not in ANGLES or zero not in ZEROS:
-            raise ValueError(
-                f"`convention` must be one of {ANGLES} followed by one of {ZEROS}, "
-                f"got {tuple(convention)}."
-            )
+        angles = AngleConvention.of(_texts("convention", convention))
         if not isinstance(name, str):
             raise ValueError(f"`name` must be text, got {reprlib.repr(name)}.")
         if position_quantum is not None:
@@ -124,7 +118,7 @@ class Plant(nn.Module, ABC):
         self.joint_names = names
         self.name = name
         self.unit = unit
-        self.convention = (angles, zero)
+        self.convention = (angles.angles, angles.measured_from)
         self.position_quantum = position_quantum
         if not isinstance(motor, Motor | None):
             raise TypeError(f"`motor` must be a Motor(gear_ratio, ...) or None, got {motor!r}.")

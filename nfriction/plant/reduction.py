@@ -79,9 +79,6 @@ def pendulum_chain(links: Sequence[HingedLink], gravity: Array, name: str) -> Pe
     hanging at zero, its convention is measured from upright, else from hanging, and the rest goes
     into `angle_offset`. A first joint about the vertical becomes the arm. The length of the last
     link, which only drag needs, is that of a rod with its mass and inertia.
-
-    Raises:
-        ValueError: if they form no such chain, naming the joint and the rule.
     """
     chain = _in_series(links)
     strength = float(np.linalg.norm(gravity))

@@ -36,11 +36,6 @@ def read_robot(path: str | Path) -> PendulumChain:
     Serial chains of hinges with parallel, horizontal axes are read, alone or on an arm that turns
     about the vertical. Bodies fixed to a link count as part of it. Rotor inertias are MJCF's
     `armature`; friction, limits, contacts and actuators are left out.
-
-    Raises:
-        ValueError: for another mechanism, naming the joint and the rule, or an invalid file.
-        OSError: if it cannot be read.
-        ImportError: for an MJCF where MuJoCo is not installed.
     """
     path = Path(path)
     root = parse_xml(path)
@@ -55,11 +50,7 @@ def read_robot(path: str | Path) -> PendulumChain:
 
 
 def parse_xml(path: Path, *, comments: bool = False) -> Element:
-    """The root of an XML file, with its `comments` as elements if asked for.
-
-    Raises:
-        ValueError: if it is too large, not UTF-8, no XML, or declares a document type.
-    """
+    """The root of an XML file, with its `comments` as elements if asked for."""
     size = path.stat().st_size
     if size > LARGEST_FILE:
         raise ValueError(f"{size} bytes are too large for a robot description.")

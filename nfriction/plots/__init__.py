@@ -3,23 +3,23 @@
 They are as wide as one or both columns of a paper; `figure.set_figwidth(inches)` changes that.
 """
 
-from nfriction.plots.coefficients import (
-    coefficient_sections,
-    coefficient_surfaces,
-    coefficients_over_time,
-)
 from nfriction.plots.comparison import (
     coefficient_intervals,
     horizon_curve,
     motion,
     positions,
     rmse_bars,
-    torque_over_velocity,
+    save_all,
 )
 from nfriction.plots.drawing import animate, mechanism
-from nfriction.plots.fuzzy import controller_surface, memberships
-from nfriction.plots.saving import save_all
-from nfriction.plots.torque_table import friction_curves
+from nfriction.plots.friction_torque import friction_curves, torque_over_velocity
+from nfriction.plots.neurofuzzy import (
+    coefficient_sections,
+    coefficient_surfaces,
+    coefficients_over_time,
+    controller_surface,
+    memberships,
+)
 
 __all__ = [
     "animate", "coefficient_intervals", "coefficient_sections", "coefficient_surfaces",

@@ -1,37 +1,41 @@
-"""Figures of a comparison: errors, torque over velocity, intervals of its fits."""
+"""Figures of a comparison: errors, motions, intervals of its fits, and all of them as files."""
 
 import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import torch
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from nfriction.evaluation.compare import LIMIT, NO_FRICTION, Comparison, Part
 from nfriction.evaluation.score import Score
-from nfriction.fitting.equation_error import friction_torque
-from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.fitting.result.identifiability import NORMAL_95, CoefficientUncertainty
 from nfriction.friction import both_names
 from nfriction.friction.models import FrictionModel
-from nfriction.plant import Plant
 from nfriction.plots import style
+from nfriction.plots.drawing import mechanism
+from nfriction.plots.friction_torque import torque_over_velocity
+from nfriction.plots.neurofuzzy import (
+    coefficient_sections,
+    coefficient_surfaces,
+    coefficients_over_time,
+    memberships,
+)
 from nfriction.recording import Recording
-from nfriction.signals import Motion, kalman_smoother
 
 Array = NDArray[np.float64]
 
 # Room that a bar and its number need side by side with others [in].
 _BAR = 0.13
-_POINTS = 3000  # of the scatter of torques, a joint
 
 
 def motion(
@@ -228,89 +232,6 @@ def horizon_curve(
     return figure
 
 
-def torque_over_velocity(
-    plant: Plant,
-    models: Mapping[str, FrictionModel],
-    recordings: Sequence[Recording],
-    motions: Sequence[Motion] | None = None,
-    *,
-    uncertainty: Mapping[str, CoefficientUncertainty] | None = None,
-) -> Figure:
-    """Friction torque of each law over velocity, a panel a joint, over that of the motion.
-
-    Lines are at the load at rest and without acceleration, with 95 % bands; dots are
-    `tau - M qdd - bias` along the recordings, averaged over 30 ms in which the joint turns one way.
-
-    Args:
-        plant: the mechanism, with its fitted terms where there are any.
-        models: friction models by name.
-        recordings: in any convention.
-        motions: their smoothed motion in joint coordinates; computed where not given.
-        uncertainty: of the models' fits by name (`FitResult.uncertainty`), for the bands.
-    """
-    joint = [r.joint_coordinates(plant) for r in recordings]
-    motions = motions or [kalman_smoother(r.time, r.q) for r in joint]
-    known = uncertainty or {}
-    with torch.no_grad():
-        parts = [
-            _averaged(*friction_torque(plant, r, m)[::2], r.sample_time)
-            for r, m in zip(joint, motions, strict=True)
-        ]
-    qd, torque = (np.concatenate(x) for x in zip(*parts, strict=True))
-    columns = min(plant.joints, 3) if plant.joints != 4 else 2
-    figure, axes = style.panel_each(
-        plant.joints, columns, style.PAGE if columns > 1 else style.COLUMN, 2.0
-    )
-    looks = style.looks(models)
-    for k, ax in enumerate(axes):
-        grid = velocities(qd[:, k])
-        lines = {name: _torque(model, grid, k) for name, model in models.items()}
-        seen = np.flatnonzero(np.isfinite(torque[:, k]))
-        # Dots may scatter far beyond any friction; the laws and most dots set the limits.
-        most = np.quantile(torque[seen, k], [0.05, 0.95]) if len(seen) else np.zeros(0)
-        extremes = np.concatenate([*lines.values(), most])
-        factor, unit = style.scaled(style.sliding("N m", plant.unit), extremes)
-        some = seen[np.linspace(0, len(seen) - 1, min(_POINTS, len(seen))).astype(int)]
-        ax.plot(
-            qd[some, k], factor * torque[some, k], ".", color=style.FAINT, markersize=2.5,
-            alpha=0.5, markeredgewidth=0, rasterized=True,
-        )  # fmt: skip
-        for name, line in lines.items():
-            ax.plot(grid, factor * line, **looks[name].line)
-            if name in known:
-                reach = NORMAL_95 * _torque_sd(known[name], models[name], grid, k)
-                low, high = (factor * (line + sign * reach) for sign in (-1, 1))
-                colour = looks[name].line["color"]
-                ax.fill_between(grid, low, high, color=colour, alpha=0.25, linewidth=0)
-        ax.set_ylim(style.padded(factor * extremes.min(), factor * extremes.max(), 0.15))
-        ax.margins(x=0.02)
-        style.title(ax, plant.joint_names[k])
-        ax.set_ylabel(f"friction {'torque' if plant.unit == 'rad' else 'force'} [{unit}]")
-        if k + columns >= plant.joints:
-            ax.set_xlabel(f"joint velocity [{plant.unit}/s]")
-    handles: list[Artist] = [
-        Line2D([], [], linestyle="", marker=".", color=style.FAINT),
-        *(looks[name].handle for name in models),
-    ]
-    labels = ["from the motion", *models]
-    if any(name in known for name in models):
-        handles.append(Patch(facecolor=style.FAINT, alpha=0.4))
-        labels.append("95 % bands")
-    style.legend(figure, handles, labels)
-    return figure
-
-
-def _averaged(qd: torch.Tensor, torque: torch.Tensor, step: float) -> tuple[Array, Array]:
-    """Means over blocks of samples, NaN where a joint does not turn one way throughout."""
-    size = max(1, round(DEFAULTS.diagnosis_block / step))
-    size = min(size, max(1, len(qd)))
-    whole = len(qd) // size * size
-    speeds, torques = (x[:whole].reshape(-1, size, x.shape[-1]) for x in (qd, torque))
-    one_way = torch.sign(speeds).mean(1).abs() == 1
-    # Dry friction takes any value at rest.
-    return speeds.mean(1).numpy(), torch.where(one_way, torques.mean(1), torch.nan).numpy()
-
-
 def coefficient_intervals(fits: Mapping[str, FitResult]) -> Figure:
     """Fitted coefficients with their 95 % intervals, a panel a coefficient; joints side by side.
 
@@ -389,30 +310,6 @@ def _digits(value: float) -> str:
     return f"{value:.0f}" if value >= 100 else f"{value:#.3g}"
 
 
-def velocities(qd: Array) -> Array:
-    """The range of the data, dense about zero, where laws turn over a few thousandths."""
-    low, high = float(qd.min()), float(qd.max())
-    # Evenly spaced velocities would draw the step at zero as a slope.
-    near = np.geomspace(1e-5, 1.0, 100) * max(abs(low), abs(high))
-    grid = np.unique(np.concatenate([np.linspace(low, high, 300), -near, [0.0], near]))
-    return grid[(grid >= low) & (grid <= high)]
-
-
-def _torque(model: FrictionModel, qd: Array, joint: int) -> Array:
-    """Torque of one joint over its velocity, at the load at rest and without acceleration."""
-    velocity = torch.as_tensor(qd)[:, None].expand(-1, model.joints)
-    with torch.no_grad():
-        held = model.coefficients(velocity, torch.zeros_like(velocity))
-        torque = model.steady_torque(velocity, torch.ones_like(velocity), held)
-    return torque[:, joint].numpy()
-
-
-def _torque_sd(known: CoefficientUncertainty, model: FrictionModel, qd: Array, joint: int) -> Array:
-    """Standard deviation of one joint's torque over its velocity."""
-    velocity = torch.as_tensor(qd)[:, None].expand(-1, model.joints).contiguous()
-    return known.torque_sd(model, velocity)[:, joint].numpy()
-
-
 def _intervals(found: FitResult, name: str, k: int) -> Array:
     """Value, lower and upper end of a coefficient of every joint, (3, joint)."""
     ends = {i.name: (i.low, i.high) for i in found.intervals}
@@ -421,3 +318,134 @@ def _intervals(found: FitResult, name: str, k: int) -> Array:
         (value, *ends.get(f"{name} of {joint}", (-math.inf, math.inf)))
         for joint, value in zip(found.plant.joint_names, values, strict=True)
     ]).T  # fmt: skip
+
+
+DPI = 150
+RUN_KEY = "nfriction run"
+"""Of the text in a PNG file that names its run."""
+
+
+def save_all(
+    comparison: Comparison,
+    recordings: Sequence[Recording],
+    folder: str | Path,
+    *,
+    run: str = "",
+    formats: Sequence[str] = (),
+) -> list[Path]:
+    """Write every figure of a comparison as PNG.
+
+    `mechanism`, `rmse_*` and `horizons_*` for test and training recordings, `positions_*` for each
+    recording given, `torque_over_velocity`, `over_time_*` for each law of which a model follows the
+    motion, and for each neuro-fuzzy model `coefficients_*`, `sections_*` and `memberships_*`. A
+    network that was rejected has constant coefficients and none of these.
+
+    Args:
+        comparison: fits and scores.
+        recordings: those compared, or some of them.
+        folder: made where it does not exist; files of the same name are replaced.
+        run: id of the run, kept in each PNG file.
+        formats: further ones: `"svg"` or `"pdf"` for papers, `"gif"` for animations of the test
+            recordings, `motion_1.gif` and so on.
+
+    Returns:
+        The files written.
+
+    Raises:
+        ValueError: if a recording is not among those compared.
+    """
+    scored = {
+        s.recording for p in comparison.parts for s in next(iter(comparison.scores(p).values()))
+    }
+    for recording in recordings:
+        if recording.name not in scored:
+            raise ValueError(
+                f"recording {recording.name!r} is not in the comparison, which has "
+                f"{', '.join(sorted(scored))}."
+            )
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    written: list[Path] = []
+    for name, figure in _figures(comparison, recordings):
+        path = _free(folder, name, written)
+        kept = {RUN_KEY: run} if run else {}
+        figure.savefig(path, dpi=DPI, metadata=kept)
+        for ending in set(formats) - {"gif"}:
+            figure.savefig(path.with_suffix(f".{ending}"))
+            written.append(path.with_suffix(f".{ending}"))
+        figure.clear()
+        written.append(path)
+    if "gif" in formats and comparison.fits:
+        tested = {s.recording for of in comparison.test.values() for s in of}
+        for k, recording in enumerate(r for r in recordings if r.name in tested):
+            written.append(comparison.animate(recording, folder / f"motion_{k + 1}.gif"))
+    return written
+
+
+def _free(folder: Path, name: str, taken: Sequence[Path]) -> Path:
+    """A path that is not taken: names of recordings may differ only in characters replaced here."""
+    stem = re.sub(r"[^\w-]+", "_", name)
+    ends = ("", *(f"_{k}" for k in range(2, 3 + len(taken))))
+    return next(path for end in ends if (path := folder / f"{stem}{end}.png") not in taken)
+
+
+def _figures(
+    comparison: Comparison, recordings: Sequence[Recording]
+) -> Iterator[tuple[str, Figure]]:
+    """Name and figure, one after the other, so that only one is in memory."""
+    for part in comparison.parts:
+        scores = comparison.scores(part)
+        table = comparison.table(part=part)
+        if len(comparison.joint_names) == 1:
+            table = table.drop(columns="all")  # it would repeat the joint's bars
+        yield f"rmse_{part}", rmse_bars(table, comparison.unit)
+        yield f"horizons_{part}", horizon_curve(comparison, part=part)
+        for recording in recordings:
+            of = {m: s for m, many in scores.items() for s in many if s.recording == recording.name}
+            if of:
+                yield f"positions_{part}_{recording.name}", positions(recording, of)
+    # A comparison that was read from a file has scores only.
+    if not comparison.fits:
+        return
+    last = list(comparison.fits.values())[-1]
+    yield "mechanism", mechanism(last.plant)
+    moved = last.motions
+    if last.encoder_offsets:
+        # Motions are kept as recorded; the plant expects corrected angles.
+        pairs = zip(moved, last.encoder_offsets, strict=True)
+        moved = tuple(replace(m, q=m.q + offset) for m, offset in pairs)
+    order = [s.recording for s in next(iter(comparison.train.values()))]
+    trained = dict(zip(order, moved, strict=True))
+    given = [r for r in recordings if r.name in trained]
+    models = {name: found.model for name, found in comparison.fits.items()}
+    if given:
+        motions = [trained[r.name] for r in given]
+        bands = {
+            name: found.uncertainty
+            for name, found in comparison.fits.items()
+            if found.uncertainty is not None
+        }
+        figure = torque_over_velocity(last.plant, models, given, motions, uncertainty=bands)
+        yield "torque_over_velocity", figure
+    labels: dict[str, Any] = {"joint_names": comparison.joint_names, "unit": comparison.unit}
+    for law in dict.fromkeys(model.law.name for model in models.values()):
+        of_law = {name: model for name, model in models.items() if model.law.name == law}
+        # Constants along the motion are worth a figure beside coefficients that follow it.
+        if any(_follows_motion(model) for model in of_law.values()):
+            yield f"over_time_{law}", coefficients_over_time(of_law, last.motions[0], **labels)
+    for name, found in comparison.fits.items():
+        if found.model.schedule.fuzzy_rules() is not None and _follows_motion(found.model):
+            known = labels | {"motions": last.motions, "uncertainty": found.uncertainty}
+            yield f"coefficients_{name}", coefficient_surfaces(found.model, **known)
+            yield f"sections_{name}", coefficient_sections(found.model, **known)
+            yield f"memberships_{name}", memberships(found.model, **labels)
+
+
+def _follows_motion(model: FrictionModel) -> bool:
+    """True unless the coefficients are constants, as also those of a rejected network."""
+    rules = model.schedule.fuzzy_rules()
+    if rules is None:
+        return model.schedule.follows_motion
+    first = rules.coefficients[:, :1].expand_as(rules.coefficients)
+    # A network's sums round.
+    return not torch.allclose(rules.coefficients, first, rtol=1e-9, atol=0.0)

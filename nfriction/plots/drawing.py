@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 MEASURED = "measured"
 _FRAMES_A_SECOND, _DPI = 25, 80
 _MOTOR = {"gear_ratio": "", "rotor_inertia": "kg m²", "torque_constant": "N m/A"}
+_UNITS = {"inertia": "kg m² about the axis", "mass": "kg", "com": "m to the mass centre"}
 _BENT = 0.5  # between links of the drawing, so that none hides another [rad]
 
 
@@ -176,27 +177,21 @@ def _data(plant: Plant) -> list[str]:
     """The plant's numbers in words, a line each."""
     given = plant.to_dict()
     lines = [plant.name or f"{given['kind']} without a name", ""]
-    if isinstance(plant, LinearAxis):
-        lines.append(f"moving mass {given['mass']:.4g} kg")
-    elif isinstance(plant, Rotor):
-        units = {"inertia": "kg m² about the axis", "mass": "kg", "com": "m to the mass centre"}
-        lines += [f"{key} {given[key]:.4g} {unit}" for key, unit in units.items() if given[key]]
-        lines += [] if given["mass"] else ["", "flywheel, not to scale"]
-    elif isinstance(plant, PendulumChain):
-        if plant.first_link:
-            lines.append(f"arm: {given['arm']['length']:.4g} m")
-        for k in range(plant.links):
-            mass, length, com = (given[key][k] for key in ("mass", "length", "com"))
-            lines += [
-                f"{plant.joint_names[k + plant.first_link]}: {mass:.4g} kg",
-                f"    length {length:.4g} m, mass centre at {com:.4g} m",
-            ]
+    if isinstance(plant, PendulumChain) and not isinstance(plant, Rotor):
+        lines += [f"arm: {given['arm']['length']:.4g} m"] if plant.first_link else []
+        for name, *of in zip(
+            plant.joint_names[plant.first_link :], given["mass"], given["length"], given["com"],
+            strict=True,
+        ):  # fmt: skip
+            text = "{}: {:.4g} kg\n    length {:.4g} m, mass centre at {:.4g} m"
+            lines.append(text.format(name, *of))
         lines += ["", "× mass centres"]
-    if "motor" in given:
-        lines.append("")
-    for key, unit in _MOTOR.items():
-        value = given.get("motor", {}).get(key)
-        if value is not None:
-            values = ", ".join(f"{x:.4g}" for x in (value if isinstance(value, list) else [value]))
-            lines.append(f"{key.replace('_', ' ')} {values} {unit}")
+    else:
+        lines += [f"{key} {given[key]:.4g} {_UNITS[key]}" for key in _UNITS if given.get(key)]
+        lines += ["", "flywheel, not to scale"] if given.get("mass") == 0 else []
+    motor = given.get("motor", {})
+    for key in motor:
+        numbers = motor[key] if isinstance(motor[key], list) else [motor[key]]
+        text = ", ".join(f"{x:.4g}" for x in numbers)
+        lines.append(f"{key.replace('_', ' ')} {text} {_MOTOR[key]}")
     return lines

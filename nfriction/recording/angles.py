@@ -82,7 +82,7 @@ class AngleConvention:
             if len(settings) == len(words) and set(words) <= _WORDS:
                 return cls(**settings)
         raise ValueError(
-            "an angle convention is one of relative, absolute and one of upright, hanging, such as "
+            "`convention` must be one of relative, absolute and one of upright, hanging, such as "
             f"'absolute,hanging', an AngleConvention, or a plant that has one; got {given!r}."
         )
 

@@ -291,10 +291,8 @@ class Recording:
                     "`convention=('relative', 'hanging')`."
                 )
         found: Unit | None = None if slides is None else "m" if slides else "rad"
-        written = attributes.get("unit")
-        # The file's own word for what `degrees` states.
-        if degrees and written == "deg":
-            written = None
+        # "deg" is the file's own word for what `degrees` states.
+        written = None if degrees and attributes.get("unit") == "deg" else attributes.get("unit")
         unit = unit or written or found or ("m" if plant and plant.unit == "m" else "rad")
         if found and found != unit:
             raise ValueError(

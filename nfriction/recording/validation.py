@@ -34,11 +34,7 @@ def gaps(time: Array) -> NDArray[np.intp]:
 
 
 def read_only(values: ArrayLike, key: str) -> Array:
-    """A read-only float64 copy.
-
-    Raises:
-        ValueError: no rectangular array of numbers; names `key`.
-    """
+    """A read-only float64 copy."""
     try:
         # First as it is: a tensor does not know `copy`.
         array = np.array(np.asarray(values), dtype=np.float64)

@@ -25,6 +25,7 @@ from nfriction.evaluation.tables import (
     coefficient_table,
     coefficient_units,
     error_table,
+    four_digits,
     interval_table,
     selection_table,
 )
@@ -327,7 +328,6 @@ def _cards(run: Run) -> list[dict[str, Any]]:
     if best is None or best not in run.fits:
         return []
     sets, units = run.coefficients.get(best, {}), _units(run, best)
-    show = Table("", (), ()).text
     cards = []
     for j, joint in enumerate(run.comparison.joint_names):
         lines = []
@@ -338,12 +338,12 @@ def _cards(run: Run) -> list[dict[str, Any]]:
             low, high = run.fits[best].intervals.get(f"{name} of {joint}", (math.nan, math.nan))
             note = ""
             if len(values) > 1:
-                value = f"{show(min(values))} to {show(max(values))}{unit}"
+                value = f"{four_digits(min(values))} to {four_digits(max(values))}{unit}"
                 note = "follows the motion"
             else:
-                value = f"{show(values[0])}{unit}"
+                value = f"{four_digits(values[0])}{unit}"
                 if math.isfinite(low) and math.isfinite(high):
-                    note = f"{show(low)} to {show(high)}"
+                    note = f"{four_digits(low)} to {four_digits(high)}"
                 elif not math.isnan(low):
                     note = "not identifiable"
             lines.append({"name": name, "value": value, "note": note})

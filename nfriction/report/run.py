@@ -1,11 +1,9 @@
-"""Read a comparison's folder without trusting any of it."""
+"""Read a comparison's folder."""
 
 import math
 import re
-import types
-import typing
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +12,10 @@ import numpy as np
 from nfriction.evaluation.compare import PART_NAMES, SCHEMA, Comparison, Part
 from nfriction.evaluation.cross_validation import Candidate, Selection
 from nfriction.evaluation.results import COMPLETE, exclusive
-from nfriction.evaluation.score import Score
+from nfriction.evaluation.score import RMSE, Errors, Score
 from nfriction.friction import model_names
 from nfriction.friction.models import FrictionModel
-from nfriction.io.files import parse_json
+from nfriction.io.files import is_intact, parse_json
 from nfriction.io.model_file import ModelFileError, ModelInfo, load, load_info
 
 # Far above any run of ours; larger files are none of it.
@@ -25,8 +23,6 @@ LARGEST_RESULTS, LARGEST_FIGURE, MOST_FIGURES = 64 * 2**20, 16 * 2**20, 100
 _PNG, _GIF = b"\x89PNG\r\n\x1a\n", b"GIF8"
 # Text that `plots.save_all` puts before the picture.
 _RUN = re.compile(rb"tEXtnfriction run\0([0-9a-f]{16})")
-# Squares of smaller numbers are finite.
-LARGEST_NUMBER = 10**100
 
 Coefficients = dict[str, dict[str, tuple[float, ...]]]
 
@@ -35,20 +31,9 @@ class RunError(ValueError):
     """The folder is not one that a comparison wrote, or it is damaged."""
 
 
-class _EntryError(ValueError):
-    """An entry of the results file has another form."""
-
-
 @dataclass(frozen=True)
 class FitRecord:
-    """End of a fit, from `FitResult.to_dict`.
-
-    Attributes:
-        usability: "good", "doubtful" or "do not use", and why.
-        intervals: 95 % interval by parameter, infinity for an open end.
-        plant: adjusted terms of the plant by name.
-        rule_seconds: how long the recordings fired each rule of a network [s], by joint.
-    """
+    """End of a fit, from `FitResult.to_dict`."""
 
     status: str = "unknown"
     converged: bool = False
@@ -58,9 +43,16 @@ class FitRecord:
     at_bounds: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     unidentifiable: tuple[str, ...] = ()
-    plant: dict[str, float] = field(default_factory=dict)
+    plant: dict[str, float] = field(default_factory=dict)  # adjusted terms by name
     intervals: dict[str, tuple[float, float]] = field(default_factory=dict)
     rule_seconds: tuple[tuple[float, ...], ...] = ()
+
+    @classmethod
+    def of(cls, entry: dict[str, Any]) -> "FitRecord":
+        """The record of a fit's entry."""
+        known = {f.name: entry[f.name] for f in fields(cls) if f.name in entry}
+        ends = {name: (_number(a), _number(b)) for name, (a, b) in entry["intervals"].items()}
+        return cls(**known | {"intervals": ends, "residual": _number(entry["residual"])})
 
 
 @dataclass(frozen=True)
@@ -137,122 +129,97 @@ def read_run(folder: str | Path) -> Run:
         content = parse_json(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise RunError(f"{path}: is no JSON, or cut short ({error}).") from error
+    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
+        raise RunError(f"{path}: not results of schema {SCHEMA}; run the comparison again.")
+    if not is_intact(content):
+        raise RunError(
+            f"{path}: the checksum is missing or does not match, so it was damaged or edited, or "
+            "written by an older version; run the comparison again."
+        )
     try:
-        return _run(folder, _read(dict[str, Any], content, "the file"))
-    except _EntryError as error:
-        raise RunError(f"{path}: not results of a comparison: {error}.") from error
+        run = _run(folder, content)
+    # Of what another program wrote, with a checksum that matches.
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise RunError(f"{path}: not results of a comparison ({error!r:.200}).") from error
+    _require_one_run(run)
+    return run
 
 
 def _run(folder: Path, content: dict[str, Any]) -> Run:
-    if content.get("schema") != SCHEMA:
-        found = str(content.get("schema"))[:40]
-        raise _EntryError(f"its schema is {found}, not {SCHEMA}; run the comparison again")
-    joints = _read(tuple[str, ...], content.get("joints"), "`joints`")
-    unit = content.get("units")
-    if unit not in ("rad", "m"):
-        raise _EntryError('`units` must be "rad" or "m"')
-    entries = _read(dict[str, dict[str, Any]], content.get("models"), "`models`")
-    if not joints or not entries:
-        raise _EntryError("it has no joints or no models")
-    scores = {part: _scores(entries, part, len(joints)) for part in PART_NAMES}
-    if not any(scores.values()):
-        raise _EntryError("it has no scores")
-    best = _read(dict[str, Any], content.get("best") or {}, "`best`")
-    # Names select files and table rows further on.
-    if best and _read(str, best.get("model"), "`best`") not in entries:
-        raise _EntryError("its best model is none of its models")
-    recordings = _read(dict[str, dict[str, str]], content.get("recordings", {}), "`recordings`")
-    fits: dict[str, FitRecord] = {
-        n: _read(FitRecord, e["fit"], f"fit of {n}") for n, e in entries.items() if "fit" in e
+    joints, unit, entries = tuple(content["joints"]), content["units"], content["models"]
+    best = content["best"] or {}
+    scores = {
+        part: {
+            name: [_score(recording, of) for recording, of in entry[part].items()]
+            for name, entry in entries.items()
+            if entry[part]
+        }
+        for part in PART_NAMES
     }
+    fits = {name: FitRecord.of(entry["fit"]) for name, entry in entries.items() if "fit" in entry}
     models, notes = _models(folder, fits, len(joints))
     figures, unread = _figures(folder / "figures")
-    failed = _read(dict[str, str], content.get("failed", {}), "`failed`")
-    run = Run(
-        id=_read(str, content.get("run", ""), "`run`"),
+    failed = content.get("failed", {})
+    return Run(
+        id=content.get("run", ""),
         folder=folder,
         comparison=Comparison({}, scores["train"], scores["test"], unit, joints, failed=failed),
         fits=fits,
         coefficients={
-            name: _coefficients(entry["coefficients"], f"coefficients of {name}", len(joints))
+            name: _coefficients(entry["coefficients"])
             for name, entry in entries.items()
             if "coefficients" in entry
         },
         best=best.get("model"),
-        judged_by=_read(str, best.get("by", ""), "`best`"),
-        indistinguishable=_read(tuple[str, ...], best.get("indistinguishable", []), "`best`"),
-        unfit=_read(dict[str, str], content.get("unfit", {}), "`unfit`"),
-        command=_read(str, content.get("command", ""), "`command`"),
-        recordings={part: recordings.get(part, {}) for part in PART_NAMES},
+        judged_by=best.get("by", ""),
+        indistinguishable=tuple(best.get("indistinguishable", ())),
+        unfit=content.get("unfit", {}),
+        command=content.get("command", ""),
+        recordings=content["recordings"],
         models=models,
         figures=figures,
         notes=(*notes, *unread),
         selection=_selection(content.get("selection"), unit),
     )
-    _require_one_run(run)
-    return run
 
 
-def _scores(
-    entries: Mapping[str, Mapping[str, Any]], part: Part, joints: int
-) -> dict[str, list[Score]]:
-    found: dict[str, list[Score]] = {}
-    nothing = np.zeros(0)
-    for name, entry in entries.items():
-        where = f"{name}, {part}"
-        found[name] = [
-            _read_record(
-                Score, {"windows": {}, "diverged_at": None, "limit": None} | of,
-                f"{where}, {recording}", recording=recording, time=nothing, simulated=nothing,
-            )
-            for recording, of in _read(dict[str, dict], entry.get(part, {}), where).items()
-        ]  # fmt: skip
-        for score in found[name]:
-            for rmse in (e for part in (score, score.limit) if part
-                         for e in (part.free_run, *part.windows.values())):  # fmt: skip
-                if len(rmse.joints) != joints:
-                    raise _EntryError(f"{where} needs an error for each of {joints} joints")
-                if min(*rmse.joints, rmse.all) < 0:
-                    raise _EntryError(f"{where} has a negative error")
-            for horizon in score.windows:
-                try:
-                    float(horizon)
-                except ValueError:
-                    raise _EntryError(f"{where} has windows of {horizon!r} seconds") from None
-    # Tables pool the recordings of a model, so all must have been scored on the same.
-    if len({tuple((s.recording, *s.windows) for s in many) for many in found.values()}) > 1:
-        raise _EntryError(f"its models were scored on different recordings ({part})")
-    return {name: many for name, many in found.items() if many}
+def _number(value: float | None) -> float:
+    """A number of JSON, where null is infinite."""
+    return math.inf if value is None else float(value)
 
 
-def _selection(value: Any, unit: str) -> Selection | None:
-    if value is None:
-        return None
-    where = "`selection`"
-    entry = _read(dict[str, Any], value, where)
-    candidates = tuple(
-        _read_record(Candidate, {"converged": False} | of, where, name=name,
-                     errors=_read(tuple[float, ...], of.get("blocks"), where))
-        for name, of in _read(dict[str, dict], entry.get("candidates"), where).items()
+def _errors(of: dict[str, Any]) -> Errors:
+    def rmse(of: dict[str, Any]) -> RMSE:
+        return RMSE(tuple(map(_number, of["joints"])), _number(of["all"]))
+
+    windows = {horizon: rmse(window) for horizon, window in of["windows"].items()}
+    return Errors(rmse(of["free_run"]), windows)
+
+
+def _score(recording: str, of: dict[str, Any]) -> Score:
+    errors, nothing = _errors(of), np.zeros(0)
+    return Score(
+        errors.free_run, errors.windows, of["limit"] and _errors(of["limit"]), recording,
+        nothing, nothing, _number(of["diverged_at"]),
     )  # fmt: skip
-    if not all(candidate.errors for candidate in candidates):
-        raise _EntryError(f"{where} needs the error of each block")
-    if entry.get("chosen") not in [candidate.name for candidate in candidates]:
-        raise _EntryError(f"{where} chose none of its candidates")
-    if entry.get("horizon") is None:
-        raise _EntryError(f"{where} has no `horizon`")
-    known = {"candidates": candidates, "unit": unit}
-    selection: Selection = _read_record(Selection, {"reason": ""} | entry, where, **known)
-    return selection
 
 
-def _coefficients(value: Any, where: str, joints: int) -> Coefficients:
-    entry = _read(dict[str, Any], value, where)
-    sets = entry if all(isinstance(v, dict) for v in entry.values()) else {"always": entry}
-    found: Coefficients = _read(Coefficients, sets, where)
-    if any(len(values) != joints for of in found.values() for values in of.values()):
-        raise _EntryError(f"{where} need a value for each of {joints} joints")
-    return found
+def _selection(of: dict[str, Any] | None, unit: str) -> Selection | None:
+    if of is None:
+        return None
+    candidates = tuple(
+        Candidate(name, tuple(map(_number, c["blocks"])), c["parameters"], c["converged"])
+        for name, c in of["candidates"].items()
+    )
+    return Selection(of["chosen"], of["reason"], candidates, of["horizon"], unit)
+
+
+def _coefficients(of: dict[str, Any]) -> Coefficients:
+    sets = of if all(isinstance(v, dict) for v in of.values()) else {"always": of}
+    return {
+        label: {name: tuple(map(_number, values)) for name, values in named.items()}
+        for label, named in sets.items()
+    }
 
 
 def _models(
@@ -299,13 +266,10 @@ def _figures(folder: Path) -> tuple[tuple[Figure, ...], list[str]]:
 
 def _require_one_run(run: Run) -> None:
     """Refuse models and figures of another run than the results'."""
-    trained_on = run.recordings["train"]
     foreign = [
         f"models/{name}.json"
         for name, (_, info) in run.models.items()
         if info.fit.get("run", "") != run.id
-        # Runs of older versions have no id, but the digests of their recordings.
-        or (info.training_data and info.training_data != trained_on)
     ]
     foreign += [f"figures/{f.name}.png" for f in run.figures if f.run not in ("", run.id)]
     if foreign:
@@ -313,53 +277,3 @@ def _require_one_run(run: Run) -> None:
             f"{run.folder}: has files of two runs: {', '.join(foreign)} belong to another run than "
             f"results.json; run the comparison again, or give a folder that a single run wrote."
         )
-
-
-def _read(kind: Any, value: Any, where: str) -> Any:
-    """A JSON value as a type, such as `dict[str, float]`; null is an infinite number.
-
-    Raises:
-        _EntryError: if it is of another type.
-    """
-    origin, of = typing.get_origin(kind), typing.get_args(kind)
-    if kind is Any:
-        return value
-    if origin is types.UnionType:
-        return None if value is None else _read(of[0], value, where)
-    if origin is tuple:
-        if not isinstance(value, list):
-            raise _EntryError(f"{where} must be a list")
-        if of[-1] is not ... and len(value) != len(of):
-            raise _EntryError(f"{where} needs {len(of)} values")
-        return tuple(_read(of[0], entry, where) for entry in value)
-    if kind is dict or origin is dict or is_dataclass(kind):
-        if not isinstance(value, dict):
-            raise _EntryError(f"{where} must be an object")
-        if is_dataclass(kind):
-            return _read_record(kind, value, where)
-        return {k: _read(of[1], v, f"{where}, {k}") for k, v in value.items()} if of else value
-    if kind in (float, int):
-        if value is None and kind is float:
-            return math.inf
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise _EntryError(f"{where} must be a number")
-        # An int may be too large for a comparison with floats.
-        if abs(value) > LARGEST_NUMBER:
-            raise _EntryError(f"{where} is too large a number")
-        return kind(value)
-    if not isinstance(value, kind):
-        raise _EntryError(f"{where} must be {'text' if kind is str else 'true or false'}")
-    return value
-
-
-def _read_record(kind: Any, entry: Mapping[str, Any], where: str, **known: Any) -> Any:
-    """A dataclass from the entries of its fields' names, and from fields that are known."""
-    types_of = typing.get_type_hints(kind)
-    for of in fields(kind):
-        if of.name in known:
-            continue
-        if of.name in entry:
-            known[of.name] = _read(types_of[of.name], entry[of.name], f"{where}, {of.name}")
-        elif of.default is MISSING and of.default_factory is MISSING:
-            raise _EntryError(f"{where} has no `{of.name}`")
-    return kind(**known)

@@ -11,7 +11,7 @@ from nfriction.evaluation.torque_tables import TorqueFits
 from nfriction.friction import plain_name
 from nfriction.io.files import write_atomically
 from nfriction.io.model_file import save
-from nfriction.plots.saving import DPI
+from nfriction.plots.comparison import DPI
 from nfriction.report.page import document, pictures
 from nfriction.report.run import Figure
 
@@ -63,9 +63,6 @@ def write_torque_fits(
         folder: made where it does not exist; files of these names are replaced.
         command: reproduces the results.
         figures: draw friction over velocity.
-
-    Raises:
-        OSError: another process is writing a run into the folder, or it cannot be written.
     """
     folder = Path(folder)
     written, drawn = [], []

@@ -42,11 +42,7 @@ class Motion:
 
 
 def check_motion(time: ArrayLike, q: ArrayLike) -> tuple[Array, Array]:
-    """Time (time,) and positions (time, joint) as float64, checked.
-
-    Raises:
-        ValueError: wrong shapes, fewer than 8 samples, NaN, or time that does not increase.
-    """
+    """Time (time,) and positions (time, joint) as float64, checked."""
     time, q = np.asarray(time, dtype=np.float64), np.asarray(q, dtype=np.float64)
     if q.ndim != 2 or time.shape != q.shape[:1]:
         raise ValueError(

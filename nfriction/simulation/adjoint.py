@@ -42,15 +42,10 @@ def wants_gradients(inputs: RolloutInputs, tensors: Iterable[Tensor]) -> bool:
 def adjoint_rollout(
     simulate: Callable[[], States], plant: Plant, friction: Friction, inputs: RolloutInputs
 ) -> States | None:
-    """States of a rollout, differentiable once by the initial state, the torque and the modules.
+    """States that `simulate` computes, differentiable once by initial state, torque and modules.
 
-    Args:
-        simulate: computes the states q, qd, qdd, each (*batch, steps + 1, joint).
-        plant, friction, inputs: the rollout that it simulates.
-
-    Returns:
-        None where a gradient would be incomplete: with a hidden state, a law with memory, a sample
-        time or measured motion that requires one, or modules that read tensors of others.
+    None where a gradient would be incomplete: with a hidden state, a law with memory, a sample
+    time or measured motion that requires one, or modules that read tensors of others.
     """
     system = _System(plant, friction, inputs, own_tensors(plant, friction))
     fixed = (inputs.step, *(inputs.measured or ()))
@@ -139,11 +134,7 @@ class _Sweep:
         self.by_tensor = [torch.zeros_like(t) for t in self.tensors]
 
     def run(self, states: Tensor, cotangents: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradients by the initial position and velocity, each (*batch, joint).
-
-        Args:
-            states, cotangents: (steps + 1, *batch, 3 joint).
-        """
+        """Gradients by q and qd at the start; arguments are (steps + 1, *batch, 3 joint)."""
         # A step that diverges passes nothing back, but its numbers would turn zeros into NaN.
         alive = torch.isfinite(states[1:]).all(-1, keepdim=True)
         before = torch.where(alive, states[:-1], 0.0)

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nfriction.codegen.rollout_program import SPEED_LIMIT
+from nfriction.codegen.rollout import SPEED_LIMIT
 from nfriction.simulation.compiled import System
 from nfriction.simulation.protocols import (
     Friction,
@@ -27,7 +27,7 @@ from nfriction.simulation.validate import (
     outside_inference_mode,
     require_stability,
     validate_inputs,
-    with_law_state,
+    with_states,
 )
 
 Array = NDArray[np.float64]
@@ -139,64 +139,61 @@ def control(
             the controller gives a torque of another shape or one that is not finite.
     """
     model = NoFriction(plant.joints) if friction is None else friction
-    given = validate_inputs(
-        plant, model, q0, qd0, None, electronics.sample_time, steps, electronics.substeps
+    sample_time, substeps = electronics.sample_time, electronics.substeps
+    given = with_states(
+        validate_inputs(plant, model, q0, qd0, None, sample_time, steps, substeps), model
     )
-    given = with_law_state(given, model, None)
     system = System.of(plant, model)
     require_stability(system, given)
-    q, qd, step = given.q0, given.qd0, given.step[:1]
-    qdd = plant.forward_dynamics(q, qd, torch.zeros_like(q))
-    stateful = as_stateful(model)
+    q, qd, step, axis = given.q0, given.qd0, given.step[:1], given.q0.ndim - 1
+    law = [] if given.law_state is None else [given.law_state]
+    states = [(q, qd, plant.forward_dynamics(q, qd, torch.zeros_like(q)), *law)]
     hidden: Tensor | None = None
-    law_states: list[Tensor] = []
-    if given.law_state is not None:
-        law_states.append(given.law_state)
-    states, torques, readings = [(q, qd, qdd)], [], []
+    stateful = as_stateful(model)
+    torques, readings = [], []
     waiting = [np.zeros(q.shape)] * electronics.delay
     diverged_at = torch.full(q.shape[:-1], torch.inf, dtype=q.dtype)
     for k in range(steps):
-        time = k * electronics.sample_time
         reading = electronics.read(q.numpy())
-        # Encoders are read before the torque of the sample acts.
-        wanted = np.asarray(controller(time, reading), dtype=np.float64)
-        if wanted.shape != reading.shape or not np.isfinite(wanted).all():
-            raise ValueError(
-                f"the controller must give finite torques {reading.shape}, got shape "
-                f"{wanted.shape} at {time:g} s."
-            )
-        # Samples in flight: those read now act after the delay.
-        waiting.append(electronics.drive(wanted))
+        # Encoders are read before the torque of the sample acts; torques in flight act first.
+        waiting.append(electronics.drive(_wanted(controller, k * sample_time, reading)))
         tau = torch.as_tensor(waiting.pop(0)).clone()
         if stateful is not None:
-            if hidden is None:
-                hidden = stateful.initial_state(qd, qdd)
-            else:
-                hidden = stateful.advance(qd, qdd, hidden)
-        inputs = RolloutInputs(q, qd, tau.unsqueeze(-2), step, electronics.substeps, None, hidden)
-        inputs = with_law_state(inputs, model, law_states[-1] if law_states else None)
-        found = simulate(system, inputs)
-        q, qd, qdd = (x[..., -1, :].clone() for x in found[:3])
-        law_states += [x[..., -1, :, :].clone() for x in found[3:]]
-        states.append((q, qd, qdd))
+            motion = qd, states[-1][2]
+            hidden = (
+                stateful.initial_state(*motion) if hidden is None
+                else stateful.advance(*motion, hidden)
+            )  # fmt: skip
+        inputs = RolloutInputs(q, qd, tau.unsqueeze(-2), step, substeps, None, hidden, *law)
+        after = [x.select(axis, -1).clone() for x in simulate(system, inputs)]
+        states.append(tuple(after))
+        q, qd, _, *law = after
         torques.append(tau)
         readings.append(torch.as_tensor(reading).clone())
         # A motion that is lost must not reach the controllers of the others.
         lost = ~(torch.isfinite(q) & (qd.abs() < SPEED_LIMIT)).all(-1)
         if bool(lost.any()):
             # The sample after this one, as of a rollout.
-            diverged_at[lost] = diverged_at[lost].clamp_max((k + 1) * electronics.sample_time)
+            diverged_at[lost] = diverged_at[lost].clamp_max((k + 1) * sample_time)
             q = torch.where(lost[..., None], given.q0, q)
             qd = torch.where(lost[..., None], torch.zeros_like(qd), qd)
-    seconds = electronics.sample_time * torch.arange(steps + 1, dtype=q.dtype)
+    seconds = sample_time * torch.arange(steps + 1, dtype=q.dtype)
     gone = (seconds >= diverged_at[..., None])[..., None]
-    q, qd, qdd = (
-        torch.stack(x, -2).masked_fill(gone, torch.nan) for x in zip(*states, strict=True)
-    )
-    applied, read = torch.stack(torques, -2), torch.stack(readings, -2)
-    law = None
-    if law_states:
-        law = torch.stack(law_states, -3).masked_fill(gone[..., None], torch.nan)
+    q, qd, qdd, *law = (torch.stack(x, axis) for x in zip(*states, strict=True))
+    q, qd, qdd = (x.masked_fill(gone, torch.nan) for x in (q, qd, qdd))
+    law = [x.masked_fill(gone[..., None], torch.nan) for x in law]
     return ControlledMotion(
-        step.expand(steps), q, qd, qdd, diverged_at, law, tau=applied, measured=read
-    )
+        step.expand(steps), q, qd, qdd, diverged_at, *law,
+        tau=torch.stack(torques, -2), measured=torch.stack(readings, -2),
+    )  # fmt: skip
+
+
+def _wanted(controller: Feedback, time: float, reading: Array) -> Array:
+    """Torque that the controller wants."""
+    wanted = np.asarray(controller(time, reading), dtype=np.float64)
+    if wanted.shape != reading.shape or not np.isfinite(wanted).all():
+        raise ValueError(
+            f"the controller must give finite torques {reading.shape}, got shape "
+            f"{wanted.shape} at {time:g} s."
+        )
+    return wanted

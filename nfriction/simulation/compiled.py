@@ -34,18 +34,12 @@ _warned: set[str] = set()
 
 @dataclass(frozen=True)
 class System:
-    """Plant and friction, with a fingerprint by which a later change is noticed.
-
-    Attributes:
-        plant, friction: the mechanism and its friction model.
-        tensors: their floating-point parameters and buffers, by "plant." or "friction." and name.
-        fingerprint: of all else that they read; the error that says why there is none.
-    """
+    """Plant and friction, with a fingerprint by which a later change is noticed."""
 
     plant: Any
     friction: Any
-    tensors: Mapping[str, Tensor]
-    fingerprint: Hashable
+    tensors: Mapping[str, Tensor]  # floating-point ones, by "plant." or "friction." and name
+    fingerprint: Hashable  # of all else that they read; the error that says why there is none
 
     @classmethod
     def of(cls, plant: Any, friction: Any) -> "System":
@@ -66,11 +60,7 @@ class System:
 
 
 def wants_compiled(backend: Backend, q: Tensor, gradients: bool) -> bool:
-    """Return true if compiled code should be tried.
-
-    Raises:
-        ValueError: if compiled code is asked for together with gradients or off the CPU.
-    """
+    """Return true if compiled code should be tried."""
     if backend not in get_args(Backend):
         raise ValueError(f"`backend` must be one of {get_args(Backend)}, got {backend!r}.")
     able = not gradients and q.dtype == torch.float64 and q.device.type == "cpu"
@@ -92,57 +82,17 @@ def integrate_compiled(
 ) -> tuple[Tensor, ...] | None:
     """States at every sample: q, qd, qdd, each (*batch, steps + 1, joint), and that of the law.
 
-    Args:
-        system, inputs: what moves, and how.
-        backend: `"auto"` or `"compiled"`.
-        threads: number of threads that share a batch.
-        parameters: values of the friction model's parameters by name that differ from its own,
-            each (*batch, *the parameter's shape).
-        step_function: what is repeated, with the arguments of `rk4_step`.
-
-    Returns:
-        None where `backend="auto"` finds no way to compile, so that eager torch has to do it.
-
-    Raises:
-        CodegenError: if compiled code is asked for and cannot be made.
+    None where `backend="auto"` finds no way to compile, so that eager torch has to do it. The
+    friction model's parameters that differ from its own come by name, (*batch, *its shape).
     """
     compiled = _compiled(system, backend, step_function)
     if compiled is None:
         return None
-    q, qd, measured, memory = inputs.q0, inputs.qd0, inputs.measured, inputs.hidden_state
-    law = inputs.law_state
-    batch, joints = q.shape[:-1], q.shape[-1]
-
-    def rows(x: Tensor, trailing: int) -> Tensor:
-        """Candidates on one leading axis; what all share keeps none."""
-        x = x.detach()
-        if x.ndim > trailing:
-            x = x.expand(*batch, *x.shape[x.ndim - trailing :]).reshape(-1, *x.shape[-trailing:])
-        # An expanded constant needs no value for each step.
-        return x[0] if x.ndim == trailing and not x.stride(0) else x
-
-    drive = None if measured is None else (rows(measured[0], 2), rows(measured[1], 2))
+    dims = inputs.q0.ndim - 1
     values = {name: system.tensors[name].detach() for name in compiled.parameter_names}
     for name, value in (parameters or {}).items():
-        own = value.shape[len(batch) :]
-        values[f"friction.{name}"] = value.detach().reshape(-1, *own)
-    found = compiled(
-        q.detach().reshape(-1, joints),
-        qd.detach().reshape(-1, joints),
-        codegen.RolloutSignals(
-            steps=inputs.step.shape[-1],
-            time_step=rows(inputs.step, 1),
-            tau=rows(inputs.tau, 2),
-            drive=drive,
-            substeps=inputs.substeps,
-            memory=None if memory is None else rows(memory, 2).reshape(-1, *memory.shape[-2:]),
-            law_state=None if law is None else rows(law, 2).reshape(-1, *law.shape[-2:]),
-        ),
-        values,
-        threads,
-    )
-    given = [found.q, found.qd, found.qdd] + [found.law_state] * (law is not None)
-    return tuple(x.reshape(*batch, *x.shape[1:]) for x in given)
+        values[f"friction.{name}"] = value.detach().reshape(-1, *value.shape[dims:])
+    return compiled(inputs, values, threads)
 
 
 def _compiled(
@@ -184,7 +134,7 @@ def _attempt(
     """A compiled rollout, or the reason why there is none."""
     try:
         _check_compilable(plant, friction)
-        traced = codegen.trace_rollout(plant, friction, step_function)
+        traced = codegen.CompiledRollout(plant, friction, step_function)
         found = _compiled_graphs.get(traced.digest)
         if found is None:
             traced.check()

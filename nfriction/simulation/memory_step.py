@@ -40,6 +40,7 @@ class LawMemory(Protocol):
     """Internal state of a friction law, see `nfriction.friction.memory`."""
 
     size: int
+    transmitted: bool
 
     def advance(
         self, state: Tensor, qd: Tensor, load: Tensor, coefficients: Tensor,
@@ -82,7 +83,8 @@ def memory_step(
     law = memory_of(friction)
     assert law is not None
     # Held like the torque: a load that changes within a step is of the step's own order.
-    load, zero = plant.load(q, qd), torch.zeros_like(qd)
+    zero = torch.zeros_like(qd)
+    load = tau + zero if law.transmitted else plant.load(q, qd)
     mobility = _mobility(plant, q, zero)
     at_ease = torch.zeros_like(state)
     moved = law.advance(at_ease, zero + SLOW, load, coefficients, step)

@@ -9,6 +9,8 @@ from typing import Protocol, cast
 import torch
 from torch import Tensor, nn
 
+from nfriction.codegen import RolloutInputs
+
 logger = logging.getLogger(__name__)
 
 
@@ -69,33 +71,6 @@ def as_stateful(friction: Friction) -> StatefulFriction | None:
     if getattr(friction, "state_size", 0) > 0:
         return cast(StatefulFriction, friction)
     return None
-
-
-@dataclass(frozen=True)
-class RolloutInputs:
-    """Initial state and inputs of a rollout.
-
-    Attributes:
-        q0, qd0: initial state [rad, rad/s], (*batch, joint).
-        tau: torque held over each step [N m], (steps, joint) or (*batch, steps, joint).
-        step: sample times [s], (steps,) or (*batch, steps).
-        substeps: integration steps to each sample.
-        measured: velocity and acceleration that drive the coefficients in place of the simulated
-            ones, each (*batch, steps, joint) or without batch; None for the simulated ones.
-        hidden_state: of the coefficients after the first sample, (*batch, joint, state_size);
-            None for that of the first sample alone.
-        law_state: internal state of the friction law at the start, (*batch, joint, state); None of
-            a law without.
-    """
-
-    q0: Tensor
-    qd0: Tensor
-    tau: Tensor
-    step: Tensor
-    substeps: int = 1
-    measured: tuple[Tensor, Tensor] | None = None
-    hidden_state: Tensor | None = None
-    law_state: Tensor | None = None
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from nfriction.codegen.rollout_program import SPEED_LIMIT
+from nfriction.codegen.rollout import SPEED_LIMIT
 from nfriction.simulation.protocols import (
     Friction,
     Plant,

@@ -31,8 +31,7 @@ from nfriction.simulation.validate import (
     validate_inputs,
     validate_measured,
     warn_of_sample_time,
-    with_hidden_state,
-    with_law_state,
+    with_states,
 )
 
 Scheme = Literal["rk4", "time_stepping"]
@@ -103,8 +102,7 @@ def rollout(
     model = NoFriction(plant.joints) if friction is None else friction
     inputs = validate_inputs(plant, model, q0, qd0, tau, sample_time, steps, substeps)
     inputs = replace(inputs, measured=validate_measured(drive, measured, inputs))
-    inputs = with_hidden_state(inputs, model, hidden_state)
-    inputs = with_law_state(inputs, model, law_state)
+    inputs = with_states(inputs, model, hidden_state, law_state)
     if scheme not in get_args(Scheme):
         raise ValueError(f"`scheme` must be one of {get_args(Scheme)}, got {scheme!r}.")
     if scheme == "time_stepping":
@@ -121,7 +119,7 @@ def rollout(
 def integrate(plant: Plant, friction: Friction | None, inputs: RolloutInputs) -> Rollout:
     """`rollout` without checks and gradients, for searches whose trials may well be unstable."""
     model = NoFriction(plant.joints) if friction is None else friction
-    inputs = with_law_state(inputs, model, inputs.law_state)
+    inputs = with_states(inputs, model, inputs.hidden_state, inputs.law_state)
     return Rollout.of(inputs, simulate(System.of(plant, model), inputs))
 
 

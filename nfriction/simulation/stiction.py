@@ -35,16 +35,7 @@ def moreau_step(
     The impulse of friction brings each joint to rest, limited to what the law gives while it
     slides. With several joints impulses are found in turns (projected Gauss-Seidel).
 
-    Args:
-        plant: the mechanism.
-        friction: friction model.
-        q, qd: state at the start of the step, (*batch, joint).
-        tau: torque over the step, (*batch, joint).
-        coefficients: held over the step, (*batch, joint, coefficient).
-        step: its length [s], (*batch, 1).
-
-    Returns:
-        q and qd at the end of the step, and the mean qdd over it.
+    Arguments are those of `rk4_step`; the results q and qd at the end, and the mean qdd.
 
     References:
         M. Duclusaud et al., Extended friction models for the physics simulation of servo
@@ -85,11 +76,7 @@ def moreau_step(
 def simulate_stiction(
     plant: Plant, friction: Friction, inputs: RolloutInputs, gradients: bool | None
 ) -> tuple[Tensor, ...]:
-    """States at every sample: q, qd, qdd, each (*batch, steps + 1, joint).
-
-    Raises:
-        ValueError: for what this scheme does not have.
-    """
+    """States at every sample: q, qd, qdd, each (*batch, steps + 1, joint)."""
     given = gradients or inputs.measured is not None or inputs.hidden_state is not None
     if memory_of(friction) is not None:
         raise ValueError(
@@ -101,13 +88,8 @@ def simulate_stiction(
             '`scheme="time_stepping"` needs a friction model, and has no gradients, measured '
             'drive or coefficients with a hidden state; use scheme="rk4" for these.'
         )
-    double = replace(
-        inputs,
-        q0=inputs.q0.double(),
-        qd0=inputs.qd0.double(),
-        tau=inputs.tau.double(),
-        step=inputs.step.double(),
-    )
+    as_double = {name: getattr(inputs, name).double() for name in ("q0", "qd0", "tau", "step")}
+    double = replace(inputs, **as_double)
     states = integrate_compiled(
         System.of(plant, friction), double, "auto", 1, step_function=moreau_step
     )

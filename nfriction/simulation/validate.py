@@ -54,11 +54,7 @@ def all_finite(x: Tensor) -> bool:
 
 
 def as_tensor(name: str, value: Any) -> Tensor:
-    """Tensors as they are; arrays keep their precision, whole numbers and lists become float64.
-
-    Raises:
-        ValueError: if it is no array of real numbers.
-    """
+    """Tensors as they are; arrays keep their precision, whole numbers and lists become float64."""
     if isinstance(value, Tensor):
         found = value
     else:
@@ -164,50 +160,42 @@ def validate_measured(
     return found[0], found[1]
 
 
-def with_hidden_state(
-    inputs: RolloutInputs, friction: Friction, hidden_state: Tensor | None
+def with_states(
+    inputs: RolloutInputs,
+    friction: Friction,
+    hidden_state: Tensor | None = None,
+    law_state: Tensor | None = None,
 ) -> RolloutInputs:
-    """The inputs with a hidden state from which coefficients continue."""
-    if hidden_state is None:
-        return inputs
-    given = as_tensor("hidden_state", hidden_state).to(inputs.q0)
-    joints = inputs.q0.shape[-1]
-    size = getattr(friction, "state_size", 0)
-    if size == 0:
+    """The inputs with the states from which coefficients and a law with memory continue."""
+    law, size = memory_of(friction), getattr(friction, "state_size", 0)
+    if hidden_state is not None and size == 0:
         raise ValueError(
             "`hidden_state` is for friction whose coefficients have one; leave it out."
         )
-    if given.shape[-2:] != (joints, size) or not all_finite(given):
+    if law_state is not None and law is None:
         raise ValueError(
-            f"`hidden_state` must be finite (*batch, {joints}, {size}), got {tuple(given.shape)}."
+            "`law_state` is for a friction law with memory, such as LuGre; leave it out."
         )
-    shape = np.broadcast_shapes(inputs.q0.shape, given.shape[:-1])
-    q0, qd0 = inputs.q0.expand(shape), inputs.qd0.expand(shape)
-    return replace(inputs, q0=q0, qd0=qd0, hidden_state=given)
-
-
-def with_law_state(
-    inputs: RolloutInputs, friction: Friction, law_state: Tensor | None
-) -> RolloutInputs:
-    """The inputs with the state that a friction law with memory starts from."""
-    law, shape = memory_of(friction), tuple(inputs.q0.shape)
-    if law is None:
-        if law_state is not None:
-            raise ValueError(
-                "`law_state` is for a friction law with memory, such as LuGre; leave it out."
-            )
+    if law is not None and law_state is None:
+        law_state = inputs.q0.new_zeros(inputs.q0.shape[-1], law.size)
+    sizes = {"hidden_state": size, "law_state": 0 if law is None else law.size}
+    found: dict[str, Any] = {}
+    shape = tuple(inputs.q0.shape)
+    for name, given in (("hidden_state", hidden_state), ("law_state", law_state)):
+        if given is not None:
+            found[name] = state = as_tensor(name, given).to(inputs.q0)
+            wanted = (shape[-1], sizes[name])
+            if state.shape[-2:] != wanted or not all_finite(state):
+                raise ValueError(
+                    f"`{name}` must be finite (*batch, {wanted[0]}, {wanted[1]}), got "
+                    f"{tuple(state.shape)}."
+                )
+            shape = np.broadcast_shapes(shape, state.shape[:-1])
+    if not found:
         return inputs
-    if law_state is None:
-        return replace(inputs, law_state=inputs.q0.new_zeros(*shape, law.size))
-    given = as_tensor("law_state", law_state).to(inputs.q0)
-    if given.shape[-2:] != (shape[-1], law.size) or not all_finite(given):
-        raise ValueError(
-            f"`law_state` must be finite (*batch, {shape[-1]}, {law.size}), got "
-            f"{tuple(given.shape)}."
-        )
-    shape = np.broadcast_shapes(shape, given.shape[:-1])
-    q0, qd0 = inputs.q0.expand(shape), inputs.qd0.expand(shape)
-    return replace(inputs, q0=q0, qd0=qd0, law_state=given.expand(*shape, law.size))
+    if law is not None:
+        found["law_state"] = found["law_state"].expand(*shape, law.size)
+    return replace(inputs, q0=inputs.q0.expand(shape), qd0=inputs.qd0.expand(shape), **found)
 
 
 def required_substeps(plant: Plant, friction: Friction, sample_time: float) -> int:

@@ -73,7 +73,7 @@ def test_equal_input_gives_equal_bytes(bench: Path, compared: Path) -> None:
     assert compare(bench, bench / "again", "--no-figures", models="NCFM,LFM") == 0
     assert not (bench / "again" / "figures").exists()
     assert (bench / "again/table.csv").read_bytes() == (compared / "table.csv").read_bytes()
-    own = {"command": "", "files": []}
+    own = {"command": "", "files": [], "checksum": ""}
     assert results(bench / "again") | own == results(compared) | own
 
 

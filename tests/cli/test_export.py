@@ -12,9 +12,9 @@ import pytest
 
 from nfriction import LFM, NFLFM, ModelInfo, Recording, cli, rigs, save
 from nfriction.cli import export
-from nfriction.cli.console import Parser
-from nfriction.export.c_code.dialect import ControllerC
-from nfriction.export.c_code.export import find_compiler
+from nfriction.cli.console import Commands, Parser
+from nfriction.export.c_dialect import ControllerC
+from nfriction.export.c_file import find_compiler
 from tests.friction.samples import randomise
 
 RIG = rigs.tlrip()
@@ -30,7 +30,7 @@ def model(tmp_path: Path) -> Path:
 
 def run_verify(*words: Any) -> int:
     parser = Parser()
-    export.add_verify(parser.add_subparsers(), Parser(add_help=False))
+    export.add_verify(Commands(parser))
     arguments = parser.parse_args(["verify", *map(str, words)], argparse.Namespace())
     return int(arguments.run(arguments))
 
@@ -170,7 +170,7 @@ def test_a_recording_in_degrees_with_names_of_its_own_gives_the_same(
         (["--cutoff", "1,2"], "takes one number"),
         (["--with-filter", "--cutoff", "900"], "cutoff_hz"),
         (["--online", "0.1"], "--online takes one number, with c in"),
-        (["--online", "0.1,0.2", "--format", "c"], "--online takes one number"),
+        (["--online", "0.1,0.2", "--format", "c"], "--online: takes one number"),
     ],
 )
 def test_what_cannot_be_done_is_said(

@@ -157,7 +157,7 @@ def test_export_info_and_demo_say_what_they_cannot(bench: Path, compared: Path, 
         assert "model file" in failing(command, bench / "bench.json")
     model = compared / "models" / "NCFM.json"
     assert "torchscript" in failing("export", model, "--format", "basic")
-    assert "positive seconds" in failing("demo", "--seconds", "nan")
+    assert "number above 0" in failing("demo", "--seconds", "nan")
     assert "whole number" in failing("demo", "--seed", "-1")
     assert "viscous (NCFM)" in failing("demo", "--models", "FOO")
 

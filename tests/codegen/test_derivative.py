@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction.codegen import UnsupportedOperation, compile_function
+from nfriction.codegen import CompiledFunction, UnsupportedOperation
 from nfriction.codegen.graph import trace
 from nfriction.codegen.scalar import Graph, evaluate, reachable
 from nfriction.codegen.transform import _RULES, tangents, with_jacobian
@@ -126,7 +126,7 @@ def test_compiled_jacobians_are_batched_and_come_last():
     def function(x, y):
         return x.tanh() * y.sum(), (x * x).sum()[None]
 
-    compiled = compile_function(function, (X, Y), jacobian=(0, 1))
+    compiled = CompiledFunction(function, (X, Y), jacobian=(0, 1))
     rows = torch.linspace(0.5, 2.0, 3, dtype=torch.float64)[:, None]
     *values, found = compiled(rows * X, rows * Y)
     assert [v.shape for v in values] == [(3, 4), (3, 1)]

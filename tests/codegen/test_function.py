@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from nfriction.codegen import CompiledFunction, compile_function
-from nfriction.codegen.llvm import jit
+from nfriction.codegen import CompiledFunction, jit
 from tests.codegen.mechanisms import F64, NeuroFuzzy
 
 
@@ -41,7 +40,7 @@ def everything(x, y):
 def test_every_operation_agrees():
     rng = np.random.default_rng(0)
     x, y = rng.normal(size=(2, 50, 3))
-    compiled = compile_function(everything, torch.randn(2, 3, dtype=F64).unbind())
+    compiled = CompiledFunction(everything, torch.randn(2, 3, dtype=F64).unbind())
     expected = torch.stack([everything(a, b) for a, b in zip(*map(torch.tensor, (x, y)))])  # noqa: B905
     np.testing.assert_allclose(compiled(x, y), expected.numpy(), rtol=1e-13, atol=1e-15)
 
@@ -53,7 +52,7 @@ def test_truth_values_are_numbers_where_numbers_are_wanted():
         return torch.where(torch.isfinite(x), counted, above + 1.0), ~above, torch.maximum(above, x)
 
     x = np.array([[np.nan, np.inf, -1.0, 0.0, 1.0, 3.0]])
-    compiled = compile_function(f, [torch.ones(6, dtype=F64)])
+    compiled = CompiledFunction(f, [torch.ones(6, dtype=F64)])
     for ours, expected in zip(compiled(x), f(torch.tensor(x[0])), strict=True):
         np.testing.assert_array_equal(ours[0], expected.numpy().astype(float))
 
@@ -64,14 +63,14 @@ def test_nan_and_infinity_pass_as_in_torch():
 
     special = np.array([np.nan, np.inf, -np.inf, 0.0, 1.0])
     x, y = (a.reshape(-1, 1) for a in np.meshgrid(special, special))
-    compiled = compile_function(f, torch.ones(2, 1, dtype=F64).unbind())
+    compiled = CompiledFunction(f, torch.ones(2, 1, dtype=F64).unbind())
     expected = torch.stack([f(a, b) for a, b in zip(*map(torch.tensor, (x, y)))])  # noqa: B905
     np.testing.assert_array_equal(compiled(x, y), expected.numpy())
 
 
 def test_parameters_of_a_module_stay_inputs():
     network = Network()
-    compiled = compile_function(network, torch.ones(2, 2, dtype=F64).unbind())
+    compiled = CompiledFunction(network, torch.ones(2, 2, dtype=F64).unbind())
     with torch.no_grad():
         network.layers[0].weight *= 2.0
     x = torch.randn(7, 2, dtype=F64)
@@ -84,7 +83,7 @@ def test_parameters_of_a_module_stay_inputs():
 
 def test_a_bound_method_lifts_its_module():
     friction = NeuroFuzzy(2)
-    compiled = compile_function(friction.coefficients, torch.ones(2, 2, dtype=F64).unbind())
+    compiled = CompiledFunction(friction.coefficients, torch.ones(2, 2, dtype=F64).unbind())
     with torch.no_grad():
         friction.rule *= 0.5
     qd, qdd = torch.randn(2, 9, 2, dtype=F64)
@@ -110,21 +109,21 @@ def test_random_graphs_agree(lines):
         return values[-1]
 
     x = torch.linspace(-2, 2, 6, dtype=F64).reshape(3, 2)
-    compiled = compile_function(f, (x[0], x[1]))
+    compiled = CompiledFunction(f, (x[0], x[1]))
     got, expected = compiled(x, x.flip(0)), f(x, x.flip(0)).numpy()
     np.testing.assert_allclose(got, expected, rtol=1e-10, atol=1e-10)  # chains of 20 products
 
 
 def test_emitted_code_is_the_same_every_time():
     inputs = [torch.ones(2, dtype=F64), torch.ones(2, dtype=F64)]
-    a, b = (compile_function(NeuroFuzzy(2).coefficients, inputs) for _ in range(2))
+    a, b = (CompiledFunction(NeuroFuzzy(2).coefficients, inputs) for _ in range(2))
     assert a.source() == b.source()
     assert a.source(8) == b.source(8) != a.source()
 
 
 @pytest.mark.parametrize("rows", [2, 3, 8, 21])
 def test_rows_computed_together_have_the_bits_of_single_ones(rows):
-    compiled = compile_function(everything, torch.randn(2, 3, dtype=F64).unbind())
+    compiled = CompiledFunction(everything, torch.randn(2, 3, dtype=F64).unbind())
     x, y = np.random.default_rng(2).normal(size=(2, rows, 3))
     together = compiled(x, y)
     for i in range(rows):
@@ -133,7 +132,7 @@ def test_rows_computed_together_have_the_bits_of_single_ones(rows):
 
 def test_all_functions_of_the_library_are_known_to_the_loader():
     """On Windows LLVM finds none of them by itself."""
-    compiled = compile_function(everything, torch.randn(2, 3, dtype=F64).unbind())
+    compiled = CompiledFunction(everything, torch.randn(2, 3, dtype=F64).unbind())
     called = set(re.findall(r"declare double @([a-z0-9]+)\(", compiled.source()))
     assert called <= set(jit.LIBRARY)
     assert {"fmod", "pow", "log1p"} - called == {"fmod"}  # a remainder is LLVM's own instruction
@@ -150,7 +149,7 @@ def test_jacobians_are_checked_where_their_inputs_have_the_signs_of_the_example(
 
     monkeypatch.setattr(CompiledFunction, "_eager", kept)
     small, size = torch.full((50,), 1e-3, dtype=F64), torch.full((50,), -3.0, dtype=F64)
-    compile_function(lambda x, y: (x * y).sum()[None], (small, size), jacobian=(0, 1))
+    CompiledFunction(lambda x, y: (x * y).sum()[None], (small, size), jacobian=(0, 1))
     assert (checked[0] > 0).all()
     assert (checked[1] < 0).all()
     assert not torch.equal(checked[0], small)

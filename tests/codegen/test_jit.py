@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction.codegen.llvm import jit
-from nfriction.export.c_code.export import find_compiler
+from nfriction.codegen import jit
+from nfriction.export.c_file import find_compiler
 
 F64 = torch.float64
 SOURCE = """
@@ -170,7 +170,7 @@ def test_neither_a_compiler_nor_numba_is_needed(cache, tmp_path):
     script = (
         "import sys; sys.modules['numba'] = None\n"
         "import torch; from nfriction import LFM, NFLFM, PendulumChain, rollout\n"
-        "from nfriction.codegen.llvm import jit; plant = PendulumChain([0.3, 0.2], [0.2, 0.15])\n"
+        "from nfriction.codegen import jit; plant = PendulumChain([0.3, 0.2], [0.2, 0.15])\n"
         "made = []; make = jit._compile\n"
         "jit._compile = lambda source: made.append(1) or make(source)\n"
         "for model in (LFM(2, v_smooth=0.1), NFLFM(2, v_smooth=0.1, terms=(2, 2), head_units=2)):\n"

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from nfriction.codegen.llvm import jit
-from nfriction.codegen.llvm.emit import write_function
-from nfriction.codegen.llvm.ir import Body
+from nfriction.codegen import jit
+from nfriction.codegen.emit import write_function
+from nfriction.codegen.ir import Body
 from nfriction.codegen.scalar import Graph, evaluate
 
 OPERATIONS = ("sin", "cos", "exp", "tanh")

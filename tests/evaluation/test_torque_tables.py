@@ -16,7 +16,7 @@ from nfriction.evaluation.torque_tables import (
     score_models,
     split,
 )
-from nfriction.export.torchscript_file import open_torchscript
+from nfriction.export.torch_files import open_torchscript
 from nfriction.fitting.torque_table import fit_joint, join
 from nfriction.recording.torque_table import TorqueTable, blocks
 from nfriction.report.torque import write_torque_fits

@@ -12,11 +12,10 @@ import torch
 from torch import Tensor, nn
 
 from nfriction.export import ExportError, pt2, torchscript, verification, verify_artefact
+from nfriction.export.contract import draw
 from nfriction.export.controller import controller_of
-from nfriction.export.pt2_file import open_pt2
-from nfriction.export.test_vectors import draw
 from nfriction.export.torch_archive import METADATA, check_program, check_source
-from nfriction.export.torchscript_file import open_torchscript
+from nfriction.export.torch_files import open_pt2, open_torchscript
 from nfriction.friction.models import LFM
 from tests.export.artefacts import INFO
 from tests.export.test_pt2 import rewritten

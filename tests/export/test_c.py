@@ -13,11 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nfriction.codegen import UnsupportedOperation
-from nfriction.export.c_code.dialect import comment
-from nfriction.export.c_code.export import c, c_contract, c_runner
-from nfriction.export.contract import ExportError, compare, verify
+from nfriction.export.c_dialect import comment
+from nfriction.export.c_file import c, c_contract, c_runner
+from nfriction.export.contract import ExportError, compare, draw, verify
 from nfriction.export.controller import NOT_FINITE, OUTSIDE, SATURATED, controller_of
-from nfriction.export.test_vectors import draw
 from nfriction.friction import model_by_name, model_names
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law

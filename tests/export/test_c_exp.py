@@ -8,8 +8,8 @@ import subprocess
 import numpy as np
 import pytest
 
-from nfriction.export.c_code.dialect import ControllerC
-from nfriction.export.c_code.model import exponential
+from nfriction.export.c_dialect import ControllerC
+from nfriction.export.c_model import exponential
 
 GCC = shutil.which("gcc")
 # Arguments that it takes. Below -87.3 the result is 0; further down k would not fit its integer,

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from nfriction.export.contract import draw
 from nfriction.export.controller import NOT_FINITE, OUTSIDE, SATURATED, controller_of
-from nfriction.export.test_vectors import draw
 from nfriction.friction.models import LFM
 from nfriction.friction.neurofuzzy import NFLFM
 from nfriction.io.model_file import ModelInfo

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nfriction import ModelInfo, export
-from nfriction.export.c_code.export import c_runner, find_compiler
+from nfriction.export.c_file import c_runner, find_compiler
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.hysteresis import ELEMENTS, LoadSlip, Slip
 from nfriction.friction.laws import Coefficient, Law, Memory

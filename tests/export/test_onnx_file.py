@@ -11,10 +11,9 @@ import torch
 from torch import Tensor
 
 from nfriction.export import ExportError, onnx, verify_artefact
-from nfriction.export.contract import ContractError, compare, verify
+from nfriction.export.contract import ContractError, compare, draw, verify
 from nfriction.export.controller import controller_of
 from nfriction.export.onnx_file import open_onnx
-from nfriction.export.test_vectors import draw
 from nfriction.export.torch_archive import METADATA
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law

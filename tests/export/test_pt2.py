@@ -8,11 +8,10 @@ import pytest
 import torch
 
 from nfriction.export import ExportError, pt2
-from nfriction.export.contract import ContractError, compare, verify
+from nfriction.export.contract import ContractError, compare, draw, verify
 from nfriction.export.controller import controller_of
-from nfriction.export.pt2_file import open_pt2
-from nfriction.export.test_vectors import draw
 from nfriction.export.torch_archive import METADATA
+from nfriction.export.torch_files import open_pt2
 from nfriction.friction.models import FrictionModel
 from tests.export.artefacts import INFO, rising
 from tests.friction.samples import motion, named_models

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from nfriction import LinearAxis, rollout
 from nfriction.export import fit_damping_frictionloss, mjcf, urdf
+from nfriction.friction import model_by_name
 from nfriction.friction.memory import Dahl
 from nfriction.friction.models import LFM, NCFM, NLFM
 from nfriction.friction.neurofuzzy import NFLFM
@@ -118,6 +120,39 @@ def test_mujoco_damps_as_the_numbers_say(tmp_path: Path) -> None:
     np.testing.assert_allclose(loaded.dof_frictionloss, [0.9, 0.7], rtol=1e-9)
     assert found.damping == pytest.approx([0.3, 0.5])
     assert "kept" in (tmp_path / "out.xml").read_text()
+
+
+@pytest.mark.parametrize("name", ["lugre", "dahl"])
+def test_bristles_move_in_mujoco_as_in_a_rollout(name: str, tmp_path: Path) -> None:
+    mujoco: Any = pytest.importorskip("mujoco", minversion="4.0")
+    body = '<body><joint name="x" type="slide" axis="1 0 0"/><geom size="0.1" mass="0.5"/></body>'
+    option = '<option timestep="1e-4" gravity="0 0 0" integrator="implicitfast"/>'
+    robot = f"<mujoco>{option}<worldbody>{body}</worldbody></mujoco>"
+    (tmp_path / "robot.xml").write_text(robot)
+    values = {"lugre": [1.0, 0.5, 0.05, 300.0, 5.0, 0.4], "dahl": [1.0, 0.4, 300.0]}[name]
+    model = model_by_name(name)(1, values).requires_grad_(False)
+    info = ModelInfo(joint_names=["x"], unit="m")
+    found = mjcf(model, tmp_path / "out.xml", swing(1), info, patch=tmp_path / "robot.xml")
+    assert "exact" in str(found)
+    loaded = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
+    state = mujoco.MjData(loaded)
+    time = 1e-4 * np.arange(10_000)
+    force = 1.3 * (1.2 + 0.8 * np.sin(3.0 * time)) * np.sin(5.0 * time)
+    positions = []
+    for f in force:
+        state.qfrc_applied[0] = f
+        mujoco.mj_step(loaded, state)
+        positions.append(float(state.qpos[0]))
+    zero = torch.zeros(1, dtype=torch.float64)
+    tau = torch.tensor(force)[:, None]
+    run = rollout(LinearAxis(0.5), model, zero, zero, tau, sample_time=1e-4)
+    # MuJoCo's steps are of first order.
+    assert np.ptp(positions) > 0.05
+    np.testing.assert_allclose(positions, run.q[1:, 0].numpy(), atol=1e-3 * np.ptp(positions))
+    mjcf(model, tmp_path / "part.xml", swing(1), info)
+    assert 'lugre="300 ' in (tmp_path / "part.xml").read_text()
+    with pytest.raises(ValueError, match="have no memory"):
+        urdf(model, tmp_path / "out.urdf", swing(1), info)
 
 
 def test_the_snippets_load_and_tell_their_price(tmp_path: Path) -> None:

@@ -10,6 +10,6 @@ NAMES = ["adaptive.c", "arduino.ino", "controller.c", "controller.h", "exponenti
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_template_is_found_where_the_package_is(name):
-    template = resources.files("nfriction.export.c_code").joinpath("templates", name)
+    template = resources.files("nfriction.export").joinpath("templates", name)
     text = template.read_text("ascii")
     assert "nf_" in text or "NF_" in text  # in place of which the prefix is written

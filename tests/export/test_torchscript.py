@@ -11,11 +11,10 @@ import torch
 from torch import Tensor
 
 from nfriction.export import ExportError, torchscript
-from nfriction.export.contract import compare, verify
+from nfriction.export.contract import compare, draw, draw_motion, verify
 from nfriction.export.controller import controller_of
-from nfriction.export.test_vectors import draw, draw_motion
 from nfriction.export.torch_archive import METADATA
-from nfriction.export.torchscript_file import open_torchscript
+from nfriction.export.torch_files import open_torchscript
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law, TorqueFunction
 from nfriction.friction.models import LFM, FrictionModel

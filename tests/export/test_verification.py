@@ -20,7 +20,7 @@ from nfriction.export import (
     verification,
     verify_artefact,
 )
-from nfriction.export.c_code.export import find_compiler
+from nfriction.export.c_file import find_compiler
 from nfriction.export.contract import Contract, verify
 from nfriction.friction.models import LFM
 from nfriction.friction.neurofuzzy import NFNLFM

@@ -42,13 +42,17 @@ def swing(
     return Recording(out.time.numpy(), q, convention=written, name=name)
 
 
-def driven_axis(axis: LinearAxis, model: FrictionModel, *, seconds: float = 3.0) -> Recording:
+def driven_axis(
+    axis: LinearAxis, model: FrictionModel, *, seconds: float = 3.0, substeps: int = 2
+) -> Recording:
     """An axis driven by two sines, whose position is read to a micrometre."""
     time = np.arange(0.0, seconds, 2e-3)
     force = 6.0 * np.sin(2 * np.pi * time) + 4.0 * np.sin(2 * np.pi * 2.7 * time)
     tau = torch.as_tensor(force[:, None])
     zero = torch.zeros(1, dtype=F64)
-    out = rollout(axis, model, zero, zero, tau[:-1], sample_time=2e-3, substeps=2, gradients=False)
+    out = rollout(
+        axis, model, zero, zero, tau[:-1], sample_time=2e-3, substeps=substeps, gradients=False
+    )
     q = 1e-6 * np.rint(out.q.numpy() / 1e-6)
     return Recording(time, q, tau=tau.numpy(), unit="m", name="axis")
 

@@ -12,6 +12,7 @@ from nfriction.fitting.result.of_search import result_from_shooting
 from nfriction.fitting.shooting.autocorrelation import bandwidth, hac_sd
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
+from nfriction.fitting.shooting.uncertainty import gathered_information
 from nfriction.fitting.strategy.extrapolation_prior import (
     ExtrapolationPrior,
     prior_on_unvisited_cells,
@@ -154,7 +155,7 @@ def test_what_is_only_held_is_not_taken_for_told_by_the_data():
     alone = result_from_shooting(model, problem(model, None), result, ())
     torch.testing.assert_close(told, openness(alone.uncertainty))
     # As if the data had said what was held.
-    known = p.information(result.x, hac_sd(errors, bandwidth(p.windows.q)))
+    known = gathered_information(p, result.x, hac_sd(errors, bandwidth(p.windows.q)))
     known.data[:n, :n] += held.normal_equations(model.schedule)[1]
     mistaken = openness(CoefficientUncertainty(model.schedule, covariance_root(known)[:n]))
     assert (told >= (1 - 1e-6) * mistaken).all()

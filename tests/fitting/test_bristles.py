@@ -1,4 +1,4 @@
-"""Dahl, LuGre and elasto-plastic friction recovered from tables of torque."""
+"""Dahl, LuGre, elasto-plastic and gear friction recovered from tables of torque."""
 
 import numpy as np
 import pandas as pd
@@ -12,6 +12,7 @@ from nfriction.recording.torque_table import TorqueTable
 
 TRUE = {
     "Dahl": (1.0, 0.5, 300.0),
+    "Gear": (0.5, 0.1, 0.25, 0.4, 300.0),
     "LuGre": (1.0, 0.5, 0.02, 500.0, 2.0, 0.4),
     "ElastoPlastic": (1.0, 0.5, 0.02, 500.0, 2.0, 0.4, 0.5),
 }
@@ -22,7 +23,9 @@ def table_of(name: str, seed: int = 0, reach: float = 1.0) -> pd.DataFrame:
     time = np.linspace(0.0, 8.0, 1600)
     q = reach * 0.06 * np.sin(1.7 * time + seed) * (0.1 + np.sin(0.43 * time) ** 2)
     q += reach * 0.003 * np.sin(6.1 * time + 1)
-    given = pd.DataFrame({"time": time, "q": q, "qd": np.gradient(q, time), "tau": q})
+    # Drives the joint and is driven back; only a gear reads it.
+    load = 1.0 + 6.0 * np.sin(2.3 * time + 0.5 * seed)
+    given = pd.DataFrame({"time": time, "q": q, "qd": np.gradient(q, time), "tau": q, "load": load})
     joint = TorqueTable.from_pandas(given).joints[0]
     model = model_by_name(name)(1, TRUE[name])
     noise = np.random.default_rng(seed).normal(0, 0.02, len(q))

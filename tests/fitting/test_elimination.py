@@ -27,6 +27,7 @@ from nfriction.fitting.shooting.normal_equations import (
 )
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
+from nfriction.fitting.shooting.uncertainty import gathered_information
 from nfriction.fitting.strategy.continuation import ShootingFitter
 from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import F64, pendulum, solve, swing
@@ -68,7 +69,7 @@ def error_sizes(p: ShootingProblem) -> torch.Tensor:
 
 def by_squares(p: ShootingProblem, x: torch.Tensor, sd: torch.Tensor) -> Information:
     """All unknowns' normal equations, and the states marginalize_states from these."""
-    rows = p._rows(p._simulate(x), p._scale * sd / p.noise_sd)
+    rows = p.rows(p.simulate(x), p.scale * sd / p.noise_sd)
     covariance = normal_equations(rows, torch.zeros_like(sd), p.variables.indices(), len(x))[1]
     hessian = p.linearise(x).hessian
     return information(hessian, p.variables.prior()[0], p.variables.shared_count, covariance)
@@ -80,7 +81,7 @@ def test_rows_tell_what_squares_do_where_motion_is_tame(stride, offset_sd):
     p = tame(stride, offset_sd=offset_sd)
     assert len(p.windows) == 6
     x, sd = p.variables.start(), error_sizes(p)
-    found, expected = p.information(x, sd), by_squares(p, x, sd)
+    found, expected = gathered_information(p, x, sd), by_squares(p, x, sd)
     torch.testing.assert_close(found.prior, expected.prior)
     for name in ("data", "score"):
         one, other = getattr(found, name), getattr(expected, name)
@@ -94,9 +95,9 @@ def test_rows_tell_what_squares_do_where_motion_is_tame(stride, offset_sd):
 def test_pieces_do_not_show(piece, monkeypatch):
     p = tame(offset_sd=torch.full((2, 2), 0.05, dtype=F64))
     x, sd = p.variables.start(), error_sizes(p)
-    whole = p.information(x, sd)
+    whole = gathered_information(p, x, sd)
     monkeypatch.setattr("nfriction.fitting.shooting.sensitivity.PIECE", piece)
-    parts = p.information(x, sd)
+    parts = gathered_information(p, x, sd)
     torch.testing.assert_close(parts.data, whole.data, rtol=1e-8, atol=1e-3)
     torch.testing.assert_close(parts.score, whole.score, rtol=1e-8, atol=1e-3)
 
@@ -212,13 +213,14 @@ def test_a_chaotic_window_loses_nothing_that_it_tells():
     assert float(result.hessian.max()) > 1e24
     moved = tuple(kalman_smoother(r.time, r.q) for r in search.recordings)
     assert result_from_shooting(p.friction, p, result, moved).unidentifiable == ()
-    rows = torch.cat([scaled for _, scaled in p._rows(p._simulate(x), p._scale)], 1)[0]
+    rows = torch.cat([scaled for _, scaled in p.rows(p.simulate(x), p.scale)], 1)[0]
     exact = in_whole_numbers(rows.numpy(), count, p.variables.prior()[0][count:].tolist())
     lower, upper = p.variables.bounds()
     fitted = (lower < upper)[:count]
     index = fitted.nonzero().flatten()
     sd = torch.full_like(errors, p.noise_sd)
-    told, squares = p.information(x, sd).subset(index), by_squares(p, x, sd).subset(index)
+    told = gathered_information(p, x, sd).subset(index)
+    squares = by_squares(p, x, sd).subset(index)
     expected = torch.as_tensor(exact)[fitted][:, fitted]
     scale = expected.diagonal().rsqrt()
 
@@ -239,7 +241,7 @@ def test_drawn_errors_give_the_covariance_of_the_gradient() -> None:
     _, response = marginalize_states([(slice(None), rows)], kept, precision)
 
     def drawn(errors: torch.Tensor) -> torch.Tensor:
-        return drawn_score([(slice(None), rows)], kept, response, precision, errors[..., None, :])
+        return drawn_score([(slice(None), rows)], kept, response, errors[..., None, :])
 
     expected = score_covariance([(slice(None), rows)], kept, response, precision)
     errors = torch.randn(2, 60, 4000, generator=generator, dtype=F64)

@@ -27,7 +27,7 @@ from nfriction import (
 from nfriction.fitting.equation_error import fit_equation_error
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.shooting.autocorrelation import effective_noise
-from nfriction.fitting.strategy.continuation import HorizonResult
+from nfriction.fitting.strategy.continuation import HorizonResult, ShootingFitter
 from nfriction.fitting.strategy.neurofuzzy import _Validation
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import STRIBECK
@@ -100,6 +100,18 @@ def test_a_driven_axis_gives_mass_and_offset():
     assert float(found.plant.torque_offset) == pytest.approx(0.3, abs=0.03)
     values = found.model.schedule.values[0].tolist()
     assert values == pytest.approx([3.0, 1.0], rel=0.05)
+
+
+def test_the_sign_of_a_named_model_turns_within_a_share_of_the_slowest_joints_speed():
+    """An axis that reaches 6 cm/s would creep at the speed at which a wheel's sign turns."""
+    axis, ideal = LinearAxis(20.0), CVFM(1, [4.0, 20.0], v_smooth=2e-5)
+    recording = driven_axis(axis, ideal, substeps=32)
+    found, usual = (
+        fit(model, axis, recording, windows=(1.0,), fit_plant=False) for model in ("CVFM", CVFM(1))
+    )
+    assert found.model.v_smooth < 1e-4 < usual.model.v_smooth
+    assert found.residual < 0.2 * usual.residual
+    assert found.model.schedule.values[0].tolist() == pytest.approx([4.0, 20.0], rel=0.01)
 
 
 def test_viscous_and_coulomb_friction_at_one_speed_are_named_as_lost():
@@ -463,7 +475,7 @@ def misled(monkeypatch):
         poor = torch.tensor(POOR, dtype=F64)[:, : found.coefficients.shape[1]]
         return replace(found, coefficients=poor)
 
-    monkeypatch.setattr("nfriction.fitting.strategy.constant.fit_equation_error", by_torque)
+    monkeypatch.setattr("nfriction.fitting.task.fit_equation_error", by_torque)
     return asked
 
 
@@ -474,6 +486,23 @@ def test_stribeck_friction_is_found_again():
     assert found.residual == pytest.approx(2 * np.pi / 8192 / 12**0.5, rel=0.02)
     truth = torch.tensor(FALLING, dtype=F64)
     torch.testing.assert_close(found.model.schedule.values, truth, rtol=0.05, atol=0)
+
+
+def test_no_search_is_made_twice(monkeypatch):
+    """On a plant that is not fitted, torques lead again to where the search began."""
+    begun, search = [], ShootingFitter.search
+
+    def counted(fitter, problem, start, *rest):
+        begun.append(start)
+        return search(fitter, problem, start, *rest)
+
+    monkeypatch.setattr(ShootingFitter, "search", counted)
+    # Another law's friction, so that the encoder's rounding does not end the restarts.
+    recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH), seconds=1.0)
+    settings = {"windows": (0.5,), "fit_plant": False, "max_steps": 1}
+    fit(NLFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
+    assert len(begun) > 3
+    assert not any(torch.equal(a, b) for k, a in enumerate(begun) for b in begun[:k])
 
 
 @pytest.mark.slow
@@ -524,7 +553,7 @@ def test_a_search_in_vain_from_the_simpler_law_leaves_the_model_as_it_was(monkey
             return found
         return replace(found, coefficients=torch.tensor(POOR, dtype=F64))
 
-    monkeypatch.setattr("nfriction.fitting.strategy.constant.fit_equation_error", by_torque)
+    monkeypatch.setattr("nfriction.fitting.task.fit_equation_error", by_torque)
     found = fit(Stribeck(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
     assert simpler
     monkeypatch.setattr(
@@ -547,7 +576,7 @@ def test_a_law_leaves_no_more_over_than_the_simpler_one_in_it(law, monkeypatch):
             return found
         return replace(found, coefficients=0 * found.coefficients + 10.0)
 
-    monkeypatch.setattr("nfriction.fitting.strategy.constant.fit_equation_error", by_torque)
+    monkeypatch.setattr("nfriction.fitting.task.fit_equation_error", by_torque)
     recording = swing(pendulum(), Stribeck(2, FALLING, v_smooth=V_SMOOTH), seconds=2.0)
     simpler, found = (
         fit(of(2, v_smooth=V_SMOOTH), pendulum(), recording, windows=(0.5, 1.0), max_steps=8)

@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from nfriction import LinearAxis, PendulumChain, Rotor, rigs
+from nfriction.fitting.adjusted_plant import adjusted_buffers
 from nfriction.fitting.options import DEFAULTS
-from nfriction.fitting.plant_parameters import adjusted_buffers, plant_parameters
+from nfriction.fitting.plant_parameters import plant_parameters
 from tests.fitting.recordings import F64, pendulum
 
 

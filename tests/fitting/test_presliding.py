@@ -12,9 +12,9 @@ from nfriction.evaluation.score import score
 from nfriction.fitting.data.windows import cut_windows
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
-from nfriction.fitting.strategy.constant import yielding
+from nfriction.fitting.strategy.presliding import yielding
 from nfriction.friction import model_by_name
-from nfriction.friction.memory import DAHL, LuGre, MaxwellSlip, NFLuGre
+from nfriction.friction.memory import DAHL, Dahl, Gear, LuGre, MaxwellSlip, NFLuGre
 from nfriction.friction.models import FrictionModel
 from nfriction.signals import kalman_smoother, quantise
 from tests.fitting.recordings import F64, pendulum
@@ -51,6 +51,7 @@ def recorded(truth: tuple[float, ...], seed: int, seconds: float, rate: int) -> 
     [
         ("LuGre", LinearAxis(0.5), SOFT),
         ("NFLuGre", LinearAxis(0.5), SOFT),
+        ("Gear", LinearAxis(0.5), (0.5, 0.1, 0.25, 0.4, 300.0)),
         pytest.param("MaxwellSlip", LinearAxis(0.05), SLIPS, marks=pytest.mark.slow),
         pytest.param("LuGre", pendulum(), (0.03, 0.015, 0.3, 3.0, 0.01, 0.003),
                      marks=pytest.mark.slow),
@@ -127,6 +128,20 @@ def test_searches_start_with_the_rise_of_friction_that_torques_of_a_stuck_joint_
     assert 800 < stiffness < 3200
 
 
+def test_rows_near_reversals_do_not_bias_the_friction_of_sliding() -> None:
+    """By all rows F_c is 0.42 and F_v 1.6: a contact that yields balances any torque."""
+    time = 2e-3 * np.arange(2001)
+    tau = ((0.7 + 2.0 * np.sin(np.pi * time / 4) ** 2) * np.sin(7 * time))[:, None]
+    zero = torch.zeros(1, dtype=F64)
+    model = Dahl(1, [1.0, 0.4, 310.0]).requires_grad_(False)
+    run = rollout(AXIS, model, zero, zero, torch.tensor(tau[:-1]), sample_time=2e-3)
+    recording = Recording(time, quantise(run.q.numpy(), 2**13), tau=tau, unit="m")
+    begun = fit("dahl", AXIS, recording, windows=(0.5,), fit_plant=False, max_steps=0)
+    f_c, f_v, _ = begun.model.schedule.values[0].tolist()
+    assert f_c == pytest.approx(1.0, abs=0.05)
+    assert f_v == pytest.approx(0.4, abs=0.1)
+
+
 def test_presliding_and_sliding_give_all_coefficients(short) -> None:
     _, found = short
     assert found.model.schedule.values[0].tolist() == pytest.approx(SOFT, rel=0.03)
@@ -146,6 +161,21 @@ def test_a_fit_with_memory_is_scored_saved_and_tabulated(short, tmp_path) -> Non
     sd = found.uncertainty.torque_sd(found.model, torch.tensor([[-0.5], [0.5]], dtype=F64))
     assert (sd > 0).all()
     assert (sd < 0.1).all()
+
+
+@pytest.mark.slow
+def test_gear_loss_is_found_in_both_directions_of_the_power() -> None:
+    truth = (0.4, 0.08, 0.2, 0.3, 400.0)
+    recording = pushed(Gear(1, truth).requires_grad_(False), 3, seconds=10.0, rate=500)
+    found = fit("gear", AXIS, recording, windows=(0.5, 2.0))
+    assert found.model.schedule.values[0].tolist() == pytest.approx(truth, rel=0.05)
+    assert not found.unidentifiable
+    dahl = fit("dahl", AXIS, recording, windows=(0.5, 2.0))
+    apart = pushed(Gear(1, truth).requires_grad_(False), 4, seconds=10.0, rate=500)
+    gear, other = (
+        score(f.plant, f.model, apart, limit=False).windows["1"].all for f in (found, dahl)
+    )
+    assert gear < 0.2 * other
 
 
 @pytest.mark.slow

@@ -5,7 +5,8 @@ import torch
 
 from nfriction import LFM, LinearAxis
 from nfriction.codegen import CodegenError
-from nfriction.fitting.plant_parameters import adjusted_buffers, plant_parameters
+from nfriction.fitting.adjusted_plant import adjusted_buffers
+from nfriction.fitting.plant_parameters import plant_parameters
 from nfriction.fitting.shooting.sensitivity import CHUNK, StepJacobian, Trajectory, propagate
 from nfriction.friction import model_by_name
 from nfriction.simulation.memory_step import memory_step
@@ -33,7 +34,7 @@ def without_compiler(monkeypatch, plant, model, terms):
         raise CodegenError("none")
 
     with monkeypatch.context() as patch:
-        patch.setattr("nfriction.codegen.compile_function", nothing)
+        patch.setattr("nfriction.codegen.CompiledFunction", nothing)
         return StepJacobian(plant, model, terms)
 
 

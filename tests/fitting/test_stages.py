@@ -10,6 +10,7 @@ from nfriction import LFM, LinearAxis, Stribeck, fit
 from nfriction.fitting.data.inputs import measurement_matrix
 from nfriction.fitting.data.windows import cut_windows
 from nfriction.fitting.options import DEFAULTS, FitOptions
+from nfriction.fitting.result.identifiability import information, standard_deviations
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.continuation import (
     ShootingFitter,
@@ -83,7 +84,8 @@ def test_what_is_shared_has_settled_once_it_moves_no_more():
     _, problem = short_search()
     x = problem.variables.start()
     local = problem.linearise(x)
-    sd, count = problem.posterior_sd(local.hessian), problem.variables.shared_count
+    count, (precision, _) = problem.variables.shared_count, problem.variables.prior()
+    sd = standard_deviations(information(local.hessian, precision, count))
     far, near, states = x.clone(), x.clone(), x.clone()
     far[:count] += sd
     near[:count] += 0.5 * SETTLED * sd

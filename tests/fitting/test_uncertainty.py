@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from nfriction import LFM, NFLFM, Recording, fit, rigs, rollout
+from nfriction import CVFM, LFM, NFLFM, LinearAxis, Recording, fit, rigs, rollout
 from nfriction.fitting.result.identifiability import PIECE, CoefficientUncertainty
 from nfriction.fitting.strategy.neurofuzzy import _Validation
+from tests.fitting.recordings import flywheel
 
 F64 = torch.float64
 
@@ -36,6 +37,20 @@ def fits(swings):
         patch.setattr("nfriction.fitting.strategy.neurofuzzy.gains", lambda *_: True)
         patch.setattr(_Validation, "trained_on", lambda self, trial: trial)
         return law, fit(NFLFM(1), *swings, start=law, **options)
+
+
+def test_intervals_know_the_noise_of_the_torque():
+    """It moves all samples after it, within windows whose start hides most of it."""
+    off = []
+    for seed in range(4):
+        recording = flywheel(seed, CVFM(1, [0.35, 0.12]))
+        found = fit(CVFM(1), LinearAxis(0.13), recording, windows=(2.0,))
+        off += [
+            (i.value - truth) / i.sd
+            for i, truth in zip(found.intervals, (0.35, 0.12), strict=False)
+        ]
+    # By residuals alone 3 standard deviations.
+    assert 0.3 < np.sqrt(np.mean(np.square(off))) < 1.5
 
 
 def test_moved_parameters_move_the_coefficients_so_far():

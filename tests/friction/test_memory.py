@@ -13,16 +13,17 @@ from torch import Tensor
 from nfriction.fitting.fit import fit
 from nfriction.friction import memory_names, model_by_name, model_name, plain_name
 from nfriction.friction.laws import Law, Memory
-from nfriction.friction.memory import DAHL, ELASTO_PLASTIC, LUGRE, LuGre, maxwell_slip
+from nfriction.friction.memory import DAHL, ELASTO_PLASTIC, GEAR, LUGRE, LuGre, maxwell_slip
 from nfriction.plant.rigs import multiarm_single
 from nfriction.recording import Recording
 
-LAWS = (DAHL, LUGRE, ELASTO_PLASTIC, maxwell_slip(1), maxwell_slip(4))
+LAWS = (DAHL, GEAR, LUGRE, ELASTO_PLASTIC, maxwell_slip(1), maxwell_slip(4))
 every_law = pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
 # F_c, F_d, v_s, sigma_0, sigma_1, sigma_2 of the LuGre paper, in N m and rad.
 CLASSIC = [1.0, 0.5, 0.001, 1e5, math.sqrt(1e5), 0.4]
 TYPICAL = {
     "dahl": [1.0, 0.1, 1e3],
+    "gear": [0.6, 0.4, 0.9, 0.1, 1e3],
     "lugre": CLASSIC,
     "elasto_plastic": [*CLASSIC, 0.7],
     "maxwell_slip_1": [500.0, 2e-3, 0.1, 0.5, 0.01],
@@ -78,7 +79,8 @@ def test_energy_is_never_injected_from_a_million_states(law: Law) -> None:
     state = spread(-8.0, 2.0, law.state_size) * torch.randn(
         count, 1, law.state_size, generator=generator, dtype=torch.float64
     )
-    load = torch.ones_like(qd)
+    # Of either sign, as a gear's is: it may change from sample to sample in any way.
+    load = sign.roll(1) * spread(-3.0, 3.0)
     after = memory(law).advance(state, qd, load, coefficients, dt)
     work = memory(law).torque(after, qd, load, coefficients) * qd * dt
     before, now = stored(law, state, coefficients), stored(law, after, coefficients)
@@ -95,9 +97,9 @@ def test_energy_is_never_injected(law: Law, data: st.DataObject) -> None:
     deflections = [data.draw(st.floats(-1e3, 1e3)) for _ in range(law.state_size)]
     state = torch.tensor([deflections], dtype=torch.float64)
     qd = torch.tensor([data.draw(st.floats(-1e4, 1e4))], dtype=torch.float64)
-    dt, one = 10.0 ** data.draw(st.floats(-6, 0)), torch.ones_like(qd)
-    after = memory(law).advance(state, qd, one, c, dt)
-    work = memory(law).torque(after, qd, one, c) * qd * dt
+    dt, load = 10.0 ** data.draw(st.floats(-6, 0)), torch.full_like(qd, data.draw(st.floats(-9, 9)))
+    after = memory(law).advance(state, qd, load, c, dt)
+    work = memory(law).torque(after, qd, load, c) * qd * dt
     before, now = stored(law, state, c), stored(law, after, c)
     assert torch.isfinite(after).all()
     assert work - (now - before) >= -1e-12 * (work.abs() + now + before)
@@ -119,6 +121,9 @@ def test_a_held_velocity_is_solved_exactly(law: Law, qd: float) -> None:
             return np.where(z * math.copysign(1.0, qd) >= limit, 0.0, qd)
         if law.name == "dahl":
             return qd - float(c[2]) * abs(qd) * z / float(c[0])
+        if law is GEAR:
+            bound = float(c[0] + (c[1] if qd > 0 else c[2]))
+            return qd - float(c[4]) * abs(qd) * z / bound
         f_c, f_d, v_s, stiffness = (float(x) for x in c[:4])
         settled = (f_c + f_d * math.exp(-((qd / v_s) ** 2))) / stiffness
         y = z * math.copysign(1.0, qd)

@@ -13,8 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
 
-from nfriction.io.formats import matlab
-from nfriction.io.formats.matlab import read_mat
+from nfriction.io.formats.measurements import read_mat
 from nfriction.recording import Recording
 
 TIME = np.arange(40) / 1000
@@ -22,9 +21,9 @@ Q = np.random.default_rng(0).normal(size=(40, 2)) / 7
 
 
 @pytest.fixture(autouse=True)
-def _in_this_process(request: pytest.FixtureRequest, without_worker: Callable[[Any], None]) -> None:
+def _in_this_process(request: pytest.FixtureRequest, without_worker: Callable[[], None]) -> None:
     if request.function.__name__ not in IN_A_WORKER:
-        without_worker(matlab)
+        without_worker()
 
 
 # The process is part of what these tests are of.
@@ -161,7 +160,7 @@ def test_what_unpacks_to_far_more_is_refused(
 ) -> None:
     savemat(tmp_path / "run.mat", {"time": np.zeros(10**6)}, do_compression=True)
     assert (tmp_path / "run.mat").stat().st_size < 20_000
-    monkeypatch.setattr("nfriction.io.formats.files.LARGEST", 10**6)
+    monkeypatch.setattr("nfriction.io.formats.LARGEST", 10**6)
     with pytest.raises(ValueError, match="unpacked bytes, more than 1000000 are read"):
         Recording.read(tmp_path / "run.mat")
 

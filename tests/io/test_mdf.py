@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nfriction.io.formats import mdf
+from nfriction.io.formats import measurements
 from nfriction.recording import Recording
 
 TIME = np.arange(40) / 1000
@@ -41,7 +41,7 @@ def write(asammdf: Any, path: Path, *groups: list[tuple[str, np.ndarray, str]]) 
 
 
 def test_channels_are_read_by_name_with_their_units(
-    asammdf: Any, tmp_path: Path, without_worker: Callable[[Any], None]
+    asammdf: Any, tmp_path: Path, without_worker: Callable[[], None]
 ) -> None:
     path = tmp_path / "run.mf4"
     channels = [("enc_1", np.rad2deg(Q[:, 0]), "deg"), ("enc_2", Q[:, 1], ""), ("gas", TIME, "bar")]
@@ -49,7 +49,7 @@ def test_channels_are_read_by_name_with_their_units(
     back = Recording.read(path, columns={"q1": "enc_1", "q2": "enc_2:rad"})
     np.testing.assert_allclose(back.q, Q, rtol=6e-16)
     np.testing.assert_allclose(back.time, TIME, rtol=4e-16)
-    without_worker(mdf)
+    without_worker()
     with pytest.raises(ValueError, match="given as 'rad', but the file says 'deg'"):
         Recording.read(path, columns={"q1": "enc_1:rad"})
     with pytest.raises(ValueError, match="'bar' is no unit of q"):
@@ -59,9 +59,9 @@ def test_channels_are_read_by_name_with_their_units(
 
 
 def test_channels_of_different_rasters_are_refused(
-    asammdf: Any, tmp_path: Path, without_worker: Callable[[Any], None]
+    asammdf: Any, tmp_path: Path, without_worker: Callable[[], None]
 ) -> None:
-    without_worker(mdf)
+    without_worker()
     path = tmp_path / "run.mf4"
     write(asammdf, path, [("q1", Q[:, 0], "rad")], [("q2", Q[:, 1], "rad")])
     with pytest.raises(ValueError, match="q2 was not sampled together with q1"):
@@ -73,7 +73,7 @@ def test_channels_of_arrays_are_refused() -> None:
     arrays = SimpleNamespace(samples=Q, timestamps=TIME, unit="rad")
     file = SimpleNamespace(channels_db={"q1": ((0, 1),)}, get=lambda _: arrays)
     with pytest.raises(ValueError, match="channel q1 holds arrays"):
-        mdf.choose_channels(file, ())
+        measurements.choose_channels(file, ())
 
 
 @pytest.mark.parametrize(
@@ -89,8 +89,8 @@ def test_a_file_cut_short_is_refused(asammdf: Any, tmp_path: Path, part: float) 
 
 
 def test_a_reader_that_perishes_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mdf, "find_spec", lambda _: True)
-    monkeypatch.setattr(mdf, "__name__", "there.is_none")
+    monkeypatch.setattr(measurements, "find_spec", lambda _: True)
+    monkeypatch.setattr(measurements, "__name__", "there.is_none")
     (tmp_path / "run.mf4").write_bytes(b"MDF     ")
     with pytest.raises(ValueError, match=r"run\.mf4.*cannot read it .ModuleNotFoundError"):
         Recording.read(tmp_path / "run.mf4")

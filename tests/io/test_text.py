@@ -298,7 +298,7 @@ def test_what_unpacks_to_far_more_is_refused(
 ) -> None:
     path = tmp_path / "run.csv.gz"
     path.write_bytes(gzip.compress(b"time,q1\n" + b"0,0\n" * 100_000))
-    monkeypatch.setattr("nfriction.io.formats.files.LARGEST", 100_000)
+    monkeypatch.setattr("nfriction.io.formats.LARGEST", 100_000)
     with pytest.raises(ValueError, match="unpacked bytes, more than 100000 are read"):
         Recording.read(path)
 

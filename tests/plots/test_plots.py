@@ -27,7 +27,8 @@ from nfriction.friction.models import CVFM, LFM, NCFM, NLFM
 from nfriction.friction.neurofuzzy import NFLFM, NFNCFM, NFNLFM
 from nfriction.papers.controller.mamdani import paper_controller
 from nfriction.plant import LinearAxis, Motor, Rotor, rigs
-from nfriction.plots import saving, style
+from nfriction.plots import comparison as of_comparisons
+from nfriction.plots import style
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
@@ -358,7 +359,7 @@ def rc_params() -> dict:
 
 
 def test_save_all_writes_every_figure_and_leaves_matplotlib_alone(tmp_path, monkeypatch):
-    monkeypatch.setattr(saving, "DPI", 40)
+    monkeypatch.setattr(of_comparisons, "DPI", 40)
     plant, recording, motion = axis_data(NCFM(1, [3.0]))
     unseen = swing(1, "m", name="unseen")
     found = fit(NCFM(1), plant, recording, method="equation_error", motions=[motion])

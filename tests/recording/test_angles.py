@@ -113,5 +113,5 @@ def test_whatever_says_a_convention_is_understood(convention: AngleConvention) -
 
 @pytest.mark.parametrize("given", [None, 3, "", (), [1, 2], {"absolute": "hanging"}, b"absolute"])
 def test_what_says_no_convention_is_refused(given: object) -> None:
-    with pytest.raises(ValueError, match="an angle convention is"):
+    with pytest.raises(ValueError, match="`convention` must be one of"):
         AngleConvention.of(given)  # type: ignore[arg-type]

@@ -208,7 +208,7 @@ def test_a_failed_write_leaves_the_old_file(
     def full(*_: object) -> None:
         raise OSError("no space left on device")
 
-    monkeypatch.setattr("nfriction.io.formats.files.os.replace", full)
+    monkeypatch.setattr("nfriction.io.formats.os.replace", full)
     with pytest.raises(OSError, match="no space"):
         swing(n=30).write(path)
     assert path.read_bytes() == before
@@ -258,7 +258,7 @@ def test_pickled_objects_are_never_loaded(tmp_path: Path) -> None:
         ("time,q1\n0,0\n1,2,3\n", "ragged"),
         ("time,q1\n0,0,1\n1,2,3\n", "more cells than its header"),
         ("# unit: deg\ntime,q1\n" + "0,0\n" * 9, "`unit` must be 'rad' or 'm', got 'deg'"),
-        ("# convention: odd\ntime,q1\n" + "0,0\n" * 9, "angle convention"),
+        ("# convention: odd\ntime,q1\n" + "0,0\n" * 9, "`convention` must be one of"),
         ("time,q1,q2\n" + "".join(f"{k},0,0\n" for k in range(9)) + "9,0\n", "`q2` .*sample 9"),
     ],
 )
@@ -564,9 +564,9 @@ def test_a_convention_is_said_in_many_ways(tmp_path: Path, given: Any) -> None:
 @pytest.mark.parametrize("given", ["", "sideways", (), ("absolute", 3), 7, object(), True])
 def test_a_wrong_convention_is_refused_at_once(given: Any) -> None:
     # Before the file is looked for.
-    with pytest.raises(ValueError, match="an angle convention is"):
+    with pytest.raises(ValueError, match="`convention` must be one of"):
         Recording.read("absent.csv", convention=given)
-    with pytest.raises(ValueError, match="an angle convention is"):
+    with pytest.raises(ValueError, match="`convention` must be one of"):
         swing(convention=given)
 
 

@@ -8,6 +8,7 @@ import torch
 from matplotlib.figure import Figure
 
 from nfriction import LFM, NFLFM, ModelInfo, save
+from nfriction.io.files import checked_json
 
 EVIL = "<script>document.title='broken'</script>&\"'"
 JOINTS = ["a<b>", "second"]
@@ -86,7 +87,8 @@ def neuro_fuzzy() -> NFLFM:
 def write(folder: Path, content: dict[str, Any] | None = None) -> Path:
     """A run's folder with two model files and two figures."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "results.json").write_text(json.dumps(results() if content is None else content))
+    content = checked_json(results() if content is None else content)
+    (folder / "results.json").write_text(json.dumps(content))
     ranges = {"qd": [[-10.0, 10.0], [-5, 5]], "qdd": [[-60.0, 60], [-30, 30]]}
     info = ModelInfo(joint_names=tuple(JOINTS), input_ranges=ranges, sample_time=1e-3)
     save(LFM(2, [2e-3, 1e-2]), folder / "models" / "LFM.json", info)

@@ -4,11 +4,10 @@ import json
 import math
 from pathlib import Path
 
-import pytest
-
 from nfriction.evaluation.cross_validation import Candidate, Selection
+from nfriction.io.files import checked_json
 from nfriction.report.page import to_html
-from nfriction.report.run import RunError, read_run
+from nfriction.report.run import read_run
 from tests.report.runs import EVIL, results
 
 CHOICE = Selection(
@@ -19,7 +18,7 @@ CHOICE = Selection(
 
 
 def folder(path: Path, **changes: object) -> Path:
-    (path / "results.json").write_text(json.dumps(results() | changes))
+    (path / "results.json").write_text(json.dumps(checked_json(results() | changes)))
     return path
 
 
@@ -45,21 +44,3 @@ def test_a_model_that_failed_is_told(tmp_path: Path) -> None:
     assert "Not fitted. " in page
     assert "no classes" in page
     assert EVIL not in page
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        {"chosen": "NFLFM"},
-        {"candidates": {}},
-        {"candidates": {"LFM": {"blocks": [], "parameters": 1}}},
-        {"candidates": {"LFM": {"blocks": ["a"], "parameters": 1}}},
-        {"horizon": None},
-        {"reason": 3},
-    ],
-)
-def test_a_damaged_choice_is_refused(tmp_path: Path, damage: dict[str, object]) -> None:
-    with pytest.raises(RunError, match="selection"):
-        read_run(folder(tmp_path, selection=CHOICE.to_dict() | damage))
-    with pytest.raises(RunError, match="failed"):
-        read_run(folder(tmp_path, failed=[1]))

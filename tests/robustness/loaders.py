@@ -35,10 +35,9 @@ from nfriction.export.contract import (
 )
 from nfriction.export.controller import controller_of
 from nfriction.export.onnx_file import open_onnx
-from nfriction.export.pt2_file import open_pt2
-from nfriction.export.torchscript_file import open_torchscript
-from nfriction.io.formats import matlab, mdf
-from nfriction.io.formats.signals import load_signals, save_signals
+from nfriction.export.torch_files import open_pt2, open_torchscript
+from nfriction.io.files import checked_json
+from nfriction.io.formats import measurements
 from nfriction.io.model_file import ModelFileError, load, load_info, load_plant, parameter_hash
 from nfriction.papers.controller.fis import load_fis
 from nfriction.papers.controller.mamdani import MamdaniController
@@ -299,15 +298,15 @@ def _mdf_samples(folder: Path) -> list[bytes]:
     return [path.read_bytes()]
 
 
-def _as_a_worker(module: Any) -> Callable[[Path], None]:
+def _as_a_worker(library: str) -> Callable[[Path], None]:
     """Read a file as a worker process does; whatever the library raises ends that process."""
 
     def load(path: Path) -> None:
         folder = path.parent / "read"
         folder.mkdir(exist_ok=True)
         try:
-            save_signals(module.read_signals(path, []), folder)
-            found = Recording.from_pandas(load_signals(folder).table())
+            measurements.save_signals(measurements.SIGNALS_OF[library](path, []), folder)
+            found = Recording.from_pandas(measurements.load_signals(folder).table())
         except Exception as error:
             raise ValueError(f"{path}: {str(error)[:1000]}") from error
         _check_recording(found)
@@ -549,7 +548,7 @@ def _read_figure(path: Path) -> None:
     folder = path.with_suffix("")
     if not folder.exists():
         (folder / "figures").mkdir(parents=True)
-        (folder / "results.json").write_text(json.dumps(results()))
+        (folder / "results.json").write_text(json.dumps(checked_json(results())))
     (folder / "figures" / "damaged.png").write_bytes(path.read_bytes())
     run = read_run(folder)
     assert len(run.figures) + len(run.notes) > 0
@@ -577,9 +576,9 @@ LOADERS: dict[str, Loader] = {
         Loader("npz", ".npz", _written(".npz"), _read_recording, _damage_npz),
         Loader("parquet", ".parquet", _written(".parquet"), _read_recording, _damage_parquet,
                needs="pyarrow"),
-        Loader("mat", ".mat", _matlab_samples, _as_a_worker(matlab), _damage_matlab, apart=True),
+        Loader("mat", ".mat", _matlab_samples, _as_a_worker("SciPy"), _damage_matlab, apart=True),
         Loader("hdf5", ".h5", _hdf5_samples, _read_recording, _damage_hdf5, needs="h5py"),
-        Loader("mdf", ".mf4", _mdf_samples, _as_a_worker(mdf), damage_bytes, needs="asammdf",
+        Loader("mdf", ".mf4", _mdf_samples, _as_a_worker("asammdf"), damage_bytes, needs="asammdf",
                apart=True),
         Loader("initial_states", ".csv", lambda _: [_STATES], _read_states, damage_text),
         Loader("rig_json", ".json", _json_samples(*_RIGS), _read_rig, damage_json),

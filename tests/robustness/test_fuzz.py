@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nfriction.io.formats import files
+from nfriction.io import formats as files
 from nfriction.papers.controller.rules import load_rules
 from nfriction.plant import rigs
 from nfriction.recording import Recording, read_initial_states

@@ -152,7 +152,7 @@ def test_torques_or_steps_alone_may_bring_the_batch(backend):
     torch.testing.assert_close(out.q[1], run(smooth_model(), sample_time=step[1]).q)
 
 
-# Eager torch takes a second or more for a thousand steps, so the default run has one of each kind.
+# Eager torch takes a second for some hundred steps, so the default run has one of each kind.
 OFTEN = ("LFM", "ALFM", "NFLFM", "user")
 NAMES = [
     n if n in OFTEN else pytest.param(n, marks=pytest.mark.slow) for n in (*model_names(), "user")
@@ -163,7 +163,7 @@ NAMES = [
 def test_torch_and_compiled_code_agree(name):
     model = FrictionModel(DRAG, Constant(DRAG, 2), 1.0) if name == "user" else named_model(name)
     eager, compiled = (
-        run(model, *MOVING, sample_time=5e-4, steps=1000, backend=backend)
+        run(model, *MOVING, sample_time=1e-3, steps=400, backend=backend)
         for backend in ("torch", "compiled")
     )
     for field in ("q", "qd"):

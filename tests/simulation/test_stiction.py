@@ -104,7 +104,7 @@ def test_eager_torch_serves_where_nothing_compiles(monkeypatch, caplog):
     def refuse(*_, **__):
         raise codegen.CodegenError("no compiler")
 
-    monkeypatch.setattr(codegen, "trace_rollout", refuse)
+    monkeypatch.setattr(codegen, "CompiledRollout", refuse)
     monkeypatch.setattr(compiled, "_known", type(compiled._known)())
     eager = slide(2.5, v0=-0.1, steps=200)
     assert "eager torch, as they cannot be compiled: no compiler" in caplog.text

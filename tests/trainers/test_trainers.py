@@ -40,8 +40,7 @@ def train(*words: object) -> None:
     script, *others = map(str, words)
     sys.argv, before = [script], sys.argv
     try:
-        main = runpy.run_path(str(TRAINERS / script))["main"]
-        assert main(others) == 0
+        common.run(runpy.run_path(str(TRAINERS / script))["train"], others)
     finally:
         sys.argv = before
 

@@ -4,6 +4,7 @@ Warnings name signs in recordings that they are not what the plant and the fit a
 """
 
 import logging
+import math
 import textwrap
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
@@ -22,31 +23,50 @@ from nfriction.fitting.plant_parameters import (
     torque_delay_term,
 )
 from nfriction.friction import model_by_name
-from nfriction.friction.models import FrictionModel
+from nfriction.friction.models import V_SMOOTH, FrictionModel
 from nfriction.plant import PendulumChain, Plant
 from nfriction.recording import Recording, RecordingLike
 from nfriction.recording.angles import AngleConvention
 from nfriction.signals import Motion, count_seen, kalman_smoother
-from nfriction.simulation.validate import required_substeps
+from nfriction.simulation.validate import RK4_STABILITY, required_substeps
 
 logger = logging.getLogger(__name__)
 
 
-def as_model(model: FrictionModel | str, joints: int) -> FrictionModel:
-    """A model as it is, or a new one by its name.
+def as_model(
+    model: FrictionModel | str, joints: int, motions: Sequence[Motion] = ()
+) -> FrictionModel:
+    """A model as it is, or a new one by its name, whose sign turns as fast as the motions ask.
 
     Raises:
         TypeError: for anything else.
         ValueError: if no model has that name.
     """
     if isinstance(model, str):
-        return model_by_name(model)(joints)
+        return model_by_name(model)(joints, v_smooth=turning_velocity(motions))
     if not isinstance(model, FrictionModel):
         raise TypeError(
             "`model` must be a friction model such as LFM(joints=3), or the name of one, got "
             f"{type(model).__name__} {textwrap.shorten(repr(model), 60)}."
         )
     return model
+
+
+def turning_velocity(motions: Sequence[Motion], options: FitOptions = DEFAULTS) -> float:
+    """Velocity within which the sign of the velocity turns [rad/s; m/s].
+
+    A joint that friction holds creeps at about this velocity, so it is a small share of the largest
+    one, of the slowest joint. It is not below what an integration step takes off the velocity, or
+    friction would be too steep there.
+    """
+    if not motions:
+        return V_SMOOTH
+    speeds = np.max([np.abs(m.qd).max(axis=0) for m in motions], axis=0)
+    slowest = min((float(v) for v in speeds if v > 0), default=math.inf)
+    taken = max(float(np.abs(m.qdd).max() * np.median(np.diff(m.time))) for m in motions)
+    # Half the substeps, as friction is not known yet.
+    least = taken / (RK4_STABILITY * options.max_substeps / 2)
+    return min(V_SMOOTH, max(options.turning_share * slowest, least))
 
 
 def as_recording_list(
@@ -96,17 +116,17 @@ def warn_of_undriven(recordings: Sequence[Recording]) -> None:
 
 
 def in_joint_coordinates(
-    plant: Plant, model: FrictionModel, recordings: Sequence[Recording]
+    plant: Plant, recordings: Sequence[Recording], modelled: int
 ) -> list[Recording]:
-    """The recordings in joint coordinates, checked against plant and model."""
+    """The recordings in joint coordinates, checked against the joints of plant and model."""
     if not recordings:
         raise ValueError("at least one recording is needed to fit a model.")
     for recording in recordings:
         joints = recording.q.shape[1]
-        if joints != plant.joints or joints != model.joints:
+        if joints != plant.joints or joints != modelled:
             raise ValueError(
                 f"{recording.name}: {joints} joints recorded, the plant has {plant.joints}, the "
-                f"model {model.joints}; they must agree."
+                f"model {modelled}; they must agree."
             )
     conventions = {str(r.resolve_convention(plant)) for r in recordings}
     # Residuals are formed as the encoders read, by one matrix for all windows.

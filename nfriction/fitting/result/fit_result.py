@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nfriction.fitting.adjusted_plant import TORQUE_DELAY
 from nfriction.fitting.data.inputs import advanced_torques
 from nfriction.fitting.options import DEFAULTS
-from nfriction.fitting.plant_parameters import TORQUE_DELAY
 from nfriction.fitting.result.identifiability import CoefficientUncertainty, Interval
 from nfriction.fitting.robust_loss import Outliers
 from nfriction.friction import both_names

@@ -1,14 +1,6 @@
-"""The result of a search or a regression: intervals, warnings, and the noise of its data.
+"""The result of a search or a regression: intervals and warnings."""
 
-A right law on a right plant leaves the encoder's rounding, and the motion by which a simulation
-with the recorded torque departs from the true one. The noise of the torque is that part of the
-record which changes from sample to sample; its effect is found by simulation. Noise that lasts for
-many samples is not counted, since it looks like an error of the law.
-"""
-
-import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -25,18 +17,25 @@ from nfriction.fitting.result.identifiability import (
     exceeds_drive_torque,
     model_error_warning,
     null_directions,
-    observed_count,
     standard_deviations,
     warnings_of,
     weakly_identified,
 )
-from nfriction.fitting.robust_loss import SQUARES, Outliers, named_outliers, outlier_warning
-from nfriction.fitting.shooting.autocorrelation import bandwidth, effective_noise, hac_sd
+from nfriction.fitting.robust_loss import Outliers, named_outliers, outlier_warning
+from nfriction.fitting.shooting.autocorrelation import (
+    bandwidth,
+    effective_noise,
+    hac_sd,
+)
 from nfriction.fitting.shooting.problem import ShootingProblem
+from nfriction.fitting.shooting.uncertainty import (
+    encoder_count,
+    gathered_information,
+    measurement_noise,
+)
 from nfriction.fitting.shooting.variables import model_at
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import LeastSquaresResult
-from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
 from nfriction.plant import Plant
 from nfriction.signals import Motion
 
@@ -46,12 +45,6 @@ BLURRED = (
 )
 # A lower bound no larger exists only for the logarithm of a positive coefficient, in SI.
 NOTHING = 1e-9
-# Counts of a coarse encoder that is still in use.
-USUAL_COUNTS = 4096
-# Weights of a third difference: smooth motion cancels, white noise of sd 1 has an sd of √20.
-GAIN = 20**0.5
-# Median of the absolute value of a normal variable of sd 1.
-NORMAL_MEDIAN = 0.674490
 
 
 def result_from_equation_error(
@@ -207,7 +200,8 @@ def _identifiability(
     quantum = encoder_count(problem) if problem.friction.law.memory else None
     rms = float(residuals.square().mean().sqrt())
     rounded = quantum and rms <= options.explained_ratio * quantum / 12**0.5
-    known = problem.information(result.x, sd, quantum if rounded else None).subset(fitted)
+    known = gathered_information(problem, result.x, sd, quantum if rounded else None)
+    known = known.subset(fitted)
     root = torch.zeros(count, len(fitted), dtype=torch.float64)
     root[fitted] = covariance_root(known)
     root[[names.index(name) for name in ambiguous]] = torch.inf
@@ -247,82 +241,3 @@ def _torque_scale(
         torque = problem.friction.steady_torque(speed, torch.ones_like(speed), table)
         (slope,) = torch.autograd.grad(torque.sum(), table)
     return slope.flatten(), need[:, None].expand_as(slope).flatten()
-
-
-def white_noise(values: Tensor) -> Tensor:
-    """Standard deviation of the noise in signals (window, sample, joint) by joint, (joint,).
-
-    By the median of third differences, which neither steps nor jumps of the signal's slope raise;
-    zero of a signal that is held over several samples.
-    """
-    if values.shape[1] < 4:
-        return torch.zeros_like(values[0, 0])
-    size = torch.diff(values, n=3, dim=1).abs().flatten(0, 1)
-    return size.median(0).values / (NORMAL_MEDIAN * GAIN)
-
-
-def rounding(problem: ShootingProblem) -> float:
-    """Root mean square rounding of the encoders [rad; m], by their count.
-
-    A count that neither the plant states nor the positions show is taken for a 4096th of the motion
-    within a window.
-    """
-    count = encoder_count(problem)
-    if not count:
-        recorded = problem.windows.q @ problem.measurement.T
-        moved = recorded.amax(1) - recorded.amin(1)
-        count = float(moved.square().mean().sqrt()) / USUAL_COUNTS
-    return count / math.sqrt(12)
-
-
-def encoder_count(problem: ShootingProblem) -> float | None:
-    """Count of the encoders that the plant states or the positions show [rad; m]."""
-    recorded = problem.windows.q @ problem.measurement.T
-    return problem.jacobian.plant.position_quantum or observed_count(recorded)
-
-
-def measurement_noise(problem: ShootingProblem, x: Tensor, residual: float) -> float:
-    """Residual of a right law [rad; m], given that of a solution, both root mean square.
-
-    Only a residual far above the rounding is worth the simulation of the torque's noise.
-    """
-    least = rounding(problem)
-    if residual <= problem.options.model_error_ratio * least:
-        return least
-    errors = problem.errors(x)
-    encoder = float(white_noise(errors).clamp(min=least).square().mean().sqrt())
-    return math.hypot(encoder, _by_torque(problem, x, errors))
-
-
-def _by_torque(problem: ShootingProblem, x: Tensor, errors: Tensor, seed: int = 0) -> float:
-    """Root mean square residual by one realisation of the torque's noise, once fitted [rad; m]."""
-    windows, options = problem.windows, problem.options
-    sd = white_noise(windows.tau)
-    if not sd.any():
-        return 0.0
-    random = np.random.default_rng(seed)
-    recordings = tuple(
-        r._replace(tau=r.torque_at(r.time) + sd.numpy() * random.standard_normal(r.q.shape))
-        for r in windows.recordings
-    )
-    # Positions as simulated without the noise, and priors around this solution, so that the noise
-    # alone makes the errors.
-    exact = windows.q + torch.linalg.solve(problem.measurement, errors.mT).mT
-    friction, plant, states, _ = problem.variables.split(x)
-    q0, qd0 = states[:, : 2 * windows.q0.shape[-1]].chunk(2, -1)
-    noisy = replace(windows, q=exact, q0=q0, qd0=qd0, recordings=recordings)
-    noisy = replace(noisy, tau=noisy.torque_at(0.0)[0])
-    of_friction, of_plant = problem.variables.split(problem.variables.prior()[0])[:2]
-    pretended = replace(
-        problem, windows=noisy, loss=SQUARES,
-        friction_prior=(friction, of_friction.rsqrt()), plant_prior=(plant, of_plant.rsqrt()),
-    )  # fmt: skip
-    solver = LevenbergMarquardt(
-        max_steps=options.settling_steps, cost_tolerance=options.settling_tolerance
-    )
-    lower, upper = pretended.variables.bounds()
-    fitted = solver.minimise(
-        pretended.linearise, x, cost=pretended.cost, lower=lower, upper=upper
-    ).x
-    found = float(pretended.errors(fitted).square().mean().sqrt())
-    return found if math.isfinite(found) else 0.0

@@ -1,4 +1,4 @@
-"""Autocorrelation of residuals: how many independent ones they count for."""
+"""Noise of signals, and autocorrelation of residuals: how many independent ones they count for."""
 
 import math
 
@@ -6,6 +6,11 @@ import torch
 from torch import Tensor
 
 from nfriction.fitting.options import DEFAULTS, FitOptions
+
+# Weights of a third difference: smooth motion cancels, white noise of sd 1 has an sd of √20.
+GAIN = 20**0.5
+# Median of the absolute value of a normal variable of sd 1.
+NORMAL_MEDIAN = 0.674490
 
 
 def correlation_time(residuals: Tensor) -> float:
@@ -15,6 +20,18 @@ def correlation_time(residuals: Tensor) -> float:
     """
     centred = residuals - residuals.mean(1, keepdim=True)
     return float(_integrated(_autocovariance(centred).sum((0, 2))[None, :, None]))
+
+
+def white_noise(values: Tensor) -> Tensor:
+    """Standard deviation of the noise in signals (window, sample, joint) by joint, (joint,).
+
+    By the median of third differences, which neither steps nor jumps of the signal's slope raise;
+    zero of a signal that is held over several samples.
+    """
+    if values.shape[1] < 4:
+        return torch.zeros_like(values[0, 0])
+    size = torch.diff(values, n=3, dim=1).abs().flatten(0, 1)
+    return size.median(0).values / (NORMAL_MEDIAN * GAIN)
 
 
 def effective_noise(residuals: Tensor) -> float:

@@ -96,14 +96,32 @@ class Kept:
 
     def squares(self, rows: Tensor) -> Tensor:
         """J^T J of rows (window, row, column) without states, (kept, kept)."""
-        states, offsets = len(self.indices) * self.state, self.indices[:, self.state :]
-        if not offsets.shape[1]:
+        if self.shared == rows.shape[-1]:
             flat = rows.flatten(0, 1)
             return flat.T @ flat
-        total = torch.zeros(self.size - states, self.size - states, dtype=torch.float64)
-        common = torch.arange(self.shared).expand(len(rows), -1)
-        at = torch.cat([common, offsets - states], 1)
+        total = torch.zeros(self.count, self.count, dtype=torch.float64)
+        at = self._places()
         return total.index_put_((at[:, :, None], at[:, None]), rows.mT @ rows, accumulate=True)
+
+    def by_states(self, response: Tensor, precision: Tensor) -> Tensor:
+        """Covariance of the gradient by the prior of the states alone, (kept, kept)."""
+        return self.squares(precision.sqrt()[..., None] * response)
+
+    def sums(self, rows: Tensor, errors: Tensor) -> Tensor:
+        """J^T e of rows (window, row, column) and errors (window, row, draw), (kept, draw)."""
+        total = torch.zeros(self.count, errors.shape[-1], dtype=torch.float64)
+        return total.index_put_((self._places(),), rows.mT @ errors, accumulate=True)
+
+    @property
+    def count(self) -> int:
+        """Number of the variables that remain."""
+        return self.size - len(self.indices) * self.state
+
+    def _places(self) -> Tensor:
+        """Place of each window's columns among the variables that remain, (window, column)."""
+        states, common = self.size - self.count, torch.arange(self.shared)
+        offsets = self.indices[:, self.state :] - states
+        return torch.cat([common.expand(len(offsets), -1), offsets], 1)
 
 
 def marginalize_states(
@@ -146,23 +164,20 @@ def score_covariance(
     rows: Iterable[Rows], kept: Kept, response: Tensor, precision: Tensor
 ) -> Tensor:
     """Covariance of the gradient, (kept, kept), by rows scaled to their own residuals."""
-    total = kept.squares(precision.sqrt()[..., None] * response)
+    total = kept.by_states(response, precision)
     for _, scaled in rows:
         own, others = kept.split(scaled)
         total += kept.squares(others + own @ response)
     return total
 
 
-def drawn_score(
-    rows: Iterable[Rows], kept: Kept, response: Tensor, precision: Tensor, errors: Tensor
-) -> Tensor:
-    """The same by drawn errors (window, sample, joint, draw), scaled like the rows."""
-    total = kept.squares(precision.sqrt()[..., None] * response)
-    sums = total.new_zeros(len(total), errors.shape[-1])
+def drawn_score(rows: Iterable[Rows], kept: Kept, response: Tensor, errors: Tensor) -> Tensor:
+    """The part of it by drawn errors (window, sample, joint, draw), scaled like the rows."""
+    sums = torch.zeros(kept.count, errors.shape[-1], dtype=torch.float64)
     for part, scaled in rows:
         own, others = kept.split(scaled)
-        sums += torch.einsum("wrc,wrd->cd", others + own @ response, errors[:, part].flatten(1, 2))
-    return total + sums @ sums.T / sums.shape[1]
+        sums += kept.sums(others + own @ response, errors[:, part].flatten(1, 2))
+    return sums @ sums.T / sums.shape[1]
 
 
 def rounding_of(

@@ -15,6 +15,7 @@ References:
     H. G. Bock, in: Modelling of Chemical Reaction Systems, Springer (1981), 102-125.
 """
 
+import copy
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -22,28 +23,20 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from nfriction.fitting.adjusted_plant import adjusted_plant
 from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.options import DEFAULTS, FitOptions
-from nfriction.fitting.plant_parameters import adjusted_plant
 from nfriction.fitting.result.identifiability import (
-    Information,
-    information,
     observed_count,
-    standard_deviations,
 )
 from nfriction.fitting.robust_loss import SQUARES, RobustLoss
 from nfriction.fitting.shooting.normal_equations import (
-    Kept,
     Rows,
-    drawn_score,
-    marginalize_states,
     normal_equations,
-    rounding_of,
     scaled_rows,
-    score_covariance,
 )
 from nfriction.fitting.shooting.sensitivity import StepJacobian, Trajectory, propagate
-from nfriction.fitting.shooting.variables import DecisionVariables, deflected, model_at
+from nfriction.fitting.shooting.variables import DecisionVariables, deflected
 from nfriction.fitting.strategy.extrapolation_prior import ExtrapolationPrior
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import Quadratic
@@ -99,14 +92,14 @@ class ShootingProblem:
 
     def cost(self, x: Tensor) -> Tensor:
         """Half the sum of squares of errors and priors."""
-        return self._cost(x, self._simulate(x))
+        return self._cost(x, self.simulate(x))
 
     def linearise(self, x: Tensor) -> Quadratic:
         """Cost, gradient and Gauss-Newton Hessian at `x` from one simulation."""
-        run = self._simulate(x, with_memory=True)
-        errors = self._deviation(x, run)
-        scale = self._scale * self.loss.weight(errors).sqrt()
-        rows = self._rows(run, scale)
+        run = self.simulate(x, with_memory=True)
+        errors = self.deviation(x, run)
+        scale = self.scale * self.loss.weight(errors).sqrt()
+        rows = self.rows(run, scale)
         gradient, hessian = normal_equations(rows, errors * scale, self.variables.indices(), len(x))
         if self.extrapolation is not None:
             slope, curvature = self.extrapolation.normal_equations(run.friction.schedule)
@@ -122,7 +115,7 @@ class ShootingProblem:
 
     def errors(self, x: Tensor) -> Tensor:
         """Position error at every sample [rad; m], (window, step + 1, joint)."""
-        return self._deviation(x, self._simulate(x)) * self.windows.weight[..., None]
+        return self.deviation(x, self.simulate(x)) * self.windows.weight[..., None]
 
     def counted_errors(self, x: Tensor) -> Tensor:
         """Errors whose squares are what the loss counts; `errors` where it is the square."""
@@ -135,10 +128,6 @@ class ShootingProblem:
         least = max(count / 12**0.5, self.options.min_noise)
         return replace(self, loss=RobustLoss.of_errors(self.options.loss, errors, least))
 
-    def residuals(self, x: Tensor) -> Tensor:
-        """Errors of the counted samples over the noise, (window, step + 1, joint)."""
-        return self._deviation(x, self._simulate(x)) * self._scale
-
     def plant_at(self, vector: Tensor) -> Plant:
         """The plant with its adjustable terms at a parameter vector."""
         return adjusted_plant(self.jacobian.plant, self.jacobian.terms, vector)
@@ -148,7 +137,7 @@ class ShootingProblem:
 
         Longer windows then start from fitted states instead of a smoother's.
         """
-        run, offsets = self._simulate(x).motion, self.variables.window_offsets(x)
+        run, offsets = self.simulate(x).motion, self.variables.window_offsets(x)
         run = replace(run, q=run.q - offsets[:, None])
         states = [(m.q.copy(), m.qd.copy()) for m in motions]
         # A sample that two windows share is taken from the later one's fitted start.
@@ -158,44 +147,23 @@ class ShootingProblem:
                 kept[first : last + 1] = found[w, : n : self.substeps].numpy()
         return tuple(replace(m, q=q, qd=qd) for m, (q, qd) in zip(motions, states, strict=True))
 
-    def posterior_sd(self, hessian: Tensor) -> Tensor:
-        """Standard deviation of every shared variable by a Gauss-Newton Hessian."""
-        precision, _ = self.variables.prior()
-        return standard_deviations(information(hessian, precision, self.variables.shared_count))
-
-    def information(self, x: Tensor, sd: Tensor, count: float | None = None) -> Information:
-        """Information about the shared variables, given the sd of each error times its weight.
-
-        `sd` is inflated for autocorrelation, (window, step + 1, joint). If the errors are the
-        rounding of encoders to a `count` [rad; m], their covariance is that of rounding instead.
-        """
-        variables, run = self.variables, self._simulate(x, with_memory=True)
-        shared, (precision, _) = variables.shared_count, variables.prior()
-        of_states, of_offsets = variables.split(precision)[2:]
-        kept = Kept(variables.indices(), variables.state_count, len(x))
-        scale = self._scale * self.loss.weight(self._deviation(x, run)).sqrt()
-        data, response = marginalize_states(self._rows(run, scale), kept, of_states)
-        if count and self.loss is SQUARES and not variables.offset_count:
-            q = run.motion.q[:, :: self.substeps] @ self.measurement.T
-            drawn = rounding_of(q, count, self.windows.spans) * self._scale[..., None]
-            score = drawn_score(self._rows(run, scale), kept, response, of_states, drawn)
-        else:
-            rows = self._rows(run, self._scale * sd / self.noise_sd)
-            score = score_covariance(rows, kept, response, of_states)
-        prior = torch.cat([precision[:shared], of_offsets.flatten()])
-        return information(data + torch.diag(prior), prior, shared, score)
-
     @cached_property
-    def _scale(self) -> Tensor:
+    def scale(self) -> Tensor:
         """Weight of each sample over the noise, (window, step + 1, 1)."""
         counted = torch.zeros_like(self.windows.weight)
         counted[:, :: self.stride] = self.windows.weight[:, :: self.stride] * self.stride**0.5
         return counted[..., None] / self.noise_sd
 
-    def _simulate(self, x: Tensor, *, with_memory: bool = False) -> Trajectory:
-        """The windows' motion at `x`; the memory of its coefficients only for derivatives."""
+    @cached_property
+    def _moving(self) -> FrictionModel:
+        """A copy of the friction model, which every simulation moves to its parameters."""
+        return copy.deepcopy(self.friction)
+
+    def simulate(self, x: Tensor, *, with_memory: bool = False) -> Trajectory:
+        """The windows' motion at `x`, valid until the next; memory only for derivatives."""
         friction, plant, states, _ = self.variables.split(x)
-        model, joints = model_at(self.friction, friction), self.windows.q0.shape[-1]
+        model, joints = self._moving, self.windows.q0.shape[-1]
+        model.schedule.set_parameter_vector(friction)
         q0, qd0, shares = states.tensor_split([joints, 2 * joints], -1)
         law_state, law_slope = deflected(model, shares)
         held, linearised = (t.repeat_interleave(self.substeps, 1) for t in self._torques(plant))
@@ -229,18 +197,18 @@ class ShootingProblem:
             rows.append(model.schedule.advance(qd, qdd, rows[-1]))
         return torch.stack(rows, 1)
 
-    def _deviation(self, x: Tensor, run: Trajectory) -> Tensor:
+    def deviation(self, x: Tensor, run: Trajectory) -> Tensor:
         q = run.motion.q[:, :: self.substeps] - self.variables.window_offsets(x)[:, None]
         return (q - self.windows.q) @ self.measurement.T
 
     def _cost(self, x: Tensor, run: Trajectory) -> Tensor:
-        misfit = (self.loss.counted(self._deviation(x, run)) * self._scale).square().sum()
+        misfit = (self.loss.counted(self.deviation(x, run)) * self.scale).square().sum()
         if self.extrapolation is not None:
             misfit = misfit + self.extrapolation.residuals(run.friction.schedule).square().sum()
         precision, mean = self.variables.prior()
         return 0.5 * (misfit + (precision * (x - mean) ** 2).sum())
 
-    def _rows(self, run: Trajectory, scale: Tensor) -> Iterator[Rows]:
+    def rows(self, run: Trajectory, scale: Tensor) -> Iterator[Rows]:
         """Rows of the Jacobian, some samples at a time."""
         pieces = propagate(self.jacobian, run, self.substeps, self.stride)
         return scaled_rows(pieces, scale, self.measurement, self.variables.indices())

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from nfriction import codegen
-from nfriction.fitting.plant_parameters import PlantParameter, adjusted_plant, delay_index
+from nfriction.fitting.adjusted_plant import PlantParameter, adjusted_plant, delay_index
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.parameters import Sensitivity
 from nfriction.plant import Plant
@@ -113,7 +113,7 @@ def _jacobian(
 ) -> Callable[..., Tensor]:
     """The Jacobian of a function by some inputs, over batches of all of them but the last."""
     try:
-        compiled = codegen.compile_function(function, example, jacobian=by)
+        compiled = codegen.CompiledFunction(function, example, jacobian=by)
     except codegen.CodegenError as error:
         logger.warning("fits run slowly, as steps are linearised in eager torch: %s", error)
         axes = (*[0] * (len(example) - 1), None)

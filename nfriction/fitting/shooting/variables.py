@@ -8,9 +8,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from nfriction.fitting.adjusted_plant import PlantParameter
 from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.options import DEFAULTS, FitOptions
-from nfriction.fitting.plant_parameters import PlantParameter
 from nfriction.friction.coefficients import Schedule
 from nfriction.friction.memory import reference_coefficients, slipping_state
 from nfriction.friction.models import FrictionModel

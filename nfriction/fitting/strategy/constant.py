@@ -3,35 +3,26 @@
 A nonlinear law has several starts: its own, and two from the law that it contains.
 """
 
-import itertools
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeGuard
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import TypeGuard
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.fitting.data.inputs import adjustable_terms, advanced_torques
+from nfriction.fitting.data.inputs import adjustable_terms
 from nfriction.fitting.data.windows import Windows
-from nfriction.fitting.diagnosis import delay_in_words
 from nfriction.fitting.equation_error import (
     TorqueFit,
-    fit_equation_error,
-    prior_sd,
-    steady_law,
 )
-from nfriction.fitting.options import FitOptions
-from nfriction.fitting.plant_parameters import TORQUE_DELAY, PlantParameter
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.of_search import (
     result_from_equation_error,
     result_from_shooting,
-    rounding,
 )
 from nfriction.fitting.robust_loss import RobustLoss
-from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.continuation import (
     Continuation,
@@ -43,34 +34,28 @@ from nfriction.fitting.strategy.continuation import (
     loses,
     weighted_cost,
 )
-from nfriction.fitting.task import FitTask
+from nfriction.fitting.strategy.further_terms import delay_warning, richer_by_evidence
+from nfriction.fitting.strategy.presliding import (
+    TRAVELLED,
+    ambiguous_stiffness,
+    presliding_starts,
+)
+from nfriction.fitting.task import (
+    FitTask,
+    constant_prior,
+    fits_eccentricity,
+    known_terms,
+    regression,
+)
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Law
 from nfriction.friction.models import FrictionModel
-from nfriction.optim.least_squares import Quadratic
 from nfriction.plant import PendulumChain, Plant
 from nfriction.signals import Motion
-
-# Displacements over which a contact yields, over the range of the motion, and ratios of damping to
-# stiffness [s]: from what hardly shows to what would be no presliding.
-PRESLIDING = tuple(np.geomspace(1e-5, 1.0, 11).tolist())
-BRISTLE_TIMES = (1e-4, 1e-3, 1e-2, 1e-1)
-# Rises of friction at rest over that at high speed: torques of joints that stick do not show them.
-PEAKS = (0.1, 0.3, 1.0)
-# Displacements that are searched from where the first leaves more than the encoder's rounding.
-MOST_STARTS = 4
-
-# Stiffness and damping of a rival over those found: its contacts relax at once.
-STIFFER = (10.0, 0.01)
 
 TOO_LONG = (
     "Windows of {:g} s were skipped: the motion forgets its start within them, or law or plant are "
     "wrong."
-)
-
-LATE = (
-    "Perhaps {}: with that delay the residual would fall by about {:.0f} %, and coefficients may "
-    "move by more than their intervals."
 )
 
 LOSSY = (
@@ -89,17 +74,19 @@ def fit_constant(task: FitTask) -> FitResult:
 
     def equation_error(plant: Plant) -> Iterable[Tensor]:
         implied = regression(task, model, plant)
-        return with_presliding(torch.cat([implied.coefficients[None], implied.starts]))
+        return with_presliding(torch.cat([implied.coefficients[None], implied.starts]), plant)
 
-    def with_presliding(sliding: Tensor) -> Iterable[Tensor]:
+    def with_presliding(sliding: Tensor, rig: Plant) -> Iterable[Tensor]:
         if not model.law.memory:
             return sliding
-        return presliding_starts(fitter, sliding, plant, task.motions)
+        # Rows of a contact that yields would be taken for sliding, at a smaller friction.
+        apart = regression(task, model, rig, TRAVELLED).coefficients
+        return presliding_starts(fitter, sliding, apart, plant, task.motions)
 
     eccentric = fits_eccentricity(options, start)
     fitter = _fitter(task, model, torque, eccentric)
     plant = known_terms(start, fitter.jacobian.terms, task.delay)
-    friction = next(iter(with_presliding(torque.coefficients[None]))).reshape(-1)
+    friction = next(iter(with_presliding(torque.coefficients[None], begun))).reshape(-1)
     linear = all(c.linear or not c.fitted for c in model.law.coefficients)
     search = horizon_continuation(
         fitter, friction, plant, task.motions,
@@ -140,151 +127,6 @@ def fit_constant(task: FitTask) -> FitResult:
     return fitted.with_warnings(said)
 
 
-def regression(task: FitTask, model: FrictionModel, plant: Plant) -> TorqueFit:
-    """Constant coefficients that torques imply on a plant."""
-    recordings = advanced_torques(task.recordings, task.delay)
-    return fit_equation_error(
-        steady_law(model.law), plant, recordings, task.motions, model.v_smooth, task.options
-    )
-
-
-def presliding_starts(
-    fitter: ShootingFitter, sliding: Tensor, plant: Tensor, motions: tuple[Motion, ...]
-) -> Iterator[Tensor]:
-    """Coefficients of a law with memory to start from, (joint, coefficient), the best first.
-
-    `sliding` are sets of coefficients that torques imply, (set, joint, coefficient), which show how
-    a joint slides alone. The displacement over which its contact yields is sought among shares of
-    the joint's range, its damping among times, by the cost of short windows; the rise of friction
-    at rest and its velocity likewise, in turn. Several displacements of the first set follow, and
-    the best of every other one where the law has no such rise.
-    """
-    for place, coefficients in enumerate(sliding):
-        if place and peaked(fitter.friction.law, coefficients):
-            return
-        found = _yielding_alike(fitter, coefficients, plant, motions)
-        yield from found[: 1 if place else MOST_STARTS]
-
-
-def _yielding_alike(
-    fitter: ShootingFitter, coefficients: Tensor, plant: Tensor, motions: tuple[Motion, ...]
-) -> list[Tensor]:
-    """The best coefficients of every share of the range, least cost of short windows first."""
-    law, windows = fitter.friction.law, fitter.cut(motions, fitter.options.windows[0])
-    ranges = np.max([np.ptp(m.q, axis=0) for m in motions], axis=0)
-
-    def yields(share: float, time: float, base: Tensor, joints: Sequence[int]) -> _Start:
-        trial = base.clone()
-        for j in joints:
-            trial[j] = yielding(law, base[j], share * float(ranges[j]), time)
-        return tried(trial)
-
-    def tried(trial: Tensor) -> _Start:
-        problem = fitter.problem(windows, fitter.options.first_noise, trial.reshape(-1))
-        return _Start(float(problem.cost(problem.variables.start(plant))), trial)
-
-    def best(joints: Sequence[int], base: Tensor) -> list[_Start]:
-        rows = ([yields(s, t, base, joints) for t in BRISTLE_TIMES] for s in PRESLIDING)
-        return sorted((min(row, key=_Start.rank) for row in rows), key=_Start.rank)
-
-    # All joints alike first, then each by itself.
-    everyone = range(len(coefficients))
-    found = best(everyone, coefficients)
-    while peaks := [tried(trial) for trial in peaked(law, found[0].coefficients)]:
-        peak = min(peaks, key=_Start.rank)
-        if not peak.rank() < found[0].rank():
-            break
-        found = best(everyone, peak.coefficients)
-    for j in range(len(coefficients)) if len(coefficients) > 1 else ():
-        found = [*best([j], found[0].coefficients)[:1], *found]
-    return [start.coefficients for start in sorted(found, key=_Start.rank)]
-
-
-class _Start(NamedTuple):
-    cost: float
-    coefficients: Tensor
-
-    def rank(self) -> float:
-        return self.cost if math.isfinite(self.cost) else math.inf
-
-
-def ambiguous_stiffness(
-    fitter: ShootingFitter, found: HorizonResult, stage: HorizonResult
-) -> list[str]:
-    """Names of stiffness and damping of bristles that the data leave open.
-
-    Presliding below what the encoder resolves has minima of about equal cost at quite different
-    stiffness. A search from far stiffer bristles finds another one; where it differs by more than
-    a factor of two, and the likelihood does not prefer the first, neither is known; nor where a
-    search ended early, and the other one explains the motion to the encoder's rounding.
-
-    Args:
-        fitter: of the law.
-        found: its end.
-        stage: of short windows, whose states hardly trap a search.
-    """
-    from scipy.special import chdtri  # slow to import
-
-    problem, law = stage.problem, stage.problem.friction.law
-    count, tolerance = problem.variables.shared_count, fitter.options.loose_tolerance
-    # Terms that only the end may have come last.
-    start = torch.cat([found.result.x[:count], stage.result.x[count:]])
-    found = fitter.search(problem, start, tolerance, "stiffness")
-    places = [law.names.index(name) for name in ("sigma_0", "sigma_1") if name in law.names]
-    table = found.parts.friction.reshape(-1, len(law.names)).clone()
-    table[:, places] *= torch.tensor(STIFFER[: len(places)])
-    lower, upper = problem.friction.schedule.bounds()
-    start = torch.cat([table.reshape(-1).clamp(lower, upper), found.result.x[table.numel() :]])
-    rival = fitter.search(problem, start, tolerance, "stiffer bristles")
-    # The noise of a first stage is a guess.
-    lost = float(rival.result.cost - found.result.cost) * (problem.noise_sd / found.noise) ** 2
-    # Of searches that ended before a minimum, costs are no likelihoods.
-    early = not (found.result.converged and rival.result.converged)
-    explained = early and rival.rms <= rounding(problem)
-    if not (explained or lost < 0.5 * float(chdtri(len(table) * len(places), 0.05))):
-        return []
-    apart = (rival.parts.friction / found.parts.friction).log().abs().reshape(table.shape)
-    names = problem.friction.schedule.parameter_names(problem.jacobian.plant.joint_names)
-    return [
-        names[j * table.shape[1] + k]
-        for j in range(len(table)) if apart[j, places[0]] > math.log(2.0) for k in places
-    ]  # fmt: skip
-
-
-def peaked(law: Law, coefficients: Tensor) -> list[Tensor]:
-    """Coefficients (joint, coefficient) with other rises of the friction at rest."""
-    if not {"F_c", "F_d", "v_s"} <= set(law.names):
-        return []
-    found = []
-    coulomb, rise, velocity = (law.names.index(name) for name in ("F_c", "F_d", "v_s"))
-    for share, v_s in itertools.product(PEAKS, law.coefficients[velocity].initial_grid):
-        trial = coefficients.clone()
-        trial[:, rise], trial[:, velocity] = share * trial[:, coulomb], v_s
-        found.append(trial)
-    return found
-
-
-def yielding(law: Law, coefficients: Tensor, displacement: float, time: float) -> Tensor:
-    """Coefficients of one joint that slides alike, but yields over a displacement before.
-
-    `time` is the ratio of the damping of a bristle to its stiffness [s]. Laws that name their
-    coefficients otherwise stay as they are.
-    """
-    values = dict(zip(law.names, coefficients.tolist(), strict=True))
-    widths = [name for name in values if name.startswith("d_") and f"k{name[1:]}" in values]
-    if {"sigma_0", "F_c"} <= values.keys():
-        values["sigma_0"] = values["F_c"] / max(displacement, 1e-12)
-        values["sigma_1"] = time * values["sigma_0"]
-    elif widths:
-        scale = displacement / max(values[name] for name in widths)
-        for name in widths:
-            values[name] *= scale
-            values["k" + name[1:]] /= scale
-    found = torch.tensor([values[name] for name in law.names], dtype=torch.float64)
-    lower, upper = Constant(law, 1, found).bounds()
-    return found.clamp(lower, upper)
-
-
 def _fitter(
     task: FitTask, model: FrictionModel, torque: TorqueFit, eccentric: bool
 ) -> ShootingFitter:
@@ -299,136 +141,6 @@ def _fitter(
         task.callback, friction_prior=constant_prior(model, torque, options),
         offset_sd=torch.full(shape, sd, dtype=torch.float64) if task.per_recording else None,
     )  # fmt: skip
-
-
-def constant_prior(
-    model: FrictionModel, torque: TorqueFit, options: FitOptions
-) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of a law's constant coefficients, each (parameter,)."""
-    sd = prior_sd(model.law, torque, options).reshape(-1)
-    return torch.zeros_like(sd), sd
-
-
-def known_terms(
-    start: FitResult | None, terms: Sequence[PlantParameter], delay: float = 0.0
-) -> Tensor:
-    """Plant terms of an earlier fit by name, 0 where it has none but for the delay, (term,)."""
-    known = {TORQUE_DELAY: delay}
-    if start is not None:
-        known |= {name: value for name, value, _ in start.plant_terms}
-    return torch.tensor([known.get(t.name, 0.0) for t in terms], dtype=torch.float64)
-
-
-def fits_eccentricity(options: FitOptions, start: FitResult | None) -> bool:
-    """True if a search has encoder terms: `"on"`, or `"auto"` after a fit that has them."""
-    terms = start.plant_terms if start else ()
-    found = any(name.startswith("encoder ") for name, _, _ in terms)
-    return options.eccentricity == "on" or (options.eccentricity == "auto" and found)
-
-
-def richer_by_evidence(
-    base: HorizonResult, richer: ShootingFitter, tolerance: float
-) -> HorizonResult | None:
-    """The stage with encoder terms if the data ask for them, else None.
-
-    The two plants are compared by their evidence in Laplace's approximation: the decrease of the
-    cost less the Occam factor of the new terms, with residuals inflated for autocorrelation. A
-    first prediction of the decrease from derivatives alone may save the search. The terms of
-    `richer` are those of `base`, then the encoders'.
-
-    References:
-        D. J. C. MacKay, Neural Computation 4 (1992), 415-447.
-    """
-    further = _FurtherTerms.of(base, richer)
-    # The prediction costs one step, the search it may save costs a whole fit.
-    if further is None or further.predicted_gain() <= 0:
-        return None
-    problem, before = further.problem, further.before
-    zeros = torch.zeros(further.count, dtype=torch.float64)
-    start = problem.variables.start(torch.cat([base.parts.plant, zeros]), base.parts.offsets)
-    found = richer.search(problem, start, tolerance, "eccentric encoders")
-    end = found.result
-    gain = float(before.cost) - float(end.cost)
-    better = gain + further.occam(Quadratic(end.cost, end.gradient, end.hessian)) > 0
-    return found if better else None
-
-
-def delay_warning(found: HorizonResult, delayed: ShootingFitter) -> list[str]:
-    """A sentence on the delay between torques and positions that the data ask for, if any.
-
-    By derivatives alone: a delay below a sample hardly shows in the balance of torques, but it
-    biases coefficients by more than their intervals.
-    """
-    further = _FurtherTerms.of(found, delayed)
-    if further is None or further.predicted_gain() <= 0:
-        return []
-    delay = float(further.step()[further.first])
-    fall = 1.0 - max(0.0, 1.0 - further.decrease() / float(further.before.cost)) ** 0.5
-    return [LATE.format(delay_in_words(delay), 100 * fall)]
-
-
-@dataclass(frozen=True)
-class _FurtherTerms:
-    """Local model of a stage with further plant terms, which begin at 0 behind its own."""
-
-    problem: ShootingProblem
-    before: Quadratic
-    first: int
-    count: int
-    # Variables that may move, without and with the further terms.
-    known: Tensor
-    both: Tensor
-
-    @classmethod
-    def of(cls, base: HorizonResult, richer: ShootingFitter) -> "_FurtherTerms | None":
-        count = len(richer.jacobian.terms) - len(base.problem.jacobian.terms)
-        if not base.noise > 0 or count < 1:
-            return None
-        problem = richer.problem(base.problem.windows, base.noise, base.parts.friction)
-        first = base.problem.variables.shared_count
-        zeros = torch.zeros(count, dtype=torch.float64)
-        at_base = torch.cat([base.result.x[:first], zeros, base.result.x[first:]])
-        lower, upper = problem.variables.bounds()
-        # Variables at a bound cannot move, so they take no volume of the posterior.
-        known = (at_base > lower) & (at_base < upper)
-        known[first : first + count] = False
-        both = known.clone()
-        both[first : first + count] = True
-        return cls(problem, problem.linearise(at_base), first, count, known, both)
-
-    def occam(self, after: Quadratic) -> float:
-        """Logarithm of the Occam factor of the further terms."""
-        precision = self.problem.variables.prior()[0][self.first : self.first + self.count]
-        volume = _log_volume(after, self.both) - _log_volume(self.before, self.known)
-        return 0.5 * (float(precision.log().sum()) - volume)
-
-    def step(self) -> Tensor:
-        """Gauss-Newton step with the further terms, (variable,)."""
-        step = torch.zeros_like(self.before.gradient)
-        step[self.both] = -_newton_step(self.before, self.both)
-        return step
-
-    def decrease(self) -> float:
-        """Decrease of the cost by the further terms that derivatives predict."""
-        return _newton_decrease(self.before, self.both) - _newton_decrease(self.before, self.known)
-
-    def predicted_gain(self) -> float:
-        """Gain of the log evidence that derivatives predict."""
-        return self.decrease() + self.occam(self.before)
-
-
-def _newton_step(local: Quadratic, chosen: Tensor) -> Tensor:
-    slope = local.gradient[chosen]
-    return torch.linalg.lstsq(local.hessian[chosen][:, chosen], slope).solution
-
-
-def _newton_decrease(local: Quadratic, chosen: Tensor) -> float:
-    """Decrease of the cost that its quadratic model predicts when the chosen variables move."""
-    return 0.5 * float(local.gradient[chosen] @ _newton_step(local, chosen))
-
-
-def _log_volume(local: Quadratic, chosen: Tensor) -> float:
-    return float(torch.linalg.slogdet(local.hessian[chosen][:, chosen]).logabsdet)
 
 
 def is_constant_fit(start: FitResult | None, model: FrictionModel) -> TypeGuard[FitResult]:

@@ -11,10 +11,11 @@ from torch import Tensor
 from nfriction.fitting.data.inputs import integration_substeps
 from nfriction.fitting.data.windows import Windows, cut_windows
 from nfriction.fitting.options import FitOptions
-from nfriction.fitting.result.identifiability import observed_count
+from nfriction.fitting.result.identifiability import information, standard_deviations
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
+from nfriction.fitting.shooting.uncertainty import explained
 from nfriction.fitting.shooting.variables import Parts, model_at
 from nfriction.fitting.strategy.extrapolation_prior import ExtrapolationPrior
 from nfriction.friction.models import FrictionModel
@@ -61,14 +62,10 @@ class HorizonResult:
         """Standard deviation of a residual, inflated for autocorrelation."""
         return effective_noise(self.residuals)
 
-    @property
+    @cached_property
     def explained(self) -> bool:
-        """True if the rounding of the encoder explains the residuals."""
-        problem = self.problem
-        seen = observed_count(problem.windows.q @ problem.measurement.T)
-        quantum = problem.jacobian.plant.position_quantum or seen
-        limit = problem.options.explained_ratio * (quantum or 0.0) / 12**0.5
-        return self.rms <= limit
+        """True if the noise of encoders and torques explains the residuals."""
+        return explained(self.problem, self.result.x, self.rms)
 
     def lost_motion(self, before: "HorizonResult", options: FitOptions) -> bool:
         """True if the longer windows only show that the motion forgets its start within them."""
@@ -201,7 +198,8 @@ class StallMonitor:
         # A step that damping cut short shows no convergence.
         if before is None or step.damping > WEAK_DAMPING:
             return torch.inf
-        sd = self.problem.posterior_sd(local.hessian)
+        precision, _ = self.problem.variables.prior()
+        sd = standard_deviations(information(local.hessian, precision, count))
         # Of chaotic windows the curvature is round-off, by which nothing would ever move.
         if torch.isinf(sd).all():
             return torch.inf
@@ -281,7 +279,9 @@ def horizon_continuation(
         found = fitter.search(problem, start, tolerance, name)
         ends = [found]
         if equation_error is not None and not found.stopped and (last or not stages):
-            other = restart_from_equation_error(fitter, found, tolerance, name, equation_error)
+            other = restart_from_equation_error(
+                fitter, found, start, tolerance, name, equation_error
+            )
             ends = [other, found] if other is not found else ends
         if stages and ends[0].lost_motion(stages[-1], options):
             return Continuation(tuple(stages), rest)
@@ -393,14 +393,16 @@ def student_quantile(freedom: int, level: float) -> float:
 def restart_from_equation_error(
     fitter: ShootingFitter,
     found: HorizonResult,
+    start: Tensor,
     tolerance: float,
     name: str,
     equation_error: EquationError,
 ) -> HorizonResult:
     """A stage, or the lowest that starts where torques lead on its plant, if lower.
 
-    The starts after the first, from the law's grid of initial values, are tried only where the
-    encoder's rounding does not explain the residual: below that is no other minimum.
+    The stage's own start is not tried again. The starts after the first, from the law's grid of
+    initial values, are tried only where the encoder's rounding does not explain the residual: below
+    that is no other minimum.
     """
     problem, plant = found.problem, found.parts.plant
     best = found
@@ -408,10 +410,13 @@ def restart_from_equation_error(
         if place and best.explained:
             break
         begun = replace(problem, friction=model_at(problem.friction, friction.reshape(-1)))
-        start = begun.variables.start(plant, found.parts.offsets)
+        x = begun.variables.start(plant, found.parts.offsets)
+        # As on the first windows of a plant that is not fitted.
+        if torch.equal(x, start):
+            continue
         count = begun.variables.shared_count
-        start = torch.cat([start[:count], found.result.x[count:]]) if place else start
-        other = fitter.search(begun, start, tolerance, name)
+        x = torch.cat([x[:count], found.result.x[count:]]) if place else x
+        other = fitter.search(begun, x, tolerance, name)
         if other.stopped:
             return best.as_stopped() if place else other
         if other.result.cost < best.result.cost * (1 - tolerance if place else 1):

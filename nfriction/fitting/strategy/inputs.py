@@ -19,12 +19,6 @@ from nfriction.fitting.result.fit_result import FitResult, InputGain
 from nfriction.fitting.result.of_search import result_from_shooting
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
 from nfriction.fitting.shooting.sensitivity import StepJacobian
-from nfriction.fitting.strategy.constant import (
-    constant_prior,
-    fits_eccentricity,
-    known_terms,
-    regression,
-)
 from nfriction.fitting.strategy.continuation import (
     ShootingFitter,
     loglik_tolerance,
@@ -32,7 +26,13 @@ from nfriction.fitting.strategy.continuation import (
     weighted_cost,
 )
 from nfriction.fitting.strategy.holdout import gains
-from nfriction.fitting.task import FitTask
+from nfriction.fitting.task import (
+    FitTask,
+    constant_prior,
+    fits_eccentricity,
+    known_terms,
+    regression,
+)
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.inputs import INPUTS, with_inputs
 from nfriction.friction.models import FrictionModel

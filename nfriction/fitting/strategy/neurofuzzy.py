@@ -28,13 +28,7 @@ from nfriction.fitting.result.of_search import result_from_shooting
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.shooting.variables import model_at
-from nfriction.fitting.strategy.constant import (
-    constant_prior,
-    constant_start,
-    fits_eccentricity,
-    known_terms,
-    regression,
-)
+from nfriction.fitting.strategy.constant import constant_start
 from nfriction.fitting.strategy.continuation import (
     HorizonResult,
     ShootingFitter,
@@ -56,7 +50,13 @@ from nfriction.fitting.strategy.inputs import (
     seeing_plant,
     widened_start,
 )
-from nfriction.fitting.task import FitTask
+from nfriction.fitting.task import (
+    FitTask,
+    constant_prior,
+    fits_eccentricity,
+    known_terms,
+    regression,
+)
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy, NeuroFuzzyModel
 from nfriction.optim.evidence import GroupEvidence, group_evidence

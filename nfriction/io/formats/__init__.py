@@ -7,8 +7,137 @@ them; cells of a CSV file stay text. Its `attrs` hold the file's other informati
 pandas is slow to import, so only functions that make tables import it.
 """
 
-from nfriction.io.formats.files import read_table, stem, write_table
+from __future__ import annotations
+
+import csv
+import os
+import zipfile
+import zlib
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING
+
+from nfriction.io.files import write_atomically
 from nfriction.io.formats.numbers import column_numbers
 from nfriction.io.formats.selection import Arrays, table_arrays
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 __all__ = ["Arrays", "column_numbers", "read_table", "stem", "table_arrays", "write_table"]
+
+# An hour of ten joints at 1 kHz with torque and velocity, as numbers [bytes].
+LARGEST = 2**30
+MOST_COLUMNS = 2000
+# Measurements compress to a tenth, perhaps; to this share only what is nearly constant.
+UNSUSPECTED, LARGEST_RATIO = 2**26, 200
+
+# Modules and functions by ending, imported on use.
+_READERS = {
+    ".csv": "text:read_csv",
+    ".csv.gz": "text:read_csv_gz",
+    ".tsv": "text:read_csv",
+    ".txt": "text:read_csv",
+    ".parquet": "columnar:read_parquet",
+    ".npz": "columnar:read_npz",
+    ".mat": "measurements:read_mat",
+    ".h5": "measurements:read_hdf5",
+    ".hdf5": "measurements:read_hdf5",
+    ".mf4": "measurements:read_mdf",
+}
+_WRITERS = {
+    ".csv": "text:write_csv",
+    ".csv.gz": "text:write_csv_gz",
+    ".parquet": "columnar:write_parquet",
+    ".npz": "columnar:write_npz",
+}
+# Errors of the readers on broken content. ValueError covers pandas' parser, pyarrow and Unicode;
+# NotImplementedError and RuntimeError archives of unknown versions or with a password.
+_BROKEN = (ValueError, OSError, OverflowError, NotImplementedError, RuntimeError,
+           zipfile.BadZipFile, zlib.error, EOFError, csv.Error)  # fmt: skip
+
+
+def read_table(path: str | os.PathLike[str], sources: Sequence[str] = ()) -> pd.DataFrame:
+    """Read the table in a file; the ending selects the format.
+
+    Args:
+        path: of the file.
+        sources: wanted columns, perhaps with a unit after a colon; formats that hold much else give
+            only these and those with names of ours.
+    Raises:
+        FileNotFoundError: there is no such file.
+        ImportError: a format whose library is not installed.
+        ValueError: an unknown ending, an empty, truncated or malformed file.
+    """
+    path = Path(path)
+    reader = _READERS[_ending(path, _READERS, "read")]
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no recording at '{path}'; check the path.")
+    if path.stat().st_size == 0:
+        raise ValueError(f"'{path}' is empty; a recording has a header and samples.")
+    try:
+        table: pd.DataFrame = resolve_name(f"{__name__}.{reader}")(path, sources)
+    except _BROKEN as error:
+        reason = str(error)
+        # It may quote the file.
+        reason = reason if len(reason) <= 500 else f"{reason[:497]}..."
+        raise ValueError(
+            f"'{path}' is truncated, ragged or not what its ending says ({reason}); "
+            f"repair or fetch it again."
+        ) from error
+    return table
+
+
+def write_table(table: pd.DataFrame, path: str | os.PathLike[str]) -> None:
+    """Write a table atomically; the ending selects the format. Missing folders are made.
+
+    Raises:
+        ValueError: an unknown ending.
+        OSError: the file cannot be written.
+    """
+    path = Path(path)
+    writer = resolve_name(f"{__name__}.{_WRITERS[_ending(path, _WRITERS, 'written')]}")
+    write_atomically(path, writer(table))
+
+
+def stem(path: str | os.PathLike[str]) -> str:
+    """A file's name without the ending of its format, as text that any file can hold."""
+    name = os.fsencode(Path(path).name)[: -len(_ending(Path(path), _READERS, "read"))]
+    try:
+        return name.decode()
+    except UnicodeDecodeError:
+        # Of an older system, like the file's content; Python's stand-ins cannot be written.
+        return name.decode("latin-1")
+
+
+def most_unpacked(packed: int) -> int:
+    """Largest unpacked size [bytes] accepted from a file of this size."""
+    return min(LARGEST, max(UNSUSPECTED, LARGEST_RATIO * packed))
+
+
+def refuse_bomb(unpacked: int, packed: int) -> None:
+    """Raise ValueError where a file unpacks to far more [bytes] than measurements would."""
+    refuse_size(unpacked, "unpacked bytes")
+    if unpacked > most_unpacked(packed):
+        raise ValueError(
+            f"it unpacks to {unpacked} bytes or more, {unpacked // max(packed, 1)} times its size, "
+            f"as no recording does; if it is one, write it uncompressed"
+        )
+
+
+def refuse_size(count: int, unit: str = "bytes") -> None:
+    """Raise ValueError where a file is larger than any recording."""
+    if count > LARGEST:
+        raise ValueError(
+            f"it holds {count} {unit}, more than {LARGEST} are read; cut it into parts"
+        )
+
+
+def _ending(path: Path, known: Iterable[str], verb: str) -> str:
+    for ending in known:
+        if path.name.lower().endswith(ending):
+            return ending
+    raise ValueError(
+        f"'{path}' must end in one of {', '.join(known)}, the formats that are {verb}."
+    )

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from nfriction.io.formats.files import MOST_COLUMNS, refuse_bomb
+from nfriction.io.formats import MOST_COLUMNS, refuse_bomb
 from nfriction.io.formats.text import ATTRIBUTES
 
 _HEADER = re.compile(

@@ -33,8 +33,6 @@ def decimal_sign(table: pd.DataFrame, stated: str | None, usual: str) -> tuple[s
         stated: the sign that the file states, if it does.
         usual: guessed where all columns can be read both ways and move alike; without commas, the
             point.
-    Raises:
-        ValueError: columns that contradict each other or the statement.
     """
     if stated is not None and stated not in THOUSANDS:
         raise ValueError(

@@ -68,19 +68,13 @@ class Source(NamedTuple):
 
 
 class Arrays(NamedTuple):
-    """Arrays of a recording in SI.
+    """Arrays of a recording in SI."""
 
-    Attributes:
-        values: time, q; qd where every joint has it; tau where any has, zero for the others.
-        slides: whether positions are lengths; None if unknown.
-        remarks: doubts about the choice of columns, and the remedy of each.
-        of_motors: True if positions follow from the angles of motors.
-    """
-
+    # time, q; qd where every joint has it; tau where any has, zero for the others
     values: dict[str, Array]
-    slides: bool | None
-    remarks: tuple[tuple[str, str], ...] = ()
-    of_motors: bool = False
+    slides: bool | None  # whether positions are lengths; None if unknown
+    remarks: tuple[tuple[str, str], ...] = ()  # doubts about the columns, the remedy of each
+    of_motors: bool = False  # positions follow from the angles of motors
 
 
 def table_arrays(
@@ -179,8 +173,6 @@ def to_si(kind: str, values: Array, unit: str) -> Array:
         values: any shape.
         unit: s, ms, us, ns; rad, mrad, deg, rev, counts/8192 (any count a revolution), m, mm; those
             per second, rpm; N m, mN m, N, mN; A, mA.
-    Raises:
-        ValueError: no unit of that kind.
     """
     per = _per_si(kind, unit)
     if per is None:

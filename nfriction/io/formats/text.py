@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from nfriction.io.formats.files import MOST_COLUMNS, most_unpacked, refuse_bomb, refuse_size
+from nfriction.io.formats import MOST_COLUMNS, most_unpacked, refuse_bomb, refuse_size
 from nfriction.io.formats.numbers import decimal_sign, is_number
 from nfriction.io.formats.selection import is_unit
 
@@ -50,11 +50,7 @@ def write_csv_gz(table: pd.DataFrame) -> bytes:
 
 
 def parse_csv(text: str) -> pd.DataFrame:
-    """Table of a CSV text.
-
-    Raises:
-        ValueError: no header, rows that do not fit it, or ambiguous numbers.
-    """
+    """Table of a CSV text."""
     # Only whole lines are comments, for a column may be called "enc #1".
     content = [line for line in io.StringIO(text) if line.strip() and not _is_comment(line)]
     if not content:

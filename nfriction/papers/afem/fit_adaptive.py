@@ -25,9 +25,9 @@ from nfriction.fitting.result.of_search import result_from_shooting
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
-from nfriction.fitting.strategy.constant import constant_start, known_terms
+from nfriction.fitting.strategy.constant import constant_start
 from nfriction.fitting.strategy.continuation import ShootingFitter
-from nfriction.fitting.task import Callback, FitTask, prepare_task
+from nfriction.fitting.task import Callback, FitTask, known_terms, prepare_task
 from nfriction.friction.models import FrictionModel
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
 from nfriction.papers.afem.classes import (
@@ -205,16 +205,16 @@ class PositionError:
     def mean_square(self, vectors: Tensor) -> Tensor:
         """Mean square of the error [rad^2] of candidates (m, parameter), shape (m,)."""
         total = torch.zeros(len(vectors), dtype=torch.float64)
-        for error in self._residuals(vectors):
+        for error in self.parts(vectors):
             total += error.square().sum((1, 2))
         return total / self.values
 
     def residuals(self, vector: Tensor) -> Tensor:
         """Error of one candidate [rad], (window, step + 1, joint)."""
-        return torch.cat(list(self._residuals(vector[None])))
+        return torch.cat(list(self.parts(vector[None])))
 
-    def _residuals(self, vectors: Tensor) -> Iterator[Tensor]:
-        """Errors of every candidate, (m, step + 1, joint), window by window."""
+    def parts(self, vectors: Tensor) -> Iterator[Tensor]:
+        """Errors of candidates (m, parameter) [rad], (m, step + 1, joint), window by window."""
         of = self.windows
         rows = [
             {name: p.detach().clone() for name, p in self.friction.named_parameters()}

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -22,9 +22,12 @@ from nfriction.fitting.options import FitOptions, Method
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.fitting.strategy.constant import constant_start, fit_constant
+from nfriction.fitting.strategy.continuation import loglik_tolerance
 from nfriction.fitting.task import FitTask, prepare_task
 from nfriction.friction.coefficients import Constant, Tabulated
 from nfriction.friction.models import FrictionModel
+from nfriction.optim import bounded_qp
+from nfriction.optim.least_squares import Quadratic
 from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.afem.classes import DEFAULTS, ClassOptions
 from nfriction.papers.afem.fit_adaptive import ClassFit, PositionError, like_start
@@ -35,6 +38,8 @@ from nfriction.signals import Motion
 SearchMethod = Literal["pattern", "sqp"]
 # First mesh of a pattern search, and its factor after a poll without a better point.
 INITIAL_MESH, CONTRACTION = 0.25, 0.5
+# Damping, relative to the curvature, of the candidates from a local quadratic.
+DAMPINGS = tuple(10.0**-power for power in range(8))
 # Forward differences of a smooth simulation: half the digits.
 DIFFERENCE = 1e-6
 # Cost of a diverged candidate in a gradient, relative to the start: finite, but beyond all others.
@@ -183,6 +188,7 @@ class Box:
 
 
 Cost = Callable[[Tensor], Tensor]
+Residuals = Callable[[Tensor], Iterable[Tensor]]
 Callback = Callable[[SearchState], "bool | None"]
 
 
@@ -191,7 +197,8 @@ def search(
     box: Box,
     options: SearchOptions,
     callback: Callback | None = None,
-    shape: Tensor | None = None,
+    residuals: Residuals | None = None,
+    negligible: float = 0.0,
 ) -> SearchResult:
     """Minimise a cost within bounds by pattern search or sequential quadratic programming.
 
@@ -200,7 +207,9 @@ def search(
         box: start, bounds and scales.
         options: method, limits and the state to resume.
         callback: called after every iteration; True stops.
-        shape: of a pattern search's polls, see `poll_shape`; round by default.
+        residuals: of candidates (m, parameter), in parts (m, n) whose squares add up to twice the
+            cost; a pattern search then also tries steps of the quadratic that they imply.
+        negligible: relative decrease of the cost that a pattern search counts as none.
 
     Raises:
         ValueError: if the state is another search's.
@@ -214,69 +223,58 @@ def search(
     callback = callback or (lambda _: None)
     if options.method == "sqp":
         return _sqp(cost, box, options, callback)
-    shape = torch.eye(size, dtype=torch.float64) if shape is None else shape
-    return _pattern(cost, box, options, callback, shape)
-
-
-def poll_shape(residuals: Callable[[Tensor], Tensor], box: Box, weight: Tensor) -> Tensor:
-    """Matrix (free, free) that maps the unit ball into an ellipsoid of about equal cost.
-
-    Along a valley of the cost a poll then steps far, across it as little as it must.
-
-    Args:
-        residuals: of a vector (parameter,), scaled so that half the sum of squares is the data's
-            part of the cost.
-        box: variables of the search.
-        weight: second derivatives of the rest of the cost by the vector, (parameter,).
-    """
-    at = box.to_unit(box.start.clamp(box.lower, box.upper))
-    upper, free = box.ends[1], box.free
-    # Backward at an upper bound, where forward would not move.
-    steps = torch.where(at + DIFFERENCE > upper, -DIFFERENCE, DIFFERENCE)
-    points = box.from_unit(torch.cat([at[None], at + torch.diag(steps)]))
-    first, *moved = [residuals(point).reshape(-1) for point in points]
-    slopes = torch.stack([m - first for m in moved], -1) / steps
-    change = (points[1:, free] - points[0, free]).diagonal() / steps
-    curvature = slopes.mT @ slopes + torch.diag(weight[free] * change.square())
-    if not torch.isfinite(curvature).all():  # the start diverges
-        return torch.eye(len(at), dtype=torch.float64)
-    values, axes = torch.linalg.eigh(curvature)
-    # By the curvature no step needs to reach further than where the start's errors double.
-    reach = (first.square().sum() / values.clamp_min(TINY)).sqrt().clamp_max(1.0)
-    return axes * reach @ axes.mT
+    return _pattern(cost, box, options, callback, residuals, negligible)
 
 
 def _pattern(
-    cost: Cost, box: Box, options: SearchOptions, callback: Callback, shape: Tensor
+    cost: Cost,
+    box: Box,
+    options: SearchOptions,
+    callback: Callback,
+    residuals: Residuals | None,
+    negligible: float,
 ) -> SearchResult:
     """Generalised pattern search, every poll one batch of candidates.
 
     An iteration polls x ± mesh along every axis and one point beyond x along the last successful
-    step. It moves to the best of these and doubles the mesh if that is better than x, else it
-    contracts the mesh. Points outside the bounds are moved onto them. The axes are turned at random
-    in every iteration, so that a ridge or a kink askew to them cannot stop the search, and then
-    stretched by `shape`.
+    step. It moves to the best of these, doubles the mesh if that is better than x by more than is
+    negligible, else contracts it. Points outside the bounds are moved onto them. The axes are
+    turned at random in every iteration, so that a ridge or a kink askew to them cannot stop the
+    search. Of residuals it knows the local quadratic, whose damped minima are candidates, and in
+    whose metric it polls: a mesh of m then changes the cost by about m^2 of itself.
 
     References:
-        V. Torczon, SIAM J. Optim. 7 (1997); C. Audet and J. E. Dennis, SIAM J. Optim. 17 (2006).
+        V. Torczon, SIAM J. Optim. 7 (1997); C. Audet and J. E. Dennis, SIAM J. Optim. 17 (2006);
+        A. J. Booker et al., Struct. Optim. 17 (1999), on candidates from a model of the cost;
+        T. G. Kolda, R. M. Lewis, V. Torczon, SIAM Review 45 (2003), on sufficient decrease.
     """
     start = box.to_unit(box.start.clamp(box.lower, box.upper))
-    poll = 2 * len(start) + 1
     state = options.state or SearchState(
         "pattern", start.tolist(), math.inf, 0, step=[0.0] * len(start)
     )
     message = CONVERGED
+    local, trials, poll = None, 0 if residuals is None else len(DAMPINGS), 2 * len(start) + 1
     try:
         if state.evaluations == 0:
             value = _values(cost, box, box.tensor(state.point)[None])[0]
             state = replace(state, value=float(value), evaluations=1)
-        while state.mesh >= options.tolerance:
+        finest = (
+            options.tolerance
+            if residuals is None
+            else max(options.tolerance, math.sqrt(negligible))
+        )
+        while state.mesh >= finest:
+            moved = residuals is not None and (state.iterations == 0 or any(state.step))
+            most = poll + trials + moved * (len(start) + 1)
             # A partial poll would depend on the limit, and a resumed search would differ from a
             # whole one.
-            if state.evaluations + poll > options.max_evaluations:
+            if state.evaluations + most > options.max_evaluations:
                 message = LIMIT
                 break
-            state = _polled(cost, box, state, options.seed, shape)
+            if residuals is not None and (moved or local is None):
+                local = local_quadratic(residuals, box, box.tensor(state.point))
+            state = _polled(cost, box, state, options.seed, local, negligible)
+            state = replace(state, evaluations=state.evaluations + moved * (len(start) + 1))
             if callback(state):
                 message = STOPPED
                 break
@@ -288,7 +286,49 @@ def _pattern(
     return SearchResult(vector, state.value, message == CONVERGED, message, state.iterations)
 
 
-def _polled(cost: Cost, box: Box, state: SearchState, seed: int, shape: Tensor) -> SearchState:
+def local_quadratic(residuals: Residuals, box: Box, x: Tensor) -> Quadratic | None:
+    """Quadratic of a cost near a point (free,) by forward differences; None where it diverges.
+
+    As Gauss and Newton: without the residuals' own curvature.
+    """
+    # Backward at an upper bound, where forward would not move.
+    step = torch.where(x + DIFFERENCE > box.ends[1], -DIFFERENCE, DIFFERENCE)
+    zero = torch.zeros((), dtype=x.dtype)
+    cost, gradient, hessian = zero, zero, zero
+    for part in residuals(box.from_unit(torch.cat([x[None], x + torch.diag(step)]))):
+        first, slopes = part[0], (part[1:] - part[0]) / step[:, None]
+        cost = cost + 0.5 * first.square().sum()
+        gradient, hessian = gradient + slopes @ first, hessian + slopes @ slopes.mT
+    local = Quadratic(cost, gradient, hessian)
+    return local if local.finite else None
+
+
+def _steps(local: Quadratic, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    """Shape of the polls (free, free), and the quadratic's minima within bounds (damping, free)."""
+    values, axes = torch.linalg.eigh(local.hessian)
+    # Along a valley of the cost a poll steps far, across it as little as it must: to where the
+    # squared errors are twice as large.
+    reach = (2 * local.cost / values.clamp_min(TINY)).sqrt().clamp_max(1.0)
+    inside = (low < 0) & (high > 0)
+    diagonal = local.hessian.diagonal().clamp_min(TINY)
+    trials = [
+        bounded_qp.minimise(
+            local.hessian + torch.diag(damping * diagonal), local.gradient, low, high, inside,
+            lambda matrix, right, _: bounded_qp.solve_semidefinite(matrix, right),
+        )
+        for damping in DAMPINGS
+    ]  # fmt: skip
+    return axes * reach @ axes.mT, torch.stack(trials)
+
+
+def _polled(
+    cost: Cost,
+    box: Box,
+    state: SearchState,
+    seed: int,
+    local: Quadratic | None,
+    negligible: float,
+) -> SearchState:
     x, last = box.tensor(state.point), box.tensor(state.step)
     # A generator of its own per iteration: a resumed search needs no generator state.
     random = torch.Generator().manual_seed(seed * 1_000_003 + state.iterations)
@@ -297,14 +337,19 @@ def _polled(cost: Cost, box: Box, state: SearchState, seed: int, shape: Tensor) 
     )
     # The sign makes the factorisation unique, and so the rotations uniform.
     axes = axes * triangle.diagonal().sign()
-    steps = state.mesh * torch.cat([axes, -axes]) @ shape
+    low, high = box.ends
+    steps, trials = state.mesh * torch.cat([axes, -axes]), axes[:0]
+    if local is not None:
+        shape, trials = _steps(local, low - x, high - x)
+        steps = steps @ shape
     # The direction of the last success comes first: ties then keep going the same way.
     steps = steps[(steps @ last).argsort(descending=True, stable=True)]
     # Projected, not rejected: a minimum at a bound is approached along it.
-    candidates = (x + torch.cat([last[None], steps])).clamp(*box.ends)
+    candidates = (x + torch.cat([last[None], steps, trials])).clamp(low, high)
     values = _values(cost, box, candidates)
     best = int(values.argmin())
     better = bool(values[best] < state.value)
+    success = better and not values[best] >= (1.0 - negligible) * state.value
     return replace(
         state,
         point=candidates[best].tolist() if better else state.point,
@@ -312,7 +357,7 @@ def _polled(cost: Cost, box: Box, state: SearchState, seed: int, shape: Tensor) 
         # A direction that failed once must not be preferred.
         step=(candidates[best] - x).tolist() if better else [0.0] * len(x),
         # A mesh beyond the range of the variables would only poll the bounds.
-        mesh=min(2.0 * state.mesh, 1.0) if better else CONTRACTION * state.mesh,
+        mesh=min(2.0 * state.mesh, 1.0) if success else CONTRACTION * state.mesh,
         evaluations=state.evaluations + len(candidates),
         iterations=state.iterations + 1,
     )
@@ -444,14 +489,17 @@ def fit_by_search(
     noise = effective_noise(first.nan_to_num(1.0, 1.0, -1.0))
     mean, sd = table.prior()
 
-    def cost(vectors: Tensor) -> Tensor:
-        data = error.mean_square(vectors) * (error.values / noise**2)
-        return 0.5 * (data + ((vectors - mean) / sd).square().sum(-1))
+    def residuals(vectors: Tensor) -> Iterator[Tensor]:
+        for part in error.parts(vectors):
+            yield part.flatten(1) / noise
+        yield (vectors - mean) / sd
 
-    shape = None
-    if options.method == "pattern":
-        shape = poll_shape(lambda x: error.residuals(x) / noise, box, sd**-2)
-    result = search(cost, box, options, callback, shape)
+    def cost(vectors: Tensor) -> Tensor:
+        return 0.5 * sum((part.square().sum(-1) for part in residuals(vectors)), torch.zeros(()))
+
+    # The noise is that of the start, so the cost there says what counts in log likelihood.
+    negligible = loglik_tolerance(float(cost(box.start[None])), asked)
+    result = search(cost, box, options, callback, residuals, negligible)
     table.set_parameter_vector(result.vector)
     names = table.parameter_names(plant.joint_names)
     hit = box.free & ((result.vector <= box.lower) | (result.vector >= box.upper))

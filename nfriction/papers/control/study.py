@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nfriction.codegen import compile_function
+from nfriction.codegen import CompiledFunction
 from nfriction.fitting.fit import fit
 from nfriction.fitting.options import FitOptions
 from nfriction.friction import model_by_name
@@ -165,7 +165,7 @@ def compensation_of(model: FrictionModel) -> Compensation:
         def torque(qd: Tensor, qdd: Tensor, load: Tensor) -> Tensor:
             return model.torque(qd, load, model.coefficients(qd, qdd))
 
-        compiled = compile_function(torque, (example,) * 3)
+        compiled = CompiledFunction(torque, (example,) * 3)
         return lambda *given: np.reshape(compiled(*map(_rows, given)), given[0].shape)
 
     schedule = model.schedule
@@ -177,7 +177,7 @@ def compensation_of(model: FrictionModel) -> Compensation:
         following = schedule.advance(qd, qdd, state)
         return model.torque(qd, load, schedule.coefficients_from(qd, qdd, following)), following
 
-    advance = compile_function(step, (example, example, example, start))
+    advance = CompiledFunction(step, (example, example, example, start))
 
     def stateful(qd: Array, qdd: Array, load: Array) -> Array:
         given = [_rows(x) for x in (qd, qdd, load)]

@@ -71,44 +71,99 @@ def plan_swing_up(
     """
     from scipy.optimize import least_squares  # slow to import
 
-    joints, size = plant.joints, 2 * plant.joints
-    steps = round(seconds / sample_time / windows)
-    hanging, upright = np.zeros(size), np.zeros(size)
-    hanging[1] = math.pi
-    scale = np.repeat([1.0, RATE_SCALE], joints)
-    inner = (windows - 1) * size
-    middle = (np.arange(steps) + 0.5) / steps
-    effort = TORQUE * math.sqrt(seconds / windows)
-    substeps = 1 if friction is None else required_substeps(plant, friction, sample_time)
+    problem = _Shooting(plant, friction, windows, seconds, sample_time)
+    line = np.linspace(0.0, 1.0, windows + 1)[1:-1, None]
+    states = (1.0 - line) * problem.hanging / problem.scale
+    most = torque_limit / TORQUE_SCALE
+    sizes = [problem.inner, windows + 1]
+    end = least_squares(
+        problem.residuals, np.concatenate([states.ravel(), np.zeros(windows + 1)]), problem.slopes,
+        bounds=(np.repeat([-np.inf, -most], sizes), np.repeat([np.inf, most], sizes)),
+        max_nfev=max_steps,
+    )  # fmt: skip
+    gap = np.abs(end.fun[: windows * problem.size]).max() / GAP
+    if gap > CLOSED:
+        raise ValueError(
+            f"no swing-up within {seconds:g} s and {torque_limit:g} N m was found: a gap of "
+            f"{gap:.2g} remained; take more time or torque."
+        )
+    nodes, torque = problem.split(end.x)
+    motion, tau = problem.moved(nodes[:-1], torque[:-1], torque[1:])
+    q, qd = np.split(motion[:, :-1].reshape(-1, problem.size), 2, -1)
+    return Plan(q, qd, tau.ravel())
 
-    def moved(states: Array, first: Array, last: Array) -> tuple[Array, Array]:
+
+@dataclass(frozen=True, eq=False)
+class _Shooting:
+    """Residuals of a plan and their slopes by x: states between windows, then torques."""
+
+    plant: PendulumChain
+    friction: FrictionModel | None
+    windows: int
+    seconds: float
+    sample_time: float
+
+    @property
+    def size(self) -> int:
+        return 2 * self.plant.joints
+
+    @property
+    def inner(self) -> int:
+        """Entries of x that are states."""
+        return (self.windows - 1) * self.size
+
+    @property
+    def scale(self) -> Array:
+        return np.repeat([1.0, RATE_SCALE], self.plant.joints)
+
+    @property
+    def hanging(self) -> Array:
+        return math.pi * np.eye(self.size)[1]
+
+    @property
+    def effort(self) -> float:
+        return TORQUE * math.sqrt(self.seconds / self.windows)
+
+    def split(self, x: Array) -> tuple[Array, Array]:
+        """States at both ends of every window, and torques there."""
+        nodes = x[: self.inner].reshape(-1, self.size) * self.scale
+        return np.vstack([self.hanging, nodes, np.zeros(self.size)]), TORQUE_SCALE * x[self.inner :]
+
+    def moved(self, states: Array, first: Array, last: Array) -> tuple[Array, Array]:
         """States of windows (window, step + 1, state), and their torques (window, step)."""
+        joints, steps = self.plant.joints, round(self.seconds / self.sample_time / self.windows)
+        middle = (np.arange(steps) + 0.5) / steps
         tau = first[:, None] * (1.0 - middle) + last[:, None] * middle
         driven = torch.zeros(*tau.shape, joints, dtype=torch.float64)
         driven[..., 0] = torch.as_tensor(tau)
         q0, qd0 = torch.as_tensor(states).split(joints, -1)
-        run = rollout(plant, friction, q0, qd0, driven, sample_time=sample_time, substeps=substeps)
+        substeps = 1
+        if self.friction is not None:
+            substeps = required_substeps(self.plant, self.friction, self.sample_time)
+        run = rollout(
+            self.plant, self.friction, q0, qd0, driven,
+            sample_time=self.sample_time, substeps=substeps,
+        )  # fmt: skip
         return torch.cat([run.q, run.qd], -1).numpy(), tau
 
-    def split(x: Array) -> tuple[Array, Array]:
-        nodes = np.vstack([hanging, x[:inner].reshape(-1, size) * scale, upright])
-        return nodes, TORQUE_SCALE * x[inner:]
-
-    def residuals(x: Array) -> Array:
-        nodes, torque = split(x)
-        ends = moved(nodes[:-1], torque[:-1], torque[1:])[0][:, -1]
+    def residuals(self, x: Array) -> Array:
+        """Gaps between windows, and torques."""
+        nodes, torque = self.split(x)
+        ends = self.moved(nodes[:-1], torque[:-1], torque[1:])[0][:, -1]
         # A window that diverges is a large gap.
-        gaps = np.nan_to_num((nodes[1:] - ends) / scale, nan=1e3)
-        return np.concatenate([GAP * gaps.ravel(), effort * x[inner:]])
+        gaps = np.nan_to_num((nodes[1:] - ends) / self.scale, nan=1e3)
+        return np.concatenate([GAP * gaps.ravel(), self.effort * x[self.inner :]])
 
-    def slopes(x: Array) -> Array:
-        nodes, _ = split(x)
-        given = np.concatenate([nodes[:-1] / scale, x[inner:-1, None], x[inner + 1 :, None]], -1)
-        units = np.concatenate([scale, [TORQUE_SCALE, TORQUE_SCALE]])
+    def slopes(self, x: Array) -> Array:
+        """Derivatives of the residuals by x, a row a residual."""
+        size, windows, inner = self.size, self.windows, self.inner
+        nodes, tau = self.split(x)[0][:-1] / self.scale, x[inner:, None]
+        given = np.concatenate([nodes, tau[:-1], tau[1:]], -1)
+        units = np.concatenate([self.scale, [TORQUE_SCALE, TORQUE_SCALE]])
         # Central differences of every window by all that it depends on, in one batch.
         shift = 1e-6 * np.concatenate([np.eye(size + 2), -np.eye(size + 2)])
         near = (given + shift[:, None]).reshape(-1, size + 2) * units
-        ends = moved(near[:, :size], near[:, size], near[:, size + 1])[0][:, -1] / scale
+        ends = self.moved(near[:, :size], near[:, size], near[:, size + 1])[0][:, -1] / self.scale
         ahead, behind = np.nan_to_num(ends).reshape(2, size + 2, windows, size)
         change = ((ahead - behind) / 2e-6).transpose(1, 2, 0)
         found = np.zeros((windows * size + windows + 1, len(x)))
@@ -119,25 +174,5 @@ def plan_swing_up(
             if k < windows - 1:
                 found[rows, k * size : (k + 1) * size] = GAP * np.eye(size)
             found[rows, inner + k : inner + k + 2] = -GAP * change[k, :, size:]
-        found[windows * size :, inner:] = effort * np.eye(windows + 1)
+        found[windows * size :, inner:] = self.effort * np.eye(windows + 1)
         return found
-
-    line = np.linspace(0.0, 1.0, windows + 1)[1:-1, None]
-    states = (1.0 - line) * hanging / scale
-    most = torque_limit / TORQUE_SCALE
-    end = least_squares(
-        residuals, np.concatenate([states.ravel(), np.zeros(windows + 1)]), slopes,
-        bounds=(np.repeat([-np.inf, -most], [inner, windows + 1]),
-                np.repeat([np.inf, most], [inner, windows + 1])),
-        max_nfev=max_steps,
-    )  # fmt: skip
-    gap = np.abs(end.fun[: windows * size]).max() / GAP
-    if gap > CLOSED:
-        raise ValueError(
-            f"no swing-up within {seconds:g} s and {torque_limit:g} N m was found: a gap of "
-            f"{gap:.2g} remained; take more time or torque."
-        )
-    nodes, torque = split(end.x)
-    motion, tau = moved(nodes[:-1], torque[:-1], torque[1:])
-    q, qd = np.split(motion[:, :-1].reshape(-1, size), 2, -1)
-    return Plan(q, qd, tau.ravel())

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from nfriction.codegen.graph import trace
-from nfriction.export.c_code.dialect import ControllerC, is_identifier, statements
+from nfriction.export.c_dialect import ControllerC, is_identifier, statements
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.parameters import positive_number
 from nfriction.io.files import write_atomically

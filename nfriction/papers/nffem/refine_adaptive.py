@@ -71,7 +71,7 @@ def refine_adaptive(
     """
     schedule, reference = _schedules_of(model, adaptive)
     plant, motions = adaptive.plant, adaptive.motions
-    joint = in_joint_coordinates(plant, model, list(recordings))
+    joint = in_joint_coordinates(plant, list(recordings), model.joints)
     scale = coefficient_scale(model, plant, joint, motions)
     schedule.set_adaptive(reference, scale)
     schedule.set_range(*input_range(motions, schedule.deviation.along_motion))

@@ -20,6 +20,7 @@ from nfriction.io.model_file import load
 from nfriction.papers.control.study import SAMPLE_TIME, SHARED, THINNED, balance_figure
 from nfriction.papers.controller.mamdani import paper_controller
 from nfriction.papers.controller.rules import Variable
+from nfriction.papers.nffem.rbf_coefficients import RBFCoefficients
 from nfriction.papers.reproduction import tables
 from nfriction.papers.reproduction.agreement import simulations
 from nfriction.papers.reproduction.stages import (
@@ -40,6 +41,7 @@ from nfriction.plots import (
     style,
     torque_over_velocity,
 )
+from nfriction.plots.neurofuzzy import draw_map
 from nfriction.recording import Recording
 from nfriction.recording.angles import AngleConvention
 from nfriction.signals import Motion
@@ -58,6 +60,7 @@ FULL_TENSOR = tuple((0.1 * izz, izz, izz, 0.0, 0.0, 0.0) for izz in (0.04, 0.05,
 """Ixx, Iyy, Izz, products of each link [kg m^2]: the printed Izz across, a tenth along it."""
 CLASS_COLOURS = {"low": "#eef3f7", "medium": "#cfe0ec", "high": "#a3c4dc"}
 _POINTS = 600  # of a membership's line
+_CELLS = 81  # of a map along each axis
 
 
 def draw_all(workspace: Workspace, *, progress: bool = False) -> list[Path]:
@@ -97,6 +100,7 @@ def figures(workspace: Workspace) -> dict[str, Callable[[], Figure]]:
             f"fig_08_surfaces_joint_{joint}": partial(controller_surface, paper_controller(joint))
             for joint in (2, 3, 4)
         },
+        "networks_NFLFM": partial(network_surfaces, workspace),
         **{
             f"fig_{number}_coefficients_{model}": partial(coefficients, workspace, model)
             for number, model in zip((11, 12, 13), NEURO_FUZZY, strict=True)
@@ -200,6 +204,29 @@ def without_friction(workspace: Workspace) -> Figure:
     )  # fmt: skip
     motions = {name: convention.position_from_joint(q) for name, q in simulated.items()}
     return _lines({MEASURED: first.q} | motions, tables.JOINTS)
+
+
+def network_surfaces(workspace: Workspace) -> Figure:
+    """B and C as the papers' networks learnt them from the controllers, a row a joint."""
+    model = load(workspace.model("NFLFM-papers"))
+    schedule = model.schedule
+    assert isinstance(schedule, RBFCoefficients)
+    figure, axes = style.panels(model.joints, 2, style.PAGE, 0.5 + 1.6 * model.joints, sharey="row")
+    low, high = schedule.input_lower.numpy(), schedule.input_upper.numpy()
+    for joint, row in enumerate(axes):
+        # Speed and acceleration of this joint; the others' do not enter.
+        x = np.linspace(0.0, high[joint, 0], _CELLS)
+        y = np.linspace(low[joint, 1], high[joint, 1], _CELLS)
+        qd, qdd = (torch.as_tensor(v)[..., None].expand(_CELLS, _CELLS, model.joints)
+                   for v in np.meshgrid(x, y))  # fmt: skip
+        with torch.no_grad():
+            values = schedule(qd, qdd)[..., joint, :].numpy()
+        for k, (ax, coefficient) in enumerate(zip(row, model.law.coefficients, strict=True)):
+            draw_map(ax, (x, y), values[..., k], label=(coefficient.name, coefficient.unit))
+            style.title(ax, tables.JOINTS[joint])
+            ax.set_xlabel("|velocity| [rad/s]" if joint == model.joints - 1 else "")
+        row[0].set_ylabel("acceleration [rad/s²]")
+    return figure
 
 
 def coefficients(workspace: Workspace, name: str) -> Figure:

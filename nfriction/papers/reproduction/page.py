@@ -47,11 +47,15 @@ FIRST = (
          ("table_6", "experiment_classes"),
          "The experiment is a release from upright, the reading of 180° that fits Table 4."),
     Item("Tables 7, 8, 9: adaptive coefficients by class", ("table_7", "table_8", "table_9"),
-         "The printed ones are lost in the scan."),
+         "The printed ones are lost in the scan. The paper searches by pattern; Gauss-Newton's are "
+         "those from which the neuro-fuzzy models start."),
     Item("Fig. 7 and Table 4: fuzzy sets of joint 2", ("fig_07_memberships",)),
     Item("Fig. 8 and Table 5: coefficients that the fuzzy controllers give",
          tuple(f"fig_08_surfaces_joint_{joint}" for joint in (2, 3, 4)),
          "Rules (b) and (c) are lost; all joints have rules (a)."),
+    Item("Networks 2-10-2 after their training on the controllers' outputs", ("networks_NFLFM",),
+         "The paper shows none. Controllers here span the coefficients by class of the twin.",
+         ("NFLFM-papers",)),
     Item("Figs. 11, 12, 13: coefficients of the neuro-fuzzy models in the experiment",
          ("fig_11_coefficients_NFNCFM", "fig_12_coefficients_NFLFM",
           "fig_13_coefficients_NFNLFM"),
@@ -61,7 +65,8 @@ FIRST = (
          "On a recording that no model was fitted to."),
     Item("Table 10: position error of every model",
          ("table_10", "table_10_measured_drive", "rmse"),
-         "Another machine's friction: the printed numbers cannot come out."),
+         "Another machine's friction: the printed numbers cannot come out. -pattern: by the "
+         "papers' pattern search; -papers: by their fuzzy controller and network."),
     Item("Table 11: error of NFNLFM below that of each other model", ("table_11", "error_saved")),
 )  # fmt: skip
 SECOND = (
@@ -127,7 +132,7 @@ def _shown(
             path = workspace.folder / "figures" / f"{name}{suffix}"
             if path.exists():
                 data = base64.b64encode(path.read_bytes()).decode()
-                shown["pictures"].append((name, f"data:image/{kind};base64,{data}"))
+                shown["pictures"].append((path.name, f"data:image/{kind};base64,{data}"))
     return shown
 
 

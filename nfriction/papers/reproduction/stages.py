@@ -36,7 +36,7 @@ from nfriction.papers.afem.fit_by_search import SearchMethod, SearchOptions, fit
 from nfriction.papers.control import study
 from nfriction.papers.nffem.refine_adaptive import refine_adaptive
 from nfriction.papers.nffem.train_network import TrainingOptions
-from nfriction.papers.reproduction.missed_torque import missed_torque
+from nfriction.papers.reproduction.agreement import missed_torque
 from nfriction.papers.reproduction.procedure import papers_neuro_fuzzy
 from nfriction.papers.reproduction.workspace import (
     FULL,
@@ -58,6 +58,8 @@ LAWS = {"NCFM": "viscous", "LFM": "linear", "NLFM": "nonlinear"}
 """The papers' laws by the name of their constant model."""
 CONSTANT = (*LAWS, "Stribeck")
 ADAPTIVE = tuple(f"A{law}" for law in LAWS)
+BY_PATTERN = tuple(f"{name}-pattern" for name in ADAPTIVE)
+"""Adaptive models by the first paper's pattern search."""
 NEURO_FUZZY = tuple(f"NF{law}" for law in LAWS)
 PAPERS_WAY = tuple(f"{name}-papers" for name in NEURO_FUZZY)
 SECOND_PAPER = tuple(f"rtip-{law}" for law in LAWS)
@@ -94,6 +96,11 @@ def stages() -> dict[str, Stage]:
                 f"A{law}",
                 (law, f"twin-{EXPERIMENT}"),
                 partial(fitted, fit=fit_by_class, name=f"A{law}"),
+            ),
+            Stage(
+                f"A{law}-pattern",
+                (law, f"twin-{EXPERIMENT}"),
+                partial(fitted, fit=fit_by_pattern, name=f"A{law}-pattern"),
             ),
             Stage(f"NF{law}", (f"A{law}",), partial(fitted, fit=fit_network, name=f"NF{law}")),
             Stage(f"NF{law}-papers", (f"A{law}",), partial(papers_way, law=law)),
@@ -273,20 +280,39 @@ def fit_searched(
     bench: Bench,
     name: str,
     method: SearchMethod,
+    horizon: float,
     *,
     start: FitResult | None = None,
     threads: int | None = None,
 ) -> FitResult:
-    """A model fitted by a search on the simulated position, resumed where it was interrupted."""
-    settings, law = workspace.settings, name.removeprefix("rtip-")
+    """A model fitted by a search on the simulated position, resumed where it was interrupted.
+
+    Args:
+        workspace, bench: the run and its rig.
+        name: of the stage: a model's, with a prefix or an ending.
+        method, threads: see `SearchOptions`.
+        horizon: length of the simulated windows [s].
+        start: fit to start from.
+    """
+    settings = workspace.settings
+    model = model_by_name(name.removeprefix("rtip-").removesuffix("-pattern"))(bench.plant.joints)
     options = SearchOptions(
-        method, settings.search_horizon, max_evaluations=settings.search_evaluations,
+        method, horizon, max_evaluations=settings.search_evaluations,
         seed=settings.seed, threads=threads, state=workspace.search_state(name),
     )  # fmt: skip
     return workspace.fit(name, bench, lambda step: fit_by_search(
-        model_by_name(law)(bench.plant.joints), bench.plant, bench.train, options=options,
+        model, bench.plant, bench.train, options=options,
         start=start, motions=bench.train_motions, callback=workspace.keep_search(name, step),
     ))  # fmt: skip
+
+
+def fit_by_pattern(workspace: Workspace, bench: Bench, name: str) -> FitResult:
+    """An adaptive model the first paper's way, from its constant fit."""
+    law = name.removeprefix("A").removesuffix("-pattern")
+    return fit_searched(
+        workspace, bench, name, "pattern", workspace.settings.windows[-1],
+        start=fit_constant(workspace, bench, law), threads=1,
+    )  # fmt: skip
 
 
 def network_by_controller(
@@ -329,7 +355,8 @@ def fitted(
 def second_paper(workspace: Workspace, law: str) -> dict[str, Any]:
     """Result of a search on the second paper's rig."""
     bench, name = workspace.bench("rtip"), f"rtip-{law}"
-    found = fit_searched(workspace, bench, name, SEARCH[law], threads=1)
+    horizon = workspace.settings.search_horizon
+    found = fit_searched(workspace, bench, name, SEARCH[law], horizon, threads=1)
     return _finish(workspace, name, bench, found)
 
 

@@ -5,7 +5,6 @@ Rigs, hidden friction and releases are data here; the cards in `datasets/` say w
 
 from __future__ import annotations
 
-import argparse
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -348,23 +347,6 @@ def read(name: str, folder: Path) -> Twin:
         initial_states=dict(read_initial_states(folder / "recordings.csv")),
         truth=truth,
     )
-
-
-def main(name: str, argv: Sequence[str] | None = None) -> int:
-    """Command line of the builders in `datasets/`: build a twin and print a summary."""
-    parser = argparse.ArgumentParser(description=f"Build the recordings of the {name} twin.")
-    parser.add_argument("--out", type=Path, default=Path(f"runs/{name}_twin"), help="folder")
-    parser.add_argument("--seed", type=int, default=0, help="of encoder errors and jitter")
-    parser.add_argument(
-        "--quick", action="store_true", help=f"recordings of {QUICK_DURATION:g} s only"
-    )
-    arguments = parser.parse_args(argv)
-    duration = QUICK_DURATION if arguments.quick else None
-    twin = build(name, arguments.out, seed=arguments.seed, duration=duration, progress=True)
-    for label, recording in twin.recordings.items():
-        print(f"{label:16} {twin.splits[label]:9} {len(recording)} samples")
-    print(f"written to {arguments.out}")
-    return 0
 
 
 def _read(

@@ -15,7 +15,7 @@ from nfriction.papers.afem.fit_by_search import (
     SearchOptions,
     SearchResult,
     SearchState,
-    poll_shape,
+    local_quadratic,
     search,
 )
 
@@ -250,23 +250,76 @@ def test_a_logarithmic_variable_at_its_bound_is_exactly_there() -> None:
     assert torch.equal(decades.from_unit(low), decades.lower)
 
 
-def test_polls_shaped_by_the_curvature_follow_a_narrow_valley() -> None:
-    random = torch.Generator().manual_seed(0)
+def valley(seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Slopes of four residuals, turned and of very different size, and where they vanish."""
+    random = torch.Generator().manual_seed(seed)
     turned = torch.linalg.qr(torch.randn(4, 4, generator=random, dtype=F64))[0]
     stiffness = vector(1.0, 30.0, 300.0, 1000.0)
-    slopes = torch.diag(stiffness) @ turned
-    least = turned.mT @ (0.3 / stiffness)
+    return torch.diag(stiffness) @ turned, turned.mT @ (0.3 / stiffness)
 
-    def residuals(x: Tensor) -> Tensor:
-        return slopes @ (x - least)
+
+def test_quadratic_of_residuals_follows_a_narrow_valley_to_its_end() -> None:
+    slopes, least = valley()
+
+    def residuals(x: Tensor) -> list[Tensor]:
+        return [(x - least) @ slopes[:1].mT, (x - least) @ slopes[1:].mT]
 
     def cost(x: Tensor) -> Tensor:
-        return 0.5 * ((x - least) @ slopes.mT).square().sum(-1)
+        return 0.5 * torch.cat(residuals(x), 1).square().sum(-1)
 
-    variables = box(torch.zeros(4, dtype=F64), scale=1.0)
-    options = SearchOptions(tolerance=1e-3, max_evaluations=1000)
-    shape = poll_shape(residuals, variables, torch.zeros(4, dtype=F64))
-    shaped, round_ = (search(cost, variables, options, None, s) for s in (shape, None))
-    assert shaped.converged
-    torch.testing.assert_close(shaped.vector, least, rtol=0, atol=0.01)
-    assert shaped.value < 1e-2 * round_.value
+    variables = box(
+        torch.zeros(4, dtype=F64), upper=vector(5, 5, 5, float(least[3]) - 0.01), scale=1.0
+    )
+    local = local_quadratic(residuals, variables, torch.zeros(4, dtype=F64))
+    assert local is not None
+    torch.testing.assert_close(local.hessian, slopes.mT @ slopes, rtol=1e-5, atol=1e-3)
+    torch.testing.assert_close(local.gradient, -slopes.mT @ slopes @ least, rtol=1e-5, atol=1e-3)
+    options = SearchOptions(tolerance=1e-3, max_evaluations=400)
+    by_quadratic, by_polls = (search(cost, variables, options, None, r) for r in (residuals, None))
+    assert by_quadratic.converged
+    assert by_polls.value > 10 * by_quadratic.value
+    # Within the last bound, the best of the other three.
+    others = torch.linalg.lstsq(slopes[:, :3], slopes @ least - slopes[:, 3] * variables.upper[3])
+    expected = torch.cat([others.solution, variables.upper[3:]])
+    torch.testing.assert_close(by_quadratic.vector, expected, rtol=0, atol=1e-5)
+
+
+def test_a_decrease_that_is_negligible_ends_the_search() -> None:
+    def residuals(x: Tensor) -> list[Tensor]:
+        # An endless slope, ever flatter.
+        return [1.0 + torch.exp(-x)]
+
+    def cost(x: Tensor) -> Tensor:
+        return 0.5 * residuals(x)[0].square().sum(-1)
+
+    variables = box(vector(0.0), upper=1e4, scale=1.0)
+    options = SearchOptions(tolerance=1e-6, max_evaluations=10_000)
+    whole, part = (search(cost, variables, options, None, residuals, n) for n in (0.0, 1e-3))
+    assert part.converged
+    assert part.iterations < whole.iterations
+    assert part.value == pytest.approx(0.5, rel=0.02)
+
+
+def test_a_search_with_a_quadratic_resumes_bit_for_bit() -> None:
+    def residuals(x: Tensor) -> list[Tensor]:
+        return [torch.stack([10 * (x[:, 1] - x[:, 0].square()), 1 - x[:, 0]], -1)]
+
+    def run(state: SearchState | None, stop: int) -> tuple[SearchResult, list[SearchState]]:
+        kept: list[SearchState] = []
+
+        def keep(at: SearchState) -> bool:
+            kept.append(at)
+            return len(kept) == stop
+
+        options = SearchOptions(tolerance=1e-4, state=state)
+        return search(
+            lambda x: 0.5 * rosenbrock(x), box(vector(-1.2, 1)), options, keep, residuals
+        ), kept
+
+    whole, steps = run(None, 0)
+    _, begun = run(None, 5)
+    rest, _ = run(begun[-1], 0)
+    assert whole.converged
+    assert torch.equal(rest.vector, whole.vector)
+    torch.testing.assert_close(whole.vector, vector(1, 1), rtol=0, atol=1e-4)
+    assert steps[-1].evaluations < 1000

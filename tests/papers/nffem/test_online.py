@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nfriction.export.c_code.export import find_compiler
+from nfriction.export.c_file import find_compiler
 from nfriction.friction.neurofuzzy import NFLFM, NFNLFM
 from nfriction.fuzzy import RBFNetwork
 from nfriction.papers.nffem.online import OnlineNetwork, OnlineOptions, write_online

@@ -127,4 +127,4 @@ def test_a_run_that_is_killed_goes_on_where_it_was(tmp_path: Path) -> None:
     subprocess.run([sys.executable, str(script), str(folder)], check=True)
     for name, result in done.items():
         assert workspace.found(name) == result  # its seconds too: it was not run again
-    assert len(tables.table_10(workspace)) == 13
+    assert len(tables.table_10(workspace)) == 16

@@ -236,14 +236,14 @@ def test_test_motions_are_predictable(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", twin.names())
+@pytest.mark.parametrize("name", ["experiment_twin", "rtip_twin", "tlrip_controller"])
 def test_builder_script(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = DATASETS / f"{name}_twin" / "build.py"
-    spec = importlib.util.spec_from_file_location(f"build_{name}_twin", path)
+    spec = importlib.util.spec_from_file_location("build", DATASETS / "build.py")
     assert spec is not None
     assert spec.loader is not None
     script = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(script)
-    assert script.main(["--out", str(tmp_path), "--quick"]) == 0
-    assert re.search(r"^test_\w+ +test ", capsys.readouterr().out, re.MULTILINE)
-    assert len(Recording.read(next(tmp_path.glob("test_*.csv.gz")))) == 10_000
+    assert script.main([name, "--out", str(tmp_path), "--quick"]) == 0
+    said, files = capsys.readouterr().out, sorted(tmp_path.glob("*.csv.gz"))
+    assert re.findall(r"10000 samples", said) == ["10000 samples"] * len(files)
+    assert len(files) == {"experiment_twin": 1, "rtip_twin": 4, "tlrip_controller": 3}[name]

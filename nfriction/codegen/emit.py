@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import groupby
 
-from nfriction.codegen.llvm.ir import Body, real, truth
+from nfriction.codegen.ir import Body, real, truth
 from nfriction.codegen.scalar import Node, is_predicate, reachable
 
 _FAMILIES = {"sin": "sincos", "cos": "sincos", "exp": "exp", "tanh": "tanh"}

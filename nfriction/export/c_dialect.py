@@ -40,15 +40,10 @@ _HELPERS = {
 
 @dataclass(frozen=True)
 class ControllerC:
-    """The dialect of exported C.
+    """The dialect of exported C."""
 
-    Attributes:
-        real: type of all numbers.
-        prefix: of every name in the file, for which templates write `nf`.
-    """
-
-    real: Real = "double"
-    prefix: str = "nfriction"
+    real: Real = "double"  # type of all numbers
+    prefix: str = "nfriction"  # of every name in the file, for which templates write `nf`
 
     def literal(self, value: float | bool) -> str:
         """A number as C spells it, in brackets where it is negative."""
@@ -143,7 +138,7 @@ class ControllerC:
 
 @cache
 def _templates(dialect: ControllerC) -> jinja2.Environment:
-    folder = resources.files("nfriction.export.c_code").joinpath("templates")
+    folder = resources.files("nfriction.export").joinpath("templates")
 
     def load(name: str) -> str:
         return dialect.own(folder.joinpath(name).read_text("ascii"))

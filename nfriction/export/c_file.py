@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nfriction.export.c_code.dialect import ControllerC, Real, is_identifier
-from nfriction.export.c_code.model import source_of
+from nfriction.export.c_dialect import ControllerC, Real, is_identifier
+from nfriction.export.c_model import source_of
 from nfriction.export.contract import (
     COEFFICIENT_SLACK,
     Contract,
@@ -175,12 +175,7 @@ def c_contract(source: str | Path) -> Contract:
 
 
 def c_runner(source: str | Path, flags: Sequence[str] = FLAGS) -> Callable[..., tuple[Any, ...]]:
-    """Compile an exported C file; returns how to run it, see `verify`.
-
-    Raises:
-        ExportError: if there is no C compiler, or it refuses the file.
-        ContractError: if the metadata are damaged.
-    """
+    """Compile an exported C file; returns how to run it, see `verify`."""
     source = Path(source)
     description = c_contract(source).description
     joints, count = int(description["joints"]), len(description["coefficients"])
@@ -203,12 +198,7 @@ def c_runner(source: str | Path, flags: Sequence[str] = FLAGS) -> Callable[..., 
 
 
 def open_c(path: str | Path) -> tuple[Contract, Runner]:
-    """Compile a controller's C; returns the contract beside it, and how to run it.
-
-    Raises:
-        ExportError: if there is no compiler, or it refuses the file.
-        ContractError: if the metadata are absent or damaged.
-    """
+    """Compile a controller's C; returns the contract beside it, and how to run it."""
     path = Path(path)
     metadata = beside(path)
     if not metadata.is_file():

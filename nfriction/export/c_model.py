@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from nfriction.codegen.errors import UnsupportedOperation
 from nfriction.codegen.graph import Program, trace
-from nfriction.codegen.scalar import Node, evaluate, reachable
-from nfriction.export.c_code.dialect import ControllerC, Real, comment, statements
+from nfriction.codegen.scalar import Node, UnsupportedOperation, evaluate, reachable
+from nfriction.export.c_dialect import ControllerC, Real, comment, statements
 from nfriction.export.contract import ExportError
 from nfriction.export.controller import (
     FILTER_STATE,
@@ -56,10 +55,6 @@ def source_of(
     """Texts of a controller's `.c` and `.h`; the description is for the header's comment.
 
     With a plant, and a law that reads the load, they have a function of the plant's load.
-
-    Raises:
-        ExportError: if the law or schedule uses an operation that has no C form, or a number of
-            the model is not finite.
     """
     if dialect.real == "float":
         controller = for_single_precision(controller)

@@ -1,1 +1,0 @@
-"""Machine code by LLVM: scalar nodes as its text, and that as functions."""

@@ -1,0 +1,388 @@
+"""Artefacts of torch: TorchScript, for Python or LibTorch, and programs of `torch.export`."""
+
+import io
+import math
+import re
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from nfriction.export.contract import (
+    Contract,
+    ContractError,
+    ExportError,
+    Runner,
+    contract_of,
+    draw,
+    draw_motion,
+    first_line,
+    write_verified,
+)
+from nfriction.export.controller import Controller, controller_of, run_in_order
+from nfriction.export.torch_archive import (
+    METADATA,
+    check_program,
+    check_script,
+    check_source,
+    contents,
+    repacked,
+)
+from nfriction.friction.models import FrictionModel
+from nfriction.io.files import parse_json
+from nfriction.io.model_file import ModelInfo
+
+# All that archives of ours hold.
+_SCRIPT = re.compile(
+    r"data\.pkl|code/__torch__/[\w./]+\.py(\.debug_pkl)?|constants/\d+|constants\.pkl|version"
+    r"|byteorder|\.data/(serialization_id|version)|extra/nfriction\.json"
+)
+_PROGRAM = re.compile(
+    r"data/weights/(weight_\d+|model_weights_config\.json)"
+    r"|data/constants/(tensor_\d+|model_constants_config\.json)"
+    r"|data/sample_inputs/model\.pt|models/model\.json|extra/nfriction\.json"
+    r"|archive_format|archive_version|byteorder|version|\.data/(version|serialization_id|.*)"
+)
+
+
+def torchscript(
+    model: FrictionModel,
+    path: str | Path,
+    info: ModelInfo | None = None,
+    *,
+    torque_limit: float | Sequence[float] | None = None,
+    with_filter: bool = False,
+    cutoff_hz: float = 20.0,
+) -> Path:
+    """Write a model as TorchScript, frozen, all joints in stacked tensors.
+
+    The artefact is `module(qd, qdd, load) -> tau_f`, every argument (*batch, joint) in SI and
+    float64, on the CPU. `module.step` gives torque, coefficients and status: `step(qd, qdd, load)`;
+    with a memory `step(qd, qdd, load, state)` from `initial_state(qd, qdd)`, with the filter
+    `step(q, load, state)` from `initial_state(q)`, both with the next state as a fourth result. The
+    metadata (see `Contract`) are JSON under `nfriction.json` in `_extra_files`. It is loaded again
+    and compared with the model before it takes its place.
+
+    Args:
+        model: a friction model.
+        path: file to write, by custom `.pt`; missing folders are made.
+        info: description of the model besides its parameters.
+        torque_limit, with_filter, cutoff_hz: see `controller_of`.
+
+    Returns:
+        The path.
+
+    Raises:
+        ExportError: if this torch has no TorchScript, the model's law or schedule does not
+            script, or the artefact differs from the model by more than 1e-12 of full scale.
+        ValueError: if `info` or an option is malformed.
+        OSError: if the file cannot be written.
+    """
+    controller = controller_of(
+        model, info, torque_limit=torque_limit, with_filter=with_filter, cutoff_hz=cutoff_hz
+    )
+    contract = contract_of(model, controller, info)
+    buffer = io.BytesIO()  # into memory, so that the temporary file's name is not kept inside
+    with silent():
+        scripted = _compile(controller)
+        torch.jit.save(scripted, buffer, _extra_files={METADATA: contract.to_json()})
+
+    def loaded(path: Path) -> tuple[Contract, Runner]:
+        with silent():
+            module = torch.jit.load(str(path))
+        _check_torque(controller, module, contract)
+        return contract, _script_runner(module, contract)
+
+    return write_verified(path, buffer.getvalue(), loaded, "TorchScript")
+
+
+@torch.no_grad()
+def _check_torque(controller: Controller, module: Any, contract: Contract) -> None:
+    """Refuse a TorchScript whose `forward` is not the model."""
+    inputs = draw_motion(controller, 1000)
+    expected, got = controller.torque(*inputs), module(*inputs)
+    scale = torch.maximum(expected.abs().amax(0), contract.scales["tau_f"]).clamp_min(1e-300)
+    error = float(((got - expected).abs() / scale).max())
+    if not error <= contract.tolerance:
+        raise ExportError(f"the TorchScript differs from its model by {error:.1e} of full scale.")
+
+
+def _script_runner(module: Any, contract: Contract) -> Runner:
+    """Torque, coefficients and status of samples (sample, joint) in order."""
+
+    @torch.no_grad()
+    def run(*inputs: Tensor) -> tuple[Tensor, ...]:
+        if not contract.state_size:
+            return tuple(module.step(*inputs))
+        # The load, which comes last, has no part in the state.
+        start = module.initial_state(*(x[0] for x in inputs[:-1]))
+        return run_in_order(module.step, inputs, start)
+
+    return run
+
+
+def open_torchscript(path: str | Path) -> tuple[Contract, Runner]:
+    """Load an artefact; returns its contract, and how to run it.
+
+    A damaged file can end the process in `torch.jit.load`; see `verify_artefact`.
+    """
+
+    def load(files: dict[str, bytes]) -> Any:
+        for name, content in files.items():
+            check_source(name, content)
+        # Pickles of line numbers are not looked at, and so not handed on.
+        needed = {name: x for name, x in files.items() if not name.endswith(".debug_pkl")}
+        module = torch.jit.load(repacked(needed), map_location="cpu")
+        if not hasattr(module, "step"):
+            raise ExportError("a TorchScript, but none of nfriction: it has no `step`.")
+        for name in _methods(module):
+            check_script(getattr(module, name).inlined_graph)
+        return module
+
+    module, contract = _opened(path, _SCRIPT, "TorchScript", load)
+    return contract, _script_runner(module, contract)
+
+
+def _opened(
+    path: str | Path, ours: re.Pattern[str], what: str, load: Callable[[dict[str, bytes]], Any]
+) -> tuple[Any, Contract]:
+    """Read an archive: the result of `load` for its files, and its contract."""
+    files = contents(path, ours, what)
+    try:
+        contract = Contract.from_json(files.get(f"extra/{METADATA}", b""))
+        with silent():
+            return load(files), contract
+    except ContractError:
+        raise
+    except ExportError as error:
+        raise ExportError(f"{path}: {error}") from None
+    except RecursionError:
+        raise ExportError(f"{path}: nested without end.") from None
+    except (RuntimeError, ArithmeticError, AttributeError, AssertionError, LookupError, TypeError,
+            ValueError) as error:  # fmt: skip
+        reason = first_line(error)
+        raise ExportError(f"{path}: damaged, or no {what} of nfriction ({reason}).") from error
+
+
+class _Host(nn.Module):
+    """A controller as hosts call it; `step` and `initial_state` come with the kind of its state."""
+
+    def __init__(self, controller: Controller) -> None:
+        super().__init__()
+        self.controller = controller
+
+    def forward(self, qd: Tensor, qdd: Tensor, load: Tensor) -> Tensor:
+        return self.controller.torque(qd, qdd, load)
+
+
+class _Stateless(_Host):
+    @torch.jit.export
+    def step(self, qd: Tensor, qdd: Tensor, load: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        tau_f, coefficients, status, _ = self.controller.step(qd, qdd, load, load)
+        return tau_f, coefficients, status
+
+
+class _Remembering(_Host):
+    @torch.jit.export
+    def step(
+        self, qd: Tensor, qdd: Tensor, load: Tensor, state: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return self.controller.step(qd, qdd, load, state)
+
+    @torch.jit.export
+    def initial_state(self, qd: Tensor, qdd: Tensor) -> Tensor:
+        return self.controller.initial_memory(qd, qdd)
+
+
+class _Filtering(_Host):
+    @torch.jit.export
+    def step(self, q: Tensor, load: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return self.controller.filtered_step(q, load, state)
+
+    @torch.jit.export
+    def initial_state(self, q: Tensor) -> Tensor:
+        return self.controller.filtered_start(q)
+
+
+def _compile(controller: Controller) -> Any:
+    """Script and freeze a controller."""
+    try:
+        from torch.jit.frontend import FrontendError
+    except ImportError as error:
+        raise ExportError(
+            f"torch {torch.__version__} has no TorchScript; use an older torch for it."
+        ) from error
+    # TorchScript has no error class of its own for code that it cannot compile.
+    refusals = (FrontendError, RuntimeError, TypeError, ValueError, AttributeError, OSError,
+                SyntaxError)  # fmt: skip
+    model = controller.model
+    try:
+        # Tried apart from the model, so that the message is about the law's own lines.
+        qd, qdd, load = draw_motion(controller, 1)
+        torch.jit.script(model.law.torque)(qd, load, model.schedule(qd, qdd), model.v_smooth)
+    except refusals as error:
+        raise ExportError(
+            f"the law {model.law.name!r} does not script; it must be a function in a file, of "
+            f"torch operations and annotated arguments:\n{error}"
+        ) from error
+    kind = (
+        _Filtering if controller.filters else _Remembering if controller.remembers else _Stateless
+    )
+    module = kind(controller).eval()
+    methods = [name for name in _methods(module) if name != "forward"]
+    try:
+        return torch.jit.freeze(torch.jit.script(module), preserved_attrs=methods)
+    except refusals as error:
+        raise ExportError(f"the model does not script:\n{error}") from error
+
+
+def _methods(module: Any) -> list[str]:
+    """Names of the methods for hosts."""
+    return [name for name in ("forward", "step", "initial_state") if hasattr(module, name)]
+
+
+def pt2(
+    model: FrictionModel,
+    path: str | Path,
+    info: ModelInfo | None = None,
+    *,
+    torque_limit: float | Sequence[float] | None = None,
+    with_filter: bool = False,
+    cutoff_hz: float = 20.0,
+) -> Path:
+    """Write a model as a `torch.export` program with a batch of any size.
+
+    `torch.export.load(path).module()(qd, qdd, load)` gives torque, coefficients and status, every
+    argument (batch, joint) in SI and float64. Where the controller has a state, that is the last
+    argument and the last result, (batch, joint, number); one that is NaN is a fresh start. The
+    metadata (see `Contract`) are JSON under `nfriction.json` in `extra_files`. The file is loaded
+    again and compared with the model before it takes its place.
+
+    Args:
+        model: a friction model.
+        path: file to write, by custom `.pt2`; missing folders are made.
+        info: description of the model besides its parameters.
+        torque_limit, with_filter, cutoff_hz: see `controller_of`.
+
+    Returns:
+        The path.
+
+    Raises:
+        ExportError: if torch cannot export the model, or the artefact differs from it.
+        ValueError: if `info` or an option is malformed.
+        OSError: if the file cannot be written.
+    """
+    controller = controller_of(
+        model, info, torque_limit=torque_limit, with_filter=with_filter, cutoff_hz=cutoff_hz
+    )
+    contract = contract_of(model, controller, info)
+    program = exported(controller)
+    try:
+        program.example_inputs = None  # torch would pickle them
+    except ValueError as error:
+        raise ExportError(
+            f"torch {torch.__version__} writes pickled objects into a .pt2; use a newer one for it."
+        ) from error
+    for node in program.graph.nodes:  # the stack names this machine's folders
+        node.meta = {key: value for key, value in node.meta.items() if key == "val"}
+    buffer = io.BytesIO()  # into memory, so that the temporary file's name is not kept inside
+    with silent():
+        torch.export.save(program, buffer, extra_files={METADATA: contract.to_json()})
+    return write_verified(path, buffer.getvalue(), open_pt2, "program")
+
+
+def open_pt2(path: str | Path) -> tuple[Contract, Runner]:
+    """Load an artefact; returns its contract, and how to run it.
+
+    A damaged one may lead torch to errors of its own besides; see `verify_artefact`.
+    """
+
+    def load(files: dict[str, bytes]) -> Any:
+        _refuse_pickles(files)
+        return torch.export.load(repacked(files)).module()
+
+    module, contract = _opened(path, _PROGRAM, "program", load)
+
+    @torch.no_grad()
+    def run(*inputs: Tensor) -> tuple[Any, ...]:
+        return run_from_nan(module, inputs, contract.state_size)
+
+    return contract, run
+
+
+def _refuse_pickles(files: Mapping[str, bytes]) -> None:
+    """Refuse files that are more than tensors and JSON: torch would unpickle them."""
+    check_program(parse_json(files["models/model.json"]))
+    for name, content in files.items():
+        if name.endswith("_config.json"):
+            config = parse_json(content)["config"]
+            if any(entry["use_pickle"] for entry in config.values()):
+                raise ExportError("it holds pickled objects, which are refused.")
+        if name.endswith(".pt") and content:
+            raise ExportError("it holds pickled inputs, which are refused.")
+
+
+def run_from_nan(step: Any, inputs: Sequence[Tensor], state_size: int) -> tuple[Any, ...]:
+    """Run a program over samples (sample, joint) in order; its state, if any, starts as NaN."""
+    if not state_size:
+        return tuple(step(*inputs))
+    state = inputs[0].new_full((1, inputs[0].shape[1], state_size), math.nan)
+    found = run_in_order(
+        lambda *x: [torch.as_tensor(y) for y in step(*x)], (x[:, None] for x in inputs), state
+    )
+    return tuple(x[:, 0] for x in found)
+
+
+# Programs keep the names of their arguments, so that each kind of controller has its own.
+
+
+class _Program(nn.Module):
+    def __init__(self, controller: Controller) -> None:
+        super().__init__()
+        self.controller = controller
+
+    def forward(self, qd: Tensor, qdd: Tensor, load: Tensor) -> Any:
+        return self.controller(qd, qdd, load)
+
+    def _or_start(self, state: Tensor, *inputs: Tensor) -> Tensor:
+        """The state, or that before a first sample where it is NaN."""
+        return torch.where(state == state, state, self.controller.start(*inputs))
+
+
+class _RememberingProgram(_Program):
+    def forward(self, qd: Tensor, qdd: Tensor, load: Tensor, state: Tensor) -> Any:  # type: ignore[override]
+        return self.controller(qd, qdd, load, self._or_start(state, qd, qdd))
+
+
+class _FilteringProgram(_Program):
+    def forward(self, q: Tensor, load: Tensor, state: Tensor) -> Any:  # type: ignore[override]
+        return self.controller(q, load, self._or_start(state, q))
+
+
+def exported(controller: Controller) -> torch.export.ExportedProgram:
+    """The controller as a `torch.export` program with a dynamic batch."""
+    example, kind = draw(controller, 7), _Program
+    if controller.state_size:
+        example = (*example, example[0].new_zeros(7, controller.joints, controller.state_size))
+        kind = _FilteringProgram if controller.filters else _RememberingProgram
+    batch = torch.export.Dim("batch")
+    try:
+        with silent():
+            shapes = tuple({0: batch} for _ in example)
+            return torch.export.export(kind(controller).eval(), example, dynamic_shapes=shapes)
+    except (RuntimeError, TypeError, ValueError, AttributeError) as error:
+        raise ExportError(f"torch cannot export the model:\n{error}") from error
+
+
+@contextmanager
+def silent() -> Iterator[None]:
+    """Suppress warnings of torch to its own developers, and of torch.jit's deprecation."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*torch.jit.*")
+        warnings.filterwarnings("ignore", category=FutureWarning)
+        warnings.filterwarnings("ignore", category=DeprecationWarning)
+        yield

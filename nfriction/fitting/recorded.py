@@ -1,0 +1,230 @@
+"""Fuzzy rules by which friction on a table follows what the table records, see `NFSlip`.
+
+The torque is linear in all rules, so that ridge regression of what the law leaves gives them, with
+the prior of networks. An input is taken where blocks left out gain by it, beyond their scatter. The
+period of a ripple is that at which the rows' error has most power over position.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from nfriction.fitting.hysteresis import TOLERANCE, MemoryFit, fit_slip, range_of
+from nfriction.fitting.shooting.autocorrelation import effective_noise
+from nfriction.fitting.strategy.continuation import student_quantile
+from nfriction.friction.hysteresis import TERMS, Recorded
+from nfriction.friction.neurofuzzy import PRIOR_SD
+from nfriction.recording.torque_table import JointTorque
+
+Array = NDArray[np.float64]
+
+# Fewest periods of a ripple in the range of the motion: fewer are an arc of the position.
+FEWEST_PERIODS = 10
+# Spatial frequencies over that at which the range of the motion has a period more.
+SPACING = 1 / 6
+# Of the gain on blocks left out, from one side.
+CONFIDENCE = 0.95
+# Smallest change of the torque by which a law is scaled back.
+LEAST = 0.1
+# Frequencies times rows at once.
+MOST_NUMBERS = 2_000_000
+
+
+def recorded_inputs(joint: JointTorque) -> dict[str, Tensor]:
+    """Columns that friction may follow, (row, 1), by the names of `Recorded`."""
+    given = {
+        "load": joint.load, "temperature": joint.temperature, "position": joint.q,
+        "direction": joint.qd, "velocity": joint.qd,
+    }  # fmt: skip
+    return {name: torch.tensor(x)[:, None] for name, x in given.items() if x is not None}
+
+
+class Rules:
+    """Fuzzy rules of a joint, to be fitted beside its law.
+
+    Args:
+        schedule: of one joint; it gets the ranges of its inputs, and the rules by `set`.
+        joint: rows in order of time.
+        found: the law's fit to them.
+        blocks: rows that are left out in turn.
+        v_smooth: velocity within which the direction turns [rad/s; m/s].
+    """
+
+    def __init__(
+        self, schedule: Recorded, joint: JointTorque, found: MemoryFit,
+        blocks: Sequence[NDArray[np.intp]], v_smooth: float,
+    ) -> None:  # fmt: skip
+        self.schedule, self.joint, self.blocks = schedule, joint, blocks
+        inputs = recorded_inputs(joint)
+        fastest = float(inputs["velocity"].abs().max())
+        if joint.q is not None:
+            inputs["ripple"] = inputs["velocity"]
+        # Both directions alike.
+        ends = {"direction": (-v_smooth, v_smooth), "ripple": (-fastest, fastest)}
+        self.sets: dict[str, Array] = {}
+        for k, name in enumerate(TERMS):
+            if name in inputs and len(inputs[name].unique()) > 1:
+                x = inputs[name]
+                low, high = ends.get(name, (float(x.min()), float(x.max())))
+                schedule.ranges[0, k] = torch.tensor([low, high]).double()
+                self.sets[name] = (
+                    schedule.layer(name).regressor_columns(schedule.within(name, x))[0].T.numpy()
+                )
+        error = joint.tau - found.torque
+        self.size = float(np.sqrt(np.mean(joint.tau**2)))
+        self.noise = max(effective_noise(torch.tensor(error)[None, :, None]), 1e-12 * self.size)
+        self.ripple = _Ripple.of(joint, error, blocks) if "ripple" in self.sets else None
+        if self.ripple is None:
+            self.sets.pop("ripple", None)
+
+    def chosen(self, found: MemoryFit) -> tuple[list[str], Array]:
+        """Inputs that blocks left out gain by, and the squared errors there, (block,)."""
+        names: list[str] = []
+        now = self._left_out(found, names)
+        while others := [name for name in self.sets if name not in names]:
+            trials = {name: self._left_out(found, [*names, name]) for name in others}
+            best = min(trials, key=lambda name: float(trials[name].sum()))
+            gains = now - trials[best]
+            # What few blocks show is not seen again in other recordings.
+            error = gains.std(ddof=1) / len(gains) ** 0.5
+            least = student_quantile(len(gains) - 1, CONFIDENCE) * error
+            if gains.mean() <= max(least, (1 - (1 - TOLERANCE) ** 2) * now.mean()):
+                break
+            names.append(best)
+            now = trials[best]
+        return names, now
+
+    @torch.no_grad()
+    def set(self, names: Sequence[str], torque: Array) -> None:
+        """Set the rules of inputs beside a law's torque, (row,)."""
+        wave = self.ripple.wave() if self.ripple else 1.0
+        x = self._columns(names, torque, wave)
+        solution: NDArray[Any] = self._weights(x, self.joint.tau - torque)
+        for name in names:
+            layer = self.schedule.layer(name)
+            own, solution = np.split(solution, [layer.consequents.numel()])
+            own = own * (self.size if name == "ripple" else 1.0)
+            layer.consequents.copy_(torch.tensor(own).reshape(layer.consequents.shape))
+        self.schedule.period.fill_(2 * np.pi / wave)
+
+    def _columns(self, names: Sequence[str], torque: Array, wave: float) -> Array:
+        """Torque per unit of each rule, (row, rule)."""
+        parts = []
+        for name in names:
+            if name == "ripple":
+                assert self.joint.q is not None
+                angle = wave * self.joint.q[:, None]
+                parts += [self.size * self.sets[name] * f(angle) for f in (np.cos, np.sin)]
+            else:
+                parts.append(self.sets[name] * torque[:, None])
+        return np.concatenate(parts, 1)
+
+    def _weights(self, x: Array, error: Array) -> Array:
+        ridge = (self.noise / PRIOR_SD) ** 2 * np.eye(x.shape[1])
+        return np.asarray(np.linalg.solve(x.T @ x + ridge, x.T @ error), dtype=np.float64)
+
+    def _left_out(self, found: MemoryFit, names: Sequence[str]) -> Array:
+        assert found.without is not None
+        squares = []
+        for k, (block, torque) in enumerate(zip(self.blocks, found.without, strict=True)):
+            error = self.joint.tau - torque
+            if names:
+                rest = np.setdiff1d(np.arange(len(error)), block)
+                x = self._columns(names, torque, self.ripple.wave(k) if self.ripple else 0.0)
+                error = error - x @ self._weights(x[rest], error[rest])
+            squares.append(float(error[block] @ error[block]))
+        return np.array(squares)
+
+
+def fit_recorded(
+    schedule: Recorded,
+    joint: JointTorque,
+    blocks: Sequence[NDArray[np.intp]],
+    v_smooth: float,
+) -> MemoryFit:
+    """Fit the law and set the rules that blocks left out gain by.
+
+    Args:
+        schedule: of one joint; it gets the rules.
+        joint: rows in order of time.
+        blocks: rows that are left out in turn.
+        v_smooth: velocity within which the direction turns [rad/s; m/s].
+
+    Returns:
+        Fit of the law, with the torque that the rules make of it and their errors on the blocks.
+    """
+    found = fit_slip(joint, blocks, loaded=False)
+    rules = Rules(schedule, joint, found, blocks, v_smooth)
+    names, squares = rules.chosen(found)
+    torque = found.torque
+    if names:
+        rules.set(names, found.torque)
+        # The law once more, to the torque without what the rules explain.
+        inputs = recorded_inputs(joint)
+        at = [
+            schedule.corrected(torch.full((len(joint), 1), x).double(), inputs) for x in (0.0, 1.0)
+        ]
+        ripple, both = (x.detach().numpy()[:, 0] for x in at)
+        alone = replace(joint, tau=(joint.tau - ripple) / np.maximum(both - ripple, LEAST))
+        found = fit_slip(alone, blocks, loaded=False)
+        rules.set(names, found.torque)
+        torque = (
+            schedule.corrected(torch.tensor(found.torque)[:, None], inputs).detach().numpy()[:, 0]
+        )
+    lengths = np.array([len(block) for block in blocks])
+    return replace(found, torque=torque, errors=tuple(np.sqrt(squares / lengths).tolist()))
+
+
+class _Ripple(NamedTuple):
+    """Power of errors over the frequency of a position.
+
+    Attributes:
+        waves: radians of the ripple per unit of position, (frequency,).
+        sums: of the error times the speed and a wave, (block, direction, frequency).
+        squares: of the speed, (block, direction).
+    """
+
+    waves: Array
+    sums: NDArray[np.complex128]
+    squares: Array
+
+    @classmethod
+    def of(
+        cls, joint: JointTorque, error: Array, blocks: Sequence[NDArray[np.intp]]
+    ) -> "_Ripple | None":
+        assert joint.q is not None
+        unit = 2 * np.pi / range_of(joint)
+        # A period has at least a row at the highest speed.
+        highest = 2 * np.pi / float(np.abs(np.diff(joint.q)).max())
+        waves = np.arange(FEWEST_PERIODS * unit, highest, SPACING * unit)
+        sums = np.zeros((len(blocks), 2, len(waves)), complex)
+        squares = np.zeros((len(blocks), 2))
+        for k, block in enumerate(blocks):
+            for i, sign in enumerate((1.0, -1.0)):
+                rows = block[sign * joint.qd[block] > 0]
+                # Ripple grows with speed, and each direction has a phase of its own.
+                speed = np.abs(joint.qd[rows])
+                squares[k, i] = speed @ speed
+                parts = 1 + len(waves) * len(rows) // MOST_NUMBERS
+                for some in np.array_split(np.arange(len(waves)), parts):
+                    turns = np.exp(1j * np.outer(waves[some], joint.q[rows]))
+                    sums[k, i, some] = turns @ (speed * error[rows])
+        return cls(waves, sums, squares) if len(waves) else None
+
+    def wave(self, left_out: int | None = None) -> float:
+        """The frequency of most power, in all blocks or without one."""
+        kept = np.arange(len(self.sums)) != (-1 if left_out is None else left_out)
+        power = np.abs(self.sums[kept].sum(0)) ** 2
+        of = self.squares[kept].sum(0)[:, None]
+        explained = (power / np.maximum(of, 1e-300)).sum(0)
+        top = int(explained.argmax())
+        before, peak, after = (explained[max(top + k, 0) :][:1].sum() for k in (-1, 0, 1))
+        # A parabola through the peak; none at an end.
+        bend = before - 2 * peak + after
+        shift = 0.5 * (before - after) / bend if bend < 0 and 0 < top < len(explained) - 1 else 0.0
+        return float(self.waves[top] + shift * (self.waves[1] - self.waves[0] if top else 0.0))

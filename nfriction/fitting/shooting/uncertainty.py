@@ -1,0 +1,162 @@
+"""Noise of encoders and torques, and the information that windows give despite it.
+
+A right law on a right plant leaves the encoder's rounding, and the motion by which a simulation
+with the recorded torque departs from the true one. The noise of the torque is that part of the
+record which changes from sample to sample; its effect is found by simulation. Noise that lasts for
+many samples is not counted, since it looks like an error of the law.
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nfriction.fitting.result.identifiability import (
+    Information,
+    information,
+    observed_count,
+)
+from nfriction.fitting.robust_loss import SQUARES
+from nfriction.fitting.shooting.autocorrelation import white_noise
+from nfriction.fitting.shooting.normal_equations import (
+    Kept,
+    drawn_score,
+    marginalize_states,
+    normal_equations,
+    rounding_of,
+    score_covariance,
+)
+from nfriction.fitting.shooting.problem import ShootingProblem
+
+# Counts of a coarse encoder that is still in use.
+USUAL_COUNTS = 4096
+# Share of a noise at which simulations respond linearly to it.
+SMALL = 1e-3
+# Realisations of the torque's noise for intervals.
+DRAWS = 30
+
+
+def rounding(problem: ShootingProblem) -> float:
+    """Root mean square rounding of the encoders [rad; m], by their count.
+
+    A count that neither the plant states nor the positions show is taken for a 4096th of the motion
+    within a window.
+    """
+    count = encoder_count(problem)
+    if not count:
+        recorded = problem.windows.q @ problem.measurement.T
+        moved = recorded.amax(1) - recorded.amin(1)
+        count = float(moved.square().mean().sqrt()) / USUAL_COUNTS
+    return count / math.sqrt(12)
+
+
+def encoder_count(problem: ShootingProblem) -> float | None:
+    """Count of the encoders that the plant states or the positions show [rad; m]."""
+    recorded = problem.windows.q @ problem.measurement.T
+    return problem.jacobian.plant.position_quantum or observed_count(recorded)
+
+
+def explained(problem: ShootingProblem, x: Tensor, rms: float) -> bool:
+    """True if the noise of encoders and torques explains residuals of this root mean square."""
+    limit = problem.options.explained_ratio
+    return rms <= limit * measurement_noise(problem, x, rms, limit)
+
+
+def measurement_noise(
+    problem: ShootingProblem, x: Tensor, residual: float, enough: float | None = None
+) -> float:
+    """Residual of a right law [rad; m], given that of a solution, both root mean square.
+
+    The torque's noise is simulated only for residuals of more than `enough` times the rounding, by
+    default those that count as errors of the model.
+    """
+    least = rounding(problem)
+    if residual <= (enough or problem.options.model_error_ratio) * least:
+        return least
+    errors = problem.errors(x)
+    encoder = float(white_noise(errors).clamp(min=least).square().mean().sqrt())
+    return math.hypot(encoder, _by_torque(problem, x))
+
+
+def _by_torque(problem: ShootingProblem, x: Tensor) -> float:
+    """Root mean square residual by one realisation of the torque's noise, once fitted [rad; m]."""
+    response = torque_response(problem, x, 1)
+    if response is None:
+        return 0.0
+    variables, off = problem.variables, response[..., 0] * problem.scale
+    lower, upper = variables.bounds()
+    free = (lower < upper).nonzero().flatten()
+    rows = problem.rows(problem.simulate(x, with_memory=True), problem.scale)
+    gradient, hessian = normal_equations(rows, off, variables.indices(), len(x))
+    gradient, hessian = gradient[free], hessian[free][:, free]
+    hessian.diagonal().add_(variables.prior()[0][free])
+    step, failed = torch.linalg.solve_ex(hessian, gradient)
+    left = float(off.square().sum() - gradient @ step)
+    if failed or not math.isfinite(left):
+        return 0.0
+    counted = float(problem.scale.square().sum()) * off.shape[-1]
+    return math.sqrt(max(left, 0.0) / counted)
+
+
+def gathered_information(
+    problem: ShootingProblem, x: Tensor, sd: Tensor, count: float | None = None
+) -> Information:
+    """Information about the shared variables, given the sd of each error times its weight.
+
+    `sd` is inflated for autocorrelation, (window, step + 1, joint). If the errors are the
+    rounding of encoders to a `count` [rad; m], their covariance is that of rounding instead.
+    Errors by the torque's noise are added: they last longer than a window, whose own start
+    hides most of them, so residuals show too little of their autocorrelation.
+    """
+    variables, run = problem.variables, problem.simulate(x, with_memory=True)
+    shared, (precision, _) = variables.shared_count, variables.prior()
+    of_states, of_offsets = variables.split(precision)[2:]
+    kept = Kept(variables.indices(), variables.state_count, len(x))
+    scale = problem.scale * problem.loss.weight(problem.deviation(x, run)).sqrt()
+    data, response = marginalize_states(problem.rows(run, scale), kept, of_states)
+    if count and problem.loss is SQUARES:
+        q = run.motion.q[:, :: problem.substeps] @ problem.measurement.T
+        drawn = rounding_of(q, count, problem.windows.spans) * problem.scale[..., None]
+        score = kept.by_states(response, of_states)
+        score += drawn_score(problem.rows(run, scale), kept, response, drawn)
+    else:
+        rows = problem.rows(run, problem.scale * sd / problem.noise_sd)
+        score = score_covariance(rows, kept, response, of_states)
+    by_torque = torque_response(problem, x, DRAWS)
+    if by_torque is not None:
+        drawn = by_torque * problem.scale[..., None]
+        score += drawn_score(problem.rows(run, scale), kept, response, drawn)
+    prior = torch.cat([precision[:shared], of_offsets.flatten()])
+    return information(data + torch.diag(prior), prior, shared, score)
+
+
+def torque_response(
+    problem: ShootingProblem, x: Tensor, draws: int, seed: int = 0
+) -> Tensor | None:
+    """Position errors by the noise of the recorded torques, (window, sample, joint, draw).
+
+    The noise is that part of a torque which changes from sample to sample, see `white_noise`;
+    None without any, or without the recordings. A torque that is off moves all samples after it,
+    so these errors last.
+    """
+    sd = white_noise(problem.windows.tau).numpy()
+    if not (problem.windows.recordings and sd.any()):
+        return None
+    random = np.random.default_rng(seed)
+    exact, found = _positions(problem, x), []
+    for _ in range(draws):
+        recordings = tuple(
+            r._replace(tau=r.torque_at(r.time) + SMALL * sd * random.standard_normal(r.q.shape))
+            for r in problem.windows.recordings
+        )
+        noisy = replace(problem.windows, recordings=recordings)
+        noisy = replace(noisy, tau=noisy.torque_at(0.0)[0])
+        found.append((_positions(replace(problem, windows=noisy), x) - exact) / SMALL)
+    return torch.stack(found, -1)
+
+
+def _positions(problem: ShootingProblem, x: Tensor) -> Tensor:
+    q = problem.simulate(x).motion.q[:, :: problem.substeps]
+    return q @ problem.measurement.T * problem.windows.weight[..., None]

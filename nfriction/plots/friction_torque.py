@@ -1,0 +1,266 @@
+"""Friction torque over velocity, or position, with laws: of a motion, and of a table."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from nfriction.fitting.hysteresis import path_of
+from nfriction.fitting.result.identifiability import NORMAL_95
+from nfriction.fitting.torque_table import predict
+from nfriction.friction import model_by_name, plain_name
+from nfriction.plots import style
+
+if TYPE_CHECKING:
+    from nfriction.evaluation.torque_tables import TorqueFits
+    from nfriction.fitting.torque_table import JointFit
+    from nfriction.recording.torque_table import JointTorque
+
+from collections.abc import Mapping, Sequence
+
+from nfriction.fitting.equation_error import friction_torque
+from nfriction.fitting.options import DEFAULTS
+from nfriction.fitting.result.identifiability import CoefficientUncertainty
+from nfriction.friction.models import FrictionModel
+from nfriction.plant import Plant
+from nfriction.recording import Recording
+from nfriction.signals import Motion, kalman_smoother
+
+Array = NDArray[np.float64]
+
+_POINTS = 3000  # that are drawn, a joint
+_BINS = 24  # of medians
+_DOT = Line2D([], [], linestyle="", marker=".", color=style.FAINT)
+_BAND = Patch(facecolor=style.FAINT, alpha=0.4)
+
+
+def torque_over_velocity(
+    plant: Plant,
+    models: Mapping[str, FrictionModel],
+    recordings: Sequence[Recording],
+    motions: Sequence[Motion] | None = None,
+    *,
+    uncertainty: Mapping[str, CoefficientUncertainty] | None = None,
+) -> Figure:
+    """Friction torque of each law over velocity, a panel a joint, over that of the motion.
+
+    Lines are at the load at rest and without acceleration, with 95 % bands; dots are
+    `tau - M qdd - bias` along the recordings, averaged over 30 ms in which the joint turns one way.
+
+    Args:
+        plant: the mechanism, with its fitted terms where there are any.
+        models: friction models by name.
+        recordings: in any convention.
+        motions: their smoothed motion in joint coordinates; computed where not given.
+        uncertainty: of the models' fits by name (`FitResult.uncertainty`), for the bands.
+    """
+    joint = [r.joint_coordinates(plant) for r in recordings]
+    motions = motions or [kalman_smoother(r.time, r.q) for r in joint]
+    known = uncertainty or {}
+    with torch.no_grad():
+        parts = [
+            _averaged(*friction_torque(plant, r, m)[::2], r.sample_time)
+            for r, m in zip(joint, motions, strict=True)
+        ]
+    qd, torque = (np.concatenate(x) for x in zip(*parts, strict=True))
+    figure, axes, columns = _panels(plant.joints)
+    looks = style.looks(models)
+    for k, ax in enumerate(axes):
+        grid = velocities(qd[:, k])
+        lines = {name: _torque(model, grid, k) for name, model in models.items()}
+        seen = np.flatnonzero(np.isfinite(torque[:, k]))
+        # Dots may scatter far beyond any friction; the laws and most dots set the limits.
+        most = np.quantile(torque[seen, k], [0.05, 0.95]) if len(seen) else np.zeros(0)
+        extremes = np.concatenate([*lines.values(), most])
+        factor, unit = style.scaled(style.sliding("N m", plant.unit), extremes)
+        _dots(ax, qd[seen, k], factor * torque[seen, k])
+        for name, line in lines.items():
+            ax.plot(grid, factor * line, **looks[name].line)
+            if name in known:
+                sd = _torque_sd(known[name], models[name], grid, k)
+                _band(ax, grid, factor * line, factor * sd, looks[name].line["color"])
+        ax.set_ylim(style.padded(factor * extremes.min(), factor * extremes.max(), 0.15))
+        _name_axes(ax, plant.joint_names[k], plant.unit, unit)
+        if k + columns >= plant.joints:
+            ax.set_xlabel(f"joint velocity [{plant.unit}/s]")
+    handles: list[Artist] = [_DOT, *(looks[name].handle for name in models)]
+    labels = ["from the motion", *models]
+    if any(name in known for name in models):
+        handles.append(_BAND)
+        labels.append("95 % bands")
+    style.legend(figure, handles, labels)
+    return figure
+
+
+def _averaged(qd: torch.Tensor, torque: torch.Tensor, step: float) -> tuple[Array, Array]:
+    """Means over blocks of samples, NaN where a joint does not turn one way throughout."""
+    size = max(1, round(DEFAULTS.diagnosis_block / step))
+    size = min(size, max(1, len(qd)))
+    whole = len(qd) // size * size
+    speeds, torques = (x[:whole].reshape(-1, size, x.shape[-1]) for x in (qd, torque))
+    one_way = torch.sign(speeds).mean(1).abs() == 1
+    # Dry friction takes any value at rest.
+    return speeds.mean(1).numpy(), torch.where(one_way, torques.mean(1), torch.nan).numpy()
+
+
+def _panels(joints: int) -> tuple[Figure, list[Axes], int]:
+    """A panel a joint, and how many are side by side."""
+    columns = min(joints, 3) if joints != 4 else 2
+    width = style.PAGE if columns > 1 else style.COLUMN
+    return *style.panel_each(joints, columns, width, 2.0), columns
+
+
+def _dots(ax: Axes, x: Array, y: Array) -> None:
+    some = np.linspace(0, len(x) - 1, min(_POINTS, len(x))).astype(int)
+    ax.plot(
+        x[some], y[some], ".", color=style.FAINT, markersize=2.5, alpha=0.5, markeredgewidth=0,
+        rasterized=True,
+    )  # fmt: skip
+
+
+def _band(ax: Axes, x: Array, y: Array, sd: Array, colour: str) -> None:
+    """The 95 % band of a line."""
+    low, high = y - NORMAL_95 * sd, y + NORMAL_95 * sd
+    ax.fill_between(x, low, high, color=colour, alpha=0.25, linewidth=0)
+
+
+def _name_axes(ax: Axes, title: str, position: str, unit: str) -> None:
+    style.title(ax, title)
+    ax.set_ylabel(f"friction {'torque' if position == 'rad' else 'force'} [{unit}]")
+    ax.margins(x=0.02)
+
+
+def velocities(qd: Array) -> Array:
+    """The range of the data, dense about zero, where laws turn over a few thousandths."""
+    low, high = float(qd.min()), float(qd.max())
+    # Evenly spaced velocities would draw the step at zero as a slope.
+    near = np.geomspace(1e-5, 1.0, 100) * max(abs(low), abs(high))
+    grid = np.unique(np.concatenate([np.linspace(low, high, 300), -near, [0.0], near]))
+    return grid[(grid >= low) & (grid <= high)]
+
+
+def _torque(model: FrictionModel, qd: Array, joint: int) -> Array:
+    """Torque of one joint over its velocity, at the load at rest and without acceleration."""
+    velocity = torch.as_tensor(qd)[:, None].expand(-1, model.joints)
+    with torch.no_grad():
+        held = model.coefficients(velocity, torch.zeros_like(velocity))
+        torque = model.steady_torque(velocity, torch.ones_like(velocity), held)
+    return torque[:, joint].numpy()
+
+
+def _torque_sd(known: CoefficientUncertainty, model: FrictionModel, qd: Array, joint: int) -> Array:
+    """Standard deviation of one joint's torque over its velocity."""
+    velocity = torch.as_tensor(qd)[:, None].expand(-1, model.joints).contiguous()
+    return known.torque_sd(model, velocity)[:, joint].numpy()
+
+
+def friction_curves(fits: "TorqueFits") -> Figure:
+    """Friction torque of the rows and of the laws, a panel a joint.
+
+    Over velocity, with medians of bins, where the law chosen has no memory: it is drawn thick at
+    the median load and without acceleration, with the 95 % band that the uncertainty of its
+    coefficients leaves; bars are the quartiles of each bin of velocity. Over position, row by row,
+    where it has memory, as no curve over velocity shows a loop. Beside it is the best law of the
+    other kind.
+    """
+    joints = fits.table.joints
+    figure, axes, _ = _panels(len(joints))
+    looks = style.looks(fits.fits)
+    shown: list[str] = []
+    bins = False
+    for k, (joint, ax) in enumerate(zip(joints, axes, strict=True)):
+        chosen, *others = _drawn(fits, joint)
+        shown += [chosen, *others]
+        looped = _remembers(chosen)
+        draw = _loops if looped else _curves
+        unit = draw(ax, fits, k, [(name, looks[name].line) for name in (chosen, *others)])
+        bins = bins or not looped
+        _name_axes(ax, f"{joint.name}: {plain_name(chosen)}", fits.table.unit, unit)
+        ax.set_xlabel(f"position [{fits.table.unit}]" if looped
+                      else f"velocity [{fits.table.unit}/s]")  # fmt: skip
+    names = [name for name in fits.fits if name in shown]
+    entries: dict[str, Artist] = {
+        "rows": _DOT,
+        **{plain_name(name): looks[name].handle for name in names},
+    }
+    if bins:
+        entries["median and quartiles"] = Line2D(
+            [], [], linestyle="", marker="o", color=style.INK, markersize=2.2
+        )
+        entries["95 % of the law chosen"] = _BAND
+    style.legend(figure, entries.values(), list(entries))
+    return figure
+
+
+def _remembers(name: str) -> bool:
+    return model_by_name(name).definition.memory is not None
+
+
+def _drawn(fits: "TorqueFits", joint: "JointTorque") -> list[str]:
+    """The law chosen, and the best with or without memory, unlike it, if there is one."""
+    chosen = fits.chosen[joint.name]
+    others = [c for c in fits.candidates[joint.name] if _remembers(c.name) != _remembers(chosen)]
+    return [chosen, *(c.name for c in sorted(others, key=lambda c: c.error)[:1])]
+
+
+def _loops(ax: Axes, fits: "TorqueFits", k: int, lines: list[tuple[str, dict[str, Any]]]) -> str:
+    """Torque over position; returns its unit."""
+    joint = fits.table.joints[k]
+    path = np.cumsum(path_of(joint)) if joint.q is None else joint.q
+    torques = {name: predict(fits.fits[name][k].model, joint).numpy() for name, _ in lines}
+    factor, unit = style.scaled(fits.unit, joint.tau)
+    ax.plot(
+        path, factor * joint.tau, ".", color=style.FAINT, markersize=1.5, alpha=0.5,
+        markeredgewidth=0, rasterized=True,
+    )  # fmt: skip
+    # The one chosen on top.
+    for name, look in reversed(lines):
+        first = name == lines[0][0]
+        ax.plot(path, factor * torques[name], **look | {"linewidth": 0.9 if first else 0.5},
+                alpha=1.0 if first else 0.6, rasterized=len(joint) > _POINTS)  # fmt: skip
+    return unit
+
+
+def _curves(ax: Axes, fits: "TorqueFits", k: int, lines: list[tuple[str, dict[str, Any]]]) -> str:
+    """Torque over velocity; returns its unit."""
+    joint = fits.table.joints[k]
+    grid = velocities(joint.qd)
+    found = {name: _steady(fits.fits[name][k], joint, grid) for name, _ in lines}
+    middle, low, median, high = _binned(joint)
+    extremes = np.concatenate([low, high, *(line for line, _ in found.values())])
+    factor, unit = style.scaled(fits.unit, extremes)
+    _dots(ax, joint.qd, factor * joint.tau)
+    for name, look in reversed(lines):
+        first = name == lines[0][0]
+        ax.plot(grid, factor * found[name][0], **look | {"linewidth": 1.8 if first else 0.8})
+    look, (line, sd) = lines[0][1], found[lines[0][0]]
+    _band(ax, grid, factor * line, factor * sd, look["color"])
+    ax.errorbar(
+        middle, factor * median, factor * np.stack([median - low, high - median]), fmt="o",
+        color=style.INK, markersize=2.2, elinewidth=0.6, zorder=3,
+    )  # fmt: skip
+    ax.set_ylim(style.padded(factor * extremes.min(), factor * extremes.max(), 0.1))
+    return unit
+
+
+def _steady(found: "JointFit", joint: "JointTorque", qd: Array) -> tuple[Array, Array]:
+    """Torque over velocity at the median load, and its standard deviation."""
+    load = 1.0 if joint.load is None else float(np.median(joint.load))
+    velocity = torch.as_tensor(qd)
+    zero = torch.zeros_like(velocity)
+    torque, sd = found.steady(velocity, zero, torch.full_like(velocity, load))
+    return torque.numpy(), sd.numpy()
+
+
+def _binned(joint: "JointTorque") -> tuple[Array, Array, Array, Array]:
+    """Median velocity, and quartiles and median of the torque, in bins of equally many rows."""
+    bins = np.array_split(np.argsort(joint.qd), min(_BINS, len(joint)))
+    middle = np.array([np.median(joint.qd[rows]) for rows in bins])
+    low, median, high = np.array([np.quantile(joint.tau[b], [0.25, 0.5, 0.75]) for b in bins]).T
+    return middle, low, median, high

@@ -1,0 +1,80 @@
+"""Slip elements whose friction follows temperature, load, direction and position of a table."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from nfriction import LinearAxis, load, rollout, save
+from nfriction.evaluation.torque_tables import TorqueFits, fit_torque
+from nfriction.export.controller import controller_of
+from nfriction.fitting.hysteresis import deflections
+from nfriction.friction.hysteresis import NFSlip
+from nfriction.io.model_file import ModelInfo
+
+PERIOD = 2.3e-3
+
+
+def recorded(
+    seed: int = 0, rows: int = 1500, ripple: float = 0.2, warm: float = 0.4
+) -> pd.DataFrame:
+    """Strokes; friction that falls while the joint warms up, with a ripple over the position."""
+    rng = np.random.default_rng(seed)
+    time = np.linspace(0.0, 15.0, rows)
+    phase = rng.uniform(0, 2 * np.pi, 2)
+    q = 0.06 * np.sin(1.1 * time + phase[0]) + 0.02 * np.sin(2.9 * time + phase[1])
+    qd = np.gradient(q, time)
+    temperature = 20.0 + 30.0 * (0.5 + 0.5 * np.sin(0.7 * time + phase[1]))
+    z = deflections(np.diff(q, prepend=q[0]), np.array([0.002, 0.02]), np.zeros(2))
+    tau = (z @ [0.7, 0.4] + 0.2 * qd) * (1.0 - warm * (temperature - 20.0) / 30.0)
+    tau += ripple * np.abs(qd / 0.07) * np.cos(2 * np.pi * q / PERIOD + 1.0 + 0.5 * np.sign(qd))
+    tau += rng.normal(0, 0.02, rows)
+    return pd.DataFrame({"time": time, "q": q, "qd": qd, "temperature": temperature, "tau": tau})
+
+
+@pytest.fixture(scope="module")
+def found() -> TorqueFits:
+    return fit_torque(recorded(), "slip,neuro-fuzzy:slip")
+
+
+def test_temperature_and_ripple_are_found_and_predict_another_run(found: TorqueFits) -> None:
+    assert found.chosen == {"joint1": "NFSlip"}
+    fit = found.fits["NFSlip"][0]
+    assert set(fit.model.schedule.followed()) == {"temperature", "ripple"}
+    assert "temperature" in found.summary()
+    assert abs(float(fit.model.schedule.period[0]) - PERIOD) < 1e-3 * PERIOD
+    other = recorded(seed=5)
+    plain, own = (float(found.score(other, name)["rmse"].iloc[0]) for name in found.fits)
+    assert own < 0.4 * plain
+    assert own < 0.08
+
+
+def test_what_friction_does_not_follow_is_dropped() -> None:
+    found = fit_torque(recorded(ripple=0.0, warm=0.0), "slip,neuro-fuzzy:slip")
+    assert found.chosen == {"joint1": "Slip"}
+    assert found.fits["NFSlip"][0].model.schedule.followed() == ()
+    errors = found.to_frame()
+    assert errors["Slip"].iloc[0] == pytest.approx(errors["NFSlip"].iloc[0], rel=1e-9)
+
+
+def test_a_table_without_such_a_column_is_refused(found: TorqueFits) -> None:
+    with pytest.raises(ValueError, match="no column temperature"):
+        found.predict(recorded(seed=5).drop(columns="temperature"), "neuro-fuzzy:slip")
+
+
+def test_files_keep_the_rules(found: TorqueFits, tmp_path: Path) -> None:
+    save(found.model("neuro-fuzzy:slip"), tmp_path / "model.json")
+    again = load(tmp_path / "model.json")
+    assert isinstance(again, NFSlip)
+    for name, value in found.model("neuro-fuzzy:slip").state_dict().items():
+        assert torch.equal(again.state_dict()[name], value)
+
+
+def test_simulations_and_controllers_refuse_what_they_do_not_record(found: TorqueFits) -> None:
+    model, zero = found.model("neuro-fuzzy:slip"), torch.zeros(1).double()
+    with pytest.raises(ValueError, match="take slip"):
+        rollout(LinearAxis(1.0), model, zero, zero, steps=2, sample_time=1e-3)
+    with pytest.raises(ValueError, match="take slip"):
+        controller_of(model, ModelInfo(sample_time=1e-3))
