@@ -48,10 +48,11 @@ def fit(
     refines them and the plant. Windows that would lose what shorter ones found are skipped, with a
     warning. Laws with several minima are also started from their grid of initial values and from
     the simpler law that they contain (`Law.nested_law`); the lowest residual wins. A neuro-fuzzy
-    model starts at the constant fit of its law and is kept only if its hold-out RMSE is 20 % below
-    the law's; its plant prior is relaxed, its sets move, and its friction depends on further inputs
-    (`FitResult.inputs`: the direction of turning, the load of the bearings), only for a further
-    20 %. An adaptive model starts at the constant fit, too; `fit_adaptive` has more settings.
+    model starts at the constant fit of its law and is kept only if it errs less on windows held
+    out, each in turn, by more than their scatter explains; its plant prior is relaxed, its sets
+    move and it takes further inputs (`FitResult.inputs`: the direction of turning, the load of the
+    bearings) only for such a gain. An adaptive model starts at the constant fit, too;
+    `fit_adaptive` has more settings.
 
     Args:
         model: the model to fit, changed in place; or its name, such as "coulomb-viscous": its sign
