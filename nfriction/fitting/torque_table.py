@@ -3,7 +3,7 @@
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -212,8 +212,8 @@ def fit_memory(
         if not found.presliding:
             # A stiff joint explains the rows as well: they hold no presliding.
             unknown = (f"sigma_0 of {joint.name}",)
-    elif isinstance(schedule, Recorded):
-        found = fit_recorded(schedule, joint, blocks, v_smooth)
+    elif schedule.form == "recorded":
+        found = fit_recorded(cast("Recorded", schedule), joint, blocks, v_smooth)
     elif "f_o" in model.law.names:
         loaded = joint.load is not None and reads_load(model)
         found = fit_slip(joint, blocks, loaded=loaded)
@@ -303,8 +303,8 @@ def _remembered(model: FrictionModel, memory: Memory, joint: JointTorque, lead_i
             still[..., -1] = left @ error / left.square().sum()
     states = along(still, slice(None))[:, 0]
     torque = memory.torque(states, qd, load, coefficients)
-    if isinstance(model.schedule, Recorded):
-        torque = model.schedule.corrected(torque, recorded_inputs(joint))
+    if model.schedule.form == "recorded":
+        torque = cast("Recorded", model.schedule).corrected(torque, recorded_inputs(joint))
     return torque[:, 0]
 
 
