@@ -152,8 +152,11 @@ class FitOptions:
     # --- Hold-out of a network.
     # Every so many-th window is held out at once, so that all sizes of the motion are represented.
     folds: int = 3
-    # Chance that what counts as a gain on windows held out is their scatter.
-    gain_chance: float = 0.05
+    # Chance that what counts as a gain on windows held out is their scatter: one standard error for
+    # a network, which its prior keeps near its law.
+    gain_chance: float = 0.16
+    # And of a further input, which is a new term of the law and one of several that are tried.
+    input_chance: float = 0.05
     # Candidate priors, relative to the network's own.
     prior_shares: tuple[float, ...] = (1.0, 1 / 3)
     # Updates of the priors of a network's groups by evidence; each searches on from the last.

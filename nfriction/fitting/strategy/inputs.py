@@ -129,7 +129,7 @@ def chosen_inputs(task: FitTask, start: FitResult) -> tuple[InputGain, ...]:
     names = candidates(task)
     fitter = widened_fitter(task, start, names)
     choice = _Choice.of(fitter, task, start, names)
-    return () if choice is None else tuple(choice.forward())
+    return () if choice is None else tuple(choice.forward(task.options.input_chance))
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ class _Choice:
         columns = {name: rows[:, own + k].tolist() for k, name in enumerate(names)}
         return cls(found, prior, (lower.clamp(max=0.0), upper.clamp(min=0.0)), columns)
 
-    def forward(self) -> list[InputGain]:
+    def forward(self, chance: float) -> list[InputGain]:
         """Inputs one after the other, as long as one gains by more than its scatter over blocks."""
         chosen: list[InputGain] = []
         held: list[int] = []
@@ -180,7 +180,7 @@ class _Choice:
                 if columns[0] in held:
                     continue
                 after = self.left_out([*held, *columns])
-                if gains(after, before):
+                if gains(after, before, chance):
                     shares[name] = float(1.0 - after.sum() / before.sum())
             if not shares:
                 break

@@ -114,10 +114,11 @@ def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[InputGain, ...], "_Con
     cast("NeuroFuzzyModel", model).see(names)
     seeing = replace(task, model=model, plant=seeing_plant(task.plant, names))
     rival = _Contest(seeing, start)
-    if not gains(rival.validation.of_law, plain.validation.of_law):
+    chance = task.options.input_chance
+    if not gains(rival.validation.of_law, plain.validation.of_law, chance):
         return (), plain
     rival.train()
-    return (chosen, rival) if gains(rival.squares, plain.squares) else ((), plain)
+    return (chosen, rival) if gains(rival.squares, plain.squares, chance) else ((), plain)
 
 
 class _Contest:
