@@ -335,6 +335,8 @@ class _Validation:
         # horizon; its cost scales the tolerance.
         self.noise = effective_noise(start.residuals)
         self.stride = decimation(start.residuals, self.options)
+        # Below it a network would learn the noise, and rounding that a periodic motion repeats.
+        self.explained = self.options.explained_ratio * (start.noise or 0.0)
         cost = weighted_cost(start.residuals, self.noise)
         self.tolerance = loglik_tolerance(cost, self.options)
 
@@ -437,7 +439,8 @@ class _Validation:
         if end.stopped:
             raise StoppedError
         friction, plant, *_ = end.parts
-        return holdout_squares(self.splits[place][1], end.problem, friction, plant)
+        squares = holdout_squares(self.splits[place][1], end.problem, friction, plant)
+        return squares.clamp_min(self.explained**2)
 
 
 def _constant_kept(
