@@ -83,7 +83,7 @@ def run_export(arguments: argparse.Namespace) -> int:
     if arguments.patch and len(wanted) != 1:
         raise UsageError("--patch takes one of mjcf and urdf in --format.")
     if arguments.online and "c" not in arguments.format:
-        raise UsageError("--online takes one number, with c in --format.")
+        raise UsageError("--online needs c in --format.")
     model, info = load(arguments.model), load_info(arguments.model)
     check_writable(arguments.out)
     for target in arguments.format:

@@ -79,8 +79,9 @@ def prepare_task(
     plant = rigs.of(plant)
     if not isinstance(start, FitResult | None):
         raise TypeError(f"`start` must be the result of a fit, got a {type(start).__name__}.")
+    # Before much time is spent on recordings.
+    modelled = as_model(model, plant.joints).joints
     given = as_recording_list(recordings, plant)
-    modelled = model.joints if isinstance(model, FrictionModel) else plant.joints
     joint = in_joint_coordinates(plant, given, modelled)
     moved = smoothed_motions(joint, motions)
     model = as_model(model, plant.joints, moved)

@@ -171,8 +171,8 @@ class NamedModel(FrictionModel):
         v_smooth: float = V_SMOOTH,
         **options: Any,
     ) -> None:
-        # Behind the law, the joints and the initial values.
-        known = list(signature(self.make_schedule).parameters)[3:]
+        # Behind the law, the joints and the initial values; cells are those of a schedule's own.
+        known = [name for name in signature(self.make_schedule).parameters if name != "cells"][3:]
         if unknown := [name for name in options if name not in known]:
             raise ValueError(
                 f"{type(self).__name__} has no option {', '.join(unknown)}; "

@@ -83,7 +83,8 @@ class AngleConvention:
                 return cls(**settings)
         raise ValueError(
             "`convention` must be one of relative, absolute and one of upright, hanging, such as "
-            f"'absolute,hanging', an AngleConvention, or a plant that has one; got {given!r}."
+            "['absolute', 'hanging'] or, of a recording, 'absolute,hanging', an AngleConvention, "
+            f"or a plant that has one; got {given!r}."
         )
 
     def __str__(self) -> str:

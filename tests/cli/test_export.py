@@ -67,7 +67,7 @@ def test_the_papers_network_is_also_written_to_learn_online(
     assert "arm_online_learn(" in (tmp_path / "arm_online.h").read_text("ascii")
     capsys.readouterr()
     assert cli.main(words) == 2
-    assert "--online takes one number, with c in --format" in capsys.readouterr().err
+    assert "--online needs c in --format" in capsys.readouterr().err
     other = save(LFM(2), tmp_path / "lfm.json")
     failed = cli.main(["export", str(other), *words[2:], "--format", "c"])
     assert failed
@@ -169,7 +169,7 @@ def test_a_recording_in_degrees_with_names_of_its_own_gives_the_same(
         (["--torque-limit", "1,2"], "torque_limit"),
         (["--cutoff", "1,2"], "takes one number"),
         (["--with-filter", "--cutoff", "900"], "cutoff_hz"),
-        (["--online", "0.1"], "--online takes one number, with c in"),
+        (["--online", "0.1"], "--online needs c in"),
         (["--online", "0.1,0.2", "--format", "c"], "--online: takes one number"),
     ],
 )
