@@ -1,5 +1,6 @@
 """Slip elements whose friction follows temperature, load, direction and position of a table."""
 
+import time as clock
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,10 @@ from nfriction import LinearAxis, load, rollout, save
 from nfriction.evaluation.torque_tables import TorqueFits, fit_torque
 from nfriction.export.controller import controller_of
 from nfriction.fitting.hysteresis import deflections
+from nfriction.fitting.recorded import _Ripple
 from nfriction.friction.hysteresis import NFSlip
 from nfriction.io.model_file import ModelInfo
+from nfriction.recording.torque_table import TorqueTable, blocks
 
 PERIOD = 2.3e-3
 
@@ -70,6 +73,15 @@ def test_files_keep_the_rules(found: TorqueFits, tmp_path: Path) -> None:
     assert isinstance(again, NFSlip)
     for name, value in found.model("neuro-fuzzy:slip").state_dict().items():
         assert torch.equal(again.state_dict()[name], value)
+
+
+def test_the_period_of_a_long_table_is_found_in_moments() -> None:
+    joint = TorqueTable.from_pandas(recorded(rows=12000)).joints[0]
+    begin = clock.process_time()
+    ripple = _Ripple.of(joint, joint.tau, blocks(joint, 10))
+    assert clock.process_time() - begin < 2.0
+    assert ripple is not None
+    assert 2 * np.pi / ripple.wave() == pytest.approx(PERIOD, rel=1e-3)
 
 
 def test_simulations_and_controllers_refuse_what_they_do_not_record(found: TorqueFits) -> None:
