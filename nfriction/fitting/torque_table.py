@@ -76,10 +76,7 @@ class JointFit:
     def note(self) -> str:
         """Recorded inputs that the friction follows, behind a semicolon; empty for none."""
         own = self.model.schedule
-        if not isinstance(own, Recorded) or not own.followed():
-            return ""
-        ripple = f"ripple with a period of {float(own.period[0]):.4g}"
-        return f"; follows {', '.join(own.followed())}".replace("ripple", ripple)
+        return f"; follows {own.described(0)}" if isinstance(own, Recorded) and self.rules else ""
 
     @torch.no_grad()
     def steady(self, qd: Tensor, qdd: Tensor, load: Tensor) -> tuple[Tensor, Tensor]:

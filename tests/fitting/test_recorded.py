@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 import torch
 
-from nfriction import LinearAxis, load, rollout, save
+from nfriction import LinearAxis, cli, load, rollout, save
 from nfriction.evaluation.torque_tables import TorqueFits, fit_torque
 from nfriction.export.controller import controller_of
 from nfriction.fitting.hysteresis import deflections
@@ -73,6 +73,17 @@ def test_files_keep_the_rules(found: TorqueFits, tmp_path: Path) -> None:
     assert isinstance(again, NFSlip)
     for name, value in found.model("neuro-fuzzy:slip").state_dict().items():
         assert torch.equal(again.state_dict()[name], value)
+
+
+def test_info_says_what_the_friction_follows(
+    found: TorqueFits, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = save(found.model("neuro-fuzzy:slip"), tmp_path / "model.json", ModelInfo(unit="m"))
+    assert cli.main(["info", str(file)]) == 0
+    said = capsys.readouterr().out
+    period = float(found.fits["NFSlip"][0].model.schedule.period[0])
+    assert "joint1 follows: temperature from 20 to 50, ripple with a period" in said
+    assert f"a period of {period:.4g} m\n" in said
 
 
 def test_the_period_of_a_long_table_is_found_in_moments() -> None:
