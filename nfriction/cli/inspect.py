@@ -68,10 +68,16 @@ def run_info(arguments: argparse.Namespace) -> int:
 
 
 def _facts(model: "FrictionModel", info: "ModelInfo") -> Iterator[tuple[str, str]]:
+    from nfriction.friction.hysteresis import Recorded
+
     name = type(model).__name__
     known = name in (*model_names(), *memory_names())
     yield "model", f"{name}, {plain_name(name) if known else f'law {model.law.name}'}"
+    joints = info.joint_names or [f"joint{k + 1}" for k in range(model.joints)]
     yield "joints", ", ".join(info.joint_names) or str(model.joints)
+    if isinstance(model.schedule, Recorded):
+        for k, joint in enumerate(joints):
+            yield f"{joint} follows", model.schedule.described(k, info.unit) or "nothing recorded"
     if info.rig is not None:
         yield "rig", str(info.rig.get("name") or "unnamed")
     if info.sample_time is not None:

@@ -76,10 +76,7 @@ class JointFit:
     def note(self) -> str:
         """Recorded inputs that the friction follows, behind a semicolon; empty for none."""
         own = self.model.schedule
-        if not isinstance(own, Recorded) or not own.followed():
-            return ""
-        ripple = f"ripple with a period of {float(own.period[0]):.4g}"
-        return f"; follows {', '.join(own.followed())}".replace("ripple", ripple)
+        return f"; follows {own.described(0)}" if isinstance(own, Recorded) and self.rules else ""
 
     @torch.no_grad()
     def steady(self, qd: Tensor, qdd: Tensor, load: Tensor) -> tuple[Tensor, Tensor]:
@@ -191,7 +188,8 @@ def fit_memory(
     """Coefficients of a named model with memory, and its errors on blocks left out [N m; N].
 
     Raises:
-        ValueError: if the rows have no time, or the law needs a load that the table lacks.
+        ValueError: if the rows have no time, their position does not change, or the law needs a
+            load that the table lacks.
     """
     model = model_by_name(name)(1, v_smooth=v_smooth)
     schedule: Any = model.schedule
@@ -204,6 +202,11 @@ def fit_memory(
         raise ValueError(
             f"{plain_name(name)} remembers the motion before, and {joint.name} has no column time; "
             "add one, or leave the model out."
+        )
+    if range_of(joint) == 0.0:
+        raise ValueError(
+            f"column q of {joint.name} does not change, and laws with memory, such as "
+            f"{plain_name(name)}, need motion; give its positions, or a table without q."
         )
     require_load(name, joint)
     unknown: tuple[str, ...] = ()

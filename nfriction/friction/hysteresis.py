@@ -179,6 +179,19 @@ class Recorded(Constant):
         """Inputs that the torque follows."""
         return tuple(name for name in TERMS if self.layer(name).consequents.any())
 
+    def described(self, joint: int, unit: str = "") -> str:
+        """Inputs that a joint's torque follows, with ranges and period; empty for none."""
+        found = []
+        for name, (low, high) in zip(TERMS, self.ranges[joint].tolist(), strict=True):
+            if self.layer(name).consequents[joint].any():
+                words = f"{name} from {low:.4g} to {high:.4g}"
+                if name == "direction":
+                    words = name
+                elif name == "ripple":
+                    words = f"ripple with a period of {float(self.period[joint]):.4g}"
+                found.append(f"{words} {unit * (name in ('position', 'ripple'))}".rstrip())
+        return ", ".join(found)
+
     def layer(self, name: str) -> Anfis:
         """Rules of an input."""
         found = self.layers[name]

@@ -46,6 +46,11 @@ def test_elements_follow_the_displacement_and_slip_at_their_width() -> None:
     np.testing.assert_allclose(z, [0.0, 0.5, 1.0, 0.5, -1.0])
 
 
+def test_positions_that_do_not_change_are_refused() -> None:
+    with pytest.raises(ValueError, match="column q of joint1 does not change"):
+        fit_torque(slip_table().assign(q=0.1), "slip")
+
+
 def test_the_law_advances_as_the_fit_does() -> None:
     table = TorqueTable.from_pandas(slip_table()).joints[0]
     found = fit_slip(table, blocks(table, 5), loaded=False)

@@ -1,5 +1,6 @@
 """Slip elements whose friction follows temperature, load, direction and position of a table."""
 
+import time as clock
 from pathlib import Path
 
 import numpy as np
@@ -7,12 +8,14 @@ import pandas as pd
 import pytest
 import torch
 
-from nfriction import LinearAxis, load, rollout, save
+from nfriction import LinearAxis, cli, load, rollout, save
 from nfriction.evaluation.torque_tables import TorqueFits, fit_torque
 from nfriction.export.controller import controller_of
 from nfriction.fitting.hysteresis import deflections
+from nfriction.fitting.recorded import _Ripple
 from nfriction.friction.hysteresis import NFSlip
 from nfriction.io.model_file import ModelInfo
+from nfriction.recording.torque_table import TorqueTable, blocks
 
 PERIOD = 2.3e-3
 
@@ -70,6 +73,26 @@ def test_files_keep_the_rules(found: TorqueFits, tmp_path: Path) -> None:
     assert isinstance(again, NFSlip)
     for name, value in found.model("neuro-fuzzy:slip").state_dict().items():
         assert torch.equal(again.state_dict()[name], value)
+
+
+def test_info_says_what_the_friction_follows(
+    found: TorqueFits, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = save(found.model("neuro-fuzzy:slip"), tmp_path / "model.json", ModelInfo(unit="m"))
+    assert cli.main(["info", str(file)]) == 0
+    said = capsys.readouterr().out
+    period = float(found.fits["NFSlip"][0].model.schedule.period[0])
+    assert "joint1 follows: temperature from 20 to 50, ripple with a period" in said
+    assert f"a period of {period:.4g} m\n" in said
+
+
+def test_the_period_of_a_long_table_is_found_in_moments() -> None:
+    joint = TorqueTable.from_pandas(recorded(rows=12000)).joints[0]
+    begin = clock.process_time()
+    ripple = _Ripple.of(joint, joint.tau, blocks(joint, 10))
+    assert clock.process_time() - begin < 2.0
+    assert ripple is not None
+    assert 2 * np.pi / ripple.wave() == pytest.approx(PERIOD, rel=1e-3)
 
 
 def test_simulations_and_controllers_refuse_what_they_do_not_record(found: TorqueFits) -> None:
