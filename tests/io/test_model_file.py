@@ -333,7 +333,7 @@ FORGED: dict[str, tuple[Callable[[dict], Any], str]] = {
     "no joints": (lambda c: c.update(joints=0), "sizes .* is refused"),
     "terms no list": (
         lambda c: c["options"].update(terms=5),
-        "unexpected keyword argument 'terms'",
+        "LFM has no option terms",
     ),
     "smoothing": (lambda c: c.update(v_smooth=-1.0), "`v_smooth` must be positive"),
     "infinite smoothing": (lambda c: c.update(v_smooth=float("inf")), "numbers must be finite"),
