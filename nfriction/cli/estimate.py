@@ -18,6 +18,8 @@ from nfriction.friction import plain_name
 if TYPE_CHECKING:
     from nfriction.evaluation.compare import Comparison, InitialStates
     from nfriction.evaluation.cross_validation import Selection
+    from nfriction.friction.models import FrictionModel
+    from nfriction.io.model_file import ModelInfo
     from nfriction.plant import Plant
     from nfriction.recording import Recording
 
@@ -97,17 +99,29 @@ def run_fit(arguments: argparse.Namespace) -> int:
             **inputs.fit_settings(arguments),
         )  # fmt: skip
         progress.stage("write the model")
-    save(found.model, arguments.out, model_info(found, recordings))
+    info = model_info(found, recordings)
+    save(found.model, arguments.out, info)
     print(fit_lines(arguments.model, found))
     print(f"position error over training windows: {1e3 * found.residual:.3g} m{plant.unit}")
     print(coefficient_table(found.model, plant.joint_names, plant.unit))
     if intervals := interval_table(found):
         print(intervals)
     print(f"wrote {arguments.out}")
-    if found.converged and found.usability[0] != "do not use":
+    usable = found.converged and found.usability[0] != "do not use"
+    if usable and _has_controller(found.model, info):
         further = ["nfriction", "export", str(arguments.out), "--format", "torchscript"]
         print(f"next: {shlex.join(further)}")
     return 0
+
+
+def _has_controller(model: FrictionModel, info: ModelInfo) -> bool:
+    from nfriction.export import controller_of
+
+    try:
+        controller_of(model, info)
+    except ValueError:
+        return False
+    return True
 
 
 def run_compare(arguments: argparse.Namespace) -> int:
@@ -156,14 +170,19 @@ def compare_and_report(
         if page is not None:
             write_report(arguments.out, page)  # else the earlier run's page would be missed
         logger.info(verdict(comparison))
-    _print(comparison, selection, plant, arguments)
+    _print(comparison, selection, plant, train, arguments)
     return 1 if comparison.failed else 0
 
 
 def _print(
-    comparison: Comparison, selection: Selection | None, plant: Plant, arguments: argparse.Namespace
+    comparison: Comparison,
+    selection: Selection | None,
+    plant: Plant,
+    train: Sequence[Recording],
+    arguments: argparse.Namespace,
 ) -> None:
     from nfriction.cli import tables
+    from nfriction.evaluation.results import model_info
 
     print(f"\n{tables.error_tables(comparison)}")
     # Tables show abbreviations, which a reader of plain names has not met.
@@ -188,8 +207,9 @@ def _print(
         model = arguments.out / "models" / f"{comparison.best()}.json"
         print(f"\n{conclusion}")
         print(f"all figures on a page: {shlex.join(['nfriction', 'report', str(arguments.out)])}")
-        export = ["nfriction", "export", str(model), "--format", "c", "--out", "controller"]
-        print(f"this model as C code:  {shlex.join(export)}")
+        if best is not None and _has_controller(best.model, model_info(best, train)):
+            export = ["nfriction", "export", str(model), "--format", "c", "--out", "controller"]
+            print(f"this model as C code:  {shlex.join(export)}")
 
 
 def _conclusion(comparison: Comparison) -> str:

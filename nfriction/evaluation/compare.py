@@ -11,7 +11,7 @@ import pandas as pd
 
 from nfriction.evaluation.parallel import Data, Progress, fit_models
 from nfriction.evaluation.score import HORIZONS, RMSE, Score, score
-from nfriction.fitting.data.inputs import warn_of_undriven
+from nfriction.fitting.data.inputs import as_model, require_drive, warn_of_undriven
 from nfriction.fitting.options import checked_lengths
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction import both_names, model_name
@@ -350,7 +350,8 @@ def compare(
         fit_settings: see `fit`.
 
     Raises:
-        ValueError: if a recording is in both parts, or names are not unique.
+        ValueError: if a recording is in both parts, or lacks a torque that a law reads, or names
+            are not unique.
         ImportError: if `jobs` needs joblib and it is not installed.
         ValueError, ArithmeticError, RuntimeError: if no model could be fitted; where only some
             could not, `failed` has the reasons.
@@ -363,6 +364,8 @@ def compare(
     if not models or not train:
         raise ValueError("at least one model and one training recording are needed.")
     check_recordings(train, test)
+    for name in models:
+        require_drive(as_model(name, plant.joints).law, [*train, *test])
     warn_of_undriven([*train, *test])
     progress = progress or Progress()
     joint = [recording.joint_coordinates(plant) for recording in train]

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nfriction.evaluation.lead_in import longest_window
 from nfriction.evaluation.score import score
+from nfriction.fitting.data.inputs import require_drive
 from nfriction.fitting.fit import fit
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction.memory import deflections, load_of
@@ -169,6 +170,7 @@ class FrictionEstimator(BaseEstimator):
             if isinstance(X, Recording | pd.DataFrame | str | os.PathLike):
                 (recording,) = _recordings(X, plant)
                 joint = recording.joint_coordinates(plant)
+                require_drive(model.law, [joint])
                 motion = kalman_smoother(joint.time, joint.q)
                 q, velocity, acceleration = map(torch.tensor, (motion.q, motion.qd, motion.qdd))
                 tau = torch.zeros_like(q) if joint.tau is None else torch.tensor(joint.tau)

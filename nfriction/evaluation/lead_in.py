@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from nfriction.fitting.data.inputs import require_drive
 from nfriction.fitting.shooting.autocorrelation import white_noise
 from nfriction.friction.memory import deflections, load_of
 from nfriction.friction.models import FrictionModel
@@ -125,6 +126,7 @@ class Simulator:
                 raise ValueError(
                     f"the plant has {plant.joints} joints, the friction model {friction.joints}."
                 )
+            require_drive(friction.law, [recording])
         self.plant, self.friction, self.recording = plant, friction, recording
         self.scheme, self.draws = scheme, draws
         self.convention = recording.resolve_convention(plant)

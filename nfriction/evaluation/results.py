@@ -264,6 +264,7 @@ def _write_model(fit: FitResult, path: Path, info: ModelInfo) -> list[Path]:
     written = [save(fit.model, path, info)]
     try:
         written.append(torchscript(fit.model, path.with_suffix(".pt"), info))
-    except ExportError as error:
+    # A ValueError of a law with memory that no controller can follow, or not at these sample times.
+    except (ExportError, ValueError) as error:
         logger.warning("%s was not exported: %s", path.stem, " ".join(str(error).split()))
     return written

@@ -130,7 +130,8 @@ def score(
         Errors in the recording's coordinates and unit.
 
     Raises:
-        ValueError: if the recording is too short for a lead-in.
+        ValueError: if the recording is too short for a lead-in, or lacks a torque that the friction
+            law reads.
     """
     plant = rigs.of(plant)
     recording = Recording.of(recording, plant=plant)

@@ -133,6 +133,7 @@ def mjcf(
         info: names of the joints, by which they are found in `patch`.
         patch: an MJCF file whose joints are given the numbers; default a file of default classes,
             one a joint, to be included and named as the joints' `class`; a motor names its joint.
+            Motors without input that are LuGre friction of these joints are replaced.
 
     Returns:
         The numbers and their errors.
@@ -301,6 +302,10 @@ def patched(
             target = ElementTree.SubElement(target, "dynamics") if dynamics is None else dynamics
         target.set("damping", repr(d))
         target.set("frictionloss" if root == "mujoco" else "friction", repr(f))
+    for group in tree.findall("actuator"):
+        for old in group.findall("dcmotor[@lugre][@input='none']"):
+            if old.get("joint") in names:
+                group.remove(old)
     if motors:
         actuators = tree.find("actuator")
         actuators = ElementTree.SubElement(tree, "actuator") if actuators is None else actuators

@@ -92,8 +92,8 @@ def fit(
 
     Raises:
         TypeError: if model, plant or recordings are something else.
-        ValueError: if recordings and plant do not match, one is given twice or holds too little,
-            or an option does not exist.
+        ValueError: if recordings and plant do not match, one is given twice, holds too little or
+            lacks a torque that the law reads, or an option does not exist.
     """
     options = FitOptions(
         method, windows, fit_plant, drag,

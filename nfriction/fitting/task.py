@@ -18,6 +18,7 @@ from nfriction.fitting.data.inputs import (
     largest_torques,
     looks_zeroed_per_recording,
     measurement_matrix,
+    require_drive,
     smoothed_motions,
 )
 from nfriction.fitting.diagnosis import balanced_delay, likely_mistakes, mistake_warning
@@ -90,6 +91,7 @@ def prepare_task(
             f"the law {model.law.name!r} is for tables of torque, see `fit_torque`; to motions fit "
             "maxwell-slip."
         )
+    require_drive(model.law, joint)
     if options.eccentricity == "on" and not isinstance(plant, PendulumChain):
         raise ValueError(f"{plant.name or 'the axis'} has no encoders that turn with its joints.")
     # Torques alone do not depend on a constant offset of the encoders enough to estimate one.

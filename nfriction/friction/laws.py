@@ -173,6 +173,11 @@ class Law:
         return tuple(c.name for c in self.coefficients)
 
     @property
+    def reads_drive(self) -> bool:
+        """True of a law whose load is the torque that the drive transmits."""
+        return self.memory is not None and self.memory.transmitted
+
+    @property
     def state_size(self) -> int:
         """Size of each joint's internal state; 0 of a law without memory."""
         return self.memory.size if self.memory else 0

@@ -100,9 +100,13 @@ def reference_coefficients(model: FrictionModel) -> Tensor:
 
 def load_of(law: Law, plant: Any, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
     """Load that a law reads along a motion: that of a plant, or the drive's torque."""
-    transmitted = law.memory is not None and law.memory.transmitted
-    load: Tensor = tau if transmitted else plant.load(q, qd)
+    load: Tensor = tau if law.reads_drive else plant.load(q, qd)
     return load
+
+
+def load_at_rest(law: Law, qd: Tensor) -> Tensor:
+    """Load that a law reads at rest, shaped like `qd`: 1 of a joint, no torque of its drive."""
+    return torch.zeros_like(qd) if law.reads_drive else torch.ones_like(qd)
 
 
 def slipping_state(memory: Memory, coefficients: Tensor) -> Tensor:

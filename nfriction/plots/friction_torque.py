@@ -15,6 +15,7 @@ from nfriction.fitting.hysteresis import path_of
 from nfriction.fitting.result.identifiability import NORMAL_95
 from nfriction.fitting.torque_table import predict
 from nfriction.friction import model_by_name, plain_name
+from nfriction.friction.memory import load_at_rest
 from nfriction.plots import style
 
 if TYPE_CHECKING:
@@ -150,7 +151,7 @@ def _torque(model: FrictionModel, qd: Array, joint: int) -> Array:
     velocity = torch.as_tensor(qd)[:, None].expand(-1, model.joints)
     with torch.no_grad():
         held = model.coefficients(velocity, torch.zeros_like(velocity))
-        torque = model.steady_torque(velocity, torch.ones_like(velocity), held)
+        torque = model.steady_torque(velocity, load_at_rest(model.law, velocity), held)
     return torque[:, joint].numpy()
 
 

@@ -1,13 +1,28 @@
 """`fit`, `info` and `export`: from a recording to a model file, what it says, and its artefact."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from nfriction import LFM, NFLFM, ModelInfo, Recording, cli, load, save
+from nfriction import (
+    LFM,
+    NFLFM,
+    FitResult,
+    LinearAxis,
+    ModelInfo,
+    Recording,
+    cli,
+    load,
+    rigs,
+    rollout,
+    save,
+)  # fmt: skip
+from nfriction.fitting.fit import fit
 from nfriction.friction import model_by_name
+from nfriction.friction.memory import Gear
 from tests.cli.benches import QUICK
 
 
@@ -67,6 +82,28 @@ def test_a_fit_that_is_not_to_be_used_is_not_told_to_be_exported(
     assert "do not use (a mistake in the data is likely" in said
     assert "gains energy" in said
     assert "next:" not in said
+
+
+def test_a_model_that_controllers_cannot_follow_is_not_told_to_be_exported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def quick(*task: Any, **_: object) -> FitResult:
+        return fit(*task, method="equation_error")
+
+    monkeypatch.setattr("nfriction.fitting.fit.fit", quick)
+    axis, time = LinearAxis(0.5, name="axis"), 4e-3 * np.arange(500)
+    rigs.write(axis, tmp_path / "axis.json")
+    truth = Gear(1, [0.4, 0.08, 0.2, 0.3, 400.0]).requires_grad_(False)
+    force = (3.0 * np.sin(5 * time) + np.sin(13 * time))[:, None]
+    zero = torch.zeros(1, dtype=torch.float64)
+    run = rollout(axis, truth, zero, zero, torch.tensor(force[:-1]), sample_time=4e-3)
+    Recording(time, run.q.numpy(), tau=force, unit="m").write(tmp_path / "a.csv")
+    words = ["fit", str(tmp_path / "a.csv"), "--rig", str(tmp_path / "axis.json")]
+    for model, told in (("dahl", True), ("gear", False)):
+        out = ["--model", model, "--out", str(tmp_path / "m.json")]
+        assert cli.main([*words, *out]) == 0
+        said = capsys.readouterr().out
+        assert ("next:" in said) is told, said
 
 
 def test_info_tells_what_the_file_says(fitted: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -155,6 +155,24 @@ def test_bristles_move_in_mujoco_as_in_a_rollout(name: str, tmp_path: Path) -> N
         urdf(model, tmp_path / "out.urdf", swing(1), info)
 
 
+def test_a_joints_friction_is_replaced_in_a_file_that_has_some(tmp_path: Path) -> None:
+    others = '<dcmotor joint="shoulder" input="none" lugre="1 0 1 1 1"/><motor joint="elbow"/>'
+    path, info = tmp_path / "robot.xml", ModelInfo(joint_names=["elbow"])
+    path.write_text(ROBOT.replace("</mujoco>", f"<actuator>{others}</actuator></mujoco>"))
+
+    def motors() -> list[tuple[str | None, ...]]:
+        found = ElementTree.parse(path).iter("dcmotor")
+        return [(motor.get("joint"), motor.get("lugre")) for motor in found]
+
+    for stiffness in (100, 300):
+        model = Dahl(1, [1.0, 0.4, stiffness]).requires_grad_(False)
+        mjcf(model, path, swing(1), info, patch=path)
+        assert motors() == [("shoulder", "1 0 1 1 1"), ("elbow", f"{stiffness} 0 1 1 1")]
+    mjcf(LFM(1, [0.3, 0.7]), path, swing(1), info, patch=path)
+    assert motors() == [("shoulder", "1 0 1 1 1")]
+    assert "<motor " in path.read_text()
+
+
 def test_the_snippets_load_and_tell_their_price(tmp_path: Path) -> None:
     mujoco: Any = pytest.importorskip("mujoco")
     info = ModelInfo(joint_names=['a "b" --', "c"])  # as awkward as names can be

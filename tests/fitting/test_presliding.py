@@ -8,14 +8,18 @@ import pytest
 import torch
 
 from nfriction import FitResult, LinearAxis, Plant, Recording, fit, rollout
+from nfriction.evaluation.compare import Comparison, compare
+from nfriction.evaluation.results import write_results
 from nfriction.evaluation.score import score
 from nfriction.fitting.data.windows import cut_windows
+from nfriction.fitting.result.identifiability import CoefficientUncertainty
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.presliding import yielding
 from nfriction.friction import model_by_name
 from nfriction.friction.memory import DAHL, Dahl, Gear, LuGre, MaxwellSlip, NFLuGre
 from nfriction.friction.models import FrictionModel
+from nfriction.plots.friction_torque import torque_over_velocity
 from nfriction.signals import kalman_smoother, quantise
 from tests.fitting.recordings import F64, pendulum
 
@@ -161,6 +165,58 @@ def test_a_fit_with_memory_is_scored_saved_and_tabulated(short, tmp_path) -> Non
     sd = found.uncertainty.torque_sd(found.model, torch.tensor([[-0.5], [0.5]], dtype=F64))
     assert (sd > 0).all()
     assert (sd < 0.1).all()
+
+
+@pytest.fixture(scope="module")
+def geared():
+    truth = Gear(1, (0.4, 0.08, 0.2, 0.3, 400.0)).requires_grad_(False)
+    recording = pushed(truth, 3, seconds=2.0, rate=500)
+    return recording, fit("gear", AXIS, recording, method="equation_error")
+
+
+def test_a_gears_loss_needs_the_drives_torque(geared) -> None:
+    recording, found = geared
+    undriven = recording._replace(tau=None, name="swing")
+    told = "in swing, and gear reads the drive's torque; add tau or take dahl"
+    with pytest.raises(ValueError, match=told):
+        fit("gear", AXIS, undriven, method="equation_error")
+    with pytest.raises(ValueError, match=told):
+        score(found.plant, found.model, undriven, limit=False)
+    # Before any fit, whose result would be lost.
+    with pytest.raises(ValueError, match=told):
+        compare(AXIS, ["viscous", "gear"], recording, undriven, callback=pytest.fail)
+
+
+def test_a_gears_curve_is_that_of_a_drive_without_torque(geared) -> None:
+    """Its load is a torque [N m]: 1 N m is no load at rest."""
+    recording, found = geared
+    constants = found.model.schedule.values
+    shares = torch.tensor([0.0, 1.0, 1.0, 0.0, 0.0], dtype=F64)
+    with torch.no_grad():
+        other = Gear(1, constants + shares, v_smooth=found.model.v_smooth)
+    name = found.model.law.name
+    first, second = (
+        torque_over_velocity(AXIS, {name: m}, [recording]).axes[0].lines[-1].get_ydata()
+        for m in (found.model, other)
+    )
+    np.testing.assert_allclose(second, first)
+    known = CoefficientUncertainty(found.model.schedule, torch.diag(shares))
+    assert not known.torque_sd(found.model, torch.tensor([[0.5]], dtype=F64)).any()
+
+
+def test_what_is_not_exported_loses_no_comparison(geared, tmp_path, caplog) -> None:
+    recording, found = geared
+    lugre = replace(found, model=LuGre(1, SOFT).requires_grad_(False))
+    slower = recording[np.arange(len(recording.time)) % 2 == 0]
+    scores = {name: [score(f.plant, f.model, recording, limit=False)] for name, f in
+              (("gear", found), ("lugre", lugre))}  # fmt: skip
+    for name, f, train in (("gear", found, [recording]), ("lugre", lugre, [recording, slower])):
+        made = Comparison({name: f}, {name: scores[name]}, {}, unit="m", joint_names=("x",))
+        write_results(made, train, [], tmp_path, figures=False)
+        assert (tmp_path / "models" / f"{name}.json").is_file()
+        assert not list(tmp_path.rglob("*.pt"))
+    assert "gear was not exported: the state of law 'gear' depends on the load" in caplog.text
+    assert "lugre was not exported: the law 'lugre' has memory" in caplog.text
 
 
 @pytest.mark.slow

@@ -23,6 +23,7 @@ from nfriction.fitting.plant_parameters import (
     torque_delay_term,
 )
 from nfriction.friction import model_by_name
+from nfriction.friction.laws import Law
 from nfriction.friction.models import V_SMOOTH, FrictionModel
 from nfriction.plant import PendulumChain, Plant
 from nfriction.recording import Recording, RecordingLike
@@ -112,6 +113,16 @@ def warn_of_undriven(recordings: Sequence[Recording]) -> None:
             f"no torque is recorded in {names}, unlike in other recordings, so nothing "
             f"is taken to drive the joints there; add the torque, or zeros where there was none.",
             stacklevel=1,
+        )
+
+
+def require_drive(law: Law, recordings: Sequence[Recording]) -> None:
+    """Refuse recordings without torque for a law that reads the torque of the drive."""
+    free = [r.name or "a recording" for r in recordings if r.tau is None]
+    if free and law.reads_drive:
+        raise ValueError(
+            f"no torque is recorded in {', '.join(dict.fromkeys(free))}, and {law.name} reads the "
+            "drive's torque; add tau or take dahl."
         )
 
 

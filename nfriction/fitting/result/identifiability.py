@@ -14,6 +14,7 @@ from torch import Tensor
 
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.friction.coefficients import Schedule
+from nfriction.friction.memory import load_at_rest
 from nfriction.friction.models import FrictionModel
 from nfriction.optim.least_squares import scaled_spectrum
 from nfriction.signals import count_seen
@@ -270,7 +271,7 @@ class CoefficientUncertainty:
         At the load at rest and without acceleration. `model` has this schedule; its `v_smooth` is
         taken for known.
         """
-        rest, load = torch.zeros_like(qd), torch.ones_like(qd)
+        rest, load = torch.zeros_like(qd), load_at_rest(model.law, qd)
         with torch.enable_grad():
             held = model.coefficients(qd, rest).detach().expand(*qd.shape, -1).clone()
             held.requires_grad_()
