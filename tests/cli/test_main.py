@@ -177,5 +177,5 @@ def test_a_closed_pipe_ends_quietly(words: list[str], unbuffered: str, tmp_path:
     done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, timeout=60, env=env)
     os.close(writer)
     assert done.stderr == b""
-    # argparse drops its own failure to write.
-    assert done.returncode == (0 if unbuffered and "--version" in words else 141)
+    # argparse of some Python versions drops its own failure to write.
+    assert done.returncode in ({0, 141} if unbuffered and "--version" in words else {141})
