@@ -67,9 +67,6 @@ class FitOptions:
     energy_rise: float = 0.5
     # Longest delay between torques and positions: some samples of a slow bus [s].
     largest_delay: float = 0.1
-    # Share of a joint's largest velocity within which its sign turns, in models made by name: the
-    # default of 3 mrad/s, or mm/s, where a joint reaches 3 rad/s, or m/s.
-    turning_share: float = 1e-3
     # More substeps would mean a sign function too steep for the sample time.
     max_substeps: int = 8
 

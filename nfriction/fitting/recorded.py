@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nfriction.fitting.hysteresis import TOLERANCE, MemoryFit, fit_slip, range_of
+from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.fitting.strategy.continuation import student_quantile
 from nfriction.friction.hysteresis import TERMS, Recorded
@@ -28,8 +29,6 @@ Array = NDArray[np.float64]
 FEWEST_PERIODS = 10
 # Spatial frequencies over that at which the range of the motion has a period more.
 SPACING = 1 / 6
-# Of the gain on blocks left out, from one side.
-CONFIDENCE = 0.95
 # Smallest change of the torque by which a law is scaled back.
 LEAST = 0.1
 # Cells of a position, at least, in the shortest period: within one the phase turns by an eighth.
@@ -93,7 +92,7 @@ class Rules:
             gains = now - trials[best]
             # What few blocks show is not seen again in other recordings.
             error = gains.std(ddof=1) / len(gains) ** 0.5
-            least = student_quantile(len(gains) - 1, CONFIDENCE) * error
+            least = student_quantile(len(gains) - 1, 1 - DEFAULTS.input_chance) * error
             if gains.mean() <= max(least, (1 - (1 - TOLERANCE) ** 2) * now.mean()):
                 break
             names.append(best)

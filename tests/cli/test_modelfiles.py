@@ -99,11 +99,11 @@ def test_a_model_that_controllers_cannot_follow_is_not_told_to_be_exported(
     run = rollout(axis, truth, zero, zero, torch.tensor(force[:-1]), sample_time=4e-3)
     Recording(time, run.q.numpy(), tau=force, unit="m").write(tmp_path / "a.csv")
     words = ["fit", str(tmp_path / "a.csv"), "--rig", str(tmp_path / "axis.json")]
-    for model, told in (("dahl", True), ("gear", False)):
+    for model, exportable in (("dahl", True), ("gear", False)):
         out = ["--model", model, "--out", str(tmp_path / "m.json")]
         assert cli.main([*words, *out]) == 0
         said = capsys.readouterr().out
-        assert ("next:" in said) is told, said
+        assert ("next:" in said) is exportable, said
 
 
 def test_info_tells_what_the_file_says(fitted: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -33,6 +33,10 @@ from nfriction.simulation.validate import RK4_STABILITY, required_substeps
 
 logger = logging.getLogger(__name__)
 
+# Share of the slowest joint's largest velocity within which the sign of a model made by name turns:
+# the default of 3 mrad/s, or mm/s, where it reaches 3 rad/s, or m/s.
+TURN_SHARE = 1e-3
+
 
 def as_model(
     model: FrictionModel | str, joints: int, motions: Sequence[Motion] = ()
@@ -53,7 +57,7 @@ def as_model(
     return model
 
 
-def turning_velocity(motions: Sequence[Motion], options: FitOptions = DEFAULTS) -> float:
+def turning_velocity(motions: Sequence[Motion]) -> float:
     """Velocity within which the sign of the velocity turns [rad/s; m/s].
 
     A joint that friction holds creeps at about this velocity, so it is a small share of the largest
@@ -66,8 +70,8 @@ def turning_velocity(motions: Sequence[Motion], options: FitOptions = DEFAULTS) 
     slowest = min((float(v) for v in speeds if v > 0), default=math.inf)
     taken = max(float(np.abs(m.qdd).max() * np.median(np.diff(m.time))) for m in motions)
     # Half the substeps, as friction is not known yet.
-    least = taken / (RK4_STABILITY * options.max_substeps / 2)
-    return min(V_SMOOTH, max(options.turning_share * slowest, least))
+    least = taken / (RK4_STABILITY * DEFAULTS.max_substeps / 2)
+    return min(V_SMOOTH, max(TURN_SHARE * slowest, least))
 
 
 def as_recording_list(
