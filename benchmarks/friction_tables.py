@@ -3,9 +3,9 @@
 Prints, for each joint, the NRMSE on contiguous blocks left out: of five models by least squares
 (the baselines of the data cards: offset, Coulomb and viscous; with three Stribeck terms; with
 load-proportional Coulomb friction; five slip elements; all of these), of the best law without
-memory that `nfriction.fit_torque` fits, and of the law that it chooses. With `--splits`, the same on rows that
-no fit has seen: what is left of a run after the first 60 %, 40 % or half judges what these
-taught, and the other way round, relative to the choice among the laws without memory.
+memory that `nfriction.fit_torque` fits, and of the law that it chooses. With `--splits`, the same
+on rows that no fit has seen: a run's first 60 %, 40 % or half teach and the rest judges, and the
+other way round, relative to the choice among the laws without memory.
 
     python benchmarks/friction_tables.py --data DATA [--only kr300 ur10 tribometer] [--splits]
 """
