@@ -249,15 +249,18 @@ def _identifiability(
 def _torque_scale(
     problem: ShootingProblem, result: LeastSquaresResult, motions: Sequence[Motion]
 ) -> tuple[Tensor, Tensor]:
-    """Derivative of the friction torque by each constant coefficient at its joint's peak speed, and
-    the largest torque that moves this joint, (friction parameter,) each.
+    """Largest |derivative| of the friction torque by each constant coefficient at its joint's peak
+    speed, and the largest torque that moves this joint, (friction parameter,) each.
     """
     friction, vector, _, _ = problem.variables.split(result.x)
     speed, moved = peak_dynamics_torque(problem.plant_at(vector), motions, problem.options)
     need = torch.maximum(moved, problem.windows.tau.abs().amax((0, 1)))
     table = friction.reshape(len(speed), -1).clone().requires_grad_()
+    # A gear's loss is a share of the torque, which drives the joint or holds it back.
+    loads = (need, -need) if problem.friction.law.reads_drive else (torch.ones_like(speed),)
     with torch.enable_grad():
         # A law is elementwise, so the sum's gradient is each coefficient's own slope.
-        torque = problem.friction.steady_torque(speed, torch.ones_like(speed), table)
-        (slope,) = torch.autograd.grad(torque.sum(), table)
+        torques = [problem.friction.steady_torque(speed, load, table).sum() for load in loads]
+        slopes = [torch.autograd.grad(torque, table)[0].abs() for torque in torques]
+    slope = torch.stack(slopes).amax(0)
     return slope.flatten(), need[:, None].expand_as(slope).flatten()
