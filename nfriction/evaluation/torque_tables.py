@@ -366,7 +366,7 @@ def _choose(candidates: Sequence[Candidate]) -> tuple[str, str]:
 
 
 def _need(name: str) -> tuple[bool, bool]:
-    """Whether a model needs memory, and whether it needs a load."""
+    """Needs of a model: memory, and a load."""
     return model_by_name(name).definition.memory is not None, reads_load(model_by_name(name)(1))
 
 
