@@ -21,7 +21,6 @@ from nfriction.export.contract import (
     Contract,
     ContractError,
     ExportError,
-    Runner,
     contract_of,
 )
 from nfriction.export.controller import controller_of
@@ -197,8 +196,8 @@ def c_runner(source: str | Path, flags: Sequence[str] = FLAGS) -> Callable[..., 
     return run
 
 
-def open_c(path: str | Path) -> tuple[Contract, Runner]:
-    """Compile a controller's C; returns the contract beside it, and how to run it."""
+def contract_of_c(path: str | Path) -> Contract:
+    """Read the contract that lies beside a controller's C, and refuse C that is not as exported."""
     path = Path(path)
     metadata = beside(path)
     if not metadata.is_file():
@@ -209,7 +208,7 @@ def open_c(path: str | Path) -> tuple[Contract, Runner]:
         raise ContractError(
             f"{path}: the file is named as its functions are; give it its old name."
         )
-    return c_contract(path), c_runner(path)
+    return c_contract(path)
 
 
 def _library(source: Path, filters: bool, flags: Sequence[str]) -> ctypes.CDLL:

@@ -405,13 +405,16 @@ def _array(x: Any) -> np.ndarray:
 
 
 def write_verified(
-    path: str | Path, content: bytes, opener: Callable[[Path], tuple[Contract, Runner]], kind: str
+    path: str | Path,
+    content: bytes,
+    contract: Contract,
+    runner: Callable[[Path], Runner],
+    kind: str,
 ) -> Path:
-    """Write an artefact, read it again and compare it with its model before it takes its place."""
+    """Write an artefact, run it and compare it with its model before it takes its place."""
     with atomic_write(path) as temporary:
         temporary.write_bytes(content)
-        contract, run = opener(temporary)
-        parity = verify(run, contract)
+        parity = verify(runner(temporary), contract)
         if not parity.passed:
             raise ExportError(f"the {kind} differs from its model: {parity}.")
     return Path(path)

@@ -2,9 +2,8 @@
 
 import io
 import math
-import re
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,39 +13,17 @@ from torch import Tensor, nn
 
 from nfriction.export.contract import (
     Contract,
-    ContractError,
     ExportError,
     Runner,
     contract_of,
     draw,
     draw_motion,
-    first_line,
     write_verified,
 )
 from nfriction.export.controller import Controller, controller_of, run_in_order
-from nfriction.export.torch_archive import (
-    METADATA,
-    check_program,
-    check_script,
-    check_source,
-    contents,
-    repacked,
-)
+from nfriction.export.torch_archive import METADATA, own_program
 from nfriction.friction.models import FrictionModel
-from nfriction.io.files import parse_json
 from nfriction.io.model_file import ModelInfo
-
-# All that archives of ours hold.
-_SCRIPT = re.compile(
-    r"data\.pkl|code/__torch__/[\w./]+\.py(\.debug_pkl)?|constants/\d+|constants\.pkl|version"
-    r"|byteorder|\.data/(serialization_id|version)|extra/nfriction\.json"
-)
-_PROGRAM = re.compile(
-    r"data/weights/(weight_\d+|model_weights_config\.json)"
-    r"|data/constants/(tensor_\d+|model_constants_config\.json)"
-    r"|data/sample_inputs/model\.pt|models/model\.json|extra/nfriction\.json"
-    r"|archive_format|archive_version|byteorder|version|\.data/(version|serialization_id|.*)"
-)
 
 
 def torchscript(
@@ -86,18 +63,23 @@ def torchscript(
         model, info, torque_limit=torque_limit, with_filter=with_filter, cutoff_hz=cutoff_hz
     )
     contract = contract_of(model, controller, info)
-    buffer = io.BytesIO()  # into memory, so that the temporary file's name is not kept inside
-    with silent():
-        scripted = _compile(controller)
-        torch.jit.save(scripted, buffer, _extra_files={METADATA: contract.to_json()})
 
-    def loaded(path: Path) -> tuple[Contract, Runner]:
+    def runner(path: Path) -> Runner:
         with silent():
             module = torch.jit.load(str(path))
         _check_torque(controller, module, contract)
-        return contract, _script_runner(module, contract)
+        return _script_runner(module, controller)
 
-    return write_verified(path, buffer.getvalue(), loaded, "TorchScript")
+    content = _script(controller, contract.to_json())
+    return write_verified(path, content, contract, runner, "TorchScript")
+
+
+def _script(controller: Controller, metadata: str) -> bytes:
+    """The artefact's content."""
+    buffer = io.BytesIO()  # into memory, so that the temporary file's name is not kept inside
+    with silent():
+        torch.jit.save(_compile(controller), buffer, _extra_files={METADATA: metadata})
+    return buffer.getvalue()
 
 
 @torch.no_grad()
@@ -111,12 +93,12 @@ def _check_torque(controller: Controller, module: Any, contract: Contract) -> No
         raise ExportError(f"the TorchScript differs from its model by {error:.1e} of full scale.")
 
 
-def _script_runner(module: Any, contract: Contract) -> Runner:
+def _script_runner(module: Any, controller: Controller) -> Runner:
     """Torque, coefficients and status of samples (sample, joint) in order."""
 
     @torch.no_grad()
     def run(*inputs: Tensor) -> tuple[Tensor, ...]:
-        if not contract.state_size:
+        if not controller.state_size:
             return tuple(module.step(*inputs))
         # The load, which comes last, has no part in the state.
         start = module.initial_state(*(x[0] for x in inputs[:-1]))
@@ -125,47 +107,11 @@ def _script_runner(module: Any, contract: Contract) -> Runner:
     return run
 
 
-def open_torchscript(path: str | Path) -> tuple[Contract, Runner]:
-    """Load an artefact; returns its contract, and how to run it.
-
-    A damaged file can end the process in `torch.jit.load`; see `verify_artefact`.
-    """
-
-    def load(files: dict[str, bytes]) -> Any:
-        for name, content in files.items():
-            check_source(name, content)
-        # Pickles of line numbers are not looked at, and so not handed on.
-        needed = {name: x for name, x in files.items() if not name.endswith(".debug_pkl")}
-        module = torch.jit.load(repacked(needed), map_location="cpu")
-        if not hasattr(module, "step"):
-            raise ExportError("a TorchScript, but none of nfriction: it has no `step`.")
-        for name in _methods(module):
-            check_script(getattr(module, name).inlined_graph)
-        return module
-
-    module, contract = _opened(path, _SCRIPT, "TorchScript", load)
-    return contract, _script_runner(module, contract)
-
-
-def _opened(
-    path: str | Path, ours: re.Pattern[str], what: str, load: Callable[[dict[str, bytes]], Any]
-) -> tuple[Any, Contract]:
-    """Read an archive: the result of `load` for its files, and its contract."""
-    files = contents(path, ours, what)
-    try:
-        contract = Contract.from_json(files.get(f"extra/{METADATA}", b""))
-        with silent():
-            return load(files), contract
-    except ContractError:
-        raise
-    except ExportError as error:
-        raise ExportError(f"{path}: {error}") from None
-    except RecursionError:
-        raise ExportError(f"{path}: nested without end.") from None
-    except (RuntimeError, ArithmeticError, AttributeError, AssertionError, LookupError, TypeError,
-            ValueError) as error:  # fmt: skip
-        reason = first_line(error)
-        raise ExportError(f"{path}: damaged, or no {what} of nfriction ({reason}).") from error
+def script_runner(path: str | Path, controller: Controller) -> Runner:
+    """Load a TorchScript; its program must be that of the controller, its numbers need not be."""
+    with silent():
+        module = torch.jit.load(own_program(path, _script(controller, "")), map_location="cpu")
+    return _script_runner(module, controller)
 
 
 class _Host(nn.Module):
@@ -280,6 +226,17 @@ def pt2(
         model, info, torque_limit=torque_limit, with_filter=with_filter, cutoff_hz=cutoff_hz
     )
     contract = contract_of(model, controller, info)
+
+    def runner(path: Path) -> Runner:
+        with silent():
+            return _program_runner(torch.export.load(path), controller)
+
+    content = _program(controller, contract.to_json())
+    return write_verified(path, content, contract, runner, "program")
+
+
+def _program(controller: Controller, metadata: str) -> bytes:
+    """The artefact's content."""
     program = exported(controller)
     try:
         program.example_inputs = None  # torch would pickle them
@@ -291,39 +248,25 @@ def pt2(
         node.meta = {key: value for key, value in node.meta.items() if key == "val"}
     buffer = io.BytesIO()  # into memory, so that the temporary file's name is not kept inside
     with silent():
-        torch.export.save(program, buffer, extra_files={METADATA: contract.to_json()})
-    return write_verified(path, buffer.getvalue(), open_pt2, "program")
+        torch.export.save(program, buffer, extra_files={METADATA: metadata})
+    return buffer.getvalue()
 
 
-def open_pt2(path: str | Path) -> tuple[Contract, Runner]:
-    """Load an artefact; returns its contract, and how to run it.
-
-    A damaged one may lead torch to errors of its own besides; see `verify_artefact`.
-    """
-
-    def load(files: dict[str, bytes]) -> Any:
-        _refuse_pickles(files)
-        return torch.export.load(repacked(files)).module()
-
-    module, contract = _opened(path, _PROGRAM, "program", load)
+def _program_runner(program: torch.export.ExportedProgram, controller: Controller) -> Runner:
+    module = program.module()
 
     @torch.no_grad()
     def run(*inputs: Tensor) -> tuple[Any, ...]:
-        return run_from_nan(module, inputs, contract.state_size)
+        return run_from_nan(module, inputs, controller.state_size)
 
-    return contract, run
+    return run
 
 
-def _refuse_pickles(files: Mapping[str, bytes]) -> None:
-    """Refuse files that are more than tensors and JSON: torch would unpickle them."""
-    check_program(parse_json(files["models/model.json"]))
-    for name, content in files.items():
-        if name.endswith("_config.json"):
-            config = parse_json(content)["config"]
-            if any(entry["use_pickle"] for entry in config.values()):
-                raise ExportError("it holds pickled objects, which are refused.")
-        if name.endswith(".pt") and content:
-            raise ExportError("it holds pickled inputs, which are refused.")
+def program_runner(path: str | Path, controller: Controller) -> Runner:
+    """Load a `.pt2`; its program must be that of the controller, its numbers need not be."""
+    with silent():
+        program = torch.export.load(own_program(path, _program(controller, "")))
+        return _program_runner(program, controller)
 
 
 def run_from_nan(step: Any, inputs: Sequence[Tensor], state_size: int) -> tuple[Any, ...]:

@@ -16,10 +16,11 @@ from nfriction.evaluation.torque_tables import (
     score_models,
     split,
 )
-from nfriction.export.torch_files import open_torchscript
+from nfriction.export.controller import controller_of
 from nfriction.fitting.torque_table import fit_joint, join
 from nfriction.recording.torque_table import TorqueTable, blocks
 from nfriction.report.torque import write_torque_fits
+from tests.export.artefacts import runner_of
 
 
 def motion(rows: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -152,7 +153,7 @@ def test_exports_give_the_predicted_torque(tmp_path: Path) -> None:
     found = fit_torque(table, "stribeck")
     model, info = found.model("stribeck"), found.info("stribeck")
     path = nfriction.export.torchscript(model, tmp_path / "model.pt", info)
-    _, run = open_torchscript(path)
+    run = runner_of(path, controller_of(model, info))
     qd = torch.tensor(table[["qd1", "qd2"]].to_numpy())
     torque = run(qd, torch.zeros_like(qd), torch.ones_like(qd))[0].numpy()
     np.testing.assert_allclose(torque, np.stack(found.predict(table), 1), rtol=1e-12)
