@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from nfriction.evaluation.cross_validation import TOLERANCE, Candidate
 from nfriction.evaluation.results import RESULTS
 from nfriction.fitting.options import DEFAULTS, FitOptions
-from nfriction.fitting.strategy.holdout import gains
+from nfriction.fitting.result.paired_test import gains
 from nfriction.fitting.torque_table import (
     LEAD_IN,
     JointFit,
@@ -361,7 +361,7 @@ def _choose(candidates: Sequence[Candidate]) -> tuple[str, str]:
 
 
 def _need(name: str) -> tuple[bool, bool]:
-    """Whether a model needs memory, and whether it needs a load."""
+    """Need of memory, and of a load, of a model by name."""
     return model_by_name(name).definition.memory is not None, reads_load(model_by_name(name)(1))
 
 
