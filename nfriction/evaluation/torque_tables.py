@@ -19,7 +19,7 @@ from nfriction.evaluation.cross_validation import TOLERANCE, Candidate
 from nfriction.evaluation.results import RESULTS
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.recorded import ripple_shift
-from nfriction.fitting.strategy.holdout import gains
+from nfriction.fitting.result.paired_test import gains
 from nfriction.fitting.torque_table import (
     LEAD_IN,
     JointFit,

@@ -18,8 +18,7 @@ from nfriction.export.contract import (
 )
 from nfriction.export.controller import Controller, controller_of
 from nfriction.export.onnx_file import contract_of_onnx, onnx_runner
-from nfriction.export.torch_archive import contract_of_archive
-from nfriction.export.torch_files import program_runner, script_runner
+from nfriction.export.torch_files import contract_of_archive, program_runner, script_runner
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import ModelInfo
 

@@ -17,9 +17,8 @@ from torch import Tensor
 
 from nfriction.fitting.hysteresis import TOLERANCE, MemoryFit, fit_slip, range_of
 from nfriction.fitting.options import DEFAULTS
+from nfriction.fitting.result.paired_test import gains, student_quantile
 from nfriction.fitting.shooting.autocorrelation import effective_noise
-from nfriction.fitting.strategy.continuation import student_quantile
-from nfriction.fitting.strategy.holdout import gains
 from nfriction.friction.hysteresis import TERMS, Recorded
 from nfriction.friction.neurofuzzy import PRIOR_SD
 from nfriction.recording.torque_table import JointTorque

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from nfriction.export import ContractError, ExportError, pt2, torchscript, verify_artefact
-from nfriction.export.torch_archive import METADATA
+from nfriction.export.torch_files import METADATA
 from nfriction.friction.models import LFM
 from tests.export.artefacts import INFO
 

@@ -8,7 +8,7 @@ import torch
 from nfriction.export import pt2
 from nfriction.export.contract import compare, draw
 from nfriction.export.controller import controller_of
-from nfriction.export.torch_archive import METADATA
+from nfriction.export.torch_files import METADATA
 from nfriction.friction.models import FrictionModel
 from tests.export.artefacts import INFO, rising, runner_of
 from tests.friction.samples import motion, named_models
