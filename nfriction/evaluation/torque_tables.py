@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from nfriction.evaluation.cross_validation import TOLERANCE, Candidate
 from nfriction.evaluation.results import RESULTS
 from nfriction.fitting.options import DEFAULTS, FitOptions
+from nfriction.fitting.strategy.holdout import gains
 from nfriction.fitting.torque_table import (
     LEAD_IN,
     JointFit,
@@ -25,6 +26,7 @@ from nfriction.fitting.torque_table import (
     fit_network,
     join,
     predict,
+    reads_load,
     require_load,
     turning_velocity,
 )
@@ -334,7 +336,41 @@ def _laws_for(table: TorqueTable) -> tuple[str, ...]:
 
 
 def _choose(candidates: Sequence[Candidate]) -> tuple[str, str]:
-    """The model with the fewest parameters whose error is within a tolerance of the least.
+    """The model to use and why.
+
+    A law that needs memory, or a load, has to be better than the choice among those that need less
+    by more than chance explains over the blocks, by the rules for networks and for their inputs:
+    what is particular to one run of few strokes is not seen again in the next.
+    """
+    by_need: dict[tuple[bool, bool], list[Candidate]] = {}
+    for candidate in candidates:
+        by_need.setdefault(_need(candidate.name), []).append(candidate)
+    first, *others = sorted(by_need)
+    chosen, why = _simplest(by_need[first])
+    for need in others:
+        more = by_need[need]
+        best, reason = _simplest(more)
+        new, old = (torch.tensor(c.errors).square() for c in (best, chosen))
+        if gains(new, old, DEFAULTS.input_chance if need[1] else DEFAULTS.gain_chance):
+            chosen, why = best, f"{_percent(chosen, best)} % less than {plain_name(chosen.name)}"
+            why += f"; {reason}" * (len(more) > 1)
+        elif best.error < chosen.error:
+            gain = f"{plain_name(best.name)} has {_percent(chosen, best)} % less"
+            why += f"; {gain}, which the blocks' scatter explains"
+    return chosen.name, why
+
+
+def _need(name: str) -> tuple[bool, bool]:
+    """Whether a model needs memory, and whether it needs a load."""
+    return model_by_name(name).definition.memory is not None, reads_load(model_by_name(name)(1))
+
+
+def _percent(more: Candidate, less: Candidate) -> str:
+    return f"{100 * (1 - less.error / more.error):.0f}"
+
+
+def _simplest(candidates: Sequence[Candidate]) -> tuple[Candidate, str]:
+    """The model with the fewest parameters whose error is within a tolerance of the least, and why.
 
     The scatter over blocks of one run is no measure here: the blocks at rest are unlike the others.
     """
@@ -344,14 +380,14 @@ def _choose(candidates: Sequence[Candidate]) -> tuple[str, str]:
     chosen = min(near, key=lambda c: (c.parameters, ":" in plain_name(c.name), c.error))
     if chosen is not least:
         number = "fewer" if chosen.parameters < least.parameters else "no more"
-        return chosen.name, (
+        return chosen, (
             f"within {100 * TOLERANCE:g} % of the least, of {plain_name(least.name)}, with "
             f"{number} parameters"
         )
     others = sorted(c.error for c in candidates if c is not least)
     if not others:
-        return least.name, "the only model"
-    return least.name, f"the next has {100 * (others[0] / least.error - 1):.0f} % more"
+        return least, "the only model"
+    return least, f"the next has {100 * (others[0] / least.error - 1):.0f} % more"
 
 
 def _fit(

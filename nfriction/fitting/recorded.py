@@ -77,10 +77,14 @@ class Rules:
                 )
         error = joint.tau - found.torque
         self.size = float(np.sqrt(np.mean(joint.tau**2)))
-        self.noise = max(effective_noise(torch.tensor(error)[None, :, None]), 1e-12 * self.size)
+        self.noise = self.noise_of(error)
         self.ripple = _Ripple.of(joint, error, blocks) if "ripple" in self.sets else None
         if self.ripple is None:
             self.sets.pop("ripple", None)
+
+    def noise_of(self, error: Array) -> float:
+        """Noise that leaves such an error, with its autocorrelation [N m; N]."""
+        return max(effective_noise(torch.tensor(error)[None, :, None]), 1e-12 * self.size)
 
     def chosen(self, found: MemoryFit) -> tuple[list[str], Array]:
         """Inputs that blocks left out gain by, and the squared errors there, (block,)."""
@@ -164,18 +168,19 @@ def fit_recorded(
     torque = found.torque
     if names:
         rules.set(names, found.torque)
-        # The law once more, to the torque without what the rules explain.
         inputs = recorded_inputs(joint)
-        at = [
-            schedule.corrected(torch.full((len(joint), 1), x).double(), inputs) for x in (0.0, 1.0)
-        ]
-        ripple, both = (x.detach().numpy()[:, 0] for x in at)
-        alone = replace(joint, tau=(joint.tau - ripple) / np.maximum(both - ripple, LEAST))
-        found = fit_slip(alone, blocks, loaded=False)
+
+        def corrected(torque: Array) -> Array:
+            with torch.no_grad():
+                return schedule.corrected(torch.tensor(torque)[:, None], inputs).numpy()[:, 0]
+
+        # The law once more, to the torque without what the rules explain, and they by what is left.
+        ripple, both = (corrected(np.full(len(joint), x)) for x in (0.0, 1.0))
+        alone = (joint.tau - ripple) / np.maximum(both - ripple, LEAST)
+        found = fit_slip(replace(joint, tau=alone), blocks, loaded=False)
+        rules.noise = rules.noise_of(joint.tau - corrected(found.torque))
         rules.set(names, found.torque)
-        torque = (
-            schedule.corrected(torch.tensor(found.torque)[:, None], inputs).detach().numpy()[:, 0]
-        )
+        torque = corrected(found.torque)
     lengths = np.array([len(block) for block in blocks])
     return replace(found, torque=torque, errors=tuple(np.sqrt(squares / lengths).tolist()))
 

@@ -7,7 +7,7 @@ With f the torque function of a law and c the coefficients that its schedule giv
 The next step is `nfriction.simulation.rk4`, the motion of a mechanism with friction.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from inspect import signature
 from typing import Any, ClassVar
 
@@ -171,15 +171,24 @@ class NamedModel(FrictionModel):
         v_smooth: float = V_SMOOTH,
         **options: Any,
     ) -> None:
-        # Behind the law, the joints and the initial values; cells are those of a schedule's own.
-        known = [name for name in signature(self.make_schedule).parameters if name != "cells"][3:]
-        if unknown := [name for name in options if name not in known]:
-            raise ValueError(
-                f"{type(self).__name__} has no option {', '.join(unknown)}; "
-                f"it has {', '.join(known) or 'none'}."
-            )
+        # What a class takes by a name of its own comes with the schedule's options.
+        given = signature(type(self)).parameters.values()
+        own = [p.name for p in given if p.kind is p.KEYWORD_ONLY and p.name != "v_smooth"]
+        require_options(type(self).__name__, self.make_schedule, options, own)
         schedule = self.make_schedule(self.definition, joints, initial, **options)
         super().__init__(self.definition, schedule, v_smooth)
+
+
+def require_options(
+    of: str, make: Callable[..., Schedule], given: Iterable[str], own: Iterable[str] = ()
+) -> None:
+    """Raise ValueError for options that neither a schedule has nor the model that makes it."""
+    # Behind the law, the joints and the initial values; cells are those of a schedule's own.
+    known = [*own, *[name for name in signature(make).parameters if name != "cells"][3:]]
+    if unknown := [name for name in given if name not in known]:
+        raise ValueError(
+            f"{of} has no option {', '.join(unknown)}; it has {', '.join(known) or 'none'}."
+        )
 
 
 class ConstantModel(NamedModel):

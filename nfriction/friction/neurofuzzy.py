@@ -2,7 +2,7 @@
 
 import math
 import reprlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pkgutil import resolve_name
 from typing import Any, Final, Literal
 
@@ -13,7 +13,7 @@ from nfriction.friction import laws
 from nfriction.friction.coefficients import Constant, Schedule
 from nfriction.friction.inputs import with_inputs
 from nfriction.friction.laws import Law
-from nfriction.friction.models import V_SMOOTH, FrictionModel, NamedModel
+from nfriction.friction.models import V_SMOOTH, FrictionModel, NamedModel, require_options
 from nfriction.friction.parameters import Sensitivity, positive_number
 from nfriction.fuzzy import AnfisRBF
 from nfriction.fuzzy.membership import FuzzyRules
@@ -480,8 +480,9 @@ class NeuroFuzzyModel(NamedModel):
     def make_schedule(*args: Any, network: str = "anfis", **options: Any) -> Schedule:
         if network not in NETWORKS:
             raise ValueError(f"`network` must be one of {sorted(NETWORKS)}, got {network!r}.")
-        schedule: Schedule = resolve_name(NETWORKS[network])(*args, **options)
-        return schedule
+        made: Callable[..., Schedule] = resolve_name(NETWORKS[network])
+        require_options(f"network {network!r}", made, options, ("network", "inputs"))
+        return made(*args, **options)
 
 
 class NFNCFM(NeuroFuzzyModel):

@@ -20,7 +20,7 @@ from nfriction.friction.sampled import sampled
 F64 = torch.float64
 STEP = 2e-3
 INFO = ModelInfo(sample_time=STEP)
-HYSTERESIS = [0.1, 0.2, 0.05, 0.3, 0.1, 0.2, 0.03, 1e-3, 0.0]
+HYSTERESIS = [0.1, 0.2, 0.3, 0.1, 0.2, 0.03, 1e-3, 0.0]
 HYSTERESIS += [*[0.05] * ELEMENTS, *[10.0 ** (0.2 * k - 4) for k in range(ELEMENTS)]]
 
 

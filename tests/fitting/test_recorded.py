@@ -49,8 +49,9 @@ def test_temperature_and_ripple_are_found_and_predict_another_run(found: TorqueF
     assert abs(float(fit.model.schedule.period[0]) - PERIOD) < 1e-3 * PERIOD
     other = recorded(seed=5)
     plain, own = (float(found.score(other, name)["rmse"].iloc[0]) for name in found.fits)
-    assert own < 0.4 * plain
-    assert own < 0.08
+    assert own < 0.2 * plain
+    # The noise has 0.02.
+    assert own < 0.04
 
 
 def test_what_friction_does_not_follow_is_dropped() -> None:

@@ -148,10 +148,18 @@ def test_nan_in_nan_out() -> None:
             assert torch.equal(torch.isnan(model(*inputs)), torch.isnan(expected)), (name, which)
 
 
-@pytest.mark.parametrize("name", ["NFLuGre", "NFDahl", "LFM"])
-def test_an_option_that_a_model_lacks_is_named(name) -> None:
-    with pytest.raises(ValueError, match=f"{name} has no option inputs; it has"):
-        model_by_name(name)(2, inputs=["direction"])
+@pytest.mark.parametrize(
+    ("name", "of", "known"),
+    [
+        ("NFLuGre", "NFLuGre", "terms"),
+        ("LFM", "LFM", "none"),
+        ("MaxwellSlip", "MaxwellSlip", "elements"),
+        ("NFLFM", "network 'anfis'", "network, inputs, terms"),
+    ],
+)
+def test_an_option_that_a_model_lacks_is_named(name, of, known) -> None:
+    with pytest.raises(ValueError, match=f"{of} has no option depth; it has {known}"):
+        model_by_name(name)(2, depth=3)
 
 
 def test_options_are_those_given() -> None:

@@ -164,12 +164,12 @@ def result_from_shooting(
 
 def scale_warning(problem: ShootingProblem, intervals: Sequence[Interval]) -> tuple[str, ...]:
     """A sentence if all of a driven rig seems heavier or lighter alike: then torques are wrong."""
-    found = [i for i in intervals if i.name.startswith(("inertia", "gravity"))]
+    found = list(_relative_weights(problem.jacobian.plant, intervals))
     if len(found) < 2 or not problem.windows.tau.any():
         return ()
-    scale = sum(i.value for i in found) / len(found)
+    scale = sum(found) / len(found)
     # One of them alone may be off by so much; their common share is what a torque's scale moves.
-    alike = all(abs(i.value - scale) < ALIKE * abs(scale) and i.low * i.high > 0 for i in found)
+    alike = all(abs(x - scale) < ALIKE * abs(scale) for x in found)
     if not alike or abs(scale) < problem.options.gain_term[1]:
         return ()
     return (
@@ -177,6 +177,25 @@ def scale_warning(problem: ShootingProblem, intervals: Sequence[Interval]) -> tu
         f"recorded {1 + scale:.3g} times too large (torque constant, gear ratio, unit); then "
         "friction is, too.",
     )
+
+
+def _relative_weights(plant: Plant, intervals: Sequence[Interval]) -> Iterator[float]:
+    """Relative changes of each link's gravity and inertia, 0 where it may be none.
+
+    Link and rotor of a geared joint count as one, since the data show their sum alone.
+    """
+    terms, own = {i.name: i for i in intervals}, dict(plant.named_buffers())
+    for k in range(plant.joints - plant.first_link):
+        inertia = terms.get(f"inertia {k + 1}{k + 1}")
+        rotor = terms.get(f"armature {k + 1 + plant.first_link}")
+        alone = [terms.get(f"gravity {k + 1}"), inertia if rotor is None else None]
+        for term in alone:
+            if term is not None:
+                yield term.value if term.low * term.high > 0 else 0.0
+        if inertia is not None and rotor is not None:
+            sizes = own["inertia_coupling"][k, k], own["armature"][k + plant.first_link]
+            moved = sizes[0] * inertia.value + sizes[1] * rotor.value
+            yield float(moved / (sizes[0] + sizes[1]))
 
 
 def outliers_of(problem: ShootingProblem, weights: Tensor) -> Iterator[Outliers]:

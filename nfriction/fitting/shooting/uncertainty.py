@@ -139,7 +139,7 @@ def torque_response(
 
     The noise is that part of a torque which changes from sample to sample, see `white_noise`;
     None without any, or without the recordings. A torque that is off moves all samples after it,
-    so these errors last.
+    so these errors last. Draws whose simulation diverges are left out.
     """
     sd = white_noise(problem.windows.tau).numpy()
     if not (problem.windows.recordings and sd.any()):
@@ -154,7 +154,8 @@ def torque_response(
         noisy = replace(problem.windows, recordings=recordings)
         noisy = replace(noisy, tau=noisy.torque_at(0.0)[0])
         found.append((_positions(replace(problem, windows=noisy), x) - exact) / SMALL)
-    return torch.stack(found, -1)
+    kept = [off for off in found if torch.isfinite(off).all()]
+    return torch.stack(kept, -1) if kept else None
 
 
 def _positions(problem: ShootingProblem, x: Tensor) -> Tensor:

@@ -275,7 +275,7 @@ def horizon_continuation(
             # The cost far from the minimum says nothing about its value; the last stage's does.
             near = weighted_cost(stages[-1].residuals, noise) if stages else None
             tolerance = loglik_tolerance(near or float(problem.cost(start)), options)
-        name = f"{length:g} s windows{of}"
+        name = f"{problem.windows.length:g} s windows{of}"
         found = fitter.search(problem, start, tolerance, name)
         ends = [found]
         if equation_error is not None and not found.stopped and (last or not stages):
