@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nfriction.export.c_file import c_runner, contract_of_c
+from nfriction.export.c_file import c_contract, c_runner
 from nfriction.export.contract import (
     Contract,
     ContractError,
@@ -24,7 +24,7 @@ from nfriction.io.model_file import ModelInfo
 
 # Readers of an artefact's contract, and what runs it for a controller, by the file's ending.
 KINDS: dict[str, tuple[Callable[[Path], Contract], Callable[[Path, Controller], Runner]]] = {
-    ".c": (contract_of_c, lambda path, _: c_runner(path)),
+    ".c": (c_contract, lambda path, _: c_runner(path)),
     ".pt": (contract_of_archive, script_runner),
     ".pt2": (contract_of_archive, program_runner),
     ".onnx": (contract_of_onnx, onnx_runner),
