@@ -77,7 +77,11 @@ def require_options(
 ) -> None:
     """Raise ValueError for options that neither a schedule has nor the model that makes it."""
     # Behind the law, the joints and the initial values; cells are those of a schedule's own.
-    known = [*own, *[name for name in signature(make).parameters if name != "cells"][3:]]
+    taken = [p for p in signature(make).parameters.values() if p.name != "cells"][3:]
+    if any(p.kind is p.VAR_KEYWORD for p in taken):
+        # It hands options on, and refuses those itself.
+        return
+    known = [*own, *(p.name for p in taken)]
     if unknown := [name for name in given if name not in known]:
         raise ValueError(
             f"{of} has no option {', '.join(unknown)}; it has {', '.join(known) or 'none'}."
