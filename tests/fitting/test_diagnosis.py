@@ -258,6 +258,7 @@ def test_an_elastic_joint_is_named_and_doubtful():
     assert float(named) == pytest.approx(resonance, rel=0.15)
     # Simulations follow the motion all the same.
     assert found.usability[0] == "doubtful"
+    assert replace(found, converged=False).usability[0] == "do not use"
 
 
 def test_a_recording_of_another_rig_is_named():
