@@ -269,8 +269,8 @@ class Simulator:
         with torch.no_grad():
             run = rollout(
                 self.plant, self.friction, torch.tensor(q0), torch.tensor(qd0), tau,
-                sample_time=step, substeps=finer * self.substeps, scheme=self.scheme, hidden_state=memory,
-                law_state=law_state,
+                sample_time=step, substeps=finer * self.substeps, scheme=self.scheme,
+                hidden_state=memory, law_state=law_state,
             )  # fmt: skip
         q = self.convention.position_from_joint(run.q.numpy(), first_link)
         return q, run.diverged_at.numpy()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,7 +18,8 @@ from numpy.typing import NDArray
 from nfriction.evaluation.cross_validation import TOLERANCE, Candidate
 from nfriction.evaluation.results import RESULTS
 from nfriction.fitting.options import DEFAULTS, FitOptions
-from nfriction.fitting.strategy.holdout import gains
+from nfriction.fitting.recorded import ripple_shift
+from nfriction.fitting.result.paired_test import gains
 from nfriction.fitting.torque_table import (
     LEAD_IN,
     JointFit,
@@ -31,7 +33,7 @@ from nfriction.fitting.torque_table import (
     turning_velocity,
 )
 from nfriction.friction import model_by_name, model_name, plain_name
-from nfriction.friction.hysteresis import LOAD_SLIP, SLIP, unused
+from nfriction.friction.hysteresis import LOAD_SLIP, SLIP, Recorded, unused
 from nfriction.friction.models import FrictionModel
 from nfriction.io.files import parse_json
 from nfriction.io.model_file import ModelInfo, load, load_info
@@ -41,6 +43,8 @@ from nfriction.recording.torque_table import JointTorque, TorqueTable, as_table,
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
+
+logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
@@ -170,7 +174,8 @@ class TorqueFits:
         """Errors of `predict` by joint: model, rmse [N m; N], nrmse [-]."""
         given = as_table(table, unit=self.table.unit)
         torques = self.predict(given, model)
-        pairs = zip(given.joints, torques, self._names(model), strict=True)
+        models = [self.fits[name][k].model for k, name in enumerate(self._names(model))]
+        pairs = zip(given.joints, torques, models, strict=True)
         return scores_frame([score_joint(*pair) for pair in pairs])
 
     def to_frame(self) -> pd.DataFrame:
@@ -361,7 +366,7 @@ def _choose(candidates: Sequence[Candidate]) -> tuple[str, str]:
 
 
 def _need(name: str) -> tuple[bool, bool]:
-    """Whether a model needs memory, and whether it needs a load."""
+    """Needs of a model: memory, and a load."""
     return model_by_name(name).definition.memory is not None, reads_load(model_by_name(name)(1))
 
 
@@ -429,17 +434,26 @@ def _fit(
     return found, Candidate(name, tuple(errors[best].tolist()), count, found.converged)
 
 
-def score_joint(joint: JointTorque, torque: Array, model: str) -> TorqueScore:
-    """Error of a torque predicted at the rows of a joint.
+def score_joint(joint: JointTorque, torque: Array, model: FrictionModel) -> TorqueScore:
+    """Error of a torque that a model of one joint predicts at the rows of a joint.
 
-    The lead-in of a law with memory is not scored, because its torque was read.
+    The lead-in of a law with memory is not scored, because its torque was read. A ripple that is
+    out of phase with the rows is logged.
     """
     rows = slice(None)
-    if joint.time is not None and model_by_name(model).definition.memory is not None:
+    if joint.time is not None and model.law.memory is not None:
         # Scoring them would reward reading the answer.
         rows = slice(int(np.searchsorted(joint.time, joint.time[0] + LEAD_IN)), None)
+    if isinstance(model.schedule, Recorded) and "ripple" in model.schedule.followed():
+        shift = ripple_shift(model.schedule, joint, torque, blocks(joint, FOLDS))
+        if shift:
+            logger.warning(
+                "%s: the ripple over the position is out of phase with this table, as with another "
+                "zero of the encoder; add %.4g to its positions, or take slip.", joint.name, shift,
+            )  # fmt: skip
     rmse = float(np.sqrt(np.mean((torque - joint.tau)[rows] ** 2)))
-    return TorqueScore(joint.name, model, rmse, rmse / (float(joint.tau[rows].std()) or math.nan))
+    nrmse = rmse / (float(joint.tau[rows].std()) or math.nan)
+    return TorqueScore(joint.name, type(model).__name__, rmse, nrmse)
 
 
 def scores_frame(scores: Sequence[TorqueScore]) -> pd.DataFrame:
@@ -503,7 +517,7 @@ def score_models(models: Sequence[SavedModel], table: TorqueTable) -> pd.DataFra
     _check_joints([one.joint for one in models], table)
     return scores_frame(
         [
-            score_joint(joint, predict(one.model, joint).numpy(), type(one.model).__name__)
+            score_joint(joint, predict(one.model, joint).numpy(), one.model)
             for one, joint in zip(models, table.joints, strict=True)
         ]
     )

@@ -94,7 +94,7 @@ def c(
         f"{name}_selftest.c": dialect.text("selftest.c", **words, **_vectors(contract, dialect)),
         f"{name}.hpp": dialect.text("wrapper.hpp", **words),
         f"{name}_sfun.c": dialect.text("simulink.c", **words),
-        f"{name}.ino": dialect.text("arduino.ino", **words),
+        f"{name}.ino": dialect.text("arduino.ino", **words, loaded=controller.loaded),
     }
     return [write_atomically(Path(folder) / key, text.encode("ascii"))
             for key, text in files.items()]  # fmt: skip

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from nfriction.fitting.options import DEFAULTS
-from nfriction.fitting.strategy.holdout import gains
+from nfriction.fitting.result.paired_test import gains
 from nfriction.friction.hysteresis import (
     DROP,
     ELEMENTS,

@@ -54,6 +54,19 @@ def test_temperature_and_ripple_are_found_and_predict_another_run(found: TorqueF
     assert own < 0.04
 
 
+def test_another_zero_of_the_encoder_is_named(
+    found: TorqueFits, caplog: pytest.LogCaptureFixture
+) -> None:
+    other = recorded(seed=6)
+    found.score(other)
+    assert not caplog.records
+    found.score(other.assign(q=other["q"] - 0.25 * PERIOD))
+    (record,) = caplog.records
+    assert "out of phase with this table" in record.getMessage()
+    assert record.args is not None
+    assert record.args[1] == pytest.approx(0.25 * PERIOD, abs=PERIOD / 24)  # type: ignore[index]
+
+
 def test_what_friction_does_not_follow_is_dropped() -> None:
     found = fit_torque(recorded(ripple=0.0, warm=0.0), "slip,neuro-fuzzy:slip")
     assert found.chosen == {"joint1": "Slip"}
