@@ -248,8 +248,9 @@ def pt2(
     contract = contract_of(model, controller, info)
 
     def runner(path: Path) -> Runner:
+        # As bytes, for torch warns of files of another ending, as the temporary one has.
         with silent():
-            return _program_runner(torch.export.load(path), controller)
+            return _program_runner(torch.export.load(io.BytesIO(path.read_bytes())), controller)
 
     content = _program(controller, contract.to_json())
     return write_verified(path, content, contract, runner, "program")

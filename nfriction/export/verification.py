@@ -95,7 +95,17 @@ def verify_artefact(
     inputs = draw(controller, count, seed)
     if contract.description["dtype"] == "float32":
         inputs = tuple(x.float().double() for x in inputs)
-    run = runner(path, controller)
+    differences = tuple(
+        f"{what} {str(contract.description.get(key))[:16]} instead of {own.description[key][:16]}"
+        for what, key in (("model", "model"), ("parameters", "parameter_hash"))
+        if contract.description.get(key) != own.description[key]
+    )
+    try:
+        run = runner(path, controller)
+    except ExportError as error:
+        if not differences:
+            raise
+        raise ExportError(f"{error} It was made of another one: {differences[0]}.") from None
     try:
         # First, since it refuses the outputs of another law by their shapes.
         at_points = compare(controller.run(*inputs), run(*inputs), own.tolerance, own.scales)
@@ -105,12 +115,6 @@ def verify_artefact(
         if isinstance(error, (ExportError, ContractError)):
             raise
         raise ExportError(f"{path}: cannot be run by its metadata ({error}).") from error
-    differences = tuple(
-        f"its {name} are not the model's ({str(contract.description.get(key))[:16]}, "
-        f"not {own.description[key][:16]})"
-        for name, key in (("model", "model"), ("parameters", "parameter_hash"))
-        if contract.description.get(key) != own.description[key]
-    )
     return Verdict(at_vectors, at_points, differences)
 
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from nfriction.export import ContractError, ExportError, pt2, torchscript, verify_artefact
 from nfriction.export.torch_files import METADATA, contract_of_archive, own_program
-from nfriction.friction.models import LFM
+from nfriction.friction.models import LFM, NLFM
 from tests.export.artefacts import INFO
 
 MODEL = LFM(3, [1e-3, 2e-3])
@@ -77,6 +77,11 @@ def test_a_sound_artefact_passes_and_other_numbers_are_found_out(
     verdict = verify_artefact(packed(tmp_path / f"m{kind}", files), MODEL, INFO, points=50)
     assert not verdict.vectors.passed
     assert 1e-4 < verdict.points.torque_error < 1e-1
+
+
+def test_an_artefact_of_another_law_is_named(artefacts: dict[str, Path]) -> None:
+    with pytest.raises(ExportError, match=r"another one: model LFM instead of NLFM\."):
+        verify_artefact(artefacts[".pt"], NLFM(3), INFO)
 
 
 def test_programs_are_the_same_whatever_was_exported_before(tmp_path: Path) -> None:
