@@ -11,11 +11,11 @@ from nfriction.fitting.data.inputs import measurement_matrix
 from nfriction.fitting.data.windows import cut_windows
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.result.identifiability import information, standard_deviations
+from nfriction.fitting.result.paired_test import log_ratio
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.continuation import (
     ShootingFitter,
     StallMonitor,
-    log_ratio,
     loses,
     settle_states,
 )
