@@ -59,7 +59,8 @@ def draw_motion(controller: Controller, count: int, seed: int = 0) -> Series:
         return low + (high - low) * torch.rand(shape, dtype=torch.float64, generator=generator)
 
     zero = torch.zeros(controller.joints, dtype=torch.float64)
-    load = even(zero, zero + LARGEST_LOAD)
+    # A transmitted torque has a sign.
+    load = even(zero - LARGEST_LOAD * controller.loaded, zero + LARGEST_LOAD)
     qd, qdd = (even(*_widened(edges)) for edges in ranges(controller).values())
     # Near rest the sign turns and the acceleration along the motion with it.
     qd[::3] *= 10.0 ** even(zero - 5.0, zero)[::3]

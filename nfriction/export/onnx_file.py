@@ -25,8 +25,7 @@ from nfriction.export.contract import (
     write_verified,
 )
 from nfriction.export.controller import Controller, controller_of, for_single_precision
-from nfriction.export.torch_archive import METADATA, another_program
-from nfriction.export.torch_files import exported, run_from_nan, silent
+from nfriction.export.torch_files import METADATA, another_program, exported, run_from_nan, silent
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import ModelInfo
 from nfriction.version import __version__
@@ -317,7 +316,7 @@ def onnx_runner(path: str | Path, controller: Controller) -> Runner:
     single = any(port.type.tensor_type.elem_type == 1 for port in file.graph.input)
     dtype = "float32" if single else "float64"
     if _without_numbers(file) != _without_numbers(_file(controller, dtype)):
-        raise ExportError(another_program(path, f"torch {torch.__version__}"))
+        raise ExportError(another_program(path))
     return _runner(file, controller, dtype, path)
 
 

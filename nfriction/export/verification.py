@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nfriction.export.c_file import c_runner, contract_of_c
+from nfriction.export.c_file import c_contract, c_runner
 from nfriction.export.contract import (
     Contract,
     ContractError,
@@ -18,14 +18,13 @@ from nfriction.export.contract import (
 )
 from nfriction.export.controller import Controller, controller_of
 from nfriction.export.onnx_file import contract_of_onnx, onnx_runner
-from nfriction.export.torch_archive import contract_of_archive
-from nfriction.export.torch_files import program_runner, script_runner
+from nfriction.export.torch_files import contract_of_archive, program_runner, script_runner
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import ModelInfo
 
 # Readers of an artefact's contract, and what runs it for a controller, by the file's ending.
 KINDS: dict[str, tuple[Callable[[Path], Contract], Callable[[Path, Controller], Runner]]] = {
-    ".c": (contract_of_c, lambda path, _: c_runner(path)),
+    ".c": (c_contract, lambda path, _: c_runner(path)),
     ".pt": (contract_of_archive, script_runner),
     ".pt2": (contract_of_archive, program_runner),
     ".onnx": (contract_of_onnx, onnx_runner),
@@ -96,7 +95,17 @@ def verify_artefact(
     inputs = draw(controller, count, seed)
     if contract.description["dtype"] == "float32":
         inputs = tuple(x.float().double() for x in inputs)
-    run = runner(path, controller)
+    differences = tuple(
+        f"{what} {str(contract.description.get(key))[:16]} instead of {own.description[key][:16]}"
+        for what, key in (("model", "model"), ("parameters", "parameter_hash"))
+        if contract.description.get(key) != own.description[key]
+    )
+    try:
+        run = runner(path, controller)
+    except ExportError as error:
+        if not differences:
+            raise
+        raise ExportError(f"{error} It was made of another one: {differences[0]}.") from None
     try:
         # First, since it refuses the outputs of another law by their shapes.
         at_points = compare(controller.run(*inputs), run(*inputs), own.tolerance, own.scales)
@@ -106,12 +115,6 @@ def verify_artefact(
         if isinstance(error, (ExportError, ContractError)):
             raise
         raise ExportError(f"{path}: cannot be run by its metadata ({error}).") from error
-    differences = tuple(
-        f"its {name} are not the model's ({str(contract.description.get(key))[:16]}, "
-        f"not {own.description[key][:16]})"
-        for name, key in (("model", "model"), ("parameters", "parameter_hash"))
-        if contract.description.get(key) != own.description[key]
-    )
     return Verdict(at_vectors, at_points, differences)
 
 

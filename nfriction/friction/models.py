@@ -7,7 +7,7 @@ With f the torque function of a law and c the coefficients that its schedule giv
 The next step is `nfriction.simulation.rk4`, the motion of a mechanism with friction.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from inspect import signature
 from typing import Any, ClassVar
 
@@ -18,7 +18,7 @@ from nfriction.friction import laws
 from nfriction.friction.coefficients import Constant, Schedule
 from nfriction.friction.inputs import require_bearing_loads
 from nfriction.friction.laws import Law
-from nfriction.friction.parameters import as_tensor, positive_number
+from nfriction.friction.parameters import as_tensor, positive_number, require_options
 
 # Velocity over which the sign changes [rad/s]; larger values creep, smaller ones make RK4 unstable.
 V_SMOOTH = 3e-3
@@ -177,18 +177,6 @@ class NamedModel(FrictionModel):
         require_options(type(self).__name__, self.make_schedule, options, own)
         schedule = self.make_schedule(self.definition, joints, initial, **options)
         super().__init__(self.definition, schedule, v_smooth)
-
-
-def require_options(
-    of: str, make: Callable[..., Schedule], given: Iterable[str], own: Iterable[str] = ()
-) -> None:
-    """Raise ValueError for options that neither a schedule has nor the model that makes it."""
-    # Behind the law, the joints and the initial values; cells are those of a schedule's own.
-    known = [*own, *[name for name in signature(make).parameters if name != "cells"][3:]]
-    if unknown := [name for name in given if name not in known]:
-        raise ValueError(
-            f"{of} has no option {', '.join(unknown)}; it has {', '.join(known) or 'none'}."
-        )
 
 
 class ConstantModel(NamedModel):

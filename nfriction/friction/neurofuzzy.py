@@ -13,8 +13,8 @@ from nfriction.friction import laws
 from nfriction.friction.coefficients import Constant, Schedule
 from nfriction.friction.inputs import with_inputs
 from nfriction.friction.laws import Law
-from nfriction.friction.models import V_SMOOTH, FrictionModel, NamedModel, require_options
-from nfriction.friction.parameters import Sensitivity, positive_number
+from nfriction.friction.models import V_SMOOTH, FrictionModel, NamedModel
+from nfriction.friction.parameters import Sensitivity, positive_number, require_options
 from nfriction.fuzzy import AnfisRBF
 from nfriction.fuzzy.membership import FuzzyRules
 from nfriction.fuzzy.partition import FreePartition

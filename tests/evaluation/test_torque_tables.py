@@ -209,3 +209,17 @@ def test_a_network_that_was_dropped_is_not_chosen_over_its_law() -> None:
     network = Candidate("NFCVFM", (1.0, 1.0 - 1e-12), 2, True)
     assert _choose([network, law])[0] == _choose([law, network])[0] == "CVFM"
     assert _choose([law, network])[1].endswith("with no more parameters")
+
+
+def test_memory_and_load_have_to_gain_more_than_the_blocks_scatter() -> None:
+    plain = Candidate("CVFM", (1.0, 1.2, 0.8, 1.1, 0.9, 2.0), 2, True)
+    # A single block gains.
+    once = Candidate("Slip", (1.0, 1.2, 0.8, 1.1, 0.9, 1.4), 9, True)
+    steady = Candidate("Slip", (0.5, 0.7, 0.4, 0.6, 0.5, 1.0), 9, True)
+    loaded = Candidate("LoadSlip", (0.4, 0.8, 0.3, 0.5, 0.5, 0.9), 9, True)
+    assert once.error < 0.9 * plain.error
+    name, why = _choose([plain, once])
+    assert name == "CVFM"
+    assert why == "the only model; slip has 12 % less, which the blocks' scatter explains"
+    assert _choose([loaded, steady, plain])[0] == "Slip"
+    assert _choose([steady, plain])[1] == "47 % less than coulomb-viscous"

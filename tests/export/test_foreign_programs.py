@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from nfriction.export import ContractError, ExportError, pt2, torchscript, verify_artefact
-from nfriction.export.torch_archive import METADATA
-from nfriction.friction.models import LFM
+from nfriction.export.torch_files import METADATA, contract_of_archive, own_program
+from nfriction.friction.models import LFM, NLFM
 from tests.export.artefacts import INFO
 
 MODEL = LFM(3, [1e-3, 2e-3])
@@ -48,10 +48,17 @@ def changed(value: Any, key: str, to: Any) -> Any:
     return [changed(v, key, to) for v in value] if isinstance(value, list) else value
 
 
-def refuse(path: Path, monkeypatch: pytest.MonkeyPatch, said: str = "its program is not") -> None:
-    """The file is refused with the reason and without a trace of having been run."""
+def refuse(path: Path, sound: Path) -> None:
+    """The file is refused with the reason, before torch is given anything of it."""
+    contract_of_archive(path)
+    with pytest.raises(ExportError, match=rf"{path.name}: its program is not the one"):
+        own_program(path, sound.read_bytes())
+
+
+def refuse_to_run(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Verification refuses the file without a trace of having run it."""
     monkeypatch.chdir(path.parent)
-    with pytest.raises(ExportError, match=rf"{path.name}: .*{said}"):
+    with pytest.raises(ExportError, match=rf"{path.name}: its program is not the one"):
         verify_artefact(path, MODEL, INFO, points=50)
     assert [x.name for x in path.parent.iterdir()] == [path.name]
 
@@ -70,6 +77,11 @@ def test_a_sound_artefact_passes_and_other_numbers_are_found_out(
     verdict = verify_artefact(packed(tmp_path / f"m{kind}", files), MODEL, INFO, points=50)
     assert not verdict.vectors.passed
     assert 1e-4 < verdict.points.torque_error < 1e-1
+
+
+def test_an_artefact_of_another_law_is_named(artefacts: dict[str, Path]) -> None:
+    with pytest.raises(ExportError, match=r"another one: model LFM instead of NLFM\."):
+        verify_artefact(artefacts[".pt"], NLFM(3), INFO)
 
 
 def test_programs_are_the_same_whatever_was_exported_before(tmp_path: Path) -> None:
@@ -91,14 +103,14 @@ def test_programs_are_the_same_whatever_was_exported_before(tmp_path: Path) -> N
     ],
 )
 def test_a_program_that_torch_would_run_as_python_is_refused(
-    artefacts: dict[str, Path], key: str, to: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    artefacts: dict[str, Path], key: str, to: Any, tmp_path: Path
 ) -> None:
     files = files_of(artefacts[".pt2"])
     document = json.loads(files["models/model.json"])
     evil = changed(document, key, to)
     assert evil != document
     files["models/model.json"] = json.dumps(evil).encode()
-    refuse(packed(tmp_path / "bad.pt2", files), monkeypatch)
+    refuse(packed(tmp_path / "bad.pt2", files), artefacts[".pt2"])
 
 
 @pytest.mark.parametrize(
@@ -111,28 +123,26 @@ def test_a_program_that_torch_would_run_as_python_is_refused(
     ],
 )
 def test_files_that_are_not_ours_are_refused(
-    artefacts: dict[str, Path],
-    name: str,
-    content: bytes,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    artefacts: dict[str, Path], name: str, content: bytes, tmp_path: Path
 ) -> None:
     files = files_of(artefacts[".pt2"]) | {name: content}
-    refuse(packed(tmp_path / "bad.pt2", files), monkeypatch)
+    refuse(packed(tmp_path / "bad.pt2", files), artefacts[".pt2"])
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_no_artefact_is_refused(
-    kind: str, artefacts: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kind: str, artefacts: dict[str, Path], tmp_path: Path
 ) -> None:
     bad = tmp_path / f"bad{kind}"
     for content in (b"", b"junk", artefacts[kind].read_bytes()[:1000]):
         bad.write_bytes(content)
-        refuse(bad, monkeypatch, "no artefact of nfriction")
+        with pytest.raises(ExportError, match=rf"bad{kind}: no artefact of nfriction"):
+            verify_artefact(bad, MODEL, INFO)
     files = files_of(artefacts[kind])
     with zipfile.ZipFile(packed(bad, files), "a") as archive:
         archive.writestr(f"archive/{[*files][-1].upper()}", b"other")
-    refuse(bad, monkeypatch, "twice")
+    with pytest.raises(ExportError, match=rf"bad{kind}: holds .* twice"):
+        verify_artefact(bad, MODEL, INFO)
     packed(bad, files | {f"extra/{METADATA}": b"{}"})
     with pytest.raises(ContractError):
         verify_artefact(bad, MODEL, INFO)
@@ -180,7 +190,7 @@ def test_a_script_that_does_more_than_arithmetic_is_refused(
     with warnings.catch_warnings():  # newer versions of torch deprecate it
         warnings.simplefilter("ignore")
         torch.jit.save(torch.jit.script(kind()), str(path), _extra_files=metadata)
-    refuse(path, monkeypatch)
+    refuse_to_run(path, monkeypatch)
 
 
 def test_a_script_that_runs_as_it_is_loaded_is_refused(
@@ -189,4 +199,4 @@ def test_a_script_that_runs_as_it_is_loaded_is_refused(
     evil = b'load: Tensor, x: Tensor=torch.from_file("attacked", True, 8))'
     files = {n: x.replace(b"load: Tensor)", evil) for n, x in files_of(artefacts[".pt"]).items()}
     assert any(evil in x for x in files.values())
-    refuse(packed(tmp_path / "bad.pt", files), monkeypatch)
+    refuse_to_run(packed(tmp_path / "bad.pt", files), monkeypatch)

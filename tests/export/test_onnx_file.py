@@ -14,7 +14,7 @@ from nfriction.export import ExportError, onnx, verify_artefact
 from nfriction.export.contract import ContractError, compare, draw
 from nfriction.export.controller import controller_of
 from nfriction.export.onnx_file import contract_of_onnx
-from nfriction.export.torch_archive import METADATA
+from nfriction.export.torch_files import METADATA
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.models import LFM, FrictionModel

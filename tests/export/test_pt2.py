@@ -1,5 +1,6 @@
 """torch.export programs: equal to the model at any batch."""
 
+import logging
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,7 @@ import torch
 from nfriction.export import pt2
 from nfriction.export.contract import compare, draw
 from nfriction.export.controller import controller_of
-from nfriction.export.torch_archive import METADATA
+from nfriction.export.torch_files import METADATA
 from nfriction.friction.models import FrictionModel
 from tests.export.artefacts import INFO, rising, runner_of
 from tests.friction.samples import motion, named_models
@@ -65,3 +66,9 @@ def test_any_batch(written: Path, batch: int) -> None:
 
 def test_it_replaces_the_file_whole_and_leaves_nothing_else(written: Path) -> None:
     assert list(written.parent.iterdir()) == [written]
+
+
+def test_it_is_written_without_a_word(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        pt2(MODELS["NCFM"], tmp_path / "m.pt2", INFO)
+    assert not caplog.records

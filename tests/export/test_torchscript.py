@@ -13,7 +13,7 @@ from torch import Tensor
 from nfriction.export import ExportError, torchscript
 from nfriction.export.contract import compare, draw, draw_motion
 from nfriction.export.controller import controller_of
-from nfriction.export.torch_archive import METADATA, contract_of_archive
+from nfriction.export.torch_files import METADATA, contract_of_archive
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law, TorqueFunction
 from nfriction.friction.models import LFM, FrictionModel

@@ -1,5 +1,7 @@
 """Where recordings never were, a network stays with its constant law."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -160,3 +162,16 @@ def test_what_is_only_held_is_not_taken_for_told_by_the_data():
     mistaken = openness(CoefficientUncertainty(model.schedule, covariance_root(known)[:n]))
     assert (told >= (1 - 1e-6) * mistaken).all()
     assert told.median() > 1.3 * mistaken.median()
+
+
+@pytest.mark.parametrize(("prior_sd", "steps"), [(0.03, 20), (0.3, 1)])
+def test_error_bars_know_a_tight_prior_and_a_search_cut_short(prior_sd, steps):
+    model, truth = network(), network(0.3)
+    start = torch.zeros_like(model.schedule.parameter_vector())
+    tight = (start, torch.full_like(start, prior_sd))
+    p = replace(problem(model, None), friction_prior=tight)
+    run = p.simulate(p.variables.start()).motion
+    found = result_from_shooting(model, p, solve(p, p.variables.start(), max_steps=steps), ())
+    off = (model.schedule(run.qd, run.qdd) - truth.schedule(run.qd, run.qdd)).abs()
+    bars = 1.96 * found.uncertainty.sd(run.qd, run.qdd)
+    assert (off < bars).double().mean() > 0.9

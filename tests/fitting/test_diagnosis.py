@@ -258,6 +258,7 @@ def test_an_elastic_joint_is_named_and_doubtful():
     assert float(named) == pytest.approx(resonance, rel=0.15)
     # Simulations follow the motion all the same.
     assert found.usability[0] == "doubtful"
+    assert replace(found, converged=False).usability[0] == "do not use"
 
 
 def test_a_recording_of_another_rig_is_named():
@@ -299,9 +300,10 @@ def test_lost_counts_and_missing_samples_are_named_with_their_time():
     assert not any("jumps" in warning for warning in warnings_of(plant, q, tau))
 
 
-def test_torques_of_a_wrong_scale_are_named():
-    """They fit a rig that is heavier throughout, within what is allowed."""
-    plant, q, tau = measured("direct")
+@pytest.mark.parametrize("name", ["direct", "motor"])
+def test_torques_of_a_wrong_scale_are_named(name):
+    """They fit a rig that is heavier throughout, within what is allowed; with a gear, too."""
+    plant, q, tau = measured(name)
     recording = Recording(STEP * np.arange(len(q)), q, 1.2 * tau, convention="relative,upright")
     found = fit(CVFM(1), plant, recording, windows=(0.5,))
     assert any("as if torques were recorded 1.2 times too large" in w for w in found.warnings)

@@ -245,8 +245,8 @@ def test_sets_move_and_the_evidence_rises_where_even_sets_are_wrong(
 ):
     recording, trials, adapted = where_even_sets_are_wrong, [], []
 
-    def record(self, trial, noise, *, learn_sets):
-        adapted.append(adapt(self, trial, noise, learn_sets=learn_sets))
+    def record(self, trial, noise, stride, *, learn_sets):
+        adapted.append(adapt(self, trial, noise, stride, learn_sets=learn_sets))
         return adapted[-1]
 
     def once(self, trial):

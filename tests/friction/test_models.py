@@ -149,17 +149,18 @@ def test_nan_in_nan_out() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "of", "known"),
+    ("name", "of", "known", "options"),
     [
-        ("NFLuGre", "NFLuGre", "terms"),
-        ("LFM", "LFM", "none"),
-        ("MaxwellSlip", "MaxwellSlip", "elements"),
-        ("NFLFM", "network 'anfis'", "network, inputs, terms"),
+        ("NFLuGre", "NFLuGre", "terms", {}),
+        ("LFM", "LFM", "none", {}),
+        ("MaxwellSlip", "MaxwellSlip", "elements", {}),
+        ("NFLFM", "network 'anfis'", "network, inputs, terms", {}),
+        ("NFLFM", "network 'by_class'", "memory, terms", {"network": "by_class", "terms": (2, 2)}),
     ],
 )
-def test_an_option_that_a_model_lacks_is_named(name, of, known) -> None:
+def test_an_option_that_a_model_lacks_is_named(name, of, known, options) -> None:
     with pytest.raises(ValueError, match=f"{of} has no option depth; it has {known}"):
-        model_by_name(name)(2, depth=3)
+        model_by_name(name)(2, depth=3, **options)
 
 
 def test_options_are_those_given() -> None:

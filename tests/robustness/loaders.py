@@ -37,7 +37,7 @@ from nfriction.export.contract import (
 )
 from nfriction.export.controller import controller_of
 from nfriction.export.onnx_file import contract_of_onnx, onnx_runner
-from nfriction.export.torch_archive import contract_of_archive, own_program
+from nfriction.export.torch_files import contract_of_archive, own_program
 from nfriction.io.files import checked_json
 from nfriction.io.formats import measurements
 from nfriction.io.model_file import ModelFileError, load, load_info, load_plant, parameter_hash

@@ -161,7 +161,7 @@ class FitResult:
             )
         reasons = [f"a mistake in data or rig is likely: {x}" for x in self.mistakes[:1]]
         # A regression on torques follows no motion that would excuse a mistake.
-        if reasons and (wrong or self.noise is None):
+        if reasons and (wrong or not self.converged or self.noise is None):
             return "do not use", reasons[0]
         if wrong and not self.converged:
             return "do not use", f"the search did not converge, and {far}"

@@ -1,6 +1,8 @@
 """The result of a search or a regression: intervals and warnings."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import torch
@@ -35,6 +37,7 @@ from nfriction.fitting.shooting.uncertainty import (
 )
 from nfriction.fitting.shooting.variables import model_at
 from nfriction.friction.models import FrictionModel
+from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.optim.least_squares import LeastSquaresResult
 from nfriction.plant import Plant
 from nfriction.signals import Motion
@@ -164,12 +167,12 @@ def result_from_shooting(
 
 def scale_warning(problem: ShootingProblem, intervals: Sequence[Interval]) -> tuple[str, ...]:
     """A sentence if all of a driven rig seems heavier or lighter alike: then torques are wrong."""
-    found = [i for i in intervals if i.name.startswith(("inertia", "gravity"))]
+    found = list(_relative_weights(problem.jacobian.plant, intervals))
     if len(found) < 2 or not problem.windows.tau.any():
         return ()
-    scale = sum(i.value for i in found) / len(found)
+    scale = sum(found) / len(found)
     # One of them alone may be off by so much; their common share is what a torque's scale moves.
-    alike = all(abs(i.value - scale) < ALIKE * abs(scale) and i.low * i.high > 0 for i in found)
+    alike = all(abs(x - scale) < ALIKE * abs(scale) for x in found)
     if not alike or abs(scale) < problem.options.gain_term[1]:
         return ()
     return (
@@ -177,6 +180,25 @@ def scale_warning(problem: ShootingProblem, intervals: Sequence[Interval]) -> tu
         f"recorded {1 + scale:.3g} times too large (torque constant, gear ratio, unit); then "
         "friction is, too.",
     )
+
+
+def _relative_weights(plant: Plant, intervals: Sequence[Interval]) -> Iterator[float]:
+    """Relative changes of each link's gravity and inertia, 0 where it may be none.
+
+    Link and rotor of a geared joint count as one, since the data show their sum alone.
+    """
+    terms, own = {i.name: i for i in intervals}, dict(plant.named_buffers())
+    for k in range(plant.joints - plant.first_link):
+        inertia = terms.get(f"inertia {k + 1}{k + 1}")
+        rotor = terms.get(f"armature {k + 1 + plant.first_link}")
+        alone = [terms.get(f"gravity {k + 1}"), inertia if rotor is None else None]
+        for term in alone:
+            if term is not None:
+                yield term.value if term.low * term.high > 0 else 0.0
+        if inertia is not None and rotor is not None:
+            sizes = own["inertia_coupling"][k, k], own["armature"][k + plant.first_link]
+            moved = sizes[0] * inertia.value + sizes[1] * rotor.value
+            yield float(moved / (sizes[0] + sizes[1]))
 
 
 def outliers_of(problem: ShootingProblem, weights: Tensor) -> Iterator[Outliers]:
@@ -205,16 +227,18 @@ def _identifiability(
 
     Of a network only its plant terms have intervals, and no parameter counts as unidentifiable.
     """
+    off = torch.zeros_like(result.x)
+    constant = not problem.friction.schedule.follows_motion
+    if isinstance(problem.friction.schedule, NeuroFuzzy):
+        problem, off = _by_data(problem, result.x)
     variables, options = problem.variables, problem.options
     count, friction_count = variables.shared_count, variables.friction_count
-    constant = not problem.friction.schedule.follows_motion
     lower, upper = (bound[:count] for bound in variables.bounds())
     fitted = (lower < upper).nonzero().flatten()
     fitted_names = [names[i] for i in fitted.tolist()]
     # Residuals of exactly zero are those of joints that never moved.
     if not torch.isfinite(result.hessian).all() or not effective_noise(residuals) > 0:
         return (), tuple(fitted_names) if constant else (), None
-    # Without the extrapolation prior: where that alone holds a network, the data do not.
     sd = hac_sd(residuals, bandwidth(problem.windows.q, options), options)
     # A contact below breakaway returns to its places, and the rounding there with it, at any lag.
     quantum = encoder_count(problem) if problem.friction.law.memory else None
@@ -222,8 +246,8 @@ def _identifiability(
     rounded = quantum and rms <= options.explained_ratio * quantum / 12**0.5
     known = gathered_information(problem, result.x, sd, quantum if rounded else None)
     known = known.subset(fitted)
-    root = torch.zeros(count, len(fitted), dtype=torch.float64)
-    root[fitted] = covariance_root(known)
+    root = torch.zeros(count, len(fitted) + 1, dtype=torch.float64)
+    root[fitted] = torch.cat([covariance_root(known), off[fitted, None]], 1)
     root[[names.index(name) for name in ambiguous]] = torch.inf
     sd = root.norm(dim=1)
     shown = fitted if constant else fitted[fitted >= friction_count]
@@ -246,18 +270,44 @@ def _identifiability(
     return intervals, unidentifiable, root[:friction_count].clone()
 
 
+def _by_data(problem: ShootingProblem, x: Tensor) -> tuple[ShootingProblem, Tensor]:
+    """A network's problem with hardly any prior, and the step from `x` to its minimum.
+
+    Priors that evidence or hold-out chose keep a network near its law, also where the truth is not,
+    and its search ends in a narrow valley before the minimum. Its intervals are those of a prior of
+    one unit, within which a coefficient varies by its own size, and without the prior on unvisited
+    motion: where that alone holds a network, the data do not. The step is a further error.
+    """
+    schedule = cast("NeuroFuzzy", problem.friction.schedule)
+    own = schedule.prior()
+    mean, sd = problem.friction_prior or own
+    wide = torch.maximum(sd, own[1] / schedule.prior_sd)
+    problem = replace(problem, friction_prior=(mean, wide), extrapolation=None)
+    local = problem.linearise(x)
+    lower, upper = problem.variables.bounds()
+    free = (lower < upper).nonzero().flatten()
+    step, failed = torch.linalg.solve_ex(local.hessian[free][:, free], local.gradient[free])
+    off = torch.zeros_like(x)
+    if not failed and step.isfinite().all():
+        off[free] = step
+    return problem, off
+
+
 def _torque_scale(
     problem: ShootingProblem, result: LeastSquaresResult, motions: Sequence[Motion]
 ) -> tuple[Tensor, Tensor]:
-    """Derivative of the friction torque by each constant coefficient at its joint's peak speed, and
-    the largest torque that moves this joint, (friction parameter,) each.
+    """Largest |derivative| of the friction torque by each constant coefficient at its joint's peak
+    speed, and the largest torque that moves this joint, (friction parameter,) each.
     """
     friction, vector, _, _ = problem.variables.split(result.x)
     speed, moved = peak_dynamics_torque(problem.plant_at(vector), motions, problem.options)
     need = torch.maximum(moved, problem.windows.tau.abs().amax((0, 1)))
     table = friction.reshape(len(speed), -1).clone().requires_grad_()
+    # A gear's loss is a share of the torque, which drives the joint or holds it back.
+    loads = (need, -need) if problem.friction.law.reads_drive else (torch.ones_like(speed),)
     with torch.enable_grad():
         # A law is elementwise, so the sum's gradient is each coefficient's own slope.
-        torque = problem.friction.steady_torque(speed, torch.ones_like(speed), table)
-        (slope,) = torch.autograd.grad(torque.sum(), table)
+        torques = [problem.friction.steady_torque(speed, load, table).sum() for load in loads]
+        slopes = [torch.autograd.grad(torque, table)[0].abs() for torque in torques]
+    slope = torch.stack(slopes).amax(0)
     return slope.flatten(), need[:, None].expand_as(slope).flatten()

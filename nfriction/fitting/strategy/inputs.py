@@ -17,6 +17,7 @@ from nfriction.fitting.data.inputs import adjustable_terms
 from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.result.fit_result import FitResult, InputGain
 from nfriction.fitting.result.of_search import result_from_shooting
+from nfriction.fitting.result.paired_test import gains
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.continuation import (
@@ -25,7 +26,6 @@ from nfriction.fitting.strategy.continuation import (
     settle_states,
     weighted_cost,
 )
-from nfriction.fitting.strategy.holdout import gains
 from nfriction.fitting.task import (
     FitTask,
     constant_prior,

@@ -25,6 +25,7 @@ from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.identifiability import information
 from nfriction.fitting.result.of_search import result_from_shooting
+from nfriction.fitting.result.paired_test import gains
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.shooting.variables import model_at
@@ -38,7 +39,6 @@ from nfriction.fitting.strategy.continuation import (
 from nfriction.fitting.strategy.extrapolation_prior import prior_on_unvisited_cells
 from nfriction.fitting.strategy.holdout import (
     StoppedError,
-    gains,
     holdout_splits,
     holdout_squares,
     holdout_windows,
@@ -370,17 +370,26 @@ class _Validation:
         """A trial trained on at the noise that it left, or itself where that gains too little.
 
         Beside the law's error as noise, sets could hardly move. They move if the evidence favours
-        it.
+        it. Windows that the measurement noise explains cannot judge; there it is trained on as far
+        as its noise falls, since beside too large a noise the priors outweigh the data.
         """
-        noise = min(effective_noise(trial.end.residuals), self.noise)
-        held = self._adapted(trial, noise, learn_sets=False)
-        moved = self._adapted(held, noise, learn_sets=True)
+        residuals, used = trial.end.residuals, trial.end.problem.noise_sd
+        noise = max(min(effective_noise(residuals), self.noise), self.options.min_noise)
+        explained = trial.squares.median() <= self.explained**2
+        if explained and self.options.explained_ratio * noise >= used:
+            return trial
+        # Shorter correlations than the law's let more samples count.
+        stride = min(decimation(residuals, self.options), trial.end.problem.stride)
+        held = self._adapted(trial, noise, stride, learn_sets=False)
+        moved = self._adapted(held, noise, stride, learn_sets=True)
         gained = moved.log_evidence - held.log_evidence
         better = moved if gained > self.options.evidence_gain else held
         judged = self._judged(replace(better, squares=self._errors(better.end)))
-        return judged if gains(judged.squares, trial.squares) else trial
+        if gains(judged.squares, trial.squares):
+            return judged
+        return judged if explained and not gains(trial.squares, judged.squares) else trial
 
-    def _adapted(self, trial: _Trial, noise: float, *, learn_sets: bool) -> _Trial:
+    def _adapted(self, trial: _Trial, noise: float, stride: int, *, learn_sets: bool) -> _Trial:
         """A trial trained on, the prior of each group tightened as far as evidence favours it.
 
         It is never widened: beyond it the model of the errors is not quadratic in the sets.
@@ -397,7 +406,7 @@ class _Validation:
         best, groups = None, schedule.groups()
         for _ in range(self.options.evidence_updates + 1):
             fitter = replace(trial.fitter, friction=model, friction_prior=(mean, sd))
-            problem = fitter.problem(self.splits[0][0], noise, x[: len(mean)], stride=self.stride)
+            problem = fitter.problem(self.splits[0][0], noise, x[: len(mean)], stride=stride)
             tolerance = self.options.evidence_gain / max(float(problem.cost(x)), 1.0)
             end = fitter.search(problem, x, tolerance, "network's sets, hold-out")
             if end.stopped:
@@ -416,8 +425,8 @@ class _Validation:
 
     def _further(self, trial: _Trial, windows: Windows, name: str) -> HorizonResult:
         """The network of a trial, fitted to other windows from where it is."""
-        friction, plant, noise = *trial.end.parts[:2], trial.end.problem.noise_sd
-        problem = trial.fitter.problem(windows, noise, friction, stride=self.stride)
+        (friction, plant, *_), before = trial.end.parts, trial.end.problem
+        problem = trial.fitter.problem(windows, before.noise_sd, friction, stride=before.stride)
         return trial.fitter.search(problem, problem.variables.start(plant), trial.tolerance, name)
 
     def _trial(self, fitter: ShootingFitter, friction: Tensor, name: str) -> _Trial:
