@@ -2,9 +2,9 @@
 
 import math
 import reprlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pkgutil import resolve_name
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, SupportsIndex
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +13,7 @@ from nfriction.friction import laws
 from nfriction.friction.coefficients import Constant, Schedule
 from nfriction.friction.inputs import with_inputs
 from nfriction.friction.laws import Law
-from nfriction.friction.models import V_SMOOTH, FrictionModel, NamedModel
+from nfriction.friction.models import V_SMOOTH, FrictionModel, NamedModel, require_options
 from nfriction.friction.parameters import Sensitivity, positive_number
 from nfriction.fuzzy import AnfisRBF
 from nfriction.fuzzy.membership import FuzzyRules
@@ -118,6 +118,10 @@ class NeuroFuzzy(Schedule):
         if acceleration not in ("along_motion", "signed"):
             raise ValueError(
                 f'`acceleration` must be "along_motion" or "signed", got {acceleration!r}.'
+            )
+        if isinstance(head_units, bool) or not isinstance(head_units, SupportsIndex):
+            raise ValueError(
+                f"`head_units` must be a whole number of units, got {reprlib.repr(head_units)}."
             )
         if not isinstance(terms, list | tuple):
             raise ValueError(
@@ -460,11 +464,16 @@ class NeuroFuzzyModel(NamedModel):
         initial: Tensor | Sequence | None = None,
         *,
         v_smooth: float = V_SMOOTH,
+        network: str = "anfis",
         inputs: Sequence[str] | None = None,
         **options: Any,
     ) -> None:
+        if network not in NETWORKS:
+            raise ValueError(f"`network` must be one of {sorted(NETWORKS)}, got {network!r}.")
+        make: Callable[..., Schedule] = resolve_name(NETWORKS[network])
+        require_options(type(self).__name__, make, options, "inputs")
         law = with_inputs(self.definition, inputs or ())
-        schedule = self.make_schedule(law, joints, initial, **options)
+        schedule = make(law, joints, initial, **options)
         FrictionModel.__init__(self, law, schedule, v_smooth)
         self.inputs = None if inputs is None else list(inputs)
 
@@ -475,13 +484,6 @@ class NeuroFuzzyModel(NamedModel):
 
     def options(self) -> dict[str, Any]:
         return super().options() | ({} if self.inputs is None else {"inputs": self.inputs})
-
-    @staticmethod
-    def make_schedule(*args: Any, network: str = "anfis", **options: Any) -> Schedule:
-        if network not in NETWORKS:
-            raise ValueError(f"`network` must be one of {sorted(NETWORKS)}, got {network!r}.")
-        schedule: Schedule = resolve_name(NETWORKS[network])(*args, **options)
-        return schedule
 
 
 class NFNCFM(NeuroFuzzyModel):

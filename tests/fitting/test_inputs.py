@@ -68,6 +68,8 @@ ONE = torch.ones(6, dtype=torch.float64)
 class Contest:
     """A rival whose law and network leave these errors; without inputs they leave 1.0."""
 
+    found = None
+
     def __init__(self, task, start, of_law=ONE, error=ONE) -> None:
         self.task, self.start, self.validation = task, start, self
         self.of_law, self.final = of_law, error
@@ -88,16 +90,17 @@ def task():
 
 
 @pytest.mark.parametrize(
-    ("rival", "wins", "trained"),
+    ("rival", "driving", "wins", "trained"),
     [
-        ({"of_law": 0.9 * ONE, "error": 0.7 * ONE}, True, True),
-        ({"of_law": 0.9 * ONE, "error": torch.linspace(0.2, 1.6, 6)}, False, True),
-        ({"of_law": 1.1 * ONE, "error": 0.1 * ONE}, False, False),
-        ({"of_law": torch.linspace(0.2, 1.6, 6), "error": 0.1 * ONE}, False, False),
+        ({"of_law": 0.9 * ONE, "error": 0.7 * ONE}, False, True, True),
+        ({"of_law": 0.9 * ONE, "error": 0.7 * ONE}, True, False, True),
+        ({"of_law": 0.9 * ONE, "error": torch.linspace(0.2, 1.6, 6)}, False, False, True),
+        ({"of_law": 1.1 * ONE, "error": 0.1 * ONE}, False, False, False),
+        ({"of_law": torch.linspace(0.2, 1.6, 6), "error": 0.1 * ONE}, False, False, False),
     ],
 )
 def test_inputs_have_to_win_for_the_law_and_for_its_network(
-    task, monkeypatch, rival, wins, trained
+    task, monkeypatch, rival, driving, wins, trained
 ):
     gains, made = (InputGain("direction", 0.5, (0.5, 0.1)),), []
 
@@ -108,6 +111,7 @@ def test_inputs_have_to_win_for_the_law_and_for_its_network(
     monkeypatch.setattr(neurofuzzy, "chosen_inputs", lambda task, start: gains)
     monkeypatch.setattr(neurofuzzy, "widened_start", lambda task, start, names: start)
     monkeypatch.setattr(neurofuzzy, "_Contest", contest)
+    monkeypatch.setattr(neurofuzzy, "drives", lambda found, own: driving and own == 2)
     plain = Contest(task, "law")
     chosen, best = neurofuzzy._with_chosen_inputs(plain)
     (found,) = made

@@ -154,6 +154,21 @@ def test_an_option_that_a_model_lacks_is_named(name) -> None:
         model_by_name(name)(2, inputs=["direction"])
 
 
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"tirms": (3, 3)}, "NFLFM has no option tirms; it has terms"),
+        ({"network": "rbf", "terms": (3, 3)}, "NFLFM has no option terms; it has head_units"),
+        ({"network": "by_class", "depth": 3}, "A network by class has no option depth; it has"),
+        ({"head_units": 2.5}, "`head_units` must be a whole number"),
+        ({"inputs": "load"}, "`inputs` must be different ones of direction, load, got 'load'"),
+    ],
+)
+def test_wrong_options_of_a_network_are_named(given, words) -> None:
+    with pytest.raises(ValueError, match=words):
+        model_by_name("NFLFM")(2, **given)
+
+
 def test_options_are_those_given() -> None:
     options = {
         "terms": [3, 2],

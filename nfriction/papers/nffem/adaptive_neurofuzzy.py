@@ -8,6 +8,7 @@ from torch import Tensor
 
 from nfriction.friction.coefficients import Schedule
 from nfriction.friction.laws import Law
+from nfriction.friction.models import require_options
 from nfriction.friction.neurofuzzy import LEAST_RATIO, NeuroFuzzy, smooth_relu_inverse
 from nfriction.friction.parameters import Sensitivity
 from nfriction.fuzzy.membership import HALF_WIDTH_OF_GAUSSIAN
@@ -57,6 +58,7 @@ class AdaptiveNeuroFuzzy(Schedule):
         **network: Any,
     ) -> None:
         super().__init__(law, joints)
+        require_options("A network by class", NeuroFuzzy, network, "memory")
         self._law = law
         self.adaptive = Adaptive(law, joints, initial, **(memory or {}))
         # The mean over the classes: the network corrects all of them alike.
