@@ -3,14 +3,17 @@
 Prints, for each joint, the NRMSE on contiguous blocks left out: of five models by least squares
 (the baselines of the data cards: offset, Coulomb and viscous; with three Stribeck terms; with
 load-proportional Coulomb friction; five slip elements; all of these), of the best law without
-memory that `nfriction.fit_torque` fits, and of the law that it chooses.
+memory that `nfriction.fit_torque` fits, and of the law that it chooses. With `--splits`, the same
+on rows that no fit has seen: a run's first 60 %, 40 % or half teach and the rest judges, and the
+other way round, relative to the choice among the laws without memory.
 
-    python benchmarks/friction_tables.py --data DATA [--only kr300 ur10 tribometer]
+    python benchmarks/friction_tables.py --data DATA [--only kr300 ur10 tribometer] [--splits]
 """
 
 import argparse
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +33,13 @@ TABLES: dict[str, tuple[str, dict[str, Any]]] = {
         "presliding_tribometer/tribometer_first.csv.gz",
         {"columns": {"q": "position", "tau": "friction", "load": "normal_force"}, "unit": "m"},
     ),
+}
+# Shares of a run that train, and that judge.
+SPLITS = {
+    "60/40": ((0.0, 0.6), (0.6, 1.0)),
+    "40/60": ((0.4, 1.0), (0.0, 0.4)),
+    "1st half": ((0.0, 0.5), (0.5, 1.0)),
+    "2nd half": ((0.5, 1.0), (0.0, 0.5)),
 }
 BASELINES = ("standard", "Stribeck", "load", "5 slip", "all")
 
@@ -63,15 +73,41 @@ def left_out(joint: JointTorque, design: Array, folds: int) -> float:
     return float(np.sqrt(square / len(joint)) / joint.tau.std())
 
 
+def part(table: TorqueTable, share: tuple[float, float]) -> TorqueTable:
+    """Rows of a share of every joint's."""
+    cuts = [[int(x * len(joint)) for x in share] for joint in table.joints]
+    rows = [j.rows(np.arange(*cut)) for j, cut in zip(table.joints, cuts, strict=True)]
+    return replace(table, joints=tuple(rows))
+
+
+def judge_splits(name: str, table: TorqueTable) -> None:
+    """Print NRMSE of the choice over that of the choice without memory, on rows not seen."""
+    print(f"\n{name}: NRMSE on other rows over that of the choice without memory")
+    print(f"{'':10}" + "".join(f"{joint:>22}" for joint in table.joint_names))
+    for split, (train, test) in SPLITS.items():
+        taught, unseen = part(table, train), part(table, test)
+        every = nfriction.fit_torque(taught)
+        without = [n for n, fits in every.fits.items() if fits[0].model.law.memory is None]
+        plain = nfriction.fit_torque(taught, without).score(unseen)["nrmse"]
+        found = every.score(unseen)
+        ratios = found["nrmse"] / plain
+        pairs = zip(ratios, found["model"], strict=True)
+        print(f"{split:10}" + "".join(f"{r:12.3f} {m:>9}" for r, m in pairs), flush=True)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--data", type=Path, required=True, help="folder of the real recordings")
     parser.add_argument("--only", nargs="+", choices=TABLES, default=list(TABLES))
     parser.add_argument("--folds", type=int, default=10)
+    parser.add_argument("--splits", action="store_true", help="judge on parts of a run not seen")
     arguments = parser.parse_args(argv)
     for name in arguments.only:
         path, options = TABLES[name]
         table = TorqueTable.read(arguments.data / path, **options)
+        if arguments.splits:
+            judge_splits(name, table)
+            continue
         begin = time.perf_counter()
         found = nfriction.fit_torque(table, folds=arguments.folds)
         errors = found.to_frame()

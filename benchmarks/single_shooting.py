@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from nfriction import Recording
+from nfriction.fitting.adjusted_plant import PlantParameter, adjusted_buffers
 from nfriction.fitting.fit import fit
-from nfriction.fitting.plant_parameters import PlantParameter, adjusted_buffers, plant_parameters
+from nfriction.fitting.plant_parameters import plant_parameters
 from nfriction.friction.models import FrictionModel
 from nfriction.simulation.rollout import rollout
 from nfriction.simulation.validate import required_substeps

@@ -1,6 +1,7 @@
 """How the package hangs together: arrows point one way, and a few habits hold everywhere."""
 
 import ast
+import importlib
 import re
 import subprocess
 import sys
@@ -134,6 +135,17 @@ def test_the_allowed_arrows_make_no_circle() -> None:
 def test_folders_of_scripts_are_no_packages(folder: str) -> None:
     # With one, `datasets/` would hide another package of that name.
     report([str(p.relative_to(ROOT)) for p in (ROOT / folder).rglob("__init__.py")])
+
+
+def test_scripts_import_what_is_there() -> None:
+    lost = []
+    for folder in ("datasets", "trainers", "examples", "benchmarks"):
+        for path in (ROOT / folder).rglob("*.py"):
+            for node in nodes(path)[ast.ImportFrom]:
+                if (node.module or "").split(".")[0] == "nfriction":
+                    there = dir(importlib.import_module(node.module))
+                    lost += [f"{path.name}: {n.name}" for n in node.names if n.name not in there]
+    report(lost)
 
 
 def test_no_public_name_hides_a_module() -> None:

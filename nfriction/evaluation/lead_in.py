@@ -215,8 +215,12 @@ class Simulator:
             drawn, _ = self.simulate(state + starts.deviations[k : k + at_once], samples, noise=k)
             apart = (self._as_read(drawn, measured) - q)[:, :, scored]
             squares[k : k + at_once] = np.mean(apart**2, axis=(1, 2))
+        squares += self._noise_beyond_rounding(starts)
+        if self.draws and np.isfinite(squares).all():
+            finer, _ = self.simulate(state, samples, finer=2)
+            squares += np.mean((finer - q)[:, scored] ** 2, axis=(0, 1))
         return Runs(
-            samples, q, (q - measured)[:, scored], squares + self._noise_beyond_rounding(starts),
+            samples, q, (q - measured)[:, scored], squares,
             float((self.time[samples[:, 0]] + diverged_at).min()),
         )  # fmt: skip
 
@@ -230,7 +234,11 @@ class Simulator:
         return np.mean(np.maximum(starts.noise**2 - self.quantum**2 / 12, 0.0), axis=0)
 
     def simulate(
-        self, states: Array, samples: NDArray[np.intp], noise: int | None = None
+        self,
+        states: Array,
+        samples: NDArray[np.intp],
+        noise: int | None = None,
+        finer: int = 1,
     ) -> tuple[Array, Array]:
         """Positions (*batch, window, sample, joint), and when they diverged (*batch, window).
 
@@ -239,6 +247,7 @@ class Simulator:
             samples: (window, sample).
             noise: seed of noise that is added to the torque, as large as the recorded one; None
                 for none.
+            finer: factor of the integration steps to a sample.
         """
         joints, first_link = self.plant.joints, self.plant.first_link
         if self.substeps is None:
@@ -260,8 +269,8 @@ class Simulator:
         with torch.no_grad():
             run = rollout(
                 self.plant, self.friction, torch.tensor(q0), torch.tensor(qd0), tau,
-                sample_time=step, substeps=self.substeps, scheme=self.scheme, hidden_state=memory,
-                law_state=law_state,
+                sample_time=step, substeps=finer * self.substeps, scheme=self.scheme,
+                hidden_state=memory, law_state=law_state,
             )  # fmt: skip
         q = self.convention.position_from_joint(run.q.numpy(), first_link)
         return q, run.diverged_at.numpy()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,6 +18,8 @@ from numpy.typing import NDArray
 from nfriction.evaluation.cross_validation import TOLERANCE, Candidate
 from nfriction.evaluation.results import RESULTS
 from nfriction.fitting.options import DEFAULTS, FitOptions
+from nfriction.fitting.recorded import ripple_shift
+from nfriction.fitting.result.paired_test import gains
 from nfriction.fitting.torque_table import (
     LEAD_IN,
     JointFit,
@@ -25,11 +28,12 @@ from nfriction.fitting.torque_table import (
     fit_network,
     join,
     predict,
+    reads_load,
     require_load,
     turning_velocity,
 )
 from nfriction.friction import model_by_name, model_name, plain_name
-from nfriction.friction.hysteresis import LOAD_SLIP, SLIP, unused
+from nfriction.friction.hysteresis import LOAD_SLIP, SLIP, Recorded, unused
 from nfriction.friction.models import FrictionModel
 from nfriction.io.files import parse_json
 from nfriction.io.model_file import ModelInfo, load, load_info
@@ -39,6 +43,8 @@ from nfriction.recording.torque_table import JointTorque, TorqueTable, as_table,
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
+
+logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
@@ -168,7 +174,8 @@ class TorqueFits:
         """Errors of `predict` by joint: model, rmse [N m; N], nrmse [-]."""
         given = as_table(table, unit=self.table.unit)
         torques = self.predict(given, model)
-        pairs = zip(given.joints, torques, self._names(model), strict=True)
+        models = [self.fits[name][k].model for k, name in enumerate(self._names(model))]
+        pairs = zip(given.joints, torques, models, strict=True)
         return scores_frame([score_joint(*pair) for pair in pairs])
 
     def to_frame(self) -> pd.DataFrame:
@@ -334,7 +341,41 @@ def _laws_for(table: TorqueTable) -> tuple[str, ...]:
 
 
 def _choose(candidates: Sequence[Candidate]) -> tuple[str, str]:
-    """The model with the fewest parameters whose error is within a tolerance of the least.
+    """The model to use and why.
+
+    A law that needs memory, or a load, has to be better than the choice among those that need less
+    by more than chance explains over the blocks, by the rules for networks and for their inputs:
+    what is particular to one run of few strokes is not seen again in the next.
+    """
+    by_need: dict[tuple[bool, bool], list[Candidate]] = {}
+    for candidate in candidates:
+        by_need.setdefault(_need(candidate.name), []).append(candidate)
+    first, *others = sorted(by_need)
+    chosen, why = _simplest(by_need[first])
+    for need in others:
+        more = by_need[need]
+        best, reason = _simplest(more)
+        new, old = (torch.tensor(c.errors).square() for c in (best, chosen))
+        if gains(new, old, DEFAULTS.input_chance if need[1] else DEFAULTS.gain_chance):
+            chosen, why = best, f"{_percent(chosen, best)} % less than {plain_name(chosen.name)}"
+            why += f"; {reason}" * (len(more) > 1)
+        elif best.error < chosen.error:
+            gain = f"{plain_name(best.name)} has {_percent(chosen, best)} % less"
+            why += f"; {gain}, which the blocks' scatter explains"
+    return chosen.name, why
+
+
+def _need(name: str) -> tuple[bool, bool]:
+    """Needs of a model: memory, and a load."""
+    return model_by_name(name).definition.memory is not None, reads_load(model_by_name(name)(1))
+
+
+def _percent(more: Candidate, less: Candidate) -> str:
+    return f"{100 * (1 - less.error / more.error):.0f}"
+
+
+def _simplest(candidates: Sequence[Candidate]) -> tuple[Candidate, str]:
+    """The model with the fewest parameters whose error is within a tolerance of the least, and why.
 
     The scatter over blocks of one run is no measure here: the blocks at rest are unlike the others.
     """
@@ -344,14 +385,14 @@ def _choose(candidates: Sequence[Candidate]) -> tuple[str, str]:
     chosen = min(near, key=lambda c: (c.parameters, ":" in plain_name(c.name), c.error))
     if chosen is not least:
         number = "fewer" if chosen.parameters < least.parameters else "no more"
-        return chosen.name, (
+        return chosen, (
             f"within {100 * TOLERANCE:g} % of the least, of {plain_name(least.name)}, with "
             f"{number} parameters"
         )
     others = sorted(c.error for c in candidates if c is not least)
     if not others:
-        return least.name, "the only model"
-    return least.name, f"the next has {100 * (others[0] / least.error - 1):.0f} % more"
+        return least, "the only model"
+    return least, f"the next has {100 * (others[0] / least.error - 1):.0f} % more"
 
 
 def _fit(
@@ -393,17 +434,26 @@ def _fit(
     return found, Candidate(name, tuple(errors[best].tolist()), count, found.converged)
 
 
-def score_joint(joint: JointTorque, torque: Array, model: str) -> TorqueScore:
-    """Error of a torque predicted at the rows of a joint.
+def score_joint(joint: JointTorque, torque: Array, model: FrictionModel) -> TorqueScore:
+    """Error of a torque that a model of one joint predicts at the rows of a joint.
 
-    The lead-in of a law with memory is not scored, because its torque was read.
+    The lead-in of a law with memory is not scored, because its torque was read. A ripple that is
+    out of phase with the rows is logged.
     """
     rows = slice(None)
-    if joint.time is not None and model_by_name(model).definition.memory is not None:
+    if joint.time is not None and model.law.memory is not None:
         # Scoring them would reward reading the answer.
         rows = slice(int(np.searchsorted(joint.time, joint.time[0] + LEAD_IN)), None)
+    if isinstance(model.schedule, Recorded) and "ripple" in model.schedule.followed():
+        shift = ripple_shift(model.schedule, joint, torque, blocks(joint, FOLDS))
+        if shift:
+            logger.warning(
+                "%s: the ripple over the position is out of phase with this table, as with another "
+                "zero of the encoder; add %.4g to its positions, or take slip.", joint.name, shift,
+            )  # fmt: skip
     rmse = float(np.sqrt(np.mean((torque - joint.tau)[rows] ** 2)))
-    return TorqueScore(joint.name, model, rmse, rmse / (float(joint.tau[rows].std()) or math.nan))
+    nrmse = rmse / (float(joint.tau[rows].std()) or math.nan)
+    return TorqueScore(joint.name, type(model).__name__, rmse, nrmse)
 
 
 def scores_frame(scores: Sequence[TorqueScore]) -> pd.DataFrame:
@@ -467,7 +517,7 @@ def score_models(models: Sequence[SavedModel], table: TorqueTable) -> pd.DataFra
     _check_joints([one.joint for one in models], table)
     return scores_frame(
         [
-            score_joint(joint, predict(one.model, joint).numpy(), type(one.model).__name__)
+            score_joint(joint, predict(one.model, joint).numpy(), one.model)
             for one, joint in zip(models, table.joints, strict=True)
         ]
     )

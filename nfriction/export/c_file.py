@@ -21,7 +21,6 @@ from nfriction.export.contract import (
     Contract,
     ContractError,
     ExportError,
-    Runner,
     contract_of,
 )
 from nfriction.export.controller import controller_of
@@ -95,7 +94,7 @@ def c(
         f"{name}_selftest.c": dialect.text("selftest.c", **words, **_vectors(contract, dialect)),
         f"{name}.hpp": dialect.text("wrapper.hpp", **words),
         f"{name}_sfun.c": dialect.text("simulink.c", **words),
-        f"{name}.ino": dialect.text("arduino.ino", **words),
+        f"{name}.ino": dialect.text("arduino.ino", **words, loaded=controller.loaded),
     }
     return [write_atomically(Path(folder) / key, text.encode("ascii"))
             for key, text in files.items()]  # fmt: skip
@@ -170,8 +169,17 @@ def beside(source: str | Path) -> Path:
 
 
 def c_contract(source: str | Path) -> Contract:
-    """The contract that lies beside an exported C file."""
-    return Contract.from_json(beside(source).read_text("utf-8"))
+    """Read the contract that lies beside an exported C file, which must be named as it was."""
+    source, metadata = Path(source), beside(source)
+    if not metadata.is_file():
+        raise ContractError(f"{source}: its metadata, {metadata.name}, do not lie beside it.")
+    if max(source.stat().st_size, metadata.stat().st_size) > LARGEST_FILE:
+        raise ExportError(f"{source}: too large for a controller of nfriction.")
+    if not is_identifier(source.stem):
+        raise ContractError(
+            f"{source}: the file is named as its functions are; give it its old name."
+        )
+    return Contract.from_json(metadata.read_text("utf-8"))
 
 
 def c_runner(source: str | Path, flags: Sequence[str] = FLAGS) -> Callable[..., tuple[Any, ...]]:
@@ -195,21 +203,6 @@ def c_runner(source: str | Path, flags: Sequence[str] = FLAGS) -> Callable[..., 
         return tau, coefficients, status
 
     return run
-
-
-def open_c(path: str | Path) -> tuple[Contract, Runner]:
-    """Compile a controller's C; returns the contract beside it, and how to run it."""
-    path = Path(path)
-    metadata = beside(path)
-    if not metadata.is_file():
-        raise ContractError(f"{path}: its metadata, {metadata.name}, do not lie beside it.")
-    if max(path.stat().st_size, metadata.stat().st_size) > LARGEST_FILE:
-        raise ExportError(f"{path}: too large for a controller of nfriction.")
-    if not is_identifier(path.stem):
-        raise ContractError(
-            f"{path}: the file is named as its functions are; give it its old name."
-        )
-    return c_contract(path), c_runner(path)
 
 
 def _library(source: Path, filters: bool, flags: Sequence[str]) -> ctypes.CDLL:

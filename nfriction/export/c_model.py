@@ -64,6 +64,7 @@ def source_of(
         "state_size": controller.memory_size,
         "filter_size": FILTER_STATE if controller.filters else 0,
         "filter": controller,
+        "loaded": controller.loaded,
         "load": plant is not None and _reads_load(controller.model),
         "bits": description["status_bits"],
         # Names and units are foreign text.
@@ -348,14 +349,16 @@ def _schedule(controller: Controller, dialect: ControllerC) -> str:
     def coefficients(qd: Tensor, qdd: Tensor) -> Tensor:
         return schedule(qd, qdd).expand(joints, -1)
 
-    def advanced(qd: Tensor, qdd: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
-        following = schedule.advance(qd, qdd, last)
+    def advanced(qd: Tensor, qdd: Tensor, load: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
+        following = schedule.advance_loaded(qd, qdd, load, last)
         found = schedule.coefficients_from(qd, qdd, following)
         return found.expand(joints, -1), following
 
     if not controller.remembers:
         return _function("nf_schedule", trace(coefficients, motion), ("c",), dialect)
-    state = {**motion, "last": _example(joints, controller.memory_size)}
+    state = {
+        **motion, "load": _example(joints), "last": _example(joints, controller.memory_size)
+    }  # fmt: skip
     start = trace(schedule.initial_state, motion)
     return "\n".join([
         _function("nf_schedule_start", start, ("next",), dialect),
@@ -375,8 +378,10 @@ def _function(name: str, program: Program, outputs: Sequence[str], dialect: Cont
         for i, node in enumerate(port.nodes):
             targets.append(f"c[{i % columns}][{i // columns}]" if output == "c" else f"next[{i}]")
             nodes.append(node)
-    arguments = [f"const REAL {port.name}[NF_JOINTS]" for port in program.inputs[:2]]
-    arguments += [f"const REAL *{port.name}" for port in program.inputs[2:]]
+    arguments = [
+        f"const REAL *{p.name}" if p.name == "last" else f"const REAL {p.name}[NF_JOINTS]"
+        for p in program.inputs
+    ]
     kinds = {"c": "REAL c[NF_COEFFICIENTS][NF_JOINTS]", "next": "REAL *next"}
     arguments += [kinds[output] for output in sorted(outputs, reverse=True)]
     head = dialect.own(f"static void {name}(\n    {', '.join(arguments)})")

@@ -59,7 +59,8 @@ def draw_motion(controller: Controller, count: int, seed: int = 0) -> Series:
         return low + (high - low) * torch.rand(shape, dtype=torch.float64, generator=generator)
 
     zero = torch.zeros(controller.joints, dtype=torch.float64)
-    load = even(zero, zero + LARGEST_LOAD)
+    # A transmitted torque has a sign.
+    load = even(zero - LARGEST_LOAD * controller.loaded, zero + LARGEST_LOAD)
     qd, qdd = (even(*_widened(edges)) for edges in ranges(controller).values())
     # Near rest the sign turns and the acceleration along the motion with it.
     qd[::3] *= 10.0 ** even(zero - 5.0, zero)[::3]
@@ -405,13 +406,16 @@ def _array(x: Any) -> np.ndarray:
 
 
 def write_verified(
-    path: str | Path, content: bytes, opener: Callable[[Path], tuple[Contract, Runner]], kind: str
+    path: str | Path,
+    content: bytes,
+    contract: Contract,
+    runner: Callable[[Path], Runner],
+    kind: str,
 ) -> Path:
-    """Write an artefact, read it again and compare it with its model before it takes its place."""
+    """Write an artefact, run it and compare it with its model before it takes its place."""
     with atomic_write(path) as temporary:
         temporary.write_bytes(content)
-        contract, run = opener(temporary)
-        parity = verify(run, contract)
+        parity = verify(runner(temporary), contract)
         if not parity.passed:
             raise ExportError(f"the {kind} differs from its model: {parity}.")
     return Path(path)

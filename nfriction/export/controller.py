@@ -82,7 +82,7 @@ class Controller(nn.Module):
     load, or position and load with the filter inside: velocity is then the difference of the
     position through a causal second-order low-pass filter, acceleration the difference of that
     velocity through the same filter again. An input that is not finite leaves the state of its
-    joint as it was, a load that is not finite does not.
+    joint as it was, a load only where it moves the state.
 
     Args:
         model, info, torque_limit: see `controller_of`.
@@ -112,6 +112,7 @@ class Controller(nn.Module):
     clamps: Final[bool]
     limited: Final[bool]
     remembers: Final[bool]
+    loaded: Final[bool]
     filters: Final[bool]
 
     def __init__(
@@ -134,6 +135,7 @@ class Controller(nn.Module):
         self.register_buffer("torque_limit", _limit(torque_limit, model.joints))
         self.memory_size = model.state_size
         self.remembers = self.memory_size > 0
+        self.loaded = model.schedule.loaded
         self.filters = low_pass is not None
         self.inputs = ("q", "load") if self.filters else ("qd", "qdd", "load")
         self.state_size = self.memory_size + (FILTER_STATE if self.filters else 0)
@@ -183,9 +185,10 @@ class Controller(nn.Module):
         qd_seen, qdd_seen, outside = self.seen(qd, qdd)
         motion = qd.abs() + qdd.abs()
         if self.remembers:
-            following = self.model.schedule.advance(qd_seen, qdd_seen, memory)
+            given = motion + load.abs() if self.loaded else motion
+            following = self.model.schedule.advance_loaded(qd_seen, qdd_seen, load, memory)
             coefficients = self.model.schedule.coefficients_from(qd_seen, qdd_seen, following)
-            memory = torch.where(motion.unsqueeze(-1) < math.inf, following, memory)
+            memory = torch.where(given.unsqueeze(-1) < math.inf, following, memory)
         else:
             coefficients = self.model.schedule(qd_seen, qdd_seen)
         tau_f = self.model.torque(qd, load, coefficients)
@@ -238,7 +241,13 @@ class Controller(nn.Module):
     def torque(self, qd: Tensor, qdd: Tensor, load: Tensor) -> Tensor:
         """The torque alone, by the same contract; a memory is that after a first sample."""
         qd_seen, qdd_seen, _ = self.seen(qd, qdd)
-        tau_f = self.model.torque(qd, load, self.model.schedule(qd_seen, qdd_seen))
+        if self.loaded:
+            start = self.model.schedule.initial_state(qd_seen, qdd_seen)
+            first = self.model.schedule.advance_loaded(qd_seen, qdd_seen, load, start)
+            coefficients = self.model.schedule.coefficients_from(qd_seen, qdd_seen, first)
+        else:
+            coefficients = self.model.schedule(qd_seen, qdd_seen)
+        tau_f = self.model.torque(qd, load, coefficients)
         held = torch.clamp(tau_f, -self.torque_limit, self.torque_limit) if self.limited else tau_f
         # Zero times what is not finite is NaN: a third of the operations of comparisons.
         held = torch.addcmul(held, qd, qdd, value=0.0)

@@ -24,11 +24,11 @@ from nfriction.export.contract import (
     first_line,
     write_verified,
 )
-from nfriction.export.controller import controller_of, for_single_precision
-from nfriction.export.torch_archive import METADATA
-from nfriction.export.torch_files import exported, run_from_nan, silent
+from nfriction.export.controller import Controller, controller_of, for_single_precision
+from nfriction.export.torch_files import METADATA, another_program, exported, run_from_nan, silent
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import ModelInfo
+from nfriction.version import __version__
 
 # Old enough for runtimes in the field; nothing newer is needed.
 OPSET, IR_VERSION = 18, 8
@@ -287,7 +287,7 @@ def onnx(
         ValueError: if `info` or an option is malformed.
         OSError: if the file cannot be written.
     """
-    package = _package()
+    _package()
     if dtype == "float32" and with_filter:
         # Differences of positions over a millisecond have half the digits of the positions.
         raise ValueError('the filter needs dtype="float64"; or filter outside, in double.')
@@ -295,49 +295,64 @@ def onnx(
         model, info, torque_limit=torque_limit, with_filter=with_filter, cutoff_hz=cutoff_hz
     )
     contract = contract_of(model, controller, info, dtype=dtype)
-    inputs, outputs = list(contract.inputs), list(OUTPUTS)
-    if controller.state_size:
-        inputs, outputs = [*inputs, "state"], [*outputs, "next_state"]
-    if dtype == "float32":
-        controller = for_single_precision(controller)
-    with silent():
-        program = exported(controller).run_decompositions()
-    graph = OnnxGraph(program, inputs, outputs, REAL[dtype])
-    file = _model_file(package, graph, inputs, outputs, contract)
-    return write_verified(path, file.SerializeToString(deterministic=True), open_onnx, "ONNX graph")
+    file = _file(controller, dtype)
+    file.graph.name = str(contract.description["model"])
+    _package().helper.set_model_props(file, {METADATA: contract.to_json()})
+    return write_verified(
+        path, file.SerializeToString(deterministic=True), contract,
+        lambda written: _runner(_read(written), controller, dtype, path), "ONNX graph",
+    )  # fmt: skip
 
 
-def open_onnx(path: str | Path) -> tuple[Contract, Runner]:
-    """Load an artefact; returns its contract, and how to run it."""
-    package = _package()
-    file, contract = read_onnx(path)
-    try:
-        package.checker.check_model(file)
-    except (ValueError, RuntimeError, package.checker.ValidationError) as error:
-        raise ExportError(f"{path}: no ONNX graph ({first_line(error)}).") from error
-    size, real = contract.state_size, REAL[contract.description["dtype"]]
-    names = [value.name for value in file.graph.input]
-    evaluate = _evaluator(package, file, path)
+def contract_of_onnx(path: str | Path) -> Contract:
+    """Read the contract of an artefact."""
+    properties = {prop.key: prop.value for prop in _read(path).metadata_props}
+    return Contract.from_json(properties.get(METADATA, ""))
+
+
+def onnx_runner(path: str | Path, controller: Controller) -> Runner:
+    """Load an artefact; its graph must be that of the controller, its numbers need not be."""
+    file = _read(path)
+    single = any(port.type.tensor_type.elem_type == 1 for port in file.graph.input)
+    dtype = "float32" if single else "float64"
+    if _without_numbers(file) != _without_numbers(_file(controller, dtype)):
+        raise ExportError(another_program(path))
+    return _runner(file, controller, dtype, path)
+
+
+def _without_numbers(file: Any) -> bytes:
+    """Bytes of all that a file computes, with the sizes of its constants alone."""
+    bare = type(file)()
+    bare.CopyFrom(file)
+    bare.ClearField("metadata_props")
+    bare.ClearField("producer_version")
+    bare.graph.ClearField("name")
+    for constant in bare.graph.initializer:
+        constant.raw_data = b"%d" % len(constant.raw_data)
+    return bytes(bare.SerializeToString(deterministic=True))
+
+
+def _runner(file: Any, controller: Controller, dtype: str, path: str | Path) -> Runner:
+    names, real = [value.name for value in file.graph.input], REAL[dtype]
+    evaluate = _evaluator(file, path)
 
     def step(*inputs: torch.Tensor) -> Sequence[Any]:
         given = {name: x.numpy().astype(real) for name, x in zip(names, inputs, strict=True)}
         return evaluate(given)
 
-    return contract, lambda *x: run_from_nan(step, x, size)
+    return lambda *x: run_from_nan(step, x, controller.state_size)
 
 
-def read_onnx(path: str | Path) -> tuple[Any, Contract]:
-    """Read a file as a protocol buffer, and its contract."""
+def _read(path: str | Path) -> Any:
+    """A file as a protocol buffer."""
     package = _package()
     if Path(path).stat().st_size > LARGEST_FILE:
         raise ExportError(f"{path}: too large for a graph of nfriction.")
     broken = importlib.import_module("google.protobuf.message").DecodeError
     try:
-        file = package.load_model_from_string(Path(path).read_bytes())
+        return package.load_model_from_string(Path(path).read_bytes())
     except (broken, ValueError, RuntimeError) as error:
         raise ExportError(f"{path}: no ONNX graph ({first_line(error)}).") from error
-    properties = {prop.key: prop.value for prop in file.metadata_props}
-    return file, Contract.from_json(properties.get(METADATA, ""))
 
 
 def _package() -> Any:
@@ -351,24 +366,30 @@ def _package() -> Any:
         ) from error
 
 
-def _model_file(
-    package: Any, graph: OnnxGraph, inputs: Sequence[str], outputs: Sequence[str],
-    contract: Contract,
-) -> Any:  # fmt: skip
-    """The whole file as a protocol buffer."""
+def _file(controller: Controller, dtype: str) -> Any:
+    """The whole file but for its metadata, as a protocol buffer."""
+    package = _package()
     helper = package.helper
-    real = helper.np_dtype_to_tensor_dtype(graph.real)
-    tau_f, coefficients = contract.outputs["tau_f"], contract.outputs["coefficients"]
-    joints, size = tau_f.shape[1], contract.state_size
+    inputs, outputs = list(controller.inputs), list(OUTPUTS)
+    if controller.state_size:
+        inputs, outputs = [*inputs, "state"], [*outputs, "next_state"]
+    if dtype == "float32":
+        controller = for_single_precision(controller)
+    with silent():
+        program = exported(controller).run_decompositions()
+    graph = OnnxGraph(program, inputs, outputs, REAL[dtype])
+    real, size = helper.np_dtype_to_tensor_dtype(graph.real), controller.state_size
+    further = {"coefficients": [controller.coefficient_count], "state": [size],
+               "next_state": [size]}  # fmt: skip
 
     def port(name: str) -> Any:
-        last = {"coefficients": [coefficients.shape[2]], "state": [size], "next_state": [size]}
         kind = package.TensorProto.INT32 if name == "status" else real
-        return helper.make_tensor_value_info(name, kind, ["batch", joints, *last.get(name, [])])
+        shape = ["batch", controller.joints, *further.get(name, [])]
+        return helper.make_tensor_value_info(name, kind, shape)
 
     body = helper.make_graph(
         graph.nodes,
-        str(contract.description["model"]),
+        "controller",
         [port(name) for name in inputs],
         [port(name) for name in outputs],
         [package.numpy_helper.from_array(array, key) for key, array in graph.constants.items()],
@@ -376,16 +397,15 @@ def _model_file(
     file = helper.make_model(
         body,
         producer_name="nfriction",
-        producer_version=str(contract.description["version"]),
+        producer_version=__version__,
         opset_imports=[helper.make_opsetid("", OPSET)],
         ir_version=IR_VERSION,
     )
-    helper.set_model_props(file, {METADATA: contract.to_json()})
     package.checker.check_model(file)
     return file
 
 
-def _evaluator(package: Any, file: Any, path: str | Path) -> Callable[[dict[str, Any]], Any]:
+def _evaluator(file: Any, path: str | Path) -> Callable[[dict[str, Any]], Any]:
     """A function from named inputs to the outputs in order."""
     try:
         onnxruntime = importlib.import_module("onnxruntime")

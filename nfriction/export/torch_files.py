@@ -1,20 +1,26 @@
-"""Artefacts of torch: TorchScript, for Python or LibTorch, and programs of `torch.export`."""
+"""Artefacts of torch: TorchScript, for Python or LibTorch, and programs of `torch.export`.
+
+A program in a file may do anything as it is loaded. So none is: files are read as data, and what
+torch runs is the program that it writes for the model here and now, with the numbers of the file,
+if both programs are the same.
+"""
 
 import io
 import math
 import re
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import torch
 from torch import Tensor, nn
 
 from nfriction.export.contract import (
     Contract,
-    ContractError,
     ExportError,
     Runner,
     contract_of,
@@ -24,29 +30,20 @@ from nfriction.export.contract import (
     write_verified,
 )
 from nfriction.export.controller import Controller, controller_of, run_in_order
-from nfriction.export.torch_archive import (
-    METADATA,
-    check_program,
-    check_script,
-    check_source,
-    contents,
-    repacked,
-)
 from nfriction.friction.models import FrictionModel
-from nfriction.io.files import parse_json
 from nfriction.io.model_file import ModelInfo
+from nfriction.version import __version__
 
-# All that archives of ours hold.
-_SCRIPT = re.compile(
-    r"data\.pkl|code/__torch__/[\w./]+\.py(\.debug_pkl)?|constants/\d+|constants\.pkl|version"
-    r"|byteorder|\.data/(serialization_id|version)|extra/nfriction\.json"
-)
-_PROGRAM = re.compile(
-    r"data/weights/(weight_\d+|model_weights_config\.json)"
-    r"|data/constants/(tensor_\d+|model_constants_config\.json)"
-    r"|data/sample_inputs/model\.pt|models/model\.json|extra/nfriction\.json"
-    r"|archive_format|archive_version|byteorder|version|\.data/(version|serialization_id|.*)"
-)
+# Name under which the metadata lie in an artefact.
+METADATA = "nfriction.json"
+LARGEST = 256 * 2**20
+_DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError,
+            ValueError, LookupError, OverflowError)  # fmt: skip
+# Files of plain numbers, and those in which one program may differ: metadata and line numbers.
+_NUMBERS = re.compile(r"constants/\d+|data/weights/weight_\d+|data/constants/tensor_\d+")
+_BESIDE = re.compile(r"extra/nfriction\.json|code/.*\.debug_pkl|\.data/serialization_id")
+# torch numbers the classes that it has scripted since the process began.
+_COUNTED = re.compile(rb"___torch_mangle_\d+")
 
 
 def torchscript(
@@ -86,18 +83,23 @@ def torchscript(
         model, info, torque_limit=torque_limit, with_filter=with_filter, cutoff_hz=cutoff_hz
     )
     contract = contract_of(model, controller, info)
-    buffer = io.BytesIO()  # into memory, so that the temporary file's name is not kept inside
-    with silent():
-        scripted = _compile(controller)
-        torch.jit.save(scripted, buffer, _extra_files={METADATA: contract.to_json()})
 
-    def loaded(path: Path) -> tuple[Contract, Runner]:
+    def runner(path: Path) -> Runner:
         with silent():
             module = torch.jit.load(str(path))
         _check_torque(controller, module, contract)
-        return contract, _script_runner(module, contract)
+        return _script_runner(module, controller)
 
-    return write_verified(path, buffer.getvalue(), loaded, "TorchScript")
+    content = _script(controller, contract.to_json())
+    return write_verified(path, content, contract, runner, "TorchScript")
+
+
+def _script(controller: Controller, metadata: str) -> bytes:
+    """The artefact's content."""
+    buffer = io.BytesIO()  # into memory, so that the temporary file's name is not kept inside
+    with silent():
+        torch.jit.save(_compile(controller), buffer, _extra_files={METADATA: metadata})
+    return buffer.getvalue()
 
 
 @torch.no_grad()
@@ -111,12 +113,12 @@ def _check_torque(controller: Controller, module: Any, contract: Contract) -> No
         raise ExportError(f"the TorchScript differs from its model by {error:.1e} of full scale.")
 
 
-def _script_runner(module: Any, contract: Contract) -> Runner:
+def _script_runner(module: Any, controller: Controller) -> Runner:
     """Torque, coefficients and status of samples (sample, joint) in order."""
 
     @torch.no_grad()
     def run(*inputs: Tensor) -> tuple[Tensor, ...]:
-        if not contract.state_size:
+        if not controller.state_size:
             return tuple(module.step(*inputs))
         # The load, which comes last, has no part in the state.
         start = module.initial_state(*(x[0] for x in inputs[:-1]))
@@ -125,47 +127,11 @@ def _script_runner(module: Any, contract: Contract) -> Runner:
     return run
 
 
-def open_torchscript(path: str | Path) -> tuple[Contract, Runner]:
-    """Load an artefact; returns its contract, and how to run it.
-
-    A damaged file can end the process in `torch.jit.load`; see `verify_artefact`.
-    """
-
-    def load(files: dict[str, bytes]) -> Any:
-        for name, content in files.items():
-            check_source(name, content)
-        # Pickles of line numbers are not looked at, and so not handed on.
-        needed = {name: x for name, x in files.items() if not name.endswith(".debug_pkl")}
-        module = torch.jit.load(repacked(needed), map_location="cpu")
-        if not hasattr(module, "step"):
-            raise ExportError("a TorchScript, but none of nfriction: it has no `step`.")
-        for name in _methods(module):
-            check_script(getattr(module, name).inlined_graph)
-        return module
-
-    module, contract = _opened(path, _SCRIPT, "TorchScript", load)
-    return contract, _script_runner(module, contract)
-
-
-def _opened(
-    path: str | Path, ours: re.Pattern[str], what: str, load: Callable[[dict[str, bytes]], Any]
-) -> tuple[Any, Contract]:
-    """Read an archive: the result of `load` for its files, and its contract."""
-    files = contents(path, ours, what)
-    try:
-        contract = Contract.from_json(files.get(f"extra/{METADATA}", b""))
-        with silent():
-            return load(files), contract
-    except ContractError:
-        raise
-    except ExportError as error:
-        raise ExportError(f"{path}: {error}") from None
-    except RecursionError:
-        raise ExportError(f"{path}: nested without end.") from None
-    except (RuntimeError, ArithmeticError, AttributeError, AssertionError, LookupError, TypeError,
-            ValueError) as error:  # fmt: skip
-        reason = first_line(error)
-        raise ExportError(f"{path}: damaged, or no {what} of nfriction ({reason}).") from error
+def script_runner(path: str | Path, controller: Controller) -> Runner:
+    """Load a TorchScript; its program must be that of the controller, its numbers need not be."""
+    with silent():
+        module = torch.jit.load(own_program(path, _script(controller, "")), map_location="cpu")
+    return _script_runner(module, controller)
 
 
 class _Host(nn.Module):
@@ -280,6 +246,17 @@ def pt2(
         model, info, torque_limit=torque_limit, with_filter=with_filter, cutoff_hz=cutoff_hz
     )
     contract = contract_of(model, controller, info)
+
+    def runner(path: Path) -> Runner:
+        with silent():
+            return _program_runner(torch.export.load(path), controller)
+
+    content = _program(controller, contract.to_json())
+    return write_verified(path, content, contract, runner, "program")
+
+
+def _program(controller: Controller, metadata: str) -> bytes:
+    """The artefact's content."""
     program = exported(controller)
     try:
         program.example_inputs = None  # torch would pickle them
@@ -291,39 +268,25 @@ def pt2(
         node.meta = {key: value for key, value in node.meta.items() if key == "val"}
     buffer = io.BytesIO()  # into memory, so that the temporary file's name is not kept inside
     with silent():
-        torch.export.save(program, buffer, extra_files={METADATA: contract.to_json()})
-    return write_verified(path, buffer.getvalue(), open_pt2, "program")
+        torch.export.save(program, buffer, extra_files={METADATA: metadata})
+    return buffer.getvalue()
 
 
-def open_pt2(path: str | Path) -> tuple[Contract, Runner]:
-    """Load an artefact; returns its contract, and how to run it.
-
-    A damaged one may lead torch to errors of its own besides; see `verify_artefact`.
-    """
-
-    def load(files: dict[str, bytes]) -> Any:
-        _refuse_pickles(files)
-        return torch.export.load(repacked(files)).module()
-
-    module, contract = _opened(path, _PROGRAM, "program", load)
+def _program_runner(program: torch.export.ExportedProgram, controller: Controller) -> Runner:
+    module = program.module()
 
     @torch.no_grad()
     def run(*inputs: Tensor) -> tuple[Any, ...]:
-        return run_from_nan(module, inputs, contract.state_size)
+        return run_from_nan(module, inputs, controller.state_size)
 
-    return contract, run
+    return run
 
 
-def _refuse_pickles(files: Mapping[str, bytes]) -> None:
-    """Refuse files that are more than tensors and JSON: torch would unpickle them."""
-    check_program(parse_json(files["models/model.json"]))
-    for name, content in files.items():
-        if name.endswith("_config.json"):
-            config = parse_json(content)["config"]
-            if any(entry["use_pickle"] for entry in config.values()):
-                raise ExportError("it holds pickled objects, which are refused.")
-        if name.endswith(".pt") and content:
-            raise ExportError("it holds pickled inputs, which are refused.")
+def program_runner(path: str | Path, controller: Controller) -> Runner:
+    """Load a `.pt2`; its program must be that of the controller, its numbers need not be."""
+    with silent():
+        program = torch.export.load(own_program(path, _program(controller, "")))
+        return _program_runner(program, controller)
 
 
 def run_from_nan(step: Any, inputs: Sequence[Tensor], state_size: int) -> tuple[Any, ...]:
@@ -386,3 +349,76 @@ def silent() -> Iterator[None]:
         warnings.filterwarnings("ignore", category=FutureWarning)
         warnings.filterwarnings("ignore", category=DeprecationWarning)
         yield
+
+
+def contract_of_archive(path: str | Path) -> Contract:
+    """Read the contract of an artefact of torch."""
+    return Contract.from_json(_contents(path, path).get(f"extra/{METADATA}", b""))
+
+
+def own_program(path: str | Path, own: bytes) -> io.BytesIO:
+    """An archive of our own with the numbers of an artefact.
+
+    Args:
+        path: of the artefact.
+        own: what torch writes for the model that it should be.
+
+    Raises:
+        ExportError: if it is no archive, or its program is another one.
+    """
+    given, ours = _contents(path, path), _contents(path, io.BytesIO(own))
+    if _computed(given) != _computed(ours):
+        raise ExportError(another_program(path))
+    numbers = {name: given[name] for name in ours if _NUMBERS.fullmatch(name)}
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, content in (ours | numbers).items():
+            archive.writestr(f"archive/{name}", content)
+    buffer.seek(0)
+    return buffer
+
+
+def another_program(path: str | Path) -> str:
+    """The error of an artefact whose program is not the model's."""
+    return (
+        f"{path}: its program is not the one that nfriction {__version__} with torch "
+        f"{torch.__version__} writes for this model, and foreign programs are not run; verify it "
+        "with the versions that wrote it, or export the model anew."
+    )
+
+
+def _computed(files: Mapping[str, bytes]) -> list[tuple[bytes, bytes]]:
+    """All files that say what is computed; of numbers their size alone."""
+    return sorted(
+        (
+            _COUNTED.sub(b"", name.encode(errors="backslashreplace")),
+            b"%d" % len(content) if _NUMBERS.fullmatch(name) else _COUNTED.sub(b"", content),
+        )
+        for name, content in files.items()
+        if not _BESIDE.fullmatch(name)
+    )
+
+
+def _contents(path: str | Path, source: str | Path | IO[bytes]) -> dict[str, bytes]:
+    """All files of an archive by their name inside its one folder; `path` names it in errors."""
+    found: dict[str, bytes] = {}
+    known: set[str] = set()
+    try:
+        if Path(path).stat().st_size > LARGEST:
+            raise ExportError(f"{path}: too large for an artefact of nfriction.")
+        with zipfile.ZipFile(source) as archive:
+            entries = archive.infolist()
+            if sum(max(entry.file_size, entry.compress_size) for entry in entries) > LARGEST:
+                raise ExportError(f"{path}: too large for an artefact of nfriction.")
+            for entry in entries:
+                name = entry.filename.partition("/")[2]
+                # torch looks for names without regard to case.
+                if name.lower() in known:
+                    raise ExportError(f"{path}: holds {entry.filename[:80]!r} twice.")
+                known.add(name.lower())
+                found[name] = archive.read(entry)
+    except _DAMAGED as error:
+        if isinstance(error, ExportError):
+            raise
+        raise ExportError(f"{path}: no artefact of nfriction ({first_line(error)}).") from error
+    return found

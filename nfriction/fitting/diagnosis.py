@@ -6,7 +6,7 @@ shows which correction explains the motion. One pass of inverse dynamics each, n
 
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -23,6 +23,9 @@ from nfriction.recording.angles import AngleConvention, Angles, MeasuredFrom
 from nfriction.signals import Motion
 
 Array = NDArray[np.float64]
+
+# Samples of a block that show a curvature despite their noise.
+FEWEST_FOR_CURVATURE = 5
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,10 @@ class _Data:
     def mean(self, values: Tensor) -> Tensor:
         """Means over blocks, (block, ...)."""
         return values.reshape(-1, self.block, *values.shape[1:]).mean(1)
+
+    def needed(self, plant: Plant) -> Tensor:
+        """Torque of the motion without friction, (sample, joint)."""
+        return plant.inverse_dynamics(self.q, self.qd, self.qdd)
 
     def moving(self) -> Tensor:
         """1 where a joint turns one way during a block, else 0, (block, joint).
@@ -107,7 +114,7 @@ def mistake_warning(stated: float, mistakes: Sequence[Mistake]) -> tuple[str, ..
         f"not {stated:.2g}."
     )
     known = not math.isnan(mistakes[0].unexplained)
-    return (f"A mistake in the data is likely: {causes}.{left if known else ''}",)
+    return (f"A mistake in data or rig is likely: {causes}.{left if known else ''}",)
 
 
 def _driven_without_torque(
@@ -153,6 +160,10 @@ def _tested(
         # A torque that is held until the next sample acts late by up to a step.
         if not -max(r.sample_time for r in recordings) <= delay <= 0:
             yield delay_in_words(delay), share
+        yield _drifting_clock(plant, recordings, motions, options)
+        step = recordings[0].sample_time
+        for text, data in (*_saturated(plant, given), *_elastic(plant, given, step)):
+            yield text, _unexplained(plant, data)
     for text, rig in _corrected_terms(plant, given, options):
         yield text, _unexplained(rig, given)
     if len(recordings) > 1:
@@ -179,8 +190,12 @@ def _collect(
     motions: Sequence[Motion],
     options: FitOptions,
     delay: float = 0.0,
+    drift: float = 0.0,
 ) -> _Data:
-    """Samples away from the ends, with the torque that was recorded `delay` [s] later."""
+    """Samples away from the ends, with the torque that was recorded `delay` [s] later.
+
+    The delay grows by `drift` with time [-].
+    """
     # Both sides of the balance are averaged alike, which takes the noise of accelerations out.
     block = max(1, round(options.diagnosis_block / recordings[0].sample_time))
     # Blocks are left out evenly where there are more samples than needed.
@@ -192,7 +207,8 @@ def _collect(
         inside = np.flatnonzero((time >= time[0] + margin) & (time <= time[-1] - margin))
         starts = np.arange(0, max(0, len(inside) - block + 1), stride)
         chosen = inside[(starts[:, None] + np.arange(block)).ravel()]
-        torque = recording.torque_at(time[chosen] + delay)
+        late = delay + drift * (time[chosen] - time[0])
+        torque = recording.torque_at(time[chosen] + late)
         parts.append((motion.q[chosen], motion.qd[chosen], motion.qdd[chosen], torque))
     q, qd, qdd, tau = (torch.as_tensor(np.concatenate(x)) for x in zip(*parts, strict=True))
     return _Data(q, qd, qdd, tau, block)
@@ -334,6 +350,61 @@ def _corrected_torques(
             wrong = f"is {times} (a unit, torque constant or gear ratio)"
             cause = "has the wrong sign" if -1.5 < gain < -0.7 else wrong
             yield f"{what} {cause}", replace(given, tau=given.tau + (gain - 1) * part)
+    needed = given.needed(plant)
+    for j in driven:
+        tau = given.tau[:, j]
+        # Where gravity calls for one sign alone, this one changes nothing.
+        if bool((tau >= 0).all() or (tau <= 0).all()):
+            signed = given.tau.clone()
+            signed[:, j] = tau.abs() * torch.sign(needed[:, j])
+            text = f"the {kind} of {plant.joint_names[j]} is recorded without its sign"
+            yield text, replace(given, tau=signed)
+
+
+def _saturated(plant: Plant, given: _Data) -> Iterator[tuple[str, _Data]]:
+    """Each drive with the limit of its torque that explains most."""
+    for j in np.flatnonzero(given.tau.abs().amax(0)).tolist():
+        largest = float(given.tau[:, j].abs().max())
+
+        def limited(limit: float, joint: int = j) -> _Data:
+            tau = given.tau.clone()
+            tau[:, joint] = tau[:, joint].clamp(-limit, limit)
+            return replace(given, tau=tau)
+
+        limit, _ = _best(lambda x: _unexplained(plant, limited(x)), 0.1 * largest, largest)
+        kind, unit = ("force", "N") if plant.unit == "m" else ("torque", "N m")
+        text = (
+            f"the drive of {plant.joint_names[j]} saturates at {limit:.3g} {unit}, and its {kind} "
+            "is recorded as commanded (clip the column there)"
+        )
+        yield text, limited(limit)
+
+
+def _elastic(plant: Plant, given: _Data, step: float) -> Iterator[tuple[str, _Data]]:
+    """Each driven joint with a spring behind the inertia of its drive.
+
+    Beside the torque of a rigid joint, the drive's inertia B then takes B/k times that torque's
+    second derivative (M. W. Spong, J. Dyn. Sys. Meas. Control 109 (1987), 310-319), as it turns
+    ahead of the joint by the torque over the stiffness k.
+    """
+    if given.block < FEWEST_FOR_CURVATURE:
+        return
+    place = step * (torch.arange(given.block).to(given.q) - (given.block - 1) / 2)
+    parabola = place.square() - place.square().mean()
+    blocks = given.needed(plant).reshape(-1, given.block, plant.joints)
+    curvature = 2 * torch.einsum("bsj,s->bj", blocks, parabola) / parabola.square().sum()
+    curvature = curvature.repeat_interleave(given.block, 0)
+    for j in np.flatnonzero(given.tau.abs().amax(0)).tolist():
+        part = torch.zeros_like(given.tau)
+        part[:, j] = curvature[:, j]
+        ratio = -_balance(plant, given, part)[1]
+        if ratio > 0:
+            text = (
+                f"{plant.joint_names[j]} is elastic or has play between drive and encoder "
+                f"(resonance near {1 / (math.tau * math.sqrt(ratio)):.2g} Hz), which no rigid rig "
+                "follows"
+            )
+            yield text, replace(given, tau=given.tau - ratio * part)
 
 
 def balanced_delay(
@@ -346,16 +417,39 @@ def balanced_delay(
 
     For the arguments and the share of unexplained torque see `likely_mistakes`.
     """
+    most = options.largest_delay
+    return _best(
+        lambda x: _unexplained(plant, _collect(recordings, motions, options, x)), -most, most
+    )
+
+
+def _drifting_clock(
+    plant: Plant, recordings: Sequence[Recording], motions: Sequence[Motion], options: FitOptions
+) -> tuple[str, float]:
+    """The drift of the torques' clock that explains most, and what it leaves [-]."""
+    most = options.largest_delay / max(r.duration for r in recordings)
+    drift, share = _best(
+        lambda x: _unexplained(plant, _collect(recordings, motions, options, drift=x)), -most, most
+    )
+    fast = "fast" if drift > 0 else "slow"
+    return (
+        f"the clock of the torques is {100 * abs(drift):.2g} % {fast} beside that of the positions",
+        share,
+    )
+
+
+def _best(
+    unexplained: Callable[[float], float], lowest: float, highest: float
+) -> tuple[float, float]:
+    """The value that leaves least unexplained, and what it leaves."""
     from scipy.optimize import minimize_scalar  # slow to import
 
-    def unexplained(delay: float) -> float:
-        return _unexplained(plant, _collect(recordings, motions, options, delay))
-
     # One valley is as wide as a swing: a coarse grid finds it.
-    grid = np.linspace(-options.largest_delay, options.largest_delay, 9)
-    best = grid[int(np.argmin([unexplained(delay) for delay in grid]))]
-    around = np.clip((best - grid[1] + grid[0], best + grid[1] - grid[0]), grid[0], grid[-1])
-    found = minimize_scalar(unexplained, bounds=around, method="bounded", options={"xatol": 1e-4})
+    grid = np.linspace(lowest, highest, 9)
+    best = int(np.argmin([unexplained(x) for x in grid]))
+    around = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, 8)])
+    close = 5e-4 * (highest - lowest)
+    found = minimize_scalar(unexplained, bounds=around, method="bounded", options={"xatol": close})
     return float(found.x), float(found.fun)
 
 
@@ -372,8 +466,7 @@ def _amount(plant: Plant, change: dict[str, Tensor], given: _Data) -> float:
     """Factor of a change of buffers, in which torques are linear, that fits best."""
     own = dict(plant.named_buffers())
     moved = plant.replace(**{name: own[name] + part for name, part in change.items()})
-    states = given.q, given.qd, given.qdd
-    column = plant.inverse_dynamics(*states) - moved.inverse_dynamics(*states)
+    column = given.needed(plant) - given.needed(moved)
     return _balance(plant, given, column)[1]
 
 
@@ -384,10 +477,9 @@ def _unexplained(plant: Plant, data: _Data) -> float:
     gravity's and of inertia's.
     """
     target = _balance(plant, data)[0]
-    states = data.q, data.qd, data.qdd
     rest = torch.zeros_like(data.q)
     static = plant.inverse_dynamics(data.q, rest, rest)
-    parts = data.tau, static, plant.inverse_dynamics(*states) - static
+    parts = data.tau, static, data.needed(plant) - static
     moving = data.moving()
     size = torch.stack([(moving * data.mean(x)).square().mean(0) for x in parts]).sum(0)
     return float((target / size.clamp_min(torch.finfo(size.dtype).tiny)).mean().sqrt())
@@ -397,7 +489,7 @@ def _balance(plant: Plant, data: _Data, extra: Tensor | None = None) -> tuple[Te
     """Mean square of the unexplained torque, (joint,), and the factor of an `extra` torque."""
     from scipy.optimize import nnls  # slow to import
 
-    torque = data.tau - plant.inverse_dynamics(data.q, data.qd, data.qdd)
+    torque = data.tau - data.needed(plant)
     moving = data.moving()
     left = moving * data.mean(torque)
     weight = left.square().mean(0).sqrt()

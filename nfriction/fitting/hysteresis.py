@@ -10,10 +10,12 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from nfriction.fitting.options import DEFAULTS
+from nfriction.fitting.result.paired_test import gains
 from nfriction.friction.hysteresis import (
-    ASYMMETRY,
     DROP,
     ELEMENTS,
     FIRST,
@@ -26,9 +28,9 @@ from nfriction.recording.torque_table import JointTorque
 Array = NDArray[np.float64]
 
 # Widths of elements over the range of the motion: what is narrower turns within a sample, what is
-# wider is a spring. Many where non-negative weights choose among them, else as many as the law has.
+# wider is a spring.
 SPAN = (3e-5, 2.0)
-COUNTS = {True: 30, False: ELEMENTS}
+COUNT = 30
 # Moves before the first row over the range of the motion, which the first torques show.
 PATHS = tuple(np.geomspace(1e-4, 2.0, 10))
 # Path over which the excess of a long rest fades, over the range of the motion.
@@ -36,9 +38,11 @@ FADINGS = tuple(np.geomspace(1e-5, 0.1, 9))
 # Velocities over the largest one.
 VELOCITIES = (0.003, 0.01, 0.03, 0.1, 0.3, 0.6)
 # Ridges relative to the information of the data: neighbouring widths are nearly equivalent.
-RIDGES = (1e-1, 1e-2, 1e-3)
+RIDGES = (1e-2, 1e-3)
 # Columns that no velocity shapes, and the place of a rest's excess among them.
-PLAIN, REST = 4, 3
+PLAIN, REST = 3, 2
+# Terms of a choice before its elements: these, one that saturates, and a drop.
+LINEAR = PLAIN + 2
 # Relative difference of errors on blocks left out that is too small to choose by.
 TOLERANCE = 0.02
 # Time whose torque shows how a law with memory was deflected before, as for simulations [s].
@@ -107,37 +111,33 @@ def fit_slip(joint: JointTorque, blocks: Sequence[NDArray[np.intp]], *, loaded: 
 
     Args:
         joint: with time.
-        blocks: rows that are left out in turn; terms, signs and ridge are those with the least
-            error there.
+        blocks: rows that are left out in turn; a term or a smaller ridge that does not lower the
+            error there by more than chance is left out.
         loaded: friction is in proportion to the load.
     """
-    reach, path = range_of(joint), path_of(joint)
-    grids = {positive: reach * np.geomspace(*SPAN, count) for positive, count in COUNTS.items()}
+    path, grid = path_of(joint), range_of(joint) * np.geomspace(*SPAN, COUNT)
     every = max(1, len(joint) // START_ROWS)
-    start, fading = _likeliest_start(joint, grids[True], every, loaded)
-    tables = {
-        positive: _Dictionary.of(
-            joint, deflections(path, grid, _approached(grid, start)), loaded, fading
-        )
-        for positive, grid in grids.items()
-    }
-    folds = {positive: table.folds(blocks) for positive, table in tables.items()}
-    choices = [tables[shape.positive].best(shape) for shape in _Shape.every()]
-    left_out = [tables[c.shape.positive].left_out(c, folds[c.shape.positive]) for c in choices]
-    scores = np.sqrt(np.mean(np.square(left_out), 1))
-    # The simplest that is as accurate as the best but for the tolerance.
-    chosen = int(np.flatnonzero(scores <= (1 + TOLERANCE) * scores.min())[0])
-    choice, errors = choices[chosen], left_out[chosen]
-    table = tables[choice.shape.positive]
-    without = np.stack([table.without(choice, fold) for fold in folds[choice.shape.positive]])
-    widths = grids[choice.shape.positive]
-    if choice.shape.positive:
-        # The merged elements, with the weights that suit them.
-        widths = _merged(choice.weights[-len(widths) :], widths)
+    start, fading = _likeliest_start(joint, grid, every, loaded)
+
+    def terms(widths: Array) -> _Dictionary:
         z = deflections(path, widths, _approached(widths, start))
-        table = _Dictionary.of(joint, z, loaded, fading)
-        choice = table.at(choice)
-    return replace(table.result(choice, widths, errors, start), without=without)
+        return _Dictionary.of(joint, z, loaded, fading)
+
+    fine = terms(grid)
+    folds = fine.folds(blocks)
+    choices = [fine.best(shape) for shape in _Shape.every()]
+    left_out = [fine.left_out(choice, folds) for choice in choices]
+    squares = torch.tensor(left_out).square()
+    best = squares[int(squares.sum(1).argmin())]
+    # The simplest of which the best is no better than by chance.
+    chosen = next(k for k, own in enumerate(squares) if not gains(best, own, DEFAULTS.input_chance))
+    choice = choices[chosen]
+    without = np.stack([fine.without(choice, fold) for fold in folds])
+    # The merged elements, with the weights that suit them.
+    widths = _merged(choice.weights[-len(grid) :], grid)
+    few = terms(widths)
+    found = few.result(few.at(choice), widths, left_out[chosen], start)
+    return replace(found, without=without)
 
 
 def _approached(widths: Array, path: float) -> Array:
@@ -158,7 +158,7 @@ def _likeliest_start(
     def cost(z: Array, fading: float) -> float:
         return _Dictionary.of(some, z, loaded, fading).best(plain).cost
 
-    plain = _Shape(positive=True, ridge=RIDGES[-1], rested=True)
+    plain = _Shape(RIDGES[-1], rested=True)
     middle = reach * FADINGS[len(FADINGS) // 2]
     best = int(np.argmin([cost(z, middle) for z in coarse]))
     fadings = reach * np.array(FADINGS)
@@ -178,24 +178,20 @@ def _merged(forces: Array, widths: Array) -> Array:
     return np.array([widths[0], *sorted(width for _, width in rest[: ELEMENTS - 1])])
 
 
-@dataclass(frozen=True)
-class _Shape:
-    """Terms beside the elements, signs of the forces, and ridge."""
+class _Shape(NamedTuple):
+    """Ridge, and terms beside the elements, the offset and viscous friction."""
 
-    positive: bool
     ridge: float
     saturating: bool = False
     drop: bool = False
-    asymmetric: bool = False
     rested: bool = False
 
     @classmethod
     def every(cls) -> "Iterator[_Shape]":
         """All shapes, simplest first."""
-        for terms in itertools.product((False, True), repeat=4):
-            for positive in (True, False):
-                for ridge in RIDGES:
-                    yield cls(positive, ridge, *terms)
+        for terms in itertools.product((False, True), repeat=3):
+            for ridge in RIDGES:
+                yield cls(ridge, *terms)
 
 
 @dataclass(frozen=True)
@@ -218,7 +214,7 @@ class _Fold(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Dictionary:
-    """Columns of all terms: offset, viscous, asymmetric, of a rest, of velocities, and elements.
+    """Columns of all terms: offset, viscous, of a rest, of velocities, and elements.
 
     Attributes:
         whole: (row, column).
@@ -246,7 +242,7 @@ class _Dictionary:
         # A rest adds to the friction that holds the joint, and so has the elements' sign.
         held = float(np.sign(z[0].sum())) or float(np.sign(joint.tau[0]))
         rest = held * np.exp(-np.cumsum(np.abs(path_of(joint))) / fading)
-        plain = np.stack([np.ones_like(load), joint.qd, np.abs(joint.qd), rest], 1)
+        plain = np.stack([np.ones_like(load), joint.qd, rest], 1)
         whole = np.concatenate([plain, *(load[:, None] * x for x in scaled)], 1)
         assert joint.time is not None
         lead = max(1, int(np.searchsorted(joint.time, joint.time[0] + LEAD_IN)))
@@ -259,10 +255,9 @@ class _Dictionary:
         first = PLAIN + 2 * n
         turns = range(PLAIN, PLAIN + n) if shape.saturating else (-1,)
         drops = range(PLAIN + n, first) if shape.drop else (-1,)
-        skew = 2 if shape.asymmetric else -1
         rest = REST if shape.rested else -1
         for turn, drop in itertools.product(turns, drops):
-            yield (0, 1, skew, rest, turn, drop, *range(first, self.whole.shape[1]))
+            yield (0, 1, rest, turn, drop, *range(first, self.whole.shape[1]))
 
     def best(self, shape: _Shape) -> _Choice:
         """The choice of velocities with the least sum of squares."""
@@ -272,7 +267,7 @@ class _Dictionary:
     def at(self, choice: _Choice) -> _Choice:
         """The same terms with the weights that suit these elements."""
         first = PLAIN + 2 * len(self.velocities)
-        places = (*choice.places[:6], *range(first, self.whole.shape[1]))
+        places = (*choice.places[:LINEAR], *range(first, self.whole.shape[1]))
         return self._choice(choice.shape, places)
 
     def folds(self, blocks: Sequence[NDArray[np.intp]]) -> "list[_Fold]":
@@ -300,7 +295,7 @@ class _Dictionary:
         """
         used = np.array([p for p in choice.places if p >= 0])
         law = used != REST
-        weights = _weights(fold.gram[np.ix_(used, used)], fold.right[used], choice.shape)
+        weights = _weights(fold.gram[np.ix_(used, used)], fold.right[used], choice.shape.ridge)
         torque: Array = self.whole[rows][:, used[law]] @ weights[law]
         if choice.shape.rested:
             error = self.tau[: self.lead] - self.whole[: self.lead][:, used[law]] @ weights[law]
@@ -311,7 +306,7 @@ class _Dictionary:
     def _choice(self, shape: _Shape, places: tuple[int, ...]) -> _Choice:
         used = [p for p in places if p >= 0]
         gram, right = self.gram[np.ix_(used, used)], self.right[used]
-        solution = _weights(gram, right, shape)
+        solution = _weights(gram, right, shape.ridge)
         weights = np.zeros(len(places))
         weights[[k for k, p in enumerate(places) if p >= 0]] = solution
         # But for the square of the torque, which is the same for all.
@@ -321,22 +316,22 @@ class _Dictionary:
         self, choice: _Choice, widths: Array, errors: Sequence[float], start: float
     ) -> MemoryFit:
         """Coefficients of the law."""
-        n, forces = len(self.velocities), choice.weights[6:]
+        n, forces = len(self.velocities), choice.weights[LINEAR:]
         turn, drop = (
             self.velocities[p - first if p >= 0 else -1]
-            for p, first in zip(choice.places[4:6], (PLAIN, PLAIN + n), strict=True)
+            for p, first in zip(choice.places[LINEAR - 2 : LINEAR], (PLAIN, PLAIN + n), strict=True)
         )
-        offset, viscous, skew, _, saturating, falling = choice.weights[:6]
+        offset, viscous, _, saturating, falling = choice.weights[:LINEAR]
         blank = [0.0] * (ELEMENTS - len(forces))
         # Elements without force are as wide as the widest.
         wide = [float(widths[-1])] * len(blank)
         # Without an excess it would be gone at once.
         fading = self.fading if choice.shape.rested else 1e-6 * float(widths[0])
         coefficients = np.array(
-            [offset, viscous, skew, saturating, turn, falling, drop, fading, start,
+            [offset, viscous, saturating, turn, falling, drop, fading, start,
              *forces, *blank, *widths, *wide]
         )  # fmt: skip
-        of = (OFFSET, VISCOUS, ASYMMETRY, -1, SATURATING, DROP,
+        of = (OFFSET, VISCOUS, -1, SATURATING, DROP,
               *range(FIRST, FIRST + len(forces)))  # fmt: skip
         kept = [k for k, w in enumerate(choice.weights) if w != 0.0]
         design = self.whole[:, [choice.places[k] for k in kept]]
@@ -346,27 +341,19 @@ class _Dictionary:
         return MemoryFit(coefficients, tuple(errors), torque, design[:, own], fitted)
 
 
-def _weights(gram: Array, right: Array, shape: _Shape) -> Array:
-    """Weights of columns with these products, by least squares with a ridge."""
-    scale = np.sqrt(np.diag(gram))
-    scale[scale <= 0] = 1.0
-    a = gram / scale[:, None] / scale + shape.ridge * np.eye(len(right))
-    if not shape.positive:
-        weights: Array = np.linalg.solve(a, right / scale) / scale
-        place = REST - (not shape.asymmetric)
-        if shape.rested and weights[place] < 0:
-            rest = np.arange(len(right)) == place
-            weights[rest] = 0.0
-            weights[~rest] = np.linalg.solve(a[~rest][:, ~rest], (right / scale)[~rest])
-            weights[~rest] /= scale[~rest]
-        return weights
+def _weights(gram: Array, right: Array, ridge: float) -> Array:
+    """Weights of columns with these products, by least squares with a ridge.
+
+    None is negative but the offset, the first.
+    """
     from scipy.optimize import nnls  # slow to import
 
-    root = np.linalg.cholesky(a).T
-    # Offset and asymmetry may have either sign: their columns once more, reversed.
-    free = [0, 2] if shape.asymmetric else [0]
+    scale = np.sqrt(np.diag(gram))
+    scale[scale <= 0] = 1.0
+    root = np.linalg.cholesky(gram / scale[:, None] / scale + ridge * np.eye(len(right))).T
     target = np.linalg.solve(root.T, right / scale)
-    both, _ = nnls(np.c_[root, -root[:, free]], target, maxiter=50 * len(right))
-    solution = both[: len(right)]
-    solution[free] -= both[len(right) :]
-    return solution / scale
+    # The offset's column once more, reversed.
+    both, _ = nnls(np.c_[root, -root[:, :1]], target, maxiter=50 * len(right))
+    weights: Array = both[:-1]
+    weights[0] -= both[-1]
+    return weights / scale

@@ -54,6 +54,9 @@ class FitOptions:
     min_counts: int = 10
     # A sample is a spike if it is off its neighbours by so many times the 99 % quantile.
     spike_ratio: float = 20.0
+    # Steps of one nominal rate differ by less than the first, a quartz's error with room; rates
+    # chosen to differ do so by more than the second.
+    clock_error: tuple[float, float] = (1e-3, 0.05)
     # A mistake is named if its correction leaves half of the unexplained torque, a quarter of its
     # power: errors of a rig's data within their bounds change it by less.
     diagnosis_ratio: float = 2.0

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from nfriction.fitting.hysteresis import TOLERANCE, MemoryFit, fit_slip, range_of
 from nfriction.fitting.options import DEFAULTS
+from nfriction.fitting.result.paired_test import gains, student_quantile
 from nfriction.fitting.shooting.autocorrelation import effective_noise
-from nfriction.fitting.strategy.continuation import student_quantile
 from nfriction.friction.hysteresis import TERMS, Recorded
 from nfriction.friction.neurofuzzy import PRIOR_SD
 from nfriction.recording.torque_table import JointTorque
@@ -31,6 +31,8 @@ FEWEST_PERIODS = 10
 SPACING = 1 / 6
 # Smallest change of the torque by which a law is scaled back.
 LEAST = 0.1
+# Shifts of the phase of a ripple that are tried, over a period.
+SHIFTS = 24
 # Cells of a position, at least, in the shortest period: within one the phase turns by an eighth.
 CELLS = 8
 
@@ -77,10 +79,14 @@ class Rules:
                 )
         error = joint.tau - found.torque
         self.size = float(np.sqrt(np.mean(joint.tau**2)))
-        self.noise = max(effective_noise(torch.tensor(error)[None, :, None]), 1e-12 * self.size)
+        self.noise = self.noise_of(error)
         self.ripple = _Ripple.of(joint, error, blocks) if "ripple" in self.sets else None
         if self.ripple is None:
             self.sets.pop("ripple", None)
+
+    def noise_of(self, error: Array) -> float:
+        """Noise that leaves such an error, with its autocorrelation [N m; N]."""
+        return max(effective_noise(torch.tensor(error)[None, :, None]), 1e-12 * self.size)
 
     def chosen(self, found: MemoryFit) -> tuple[list[str], Array]:
         """Inputs that blocks left out gain by, and the squared errors there, (block,)."""
@@ -89,11 +95,11 @@ class Rules:
         while others := [name for name in self.sets if name not in names]:
             trials = {name: self._left_out(found, [*names, name]) for name in others}
             best = min(trials, key=lambda name: float(trials[name].sum()))
-            gains = now - trials[best]
+            fell = now - trials[best]
             # What few blocks show is not seen again in other recordings.
-            error = gains.std(ddof=1) / len(gains) ** 0.5
-            least = student_quantile(len(gains) - 1, 1 - DEFAULTS.input_chance) * error
-            if gains.mean() <= max(least, (1 - (1 - TOLERANCE) ** 2) * now.mean()):
+            error = fell.std(ddof=1) / len(fell) ** 0.5
+            least = student_quantile(len(fell) - 1, 1 - DEFAULTS.input_chance) * error
+            if fell.mean() <= max(least, (1 - (1 - TOLERANCE) ** 2) * now.mean()):
                 break
             names.append(best)
             now = trials[best]
@@ -164,20 +170,49 @@ def fit_recorded(
     torque = found.torque
     if names:
         rules.set(names, found.torque)
-        # The law once more, to the torque without what the rules explain.
         inputs = recorded_inputs(joint)
-        at = [
-            schedule.corrected(torch.full((len(joint), 1), x).double(), inputs) for x in (0.0, 1.0)
-        ]
-        ripple, both = (x.detach().numpy()[:, 0] for x in at)
-        alone = replace(joint, tau=(joint.tau - ripple) / np.maximum(both - ripple, LEAST))
-        found = fit_slip(alone, blocks, loaded=False)
+
+        def corrected(torque: Array) -> Array:
+            with torch.no_grad():
+                return schedule.corrected(torch.tensor(torque)[:, None], inputs).numpy()[:, 0]
+
+        # The law once more, to the torque without what the rules explain, and they by what is left.
+        ripple, both = (corrected(np.full(len(joint), x)) for x in (0.0, 1.0))
+        alone = (joint.tau - ripple) / np.maximum(both - ripple, LEAST)
+        found = fit_slip(replace(joint, tau=alone), blocks, loaded=False)
+        rules.noise = rules.noise_of(joint.tau - corrected(found.torque))
         rules.set(names, found.torque)
-        torque = (
-            schedule.corrected(torch.tensor(found.torque)[:, None], inputs).detach().numpy()[:, 0]
-        )
+        torque = corrected(found.torque)
     lengths = np.array([len(block) for block in blocks])
     return replace(found, torque=torque, errors=tuple(np.sqrt(squares / lengths).tolist()))
+
+
+@torch.no_grad()
+def ripple_shift(
+    schedule: Recorded, joint: JointTorque, torque: Array, blocks: Sequence[NDArray[np.intp]]
+) -> float:
+    """Shift of the positions at which a ripple explains a run better than by chance [rad; m].
+
+    Another zero of the encoder puts the ripple out of phase; 0 where the run does not show one.
+
+    Args:
+        schedule: of one joint.
+        joint: rows with torque and position.
+        torque: that the model predicts at the rows, (row,).
+        blocks: rows of each block of the run.
+    """
+    inputs, still = recorded_inputs(joint), torch.zeros(len(joint), 1).double()
+    shifts = float(schedule.period[0]) * np.arange(SHIFTS) / SHIFTS
+
+    def squares(shift: float) -> Tensor:
+        moved = inputs | {"position": inputs["position"] + shift}
+        change = schedule.corrected(still, moved) - schedule.corrected(still, inputs)
+        error = joint.tau - torque - change.numpy()[:, 0]
+        return torch.tensor([float(error[block] @ error[block]) for block in blocks])
+
+    found = [squares(shift) for shift in shifts]
+    best = min(range(SHIFTS), key=lambda k: float(found[k].sum()))
+    return float(shifts[best]) if gains(found[best], found[0], DEFAULTS.input_chance) else 0.0
 
 
 class _Ripple(NamedTuple):

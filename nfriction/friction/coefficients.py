@@ -40,6 +40,7 @@ class Schedule(nn.Module, ABC):
         limits: lower and upper bound of each coefficient in a fit.
         positive: which coefficients are positive by physics, a buffer (coefficient,).
         state_size: size of each joint's hidden state.
+        loaded: whether the load moves that state, see `advance_loaded`.
         follows_motion: False where the coefficients are constants.
         handles_range: False where exports must clamp the inputs to the trained range.
         fit_strategy: function that fits such coefficients, as `"module:function"`; it takes a
@@ -54,6 +55,7 @@ class Schedule(nn.Module, ABC):
 
     positive: Tensor
     state_size: int = 0
+    loaded: bool = False
 
     def __init__(self, law: Law, joints: int) -> None:
         super().__init__()
@@ -89,6 +91,10 @@ class Schedule(nn.Module, ABC):
     def advance(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
         """Hidden state after a sample (*batch, joint), given `state` after the one before."""
         return state
+
+    def advance_loaded(self, qd: Tensor, qdd: Tensor, load: Tensor, state: Tensor) -> Tensor:
+        """The same under a load, which moves the state of a sampled law alone."""
+        return self.advance(qd, qdd, state)
 
     def coefficients_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
         """Coefficients at a sample, given the hidden state after it; `forward` is a first one's."""
@@ -139,6 +145,10 @@ class Schedule(nn.Module, ABC):
         """Mean and standard deviation of the parameter vector; infinite where nothing is known."""
         vector = self.parameter_vector()
         return torch.zeros_like(vector), torch.full_like(vector, torch.inf)
+
+    def belief(self) -> tuple[Tensor, Tensor] | None:
+        """The prior that intervals take, wider than that of a fit; None: that of the fit."""
+        return None
 
     @abstractmethod
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:

@@ -2,8 +2,7 @@
 
 The torque is
 
-    tau_f = f_o + F_v qd + A_v |qd|
-            + s (f_a tanh(qd / v_a) + F_d z_1 exp(-(qd / v_s)^2) + sum_k F_k z_k) + r,
+    tau_f = f_o + F_v qd + s (f_a tanh(qd / v_a) + F_d z_1 exp(-(qd / v_s)^2) + sum_k F_k z_k) + r,
 
 with s = 1, or the load. Each element follows the displacement up to its width d_k and then slips,
 z_k = clip(z_k + qd time_step / d_k, -1, 1). What a long rest before the first sample has added to
@@ -12,9 +11,9 @@ r exp(-|qd| time_step / d_r). The elements begin undeflected, or, where an obser
 as after a move of p_0, with which the rows of the fit began.
 
 The torque is linear in all forces, so that least squares estimates them at given widths. Without
-elements it is a law of the velocity alone. It is passive where no force is negative and offset and
-asymmetry A_v are zero; a negative force is that of friction which falls over some displacement
-after a breakaway.
+elements it is a law of the velocity alone. No force is negative: each element stores and
+dissipates, and over a closed path the offset does no work. Only the drop F_d may give back energy,
+at most what the narrowest element stores.
 
 `NFSlip` lets it follow what a table records besides the motion,
 
@@ -35,7 +34,7 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from nfriction.friction.coefficients import Constant
+from nfriction.friction.coefficients import SMALLEST, Constant
 from nfriction.friction.laws import Coefficient, Law, Memory, smooth_sign
 from nfriction.friction.memory import Duration
 from nfriction.friction.models import ConstantModel, NamedModel
@@ -46,7 +45,7 @@ ELEMENTS = 12
 # the amplitude of a ripple follows: as many as of other networks.
 TERMS = {"load": 5, "temperature": 5, "position": 5, "direction": 2, "ripple": 9}
 # Places of the coefficients: those of the velocity first, then forces and widths of the elements.
-OFFSET, VISCOUS, ASYMMETRY, SATURATING, TURN, DROP, STRIBECK, FADING, START, FIRST = range(10)
+OFFSET, VISCOUS, SATURATING, TURN, DROP, STRIBECK, FADING, START, FIRST = range(9)
 
 
 def advance_hysteresis(
@@ -56,9 +55,9 @@ def advance_hysteresis(
     count = state.shape[-1] - 1
     path = (qd * time_step).unsqueeze(-1)
     # Places are written out here and below, as TorchScript takes no global.
-    width = coefficients[..., 9 + count : 9 + 2 * count]
+    width = coefficients[..., 8 + count : 8 + 2 * count]
     elements = (state[..., :count] + path / width).clamp(-1.0, 1.0)
-    fading = coefficients[..., 7:8]
+    fading = coefficients[..., 6:7]
     excess = state[..., count:] * torch.exp(-path.abs() / fading)
     return torch.cat([elements, excess], -1)
 
@@ -71,15 +70,14 @@ def hysteresis_torque(state: Tensor, qd: Tensor, load: Tensor, coefficients: Ten
 def load_hysteresis_torque(state: Tensor, qd: Tensor, load: Tensor, coefficients: Tensor) -> Tensor:
     """Torque of the elements and of the velocity, in proportion to the load."""
     count = state.shape[-1] - 1
-    offset, viscous, skew, saturating, turn, drop, stribeck = coefficients[..., :7].unbind(-1)
+    offset, viscous, saturating, turn, drop, stribeck = coefficients[..., :6].unbind(-1)
     fading = torch.exp(-(qd / stribeck).square())
     friction = (
         saturating * torch.tanh(qd / turn)
         + drop * fading * state.select(-1, 0)
-        + (coefficients[..., 9 : 9 + count] * state[..., :count]).sum(-1)
+        + (coefficients[..., 8 : 8 + count] * state[..., :count]).sum(-1)
     )
-    smooth = offset + viscous * qd + skew * qd.abs()
-    return smooth + load * friction + state.select(-1, count)
+    return offset + viscous * qd + load * friction + state.select(-1, count)
 
 
 def steady_hysteresis(
@@ -101,15 +99,14 @@ def hysteresis_law(name: str, *, loaded: bool, count: int = ELEMENTS) -> Law:
         name,
         (
             Coefficient("f_o", "N m", positive=False),
-            Coefficient("F_v", "N m s/rad", positive=False),
-            Coefficient("A_v", "N m s/rad", positive=False),
-            Coefficient("f_a", unit, positive=False),
+            Coefficient("F_v", "N m s/rad"),
+            Coefficient("f_a", unit),
             Coefficient("v_a", "rad/s", linear=False, initial_grid=velocities),
-            Coefficient("F_d", unit, positive=False),
+            Coefficient("F_d", unit),
             Coefficient("v_s", "rad/s", linear=False, initial_grid=velocities),
             Coefficient("d_r", "rad", linear=False, initial_grid=(1e-3,)),
             Coefficient("p_0", "rad", positive=False, linear=False, initial_grid=(0.0,)),
-            *(Coefficient(f"F_{k}", unit, positive=False) for k in numbers),
+            *(Coefficient(f"F_{k}", unit) for k in numbers),
             *(
                 Coefficient(f"d_{k}", "rad", linear=False, initial_grid=(10.0 ** (0.5 * k - 6),))
                 for k in numbers
@@ -126,10 +123,10 @@ def hysteresis_law(name: str, *, loaded: bool, count: int = ELEMENTS) -> Law:
 
 
 def unused(values: Mapping[str, float]) -> set[str]:
-    """Names of coefficients that add nothing: forces of zero, and what shapes their terms."""
+    """Names of coefficients that add nothing: smallest forces, and what shapes their terms."""
     shapes = {"f_a": "v_a", "F_d": "v_s"} | {f"F_{k}": f"d_{k}" for k in range(1, ELEMENTS + 1)}
-    found = {force for force in (*shapes, "A_v") if values[force] == 0.0}
-    return found | {shapes[force] for force in found & shapes.keys()}
+    found = {force for force in shapes if values[force] < 2.0 * SMALLEST}
+    return found | {shapes[force] for force in found}
 
 
 SLIP = hysteresis_law("slip", loaded=False)

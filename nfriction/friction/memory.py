@@ -475,10 +475,11 @@ class MaxwellSlip(ConstantModel):
         *,
         elements: int = 5,
         v_smooth: float = V_SMOOTH,
+        **options: Any,
     ) -> None:
         # A law of this object's own, in place of the class's.
         self.definition = maxwell_slip(elements)
-        super().__init__(joints, initial, v_smooth=v_smooth)
+        super().__init__(joints, initial, v_smooth=v_smooth, **options)
 
     def options(self) -> dict[str, Any]:
         return {"elements": self.law.state_size}

@@ -7,7 +7,7 @@ With f the torque function of a law and c the coefficients that its schedule giv
 The next step is `nfriction.simulation.rk4`, the motion of a mechanism with friction.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from inspect import signature
 from typing import Any, ClassVar
 
@@ -18,7 +18,7 @@ from nfriction.friction import laws
 from nfriction.friction.coefficients import Constant, Schedule
 from nfriction.friction.inputs import require_bearing_loads
 from nfriction.friction.laws import Law
-from nfriction.friction.parameters import as_tensor, positive_number
+from nfriction.friction.parameters import as_tensor, positive_number, require_options
 
 # Velocity over which the sign changes [rad/s]; larger values creep, smaller ones make RK4 unstable.
 V_SMOOTH = 3e-3
@@ -171,28 +171,12 @@ class NamedModel(FrictionModel):
         v_smooth: float = V_SMOOTH,
         **options: Any,
     ) -> None:
-        require_options(type(self).__name__, self.make_schedule, options)
+        # What a class takes by a name of its own comes with the schedule's options.
+        given = signature(type(self)).parameters.values()
+        own = [p.name for p in given if p.kind is p.KEYWORD_ONLY and p.name != "v_smooth"]
+        require_options(type(self).__name__, self.make_schedule, options, own)
         schedule = self.make_schedule(self.definition, joints, initial, **options)
         super().__init__(self.definition, schedule, v_smooth)
-
-
-def require_options(
-    name: str, make_schedule: Callable[..., Schedule], options: Iterable[str], *more: str
-) -> None:
-    """Refuse options that neither a schedule's maker has, nor the model of this name (`more`).
-
-    Raises:
-        ValueError: with those that it has.
-    """
-    # Behind the law, the joints and the initial values; cells are those of a schedule's own.
-    own = [p for p in signature(make_schedule).parameters.values() if p.name != "cells"][3:]
-    if any(p.kind is p.VAR_KEYWORD for p in own):
-        return  # it hands others on to a schedule that checks them
-    known = [*(p.name for p in own), *more]
-    if unknown := [option for option in options if option not in known]:
-        raise ValueError(
-            f"{name} has no option {', '.join(unknown)}; it has {', '.join(known) or 'none'}."
-        )
 
 
 class ConstantModel(NamedModel):

@@ -13,8 +13,8 @@ from nfriction.friction import laws
 from nfriction.friction.coefficients import Constant, Schedule
 from nfriction.friction.inputs import with_inputs
 from nfriction.friction.laws import Law
-from nfriction.friction.models import V_SMOOTH, FrictionModel, NamedModel, require_options
-from nfriction.friction.parameters import Sensitivity, positive_number
+from nfriction.friction.models import V_SMOOTH, FrictionModel, NamedModel
+from nfriction.friction.parameters import Sensitivity, positive_number, require_options
 from nfriction.fuzzy import AnfisRBF
 from nfriction.fuzzy.membership import FuzzyRules
 from nfriction.fuzzy.partition import FreePartition
@@ -341,6 +341,11 @@ class NeuroFuzzy(Schedule):
         sizes = [units.get(p, torch.ones_like(p)).reshape(-1) for p in self.trained()]
         return mean, self.prior_sd * torch.cat(sizes).detach()
 
+    def belief(self) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation: of one unit, as a coefficient varies by its own size."""
+        mean, sd = self.prior()
+        return mean, sd / self.prior_sd
+
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
         return self.residual_sensitivities(self.reference, qd, qdd)
 
@@ -464,16 +469,11 @@ class NeuroFuzzyModel(NamedModel):
         initial: Tensor | Sequence | None = None,
         *,
         v_smooth: float = V_SMOOTH,
-        network: str = "anfis",
         inputs: Sequence[str] | None = None,
         **options: Any,
     ) -> None:
-        if network not in NETWORKS:
-            raise ValueError(f"`network` must be one of {sorted(NETWORKS)}, got {network!r}.")
-        make: Callable[..., Schedule] = resolve_name(NETWORKS[network])
-        require_options(type(self).__name__, make, options, "inputs")
         law = with_inputs(self.definition, inputs or ())
-        schedule = make(law, joints, initial, **options)
+        schedule = self.make_schedule(law, joints, initial, **options)
         FrictionModel.__init__(self, law, schedule, v_smooth)
         self.inputs = None if inputs is None else list(inputs)
 
@@ -484,6 +484,14 @@ class NeuroFuzzyModel(NamedModel):
 
     def options(self) -> dict[str, Any]:
         return super().options() | ({} if self.inputs is None else {"inputs": self.inputs})
+
+    @staticmethod
+    def make_schedule(*args: Any, network: str = "anfis", **options: Any) -> Schedule:
+        if network not in NETWORKS:
+            raise ValueError(f"`network` must be one of {sorted(NETWORKS)}, got {network!r}.")
+        made: Callable[..., Schedule] = resolve_name(NETWORKS[network])
+        require_options(f"network {network!r}", made, options, ("network", "inputs"))
+        return made(*args, **options)
 
 
 class NFNCFM(NeuroFuzzyModel):

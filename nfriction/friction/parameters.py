@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import reprlib
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from inspect import signature
 from typing import Any
 
 import torch
@@ -69,6 +70,21 @@ def checked_coefficients(
             f"`{names[where[-1]]}` of joint {where[0] + 1} must be {rule}, got {given[where]:g}."
         )
     return given
+
+
+def require_options(
+    of: str, make: Callable[..., object], given: Iterable[str], own: Iterable[str] = ()
+) -> None:
+    """Raise ValueError for options that neither a schedule has nor the model that makes it."""
+    # Behind the law, the joints and the initial values; cells are those of a schedule's own.
+    taken = [p for p in signature(make).parameters.values() if p.name != "cells"][3:]
+    if any(p.kind is p.VAR_KEYWORD for p in taken):
+        return  # handed on to another schedule, which has them checked
+    known = [*own, *(p.name for p in taken)]
+    if unknown := [name for name in given if name not in known]:
+        raise ValueError(
+            f"{of} has no option {', '.join(unknown)}; it has {', '.join(known) or 'none'}."
+        )
 
 
 @dataclass(frozen=True)

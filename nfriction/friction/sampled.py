@@ -27,8 +27,7 @@ def sampled(model: FrictionModel, sample_time: float) -> FrictionModel:
         sample_time: time between samples [s].
 
     Raises:
-        ValueError: if the coefficients have a hidden state, if the law's state depends on the
-            load, which a schedule does not see, or if the sample time is not positive.
+        ValueError: if the coefficients have a hidden state, or the sample time is not positive.
     """
     step = positive_number("sample_time", sample_time, "s")
     law = model.law
@@ -38,24 +37,20 @@ def sampled(model: FrictionModel, sample_time: float) -> FrictionModel:
             f"got {law.name!r} with {type(model.schedule).__name__}."
         )
     model.check_loads(None)
-    _refuse_load(model, step)
     # Signed and without bounds: no fit varies them.
     states = tuple(Coefficient(f"state_{k + 1}", "-", False) for k in range(law.state_size))
     flat = Law(law.name, (*law.coefficients, *states), _Torque(law.memory.torque, law.state_size))
     return FrictionModel(flat, _Sampled(model, flat, step), model.v_smooth)
 
 
-def _refuse_load(model: FrictionModel, step: float) -> None:
+def _moved_by_load(model: FrictionModel, step: float) -> bool:
+    """True where the state of a model's law depends on the load."""
     law, c = model.law, model.schedule.rest_coefficients().detach()
     qd = torch.linspace(-1.0, 1.0, 7, dtype=c.dtype)[:, None].expand(-1, model.joints)
-    start = law.initial_state(qd)
     assert law.memory is not None
-    loaded, unloaded = (law.memory.advance(start, qd, x, c, step) for x in (qd + 2.0, qd * 0.0))
-    if not torch.equal(loaded, unloaded):
-        raise ValueError(
-            f"the state of law {law.name!r} depends on the load, which an export's coefficients "
-            "cannot follow; take a law whose torque alone depends on it, or none."
-        )
+    state = law.initial_state(qd)
+    loaded, unloaded = (law.memory.advance(state, qd, x, c, step) for x in (qd + 2.0, qd * 0.0))
+    return not torch.equal(loaded, unloaded)
 
 
 # A module and no closure, which TorchScript would not compile.
@@ -74,7 +69,11 @@ class _Torque(nn.Module):
 
 
 class _Sampled(Schedule):
-    """Coefficients, and the state of the law that has them."""
+    """Coefficients, and the state of the law that has them.
+
+    Attributes:
+        loaded: whether the load moves that state.
+    """
 
     # The law has no trained range, and a clamped velocity would move its state too little.
     handles_range = True
@@ -88,6 +87,7 @@ class _Sampled(Schedule):
         self.sample_time = sample_time
         self.given = model.schedule
         self.law_advance = model.law.memory.advance
+        self.loaded = _moved_by_load(model, sample_time)
         step = torch.tensor(sample_time, dtype=torch.float64)
         self.register_buffer("step", step, persistent=False)
         self.register_buffer("rest", step.new_zeros(self.state_size), persistent=False)
@@ -100,7 +100,10 @@ class _Sampled(Schedule):
         return qd.unsqueeze(-1) * self.rest
 
     def advance(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:
-        load = 0.0 * qd  # has no part in it
+        return self.advance_loaded(qd, qdd, 0.0 * qd, state)
+
+    def advance_loaded(self, qd: Tensor, qdd: Tensor, load: Tensor, state: Tensor) -> Tensor:
+        """The same under a load, for laws whose state it moves."""
         return self.law_advance(state, qd, load, self.given(qd, qdd), self.step)
 
     def coefficients_from(self, qd: Tensor, qdd: Tensor, state: Tensor) -> Tensor:

@@ -95,6 +95,7 @@ def describe(model: FrictionModel, info: ModelInfo) -> dict[str, Any]:
         raise ValueError(
             f"`joint_names` must name {model.joints} joints, got {list(info.joint_names)}."
         )
+    torque = _unit("N m", info.unit)
     return {
         "format": FORMAT,
         "schema": SCHEMA,
@@ -108,8 +109,8 @@ def describe(model: FrictionModel, info: ModelInfo) -> dict[str, Any]:
             {"name": c.name, "unit": _unit(c.unit, info.unit), "positive": c.positive}
             for c in model.law.coefficients
         ],
-        "units": {"qd": f"{info.unit}/s", "qdd": f"{info.unit}/s^2", "load": "-",
-                  "tau_f": _unit("N m", info.unit)},
+        "units": {"qd": f"{info.unit}/s", "qdd": f"{info.unit}/s^2",
+                  "load": torque if model.law.reads_drive else "-", "tau_f": torque},
         "parameter_hash": parameter_hash(model.state_dict()),
         **asdict(info),
     }  # fmt: skip

@@ -138,6 +138,18 @@ def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> list[tuple
                 "no simulation crosses them; each starts anew behind one",
             )
         )
+    held = held_samples(q)
+    if (held > 1).any():
+        slow_joints = ", ".join(name for name, n in zip(names, held, strict=True) if n > 1)
+        rows = int(held.max())
+        found.append(
+            (
+                f"each position of {slow_joints} is repeated for about {rows} samples, as by a "
+                "sensor that is slower than the log",
+                f"if so, keep the rows with new values, as `recording[::{rows}]` does: repeated "
+                "ones look like a joint that stops and jumps",
+            )
+        )
     if unit == "m":
         return found
     # A pendulum of 0.1 m falls from upright through the bottom at 20 rad/s, and of a whirling chain
@@ -165,6 +177,21 @@ def doubts(time: Array, q: Array, names: Sequence[str], unit: str) -> list[tuple
             )
         )
     return found
+
+
+def held_samples(q: Array) -> NDArray[np.intp]:
+    """Samples for which each new position is held, (joint,); 1 where it changes as the joint does.
+
+    A joint that moves by two counts or more from a sample to the next hardly rests at the samples
+    before and after. Where most such steps lie between two samples of rest, values are repeated.
+    """
+    held = np.ones(q.shape[1], dtype=np.intp)
+    for joint, step in enumerate(np.abs(np.diff(q, axis=0)).T):
+        moves = np.flatnonzero(step[1:-1] > 1.5 * np.min(step[step > 0], initial=np.inf)) + 1
+        alone = (step[moves - 1] == 0) & (step[moves + 1] == 0)
+        if len(moves) >= MINIMUM_SAMPLES and alone.mean() > 0.5:
+            held[joint] = max(2, round(float(np.median(np.diff(moves)))))
+    return held
 
 
 def turns_between_samples(q: Array, pauses: NDArray[np.intp]) -> NDArray[np.intp]:

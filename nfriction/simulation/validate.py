@@ -85,13 +85,13 @@ def validate_inputs(
     for name, whole in (("steps", 1 if steps is None else steps), ("substeps", substeps)):
         if not isinstance(whole, Integral) or whole < 1:
             raise ValueError(f"`{name}` must be a whole number of at least 1, got {whole!r}.")
-    q0 = as_tensor("q0", q0)
-    qd0 = as_tensor("qd0", qd0).to(q0)
     joints = plant.joints
     if friction.joints != joints:
         raise ValueError(f"the plant has {joints} joints, the friction model {friction.joints}.")
     if check := getattr(friction, "check_loads", None):  # other frictions have none
         check(plant)
+    q0 = as_tensor("q0", q0)
+    qd0 = as_tensor("qd0", qd0).to(q0)
     for name, value in (("q0", q0), ("qd0", qd0)):
         if value.ndim == 0 or value.shape[-1] != joints:
             raise ValueError(
@@ -108,6 +108,21 @@ def validate_inputs(
     torque = None if tau is None else as_tensor("tau", tau).to(q0)
     if torque is not None and (torque.ndim < 2 or torque.shape[-1] != joints):
         raise ValueError(f"`tau` must be (*batch, steps, {joints}), got {tuple(torque.shape)}.")
+    if torque is not None and not all_finite(torque):
+        raise ValueError("`tau` must be finite, got NaN or infinity.")
+    count = _step_count(steps, step, torque)
+    if step.ndim == 0:
+        step = step.expand(count)
+    if torque is None:
+        torque = q0.new_zeros(1, 1).expand(count, joints)
+    batch = _common_batch({"q0": q0.shape[:-1], "qd0": qd0.shape[:-1], "tau": torque.shape[:-2],
+                           "sample_time": step.shape[:-1]})  # fmt: skip
+    shape = (*batch, joints)
+    return RolloutInputs(q0.expand(shape), qd0.expand(shape), torque, step, int(substeps))
+
+
+def _step_count(steps: int | None, step: Tensor, torque: Tensor | None) -> int:
+    """The number of steps that all arguments agree on."""
     lengths = {
         "steps": steps,
         "sample_time": step.shape[-1] if step.ndim else None,
@@ -119,21 +134,15 @@ def validate_inputs(
     count = next(iter(known.values()))
     if count < 1:
         raise ValueError("`tau` must have a row for at least one step, got none.")
-    if step.ndim == 0:
-        step = step.expand(count)
-    if torque is None:
-        torque = q0.new_zeros(1, 1).expand(count, joints)
-    elif not all_finite(torque):
-        raise ValueError("`tau` must be finite, got NaN or infinity.")
-    batches = {"q0": q0.shape[:-1], "qd0": qd0.shape[:-1], "tau": torque.shape[:-2],
-               "sample_time": step.shape[:-1]}  # fmt: skip
+    return count
+
+
+def _common_batch(batches: dict[str, torch.Size]) -> tuple[int, ...]:
     try:
-        batch = np.broadcast_shapes(*batches.values())
+        return np.broadcast_shapes(*batches.values())
     except ValueError:
         shown = ", ".join(f"`{name}` {tuple(b)}" for name, b in batches.items() if b)
         raise ValueError(f"batches must be the same, 1 or left out, got {shown}.") from None
-    shape = (*batch, joints)
-    return RolloutInputs(q0.expand(shape), qd0.expand(shape), torque, step, int(substeps))
 
 
 def validate_measured(

@@ -1,5 +1,7 @@
 """Fixtures of the command line's tests."""
 
+import contextlib
+import io
 from collections.abc import Callable
 from pathlib import Path
 
@@ -25,6 +27,15 @@ def compared(bench: Path) -> Path:
     out = bench / "out"
     assert compare(bench, out, models="NCFM,LFM") == 0
     return out
+
+
+@pytest.fixture(scope="session")
+def again(bench: Path) -> tuple[Path, str]:
+    """Folder of the same comparison, by plain names and without figures, and what it printed."""
+    out, said = bench / "again", io.StringIO()
+    with contextlib.redirect_stdout(said):
+        assert compare(bench, out, "--no-figures", models="viscous,load-coulomb") == 0
+    return out, said.getvalue()
 
 
 @pytest.fixture

@@ -69,20 +69,16 @@ def test_figures_are_drawn_and_nothing_unfinished_stays(compared: Path) -> None:
     assert not list(compared.rglob(".*"))
 
 
-def test_equal_input_gives_equal_bytes(bench: Path, compared: Path) -> None:
-    assert compare(bench, bench / "again", "--no-figures", models="NCFM,LFM") == 0
-    assert not (bench / "again" / "figures").exists()
-    assert (bench / "again/table.csv").read_bytes() == (compared / "table.csv").read_bytes()
+def test_equal_input_gives_equal_bytes(compared: Path, again: tuple[Path, str]) -> None:
+    out, _ = again
+    assert not (out / "figures").exists()
+    assert (out / "table.csv").read_bytes() == (compared / "table.csv").read_bytes()
     own = {"command": "", "files": [], "checksum": ""}
-    assert results(bench / "again") | own == results(compared) | own
+    assert results(out) | own == results(compared) | own
 
 
-def test_verdict_names_the_winner_and_its_file(
-    bench: Path, compared: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = bench / "told"
-    assert compare(bench, out, "--no-figures", models="viscous,load-coulomb") == 0
-    said = capsys.readouterr().out
+def test_verdict_names_the_winner_and_its_file(again: tuple[Path, str]) -> None:
+    out, said = again
     assert "models: NCFM: viscous, LFM: load-coulomb\n" in said
     assert "best on test recordings: LFM" in said
     (file,) = re.findall(r"its model file: (.*)", said)
@@ -99,12 +95,11 @@ def test_verdict_names_the_winner_and_its_file(
 
 
 def test_a_comparison_ends_with_the_gain_and_commands_for_what_comes_next(
-    bench: Path, compared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    assert compare(bench, tmp_path, "--no-figures", models="NCFM,LFM") == 0
-    *_, without, learnt, report, export = capsys.readouterr().out.splitlines()
-    free = {n: m["test"]["b"]["free_run"]["all"] for n, m in results(tmp_path)["models"].items()}
+    again: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, said = again
+    *_, without, learnt, report, export = said.splitlines()
+    free = {n: m["test"]["b"]["free_run"]["all"] for n, m in results(out)["models"].items()}
     none, best = free["no friction"], free["LFM"]
     assert without.endswith(f" miss the measured motion by {1e3 * none:.3g} mrad;")
     assert "(load-coulomb)" in learnt
@@ -115,7 +110,7 @@ def test_a_comparison_ends_with_the_gain_and_commands_for_what_comes_next(
     monkeypatch.chdir(tmp_path)
     for line in (report, export):
         assert cli.main(line.partition("nfriction ")[2].split()) == 0
-    assert (tmp_path / "report.html").is_file()
+    assert (out / "report.html").is_file()
     assert list((tmp_path / "controller").glob("*.c"))
 
 

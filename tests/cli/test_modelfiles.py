@@ -79,7 +79,7 @@ def test_a_fit_that_is_not_to_be_used_is_not_told_to_be_exported(
     out = ["--out", str(tmp_path / "m.json")]
     assert cli.main(["fit", str(tmp_path / "driven.csv"), *words, *out]) == 0
     said = capsys.readouterr().out
-    assert "do not use (a mistake in the data is likely" in said
+    assert "do not use (a mistake in data or rig is likely" in said
     assert "gains energy" in said
     assert "next:" not in said
 

@@ -151,8 +151,9 @@ def _build(folder, barrier, queue):
     queue.put(answer())
 
 
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes that import nothing anew")
 def test_two_processes_may_build_at_once(cache):
-    context = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("fork")
     barrier, queue = context.Barrier(2), context.Queue()
     args = (str(cache), barrier, queue)
     workers = [context.Process(target=_build, args=args) for _ in range(2)]

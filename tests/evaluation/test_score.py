@@ -222,6 +222,18 @@ def test_the_limit_knows_the_noise_of_the_torque():
     assert within >= 5
 
 
+def test_the_limit_knows_the_integration():
+    """A fine encoder shows that steep friction is simulated by few steps."""
+    axis, friction = LinearAxis(0.5), CVFM(1, [0.4, 0.1], v_smooth=3e-3)
+    tau = 1.5 * torch.sin(2e-2 * torch.arange(1500.0, dtype=torch.float64))[:, None]
+    zero = torch.zeros(1, dtype=torch.float64)
+    run = rollout(axis, friction.requires_grad_(False), zero, zero, tau, sample_time=4e-3,
+                  substeps=32)  # fmt: skip
+    q, held = quantise(run.q.numpy(), 2**26), np.vstack([tau.numpy(), tau[-1:].numpy()])
+    found = score(axis, friction, Recording(run.time.numpy(), q, tau=held, unit="m"), horizons=())
+    assert 0.2 * found.limit.free_run.all < found.free_run.all <= found.limit.free_run.all
+
+
 def test_the_limit_knows_the_rounding_that_only_the_recording_shows():
     """A joint held by friction reads a constant, up to half a count off."""
     friction = CVFM(2, [[5e-2, 2e-3], [2e-2, 2e-3]], v_smooth=0.01).requires_grad_(False)

@@ -16,10 +16,11 @@ from nfriction.evaluation.torque_tables import (
     score_models,
     split,
 )
-from nfriction.export.torch_files import open_torchscript
+from nfriction.export.controller import controller_of
 from nfriction.fitting.torque_table import fit_joint, join
 from nfriction.recording.torque_table import TorqueTable, blocks
 from nfriction.report.torque import write_torque_fits
+from tests.export.artefacts import runner_of
 
 
 def motion(rows: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -152,7 +153,7 @@ def test_exports_give_the_predicted_torque(tmp_path: Path) -> None:
     found = fit_torque(table, "stribeck")
     model, info = found.model("stribeck"), found.info("stribeck")
     path = nfriction.export.torchscript(model, tmp_path / "model.pt", info)
-    _, run = open_torchscript(path)
+    run = runner_of(path, controller_of(model, info))
     qd = torch.tensor(table[["qd1", "qd2"]].to_numpy())
     torque = run(qd, torch.zeros_like(qd), torch.ones_like(qd))[0].numpy()
     np.testing.assert_allclose(torque, np.stack(found.predict(table), 1), rtol=1e-12)
@@ -208,3 +209,17 @@ def test_a_network_that_was_dropped_is_not_chosen_over_its_law() -> None:
     network = Candidate("NFCVFM", (1.0, 1.0 - 1e-12), 2, True)
     assert _choose([network, law])[0] == _choose([law, network])[0] == "CVFM"
     assert _choose([law, network])[1].endswith("with no more parameters")
+
+
+def test_memory_and_load_have_to_gain_more_than_the_blocks_scatter() -> None:
+    plain = Candidate("CVFM", (1.0, 1.2, 0.8, 1.1, 0.9, 2.0), 2, True)
+    # A single block gains.
+    once = Candidate("Slip", (1.0, 1.2, 0.8, 1.1, 0.9, 1.4), 9, True)
+    steady = Candidate("Slip", (0.5, 0.7, 0.4, 0.6, 0.5, 1.0), 9, True)
+    loaded = Candidate("LoadSlip", (0.4, 0.8, 0.3, 0.5, 0.5, 0.9), 9, True)
+    assert once.error < 0.9 * plain.error
+    name, why = _choose([plain, once])
+    assert name == "CVFM"
+    assert why == "the only model; slip has 12 % less, which the blocks' scatter explains"
+    assert _choose([loaded, steady, plain])[0] == "Slip"
+    assert _choose([steady, plain])[1] == "47 % less than coulomb-viscous"

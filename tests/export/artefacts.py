@@ -1,8 +1,13 @@
-"""Models, ranges and schedules to export in tests."""
+"""Models, ranges and schedules to export in tests, and what runs artefacts as they are."""
+
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from nfriction.export import onnx_file, torch_files
+from nfriction.export.contract import Runner
+from nfriction.export.controller import Controller
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import LINEAR, Law
 from nfriction.friction.models import FrictionModel
@@ -33,3 +38,13 @@ def rising(joints: int = 3, law: Law = LINEAR) -> FrictionModel:
     model = FrictionModel(law, Rising(law, joints, [1e-3, 2e-3]))
     randomise(model, 0.3)
     return model
+
+
+def runner_of(path: Path, controller: Controller, dtype: str = "float64") -> Runner:
+    """Run an artefact of our own, so that its program need not be compared with a new one."""
+    if path.suffix == ".onnx":
+        return onnx_file._runner(onnx_file._read(path), controller, dtype, path)
+    with torch_files.silent():
+        if path.suffix == ".pt":
+            return torch_files._script_runner(torch.jit.load(str(path)), controller)
+        return torch_files._program_runner(torch.export.load(path), controller)

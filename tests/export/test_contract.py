@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import pytest
@@ -25,6 +26,7 @@ from tests.friction.samples import named_models
 MODELS = named_models()
 
 
+@cache
 def contract(name: str = "LFM", with_filter: bool = False, **options: Any) -> Contract:
     controller = controller_of(MODELS[name], INFO, with_filter=with_filter)
     return contract_of(MODELS[name], controller, INFO, **options)

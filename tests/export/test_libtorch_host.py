@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from nfriction.export import torchscript
-from nfriction.export.torch_archive import METADATA
+from nfriction.export.torch_files import METADATA
 from tests.export.artefacts import INFO
 from tests.friction.samples import named_models
 

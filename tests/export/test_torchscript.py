@@ -11,16 +11,15 @@ import torch
 from torch import Tensor
 
 from nfriction.export import ExportError, torchscript
-from nfriction.export.contract import compare, draw, draw_motion, verify
+from nfriction.export.contract import compare, draw, draw_motion
 from nfriction.export.controller import controller_of
-from nfriction.export.torch_archive import METADATA
-from nfriction.export.torch_files import open_torchscript
+from nfriction.export.torch_files import METADATA, contract_of_archive
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law, TorqueFunction
 from nfriction.friction.models import LFM, FrictionModel
 from nfriction.friction.neurofuzzy import NFLFM, NeuroFuzzy
 from nfriction.io.model_file import ModelInfo, parameter_hash
-from tests.export.artefacts import INFO, rising
+from tests.export.artefacts import INFO, rising, runner_of
 from tests.friction.samples import QUADRATIC, named_models, randomise
 
 # Whatever the export lets through fails the test.
@@ -141,13 +140,12 @@ def test_parity_over_very_many_points(name: str, tmp_path: Path) -> None:
 
 
 def check_parity(model: FrictionModel, path: Path, points: int) -> None:
-    contract, run = open_torchscript(torchscript(model, path, INFO, torque_limit=50.0))
+    torchscript(model, path, INFO, torque_limit=50.0)
     controller = controller_of(model, INFO, torque_limit=50.0)
     inputs = draw(controller, points, seed=11)
-    parity = compare(controller.run(*inputs), run(*inputs), 1e-12)
+    parity = compare(controller.run(*inputs), runner_of(path, controller)(*inputs), 1e-12)
     assert parity.points == points
     assert parity.passed, parity
-    assert verify(run, contract).passed
 
 
 def test_a_schedule_of_ones_own_is_clamped_in_the_artefact(tmp_path: Path) -> None:
@@ -170,24 +168,8 @@ def test_nan_and_infinity_give_nan_from_the_short_call_too(tmp_path: Path) -> No
 def test_the_filter_inside_equals_the_one_outside(name: str, tmp_path: Path) -> None:
     model = named_models()[name]
     path = torchscript(model, tmp_path / "model.pt", INFO, with_filter=True)
-    contract, run = open_torchscript(path)
-    assert contract.state_size == 6 + model.state_size
-    assert verify(run, contract).passed
+    assert contract_of_archive(path).state_size == 6 + model.state_size
     assert_equal(model, path)  # the short call takes motions as ever
-
-
-def test_what_is_no_artefact_is_refused(tmp_path: Path) -> None:
-    good = torchscript(LFM(2), tmp_path / "good.pt").read_bytes()
-    bad = tmp_path / "bad.pt"
-    for content in (b"", b"junk", good[: len(good) // 2]):
-        bad.write_bytes(content)
-        with pytest.raises(ExportError, match="no TorchScript"):
-            open_torchscript(bad)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        torch.jit.save(torch.jit.script(torch.nn.Linear(2, 2)), str(bad))
-    with pytest.raises(ExportError, match="not ours"):
-        open_torchscript(bad)
 
 
 # Refusals

@@ -57,8 +57,8 @@ def driven_axis(
     return Recording(time, q, tau=tau.numpy(), unit="m", name="axis")
 
 
-def flywheel(seed: int, friction: FrictionModel) -> Recording:
-    """A driven axis of 0.13 kg: smooth random force with noise, 4096 counts a turn, 500 Hz."""
+def flywheel(seed: int, friction: FrictionModel, counts: int = 4096) -> Recording:
+    """A driven axis of 0.13 kg: smooth random force with noise, an encoder, 500 Hz."""
     random = np.random.default_rng(seed)
     time = np.arange(0.0, 10.0, 2e-3)[:, None]
     rate, phase = random.uniform(0.6, 9.0, 6), random.uniform(0.0, 6.0, 6)
@@ -69,7 +69,9 @@ def flywheel(seed: int, friction: FrictionModel) -> Recording:
         substeps=8, gradients=False,
     )  # fmt: skip
     read = tau + 0.01 * random.standard_normal(tau.shape)
-    return Recording(time[:, 0], quantise(out.q.numpy(), 4096), tau=read, unit="m", name=f"{seed}")
+    return Recording(
+        time[:, 0], quantise(out.q.numpy(), counts), tau=read, unit="m", name=f"{seed}"
+    )
 
 
 def solve(

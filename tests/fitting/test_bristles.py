@@ -1,10 +1,12 @@
 """Dahl, LuGre, elasto-plastic and gear friction recovered from tables of torque."""
 
+from functools import cache
+
 import numpy as np
 import pandas as pd
 import pytest
 
-from nfriction.evaluation.torque_tables import fit_torque
+from nfriction.evaluation.torque_tables import TorqueFits, fit_torque
 from nfriction.fitting.bristles import torques
 from nfriction.fitting.torque_table import predict
 from nfriction.friction import model_by_name
@@ -32,9 +34,15 @@ def table_of(name: str, seed: int = 0, reach: float = 1.0) -> pd.DataFrame:
     return given.assign(tau=predict(model, joint, 0.0).numpy() + noise)
 
 
+@cache
+def fitted(name: str) -> TorqueFits:
+    """The fit of the law that made the table."""
+    return fit_torque(table_of(name), name, folds=4)
+
+
 @pytest.mark.parametrize("name", TRUE)
 def test_coefficients_are_recovered_within_their_intervals(name: str) -> None:
-    found = fit_torque(table_of(name), name, folds=4)
+    found = fitted(name)
     values = found.intervals()
     for coefficient, true in zip(model_by_name(name)(1).law.coefficients, TRUE[name], strict=True):
         row = values.loc[f"{coefficient.name} of joint1"]
@@ -58,8 +66,7 @@ def test_rows_without_presliding_do_not_determine_the_stiffness() -> None:
     """Strokes of thousands of rad pass the presliding of 2 mrad within a sample, even near rest."""
     found = fit_torque(table_of("Dahl", reach=1e5), "dahl", folds=4)
     assert found.intervals().loc["sigma_0 of joint1", "note"] == "not identifiable"
-    seen = fit_torque(table_of("Dahl"), "dahl", folds=4)
-    assert seen.intervals().loc["sigma_0 of joint1", "note"] == ""
+    assert fitted("Dahl").intervals().loc["sigma_0 of joint1", "note"] == ""
 
 
 def test_rows_that_only_slide_are_fitted() -> None:

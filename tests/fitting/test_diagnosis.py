@@ -2,6 +2,7 @@
 
 import functools
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -133,6 +134,8 @@ def test_mistakes_in_positions(name, change, finding):
         ("driven", lambda tau: later(tau, 10), "torques are recorded 18"),
         ("motor", lambda tau: tau / 0.12, "the torque of joint1 is 8.3"),
         ("axis", lambda tau: -tau, "the force of joint1 has the wrong sign"),
+        ("motor", np.abs, "the torque of joint1 is recorded without its sign"),
+        ("driven", lambda tau: np.abs(tau) * [1, 0] + tau * [0, 1], "joint1 is recorded without"),
     ],
 )
 def test_mistakes_in_torques(name, change, finding):
@@ -202,6 +205,61 @@ def test_a_driven_motion_without_torque_is_named(name):
     assert "has no torque, but its motion gains energy up to" in found
 
 
+def test_a_drive_that_saturates_is_named():
+    plant, q, tau = measured("motor")
+    most = np.abs(tau).max()
+    # The log holds what was commanded, in which the limit does not show.
+    commanded = np.sign(tau) * np.where(np.abs(tau) > 0.6 * most, 2 * np.abs(tau) - 0.6 * most,
+                                        np.abs(tau))  # fmt: skip
+    driven = np.clip(commanded, -0.6 * most, 0.6 * most)
+    start = torch.tensor([math.pi], dtype=torch.float64)
+    model = CVFM(1, [[0.3, 0.12]]).requires_grad_(False)
+    found = rollout(plant, model, start, 0 * start, sample_time=STEP, steps=SAMPLES - 1,
+                    substeps=8, tau=torch.as_tensor(driven[:-1]))  # fmt: skip
+    q = COUNT * np.round(found.q.numpy() / COUNT)
+    assert warnings_of(plant, q, driven) == ()
+    (warning,) = warnings_of(plant, q, commanded)
+    assert f"the drive of joint1 saturates at {0.6 * most:.2g}"[:-1] in warning
+
+
+@pytest.mark.parametrize("drift", [0.01, -0.01])
+def test_a_clock_that_drifts_is_named(drift):
+    plant, q, tau = measured("motor")
+    time = STEP * np.arange(len(q))
+    late = np.interp(time * (1 - drift), time, tau[:, 0])[:, None]
+    (warning,) = warnings_of(plant, q, late)
+    way = "fast" if drift > 0 else "slow"
+    (named,) = re.findall(rf"the clock of the torques is ([\d.]+) % {way}", warning)
+    assert float(named) == pytest.approx(1, rel=0.05)
+
+
+def test_an_elastic_joint_is_named_and_doubtful():
+    """A drive of half the inertia, a spring, and a link whose encoder is read."""
+    plant, _, tau = measured("direct")
+    drive, link, stiffness = 0.04, 0.04, 80.0
+    weight = float(plant.gravity_moment.sum())
+    steps = 10
+    h, state, seen = STEP / steps, np.zeros(4), []
+    for u in tau[:, 0]:
+        seen.append(state[1])
+        for _ in range(steps):
+            # Semi-implicit: a spring without damping neither gains nor loses.
+            spring = stiffness * (state[0] - state[1]) + 0.05 * (state[2] - state[3])
+            rub = 0.3 * np.tanh(state[2] / 3e-3) + 0.12 * state[2]
+            state[2] += h * (u - rub - spring) / drive
+            state[3] += h * (spring - weight * np.sin(state[1])) / link
+            state[:2] += h * state[2:]
+    q = COUNT * np.round(np.array(seen)[:, None] / COUNT) + math.pi
+    recording = Recording(STEP * np.arange(SAMPLES), q, tau, convention="relative,upright")
+    found = fit(CVFM(1), plant, recording, windows=(0.5,))
+    assert "joint1 is elastic or has play between drive and encoder" in found.mistakes[0]
+    resonance = math.sqrt(stiffness * (1 / drive + 1 / link)) / math.tau
+    (named,) = re.findall(r"resonance near ([\d.]+) Hz", found.mistakes[0])
+    assert float(named) == pytest.approx(resonance, rel=0.15)
+    # Simulations follow the motion all the same.
+    assert found.usability[0] == "doubtful"
+
+
 def test_a_recording_of_another_rig_is_named():
     plant, q, tau = measured("motor")
     heavy = plant.replace(gravity_moment=2 * plant.gravity_moment)
@@ -241,9 +299,10 @@ def test_lost_counts_and_missing_samples_are_named_with_their_time():
     assert not any("jumps" in warning for warning in warnings_of(plant, q, tau))
 
 
-def test_torques_of_a_wrong_scale_are_named():
-    """They fit a rig that is heavier throughout, within what is allowed."""
-    plant, q, tau = measured("direct")
+@pytest.mark.parametrize("name", ["direct", "motor"])
+def test_torques_of_a_wrong_scale_are_named(name):
+    """They fit a rig that is heavier throughout, within what is allowed; with a gear, too."""
+    plant, q, tau = measured(name)
     recording = Recording(STEP * np.arange(len(q)), q, 1.2 * tau, convention="relative,upright")
     found = fit(CVFM(1), plant, recording, windows=(0.5,))
     assert any("as if torques were recorded 1.2 times too large" in w for w in found.warnings)

@@ -9,12 +9,12 @@ import torch
 from nfriction import LFM, NFLFM, fit
 from nfriction.fitting.data.inputs import measurement_matrix
 from nfriction.fitting.options import DEFAULTS
+from nfriction.fitting.result.paired_test import gains
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.continuation import ShootingFitter
 from nfriction.fitting.strategy.holdout import (
     cut_for_folds,
-    gains,
     holdout_splits,
     holdout_squares,
     holdout_windows,

@@ -66,6 +66,15 @@ def test_a_joint_that_moves_in_one_recording_is_not_named():
     assert said(plant, rest, moving) == ()
 
 
+@pytest.mark.parametrize(("stretch", "named"), [(1.02, 1), (1.0005, 0), (2.0, 0)])
+def test_clocks_that_differ_a_little_are_named(stretch, named):
+    first = swing(pendulum(), MODEL, seconds=1.0, convention="relative,hanging", name="one")
+    other = Recording(stretch * first.time, first.q, name="two", convention="relative,hanging")
+    found = said(pendulum(convention=("relative", "hanging")), first, other)
+    clocks = [w for w in found if "two has a sample every 2.04 ms, one every 2 ms" in w]
+    assert len(clocks) == named
+
+
 def test_neuro_fuzzy_coefficients_need_some_motion():
     plant, rest = resting(3)
     with pytest.raises(ValueError, match=r"joint1 never moves in rest.*record it moving"):

@@ -6,22 +6,22 @@ from dataclasses import replace
 import pytest
 import torch
 
-from nfriction import LFM, LinearAxis, Stribeck, fit
+from nfriction import CVFM, LFM, LinearAxis, Stribeck, fit
 from nfriction.fitting.data.inputs import measurement_matrix
 from nfriction.fitting.data.windows import cut_windows
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.result.identifiability import information, standard_deviations
+from nfriction.fitting.result.paired_test import log_ratio
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.continuation import (
     ShootingFitter,
     StallMonitor,
-    log_ratio,
     loses,
     settle_states,
 )
 from nfriction.optim.least_squares import Step
 from nfriction.signals import kalman_smoother
-from tests.fitting.recordings import F64, flywheel, pendulum, swing
+from tests.fitting.recordings import F64, driven_axis, flywheel, pendulum, swing
 
 PATIENCE, SETTLED = DEFAULTS.patience, DEFAULTS.settled_move
 
@@ -101,6 +101,17 @@ def test_what_is_shared_has_settled_once_it_moves_no_more():
     assert not settles([x, far, x, far])
     assert not settles([x, near, far, near])
     assert not settles([x, near, x, near], damping=10.0)
+
+
+def test_a_stage_bears_the_length_that_its_windows_have():
+    recording = driven_axis(LinearAxis(0.13), CVFM(1, [0.35, 0.12]), seconds=1.2)
+    names = set()
+    found = fit(
+        CVFM(1), LinearAxis(0.13), recording, windows=(5.0,), fit_plant=False,
+        callback=lambda stage, step: names.add(stage),
+    )  # fmt: skip
+    assert names == {"1.2 s windows"}
+    assert [length for length, _ in found.stages] == [1.2]
 
 
 def test_long_windows_do_not_lose_the_friction_that_short_ones_found():

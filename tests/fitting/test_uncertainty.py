@@ -7,8 +7,18 @@ import pytest
 import torch
 
 from nfriction import CVFM, LFM, NFLFM, LinearAxis, Recording, fit, rigs, rollout
-from nfriction.fitting.result.identifiability import PIECE, CoefficientUncertainty
+from nfriction.fitting.data.windows import cut_windows
+from nfriction.fitting.result.identifiability import (
+    PIECE,
+    CoefficientUncertainty,
+    standard_deviations,
+)
+from nfriction.fitting.shooting import uncertainty
+from nfriction.fitting.shooting.problem import ShootingProblem
+from nfriction.fitting.shooting.sensitivity import StepJacobian
+from nfriction.fitting.shooting.uncertainty import torque_response
 from nfriction.fitting.strategy.neurofuzzy import _Validation
+from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import flywheel
 
 F64 = torch.float64
@@ -51,6 +61,41 @@ def test_intervals_know_the_noise_of_the_torque():
         ]
     # By residuals alone 3 standard deviations.
     assert 0.3 < np.sqrt(np.mean(np.square(off))) < 1.5
+
+
+def test_the_noise_of_the_torque_counts_once(monkeypatch):
+    """A fine encoder shows nothing else, so residuals add nothing to what is drawn."""
+    tasks, drawn = [], uncertainty.gathered_information
+    monkeypatch.setattr(
+        "nfriction.fitting.result.of_search.gathered_information",
+        lambda *task: tasks.append(task) or drawn(*task),
+    )
+    recording = flywheel(0, CVFM(1, [0.35, 0.12]), counts=2**18)
+    fit(CVFM(1), LinearAxis(0.13), recording, windows=(0.5,), fit_plant=False)
+    ((problem, x, sd, *_),) = tasks
+    whole, alone = (standard_deviations(drawn(problem, x, by * sd)) for by in (1.0, 0.0))
+    torch.testing.assert_close(whole, alone, rtol=0.03, atol=0)
+
+
+def test_noise_by_which_a_simulation_diverges_is_left_out(monkeypatch):
+    axis, model = LinearAxis(0.13), CVFM(1, [0.35, 0.12])
+    recording = flywheel(0, model)[:400]
+    motion = kalman_smoother(recording.time, recording.q)
+    windows = cut_windows([recording], [motion], 0.4)
+    problem = ShootingProblem(
+        StepJacobian(axis, model, []), model, windows, 1e-3, torch.eye(1, dtype=F64)
+    )
+    x = problem.variables.start()
+    whole = torque_response(problem, x, 3)
+    simulate, calls = uncertainty._positions, iter(range(9))
+
+    def second_diverges(*task):
+        return simulate(*task) * (torch.inf if next(calls) == 2 else 1.0)
+
+    monkeypatch.setattr(uncertainty, "_positions", second_diverges)
+    torch.testing.assert_close(torque_response(problem, x, 3), whole[..., [0, 2]])
+    monkeypatch.setattr(uncertainty, "_positions", lambda *task: simulate(*task) * torch.inf)
+    assert torque_response(problem, x, 3) is None
 
 
 def test_moved_parameters_move_the_coefficients_so_far():

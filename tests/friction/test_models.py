@@ -148,18 +148,25 @@ def test_nan_in_nan_out() -> None:
             assert torch.equal(torch.isnan(model(*inputs)), torch.isnan(expected)), (name, which)
 
 
-@pytest.mark.parametrize("name", ["NFLuGre", "NFDahl", "LFM"])
-def test_an_option_that_a_model_lacks_is_named(name) -> None:
-    with pytest.raises(ValueError, match=f"{name} has no option inputs; it has"):
-        model_by_name(name)(2, inputs=["direction"])
+@pytest.mark.parametrize(
+    ("name", "of", "known"),
+    [
+        ("NFLuGre", "NFLuGre", "terms"),
+        ("LFM", "LFM", "none"),
+        ("MaxwellSlip", "MaxwellSlip", "elements"),
+        ("NFLFM", "network 'anfis'", "network, inputs, terms"),
+    ],
+)
+def test_an_option_that_a_model_lacks_is_named(name, of, known) -> None:
+    with pytest.raises(ValueError, match=f"{of} has no option depth; it has {known}"):
+        model_by_name(name)(2, depth=3)
 
 
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ({"tirms": (3, 3)}, "NFLFM has no option tirms; it has terms"),
-        ({"network": "rbf", "terms": (3, 3)}, "NFLFM has no option terms; it has head_units"),
-        ({"network": "by_class", "depth": 3}, "A network by class has no option depth; it has"),
+        ({"network": "rbf", "terms": (3, 3)}, "network 'rbf' has no option terms; it has"),
+        ({"network": "by_class", "depth": 3}, "network 'by_class' has no option depth; it has"),
         ({"head_units": 2.5}, "`head_units` must be a whole number"),
         ({"inputs": "load"}, "`inputs` must be different ones of direction, load, got 'load'"),
     ],

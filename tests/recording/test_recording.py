@@ -378,6 +378,23 @@ def test_arrays_are_copies_and_read_only() -> None:
         recording.q[0] = 1
 
 
+@pytest.mark.parametrize("count", [2 * np.pi / 4096, 1e-12])
+@pytest.mark.parametrize("held", [2, 5])
+def test_positions_of_a_slower_sensor_are_noticed(count: float, held: int) -> None:
+    time = 2e-3 * np.arange(2000)
+    q = count * np.round(np.sin(3 * time)[:, None] / count)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # Slow joints rest between counts, and jerky ones stop at once.
+        Recording(time, q)
+        Recording(time, 0.05 * q)
+        Recording(time, count * np.round(np.abs(np.sin(3 * time))[:, None] / count))
+    slow = np.repeat(q[::held], held, 0)
+    with pytest.warns(RecordingWarning, match=f"of joint1 is repeated for about {held} samples"):
+        found = Recording(time, slow)
+    assert len(found[::held]) == 2000 // held
+
+
 def test_milliseconds_are_noticed() -> None:
     recording = swing()
     with pytest.warns(RecordingWarning, match="milliseconds"):

@@ -12,9 +12,12 @@ import hashlib
 import io
 import json
 import struct
+import tempfile
+import zipfile
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
 from random import Random
@@ -29,13 +32,12 @@ from nfriction.export.contract import (
     Contract,
     ContractError,
     ExportError,
-    Runner,
     contract_of,
     verify,
 )
 from nfriction.export.controller import controller_of
-from nfriction.export.onnx_file import open_onnx
-from nfriction.export.torch_files import open_pt2, open_torchscript
+from nfriction.export.onnx_file import contract_of_onnx, onnx_runner
+from nfriction.export.torch_files import contract_of_archive, own_program
 from nfriction.io.files import checked_json
 from nfriction.io.formats import measurements
 from nfriction.io.model_file import ModelFileError, load, load_info, load_plant, parameter_hash
@@ -481,12 +483,11 @@ def _read_contract(path: Path) -> None:
     assert found.state_size >= 0
 
 
-def _artefact(write: Callable[..., Path]) -> Callable[[Path], list[bytes]]:
-    def samples(folder: Path) -> list[bytes]:
-        model, info = _models()[0]
-        return [write(model, folder / "sample", info).read_bytes()]
-
-    return samples
+@cache
+def _artefact(write: Callable[..., Path]) -> bytes:
+    model, info = _models()[0]
+    with tempfile.TemporaryDirectory() as folder:
+        return write(model, Path(folder) / "sample", info).read_bytes()
 
 
 def _damage_artefact(rng: Random, content: bytes) -> bytes:
@@ -501,25 +502,18 @@ def _damage_part(rng: Random, content: bytes) -> bytes:
     return damage_bytes(rng, content)
 
 
-def _read_pt2(path: Path) -> None:
-    _run_artefact(*open_pt2(path))
-
-
-def _read_torchscript(path: Path) -> None:
-    _run_artefact(*open_torchscript(path))
-
-
-def _run_artefact(contract: Contract, run: Runner) -> None:
-    """As `verify_artefact` does; a program that does not run is refused there."""
-    try:
-        verify(run, contract)
-    except (RuntimeError, TypeError, AttributeError, LookupError, ValueError) as error:
-        raise ExportError(str(error)[:1000]) from error
+def _read_archive(write: Callable[..., Path], path: Path) -> None:
+    """As `verify_artefact` does before torch runs anything."""
+    contract = contract_of_archive(path)
+    assert contract.state_size >= 0
+    with zipfile.ZipFile(own_program(path, _artefact(write))) as archive:
+        assert archive.testzip() is None
 
 
 def _read_onnx(path: Path) -> None:
-    contract, run = open_onnx(path)
-    verify(run, contract)
+    model, info = _models()[0]
+    contract = contract_of_onnx(path)
+    verify(onnx_runner(path, controller_of(model, info)), contract)
 
 
 # Folders of results.
@@ -594,11 +588,11 @@ LOADERS: dict[str, Loader] = {
         Loader("results", ".json", _run_samples, _read_results, damage_json,
                names_file=False),
         Loader("figure", ".png", _figure_samples, _read_figure, damage_bytes, names_file=False),
-        Loader("pt2", ".pt2", _artefact(pt2), _read_pt2, _damage_artefact, _ARTEFACT,
-               names_file=False, apart=True),
-        Loader("onnx", ".onnx", _artefact(onnx), _read_onnx, damage_bytes, _ARTEFACT,
+        Loader("pt2", ".pt2", lambda _: [_artefact(pt2)], partial(_read_archive, pt2),
+               _damage_artefact, _ARTEFACT, names_file=False),
+        Loader("onnx", ".onnx", lambda _: [_artefact(onnx)], _read_onnx, damage_bytes, _ARTEFACT,
                names_file=False, needs="onnx"),
-        Loader("torchscript", ".pt", _artefact(torchscript), _read_torchscript, _damage_artefact,
-               _ARTEFACT, names_file=False, apart=True),
+        Loader("torchscript", ".pt", lambda _: [_artefact(torchscript)],
+               partial(_read_archive, torchscript), _damage_artefact, _ARTEFACT, names_file=False),
     )
 }  # fmt: skip

@@ -19,8 +19,8 @@ from nfriction.recording import Recording, read_initial_states
 from tests.robustness.fuzz import fuzz
 from tests.robustness.loaders import LOADERS, Loader
 
-# Programs of torch take a second a case.
-QUICK = [name for name in LOADERS if name not in ("onnx", "pt2", "torchscript")]
+# An ONNX graph is written anew in each case, which takes a second, and a .pt2 for the first.
+QUICK = [name for name in LOADERS if name not in ("onnx", "pt2")]
 
 
 def needed(name: str) -> Loader:

@@ -1,6 +1,7 @@
 """Rollouts of friction with memory: order, stability, rest, energy, agreement of all executors."""
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -11,11 +12,13 @@ from torch import Tensor, nn
 
 from nfriction import LFM, LinearAxis, PendulumChain, Recording, Stribeck, load, rollout, save
 from nfriction.evaluation.score import score
+from nfriction.friction.coefficients import Constant
 from nfriction.friction.hysteresis import (
     ELEMENTS,
     FADING,
     FIRST,
     OFFSET,
+    SLIP,
     STRIBECK,
     TURN,
     VISCOUS,
@@ -199,12 +202,14 @@ def test_a_torque_that_cancels_an_offset_leaves_the_motion_as_it_is(offset: floa
 
 
 def test_friction_that_falls_over_the_first_displacement_keeps_the_order() -> None:
-    """A fitted `slip` may have a negative narrow element, whose slope at rest is negative."""
+    """A law of one's own may have a negative narrow element, whose slope at rest is negative."""
+    signed = tuple(replace(c, positive=False) if c.linear else c for c in SLIP.coefficients)
+    law = replace(SLIP, coefficients=signed)
     values = [0.0] * (FIRST + 2 * ELEMENTS)
     values[VISCOUS], values[TURN], values[STRIBECK], values[FADING] = 0.5, 0.1, 0.1, 1e-9
     values[FIRST : FIRST + 2] = [-0.2, 1.0]
     values[FIRST + ELEMENTS :] = [1e-5] + [1e-3] * (ELEMENTS - 1)
-    model = Slip(1, values).requires_grad_(False)
+    model = FrictionModel(law, Constant(law, 1, values)).requires_grad_(False)
     zero = torch.zeros(1, dtype=F64)
     push = 3.0 * torch.sin(2 * math.pi * torch.arange(1000, dtype=F64) / 1000)[:, None]
     coarse, fine = (

@@ -37,6 +37,14 @@ static void write_torque(int joint, nf_real tau, nf_real qd, int status)
     analogWrite(9 + joint, (int)constrain(128 + 100 * tau, 0, 255));
 }
 
+{% if loaded %}
+// Torque that the drive of a joint transmits [{{ torque_unit }}], on which this friction depends: command or current.
+static nf_real read_torque(int joint)
+{
+    return (nf_real)((analogRead(A3 + joint) - 512) * 0.01);
+}
+
+{% endif %}
 static void read_positions(double *q)
 {
     int j;
@@ -90,7 +98,11 @@ void loop()
     nf_load(at, qd, load);
 #else
     for (j = 0; j < NF_JOINTS; ++j)
+{% if loaded %}
+        load[j] = read_torque(j);
+{% else %}
         load[j] = 1;  // this law does not read it, or the model file has no rig
+{% endif %}
 #endif
 #if NF_STATE_SIZE
     nf_step(&state, qd, qdd, load, tau, coefficients, status);

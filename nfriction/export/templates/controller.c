@@ -120,10 +120,10 @@ void nf_step(
         within[1][j] = nf_clamp(qdd[j], NF_RANGE[2][j], NF_RANGE[3][j]);
     }
 {% endif %}
-    nf_schedule({{ "within[0], within[1]" if clamped else "qd, qdd" }}, {{ "state->memory, next, " if state_size }}c);
+    nf_schedule({{ "within[0], within[1]" if clamped else "qd, qdd" }}, {{ "n, state->memory, next, " if state_size }}c);
 {% if state_size %}
     for (j = 0; j < NF_JOINTS; ++j)
-        if (nf_finite(&qd[j]) && nf_finite(&qdd[j]))
+        if ({{ "sound[j]" if loaded else "nf_finite(&qd[j]) && nf_finite(&qdd[j])" }})
             for (k = 0; k < NF_STATE_SIZE; ++k)
                 state->memory[NF_STATE_SIZE * j + k] = next[NF_STATE_SIZE * j + k];
 {% endif %}

@@ -304,7 +304,7 @@ def data_warnings(
     """Warnings about recordings as written and in joint coordinates, a sentence each."""
     still = _still_joints(plant, given, joint, options.min_counts)
     heavy = _implausible_masses(plant) if is_undriven_pendulum(plant, joint) else ()
-    return (*_spikes(given, options), *still, *heavy)
+    return (*_unlike_clocks(given, options), *_spikes(given, options), *still, *heavy)
 
 
 def require_motion(plant: Plant, joint: Sequence[Recording]) -> None:
@@ -341,6 +341,22 @@ def _still_joints(
                 f"{name} moves by {extent:.3g} {plant.unit}, {extent / one:.0f} of its encoder's "
                 "counts: its friction is hardly observable."
             )
+
+
+def _unlike_clocks(recordings: Sequence[Recording], options: FitOptions) -> Iterator[str]:
+    """Recordings whose even steps differ by less than one chooses a rate to differ."""
+    even = sorted((r for r in recordings if r.is_uniform), key=lambda r: r.sample_time)
+    if not even:
+        return
+    fast, slow = even[0], even[-1]
+    apart = slow.sample_time / fast.sample_time - 1
+    if options.clock_error[0] < apart < options.clock_error[1]:
+        yield (
+            f"{slow.name or 'A recording'} has a sample every {1e3 * slow.sample_time:.6g} ms, "
+            f"{fast.name or 'another'} every {1e3 * fast.sample_time:.6g} ms: if one logger wrote "
+            f"both, one of its clocks is wrong by {100 * apart:.2g} %, and inertia and friction by "
+            "up to twice that; give both the step of the logger."
+        )
 
 
 def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[str]:

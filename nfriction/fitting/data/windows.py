@@ -47,6 +47,11 @@ class Windows:
     def __len__(self) -> int:
         return self.q.shape[0]
 
+    @property
+    def length(self) -> float:
+        """Length of the longest window, to two digits [s]."""
+        return float(f"{float(self.step.sum(1).max()):.2g}")
+
     def subset(self, chosen: Tensor) -> "Windows":
         """Some of the windows, by a mask (window,)."""
         index = chosen.nonzero().flatten().tolist()

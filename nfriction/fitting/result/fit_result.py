@@ -159,13 +159,14 @@ class FitResult:
                 f"the residual is {100 * self.residual / motion:.2g} % of the motion's standard "
                 f"deviation, and {self.residual / noise:.0f} times the measurement noise"
             )
-        if self.mistakes:
-            return "do not use", f"a mistake in the data is likely: {self.mistakes[0]}"
+        reasons = [f"a mistake in data or rig is likely: {x}" for x in self.mistakes[:1]]
+        # A regression on torques follows no motion that would excuse a mistake.
+        if reasons and (wrong or self.noise is None):
+            return "do not use", reasons[0]
         if wrong and not self.converged:
             return "do not use", f"the search did not converge, and {far}"
         if wrong and 0 < motion <= self.residual:
             return "do not use", far
-        reasons = []
         if not self.converged:
             reasons.append("the search did not converge")
         if wrong:

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import cast
 
 import numpy as np
 import torch
@@ -37,7 +36,6 @@ from nfriction.fitting.shooting.uncertainty import (
 )
 from nfriction.fitting.shooting.variables import model_at
 from nfriction.friction.models import FrictionModel
-from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.optim.least_squares import LeastSquaresResult
 from nfriction.plant import Plant
 from nfriction.signals import Motion
@@ -167,12 +165,12 @@ def result_from_shooting(
 
 def scale_warning(problem: ShootingProblem, intervals: Sequence[Interval]) -> tuple[str, ...]:
     """A sentence if all of a driven rig seems heavier or lighter alike: then torques are wrong."""
-    found = [i for i in intervals if i.name.startswith(("inertia", "gravity"))]
+    found = list(_relative_weights(problem.jacobian.plant, intervals))
     if len(found) < 2 or not problem.windows.tau.any():
         return ()
-    scale = sum(i.value for i in found) / len(found)
+    scale = sum(found) / len(found)
     # One of them alone may be off by so much; their common share is what a torque's scale moves.
-    alike = all(abs(i.value - scale) < ALIKE * abs(scale) and i.low * i.high > 0 for i in found)
+    alike = all(abs(x - scale) < ALIKE * abs(scale) for x in found)
     if not alike or abs(scale) < problem.options.gain_term[1]:
         return ()
     return (
@@ -180,6 +178,25 @@ def scale_warning(problem: ShootingProblem, intervals: Sequence[Interval]) -> tu
         f"recorded {1 + scale:.3g} times too large (torque constant, gear ratio, unit); then "
         "friction is, too.",
     )
+
+
+def _relative_weights(plant: Plant, intervals: Sequence[Interval]) -> Iterator[float]:
+    """Relative changes of each link's gravity and inertia, 0 where it may be none.
+
+    Link and rotor of a geared joint count as one, since the data show their sum alone.
+    """
+    terms, own = {i.name: i for i in intervals}, dict(plant.named_buffers())
+    for k in range(plant.joints - plant.first_link):
+        inertia = terms.get(f"inertia {k + 1}{k + 1}")
+        rotor = terms.get(f"armature {k + 1 + plant.first_link}")
+        alone = [terms.get(f"gravity {k + 1}"), inertia if rotor is None else None]
+        for term in alone:
+            if term is not None:
+                yield term.value if term.low * term.high > 0 else 0.0
+        if inertia is not None and rotor is not None:
+            sizes = own["inertia_coupling"][k, k], own["armature"][k + plant.first_link]
+            moved = sizes[0] * inertia.value + sizes[1] * rotor.value
+            yield float(moved / (sizes[0] + sizes[1]))
 
 
 def outliers_of(problem: ShootingProblem, weights: Tensor) -> Iterator[Outliers]:
@@ -210,8 +227,8 @@ def _identifiability(
     """
     off = torch.zeros_like(result.x)
     constant = not problem.friction.schedule.follows_motion
-    if isinstance(problem.friction.schedule, NeuroFuzzy):
-        problem, off = _by_data(problem, result.x)
+    if (belief := problem.friction.schedule.belief()) is not None:
+        problem, off = _by_data(problem, result.x, belief)
     variables, options = problem.variables, problem.options
     count, friction_count = variables.shared_count, variables.friction_count
     lower, upper = (bound[:count] for bound in variables.bounds())
@@ -251,18 +268,18 @@ def _identifiability(
     return intervals, unidentifiable, root[:friction_count].clone()
 
 
-def _by_data(problem: ShootingProblem, x: Tensor) -> tuple[ShootingProblem, Tensor]:
+def _by_data(
+    problem: ShootingProblem, x: Tensor, belief: tuple[Tensor, Tensor]
+) -> tuple[ShootingProblem, Tensor]:
     """A network's problem with hardly any prior, and the step from `x` to its minimum.
 
     Priors that evidence or hold-out chose keep a network near its law, also where the truth is not,
     and its search ends in a narrow valley before the minimum. Its intervals are those of a prior of
-    one unit, within which a coefficient varies by its own size, and without the prior on unvisited
-    motion: where that alone holds a network, the data do not. The step is a further error.
+    one unit and without that on unvisited motion: where priors alone hold a network, the data do
+    not. The step is a further error.
     """
-    schedule = cast("NeuroFuzzy", problem.friction.schedule)
-    own = schedule.prior()
-    mean, sd = problem.friction_prior or own
-    wide = torch.maximum(sd, own[1] / schedule.prior_sd)
+    mean, sd = problem.friction_prior or belief
+    wide = torch.maximum(sd, belief[1])
     problem = replace(problem, friction_prior=(mean, wide), extrapolation=None)
     local = problem.linearise(x)
     lower, upper = problem.variables.bounds()
@@ -277,15 +294,18 @@ def _by_data(problem: ShootingProblem, x: Tensor) -> tuple[ShootingProblem, Tens
 def _torque_scale(
     problem: ShootingProblem, result: LeastSquaresResult, motions: Sequence[Motion]
 ) -> tuple[Tensor, Tensor]:
-    """Derivative of the friction torque by each constant coefficient at its joint's peak speed, and
-    the largest torque that moves this joint, (friction parameter,) each.
+    """Largest |derivative| of the friction torque by each constant coefficient at its joint's peak
+    speed, and the largest torque that moves this joint, (friction parameter,) each.
     """
     friction, vector, _, _ = problem.variables.split(result.x)
     speed, moved = peak_dynamics_torque(problem.plant_at(vector), motions, problem.options)
     need = torch.maximum(moved, problem.windows.tau.abs().amax((0, 1)))
     table = friction.reshape(len(speed), -1).clone().requires_grad_()
+    # A gear's loss is a share of the torque, which drives the joint or holds it back.
+    loads = (need, -need) if problem.friction.law.reads_drive else (torch.ones_like(speed),)
     with torch.enable_grad():
         # A law is elementwise, so the sum's gradient is each coefficient's own slope.
-        torque = problem.friction.steady_torque(speed, torch.ones_like(speed), table)
-        (slope,) = torch.autograd.grad(torque.sum(), table)
+        torques = [problem.friction.steady_torque(speed, load, table).sum() for load in loads]
+        slopes = [torch.autograd.grad(torque, table)[0].abs() for torque in torques]
+    slope = torch.stack(slopes).amax(0)
     return slope.flatten(), need[:, None].expand_as(slope).flatten()

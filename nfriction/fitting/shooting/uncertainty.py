@@ -83,9 +83,12 @@ def measurement_noise(
 def _by_torque(problem: ShootingProblem, x: Tensor) -> float:
     """Root mean square residual by one realisation of the torque's noise, once fitted [rad; m]."""
     response = torque_response(problem, x, 1)
-    if response is None:
-        return 0.0
-    variables, off = problem.variables, response[..., 0] * problem.scale
+    return 0.0 if response is None else _once_fitted(problem, x, response[..., 0])
+
+
+def _once_fitted(problem: ShootingProblem, x: Tensor, response: Tensor) -> float:
+    """Root mean square of errors (window, sample, joint) that a fit to them leaves [rad; m]."""
+    variables, off = problem.variables, response * problem.scale
     lower, upper = variables.bounds()
     free = (lower < upper).nonzero().flatten()
     rows = problem.rows(problem.simulate(x, with_memory=True), problem.scale)
@@ -96,8 +99,19 @@ def _by_torque(problem: ShootingProblem, x: Tensor) -> float:
     left = float(off.square().sum() - gradient @ step)
     if failed or not math.isfinite(left):
         return 0.0
-    counted = float(problem.scale.square().sum()) * off.shape[-1]
-    return math.sqrt(max(left, 0.0) / counted)
+    return math.sqrt(max(left, 0.0) / _counted(problem))
+
+
+def _counted(problem: ShootingProblem) -> float:
+    """Sum of the weights of all errors."""
+    return float(problem.scale.square().sum()) * problem.windows.q.shape[-1]
+
+
+def _beside_torque(problem: ShootingProblem, x: Tensor, response: Tensor) -> float:
+    """Share of the residuals that the noise of torques does not cause [-]."""
+    power = float((problem.counted_errors(x) * problem.scale).square().sum()) / _counted(problem)
+    rest = power - _once_fitted(problem, x, response) ** 2
+    return min(1.0, math.sqrt(max(rest, rounding(problem) ** 2) / power))
 
 
 def gathered_information(
@@ -116,15 +130,17 @@ def gathered_information(
     kept = Kept(variables.indices(), variables.state_count, len(x))
     scale = problem.scale * problem.loss.weight(problem.deviation(x, run)).sqrt()
     data, response = marginalize_states(problem.rows(run, scale), kept, of_states)
+    by_torque = torque_response(problem, x, DRAWS)
     if count and problem.loss is SQUARES:
         q = run.motion.q[:, :: problem.substeps] @ problem.measurement.T
         drawn = rounding_of(q, count, problem.windows.spans) * problem.scale[..., None]
         score = kept.by_states(response, of_states)
         score += drawn_score(problem.rows(run, scale), kept, response, drawn)
     else:
-        rows = problem.rows(run, problem.scale * sd / problem.noise_sd)
+        # Residuals hold what is drawn besides.
+        share = 1.0 if by_torque is None else _beside_torque(problem, x, by_torque[..., 0])
+        rows = problem.rows(run, problem.scale * share * sd / problem.noise_sd)
         score = score_covariance(rows, kept, response, of_states)
-    by_torque = torque_response(problem, x, DRAWS)
     if by_torque is not None:
         drawn = by_torque * problem.scale[..., None]
         score += drawn_score(problem.rows(run, scale), kept, response, drawn)
@@ -139,7 +155,7 @@ def torque_response(
 
     The noise is that part of a torque which changes from sample to sample, see `white_noise`;
     None without any, or without the recordings. A torque that is off moves all samples after it,
-    so these errors last.
+    so these errors last. Draws whose simulation diverges are left out.
     """
     sd = white_noise(problem.windows.tau).numpy()
     if not (problem.windows.recordings and sd.any()):
@@ -154,7 +170,8 @@ def torque_response(
         noisy = replace(problem.windows, recordings=recordings)
         noisy = replace(noisy, tau=noisy.torque_at(0.0)[0])
         found.append((_positions(replace(problem, windows=noisy), x) - exact) / SMALL)
-    return torch.stack(found, -1)
+    kept = [off for off in found if torch.isfinite(off).all()]
+    return torch.stack(kept, -1) if kept else None
 
 
 def _positions(problem: ShootingProblem, x: Tensor) -> Tensor:

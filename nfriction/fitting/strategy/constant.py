@@ -111,10 +111,9 @@ def fit_constant(task: FitTask) -> FitResult:
     if "sigma_0" in model.law.names and not found.stopped:
         ambiguous = ambiguous_stiffness(fitter, found, search.stages[0])
     fitted = result_from_shooting(model, found.problem, found.result, task.motions, ambiguous)
-    lengths = zip(options.windows, search.stages, strict=False)
     fitted = replace(
         fitted,
-        stages=tuple((float(length), stage.rms) for length, stage in lengths),
+        stages=tuple((stage.problem.windows.length, stage.rms) for stage in search.stages),
         skipped_horizons=search.skipped,
     )
     reason = LOSSY if search.lossy else TOO_LONG

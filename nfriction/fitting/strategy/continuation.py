@@ -12,6 +12,7 @@ from nfriction.fitting.data.inputs import integration_substeps
 from nfriction.fitting.data.windows import Windows, cut_windows
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.identifiability import information, standard_deviations
+from nfriction.fitting.result.paired_test import log_ratio, student_quantile
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
@@ -275,7 +276,7 @@ def horizon_continuation(
             # The cost far from the minimum says nothing about its value; the last stage's does.
             near = weighted_cost(stages[-1].residuals, noise) if stages else None
             tolerance = loglik_tolerance(near or float(problem.cost(start)), options)
-        name = f"{length:g} s windows{of}"
+        name = f"{problem.windows.length:g} s windows{of}"
         found = fitter.search(problem, start, tolerance, name)
         ends = [found]
         if equation_error is not None and not found.stopped and (last or not stages):
@@ -364,30 +365,6 @@ def _squares(at: HorizonResult, of: HorizonResult) -> Tensor:
     count = at.problem.variables.shared_count
     x, _ = settle_states(at.problem, torch.cat([of.result.x[:count], at.result.x[count:]]))
     return at.problem.counted_errors(x).square().sum((1, 2))
-
-
-def log_ratio(new: Tensor, old: Tensor) -> tuple[float, float]:
-    """Log of the ratio of two sums over windows (window,), and its standard deviation.
-
-    By the jackknife over the windows, as residuals are correlated within and not across them;
-    infinite of a single one.
-
-    References:
-        B. Efron, C. Stein, Annals of Statistics 9 (1981), 586-596.
-    """
-    count = len(new)
-    ratio = 0.5 * float(torch.log(new.sum() / old.sum()))
-    if count < 2:
-        return ratio, math.inf
-    without = 0.5 * torch.log((new.sum() - new) / (old.sum() - old))
-    return ratio, float(((count - 1) * without.var(correction=0)).sqrt())
-
-
-def student_quantile(freedom: int, level: float) -> float:
-    """Quantile of Student's distribution; infinite without a degree of freedom."""
-    from scipy.special import stdtrit  # slow to import
-
-    return float(stdtrit(freedom, level)) if freedom > 0 else math.inf
 
 
 def restart_from_equation_error(

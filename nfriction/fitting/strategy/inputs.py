@@ -17,6 +17,7 @@ from nfriction.fitting.data.inputs import adjustable_terms
 from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.result.fit_result import FitResult, InputGain
 from nfriction.fitting.result.of_search import result_from_shooting
+from nfriction.fitting.result.paired_test import gains
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.continuation import (
@@ -25,7 +26,6 @@ from nfriction.fitting.strategy.continuation import (
     settle_states,
     weighted_cost,
 )
-from nfriction.fitting.strategy.holdout import gains
 from nfriction.fitting.task import (
     FitTask,
     constant_prior,
@@ -101,7 +101,7 @@ def widened_start(task: FitTask, start: FitResult, inputs: Sequence[str]) -> Fit
 
 @torch.no_grad()
 def drives(found: FitResult, own: int) -> bool:
-    """True if coefficients beyond a law's own let friction drive a joint along the motions.
+    """True if coefficients beyond a law's own let friction drive a joint in one direction.
 
     A constant torque that the plant lacks looks like friction larger in one direction.
     """
@@ -112,8 +112,11 @@ def drives(found: FitResult, own: int) -> bool:
         without = fitted.clone()
         without[..., own:] = 0.0
         power, least = (qd * law.torque(qd, load, c, v_smooth) for c in (fitted, without))
-        if (power < least.clamp(max=0.0)).any():
-            return True
+        # At some speeds the shape of a law may be off; a constant torque does work on one side.
+        for turning in (qd > 0, qd < 0):
+            work, own_work = ((p * turning).sum(0) for p in (power, least))
+            if (work < own_work.clamp(max=0.0)).any():
+                return True
     return False
 
 

@@ -25,6 +25,7 @@ from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.identifiability import information
 from nfriction.fitting.result.of_search import result_from_shooting
+from nfriction.fitting.result.paired_test import gains
 from nfriction.fitting.shooting.autocorrelation import decimation, effective_noise
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.shooting.variables import model_at
@@ -38,7 +39,6 @@ from nfriction.fitting.strategy.continuation import (
 from nfriction.fitting.strategy.extrapolation_prior import prior_on_unvisited_cells
 from nfriction.fitting.strategy.holdout import (
     StoppedError,
-    gains,
     holdout_splits,
     holdout_squares,
     holdout_windows,

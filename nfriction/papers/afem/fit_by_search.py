@@ -484,22 +484,10 @@ def fit_by_search(
         drive=None if by_class is None else by_class.drive(),
     )  # fmt: skip
     box = _box(table, varied, constant, task)
-    # Errors of the start set the weight of the prior; those of the end are not known yet.
-    first = error.residuals(table.parameter_vector())
-    noise = effective_noise(first.nan_to_num(1.0, 1.0, -1.0))
-    mean, sd = table.prior()
-
-    def residuals(vectors: Tensor) -> Iterator[Tensor]:
-        for part in error.parts(vectors):
-            yield part.flatten(1) / noise
-        yield (vectors - mean) / sd
-
-    def cost(vectors: Tensor) -> Tensor:
-        return 0.5 * sum((part.square().sum(-1) for part in residuals(vectors)), torch.zeros(()))
-
+    objective = _Objective.of(error, table)
     # The noise is that of the start, so the cost there says what counts in log likelihood.
-    negligible = loglik_tolerance(float(cost(box.start[None])), asked)
-    result = search(cost, box, options, callback, residuals, negligible)
+    negligible = loglik_tolerance(float(objective.cost(box.start[None])), asked)
+    result = search(objective.cost, box, options, callback, objective.residuals, negligible)
     table.set_parameter_vector(result.vector)
     names = table.parameter_names(plant.joint_names)
     hit = box.free & ((result.vector <= box.lower) | (result.vector >= box.upper))
@@ -517,7 +505,41 @@ def fit_by_search(
     )
     if by_class is None:
         return found
-    return by_class.backtracked(found, windows, float(error.mean_square(mean[None])[0].sqrt()))
+    baseline = float(error.mean_square(objective.mean[None])[0].sqrt())
+    return by_class.backtracked(found, windows, baseline)
+
+
+@dataclass(frozen=True, eq=False)
+class _Objective:
+    """Negative log posterior of a table's parameters: position errors over their noise, and prior.
+
+    Attributes:
+        error: position error of candidates.
+        noise: its standard deviation by the errors of the start; those of the end are not known.
+        mean, sd: of the prior, (parameter,).
+    """
+
+    error: PositionError
+    noise: float
+    mean: Tensor
+    sd: Tensor
+
+    @classmethod
+    def of(cls, error: PositionError, table: Tabulated) -> _Objective:
+        """The objective around the table's present values."""
+        first = error.residuals(table.parameter_vector())
+        return cls(error, effective_noise(first.nan_to_num(1.0, 1.0, -1.0)), *table.prior())
+
+    def residuals(self, vectors: Tensor) -> Iterator[Tensor]:
+        """Parts (m, n) of the residuals of candidates (m, parameter)."""
+        for part in self.error.parts(vectors):
+            yield part.flatten(1) / self.noise
+        yield (vectors - self.mean) / self.sd
+
+    def cost(self, vectors: Tensor) -> Tensor:
+        """Half the squared residuals of candidates (m, parameter), (m,)."""
+        parts = (part.square().sum(-1) for part in self.residuals(vectors))
+        return 0.5 * sum(parts, torch.zeros(()))
 
 
 def _box(table: Tabulated, model: FrictionModel, constant: FitResult, task: FitTask) -> Box:

@@ -177,21 +177,17 @@ def parse_rules(text: str, source: str = "rules") -> RuleBase:
 
 
 def format_rules(rules: RuleBase) -> str:
-    """JSON text that `parse_rules` reads back to an equal rule base."""
-    listed = [
-        {"if": list(rule.given), "then": list(rule.then), "weight": rule.weight}
-        for rule in rules.rules
-    ]
-    # A table reads like the one that is printed in a paper; a list holds every rule base.
-    table = _table(rules)
+    """JSON text that `parse_rules` reads back to an equal rule base, its rules one by one."""
     document = {
         "format": FORMAT,
         "name": rules.name,
         "inputs": _described(rules.inputs),
         "outputs": _described(rules.outputs),
-        **({"rules": listed} if table is None else {"table": table}),
+        "rules": [
+            {"if": rule.given, "then": rule.then, "weight": rule.weight} for rule in rules.rules
+        ],
     }
-    return _dump(document, "") + "\n"
+    return json.dumps(document, indent=1) + "\n"
 
 
 def save_rules(rules: RuleBase, path: str | Path) -> None:
@@ -376,34 +372,6 @@ def _described(variables: tuple[Variable, ...]) -> dict[str, Any]:
         }
         for variable in variables
     }
-
-
-def _table(rules: RuleBase) -> dict[str, Any] | None:
-    """The table of a full grid of two inputs with rules in its order, else None."""
-    # The key that names the columns shares its place with the rows.
-    if len(rules.inputs) != 2 or "columns" in rules.inputs[1].terms:
-        return None
-    columns, rows = rules.inputs
-    in_order = [(column, row) for row in rows.terms for column in columns.terms]
-    if [rule.given for rule in rules.rules] != in_order:
-        return None
-    # A cell of a table has no place for a weight, and names a term for every output.
-    if any(rule.weight != 1.0 or ANY in rule.then for rule in rules.rules):
-        return None
-    cells = {rule.given: list(rule.then) for rule in rules.rules}
-    lines = {row: [cells[column, row] for column in columns.terms] for row in rows.terms}
-    return {"columns": columns.name, **lines}
-
-
-def _dump(value: Any, indent: str) -> str:
-    """JSON with a line for every entry, but sets, rules and rows of the table in one line."""
-    deeper = f"{indent}  "
-    if isinstance(value, dict) and not {"shape", "if"} & value.keys():
-        lines = [f"{deeper}{json.dumps(key)}: {_dump(v, deeper)}" for key, v in value.items()]
-        return "{\n" + ",\n".join(lines) + f"\n{indent}}}"
-    if isinstance(value, list) and value and isinstance(value[0], dict):
-        return "[\n" + ",\n".join(deeper + _dump(v, deeper) for v in value) + f"\n{indent}]"
-    return json.dumps(value)
 
 
 def _check_terms(where: str, terms: tuple[str, ...], variables: tuple[Variable, ...]) -> None:

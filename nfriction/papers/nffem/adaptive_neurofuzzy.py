@@ -8,9 +8,8 @@ from torch import Tensor
 
 from nfriction.friction.coefficients import Schedule
 from nfriction.friction.laws import Law
-from nfriction.friction.models import require_options
 from nfriction.friction.neurofuzzy import LEAST_RATIO, NeuroFuzzy, smooth_relu_inverse
-from nfriction.friction.parameters import Sensitivity
+from nfriction.friction.parameters import Sensitivity, require_options
 from nfriction.fuzzy.membership import HALF_WIDTH_OF_GAUSSIAN
 from nfriction.fuzzy.partition import crossing_half_widths
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
@@ -58,7 +57,7 @@ class AdaptiveNeuroFuzzy(Schedule):
         **network: Any,
     ) -> None:
         super().__init__(law, joints)
-        require_options("A network by class", NeuroFuzzy, network, "memory")
+        require_options("network 'by_class'", NeuroFuzzy, network, ("network", "inputs", "memory"))
         self._law = law
         self.adaptive = Adaptive(law, joints, initial, **(memory or {}))
         # The mean over the classes: the network corrects all of them alike.

@@ -74,8 +74,9 @@ def test_workers_end_with_a_killed_caller(tmp_path: Path) -> None:
         "from multiprocessing import get_context\n"
         "from nfriction.papers.reproduction.stages import _end_with_the_caller\n"
         "if __name__ == '__main__':\n"
+        # Forked, as another import of everything takes seconds; it ends in the same way.
         "    pool = ProcessPoolExecutor(\n"
-        "        1, mp_context=get_context('spawn'), initializer=_end_with_the_caller\n"
+        "        1, mp_context=get_context('fork'), initializer=_end_with_the_caller\n"
         "    )\n"
         "    print(pool.submit(os.getpid).result(), flush=True)\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"

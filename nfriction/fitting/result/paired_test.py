@@ -1,0 +1,43 @@
+"""Paired test: errors of two models on the same windows or blocks, beyond their scatter."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from nfriction.fitting.options import DEFAULTS
+
+
+def gains(new: Tensor, old: Tensor, chance: float = DEFAULTS.gain_chance) -> bool:
+    """True if squared errors on windows (window,) fell by more than their scatter would by chance.
+
+    By Student's distribution, as windows may be few.
+    """
+    if not old.isfinite().all():
+        return bool(new.isfinite().all())
+    ratio, spread = log_ratio(new, old)
+    return ratio + spread * student_quantile(len(new) - 1, 1 - chance) < 0
+
+
+def log_ratio(new: Tensor, old: Tensor) -> tuple[float, float]:
+    """Log of the ratio of two sums over windows (window,), and its standard deviation.
+
+    By the jackknife over the windows, as residuals are correlated within and not across them;
+    infinite of a single one.
+
+    References:
+        B. Efron, C. Stein, Annals of Statistics 9 (1981), 586-596.
+    """
+    count = len(new)
+    ratio = 0.5 * float(torch.log(new.sum() / old.sum()))
+    if count < 2:
+        return ratio, math.inf
+    without = 0.5 * torch.log((new.sum() - new) / (old.sum() - old))
+    return ratio, float(((count - 1) * without.var(correction=0)).sqrt())
+
+
+def student_quantile(freedom: int, level: float) -> float:
+    """Quantile of Student's distribution; infinite without a degree of freedom."""
+    from scipy.special import stdtrit  # slow to import
+
+    return float(stdtrit(freedom, level)) if freedom > 0 else math.inf
