@@ -146,6 +146,10 @@ class Schedule(nn.Module, ABC):
         vector = self.parameter_vector()
         return torch.zeros_like(vector), torch.full_like(vector, torch.inf)
 
+    def belief(self) -> tuple[Tensor, Tensor] | None:
+        """The prior that intervals take, wider than that of a fit; None: that of the fit."""
+        return None
+
     @abstractmethod
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
         """Derivatives of the coefficients at motions of shape (sample, joint)."""

@@ -23,8 +23,9 @@ def with_inputs(law: Law, inputs: Sequence[str]) -> Law:
     Raises:
         ValueError: for an input that does not exist or is repeated.
     """
-    chosen = tuple(name for name in INPUTS if name in inputs)
-    if len(chosen) != len(inputs):
+    listed = isinstance(inputs, list | tuple)
+    chosen = tuple(name for name in INPUTS if listed and name in inputs)
+    if not listed or len(chosen) != len(inputs):
         raise ValueError(f"`inputs` must be different ones of {', '.join(INPUTS)}, got {inputs!r}.")
     if not chosen:
         return law

@@ -4,7 +4,7 @@ import math
 import reprlib
 from collections.abc import Callable, Sequence
 from pkgutil import resolve_name
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, SupportsIndex
 
 import torch
 from torch import Tensor, nn
@@ -118,6 +118,10 @@ class NeuroFuzzy(Schedule):
         if acceleration not in ("along_motion", "signed"):
             raise ValueError(
                 f'`acceleration` must be "along_motion" or "signed", got {acceleration!r}.'
+            )
+        if isinstance(head_units, bool) or not isinstance(head_units, SupportsIndex):
+            raise ValueError(
+                f"`head_units` must be a whole number of units, got {reprlib.repr(head_units)}."
             )
         if not isinstance(terms, list | tuple):
             raise ValueError(
@@ -336,6 +340,11 @@ class NeuroFuzzy(Schedule):
             units[spacings] = torch.full_like(spacings, LOGIT_SD / self.prior_sd)
         sizes = [units.get(p, torch.ones_like(p)).reshape(-1) for p in self.trained()]
         return mean, self.prior_sd * torch.cat(sizes).detach()
+
+    def belief(self) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation: of one unit, as a coefficient varies by its own size."""
+        mean, sd = self.prior()
+        return mean, sd / self.prior_sd
 
     def sensitivities(self, qd: Tensor, qdd: Tensor) -> Sensitivity:
         return self.residual_sensitivities(self.reference, qd, qdd)

@@ -68,6 +68,8 @@ ONE = torch.ones(6, dtype=torch.float64)
 class Contest:
     """A rival whose law and network leave these errors; without inputs they leave 1.0."""
 
+    found = None
+
     def __init__(self, task, start, of_law=ONE, error=ONE) -> None:
         self.task, self.start, self.validation = task, start, self
         self.of_law, self.final = of_law, error
@@ -88,16 +90,17 @@ def task():
 
 
 @pytest.mark.parametrize(
-    ("rival", "wins", "trained"),
+    ("rival", "driving", "wins", "trained"),
     [
-        ({"of_law": 0.9 * ONE, "error": 0.7 * ONE}, True, True),
-        ({"of_law": 0.9 * ONE, "error": torch.linspace(0.2, 1.6, 6)}, False, True),
-        ({"of_law": 1.1 * ONE, "error": 0.1 * ONE}, False, False),
-        ({"of_law": torch.linspace(0.2, 1.6, 6), "error": 0.1 * ONE}, False, False),
+        ({"of_law": 0.9 * ONE, "error": 0.7 * ONE}, False, True, True),
+        ({"of_law": 0.9 * ONE, "error": 0.7 * ONE}, True, False, True),
+        ({"of_law": 0.9 * ONE, "error": torch.linspace(0.2, 1.6, 6)}, False, False, True),
+        ({"of_law": 1.1 * ONE, "error": 0.1 * ONE}, False, False, False),
+        ({"of_law": torch.linspace(0.2, 1.6, 6), "error": 0.1 * ONE}, False, False, False),
     ],
 )
 def test_inputs_have_to_win_for_the_law_and_for_its_network(
-    task, monkeypatch, rival, wins, trained
+    task, monkeypatch, rival, driving, wins, trained
 ):
     gains, made = (InputGain("direction", 0.5, (0.5, 0.1)),), []
 
@@ -108,6 +111,7 @@ def test_inputs_have_to_win_for_the_law_and_for_its_network(
     monkeypatch.setattr(neurofuzzy, "chosen_inputs", lambda task, start: gains)
     monkeypatch.setattr(neurofuzzy, "widened_start", lambda task, start, names: start)
     monkeypatch.setattr(neurofuzzy, "_Contest", contest)
+    monkeypatch.setattr(neurofuzzy, "drives", lambda found, own: driving and own == 2)
     plain = Contest(task, "law")
     chosen, best = neurofuzzy._with_chosen_inputs(plain)
     (found,) = made
@@ -165,10 +169,14 @@ def test_blocks_are_contiguous_and_share_out_each_recording() -> None:
     assert [b.nonzero().flatten().tolist() for b in blocks] == [[0, 1], [2], [3], [4]]
 
 
-@pytest.mark.parametrize(("by_direction", "driving"), [(2e-3, False), (-9e-3, True)])
-def test_a_constant_torque_is_no_friction_by_direction(by_direction, driving) -> None:
+@pytest.mark.parametrize(
+    ("viscous", "by_direction", "driving"),
+    # The last drives at low speed alone, as a law does whose shape is off.
+    [(1e-4, 2e-3, False), (1e-4, -9e-3, True), (1e-3, -6e-3, False)],
+)
+def test_a_constant_torque_is_no_friction_by_direction(viscous, by_direction, driving) -> None:
     law = with_inputs(COULOMB_VISCOUS, ["direction"])
-    model = FrictionModel(law, Constant(law, 1, [5e-3, 1e-4, by_direction]), V_SMOOTH)
+    model = FrictionModel(law, Constant(law, 1, [5e-3, viscous, by_direction]), V_SMOOTH)
     time = 2e-3 * np.arange(500)
     q = np.sin(9.0 * time)[:, None]
     motion = Motion(time, q, 9.0 * np.cos(9.0 * time)[:, None], -81.0 * q)

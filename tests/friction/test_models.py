@@ -163,6 +163,20 @@ def test_an_option_that_a_model_lacks_is_named(name, of, known, options) -> None
         model_by_name(name)(2, depth=3, **options)
 
 
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"network": "rbf", "terms": (3, 3)}, "network 'rbf' has no option terms; it has"),
+        ({"network": "by_class", "depth": 3}, "network 'by_class' has no option depth; it has"),
+        ({"head_units": 2.5}, "`head_units` must be a whole number"),
+        ({"inputs": "load"}, "`inputs` must be different ones of direction, load, got 'load'"),
+    ],
+)
+def test_wrong_options_of_a_network_are_named(given, words) -> None:
+    with pytest.raises(ValueError, match=words):
+        model_by_name("NFLFM")(2, **given)
+
+
 def test_options_are_those_given() -> None:
     options = {
         "terms": [3, 2],

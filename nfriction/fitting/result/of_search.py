@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import cast
 
 import numpy as np
 import torch
@@ -37,7 +36,6 @@ from nfriction.fitting.shooting.uncertainty import (
 )
 from nfriction.fitting.shooting.variables import model_at
 from nfriction.friction.models import FrictionModel
-from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.optim.least_squares import LeastSquaresResult
 from nfriction.plant import Plant
 from nfriction.signals import Motion
@@ -229,8 +227,8 @@ def _identifiability(
     """
     off = torch.zeros_like(result.x)
     constant = not problem.friction.schedule.follows_motion
-    if isinstance(problem.friction.schedule, NeuroFuzzy):
-        problem, off = _by_data(problem, result.x)
+    if (belief := problem.friction.schedule.belief()) is not None:
+        problem, off = _by_data(problem, result.x, belief)
     variables, options = problem.variables, problem.options
     count, friction_count = variables.shared_count, variables.friction_count
     lower, upper = (bound[:count] for bound in variables.bounds())
@@ -270,18 +268,18 @@ def _identifiability(
     return intervals, unidentifiable, root[:friction_count].clone()
 
 
-def _by_data(problem: ShootingProblem, x: Tensor) -> tuple[ShootingProblem, Tensor]:
+def _by_data(
+    problem: ShootingProblem, x: Tensor, belief: tuple[Tensor, Tensor]
+) -> tuple[ShootingProblem, Tensor]:
     """A network's problem with hardly any prior, and the step from `x` to its minimum.
 
     Priors that evidence or hold-out chose keep a network near its law, also where the truth is not,
     and its search ends in a narrow valley before the minimum. Its intervals are those of a prior of
-    one unit, within which a coefficient varies by its own size, and without the prior on unvisited
-    motion: where that alone holds a network, the data do not. The step is a further error.
+    one unit and without that on unvisited motion: where priors alone hold a network, the data do
+    not. The step is a further error.
     """
-    schedule = cast("NeuroFuzzy", problem.friction.schedule)
-    own = schedule.prior()
-    mean, sd = problem.friction_prior or own
-    wide = torch.maximum(sd, own[1] / schedule.prior_sd)
+    mean, sd = problem.friction_prior or belief
+    wide = torch.maximum(sd, belief[1])
     problem = replace(problem, friction_prior=(mean, wide), extrapolation=None)
     local = problem.linearise(x)
     lower, upper = problem.variables.bounds()

@@ -79,7 +79,7 @@ def widened_fitter(task: FitTask, start: FitResult, inputs: Sequence[str]) -> Sh
 
 
 def widened_start(task: FitTask, start: FitResult, inputs: Sequence[str]) -> FitResult | None:
-    """Constant fit of a law with inputs, from that without; None if stopped or no friction."""
+    """Constant fit of a law with inputs, from that without; None if stopped."""
     fitter = widened_fitter(task, start, inputs)
     windows = fitter.cut(task.motions, start.longest_usable_horizon(task.options.windows))
     noise = max(effective_noise(start.residuals), task.options.min_noise)
@@ -94,28 +94,29 @@ def widened_start(task: FitTask, start: FitResult, inputs: Sequence[str]) -> Fit
         return None
     model = copy.deepcopy(fitter.friction)
     found = result_from_shooting(model, end.problem, end.result, task.motions)
-    if drives(found, len(start.model.law.names)):
-        return None
     return replace(
         found, encoder_offsets=start.encoder_offsets, skipped_horizons=start.skipped_horizons
     )
 
 
+@torch.no_grad()
 def drives(found: FitResult, own: int) -> bool:
-    """True if coefficients beyond a law's own let friction drive a joint along the motions.
+    """True if coefficients beyond a law's own let friction drive a joint in one direction.
 
     A constant torque that the plant lacks looks like friction larger in one direction.
     """
     law, v_smooth = found.model.law, found.model.v_smooth
-    fitted = found.model.schedule.coefficient_sets()["always"]
-    without = fitted.clone()
-    without[:, own:] = 0.0
     for motion in found.motions:
-        q, qd = torch.as_tensor(motion.q), torch.as_tensor(motion.qd)
-        load = found.plant.load(q, qd)
+        q, qd, qdd = (torch.as_tensor(x) for x in (motion.q, motion.qd, motion.qdd))
+        load, fitted = found.plant.load(q, qd), found.model.coefficients(qd, qdd)
+        without = fitted.clone()
+        without[..., own:] = 0.0
         power, least = (qd * law.torque(qd, load, c, v_smooth) for c in (fitted, without))
-        if (power < least.clamp(max=0.0)).any():
-            return True
+        # At some speeds the shape of a law may be off; a constant torque does work on one side.
+        for turning in (qd > 0, qd < 0):
+            work, own_work = ((p * turning).sum(0) for p in (power, least))
+            if (work < own_work.clamp(max=0.0)).any():
+                return True
     return False
 
 

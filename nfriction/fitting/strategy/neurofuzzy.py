@@ -47,6 +47,7 @@ from nfriction.fitting.strategy.holdout import (
 from nfriction.fitting.strategy.inputs import (
     InputGain,
     chosen_inputs,
+    drives,
     seeing_plant,
     widened_start,
 )
@@ -118,7 +119,10 @@ def _with_chosen_inputs(plain: "_Contest") -> tuple[tuple[InputGain, ...], "_Con
     if not gains(rival.validation.of_law, plain.validation.of_law, chance):
         return (), plain
     rival.train()
-    return (chosen, rival) if gains(rival.squares, plain.squares, chance) else ((), plain)
+    if not gains(rival.squares, plain.squares, chance):
+        return (), plain
+    # Friction of the law alone may drive where that of its network does not.
+    return ((), plain) if drives(rival.found, len(task.model.law.names)) else (chosen, rival)
 
 
 class _Contest:
@@ -157,6 +161,16 @@ class _Contest:
         of_law = self.validation.of_law
         return self.best.squares if gains(self.best.squares, of_law) else of_law
 
+    @property
+    def found(self) -> FitResult:
+        """The law's fit, with the model and plant of the network where it is accepted."""
+        assert self.best is not None
+        if not gains(self.best.squares, self.validation.of_law):
+            return self.start
+        problem, parts = self.best.end.problem, self.best.end.parts
+        model, plant = model_at(problem.friction, parts.friction), problem.plant_at(parts.plant)
+        return replace(self.start, model=model, plant=plant)
+
     def train(self) -> None:
         """Find the best network; raises `StoppedError`."""
         self.best = self.validation.best_trial(_with_narrowed_priors(self.free, self.start))
@@ -185,7 +199,9 @@ class _Contest:
         result = result_from_shooting(found, end.problem, end.result, task.motions)
         model.load_state_dict(found.state_dict())
         cast("NeuroFuzzy", model.schedule).prior_sd = best.prior_sd
-        moved = " Its sets moved." if cast("NeuroFuzzy", found.schedule).learn_sets else ""
+        schedules = (cast("NeuroFuzzy", m.schedule) for m in (found, self.network))
+        pairs = zip(*(s.network.anfis.partition.parameters() for s in schedules), strict=True)
+        moved = "" if all(torch.equal(*pair) for pair in pairs) else " Its sets moved."
         return replace(
             result,
             model=model.requires_grad_(False),
