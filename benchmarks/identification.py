@@ -4,6 +4,7 @@
     python benchmarks/identification.py real DATA [--only triple ...] [--models NCFM LFM NFLFM]
                                                  [--blocks N] [--peer scipy]
                                                  [--loss huber] [--fit-delay]
+                                                 [--recorded-zeros]
     python benchmarks/identification.py intervals DATA [--only triple ...] [--models CFM]
                                                       [--seconds 5]
     python benchmarks/identification.py own-rigs [--seeds 10] [--rigs 10]
@@ -21,11 +22,13 @@ the same recordings and starts, and the true plant; it simulates them whole, or 
 from smoothed states.
 
 `real` leaves one recording out at a time, fits the others and simulates the one left out from its
-first state; with `--blocks N` each recording is cut in N, and one block of every recording is left
-out at a time, and simulated with the zeros that the others of its recording showed where encoders
-were zeroed anew. With `--peer scipy` every constant law is also fitted by single shooting, as the
-baselines on the recordings' cards were, which shows how hard these recordings are beside those that
-are kept apart. A model that is twice as bad as one named before it is marked as not fit for use.
+first state. Where encoders were zeroed at the start of each recording, its first second shows the
+zero and is not judged; `--recorded-zeros` takes it as recorded. With `--blocks N` each recording
+is cut in N, and one block of every recording is left out at a time, and simulated with the zeros
+that the others of its recording showed where encoders were zeroed anew. With `--peer scipy` every
+constant law is also fitted by single shooting, as the baselines on the recordings' cards were,
+which shows how hard these recordings are beside those that are kept apart. A model that is twice
+as bad as one named before it is marked as not fit for use.
 DATA holds a folder to each set, with a `recordings.csv` of initial states.
 
 `intervals` fits pieces of recordings, each alone, and prints how often the difference of what two
@@ -78,6 +81,7 @@ def main() -> int:
     given.add_argument("--peer", choices=["scipy"])
     given.add_argument("--loss", default="linear", choices=CHOICES["loss"])
     given.add_argument("--fit-delay", action="store_true")
+    given.add_argument("--recorded-zeros", action="store_true")
     apart = commands.add_parser("intervals", help="intervals held against pieces of recordings")
     apart.add_argument("data", type=Path)
     apart.add_argument("--only", nargs="+", default=list(SETS), choices=list(SETS))
@@ -108,7 +112,7 @@ def main() -> int:
         peer = arguments.peer is not None
         real(
             arguments.data, arguments.only, arguments.models, arguments.blocks, peer,
-            loss=arguments.loss, fit_delay=arguments.fit_delay,
+            arguments.recorded_zeros, loss=arguments.loss, fit_delay=arguments.fit_delay,
         )  # fmt: skip
     return 0
 

@@ -124,6 +124,7 @@ def real(
     models: Sequence[str],
     blocks: int = 1,
     peer: bool = False,
+    recorded_zeros: bool = False,
     **settings: Any,
 ) -> None:
     """Print the error of every model on what was left out of its recordings.
@@ -134,6 +135,7 @@ def real(
         models: by name, each fitted from the fit of one before it where that helps.
         blocks: in time, of which one is left out of every recording; 1 leaves out recordings.
         peer: also fit every constant model by single shooting with SciPy.
+        recorded_zeros: take encoders for true that were zeroed in a pose held by stiction.
         settings: of the fits.
     """
     aimed = f"{'aim':>5}  met"
@@ -141,6 +143,8 @@ def real(
     for name in only:
         of = SETS[name]
         plant = of.plant()
+        # Blocks have the zeros that the rest of their recordings showed.
+        zeroed = blocks == 1 and not recorded_zeros and of.encoder_reference == "per_recording"
         rows = {m: Row() for m in models}
         if peer:
             rows |= {f"{m}, SciPy": Row() for m in models if is_constant(m)}
@@ -159,7 +163,7 @@ def real(
                 )  # fmt: skip
                 left = fold.left if blocks == 1 else with_fitted_offsets(fits[-1], fold.left)
                 left = [one._replace(recording=fits[-1].aligned(one.recording)) for one in left]
-                rows[m].add(start, fits[-1].plant, model, left)
+                rows[m].add(start, fits[-1].plant, model, left, zeroed)
             # The peer knows no gaps and one zero for all.
             whole = [r[a : b + 1] for r in fold.fitted for a, b in r.segments]
             states = [first_state(data, of, r) if blocks == 1 else None for r in whole]
@@ -168,7 +172,7 @@ def real(
                     start = time.process_time()
                     model = model_by_name(m)(plant.joints)
                     found = single_shooting(model, plant, whole, states)
-                    rows[f"{m}, SciPy"].add(start, found, model, fold.left)
+                    rows[f"{m}, SciPy"].add(start, found, model, fold.left, zeroed)
         least = math.inf
         for m, row in rows.items():
             each = "  ".join(f"{e:.3g}" for e in row.free)
@@ -196,12 +200,15 @@ class Row:
         plant: Plant,
         model: FrictionModel,
         left: Sequence[Left] | Sequence[TimeBlock],
+        zeroed: bool,
     ) -> None:
         """Count the time since the start, and judge what was found in it."""
         self.spent += time.process_time() - start
         for one in left:
             given = one.initial_state if isinstance(one, Left) else None
-            told = score(plant, model, one.recording, initial_state=given, limit=False)
+            told = score(
+                plant, model, one.recording, initial_state=given, limit=False, zeroed=zeroed
+            )
             self.free.append(1e3 * told.free_run.all)
             five = told.windows.get("5")
             self.short.append(1e3 * five.all if five else math.nan)

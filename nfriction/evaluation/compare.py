@@ -377,6 +377,7 @@ def compare(
     )["fit"]
     scores: dict[str, dict[str, list[Score]]] = {"train": {}, "test": {}}
     states = initial_states or {}
+    zeroed = any(found.encoder_offsets for found in fits.values())
     for name in (NO_FRICTION, *fits):
         progress.stage(f"score {name}")
         found = fits.get(name)
@@ -387,6 +388,7 @@ def compare(
                         found.plant if found else plant, found.model if found else None,
                         found.aligned(recording) if found else recording,
                         initial_state=states.get(recording.name), horizons=horizons,
+                        zeroed=zeroed,
                     )
                     for recording in recordings
                 ]  # fmt: skip

@@ -13,7 +13,7 @@ import pandas as pd
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from nfriction.evaluation.lead_in import longest_window
+from nfriction.evaluation.lead_in import ZERO_IN, longest_window
 from nfriction.evaluation.score import score
 from nfriction.fitting.data.inputs import require_drive
 from nfriction.fitting.fit import fit
@@ -203,7 +203,8 @@ class FrictionEstimator(BaseEstimator):
         """
         (read,) = _recordings(recording, self.plant_)
         given = self._fitted.aligned(read)
-        run = score(self.plant_, self.model_, given, horizons=(), limit=False)
+        zeroed = bool(self._fitted.encoder_offsets)
+        run = score(self.plant_, self.model_, given, horizons=(), limit=False, zeroed=zeroed)
         table = given.to_pandas()[["time", *(f"q{k + 1}" for k in range(given.joints))]]
         table.iloc[:, 1:] = run.simulated
         return table
@@ -221,9 +222,14 @@ class FrictionEstimator(BaseEstimator):
         """
         errors = []
         for recording in _recordings(X, self.plant_):
-            horizon = min(self.horizon, longest_window(recording))
+            zeroed, room = bool(self._fitted.encoder_offsets), longest_window(recording)
+            # A short recording is scored from its lead-in on.
+            horizon = min(self.horizon, max(room - ZERO_IN, room / 2) if zeroed else room)
             aligned = self._fitted.aligned(recording)
-            found = score(self.plant_, self.model_, aligned, horizons=(horizon,), limit=False)
+            found = score(
+                self.plant_, self.model_, aligned, horizons=(horizon,), limit=False,
+                zeroed=zeroed,
+            )  # fmt: skip
             errors.append(found.windows[f"{horizon:g}"].all)
         return -math.sqrt(sum(e * e for e in errors) / len(errors))
 

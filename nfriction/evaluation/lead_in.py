@@ -15,6 +15,8 @@ import torch
 from numpy.typing import NDArray
 
 from nfriction.fitting.data.inputs import require_drive
+from nfriction.fitting.data.windows import begins_at_rest
+from nfriction.fitting.options import DEFAULTS
 from nfriction.fitting.shooting.autocorrelation import white_noise
 from nfriction.friction.memory import deflections, load_of
 from nfriction.friction.models import FrictionModel
@@ -37,6 +39,12 @@ deviation of a count over LEAD_IN sqrt(N): with 0.2 s at 500 Hz half a count a s
 windows of 1 s show hardly more than the rounding. An acceleration that a model misses biases the
 velocity at the end by half of LEAD_IN times it, which adds a fifth of the model's own error to 1 s
 windows, and less to longer ones; a longer lead-in would add more.
+"""
+ZERO_IN = 1.0
+"""Time over which the zero of encoders that were zeroed for one recording is estimated [s].
+
+Gravity shows where a zero is, beside torques that the model misses. Those of friction change their
+sign with the velocity and cancel once the joints have turned both ways; over 0.2 s they do not.
 """
 FEWEST = 8  # samples
 # Friction that needs more integration steps to a sample than this is a wall: scoring it would take
@@ -119,7 +127,9 @@ class Simulator:
         recording: Recording,
         scheme: Scheme,
         draws: int,
+        unscored: float = 0.0,
     ) -> None:
+        """Check and prepare; what begins within the first `unscored` seconds is not scored."""
         if friction is not None:
             require_model(friction)
             if friction.joints != plant.joints:
@@ -133,6 +143,7 @@ class Simulator:
         self.lead = lead_in_samples(recording)
         # From zero, so that the rounding of large stamps costs no window its last sample.
         self.time = recording.time - recording.time[0]
+        self.unscored = int(np.searchsorted(self.time, unscored))
         self.substeps: int | None = math.ceil(recording.longest_step / STOP_STEP)
         if scheme != "time_stepping":
             self.substeps = _substeps(plant, friction, recording)
@@ -169,7 +180,7 @@ class Simulator:
                 )
             given = np.concatenate(initial_state)[None]
         for first, last in self.recording.segments:
-            if last - first >= self.lead:
+            if last - first >= self.lead and last > self.unscored:
                 state = given if first == 0 else None
                 runs.append(self._score(np.arange(first, last + 1)[None], state))
         return runs
@@ -179,7 +190,7 @@ class Simulator:
         starts: list[int] = []
         length = len(self.time)
         for first, last in self.recording.segments:
-            first += self.lead
+            first = max(first + self.lead, self.unscored)
             if first >= last:
                 continue
             stamps = self.time[first : last + 1] - self.time[first]
@@ -197,7 +208,7 @@ class Simulator:
     def _score(self, samples: NDArray[np.intp], state: Array | None = None) -> Runs:
         """Simulate windows of samples (window, sample), each beginning with its lead-in.
 
-        From a given state (1, 2 joint) all samples are scored.
+        From a given state (1, 2 joint) all samples are scored but the first `unscored` seconds.
         """
         lead_in = samples[:, : self.lead]
         measured = self.recording.q[samples]
@@ -205,7 +216,7 @@ class Simulator:
             lambda states: self.simulate(states, lead_in)[0],
             self.time[lead_in], measured[:, : self.lead], self.quantum, self.draws,
         )  # fmt: skip
-        scored = slice(self.lead if state is None else 0, None)
+        scored = slice(self.lead if state is None else self.unscored, None)
         state = starts.state if state is None else state
         q, diverged_at = self.simulate(state, samples)
         squares = np.full((self.draws, self.plant.joints), np.inf)
@@ -274,6 +285,69 @@ class Simulator:
             )  # fmt: skip
         q = self.convention.position_from_joint(run.q.numpy(), first_link)
         return q, run.diverged_at.numpy()
+
+
+def with_own_zero(
+    plant: Plant,
+    friction: FrictionModel | None,
+    recording: Recording,
+    state: tuple[Array, Array] | None,
+) -> tuple[Recording, tuple[Array, Array] | None, float]:
+    """A recording with its encoders' zero added, its initial state, and the time that it took [s].
+
+    Of encoders that were set to zero at the start, at rest in a pose held by stiction; a recording
+    that begins otherwise, or is too short to be scored behind that, is as it is. Without a state it
+    begins at rest.
+    """
+    at_zero = np.abs(recording.q[0]).max() <= DEFAULTS.zero_reading
+    short = recording.time[-1] - recording.time[0] < 2 * ZERO_IN
+    if short or not (at_zero and begins_at_rest(recording, DEFAULTS.rest_speed)):
+        return recording, state, 0.0
+    q0, qd0 = state or (recording.q[0], np.zeros(plant.joints))
+    zero = estimate_zero(plant, friction, recording, (q0, qd0))
+    return recording._replace(q=recording.q + zero), (q0 + zero, qd0), ZERO_IN
+
+
+def estimate_zero(
+    plant: Plant,
+    friction: FrictionModel | None,
+    recording: Recording,
+    state: tuple[Array, Array],
+) -> Array:
+    """Zero of a recording's encoders: what to add to its positions, (joint,).
+
+    By Gauss-Newton on the errors of a simulation of the first `ZERO_IN` seconds from a recorded
+    position and velocity, (joint,) each. The prior is that of `FitOptions.encoder_offset_sd`.
+    """
+    simulator = Simulator(plant, friction, recording, "rk4", 0)
+    last = min(int(np.searchsorted(simulator.time, ZERO_IN)), recording.segments[0][1])
+    samples = np.arange(last + 1)[None]
+    joints, sd = plant.joints, DEFAULTS.encoder_offset_sd
+
+    def error(zero: Array) -> Array:
+        begin = np.concatenate([state[0] + zero, np.broadcast_to(state[1], zero.shape)], -1)
+        q, _ = simulator.simulate(begin[..., None, :], samples)
+        return (q - zero[..., None, None, :] - recording.q[samples])[..., 0, :, :]
+
+    zero = np.zeros(joints)
+    nudges = 0.1 * sd * np.eye(joints)
+    for _ in range(MOST_STEPS):
+        now, ahead, back = error(zero), error(zero + nudges), error(zero - nudges)
+        if not all(np.isfinite(x).all() for x in (now, ahead, back)):
+            break
+        slopes = (ahead - back) / (0.2 * sd)
+        # The prior only keeps the zero of a joint that gravity does not load.
+        weight = 1 / max(np.mean(now**2), np.finfo(np.float64).tiny)
+        information = weight * np.einsum("akj,bkj->ab", slopes, slopes) + np.eye(joints) / sd**2
+        gradient = weight * np.einsum("akj,kj->a", slopes, now) + zero / sd**2
+        step = -np.linalg.solve(information, gradient)
+        trials = zero + SHARES[:, None] * step
+        cost = weight * np.sum(error(trials) ** 2, axis=(1, 2))
+        cost += np.sum((trials / sd) ** 2, axis=-1)
+        zero = trials[np.where(np.isfinite(cost), cost, np.inf).argmin()]
+        if -gradient @ step < SMALL**2:
+            break
+    return zero
 
 
 def estimate_starts(

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nfriction.evaluation.lead_in import DRAWS, LEAD_IN, Runs, Simulator
+from nfriction.evaluation.lead_in import DRAWS, LEAD_IN, Runs, Simulator, with_own_zero
 from nfriction.fitting.options import checked_lengths
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant, rigs
@@ -112,6 +112,7 @@ def score(
     horizons: Sequence[float] = HORIZONS,
     scheme: Scheme = "rk4",
     limit: bool = True,
+    zeroed: bool = False,
 ) -> Score:
     """Simulate a recording and measure the position error.
 
@@ -125,28 +126,31 @@ def score(
         scheme: of the integration, see `rollout`; `"time_stepping"` where joints come to
             rest off their balance, which a smoothed sign lets creep back.
         limit: also find the limit of these data, by forty times as many simulations.
+        zeroed: at the start, at rest held by stiction: the first second shows the true zero.
 
     Returns:
         Errors in the recording's coordinates and unit.
 
     Raises:
-        ValueError: if the recording is too short for a lead-in, or lacks a torque that the friction
-            law reads.
+        ValueError: if the recording is too short, or lacks a torque that the law reads.
     """
     plant = rigs.of(plant)
     recording = Recording.of(recording, plant=plant)
     horizons = checked_lengths("horizons", horizons, 0)
-    simulator = Simulator(plant, friction, recording, scheme, DRAWS if limit else 0)
+    read, unscored = recording, 0.0
+    if zeroed:
+        recording, initial_state, unscored = with_own_zero(plant, friction, read, initial_state)
+    simulator = Simulator(plant, friction, recording, scheme, DRAWS if limit else 0, unscored)
     runs = simulator.free_runs(initial_state)
     if not runs:
         raise ValueError(
             f"{recording.name or 'the recording'} is too short to be scored: its longest stretch "
-            f"without a gap must be longer than the lead-in of {LEAD_IN:g} s."
+            f"without a gap must be longer than the lead-in of {max(LEAD_IN, unscored):g} s."
         )
     windows = {f"{h:g}": run for h in horizons if (run := simulator.windows(h)) is not None}
     simulated = np.full_like(recording.q, np.nan)
     for run in runs:
-        simulated[run.samples] = run.q
+        simulated[run.samples] = run.q - (recording.q - read.q)[0]
     return Score(
         RMSE.of(np.concatenate([run.error for run in runs], axis=1)),
         {horizon: RMSE.of(run.error) for horizon, run in windows.items()},

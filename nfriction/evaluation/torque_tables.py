@@ -375,10 +375,7 @@ def _percent(more: Candidate, less: Candidate) -> str:
 
 
 def _simplest(candidates: Sequence[Candidate]) -> tuple[Candidate, str]:
-    """The model with the fewest parameters whose error is within a tolerance of the least, and why.
-
-    The scatter over blocks of one run is no measure here: the blocks at rest are unlike the others.
-    """
+    """The model with fewest parameters whose error is within a tolerance of the least, and why."""
     least = min(candidates, key=lambda c: c.error)
     near = [c for c in candidates if c.error <= (1 + TOLERANCE) * least.error]
     # Of a law and its network that was dropped, equal but for rounding, the law.

@@ -72,9 +72,9 @@ def fit(
         encoder_reference: when incremental encoders were set to zero. `"shared"`: before all
             recordings; the offset is part of the plant. `"per_recording"`: at the start of each,
             at rest in a pose held by stiction; each recording's offset is estimated
-            (`FitResult.encoder_offsets`) and the plant keeps its own, so scores of the recordings
-            include the offsets. `"auto"`: `"per_recording"` if several recordings of a driven
-            chain all begin at rest with every encoder at zero, with a warning.
+            (`FitResult.encoder_offsets`), and by scores that of others. `"auto"`:
+            `"per_recording"` if several recordings of a driven chain all begin at rest with every
+            encoder at zero, with a warning.
         start: an earlier fit to start from: of the same law for a neuro-fuzzy model, of any model
             for the plant's terms.
         motions: smoothed motions in joint coordinates, to save smoothing again.

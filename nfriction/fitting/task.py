@@ -94,12 +94,8 @@ def prepare_task(
     require_drive(model.law, joint)
     if options.eccentricity == "on" and not isinstance(plant, PendulumChain):
         raise ValueError(f"{plant.name or 'the axis'} has no encoders that turn with its joints.")
-    # Torques alone do not depend on a constant offset of the encoders enough to estimate one.
-    found: tuple[str, ...] = ()
-    per_recording = options.encoder_reference == "per_recording"
-    if options.encoder_reference == "auto" and options.method == "output_error":
-        per_recording = looks_zeroed_per_recording(plant, given, options)
-        found = (ZEROED_PER_RECORDING,) if per_recording else ()
+    per_recording = _zeroed_per_recording(plant, given, options)
+    guessed = per_recording and options.encoder_reference == "auto"
     convention = given[0].resolve_convention(plant)
     delay = 0.0
     if options.fit_delay:
@@ -112,7 +108,7 @@ def prepare_task(
     stated, mistakes = likely_mistakes(plant, advanced, moved, convention, options)
     found = (
         *mistake_warning(stated, mistakes),
-        *found,
+        *((ZEROED_PER_RECORDING,) if guessed else ()),
         *data_warnings(plant, given, joint, moved, options),
     )
     measurement = measurement_matrix(plant, convention)
@@ -129,6 +125,18 @@ def prepare_task(
         delay,
         found,
         tuple(m.text for m in mistakes),
+    )
+
+
+def _zeroed_per_recording(
+    plant: Plant, recordings: Sequence[Recording], options: FitOptions
+) -> bool:
+    """True if encoders were set to zero at the start of each recording, or seem to have been."""
+    if options.encoder_reference != "auto":
+        return options.encoder_reference == "per_recording"
+    # Torques alone do not depend on a constant offset of the encoders enough to estimate one.
+    return options.method == "output_error" and looks_zeroed_per_recording(
+        plant, recordings, options
     )
 
 

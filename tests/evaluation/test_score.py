@@ -11,7 +11,13 @@ import torch
 
 from nfriction import CVFM, LFM, LinearAxis, PendulumChain, Recording, rigs, rollout, score
 from nfriction.evaluation.compare import Comparison
-from nfriction.evaluation.lead_in import Simulator, estimate_starts, lead_in_samples
+from nfriction.evaluation.lead_in import (
+    ZERO_IN,
+    Simulator,
+    estimate_starts,
+    estimate_zero,
+    lead_in_samples,
+)
 from nfriction.evaluation.score import RMSE, Score
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
@@ -320,3 +326,44 @@ def test_a_path_and_the_name_of_a_rig_do(tmp_path):
     named = score("multiarm-single", None, tmp_path / "run.csv", limit=False)
     given = score(rigs.of("multiarm-single"), None, recording, limit=False)
     assert named.free_run == given.free_run
+
+
+def zeroed_in_a_pose(zero, seconds=3.0):
+    """A driven double pendulum held off its balance by friction, where its encoders were zeroed."""
+    rig = pendulum(position_quantum=QUANTUM)
+    law = CVFM(2, [[2e-3, 0.02], [1e-3, 0.01]], v_smooth=0.01)
+    time = np.arange(0.0, seconds, 2e-3)
+    hanging = np.array([np.pi, 0.0])
+    turns = 0.3 * np.stack([np.sin(9.0 * time), np.cos(7.0 * time)], 1)
+    tau = turns * rig.gravity_moment.numpy()
+    run = rollout(
+        rig, law, hanging + zero, np.zeros(2), tau[:-1],
+        sample_time=2e-3, substeps=8, gradients=False,
+    )  # fmt: skip
+    q = quantise(run.q.numpy() - zero, 8192)
+    return rig, law, Recording(time, q - hanging, tau, convention="relative,hanging")
+
+
+def test_a_recording_s_own_zero_is_estimated_from_samples_that_are_not_scored():
+    zero = np.array([0.02, -0.03])
+    rig, law, recording = zeroed_in_a_pose(zero)
+    rest = (recording.q[0], np.zeros(2))
+    assert estimate_zero(rig, law, recording, rest) == pytest.approx(zero, abs=2e-3)
+    taken = score(rig, law, recording, limit=False)
+    found = score(rig, law, recording, limit=False, zeroed=True)
+    assert found.free_run.all < 0.1 * taken.free_run.all
+    assert found.windows["1"].all < 0.1 * taken.windows["1"].all
+    late = np.where(recording.time[:, None] > ZERO_IN, 0.1, 0.0)
+    other = score(
+        rig, law, recording._replace(q=recording.q + late), limit=False, horizons=(), zeroed=True
+    )
+    np.testing.assert_array_equal(other.simulated, found.simulated)
+    assert other.free_run.all == pytest.approx(0.1, rel=0.05)
+
+
+def test_a_recording_that_begins_elsewhere_or_is_short_is_taken_as_it_is():
+    rig, law, recording = zeroed_in_a_pose(np.zeros(2))
+    for part in (recording[200:], recording[:900]):
+        given = (rig, law, part)
+        found = score(*given, limit=False, horizons=(), zeroed=True)
+        assert found.free_run == score(*given, limit=False, horizons=()).free_run

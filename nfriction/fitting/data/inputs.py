@@ -267,7 +267,8 @@ Array = NDArray[np.float64]
 
 ZEROED_PER_RECORDING = (
     "Every recording begins at rest with all encoders at zero; assumed that they were zeroed "
-    'there, in whatever pose. If not: `encoder_reference="shared"`.'
+    "there, in whatever pose; scores estimate it from the first second, which they leave out. If "
+    'not: `encoder_reference="shared"`.'
 )
 # Density of steel [kg/m^3].
 STEEL = 7_850.0
