@@ -91,11 +91,17 @@ def likely_mistakes(
     given = _collect(recordings, motions, options)
     if not len(given.q):
         return math.nan, ()
-    stated = _unexplained(plant, given)
+    stated = sound = _unexplained(plant, given)
+    delay = 0.0, sound
+    if given.tau.any():
+        delay = balanced_delay(plant, recordings, motions, options)
+        # A torque that is held until the next sample acts late by up to a step.
+        if -max(r.sample_time for r in recordings) <= delay[0] <= 0:
+            sound = min(delay[1], sound)
     found = [
         Mistake(text, share)
-        for text, share in _tested(plant, recordings, motions, convention, given, options)
-        if share < stated / options.diagnosis_ratio
+        for text, share in _tested(plant, recordings, motions, convention, given, options, delay)
+        if share < sound / options.diagnosis_ratio
     ]
     if not found and not given.tau.any() and isinstance(plant, PendulumChain | LinearAxis):
         return stated, tuple(_driven_without_torque(plant, recordings, motions, options))
@@ -148,6 +154,7 @@ def _tested(
     convention: AngleConvention,
     given: _Data,
     options: FitOptions,
+    delay: tuple[float, float],
 ) -> Iterator[tuple[str, float]]:
     for text, data in _corrected_positions(plant, convention, given):
         yield text, _unexplained(plant, data)
@@ -156,10 +163,7 @@ def _tested(
     if given.tau.any():
         for text, data in _corrected_torques(plant, given, options):
             yield text, _unexplained(plant, data)
-        delay, share = balanced_delay(plant, recordings, motions, options)
-        # A torque that is held until the next sample acts late by up to a step.
-        if not -max(r.sample_time for r in recordings) <= delay <= 0:
-            yield delay_in_words(delay), share
+        yield delay_in_words(delay[0]), delay[1]
         yield _drifting_clock(plant, recordings, motions, options)
         step = recordings[0].sample_time
         for text, data in (*_saturated(plant, given), *_elastic(plant, given, step)):

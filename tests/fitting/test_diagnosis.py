@@ -233,6 +233,21 @@ def test_a_clock_that_drifts_is_named(drift):
     assert float(named) == pytest.approx(1, rel=0.05)
 
 
+@pytest.mark.parametrize("name", ["wheel", "driven"])
+def test_torques_held_for_a_sample_are_no_mistake(name):
+    """Half a sample late throughout, as a little drift or inertia would have it."""
+    plant, _, tau = measured(name)
+    joints, step, samples = plant.joints, 1e-2, 2000
+    time = step * np.arange(samples)
+    waves = 0.5 * np.abs(tau).max(0) * (np.sin(1.6 * time) + 0.5 * np.sin(2.8 * time))[:, None]
+    start = torch.zeros(joints).double()
+    start[0] = 0.0 if name == "wheel" else math.pi
+    model = NCFM(joints, [0.05]).requires_grad_(False)
+    found = rollout(plant, model, start, 0 * start, sample_time=step, substeps=8,
+                    tau=torch.as_tensor(waves[:-1]))  # fmt: skip
+    assert warnings_of(plant, found.q.numpy(), waves, time=time) == ()
+
+
 def test_an_elastic_joint_is_named_and_doubtful():
     """A drive of half the inertia, a spring, and a link whose encoder is read."""
     plant, _, tau = measured("direct")
