@@ -137,6 +137,12 @@ def score(
     plant = rigs.of(plant)
     recording = Recording.of(recording, plant=plant)
     horizons = checked_lengths("horizons", horizons, 0)
+    shapes = initial_state is not None and [np.shape(part) for part in initial_state]
+    if shapes and shapes != [(plant.joints,)] * 2:
+        raise ValueError(
+            f"`initial_state` must be q0 and qd0 of shape ({plant.joints},) each, got "
+            f"{initial_state!r}."
+        )
     read, unscored = recording, 0.0
     if zeroed:
         recording, initial_state, unscored = with_own_zero(plant, friction, read, initial_state)
