@@ -280,6 +280,15 @@ class Simulator:
         return q, run.diverged_at.numpy()
 
 
+def checked_state(plant: Plant, state: tuple[Array, Array] | None) -> tuple[Array, Array] | None:
+    """An initial state, if any, of as many joints as the plant has."""
+    if state is not None and [np.shape(part) for part in state] != [(plant.joints,)] * 2:
+        raise ValueError(
+            f"`initial_state` must be q0 and qd0 of shape ({plant.joints},) each, got {state!r}."
+        )
+    return state
+
+
 def with_own_zero(
     plant: Plant,
     friction: FrictionModel | None,
