@@ -33,7 +33,7 @@ FORMATS = (
     "CSV, TSV or TXT, Parquet, NumPy .npz, MATLAB .mat, HDF5 .h5, or MDF4 .mf4 as of ASAM loggers"
 )
 RIG_FILES = (".json", ".toml", ".urdf", ".xml", ".mjcf")
-DEFAULT_MODELS = "viscous,load-coulomb,arctan,neuro-fuzzy:load-coulomb"
+DEFAULT_MODELS = "viscous,load-coulomb,arctan,stribeck,neuro-fuzzy:load-coulomb"
 # Of `nfriction.fit`; where an option is not given, its own default.
 _FIT_OPTIONS = (
     "windows", "fit_plant", "drag", "eccentricity", "encoder_reference", "max_steps",

@@ -33,7 +33,7 @@ def example(parser: argparse.ArgumentParser) -> list[str]:
 
 def test_names_are_those_of_the_library() -> None:
     assert rigs.names() == list(inputs.RIGS)
-    assert inputs.models(inputs.DEFAULT_MODELS) == ["NCFM", "LFM", "NLFM", "NFLFM"]
+    assert inputs.models(inputs.DEFAULT_MODELS) == ["NCFM", "LFM", "NLFM", "Stribeck", "NFLFM"]
     assert (".json", ".toml", *robot_file.ENDINGS) == inputs.RIG_FILES
     assert (demo.DURATION, demo.TWIN_DURATION) == (twin.QUICK_DURATION, family.DURATION)
     assert demo.TRUTHS == twin.TRUTHS

@@ -97,11 +97,14 @@ def test_a_model_that_controllers_cannot_follow_is_not_told_to_be_exported(
     force = (3.0 * np.sin(5 * time) + np.sin(13 * time))[:, None]
     zero = torch.zeros(1, dtype=torch.float64)
     run = rollout(axis, truth, zero, zero, torch.tensor(force[:-1]), sample_time=4e-3)
-    Recording(time, run.q.numpy(), tau=force, unit="m").write(tmp_path / "a.csv")
-    words = ["fit", str(tmp_path / "a.csv"), "--rig", str(tmp_path / "axis.json")]
-    for model, exportable in (("dahl", True), ("gear", False)):
-        out = ["--model", model, "--out", str(tmp_path / "m.json")]
-        assert cli.main([*words, *out]) == 0
+    for name, each in (("a", 1), ("b", 2)):
+        q, tau = run.q.numpy()[::each], force[::each]
+        Recording(time[::each], q, tau=tau, unit="m").write(tmp_path / f"{name}.csv")
+    out = ["--rig", str(tmp_path / "axis.json"), "--out", str(tmp_path / "m.json")]
+    # A law with memory is advanced by one sample time, and recordings of different ones give none.
+    for model, names, exportable in (("gear", "a", True), ("dahl", "ab", False)):
+        logs = [str(tmp_path / f"{name}.csv") for name in names]
+        assert cli.main(["fit", *logs, "--model", model, *out]) == 0
         said = capsys.readouterr().out
         assert ("next:" in said) is exportable, said
 
