@@ -170,8 +170,10 @@ class Simulator:
 
     def free_runs(self, initial_state: tuple[Array, Array] | None) -> list[Runs]:
         """One run of each segment that is longer than a lead-in."""
-        runs = []
-        given = None if initial_state is None else np.concatenate(initial_state)[None]
+        runs, given = [], None
+        if initial_state is not None:
+            _require_joints(self.plant, initial_state)
+            given = np.concatenate(initial_state)[None]
         for first, last in self.recording.segments:
             if last - first >= self.lead and last > self.unscored:
                 state = given if first == 0 else None
@@ -280,13 +282,11 @@ class Simulator:
         return q, run.diverged_at.numpy()
 
 
-def checked_state(plant: Plant, state: tuple[Array, Array] | None) -> tuple[Array, Array] | None:
-    """An initial state, if any, of as many joints as the plant has."""
-    if state is not None and [np.shape(part) for part in state] != [(plant.joints,)] * 2:
+def _require_joints(plant: Plant, state: tuple[Array, Array]) -> None:
+    if [np.shape(part) for part in state] != [(plant.joints,)] * 2:
         raise ValueError(
             f"`initial_state` must be q0 and qd0 of shape ({plant.joints},) each, got {state!r}."
         )
-    return state
 
 
 def with_own_zero(
@@ -301,6 +301,8 @@ def with_own_zero(
     that begins otherwise, has a gap before `ZERO_IN`, or is too short to be scored behind that, is
     as it is. Without a state it begins at rest.
     """
+    if state is not None:
+        _require_joints(plant, state)
     at_zero = np.abs(recording.q[0]).max() <= DEFAULTS.zero_reading
     time = recording.time - recording.time[0]
     short = time[-1] < 2 * ZERO_IN or time[recording.segments[0][1]] < ZERO_IN

@@ -14,14 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nfriction.evaluation.lead_in import (
-    DRAWS,
-    LEAD_IN,
-    Runs,
-    Simulator,
-    checked_state,
-    with_own_zero,
-)
+from nfriction.evaluation.lead_in import DRAWS, LEAD_IN, Runs, Simulator, with_own_zero
 from nfriction.fitting.options import checked_lengths
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant, rigs
@@ -144,12 +137,11 @@ def score(
     plant = rigs.of(plant)
     recording = Recording.of(recording, plant=plant)
     horizons = checked_lengths("horizons", horizons, 0)
-    state = checked_state(plant, initial_state)
     read, unscored = recording, 0.0
     if zeroed:
-        recording, state, unscored = with_own_zero(plant, friction, read, state)
+        recording, initial_state, unscored = with_own_zero(plant, friction, read, initial_state)
     simulator = Simulator(plant, friction, recording, scheme, DRAWS if limit else 0, unscored)
-    runs = simulator.free_runs(state)
+    runs = simulator.free_runs(initial_state)
     if not runs:
         raise ValueError(
             f"{recording.name or 'the recording'} is too short to be scored: its longest stretch "
