@@ -192,7 +192,7 @@ class Comparison:
     def limit(
         self, horizon: str | None = None, column: str = "all", *, part: Part = "test"
     ) -> float | None:
-        """Error that start and torque may cause by their noise, in the best model's simulations.
+        """Error that noise of start and torque, and integration, may cause in the best model.
 
         Smaller differences between models are not meaningful.
 

@@ -160,7 +160,7 @@ _CAPTIONS = {
     "over the torque that the recorded motion implies, averaged over 30 ms",
     "rmse_test": "Position error by model and joint, test recordings",
     "horizons_test": "Position error over the length of the simulation, test recordings; the band "
-    "is the limit of these data, the effect of the noise of start and torque",
+    "is the limit of these data, the effect of noise of start and torque and of the integration",
     "rmse_train": "Position error by model and joint, training recordings",
     "horizons_train": "Position error over the length of the simulation, training recordings",
     "mechanism": "The mechanism as the rig file describes it",
