@@ -172,12 +172,7 @@ class Simulator:
         """One run of each segment that is longer than a lead-in."""
         runs, given = [], None
         if initial_state is not None:
-            shapes = [np.shape(part) for part in initial_state]
-            if shapes != [(self.plant.joints,)] * 2:
-                raise ValueError(
-                    f"`initial_state` must be q0 and qd0 of shape ({self.plant.joints},) each, "
-                    f"got {initial_state!r}."
-                )
+            _require_joints(self.plant, initial_state)
             given = np.concatenate(initial_state)[None]
         for first, last in self.recording.segments:
             if last - first >= self.lead and last > self.unscored:
@@ -287,6 +282,13 @@ class Simulator:
         return q, run.diverged_at.numpy()
 
 
+def _require_joints(plant: Plant, state: tuple[Array, Array]) -> None:
+    if [np.shape(part) for part in state] != [(plant.joints,)] * 2:
+        raise ValueError(
+            f"`initial_state` must be q0 and qd0 of shape ({plant.joints},) each, got {state!r}."
+        )
+
+
 def with_own_zero(
     plant: Plant,
     friction: FrictionModel | None,
@@ -296,11 +298,14 @@ def with_own_zero(
     """A recording with its encoders' zero added, its initial state, and the time that it took [s].
 
     Of encoders that were set to zero at the start, at rest in a pose held by stiction; a recording
-    that begins otherwise, or is too short to be scored behind that, is as it is. Without a state it
-    begins at rest.
+    that begins otherwise, has a gap before `ZERO_IN`, or is too short to be scored behind that, is
+    as it is. Without a state it begins at rest.
     """
+    if state is not None:
+        _require_joints(plant, state)
     at_zero = np.abs(recording.q[0]).max() <= DEFAULTS.zero_reading
-    short = recording.time[-1] - recording.time[0] < 2 * ZERO_IN
+    time = recording.time - recording.time[0]
+    short = time[-1] < 2 * ZERO_IN or time[recording.segments[0][1]] < ZERO_IN
     if short or not (at_zero and begins_at_rest(recording, DEFAULTS.rest_speed)):
         return recording, state, 0.0
     q0, qd0 = state or (recording.q[0], np.zeros(plant.joints))
@@ -320,8 +325,7 @@ def estimate_zero(
     position and velocity, (joint,) each. The prior is that of `FitOptions.encoder_offset_sd`.
     """
     simulator = Simulator(plant, friction, recording, "rk4", 0)
-    last = min(int(np.searchsorted(simulator.time, ZERO_IN)), recording.segments[0][1])
-    samples = np.arange(last + 1)[None]
+    samples = np.arange(np.searchsorted(simulator.time, ZERO_IN) + 1)[None]
     joints, sd = plant.joints, DEFAULTS.encoder_offset_sd
 
     def error(zero: Array) -> Array:

@@ -22,6 +22,7 @@ from nfriction.evaluation.score import RMSE, Score
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
 from nfriction.friction.models import FrictionModel
+from nfriction.recording import RecordingWarning
 from nfriction.signals import quantise
 from tests.fitting.recordings import pendulum, swing
 
@@ -361,9 +362,21 @@ def test_a_recording_s_own_zero_is_estimated_from_samples_that_are_not_scored():
     assert other.free_run.all == pytest.approx(0.1, rel=0.05)
 
 
-def test_a_recording_that_begins_elsewhere_or_is_short_is_taken_as_it_is():
-    rig, law, recording = zeroed_in_a_pose(np.zeros(2))
-    for part in (recording[200:], recording[:900]):
+def test_a_recording_whose_zero_does_not_show_is_taken_as_it_is():
+    rig, law, recording = zeroed_in_a_pose(np.array([0.02, -0.03]))
+    rows = np.r_[:3, 200:1500]
+    with pytest.warns(RecordingWarning, match="gap"):
+        broken = Recording(
+            recording.time[rows], recording.q[rows], recording.tau[rows],
+            convention="relative,hanging",
+        )  # fmt: skip
+    for part in (recording[200:], recording[:900], broken):
         given = (rig, law, part)
         found = score(*given, limit=False, horizons=(), zeroed=True)
         assert found.free_run == score(*given, limit=False, horizons=()).free_run
+
+
+def test_a_state_of_fewer_joints_is_refused_where_the_zero_is_estimated():
+    rig, law, recording = zeroed_in_a_pose(np.zeros(2))
+    with pytest.raises(ValueError, match=r"`initial_state` must be q0 and qd0 of shape \(2,\)"):
+        score(rig, law, recording, initial_state=([0.0], [0.0, 0.0]), limit=False, zeroed=True)

@@ -70,7 +70,9 @@ def test_a_joint_that_moves_in_one_recording_is_not_named():
 def test_clocks_that_differ_a_little_are_named(stretch, named):
     first = swing(pendulum(), MODEL, seconds=1.0, convention="relative,hanging", name="one")
     other = Recording(stretch * first.time, first.q, name="two", convention="relative,hanging")
-    found = said(pendulum(convention=("relative", "hanging")), first, other)
+    # A third at a rate that was chosen hides nothing.
+    slow = Recording(10 * first.time, first.q, name="slow", convention="relative,hanging")
+    found = said(pendulum(convention=("relative", "hanging")), first, other, slow)
     clocks = [w for w in found if "two has a sample every 2.04 ms, one every 2 ms" in w]
     assert len(clocks) == named
 

@@ -9,6 +9,7 @@ import textwrap
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -347,17 +348,15 @@ def _still_joints(
 def _unlike_clocks(recordings: Sequence[Recording], options: FitOptions) -> Iterator[str]:
     """Recordings whose even steps differ by less than one chooses a rate to differ."""
     even = sorted((r for r in recordings if r.is_uniform), key=lambda r: r.sample_time)
-    if not even:
-        return
-    fast, slow = even[0], even[-1]
-    apart = slow.sample_time / fast.sample_time - 1
-    if options.clock_error[0] < apart < options.clock_error[1]:
-        yield (
-            f"{slow.name or 'A recording'} has a sample every {1e3 * slow.sample_time:.6g} ms, "
-            f"{fast.name or 'another'} every {1e3 * fast.sample_time:.6g} ms: if one logger wrote "
-            f"both, one of its clocks is wrong by {100 * apart:.2g} %, and inertia and friction by "
-            "up to twice that; give both the step of the logger."
-        )
+    for fast, slow in pairwise(even):
+        apart = slow.sample_time / fast.sample_time - 1
+        if options.clock_error[0] < apart < options.clock_error[1]:
+            yield (
+                f"{slow.name or 'A recording'} has a sample every {1e3 * slow.sample_time:.6g} ms, "
+                f"{fast.name or 'another'} every {1e3 * fast.sample_time:.6g} ms: if one logger "
+                f"wrote both, one of the two steps is wrong by {100 * apart:.2g} %, and inertia "
+                "and friction by up to twice that; give both the step of the logger."
+            )
 
 
 def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[str]:
