@@ -15,7 +15,7 @@ LEGEND = (
     "or 5 s,\nover all joints; each starts from the state that its model estimates from the "
     f"{LEAD_IN:g} s before, which are\nnot scored, or from a given one; error reduction: of the "
     "free run, against no friction, simulated on\nthe rig as given; limit of these data: error "
-    "that the noise of start and torque, and the integration, may cause;\n=: within that of the least"
+    "that noise of start and torque, and integration, may cause;\n=: within that of the least"
 )
 
 

@@ -105,7 +105,7 @@ def verify_artefact(
     except ExportError as error:
         if not differences:
             raise
-        raise ExportError(f"{error} It was exported from another model: {differences[0]}.") from None
+        raise ExportError(f"{error} It is of another model: {differences[0]}.") from None
     try:
         # First, since it refuses the outputs of another law by their shapes.
         at_points = compare(controller.run(*inputs), run(*inputs), own.tolerance, own.scales)

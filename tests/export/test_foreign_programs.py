@@ -80,7 +80,7 @@ def test_a_sound_artefact_passes_and_other_numbers_are_found_out(
 
 
 def test_an_artefact_of_another_law_is_named(artefacts: dict[str, Path]) -> None:
-    with pytest.raises(ExportError, match=r"another model: model LFM instead of NLFM\."):
+    with pytest.raises(ExportError, match=r"It is of another model: model LFM instead of NLFM\."):
         verify_artefact(artefacts[".pt"], NLFM(3), INFO)
 
 
