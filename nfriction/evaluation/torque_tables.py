@@ -352,6 +352,8 @@ def _choose(candidates: Sequence[Candidate]) -> tuple[str, str]:
         by_need.setdefault(_need(candidate.name), []).append(candidate)
     first, *others = sorted(by_need)
     chosen, why = _simplest(by_need[first])
+    if others and len(by_need[first]) == 1:
+        why = "no other needs as little memory or load"
     for need in others:
         more = by_need[need]
         best, reason = _simplest(more)

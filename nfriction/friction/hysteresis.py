@@ -123,10 +123,12 @@ def hysteresis_law(name: str, *, loaded: bool, count: int = ELEMENTS) -> Law:
 
 
 def unused(values: Mapping[str, float]) -> set[str]:
-    """Names of coefficients that add nothing: smallest forces, and what shapes their terms."""
+    """Names of coefficients that add nothing: smallest forces, what shapes their terms, no rest."""
     shapes = {"f_a": "v_a", "F_d": "v_s"} | {f"F_{k}": f"d_{k}" for k in range(1, ELEMENTS + 1)}
     found = {force for force in shapes if values[force] < 2.0 * SMALLEST}
-    return found | {shapes[force] for force in found}
+    # An excess that is gone over a thousandth of the narrowest element is none.
+    at_once = values["d_r"] < 1e-3 * values["d_1"]
+    return found | {shapes[force] for force in found} | ({"d_r"} if at_once else set())
 
 
 SLIP = hysteresis_law("slip", loaded=False)
