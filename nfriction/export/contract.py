@@ -218,6 +218,14 @@ class Contract:
         """Numbers a joint that the controller carries from sample to sample."""
         return int(self.description["state_size"])
 
+    def require_dtype(self, dtype: str) -> None:
+        """Raise ContractError unless the metadata state this type, which sets the tolerance."""
+        if self.description["dtype"] != dtype:
+            raise ContractError(
+                f"the metadata state {self.description['dtype']}, but the program computes in "
+                f"{dtype}."
+            )
+
     def to_dict(self) -> dict[str, Any]:
         """As plain JSON; NaN and infinities are the strings "nan", "inf" and "-inf"."""
         vectors = {

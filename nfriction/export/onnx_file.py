@@ -306,18 +306,25 @@ def onnx(
 
 def contract_of_onnx(path: str | Path) -> Contract:
     """Read the contract of an artefact."""
-    properties = {prop.key: prop.value for prop in _read(path).metadata_props}
-    return Contract.from_json(properties.get(METADATA, ""))
+    file = _read(path)
+    properties = {prop.key: prop.value for prop in file.metadata_props}
+    contract = Contract.from_json(properties.get(METADATA, ""))
+    contract.require_dtype(_dtype(file))
+    return contract
 
 
 def onnx_runner(path: str | Path, controller: Controller) -> Runner:
     """Load an artefact; its graph must be that of the controller, its numbers need not be."""
     file = _read(path)
-    single = any(port.type.tensor_type.elem_type == 1 for port in file.graph.input)
-    dtype = "float32" if single else "float64"
+    dtype = _dtype(file)
     if _without_numbers(file) != _without_numbers(_file(controller, dtype)):
         raise ExportError(another_program(path))
     return _runner(file, controller, dtype, path)
+
+
+def _dtype(file: Any) -> str:
+    single = any(port.type.tensor_type.elem_type == 1 for port in file.graph.input)
+    return "float32" if single else "float64"
 
 
 def _without_numbers(file: Any) -> bytes:

@@ -354,7 +354,9 @@ def silent() -> Iterator[None]:
 
 def contract_of_archive(path: str | Path) -> Contract:
     """Read the contract of an artefact of torch."""
-    return Contract.from_json(_contents(path, path).get(f"extra/{METADATA}", b""))
+    contract = Contract.from_json(_contents(path, path).get(f"extra/{METADATA}", b""))
+    contract.require_dtype("float64")
+    return contract
 
 
 def own_program(path: str | Path, own: bytes) -> io.BytesIO:

@@ -79,6 +79,17 @@ def test_a_sound_artefact_passes_and_other_numbers_are_found_out(
     assert 1e-4 < verdict.points.torque_error < 1e-1
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_metadata_cannot_loosen_the_tolerance(
+    kind: str, artefacts: dict[str, Path], tmp_path: Path
+) -> None:
+    files = files_of(artefacts[kind])
+    metadata = json.loads(files[f"extra/{METADATA}"]) | {"dtype": "float32"}
+    files[f"extra/{METADATA}"] = json.dumps(metadata).encode()
+    with pytest.raises(ContractError, match="state float32, but the program computes in float64"):
+        verify_artefact(packed(tmp_path / f"m{kind}", files), MODEL, INFO, points=50)
+
+
 def test_an_artefact_of_another_law_is_named(artefacts: dict[str, Path]) -> None:
     with pytest.raises(ExportError, match=r"It is of another model: model LFM instead of NLFM\."):
         verify_artefact(artefacts[".pt"], NLFM(3), INFO)
