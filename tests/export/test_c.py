@@ -20,6 +20,7 @@ from nfriction.export.controller import NOT_FINITE, OUTSIDE, SATURATED, controll
 from nfriction.friction import model_by_name, model_names
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law
+from nfriction.friction.memory import Gear
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import ModelInfo
 from nfriction.plant import Rotor, rigs
@@ -288,6 +289,13 @@ def test_two_controllers_live_in_one_program(tmp_path):
         one = torch.ones(3, dtype=torch.float64)
         expected = [random_model(name)(one, one, one)[2].item() for name in names]
         np.testing.assert_allclose([float(x) for x in said.split()], expected, rtol=1e-13)
+
+
+def test_the_sketch_of_a_gear_names_the_torque_to_read(tmp_path):
+    c(Gear(2), tmp_path, ModelInfo(sample_time=1e-3))
+    head = (tmp_path / "nfriction.ino").read_text().partition("extern")[0]
+    assert "write `read_position`, `read_torque` and `write_torque` for your board" in head
+    build([*CXX, f"-I{STUBS}", "-fsyntax-only", "-x", "c++", "nfriction.ino"], tmp_path)
 
 
 @cases

@@ -1,5 +1,5 @@
 // {{ title }} on an Arduino. Put this file, {{ name }}.c and {{ name }}.h into one folder that is called
-// {{ name }}; write `read_position` and `write_torque` for your board.
+// {{ name }}; write `read_position`{% if loaded %}, `read_torque`{% endif %} and `write_torque` for your board.
 extern "C" {
 #include "{{ name }}.h"
 }
@@ -41,7 +41,7 @@ static void write_torque(int joint, nf_real tau, nf_real qd, int status)
 // Torque that the drive of a joint transmits [{{ torque_unit }}], on which this friction depends: command or current.
 static nf_real read_torque(int joint)
 {
-    return (nf_real)((analogRead(A3 + joint) - 512) * 0.01);
+    return (nf_real)((analogRead(A0 + NF_JOINTS + joint) - 512) * 0.01);
 }
 
 {% endif %}
