@@ -57,7 +57,7 @@ class AdaptiveNeuroFuzzy(Schedule):
         **network: Any,
     ) -> None:
         super().__init__(law, joints)
-        require_options("network 'by_class'", NeuroFuzzy, network, ("network", "inputs", "memory"))
+        require_options("network 'by_class'", NeuroFuzzy, network, ("memory",))
         self._law = law
         self.adaptive = Adaptive(law, joints, initial, **(memory or {}))
         # The mean over the classes: the network corrects all of them alike.
