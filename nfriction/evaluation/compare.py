@@ -192,7 +192,7 @@ class Comparison:
     def limit(
         self, horizon: str | None = None, column: str = "all", *, part: Part = "test"
     ) -> float | None:
-        """Error that noise of start and torque, and integration, may cause in the best model.
+        """Error that noise and integration may cause in simulations of the best model.
 
         Smaller differences between models are not meaningful.
 

@@ -126,7 +126,8 @@ def score(
         scheme: of the integration, see `rollout`; `"time_stepping"` where joints come to
             rest off their balance, which a smoothed sign lets creep back.
         limit: also find the limit of these data, by forty times as many simulations.
-        zeroed: at the start, at rest held by stiction: the first second shows the true zero.
+        zeroed: the encoders were set to zero at the start, at rest in a pose held by stiction; the
+            model estimates their true zero from the first second, which is not scored.
 
     Returns:
         Errors in the recording's coordinates and unit.

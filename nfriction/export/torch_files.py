@@ -120,7 +120,7 @@ def _script_runner(module: Any, controller: Controller) -> Runner:
     def run(*inputs: Tensor) -> tuple[Tensor, ...]:
         if not controller.state_size:
             return tuple(module.step(*inputs))
-        # The load, which comes last, has no part in the state.
+        # The load, which comes last, has no part in the state before the first step.
         start = module.initial_state(*(x[0] for x in inputs[:-1]))
         return run_in_order(module.step, inputs, start)
 

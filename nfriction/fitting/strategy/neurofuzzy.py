@@ -154,18 +154,21 @@ class _Contest:
         self.validation = _Validation(law, start, task.motions, length)
         self.best: _Trial | None = None
 
+    def accepts(self, trial: "_Trial") -> bool:
+        """True for a network that beats the law on windows held out."""
+        return gains(trial.squares, self.validation.of_law)
+
     @property
     def squares(self) -> Tensor:
         """Squared errors of the network where it is accepted, else of the law, (window,)."""
         assert self.best is not None
-        of_law = self.validation.of_law
-        return self.best.squares if gains(self.best.squares, of_law) else of_law
+        return self.best.squares if self.accepts(self.best) else self.validation.of_law
 
     @property
     def found(self) -> FitResult:
         """The law's fit, with the model and plant of the network where it is accepted."""
         assert self.best is not None
-        if not gains(self.best.squares, self.validation.of_law):
+        if not self.accepts(self.best):
             return self.start
         problem, parts = self.best.end.problem, self.best.end.parts
         model, plant = model_at(problem.friction, parts.friction), problem.plant_at(parts.plant)
@@ -191,7 +194,7 @@ class _Contest:
                 before, best = best, validation.trained_on(best)
         except StoppedError:
             best = replace(best, end=best.end.as_stopped())
-        if not gains(best.squares, validation.of_law):
+        if not self.accepts(best):
             note, stopped = verdict(best.squares, validation.of_law), best.end.stopped
             return _constant_kept(model, self, note, converged=not stopped)
         end = best.end if best.end.stopped else validation.fit_all(best)
