@@ -1,4 +1,4 @@
-"""The papers' tables: our numbers beside the printed ones, as CSV, JSON and text.
+"""The papers' tables: our numbers beside the printed ones.
 
 The papers' recordings were never published, so the printed numbers cannot be reproduced to the
 digit: they come from another machine. Units of the position errors are not printed; radians are
@@ -9,13 +9,11 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 
-from nfriction.io.files import write_atomically
 from nfriction.papers.reproduction.agreement import agreement
 from nfriction.papers.reproduction.stages import (
     ADAPTIVE,
@@ -25,7 +23,6 @@ from nfriction.papers.reproduction.stages import (
     NEURO_FUZZY,
     PAPERS_WAY,
     SECOND_PAPER,
-    stages,
 )
 from nfriction.papers.reproduction.workspace import Workspace
 from nfriction.plant import rigs
@@ -347,98 +344,3 @@ def long_table(workspace: Workspace) -> pd.DataFrame:
                         value = np.inf if value is None else value
                         rows.append(about | {"kind": kind, "joint": joint, "rmse [rad]": value})
     return pd.DataFrame(rows)
-
-
-def all_tables(workspace: Workspace) -> dict[str, tuple[str, pd.DataFrame]]:
-    """The papers' tables with their titles, by the name of their file."""
-    settings = workspace.settings
-    error = "position RMSE [mrad] on test releases, free runs of"
-    methods = ("sequential quadratic programming", "pattern search", "pattern search")
-    found = {
-        "fig_4_agreement": (
-            "Fig. 4: difference from our simulation without friction, from 20.56°, 32.21°, 45°",
-            agreement_table(),
-        ),
-        "table_6": ("Table 6: classes of acceleration in the experiment", table_6(workspace)),
-    }
-    for number, law in zip((7, 8, 9), LAWS, strict=True):
-        found[f"table_{number}"] = (
-            f"Table {number}: coefficients of A{law} by class of acceleration (the print is lost)",
-            adaptive_coefficients(workspace, law),
-        )
-    found |= {
-        "table_10": (
-            f"Table 10: {error} {settings.tlrip_seconds:g} s, coefficients driven by the "
-            "simulated motion",
-            table_10(workspace),
-        ),
-        "table_10_measured_drive": (
-            "Table 10 again, coefficients driven by the measured motion as in the paper [mrad]",
-            table_10(workspace, "measured_drive"),
-        ),
-        "table_11": (
-            "Table 11: error of NFNLFM below that of each other model [%]", table_11(workspace)
-        ),
-        "error_saved": (
-            "error saved by coefficients by class and by networks within a law [%]",
-            steps_saved(workspace),
-        ),
-    }  # fmt: skip
-    for roman, law, method in zip(("I", "II", "III"), LAWS, methods, strict=True):
-        found[f"second_table_{roman.lower()}"] = (
-            f"second paper, Table {roman}: {law} by {method}",
-            second_coefficients(workspace, law),
-        )
-    found["second_table_iv"] = (
-        f"second paper, Table IV: {error} {settings.rtip_seconds:g} s",
-        second_table_4(workspace),
-    )
-    for task, what in (
-        ("still", "a link balanced upright, the arm to stay still"),
-        ("follow", "a link balanced upright while the arm follows a slow sine"),
-        ("swing-up", "three links swung up in 5 s and balanced, planned with the same friction"),
-        ("three links", "three links balanced upright while the arm follows a slow sine"),
-    ):
-        found[f"control_{task.replace(' ', '_').replace('-', '_')}"] = (
-            f"future work, control: {what}, by the model whose friction torque is compensated "
-            "(inf: fallen)",
-            control_table(workspace, task),
-        )
-    return found
-
-
-def write_tables(workspace: Workspace, *, command: str = "") -> list[Path]:
-    """Write `tables/*.csv`, `rmse.csv` with every error, and `results.json`."""
-    verdict = order(workspace)
-    results = {
-        "command": command,
-        "settings": workspace.settings.to_dict(),
-        "order": {"holds": verdict.holds, "broken": list(verdict.broken), "best": verdict.best},
-        "stages": {name: workspace.found(name) for name in stages()},
-    }
-    content = {
-        "rmse.csv": long_table(workspace).to_csv(index=False),
-        "results.json": json.dumps(results, indent=1, allow_nan=False),
-    }
-    for name, (_, table) in all_tables(workspace).items():
-        # One header row, so that any reader of CSV can read it.
-        flat = table.set_axis([f"{column[1]}, {column[0]}" for column in table.columns], axis=1)
-        content[f"tables/{name}.csv"] = flat.to_csv(index_label="row")
-    return [write_atomically(workspace.folder / n, t.encode()) for n, t in content.items()]
-
-
-def text(workspace: Workspace) -> str:
-    """All tables beside the printed ones, and whether the papers' order of models holds."""
-    parts = []
-    for title, table in all_tables(workspace).values():
-        # Coefficients stay in SI; errors are read in thousandths.
-        shown = 1e3 * table if "[mrad]" in title else table
-        written = shown.to_string(float_format=lambda x: f"{x:.4g}", na_rep="")
-        parts.append(f"{title}\n{written}")
-    parts.append(
-        "printed: the papers' numbers, from recordings that were never published and another "
-        "machine's friction;\nours: simulated twins. -papers: made by the papers' own procedure "
-        "(fuzzy controller, 2-10-2 network), -pattern: by their pattern search."
-    )
-    parts += [str(order(workspace)), f"how the fits ended\n{fit_ends(workspace)}"]
-    return "\n\n".join(parts)
