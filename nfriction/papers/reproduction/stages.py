@@ -33,7 +33,6 @@ from nfriction.papers.afem.adaptive import CLASSES, Adaptive
 from nfriction.papers.afem.classes import class_intervals
 from nfriction.papers.afem.fit_by_search import SearchMethod, SearchOptions, fit_by_search
 from nfriction.papers.control import study
-from nfriction.papers.nffem.refine_adaptive import refine_adaptive
 from nfriction.papers.nffem.train_network import TrainingOptions
 from nfriction.papers.reproduction.agreement import missed_torque
 from nfriction.papers.reproduction.procedure import papers_neuro_fuzzy
@@ -211,14 +210,16 @@ def fit_from_start(
     name: str,
     *,
     start: FitResult | None = None,
+    max_steps: int | None = None,
     **options: Any,
 ) -> FitResult:
     """A model made with these options and fitted to trajectories, from an earlier fit or none."""
     settings = workspace.settings
     model = model_by_name(name)(bench.plant.joints, **options)
     return workspace.fit(name, bench, lambda step: fit(
-        model, bench.plant, bench.train, windows=settings.windows, max_steps=settings.max_steps,
-        fit_plant=settings.fit_plant, start=start, motions=bench.train_motions, callback=step,
+        model, bench.plant, bench.train, windows=settings.windows,
+        max_steps=max_steps or settings.max_steps, fit_plant=settings.fit_plant, start=start,
+        motions=bench.train_motions, callback=step,
     ))  # fmt: skip
 
 
@@ -230,25 +231,23 @@ def fit_by_class(workspace: Workspace, bench: Bench, name: str) -> FitResult:
 
 def fit_network(workspace: Workspace, bench: Bench, name: str) -> FitResult:
     """A neuro-fuzzy model our way: a network corrects the adaptive model, on trajectories."""
-    settings = workspace.settings
     start = fit_by_class(workspace, bench, f"A{name.removeprefix('NF')}")
-    options: dict[str, Any] = {
-        "network": "by_class", "terms": settings.terms, "head_units": settings.head_units
-    }  # fmt: skip
-    model = model_by_name(name)(bench.plant.joints, **options)
-    return workspace.fit(name, bench, lambda step: refine_adaptive(
-        model, start, bench.train, length=settings.windows[-1],
-        max_steps=settings.network_steps, callback=step,
-    ))  # fmt: skip
+    steps = workspace.settings.network_steps
+    return fit_from_start(
+        workspace, bench, name, start=start, max_steps=steps, network="by_class",
+        **_sizes(workspace),
+    )  # fmt: skip
 
 
 def fit_without_classes(workspace: Workspace, bench: Bench, name: str) -> FitResult:
     """A neuro-fuzzy model from the constant fit of its law."""
-    settings = workspace.settings
     start = fit_from_start(workspace, bench, name.removeprefix("NF"))
-    return fit_from_start(
-        workspace, bench, name, start=start, terms=settings.terms, head_units=settings.head_units
-    )
+    return fit_from_start(workspace, bench, name, start=start, **_sizes(workspace))
+
+
+def _sizes(workspace: Workspace) -> dict[str, Any]:
+    settings = workspace.settings
+    return {"terms": settings.terms, "head_units": settings.head_units}
 
 
 def fit_searched(
