@@ -184,11 +184,10 @@ def all_tables(workspace: Workspace) -> dict[str, tuple[str, pd.DataFrame]]:
 
 def write_tables(workspace: Workspace, *, command: str = "") -> list[Path]:
     """Write `tables/*.csv`, `rmse.csv` with every error, and `results.json`."""
-    verdict = tables.order(workspace)
     results = {
         "command": command,
         "settings": workspace.settings.to_dict(),
-        "order": {"holds": verdict.holds, "broken": list(verdict.broken), "best": verdict.best},
+        "order": tables.order(workspace)._asdict(),
         "stages": {name: workspace.found(name) for name in stages()},
     }
     content = {

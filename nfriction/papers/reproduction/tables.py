@@ -7,9 +7,8 @@ presumed.
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from importlib import resources
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -48,22 +47,18 @@ TLRIP = (*CONSTANT, *ADAPTIVE, *BY_PATTERN, *NEURO_FUZZY, *PAPERS_WAY)
 _PRINTED_10 = TABLE_10 | {n: TABLE_10[n.partition("-")[0]] for n in (*BY_PATTERN, *PAPERS_WAY)}
 
 
-@dataclass(frozen=True)
-class Order:
+class Order(NamedTuple):
     """Verdict on neuro-fuzzy <= adaptive <= constant for each law on every joint.
 
     Attributes:
+        holds: true without exceptions.
         broken: exceptions, in words.
         best: the best of the nine by joint, ties joined by an equals sign.
     """
 
-    broken: tuple[str, ...]
+    holds: bool
+    broken: list[str]
     best: dict[str, str]
-
-    @property
-    def holds(self) -> bool:
-        """True without exceptions."""
-        return not self.broken
 
     def __str__(self) -> str:
         best = ", ".join(f"{joint} {model}" for joint, model in self.best.items())
@@ -254,21 +249,27 @@ def order(workspace: Workspace) -> Order:
         joint: " = ".join(m for m, e in error.items() if e[k] == min(x[k] for x in error.values()))
         for k, joint in enumerate(JOINTS)
     }
-    return Order(tuple(broken), best)
+    return Order(not broken, broken, best)
 
 
 def fit_ends(workspace: Workspace) -> str:
     """The end of every fit in words, and the fits that did not converge."""
     fits = {name: workspace.found(name)["fit"] for name in (*TLRIP, *SECOND_PAPER)}
     lines = [f"{name:13} {fit['status']}" for name, fit in fits.items()]
-    open_ended = [name for name, fit in fits.items() if not fit["converged"]]
-    if not open_ended:
-        return "\n".join([*lines, "", "every fit converged"])
-    summary = (
-        f"{len(open_ended)} of {len(fits)} fits did not converge ({', '.join(open_ended)}): their "
-        "numbers are those of an unfinished search, and their order may change with more steps"
-    )
+    open_ended = _unconverged(workspace)
+    summary = "every fit converged"
+    if open_ended:
+        summary = (
+            f"{len(open_ended)} of {len(fits)} fits did not converge ({', '.join(open_ended)}): "
+            "their numbers are those of an unfinished search, and their order may change with more "
+            "steps"
+        )
     return "\n".join([*lines, "", summary])
+
+
+def _unconverged(workspace: Workspace) -> list[str]:
+    names = (*TLRIP, *SECOND_PAPER)
+    return [name for name in names if not workspace.found(name)["fit"]["converged"]]
 
 
 def conclusion(workspace: Workspace) -> str:
@@ -287,6 +288,7 @@ def conclusion(workspace: Workspace) -> str:
 
     constant = tuple(LAWS)
     *simple, five = SECOND_PAPER
+    missed = workspace.found("twin-tlrip")["missed_torque"]
     lines = [
         "The papers' claims on simulated recordings, as theirs were never published; errors of the "
         "simulated position in mrad, of viscous, load-dependent and five-coefficient friction:",
@@ -308,21 +310,12 @@ def conclusion(workspace: Workspace) -> str:
             f"on the second paper's rig five coefficients err least, {said(SECOND_PAPER)}",
             (five,) * len(simple), simple,
         ),
-        f"Why: {_why(workspace)}",
+        f"Why: of the true friction torque a curve over speed misses {missed['speed']:.1%}, one "
+        "over speed and acceleration, all that a network sees, "
+        f"{missed['speed and acceleration']:.1%}; {len(_unconverged(workspace))} of "
+        f"{len(TLRIP) + len(SECOND_PAPER)} fits ended before they converged.",
     ]  # fmt: skip
     return "\n".join(lines)
-
-
-def _why(workspace: Workspace) -> str:
-    """The reason in numbers: what networks see of the friction, and the fits that did not end."""
-    missed = workspace.found("twin-tlrip")["missed_torque"]
-    speed, both = missed["speed"], missed["speed and acceleration"]
-    ended = [workspace.found(name)["fit"]["converged"] for name in (*TLRIP, *SECOND_PAPER)]
-    return (
-        f"of the true friction torque a curve over speed misses {speed:.1%}, one over speed and "
-        f"acceleration, all that a network sees, {both:.1%}; {ended.count(False)} of {len(ended)} "
-        "fits ended before they converged."
-    )
 
 
 def long_table(workspace: Workspace) -> pd.DataFrame:
