@@ -1,11 +1,10 @@
 """Stages of a reproduction: fits and their scores, several at a time, kept when finished."""
 
-import logging
 import os
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import replace
 from functools import partial
@@ -19,14 +18,12 @@ import torch
 from tqdm import tqdm
 
 from nfriction.evaluation.compare import coefficient_summary
-from nfriction.evaluation.results import model_info
 from nfriction.evaluation.score import RMSE, score
-from nfriction.export import ExportError, torchscript
 from nfriction.fitting.fit import fit
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction import model_by_name
 from nfriction.friction.models import FrictionModel
-from nfriction.io.model_file import ModelInfo, load, load_info, save
+from nfriction.io.model_file import load, load_info, save
 from nfriction.optim.evidence import EvidenceState
 from nfriction.papers import twin
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
@@ -49,8 +46,6 @@ from nfriction.recording import Recording
 from nfriction.signals import causal_motion
 from nfriction.simulation.rollout import rollout
 from nfriction.simulation.validate import required_substeps
-
-logger = logging.getLogger(__name__)
 
 LAWS = {"NCFM": "viscous", "LFM": "linear", "NLFM": "nonlinear"}
 """The papers' laws by the name of their constant model."""
@@ -324,7 +319,8 @@ def fitted(
 ) -> dict[str, Any]:
     """Result of a fit on the TLRIP twin."""
     bench = workspace.bench("tlrip")
-    return _finish(workspace, name, bench, fit(workspace, bench, name))
+    found = fit(workspace, bench, name)
+    return _judged(workspace, name, bench, found.model, found.to_dict())
 
 
 def second_paper(workspace: Workspace, name: str) -> dict[str, Any]:
@@ -332,7 +328,7 @@ def second_paper(workspace: Workspace, name: str) -> dict[str, Any]:
     bench, method = workspace.bench("rtip"), SEARCH[name.removeprefix("rtip-")]
     horizon = workspace.settings.search_horizon
     found = fit_searched(workspace, bench, name, method, horizon, threads=1)
-    return _finish(workspace, name, bench, found)
+    return _judged(workspace, name, bench, found.model, found.to_dict())
 
 
 def papers_way(workspace: Workspace, name: str) -> dict[str, Any]:
@@ -341,7 +337,7 @@ def papers_way(workspace: Workspace, name: str) -> dict[str, Any]:
     model, ended = network_by_controller(workspace, bench, law)
     info = replace(load_info(workspace.model(f"A{law}")), fit=ended)
     save(model, workspace.model(name), info)
-    return {"fit": ended} | _judged(workspace, name, bench, model, info)
+    return _judged(workspace, name, bench, model, ended)
 
 
 def controlled(workspace: Workspace, name: str) -> dict[str, Any]:
@@ -364,39 +360,23 @@ def controlled(workspace: Workspace, name: str) -> dict[str, Any]:
     return {"tables": tables}
 
 
-def _finish(workspace: Workspace, stage: str, bench: Bench, found: FitResult) -> dict[str, Any]:
-    info = model_info(found, bench.train)
-    return {"fit": found.to_dict()} | _judged(workspace, stage, bench, found.model, info)
-
-
 def _judged(
-    workspace: Workspace, stage: str, bench: Bench, model: FrictionModel, info: ModelInfo
+    workspace: Workspace,
+    stage: str,
+    bench: Bench,
+    model: FrictionModel,
+    ended: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Scores and coefficients of a model, which is exported as TorchScript."""
-    if workspace.settings.torchscript:
-        script = workspace.model(stage).with_suffix(".pt")
-        try:
-            torchscript(model, script, info)
-        except ExportError as error:
-            script.unlink(missing_ok=True)  # an earlier run's would pass for this one's
-            logger.warning("%s was not exported: %s", stage, " ".join(str(error).split()))
+    """How the fit of a model ended, its scores and its coefficients; its classes if it has any."""
     scores, simulated = judge(bench, model)
     workspace.write_arrays(stage, simulated)
-    return {
-        "scores": scores,
-        "coefficients": coefficient_summary(model),
-        **_classes(workspace, model),
-    }
-
-
-def _classes(workspace: Workspace, model: FrictionModel) -> dict[str, Any]:
-    """Coefficients of an adaptive model by class, joint and name; its classes in the experiment."""
+    found = {"fit": ended, "scores": scores, "coefficients": coefficient_summary(model)}
     schedule = model.schedule
     if not isinstance(schedule, Adaptive):
-        return {}
+        return found
     (motion,) = workspace.bench(EXPERIMENT).motions
     labels = schedule.classes(torch.tensor(motion.qd), torch.tensor(motion.qdd)).T.numpy()
-    return {
+    return found | {
         "classes": {
             known: {n: schedule.values[:, c, k].tolist() for k, n in enumerate(model.law.names)}
             for c, known in enumerate(CLASSES)

@@ -49,7 +49,6 @@ class Settings:
         control_models: fitted to the driven rig, for friction compensation.
         control_seconds: length of each balanced motion [s].
         fit_plant: adjust inertia and gravity terms, too.
-        torchscript: export every model.
         origin: of the recordings, and further options, of a run on other data than the twins.
     """
 
@@ -68,7 +67,6 @@ class Settings:
     control_models: tuple[str, ...] = study.MODELS
     control_seconds: float = 16.0
     fit_plant: bool = False
-    torchscript: bool = True
     origin: str = ""
 
     def to_dict(self) -> dict[str, Any]:

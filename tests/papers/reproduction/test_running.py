@@ -25,7 +25,6 @@ TINY = Settings(
     search_evaluations=40,
     control_models=("NCFM",),
     control_seconds=0.5,
-    torchscript=False,
 )
 
 
