@@ -184,7 +184,12 @@ def test_a_law_that_diverges_lets_go_of_no_plant(with_plant, monkeypatch):
     assert trained[-1] == near
 
 
-@pytest.mark.parametrize("place", range(2 * len(PRIOR_SHARES)))
+PLACES = range(2 * len(PRIOR_SHARES))
+
+
+@pytest.mark.parametrize(
+    "place", [pytest.param(k, marks=[pytest.mark.slow] * (0 < k < PLACES[-1])) for k in PLACES]
+)
 def test_a_network_stopped_before_it_is_judged_gives_way_to_its_law(with_plant, place, monkeypatch):
     recording, law = with_plant
     model, begun = NFLFM(1, v_smooth=V_SMOOTH, prior_sd=0.6, **SMALL), []
