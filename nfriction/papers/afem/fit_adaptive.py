@@ -330,11 +330,11 @@ class ClassFit:
         """
         folds = self.task.options.folds
         fold = torch.arange(len(self.windows)) % folds
-        flat = self.table.parameter_vector()
+        flat, classes = self.table.parameter_vector(), self.drive()
         squares: list[tuple[Tensor, Tensor]] = []
         for k in range(folds):
             seen, rest = (
-                replace(problem, windows=self.windows.subset(own), classes=problem.classes[own])
+                replace(problem, windows=self.windows.subset(own), classes=classes[own])
                 for own in (fold != k, fold == k)
             )
             start = seen.variables.start(plant)
