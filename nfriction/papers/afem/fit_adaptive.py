@@ -32,12 +32,7 @@ from nfriction.fitting.strategy.holdout import cut_for_folds
 from nfriction.fitting.task import Callback, FitTask, known_terms, prepare_task
 from nfriction.friction.models import FrictionModel
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
-from nfriction.papers.afem.classes import (
-    DEFAULTS,
-    AccelerationClasses,
-    ClassOptions,
-    find_classes,
-)
+from nfriction.papers.afem.classes import DEFAULTS, AccelerationClasses, ClassOptions, find_classes
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
@@ -335,11 +330,11 @@ class ClassFit:
         """
         folds = self.task.options.folds
         fold = torch.arange(len(self.windows)) % folds
-        flat = self.table.parameter_vector()
+        flat, classes = self.table.parameter_vector(), self.drive()
         squares: list[tuple[Tensor, Tensor]] = []
         for k in range(folds):
             seen, rest = (
-                replace(problem, windows=self.windows.subset(own), classes=problem.classes[own])
+                replace(problem, windows=self.windows.subset(own), classes=classes[own])
                 for own in (fold != k, fold == k)
             )
             start = seen.variables.start(plant)
