@@ -333,13 +333,14 @@ class ClassFit:
 
         Better than the constant law on the constant fit's plant, of which `plant` has the terms.
         """
-        folds = self.task.options.folds
+        folds, classes = self.task.options.folds, problem.classes
+        assert classes is not None
         fold = torch.arange(len(self.windows)) % folds
         flat = self.table.parameter_vector()
         squares: list[tuple[Tensor, Tensor]] = []
         for k in range(folds):
             seen, rest = (
-                replace(problem, windows=self.windows.subset(own), classes=problem.classes[own])
+                replace(problem, windows=self.windows.subset(own), classes=classes[own])
                 for own in (fold != k, fold == k)
             )
             start = seen.variables.start(plant)
