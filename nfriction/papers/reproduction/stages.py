@@ -375,7 +375,7 @@ def _judged(
     model: FrictionModel,
     ended: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """How the fit of a model ended, its scores and its coefficients; its classes if it has any."""
+    """End of a model's fit, its scores and coefficients, and its classes if it has any."""
     scores, simulated = judge(bench, model)
     workspace.write_arrays(stage, simulated)
     found = {"fit": ended, "scores": scores, "coefficients": coefficient_summary(model)}
