@@ -224,8 +224,14 @@ def fit_by_class(workspace: Workspace, bench: Bench, name: str) -> FitResult:
 
 
 def fit_network(workspace: Workspace, bench: Bench, name: str) -> FitResult:
-    """A neuro-fuzzy model our way: a network corrects the adaptive model, on trajectories."""
+    """A neuro-fuzzy model our way: a network corrects the adaptive model, on trajectories.
+
+    Where the classes did not pay, it corrects the constant law, with inputs of its own choice.
+    """
     start = fit_by_class(workspace, bench, f"A{name.removeprefix('NF')}")
+    first, *others = start.model.schedule.coefficient_sets().values()
+    if all(torch.equal(first, other) for other in others):
+        return fit_without_classes(workspace, bench, name)
     steps = workspace.settings.network_steps
     return fit_from_start(
         workspace, bench, name, start=start, max_steps=steps, network="by_class",
@@ -311,6 +317,8 @@ def fitted(
     """Result of a fit on the TLRIP twin."""
     bench = workspace.bench("tlrip")
     found = fit(workspace, bench, name)
+    # A load that a network chose as input is that of the bearings.
+    bench = replace(bench, plant=found.plant)
     return _judged(workspace, name, bench, found.model, found.to_dict())
 
 
