@@ -22,7 +22,7 @@ from nfriction.fitting.equation_error import coefficient_scale
 from nfriction.fitting.options import EncoderReference, FitOptions
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.of_search import result_from_shooting
-from nfriction.fitting.result.paired_test import gains
+from nfriction.fitting.result.paired_test import student_quantile
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
@@ -32,12 +32,7 @@ from nfriction.fitting.strategy.holdout import cut_for_folds
 from nfriction.fitting.task import Callback, FitTask, known_terms, prepare_task
 from nfriction.friction.models import FrictionModel
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
-from nfriction.papers.afem.classes import (
-    DEFAULTS,
-    AccelerationClasses,
-    ClassOptions,
-    find_classes,
-)
+from nfriction.papers.afem.classes import DEFAULTS, AccelerationClasses, ClassOptions, find_classes
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
@@ -333,13 +328,14 @@ class ClassFit:
 
         Better than the constant law on the constant fit's plant, of which `plant` has the terms.
         """
-        folds = self.task.options.folds
+        folds, classes = self.task.options.folds, problem.classes
+        assert classes is not None
         fold = torch.arange(len(self.windows)) % folds
-        flat = self.table.parameter_vector()
+        flat, classes = self.table.parameter_vector(), self.drive()
         squares: list[tuple[Tensor, Tensor]] = []
         for k in range(folds):
             seen, rest = (
-                replace(problem, windows=self.windows.subset(own), classes=problem.classes[own])
+                replace(problem, windows=self.windows.subset(own), classes=classes[own])
                 for own in (fold != k, fold == k)
             )
             start = seen.variables.start(plant)
@@ -351,7 +347,11 @@ class ClassFit:
                             self._squares(rest, flat, plant)))  # fmt: skip
         self.table.set_parameter_vector(flat)
         new, old = (torch.cat(part) for part in zip(*squares, strict=True))
-        return gains(new, old)
+        # Window by window, as a sum over them hangs on the one or two of the liveliest motion.
+        ratio = torch.log(new / old)
+        spread = ratio.std() / len(ratio) ** 0.5
+        allowed = student_quantile(len(ratio) - 1, 1 - self.task.options.gain_chance)
+        return bool(ratio.mean() + allowed * spread < 0)
 
     def _squares(self, judged: GivenClassesProblem, table: Tensor, plant: Tensor) -> Tensor:
         """Mean squared error of windows with the class following the simulation, (window,).
@@ -364,7 +364,8 @@ class ClassFit:
         self.schedule.set_coefficients(self._filled())
         error = self._following(judged.plant_at(plant), replace(judged.windows, q0=q0, qd0=qd0))
         errors = error.residuals(self.schedule.parameter_vector())
-        return errors.square().mean((1, 2)).nan_to_num(nan=torch.inf)
+        least = self.task.options.min_noise**2
+        return errors.square().mean((1, 2)).nan_to_num(nan=torch.inf).clamp_min(least)
 
     def _filled(self) -> Tensor:
         """Coefficients by class; one without data was never varied and has its neighbour's."""
