@@ -198,9 +198,10 @@ def _errors(of: dict[str, Any]) -> Errors:
 
 def _score(recording: str, of: dict[str, Any]) -> Score:
     errors, nothing = _errors(of), np.zeros(0)
+    zero = None if of["zero"] is None else tuple(map(float, of["zero"]))
     return Score(
         errors.free_run, errors.windows, of["limit"] and _errors(of["limit"]), recording,
-        nothing, nothing, _number(of["diverged_at"]), of["zero"] and tuple(of["zero"]),
+        nothing, nothing, _number(of["diverged_at"]), zero,
     )  # fmt: skip
 
 

@@ -366,6 +366,14 @@ def test_a_recording_s_own_zero_is_estimated_from_samples_that_are_not_scored():
     assert other.free_run.all == pytest.approx(0.1, rel=0.05)
 
 
+def test_a_recording_without_any_error_has_a_zero_of_zero():
+    """As of a simulation that is scored by the model and the steps that made it."""
+    rig, law, recording = zeroed_in_a_pose(np.zeros(2))
+    (run,) = Simulator(rig, law, recording, "rk4", 0).free_runs((recording.q[0], np.zeros(2)))
+    found = score(rig, law, recording._replace(q=run.q[0]), limit=False, zeroed=True)
+    assert found.zero == pytest.approx((0.0, 0.0), abs=1e-9)
+
+
 def test_the_limit_knows_how_uncertain_the_zero_is():
     rig, law, recording = zeroed_in_a_pose(np.zeros(2))
     limits = []

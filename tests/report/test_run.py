@@ -87,6 +87,15 @@ def test_results_of_another_schema_or_program_are_refused(tmp_path):
     assert "not results of a comparison" in one_line(tmp_path)
 
 
+def test_a_zero_of_the_encoders_that_is_no_number_is_refused(tmp_path):
+    """Though the checksum matches."""
+    content = results()
+    for of in content["models"]["LFM"]["test"].values():
+        of["zero"] = "off"
+    write(tmp_path, content)
+    assert "not results of a comparison" in one_line(tmp_path)
+
+
 def test_not_a_number_is_no_json(tmp_path):
     write(tmp_path)
     path = tmp_path / "results.json"
