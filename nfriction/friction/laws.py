@@ -167,6 +167,10 @@ class Law:
                     "may be negative; let both be the same."
                 )
 
+    def __deepcopy__(self, memo: object) -> "Law":
+        # Nothing of it can change, and fits copy their models at every search.
+        return self
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the coefficients, in order."""

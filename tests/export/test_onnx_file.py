@@ -37,7 +37,7 @@ def test_in_double_it_equals_the_model(name: str, tmp_path: Path) -> None:
 
 
 @needs_onnx
-@pytest.mark.parametrize("name", ["LFM", "NFLFM"])
+@pytest.mark.parametrize("name", ["LFM", pytest.param("NFLFM", marks=pytest.mark.slow)])
 def test_in_single_precision_it_is_as_close_as_that_allows(name: str, tmp_path: Path) -> None:
     check_parity(MODELS[name], tmp_path / "m.onnx", "float32", 5000)
 

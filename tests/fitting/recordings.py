@@ -19,21 +19,27 @@ def pendulum(**settings) -> PendulumChain:
     return PendulumChain([0.3, 0.2], [0.2, 0.15], inertia=[1e-3, 4e-4], **settings)
 
 
+def one_link() -> PendulumChain:
+    """The least mechanism on which a fit has all its stages."""
+    return PendulumChain([0.3], [0.2], inertia=[1e-3])
+
+
 def swing(
     plant: PendulumChain,
     model: FrictionModel,
     *,
     seconds: float = 4.0,
-    start: tuple[float, float] = (1.6, 0.8),
+    start: tuple[float, ...] | None = None,
     sample_time: float | np.ndarray = 2e-3,
     convention: str = "relative,upright",
     name: str = "swing",
 ) -> Recording:
     """A release from rest, quantised in the convention it is written in."""
+    start = (1.6, 0.8)[: plant.joints] if start is None else start
     steps = sample_time if isinstance(sample_time, np.ndarray) else None
     count = round(seconds / sample_time) if steps is None else len(steps)
     out = rollout(
-        plant, model, torch.tensor(start, dtype=F64), torch.zeros(2, dtype=F64),
+        plant, model, torch.tensor(start, dtype=F64), torch.zeros(len(start), dtype=F64),
         sample_time=sample_time if steps is None else torch.as_tensor(steps),
         steps=count, substeps=4, gradients=False,
     )  # fmt: skip

@@ -22,7 +22,7 @@ TRUE = {
 
 def table_of(name: str, seed: int = 0, reach: float = 1.0) -> pd.DataFrame:
     """Presliding and sliding, with the torque of a law and noise."""
-    time = np.linspace(0.0, 8.0, 1600)
+    time = np.linspace(0.0, 8.0, 800)
     q = reach * 0.06 * np.sin(1.7 * time + seed) * (0.1 + np.sin(0.43 * time) ** 2)
     q += reach * 0.003 * np.sin(6.1 * time + 1)
     # Drives the joint and is driven back; only a gear reads it.
@@ -30,17 +30,20 @@ def table_of(name: str, seed: int = 0, reach: float = 1.0) -> pd.DataFrame:
     given = pd.DataFrame({"time": time, "q": q, "qd": np.gradient(q, time), "tau": q, "load": load})
     joint = TorqueTable.from_pandas(given).joints[0]
     model = model_by_name(name)(1, TRUE[name])
-    noise = np.random.default_rng(seed).normal(0, 0.02, len(q))
+    noise = np.random.default_rng(seed).normal(0, 0.014, len(q))
     return given.assign(tau=predict(model, joint, 0.0).numpy() + noise)
 
 
 @cache
 def fitted(name: str) -> TorqueFits:
     """The fit of the law that made the table."""
-    return fit_torque(table_of(name), name, folds=4)
+    return fit_torque(table_of(name), name, folds=2)
 
 
-@pytest.mark.parametrize("name", TRUE)
+# Of its relatives LuGre has all coefficients but one.
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=[pytest.mark.slow] * (x == "ElastoPlastic")) for x in TRUE]
+)
 def test_coefficients_are_recovered_within_their_intervals(name: str) -> None:
     found = fitted(name)
     values = found.intervals()
@@ -50,7 +53,7 @@ def test_coefficients_are_recovered_within_their_intervals(name: str) -> None:
         if coefficient.fitted:
             # Twice the interval, of which one in a thousand lies outside.
             assert abs(row["value"] - true) < row["high"] - row["low"]
-    assert float(found.score(table_of(name, seed=3))["rmse"].iloc[0]) < 0.025
+    assert float(found.score(table_of(name, seed=3))["rmse"].iloc[0]) < 0.018
 
 
 def test_a_batch_of_coefficients_gives_the_torque_of_each() -> None:
@@ -64,7 +67,7 @@ def test_a_batch_of_coefficients_gives_the_torque_of_each() -> None:
 
 def test_rows_without_presliding_do_not_determine_the_stiffness() -> None:
     """Strokes of thousands of rad pass the presliding of 2 mrad within a sample, even near rest."""
-    found = fit_torque(table_of("Dahl", reach=1e5), "dahl", folds=4)
+    found = fit_torque(table_of("Dahl", reach=1e5), "dahl", folds=2)
     assert found.intervals().loc["sigma_0 of joint1", "note"] == "not identifiable"
     assert fitted("Dahl").intervals().loc["sigma_0 of joint1", "note"] == ""
 
@@ -80,4 +83,4 @@ def test_rows_that_only_slide_are_fitted() -> None:
 
 def test_maxwell_slip_is_referred_to_slip() -> None:
     with pytest.raises(ValueError, match="use slip"):
-        fit_torque(table_of("Dahl"), "maxwell-slip", folds=4)
+        fit_torque(table_of("Dahl"), "maxwell-slip", folds=2)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from nfriction import LFM, LinearAxis, fit
-from tests.fitting.recordings import F64, driven_axis, pendulum, swing
+from tests.fitting.recordings import F64, driven_axis, one_link, pendulum, swing
 
 V_SMOOTH = 0.05
 SETTINGS = {"windows": (0.5, 1.0), "drag": False, "eccentricity": "auto"}
@@ -53,10 +53,12 @@ def test_encoders_that_are_centred_stay_so():
 
 
 def test_it_is_fitted_or_not_as_asked():
-    recording = recorded(0.0, seconds=1.0)
-    quick = {"windows": (0.5,), "max_steps": 1}
-    assert len(encoder_terms(fit(model(), pendulum(), recording, eccentricity="on", **quick))) == 4
-    assert not encoder_terms(fit(model(), pendulum(), recording, eccentricity="off", **quick))
+    plant = one_link()
+    recording = swing(plant, LFM(1, [1.5e-3, 2.5e-3], v_smooth=V_SMOOTH), seconds=1.0)
+    quick = {"windows": (0.5,), "max_steps": 1, "drag": False}
+    for asked, terms in (("on", 2), ("off", 0)):
+        found = fit(LFM(1, v_smooth=V_SMOOTH), plant, recording, eccentricity=asked, **quick)
+        assert len(encoder_terms(found)) == terms
     axis = LinearAxis(2.0)
     one = driven_axis(axis, LFM(1, [3.0, 1.0], v_smooth=V_SMOOTH), seconds=0.5)
     with pytest.raises(ValueError, match="no encoders that turn"):

@@ -23,10 +23,10 @@ from nfriction.fitting.strategy.neurofuzzy import initialise_from_constant, reve
 from nfriction.friction.neurofuzzy import NeuroFuzzy
 from nfriction.recording import Recording
 from nfriction.signals import kalman_smoother
-from tests.fitting.recordings import F64, pendulum, swing
+from tests.fitting.recordings import F64, one_link, swing
 
 V_SMOOTH = 0.05
-TRUTH = [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]]
+TRUTH = [[1.5e-3, 2.5e-3]]
 SMALL = {"terms": (2, 2), "head_units": 2, "inputs": ()}
 FOLDS = DEFAULTS.folds
 NONE = torch.zeros(0, dtype=F64)
@@ -34,18 +34,18 @@ NONE = torch.zeros(0, dtype=F64)
 
 @pytest.fixture(scope="module")
 def constant():
-    recording = swing(pendulum(), LFM(2, TRUTH, v_smooth=V_SMOOTH), seconds=3.0)
-    model = LFM(2, v_smooth=V_SMOOTH)
-    found = fit(model, pendulum(), recording, windows=(0.5,), fit_plant=False)
-    return recording.joint_coordinates(pendulum()), found
+    recording = swing(one_link(), LFM(1, TRUTH, v_smooth=V_SMOOTH), seconds=3.0)
+    model = LFM(1, v_smooth=V_SMOOTH)
+    found = fit(model, one_link(), recording, windows=(0.5,), fit_plant=False)
+    return recording.joint_coordinates(one_link()), found
 
 
 def refinement(constant):
     joint, found = constant
-    model = NFLFM(2, v_smooth=V_SMOOTH, **SMALL)
+    model = NFLFM(1, v_smooth=V_SMOOTH, **SMALL)
     model = initialise_from_constant(model, found, [joint], found.motions)
-    measurement = measurement_matrix(pendulum(), joint.resolve_convention(pendulum()))
-    jacobian = StepJacobian(pendulum(), model, [])
+    measurement = measurement_matrix(one_link(), joint.resolve_convention(one_link()))
+    jacobian = StepJacobian(one_link(), model, [])
     return ShootingFitter(jacobian, model, [joint], measurement, DEFAULTS)
 
 
@@ -103,7 +103,7 @@ def test_a_window_is_judged_from_the_state_that_suits_the_fit(constant):
     seen, held_back = splits(search, motions, 0.5, cut_for_folds)[0]
     law = replace(search, friction=constant[1].model)
     problem = law.problem(seen, 1e-4, vector(law))
-    off = replace(held_back, q0=held_back.q0 + 1e-3, qd0=held_back.qd0 - 0.01)
+    off = replace(held_back, q0=held_back.q0 + 5e-3, qd0=held_back.qd0 - 0.05)
     from_off = replace(problem, windows=off)
     unsettled = from_off.errors(from_off.variables.start()).square().mean().sqrt()
     settled = rmse(off, problem, vector(law), NONE)
@@ -140,12 +140,12 @@ def test_a_gain_is_larger_than_its_scatter_over_windows(ratios, gained):
 
 def test_a_model_settles_on_a_coefficient_of_zero(constant):
     search, found = refinement(constant), constant[1]
-    zero = replace(found, model=LFM(2, [[0.0, 2e-3]] * 2, v_smooth=V_SMOOTH))
+    zero = replace(found, model=LFM(1, [[0.0, 2e-3]], v_smooth=V_SMOOTH))
     revert_to_constant(search.friction, zero)
     rest = search.friction.schedule.rest_coefficients()
     scale = search.friction.schedule.scale
     assert (rest[:, 0] < 2e-6 * scale[:, 0]).all()
-    torch.testing.assert_close(rest[:, 1], torch.full((2,), 2e-3, dtype=F64), rtol=1e-6, atol=0)
+    torch.testing.assert_close(rest[:, 1], torch.full((1,), 2e-3, dtype=F64), rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize(
@@ -163,12 +163,12 @@ def test_a_network_that_does_not_win_is_put_back(constant, monkeypatch, ratio, t
         return ratio**2 * (law + torch.linspace(-0.8, 0.8, len(test), dtype=F64))
 
     monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.holdout_squares", squares)
-    model = NFLFM(2, v_smooth=V_SMOOTH, **SMALL)
-    kept = fit(model, pendulum(), joint, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
+    model = NFLFM(1, v_smooth=V_SMOOTH, **SMALL)
+    kept = fit(model, one_link(), joint, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
     assert kept.model is model
     assert told in kept.status
     assert any("constant law" in w for w in kept.warnings)
-    qd = torch.linspace(-3, 3, 14, dtype=F64).reshape(7, 2)
+    qd = torch.linspace(-3, 3, 14, dtype=F64).reshape(14, 1)
     at = qd, torch.zeros_like(qd), torch.ones_like(qd)
     torch.testing.assert_close(model(*at), found.model(*at), rtol=1e-6, atol=1e-9)
 
@@ -181,15 +181,15 @@ def test_a_fit_stopped_before_its_network_keeps_the_constant_law(constant):
         stages.append(stage)
         return True
 
-    model = NFLFM(2, v_smooth=V_SMOOTH, **SMALL)
+    model = NFLFM(1, v_smooth=V_SMOOTH, **SMALL)
     kept = fit(
-        model, pendulum(), joint, start=found, windows=(0.5,), fit_plant=False, callback=stop
+        model, one_link(), joint, start=found, windows=(0.5,), fit_plant=False, callback=stop
     )
     assert set(stages) == {"constant law, hold-out"}
     assert kept.model is model
     assert not kept.converged
     assert "Stopped" in kept.status
-    at = (torch.ones(1, 2, dtype=F64),) * 3
+    at = (torch.ones(1, 1, dtype=F64),) * 3
     torch.testing.assert_close(model(*at), found.model(*at), rtol=1e-6, atol=1e-9)
 
 
@@ -207,11 +207,11 @@ def test_an_interrupt_while_windows_judge_keeps_the_constant_law(constant, monke
     search = refinement(constant)
     held_back = len(splits(search, found.motions, 0.5)[0][1])
     monkeypatch.setattr(ShootingProblem, "cost", interrupted)
-    model = NFLFM(2, v_smooth=V_SMOOTH, **SMALL)
-    kept = fit(model, pendulum(), joint, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
+    model = NFLFM(1, v_smooth=V_SMOOTH, **SMALL)
+    kept = fit(model, one_link(), joint, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
     assert len(judged) == 1
     assert kept.model is model
     assert not kept.converged
     assert "Stopped" in kept.status
-    at = (torch.ones(1, 2, dtype=F64),) * 3
+    at = (torch.ones(1, 1, dtype=F64),) * 3
     torch.testing.assert_close(model(*at), found.model(*at), rtol=1e-6, atol=1e-9)

@@ -24,7 +24,7 @@ from nfriction.fitting.strategy.continuation import ShootingFitter
 from nfriction.fitting.strategy.holdout import StoppedError
 from nfriction.fitting.strategy.neurofuzzy import _Validation
 from nfriction.friction.neurofuzzy import NeuroFuzzy
-from tests.fitting.recordings import pendulum, swing
+from tests.fitting.recordings import one_link, swing
 
 V_SMOOTH = 0.05
 PRIOR_SHARES = DEFAULTS.prior_shares
@@ -34,16 +34,16 @@ BRIEF = {"windows": (0.5,), "max_steps": 2}
 
 @pytest.fixture(scope="module")
 def constant():
-    truth = LFM(2, [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]], v_smooth=V_SMOOTH)
-    recording = swing(pendulum(), truth, seconds=2.0)
-    model = LFM(2, v_smooth=V_SMOOTH)
-    return recording, fit(model, pendulum(), recording, windows=(0.5,), fit_plant=False)
+    truth = LFM(1, [[1.5e-3, 2.5e-3]], v_smooth=V_SMOOTH)
+    recording = swing(one_link(), truth, seconds=2.0)
+    model = LFM(1, v_smooth=V_SMOOTH)
+    return recording, fit(model, one_link(), recording, windows=(0.5,), fit_plant=False)
 
 
 @pytest.fixture(scope="module")
 def with_plant(constant):
     recording, _ = constant
-    return recording, fit(LFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **BRIEF)
+    return recording, fit(LFM(1, v_smooth=V_SMOOTH), one_link(), recording, **BRIEF)
 
 
 @pytest.fixture
@@ -65,8 +65,8 @@ def test_the_prior_is_the_one_whose_network_predicts_best(constant, monkeypatch,
         return torch.full((len(test),), 0.5 - 0.2 * found)
 
     monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.holdout_squares", squares)
-    model = NFLFM(2, v_smooth=V_SMOOTH, prior_sd=0.6, **SMALL)
-    fit(model, pendulum(), recording, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
+    model = NFLFM(1, v_smooth=V_SMOOTH, prior_sd=0.6, **SMALL)
+    fit(model, one_link(), recording, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
     tried = len(PRIOR_SHARES)
     assert seen[:tried] == pytest.approx([0.6 * share for share in PRIOR_SHARES])
     # The other windows are held out of the best alone.
@@ -79,11 +79,11 @@ def test_the_prior_is_the_one_whose_network_predicts_best(constant, monkeypatch,
 def test_a_law_that_is_not_linear_has_a_network_too(constant):
     recording, _ = constant
     settings = {"windows": (0.5,), "fit_plant": False, "max_steps": 4}
-    law = fit(Stribeck(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
+    law = fit(Stribeck(1, v_smooth=V_SMOOTH), one_link(), recording, **settings)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("nfriction.fitting.strategy.neurofuzzy.gains", lambda *_: True)
-        model = NFStribeck(2, v_smooth=V_SMOOTH, **SMALL)
-        found = fit(model, pendulum(), recording, start=law, **settings)
+        model = NFStribeck(1, v_smooth=V_SMOOTH, **SMALL)
+        found = fit(model, one_link(), recording, start=law, **settings)
     assert found.model is model
     assert found.residual <= 1.001 * law.residual
     assert float(model.schedule.parameter_vector().abs().max()) > 0
@@ -94,7 +94,7 @@ def test_a_law_that_is_not_linear_has_a_network_too(constant):
 def test_the_plant_stays_about_as_near_to_the_laws_as_that_left_it_open(constant, monkeypatch):
     recording, _ = constant
     settings = {"windows": (0.5,), "max_steps": 3}
-    law = fit(NCFM(2, v_smooth=V_SMOOTH), pendulum(), recording, **settings)
+    law = fit(NCFM(1, v_smooth=V_SMOOTH), one_link(), recording, **settings)
     open_ = {i.name: i.sd for i in law.intervals}
 
     def squares(test, problem, friction, plant):
@@ -106,8 +106,8 @@ def test_the_plant_stays_about_as_near_to_the_laws_as_that_left_it_open(constant
 
     def moved() -> float:
         """By how many standard deviations that the law's fit left open, at most."""
-        model = NFNCFM(2, v_smooth=V_SMOOTH, **SMALL)
-        found = fit(model, pendulum(), recording, start=law, **settings)
+        model = NFNCFM(1, v_smooth=V_SMOOTH, **SMALL)
+        found = fit(model, one_link(), recording, start=law, **settings)
         pairs = zip(found.plant_terms, law.plant_terms, strict=True)
         return max(abs(new - old) / open_[name] for (name, new, _), (_, old, _) in pairs)
 
@@ -147,8 +147,8 @@ def test_a_plant_is_let_go_only_for_what_windows_held_back_gain(with_plant, monk
     searched = ShootingFitter.search
     monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.holdout_squares", squares)
     monkeypatch.setattr(ShootingFitter, "search", search)
-    model = NFLFM(2, v_smooth=V_SMOOTH, **SMALL)
-    fit(model, pendulum(), recording, start=law, **BRIEF)
+    model = NFLFM(1, v_smooth=V_SMOOTH, **SMALL)
+    fit(model, one_link(), recording, start=law, **BRIEF)
     rounds = len(PRIOR_SHARES) + DEFAULTS.folds - 1
     near, free = seen[0][0], seen[rounds][0]
     assert [trial[0] for trial in seen] == rounds * [near] + rounds * [free]
@@ -178,16 +178,21 @@ def test_a_law_that_diverges_lets_go_of_no_plant(with_plant, monkeypatch):
     searched = ShootingFitter.search
     monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.holdout_squares", squares)
     monkeypatch.setattr(ShootingFitter, "search", search)
-    fit(NFLFM(2, v_smooth=V_SMOOTH, **SMALL), pendulum(), recording, start=law, **BRIEF)
+    fit(NFLFM(1, v_smooth=V_SMOOTH, **SMALL), one_link(), recording, start=law, **BRIEF)
     free, near = trained[0], trained[DEFAULTS.folds]
     assert near != free
     assert trained[-1] == near
 
 
-@pytest.mark.parametrize("place", range(2 * len(PRIOR_SHARES)))
+PLACES = range(2 * len(PRIOR_SHARES))
+
+
+@pytest.mark.parametrize(
+    "place", [pytest.param(k, marks=[pytest.mark.slow] * (0 < k < PLACES[-1])) for k in PLACES]
+)
 def test_a_network_stopped_before_it_is_judged_gives_way_to_its_law(with_plant, place, monkeypatch):
     recording, law = with_plant
-    model, begun = NFLFM(2, v_smooth=V_SMOOTH, prior_sd=0.6, **SMALL), []
+    model, begun = NFLFM(1, v_smooth=V_SMOOTH, prior_sd=0.6, **SMALL), []
 
     def search(self, problem, vector, tolerance, name):
         begun.append(name)
@@ -198,12 +203,12 @@ def test_a_network_stopped_before_it_is_judged_gives_way_to_its_law(with_plant, 
 
     searched = ShootingFitter.search
     monkeypatch.setattr(ShootingFitter, "search", search)
-    kept = fit(model, pendulum(), recording, start=law, callback=stop, **BRIEF)
+    kept = fit(model, one_link(), recording, start=law, callback=stop, **BRIEF)
     assert begun.count("network, hold-out") == place + 1
     assert begun[-1] == "network, hold-out"
     assert not kept.converged
     assert "its constant law is kept" in kept.status
-    at = (torch.ones(1, 2, dtype=torch.float64),) * 3
+    at = (torch.ones(1, 1, dtype=torch.float64),) * 3
     torch.testing.assert_close(model(*at), law.model(*at), rtol=1e-5, atol=1e-9)
     assert model.schedule.options()["prior_sd"] == 0.6
 
@@ -217,9 +222,9 @@ def test_a_stop_while_inputs_are_chosen_keeps_the_network_accepted(constant, mon
     monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy._with_chosen_inputs", stop)
     monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.gains", lambda *_: True)
     monkeypatch.setattr(_Validation, "trained_on", lambda self, trial: trial)
-    model = NFLFM(2, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2)
+    model = NFLFM(1, v_smooth=V_SMOOTH, terms=(2, 2), head_units=2)
     settings = {"windows": (0.5,), "fit_plant": False, "max_steps": 2}
-    found = fit(model, pendulum(), recording, start=law, **settings)
+    found = fit(model, one_link(), recording, start=law, **settings)
     assert not found.converged
     assert model.schedule.parameter_vector().any()
 

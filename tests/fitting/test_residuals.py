@@ -92,7 +92,9 @@ def test_units_do_not_matter_and_windows_may_be_short():
     assert hac_sd(residuals[:, :50], SLOW).shape == (3, 50, 1)
 
 
-@pytest.mark.parametrize("period", [200, 500, 700])
+@pytest.mark.parametrize(
+    "period", [200, *(pytest.param(longer, marks=pytest.mark.slow) for longer in (500, 700))]
+)
 def test_what_swings_with_the_motion_does_not_make_up_for_itself(period):
     """Not where the motion's own frequency weighs it."""
     g = torch.Generator().manual_seed(1)

@@ -105,7 +105,9 @@ def deviation(found) -> float:
 SETTINGS = {"windows": (0.5, 1.5), "fit_plant": False}
 
 
-@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize(
+    "loss", [pytest.param(loss, marks=[pytest.mark.slow] * (loss != "soft_l1")) for loss in LOSSES]
+)
 def test_spikes_hardly_change_a_robust_fit_and_are_named(loss):
     recording, axis = spiked(), LinearAxis(2.0)
     found = fit(CVFM(1, v_smooth=0.05), axis, recording, loss=loss, **SETTINGS)

@@ -81,7 +81,15 @@ OFFSETS = torch.full((2, 2), 0.05, dtype=F64)
 @pytest.mark.parametrize(
     ("name", "offset_sd"), [("LFM", None), ("LFM", OFFSETS), ("NFLFM", OFFSETS)]
 )
-@pytest.mark.parametrize(("substeps", "stride"), [(1, 1), (2, 1), (2, 3), (1, 20), (1, 12)])
+@pytest.mark.parametrize(
+    ("substeps", "stride"),
+    [
+        (1, 1),
+        (2, 3),
+        (1, 20),
+        *(pytest.param(*x, marks=pytest.mark.slow) for x in ((2, 1), (1, 12))),
+    ],
+)
 def test_gradient_and_hessian_against_finite_differences(name, substeps, stride, offset_sd):
     """Also where samples are passed over: 3 and 12 leave steps after the last that counts."""
     p = problem(bent(name), substeps, stride, offset_sd=offset_sd)

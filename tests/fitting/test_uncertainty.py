@@ -46,7 +46,8 @@ def fits(swings):
         # Nothing is left for a network to find here; it is to be kept all the same.
         patch.setattr("nfriction.fitting.strategy.neurofuzzy.gains", lambda *_: True)
         patch.setattr(_Validation, "trained_on", lambda self, trial: trial)
-        return law, fit(NFLFM(1), *swings, start=law, **options)
+        network = NFLFM(1, terms=(3, 2), head_units=2)
+        return law, fit(network, *swings, start=law, **options)
 
 
 def test_intervals_know_the_noise_of_the_torque():

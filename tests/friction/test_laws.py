@@ -1,5 +1,6 @@
 """Friction laws: odd, passive, smooth through zero, broadcasting; and what describes them."""
 
+import copy
 import itertools
 
 import pytest
@@ -21,6 +22,7 @@ from nfriction.friction.laws import (
     smooth_sign,
     stribeck,
 )
+from nfriction.friction.models import LFM
 from tests.friction.samples import LAWS, QUADRATIC, motion, normal
 
 V_SMOOTH = 3e-3
@@ -202,6 +204,14 @@ def test_a_description_of_another_type_is_refused() -> None:
 def test_start_values_are_possible_ones(start: float) -> None:
     with pytest.raises(ValueError, match="`initial_grid` of 'v_s' must be positive and finite"):
         Coefficient("v_s", "rad/s", linear=False, initial_grid=(1.0, start))
+
+
+def test_copies_of_a_model_share_its_law() -> None:
+    """Fits copy their model at every search; a law cannot change."""
+    model = LFM(1)
+    again = copy.deepcopy(model)
+    assert again.law is model.law
+    assert again.schedule.raw is not model.schedule.raw
 
 
 def test_a_law_needs_a_function() -> None:

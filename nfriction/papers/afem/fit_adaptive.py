@@ -32,12 +32,7 @@ from nfriction.fitting.strategy.holdout import cut_for_folds
 from nfriction.fitting.task import Callback, FitTask, known_terms, prepare_task
 from nfriction.friction.models import FrictionModel
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
-from nfriction.papers.afem.classes import (
-    DEFAULTS,
-    AccelerationClasses,
-    ClassOptions,
-    find_classes,
-)
+from nfriction.papers.afem.classes import DEFAULTS, AccelerationClasses, ClassOptions, find_classes
 from nfriction.plant import Plant
 from nfriction.recording import Recording
 from nfriction.signals import Motion
@@ -336,7 +331,7 @@ class ClassFit:
         folds, classes = self.task.options.folds, problem.classes
         assert classes is not None
         fold = torch.arange(len(self.windows)) % folds
-        flat = self.table.parameter_vector()
+        flat, classes = self.table.parameter_vector(), self.drive()
         squares: list[tuple[Tensor, Tensor]] = []
         for k in range(folds):
             seen, rest = (

@@ -110,10 +110,12 @@ def without_friction(workspace: Workspace) -> Figure:
         bench.plant, convention.position_to_joint(q0), convention.rate_to_joint(qd0),
         len(first) - 1,
     )  # fmt: skip
-    return motion(
-        first,
-        {n: _score(first, convention.position_from_joint(q)) for n, q in simulated.items()},
-    )
+    moved = {n: convention.position_from_joint(q) for n, q in simulated.items()}
+    figure = motion(first, {name: _score(first, q) for name, q in moved.items()})
+    for ax in figure.axes:
+        # Here the simulations that leave the measured motion are what is to be seen.
+        ax.autoscale(axis="y")
+    return figure
 
 
 def network_surfaces(workspace: Workspace) -> Figure:

@@ -24,13 +24,12 @@ from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction import model_by_name
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import load, load_info, save
-from nfriction.optim.evidence import EvidenceState
 from nfriction.papers import twin
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
 from nfriction.papers.afem.classes import class_intervals
 from nfriction.papers.afem.fit_by_search import SearchMethod, SearchOptions, fit_by_search
 from nfriction.papers.control import study
-from nfriction.papers.nffem.train_network import TrainingOptions
+from nfriction.papers.nffem.train_network import TrainingOptions, recorded_losses
 from nfriction.papers.reproduction.agreement import missed_torque
 from nfriction.papers.reproduction.procedure import papers_neuro_fuzzy
 from nfriction.papers.reproduction.workspace import (
@@ -296,15 +295,7 @@ def network_by_controller(
 ) -> tuple[FrictionModel, dict[str, Any]]:
     """A neuro-fuzzy model the papers' way, from the coefficients by class; how its fit ended."""
     settings = workspace.settings
-    joints = iter(bench.plant.joint_names)
-    losses: dict[str, list[float]] = {}
-
-    def keep(state: EvidenceState) -> None:
-        # The training of each joint counts its steps from 1.
-        if state.step == 1:
-            losses[next(joints)] = []
-        losses[[*losses][-1]].append(0.5 / state.beta)
-
+    losses, keep = recorded_losses(bench.plant.joint_names)
     model, fits = papers_neuro_fuzzy(
         load(workspace.model(f"A{law}")), bench.train_motions,
         samples=settings.controller_samples, units=settings.network_units,

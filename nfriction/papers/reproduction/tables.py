@@ -7,6 +7,7 @@ presumed.
 
 import json
 from collections.abc import Mapping, Sequence
+from functools import cache
 from importlib import resources
 from typing import Any, Literal, NamedTuple
 
@@ -95,6 +96,7 @@ def table_10(workspace: Workspace, drive: Drive = "free_run") -> pd.DataFrame:
     return _beside(rmse(workspace, TLRIP, drive=drive), _table(_PRINTED_10))
 
 
+@cache
 def agreement_table() -> pd.DataFrame:
     """Agreement of independent simulations from the paper's check pose; see `agreement`.
 

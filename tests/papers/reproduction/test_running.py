@@ -6,7 +6,10 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
 from graphlib import TopologicalSorter
+from multiprocessing import Pipe, get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,7 +21,12 @@ from nfriction.fitting.strategy.inputs import seeing_plant
 from nfriction.friction import model_by_name
 from nfriction.papers.reproduction import stages as stages_module
 from nfriction.papers.reproduction import tables
-from nfriction.papers.reproduction.stages import reproduce, run_stage, stages
+from nfriction.papers.reproduction.stages import (
+    _end_with_the_caller,
+    reproduce,
+    run_stage,
+    stages,
+)
 from nfriction.papers.reproduction.workspace import Bench, Settings, Workspace
 
 TINY = Settings(
@@ -94,27 +102,25 @@ def test_a_network_that_sees_the_bearing_load_is_judged_on_the_plant_that_knows_
     assert all(score["free_run"]["all"] < 1.0 for score in found["scores"].values())
 
 
+def _killed_caller(connection: Connection) -> None:
+    """Tell the process id of a worker, and die without a word to it."""
+    # Forked, as another import of everything takes seconds; it ends in the same way.
+    context = get_context("fork")
+    pool = ProcessPoolExecutor(1, mp_context=context, initializer=_end_with_the_caller)
+    connection.send(pool.submit(os.getpid).result())
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="processes are looked up in /proc")
-def test_workers_end_with_a_killed_caller(tmp_path: Path) -> None:
-    script = tmp_path / "run.py"
-    script.write_text(
-        "import os, signal, sys\n"
-        "from concurrent.futures import ProcessPoolExecutor\n"
-        "from multiprocessing import get_context\n"
-        "from nfriction.papers.reproduction.stages import _end_with_the_caller\n"
-        "if __name__ == '__main__':\n"
-        # Forked, as another import of everything takes seconds; it ends in the same way.
-        "    pool = ProcessPoolExecutor(\n"
-        "        1, mp_context=get_context('fork'), initializer=_end_with_the_caller\n"
-        "    )\n"
-        "    print(pool.submit(os.getpid).result(), flush=True)\n"
-        "    os.kill(os.getpid(), signal.SIGKILL)\n"
-    )
-    said = tmp_path / "said.txt"
-    with said.open("w") as file:
-        caller = subprocess.Popen([sys.executable, str(script)], stdout=file)
-    assert caller.wait(timeout=120) == -signal.SIGKILL
-    worker = int(said.read_text())
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_workers_end_with_a_killed_caller() -> None:
+    ours, theirs = Pipe()
+    caller = get_context("fork").Process(target=_killed_caller, args=(theirs,))
+    caller.start()
+    assert ours.poll(60)
+    worker = ours.recv()
+    caller.join(60)
+    assert caller.exitcode == -signal.SIGKILL
     try:
         deadline = time.monotonic() + 60
         while _runs(worker):
