@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from graphlib import TopologicalSorter
@@ -132,29 +133,34 @@ def _run_all(workspace: Workspace, waiting: dict[str, Stage], jobs: int, bar: "t
     order.prepare()
     ready: set[str] = set()
     running: dict[Future[None], str] = {}
-    with ProcessPoolExecutor(
-        jobs, mp_context=get_context("spawn"), initializer=_end_with_the_caller
-    ) as pool:
-        try:
-            while order.is_active():
-                ready |= {*order.get_ready()}
-                for name in [n for n in waiting if n in ready][: jobs - len(running)]:
-                    ready.remove(name)
-                    running[pool.submit(run_stage, workspace, name)] = name
-                bar.set_postfix_str(", ".join(running.values()))
-                # The timeout keeps the bar's clock running.
-                done, _ = wait(running, timeout=1.0, return_when=FIRST_COMPLETED)
-                for future in done:
-                    future.result()
-                    order.done(running.pop(future))
-                    bar.update()
-                bar.refresh()
-        except BaseException:
-            # Only an interrupt of the keyboard reaches the workers, and one of them may have been
-            # started just before, so it is not among `running` yet.
-            for worker in list((pool._processes or {}).values()):
-                worker.terminate()
-            raise
+    with (
+        ProcessPoolExecutor(
+            jobs, mp_context=get_context("spawn"), initializer=_end_with_the_caller
+        ) as pool,
+        ExitStack() as on_error,
+    ):
+        on_error.callback(_terminate, pool)
+        while order.is_active():
+            ready |= {*order.get_ready()}
+            for name in [n for n in waiting if n in ready][: jobs - len(running)]:
+                ready.remove(name)
+                running[pool.submit(run_stage, workspace, name)] = name
+            bar.set_postfix_str(", ".join(running.values()))
+            # The timeout keeps the bar's clock running.
+            done, _ = wait(running, timeout=1.0, return_when=FIRST_COMPLETED)
+            for future in done:
+                future.result()
+                order.done(running.pop(future))
+                bar.update()
+            bar.refresh()
+        on_error.pop_all()
+
+
+def _terminate(pool: ProcessPoolExecutor) -> None:
+    # Only an interrupt of the keyboard reaches the workers, and one of them may have been started
+    # just before, so that it is not known to be running yet.
+    for worker in list((pool._processes or {}).values()):
+        worker.terminate()
 
 
 def _end_with_the_caller() -> None:
