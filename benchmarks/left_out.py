@@ -105,6 +105,12 @@ def folds(data: Path, of: Set, blocks: int) -> list[Fold]:
     ]
 
 
+def nothing_left_out(data: Path, of: Set) -> Fold:
+    """All recordings fitted, and simulated all the same."""
+    recordings = read(data, of)
+    return Fold(recordings, [Left(r, first_state(data, of, r)) for r in recordings])
+
+
 def first_state(data: Path, of: Set, recording: Recording) -> State | None:
     """Initial state of a whole recording as its card gives it."""
     table = pd.read_csv(data / of.folder / "recordings.csv").set_index("id")
@@ -125,6 +131,7 @@ def real(
     blocks: int = 1,
     peer: bool = False,
     recorded_zeros: bool = False,
+    seen: bool = False,
     **settings: Any,
 ) -> None:
     """Print the error of every model on what was left out of its recordings.
@@ -136,54 +143,92 @@ def real(
         blocks: in time, of which one is left out of every recording; 1 leaves out recordings.
         peer: also fit every constant model by single shooting with SciPy.
         recorded_zeros: take encoders for true that were zeroed in a pose held by stiction.
+        seen: also fit all recordings at once, and print the free runs' error on these.
         settings: of the fits.
     """
     aimed = f"{'aim':>5}  met"
-    print(f"{'set':7} {'model':15} unit  free run {aimed} {'5 s':>9} {aimed}  cpu [s]  one by one")
+    print(
+        f"{'set':7} {'model':15} unit  free run {aimed} {'5 s':>9} {aimed}"
+        f"{'      seen' if seen else ''}  cpu [s]  one by one"
+    )
     for name in only:
-        of = SETS[name]
-        plant = of.plant()
-        # Blocks have the zeros that the rest of their recordings showed.
-        zeroed = blocks == 1 and not recorded_zeros and of.encoder_reference == "per_recording"
-        rows = {m: Row() for m in models}
-        if peer:
-            rows |= {f"{m}, SciPy": Row() for m in models if is_constant(m)}
-        for fold in folds(data, of, blocks):
-            fits: list[FitResult] = []
-            for m in models:
-                start = time.process_time()
-                model = model_by_name(m)(plant.joints)
-                before = nearest_fit(fits, model)
-                known = before.motions if before else None
-                fits.append(
-                    fit(
-                        model, plant, fold.fitted, start=before, motions=known,
-                        encoder_reference=of.encoder_reference, **settings,
-                    )
-                )  # fmt: skip
-                left = fold.left if blocks == 1 else with_fitted_offsets(fits[-1], fold.left)
-                left = [one._replace(recording=fits[-1].aligned(one.recording)) for one in left]
-                rows[m].add(start, fits[-1].plant, model, left, zeroed)
-            # The peer knows no gaps and one zero for all.
-            whole = [r[a : b + 1] for r in fold.fitted for a, b in r.segments]
-            states = [first_state(data, of, r) if blocks == 1 else None for r in whole]
-            for m in models if peer else ():
-                if is_constant(m):
-                    start = time.process_time()
-                    model = model_by_name(m)(plant.joints)
-                    found = single_shooting(model, plant, whole, states)
-                    rows[f"{m}, SciPy"].add(start, found, model, fold.left, zeroed)
+        contest = Contest(data, SETS[name], models, peer, recorded_zeros, settings)
+        rows = contest.rows(folds(data, contest.of, blocks))
+        known = contest.rows([nothing_left_out(data, contest.of)]) if seen else {}
         least = math.inf
         for m, row in rows.items():
             each = "  ".join(f"{e:.3g}" for e in row.free)
             errors = [root_mean_square(e) for e in (row.free, row.short)]
-            judged = " ".join(beside(e, t) for e, t in zip(errors, of.target, strict=True))
+            judged = " ".join(beside(e, t) for e, t in zip(errors, contest.of.target, strict=True))
+            in_all = f"{root_mean_square(known[m].free):10.2f}" if seen else ""
             # Models come in the order of their parameters, as `Comparison.unfit` judges them.
             mark = "  not fit for use" if errors[0] >= FAR_WORSE * least else ""
             least = min(least, errors[0])
             print(
-                f"{name:7} {m:15} {of.unit:4} {judged} {row.spent:8.0f}  {each}{mark}", flush=True
-            )
+                f"{name:7} {m:15} {contest.of.unit:4} {judged}{in_all} {row.spent:8.0f}  "
+                f"{each}{mark}", flush=True,
+            )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Contest:
+    """Models, and peers if asked for, on the recordings of one set; see `real`."""
+
+    data: Path
+    of: Set
+    models: Sequence[str]
+    peer: bool
+    recorded_zeros: bool
+    settings: dict[str, Any]
+
+    def rows(self, folds: Sequence[Fold]) -> "dict[str, Row]":
+        """Errors of every contestant over all folds."""
+        rows = {m: Row() for m in self.models}
+        if self.peer:
+            rows |= {f"{m}, SciPy": Row() for m in self.models if is_constant(m)}
+        for fold in folds:
+            self._of_models(fold, rows)
+            if self.peer:
+                self._of_peers(fold, rows)
+        return rows
+
+    def _of_models(self, fold: Fold, rows: "dict[str, Row]") -> None:
+        plant, reference = self.of.plant(), self.of.encoder_reference
+        fits: list[FitResult] = []
+        for m in self.models:
+            start = time.process_time()
+            model = model_by_name(m)(plant.joints)
+            before = nearest_fit(fits, model)
+            found = fit(
+                model, plant, fold.fitted, start=before,
+                motions=before.motions if before else None,
+                encoder_reference=reference, **self.settings,
+            )  # fmt: skip
+            fits.append(found)
+            left = with_fitted_offsets(found, fold.left) if in_blocks(fold) else fold.left
+            left = [one._replace(recording=found.aligned(one.recording)) for one in left]
+            rows[m].add(start, found.plant, model, left, self._zeroed(fold))
+
+    def _of_peers(self, fold: Fold, rows: "dict[str, Row]") -> None:
+        plant = self.of.plant()
+        # The peer knows no gaps and one zero for all.
+        whole = [r[a : b + 1] for r in fold.fitted for a, b in r.segments]
+        states = [None if in_blocks(fold) else first_state(self.data, self.of, r) for r in whole]
+        for m in filter(is_constant, self.models):
+            start = time.process_time()
+            model = model_by_name(m)(plant.joints)
+            found = single_shooting(model, plant, whole, states)
+            rows[f"{m}, SciPy"].add(start, found, model, fold.left, self._zeroed(fold))
+
+    def _zeroed(self, fold: Fold) -> bool:
+        """True if zeros are estimated: blocks have those that the rest of their recordings show."""
+        known = in_blocks(fold) or self.recorded_zeros
+        return not known and self.of.encoder_reference == "per_recording"
+
+
+def in_blocks(fold: Fold) -> bool:
+    """True if blocks were left out, rather than recordings."""
+    return isinstance(fold.left[0], TimeBlock)
 
 
 @dataclass

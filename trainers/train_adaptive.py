@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import common
 
-from nfriction.papers.reproduction.stages import fit_by_class, fit_constant, fit_searched
+from nfriction.papers.reproduction.stages import fit_by_class, fit_from_start, fit_searched
 
 MODELS = ("ANCFM", "ACFM", "ACVFM", "ALFM", "ANLFM")
 
@@ -28,7 +28,7 @@ def train(argv: Sequence[str] | None) -> str:
     if given.method == "gauss-newton":
         found = fit_by_class(workspace, bench, given.model)
     else:
-        constant = fit_constant(workspace, bench, given.model.removeprefix("A"))
+        constant = fit_from_start(workspace, bench, given.model.removeprefix("A"))
         found = fit_searched(
             workspace, bench, given.model, given.method, given.windows[-1], start=constant
         )

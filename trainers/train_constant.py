@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 import common
 
-from nfriction.papers.reproduction.stages import fit_constant, fit_searched
+from nfriction.papers.reproduction.stages import fit_from_start, fit_searched
 
 MODELS = ("NCFM", "CFM", "CVFM", "LFM", "NLFM", "Stribeck")
 
@@ -29,7 +29,7 @@ def train(argv: Sequence[str] | None) -> str:
     given = parser.parse_args(argv)
     workspace, bench = common.start(given, search_evaluations=given.max_evaluations)
     if given.method == "trajectory":
-        found = fit_constant(workspace, bench, given.model)
+        found = fit_from_start(workspace, bench, given.model)
     else:
         found = fit_searched(workspace, bench, given.model, given.method, given.horizon)
     return common.finish(given, bench, found)

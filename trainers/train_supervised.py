@@ -23,11 +23,10 @@ from nfriction.export import torchscript
 from nfriction.friction import model_names
 from nfriction.friction.laws import LINEAR, Law
 from nfriction.io.model_file import ModelInfo, save
-from nfriction.optim.evidence import EvidenceState
 from nfriction.papers.afem.adaptive import Adaptive
 from nfriction.papers.controller.mamdani import MamdaniController, paper_controller
 from nfriction.papers.controller.samples import ControllerSamples, sampled
-from nfriction.papers.nffem.train_network import TrainingOptions
+from nfriction.papers.nffem.train_network import TrainingOptions, recorded_losses
 from nfriction.papers.reproduction.procedure import controllers_from_classes, train_on_samples
 from nfriction.plots import style
 from nfriction.signals import Motion
@@ -50,14 +49,7 @@ def train(argv: Sequence[str] | None) -> str:
     parser.add_argument("--out", type=Path, default=Path("runs/supervised"), help="folder to write")
     given = parser.parse_args(argv)
     law, controllers, samples = _data(given)
-    losses: dict[str, list[float]] = {}
-
-    def keep(state: EvidenceState) -> None:
-        # The training of each joint counts its steps from 1.
-        if state.step == 1:
-            losses[samples.joint_names[len(losses)]] = []
-        losses[[*losses][-1]].append(0.5 / state.beta)
-
+    losses, keep = recorded_losses(samples.joint_names)
     options = TrainingOptions(
         max_steps=given.max_steps, seed=given.seed, starts=given.starts, callback=keep
     )

@@ -119,8 +119,7 @@ def run_reproduce(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from nfriction.evaluation.results import exclusive
-    from nfriction.papers.reproduction import tables
-    from nfriction.papers.reproduction.page import write_page
+    from nfriction.papers.reproduction import page, tables
     from nfriction.papers.reproduction.stages import reproduce
     from nfriction.papers.reproduction.workspace import FULL, QUICK
 
@@ -130,13 +129,11 @@ def run_reproduce(arguments: argparse.Namespace) -> int:
     # Two runs in one folder would take each other's stages for their own.
     with exclusive(arguments.out):
         workspace = reproduce(arguments.out, settings, jobs=arguments.jobs, progress=progress)
-        tables.write_tables(workspace, command=arguments.command_line)
-        print(tables.text(workspace))
+        page.write_tables(workspace, command=arguments.command_line)
+        print(page.text(workspace))
         if not arguments.no_figures:
-            from nfriction.papers.reproduction.figures import draw_all
-
-            draw_all(workspace, progress=progress)
-        page = write_page(workspace)
-    print(f"\ntables, models and figures are in {arguments.out}, all on one page: {page}\n")
+            page.draw_all(workspace, progress=progress)
+        written = page.write_page(workspace)
+    print(f"\ntables, models and figures are in {arguments.out}, all on one page: {written}\n")
     print(tables.conclusion(workspace))
     return 0

@@ -6,7 +6,7 @@ from nfriction.cli.console import one_line
 from nfriction.evaluation import tables
 from nfriction.evaluation.compare import NO_FRICTION, Comparison, coefficients_by_set
 from nfriction.evaluation.cross_validation import Selection
-from nfriction.evaluation.lead_in import LEAD_IN
+from nfriction.evaluation.lead_in import LEAD_IN, ZERO_IN
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction.models import FrictionModel
 
@@ -30,6 +30,14 @@ def error_tables(comparison: Comparison) -> str:
         for horizon, short in comparison.too_short(part).items():
             lasts = ", ".join(f"{name} lasts {duration:.3g} s" for name, duration in short.items())
             lines.append(f"windows of {horizon} s: none, {lasts}")
+        nearest = comparison.nearest(part)
+        for scored in comparison.scores(part)[nearest]:
+            if scored.zero is not None:
+                zero = ", ".join(f"{1e3 * x:.3g}" for x in scored.zero)
+                lines.append(
+                    f"{scored.recording}: zero of the encoders at {zero} m{comparison.unit} by "
+                    f"{nearest}, estimated from the first {ZERO_IN:g} s, which is not scored"
+                )
         parts.append("\n".join(lines))
     return "\n\n".join([*parts, LEGEND])
 

@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 NO_FRICTION = "no friction"
 LIMIT = "limit of these data"
 JUDGED_BY = "free-run RMSE over all joints and test recordings"
-SCHEMA = 3
-"""Of `results.json`; the second had a `floor` by one encoder count in place of the `limit`, the
-first no number, and `held_out` where it now says `test`."""
+SCHEMA = 4
+"""Of `results.json`; the third had no `zero`, the second a `floor` by one encoder count in place of
+the `limit`, the first no number, and `held_out` where it now says `test`."""
 # Models whose errors agree to three digits are tied.
 TIE = 1e-3
 # So many times the error of a model no larger cannot be the luck of a few test recordings.
@@ -161,7 +161,7 @@ class Comparison:
         limits = [
             (LIMIT, replace(s, free_run=s.limit.free_run, windows=s.limit.windows), part)
             for part in reversed(self.parts)
-            for s in self.scores(part)[self._nearest(part)]
+            for s in self.scores(part)[self.nearest(part)]
             if s.limit is not None
         ]
         rows = [
@@ -207,7 +207,7 @@ class Comparison:
         """
         place = [*self.joint_names, "all"].index(column)
         squares = []
-        for of in (s.limit for s in self.scores(part)[self._nearest(part)]):
+        for of in (s.limit for s in self.scores(part)[self.nearest(part)]):
             error = of and (of.free_run if horizon is None else of.windows.get(horizon))
             if not isinstance(error, RMSE):
                 return None
@@ -215,7 +215,7 @@ class Comparison:
         limit = float(np.sqrt(np.mean(squares)))
         return limit if np.isfinite(limit) else None
 
-    def _nearest(self, part: Part) -> str:
+    def nearest(self, part: Part) -> str:
         """The model with the least error of free runs; no friction where it is alone."""
         free_run = self.table(part=part)["all"]
         models = free_run.drop(NO_FRICTION, errors="ignore")

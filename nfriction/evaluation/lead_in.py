@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from nfriction.fitting.data.inputs import require_drive
 from nfriction.fitting.data.windows import begins_at_rest
 from nfriction.fitting.options import DEFAULTS
-from nfriction.fitting.shooting.autocorrelation import white_noise
+from nfriction.fitting.shooting.autocorrelation import correlation_time, white_noise
 from nfriction.friction.memory import deflections, load_of
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import require_model
@@ -127,9 +127,9 @@ class Simulator:
         recording: Recording,
         scheme: Scheme,
         draws: int,
-        unscored: float = 0.0,
+        zero: "Zero | None" = None,
     ) -> None:
-        """Check and prepare; what begins within the first `unscored` seconds is not scored."""
+        """Check and prepare; the time that showed a `zero` of the recording is not scored."""
         if friction is not None:
             require_model(friction)
             if friction.joints != plant.joints:
@@ -143,7 +143,7 @@ class Simulator:
         self.lead = lead_in_samples(recording)
         # From zero, so that the rounding of large stamps costs no window its last sample.
         self.time = recording.time - recording.time[0]
-        self.unscored = int(np.searchsorted(self.time, unscored))
+        self.unscored = 0 if zero is None else int(np.searchsorted(self.time, ZERO_IN))
         self.substeps: int | None = math.ceil(recording.longest_step / STOP_STEP)
         if scheme != "time_stepping":
             self.substeps = _substeps(plant, friction, recording)
@@ -154,6 +154,11 @@ class Simulator:
         self.torque_sd = torch.zeros(plant.joints, dtype=torch.float64)
         if recording.tau is not None:
             self.torque_sd = white_noise(torch.tensor(recording.tau)[None])
+        # Random errors of the zero, (draw, window, joint).
+        self.zeros = np.zeros((draws, 1, plant.joints))
+        if zero is not None:
+            normal = np.random.default_rng([0, 2]).standard_normal(self.zeros.shape)
+            self.zeros = normal @ zero.root.T
         self.states: torch.Tensor | None = None
         self.law_states: torch.Tensor | None = None
         # Those of a controller at every sample, from which windows go on.
@@ -218,8 +223,10 @@ class Simulator:
         at_once = max(1, DRAWN_SAMPLES // samples.size)
         # Where the run itself diverged there is no limit.
         for k in range(0, self.draws if np.isinf(diverged_at).all() else 0, at_once):
-            drawn, _ = self.simulate(state + starts.deviations[k : k + at_once], samples, noise=k)
-            apart = (self._as_read(drawn, measured) - q)[:, :, scored]
+            zero = self.zeros[k : k + at_once]
+            off = starts.deviations[k : k + at_once] + np.concatenate([zero, 0 * zero], -1)
+            drawn, _ = self.simulate(state + off, samples, noise=k)
+            apart = (self._as_read(drawn - zero[:, :, None], measured) - q)[:, :, scored]
             squares[k : k + at_once] = np.mean(apart**2, axis=(1, 2))
         squares += self._noise_beyond_rounding(starts)
         if self.draws and np.isfinite(squares).all():
@@ -289,13 +296,26 @@ def _require_joints(plant: Plant, state: tuple[Array, Array]) -> None:
         )
 
 
+@dataclass(frozen=True)
+class Zero:
+    """Zero of a recording's encoders.
+
+    Attributes:
+        offset: what to add to its positions, (joint,).
+        root: of its covariance root @ root.T, (joint, joint).
+    """
+
+    offset: Array
+    root: Array
+
+
 def with_own_zero(
     plant: Plant,
     friction: FrictionModel | None,
     recording: Recording,
     state: tuple[Array, Array] | None,
-) -> tuple[Recording, tuple[Array, Array] | None, float]:
-    """A recording with its encoders' zero added, its initial state, and the time that it took [s].
+) -> tuple[Recording, tuple[Array, Array] | None, Zero | None]:
+    """A recording and its initial state with its encoders' zero added, and that zero.
 
     Of encoders that were set to zero at the start, at rest in a pose held by stiction; a recording
     that begins otherwise, has a gap before `ZERO_IN`, or is too short to be scored behind that, is
@@ -307,10 +327,10 @@ def with_own_zero(
     time = recording.time - recording.time[0]
     short = time[-1] < 2 * ZERO_IN or time[recording.segments[0][1]] < ZERO_IN
     if short or not (at_zero and begins_at_rest(recording, DEFAULTS.rest_speed)):
-        return recording, state, 0.0
+        return recording, state, None
     q0, qd0 = state or (recording.q[0], np.zeros(plant.joints))
     zero = estimate_zero(plant, friction, recording, (q0, qd0))
-    return recording._replace(q=recording.q + zero), (q0 + zero, qd0), ZERO_IN
+    return recording._replace(q=recording.q + zero.offset), (q0 + zero.offset, qd0), zero
 
 
 def estimate_zero(
@@ -318,8 +338,8 @@ def estimate_zero(
     friction: FrictionModel | None,
     recording: Recording,
     state: tuple[Array, Array],
-) -> Array:
-    """Zero of a recording's encoders: what to add to its positions, (joint,).
+) -> Zero:
+    """Zero of a recording's encoders.
 
     By Gauss-Newton on the errors of a simulation of the first `ZERO_IN` seconds from a recorded
     position and velocity, (joint,) each. The prior is that of `FitOptions.encoder_offset_sd`.
@@ -333,7 +353,7 @@ def estimate_zero(
         q, _ = simulator.simulate(begin[..., None, :], samples)
         return (q - zero[..., None, None, :] - recording.q[samples])[..., 0, :, :]
 
-    zero = np.zeros(joints)
+    zero, root = np.zeros(joints), sd * np.eye(joints)
     nudges = 0.1 * sd * np.eye(joints)
     for _ in range(MOST_STEPS):
         now, ahead, back = error(zero), error(zero + nudges), error(zero - nudges)
@@ -342,16 +362,21 @@ def estimate_zero(
         slopes = (ahead - back) / (0.2 * sd)
         # The prior only keeps the zero of a joint that gravity does not load.
         weight = 1 / max(np.mean(now**2), np.finfo(np.float64).tiny)
-        information = weight * np.einsum("akj,bkj->ab", slopes, slopes) + np.eye(joints) / sd**2
+        data = weight * np.einsum("akj,bkj->ab", slopes, slopes)
+        prior = np.eye(joints) / sd**2
         gradient = weight * np.einsum("akj,kj->a", slopes, now) + zero / sd**2
-        step = -np.linalg.solve(information, gradient)
+        covariance = np.linalg.inv(data + prior)
+        # Errors by the torque's noise or the model last for many samples.
+        lasting = correlation_time(torch.tensor(now)[None])
+        root = covariance @ np.linalg.cholesky(lasting * data + prior)
+        step = -covariance @ gradient
         trials = zero + SHARES[:, None] * step
         cost = weight * np.sum(error(trials) ** 2, axis=(1, 2))
         cost += np.sum((trials / sd) ** 2, axis=-1)
         zero = trials[np.where(np.isfinite(cost), cost, np.inf).argmin()]
         if -gradient @ step < SMALL**2:
             break
-    return zero
+    return Zero(zero, root)
 
 
 def estimate_starts(

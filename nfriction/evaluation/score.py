@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nfriction.evaluation.lead_in import DRAWS, LEAD_IN, Runs, Simulator, with_own_zero
+from nfriction.evaluation.lead_in import DRAWS, LEAD_IN, ZERO_IN, Runs, Simulator, with_own_zero
 from nfriction.fitting.options import checked_lengths
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant, rigs
@@ -79,7 +79,7 @@ class Score(Errors):
     """Errors of one model on one recording; they are plain data, without plant or model.
 
     Attributes:
-        limit: errors that the uncertainty of the start and the noise of the torque may cause, in
+        limit: errors by an uncertain start or zero of the encoders and by noise of the torque, in
             simulations of this model; None where it was not asked for. The true model stays below
             in 95 of 100 recordings; smaller differences between models are not meaningful.
         recording: its name.
@@ -87,6 +87,7 @@ class Score(Errors):
             figures; NaN between gaps that leave no room for a lead-in.
         diverged_at: time at which the free run diverged [s], infinity where it did not. Friction
             too steep at rest to be simulated at all counts as diverged from the start.
+        zero: what the model added to recorded positions as the zero of the encoders, (joint,).
     """
 
     limit: Errors | None
@@ -94,12 +95,14 @@ class Score(Errors):
     time: Array = field(repr=False)
     simulated: Array = field(repr=False)
     diverged_at: float
+    zero: tuple[float, ...] | None = None
 
     def to_dict(self) -> dict[str, Any]:
         return {
             **super().to_dict(),
             "limit": None if self.limit is None else self.limit.to_dict(),
             "diverged_at": self.diverged_at if np.isfinite(self.diverged_at) else None,
+            "zero": None if self.zero is None else list(self.zero),
         }
 
 
@@ -138,20 +141,20 @@ def score(
     plant = rigs.of(plant)
     recording = Recording.of(recording, plant=plant)
     horizons = checked_lengths("horizons", horizons, 0)
-    read, unscored = recording, 0.0
+    zero = None
     if zeroed:
-        recording, initial_state, unscored = with_own_zero(plant, friction, read, initial_state)
-    simulator = Simulator(plant, friction, recording, scheme, DRAWS if limit else 0, unscored)
+        recording, initial_state, zero = with_own_zero(plant, friction, recording, initial_state)
+    simulator = Simulator(plant, friction, recording, scheme, DRAWS if limit else 0, zero)
     runs = simulator.free_runs(initial_state)
     if not runs:
         raise ValueError(
             f"{recording.name or 'the recording'} is too short to be scored: its longest stretch "
-            f"without a gap must be longer than the lead-in of {max(LEAD_IN, unscored):g} s."
+            f"without a gap must be longer than the lead-in of {ZERO_IN if zero else LEAD_IN:g} s."
         )
     windows = {f"{h:g}": run for h in horizons if (run := simulator.windows(h)) is not None}
     simulated = np.full_like(recording.q, np.nan)
     for run in runs:
-        simulated[run.samples] = run.q - (recording.q - read.q)[0]
+        simulated[run.samples] = run.q - (0.0 if zero is None else zero.offset)
     return Score(
         RMSE.of(np.concatenate([run.error for run in runs], axis=1)),
         {horizon: RMSE.of(run.error) for horizon, run in windows.items()},
@@ -161,6 +164,7 @@ def score(
         recording.time,
         simulated,
         min(run.diverged_at for run in runs),
+        None if zero is None else tuple(zero.offset.tolist()),
     )  # fmt: skip
 
 

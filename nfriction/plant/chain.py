@@ -45,7 +45,10 @@ class Arm:
 
 def _check_options(gravity: float, arm: Arm | None, normal_load: str) -> None:
     if gravity < WEIGHTLESS:
-        raise ValueError(f"`gravity` must be at least {WEIGHTLESS:g} m/s^2, got {gravity:g}.")
+        raise ValueError(
+            f"`gravity` must be at least {WEIGHTLESS:g} m/s^2, got {gravity:g}; give that to links "
+            "in a horizontal plane."
+        )
     if not isinstance(arm, Arm | None):
         raise TypeError(f"`arm` must be an Arm(inertia, length) or None, got {arm!r}.")
     if normal_load not in ("link", "bearing") or (normal_load == "bearing" and arm):
@@ -159,7 +162,7 @@ class PendulumChain(Plant):
         position_quantum: float | None = None,
     ) -> None:
         m = vector("mass", mass, None, positive=True)
-        gravity = number("gravity", gravity, positive=True)
+        gravity = number("gravity", gravity)
         _check_options(gravity, arm, normal_load)
         links, first = len(m), int(arm is not None)
         super().__init__(

@@ -412,12 +412,13 @@ def _recording_table(run: Run) -> Table:
             for s in scores:
                 limit = math.nan if s.limit is None else 1e3 * s.limit.free_run.all
                 at = "no" if math.isinf(s.diverged_at) else f"at {s.diverged_at:.3g} s"
-                rows.append((s.recording, model, part, 1e3 * s.free_run.all, limit, at))
+                zero = ", ".join(f"{1e3 * x:.3g}" for x in s.zero or ()) or "as recorded"
+                rows.append((s.recording, model, part, 1e3 * s.free_run.all, limit, at, zero))
     unit = run.comparison.unit
     return Table(
         "Every recording: free run over all joints",
         ("recording", "model", "part", f"RMSE [m{unit}]", f"{LIMIT} [m{unit}]",
-         "diverged"),
+         "diverged", f"zero of the encoders [m{unit}]"),
         tuple(rows), "diverged",
     )  # fmt: skip
 

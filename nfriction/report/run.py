@@ -200,7 +200,7 @@ def _score(recording: str, of: dict[str, Any]) -> Score:
     errors, nothing = _errors(of), np.zeros(0)
     return Score(
         errors.free_run, errors.windows, of["limit"] and _errors(of["limit"]), recording,
-        nothing, nothing, _number(of["diverged_at"]),
+        nothing, nothing, _number(of["diverged_at"]), of["zero"] and tuple(of["zero"]),
     )  # fmt: skip
 
 

@@ -14,6 +14,7 @@ from nfriction.evaluation.compare import Comparison
 from nfriction.evaluation.lead_in import (
     ZERO_IN,
     Simulator,
+    Zero,
     estimate_starts,
     estimate_zero,
     lead_in_samples,
@@ -349,9 +350,12 @@ def test_a_recording_s_own_zero_is_estimated_from_samples_that_are_not_scored():
     zero = np.array([0.02, -0.03])
     rig, law, recording = zeroed_in_a_pose(zero)
     rest = (recording.q[0], np.zeros(2))
-    assert estimate_zero(rig, law, recording, rest) == pytest.approx(zero, abs=2e-3)
+    assert estimate_zero(rig, law, recording, rest).offset == pytest.approx(zero, abs=2e-3)
     taken = score(rig, law, recording, limit=False)
     found = score(rig, law, recording, limit=False, zeroed=True)
+    assert found.zero == pytest.approx(zero, abs=2e-3)
+    assert found.to_dict()["zero"] == list(found.zero)
+    assert taken.zero is None
     assert found.free_run.all < 0.1 * taken.free_run.all
     assert found.windows["1"].all < 0.1 * taken.windows["1"].all
     late = np.where(recording.time[:, None] > ZERO_IN, 0.1, 0.0)
@@ -360,6 +364,19 @@ def test_a_recording_s_own_zero_is_estimated_from_samples_that_are_not_scored():
     )
     np.testing.assert_array_equal(other.simulated, found.simulated)
     assert other.free_run.all == pytest.approx(0.1, rel=0.05)
+
+
+def test_the_limit_knows_how_uncertain_the_zero_is():
+    rig, law, recording = zeroed_in_a_pose(np.zeros(2))
+    limits = []
+    for sd in (0.0, 0.02):
+        zero = Zero(np.zeros(2), sd * np.eye(2))
+        (run,) = Simulator(rig, law, recording, "rk4", 20, zero).free_runs(None)
+        limits.append(np.sqrt(run.squares.mean(-1).max()))
+    # Of unlike poses the motions differ, though the encoders read the same at first.
+    assert limits[1] > 3 * limits[0]
+    rest = (recording.q[0], np.zeros(2))
+    assert 1e-6 < np.linalg.norm(estimate_zero(rig, law, recording, rest).root, axis=1).max() < 0.02
 
 
 def test_a_recording_whose_zero_does_not_show_is_taken_as_it_is():

@@ -63,7 +63,9 @@ def driven_axis(
     return Recording(time, q, tau=tau.numpy(), unit="m", name="axis")
 
 
-def flywheel(seed: int, friction: FrictionModel, counts: int = 4096) -> Recording:
+def flywheel(
+    seed: int, friction: FrictionModel, counts: int = 4096, noise: float = 0.01
+) -> Recording:
     """A driven axis of 0.13 kg: smooth random force with noise, an encoder, 500 Hz."""
     random = np.random.default_rng(seed)
     time = np.arange(0.0, 10.0, 2e-3)[:, None]
@@ -74,7 +76,7 @@ def flywheel(seed: int, friction: FrictionModel, counts: int = 4096) -> Recordin
         LinearAxis(0.13), friction, zero, zero, torch.as_tensor(tau[:-1]), sample_time=2e-3,
         substeps=8, gradients=False,
     )  # fmt: skip
-    read = tau + 0.01 * random.standard_normal(tau.shape)
+    read = tau + noise * random.standard_normal(tau.shape)
     return Recording(
         time[:, 0], quantise(out.q.numpy(), counts), tau=read, unit="m", name=f"{seed}"
     )

@@ -315,6 +315,13 @@ def test_lost_counts_and_missing_samples_are_named_with_their_time():
     assert not any("jumps" in warning for warning in warnings_of(plant, q, tau))
 
 
+def test_a_counter_that_overflows_is_named():
+    plant, q, tau = measured("driven")
+    wrapped = (q + 0.1) % 0.7
+    (found, *_) = (w for w in warnings_of(plant, wrapped, tau) if "good" in w)
+    assert "a counter overflows, after 0.7 rad each; unwrap its column" in found
+
+
 @pytest.mark.parametrize("name", ["direct", "motor"])
 def test_torques_of_a_wrong_scale_are_named(name):
     """They fit a rig that is heavier throughout, within what is allowed; with a gear, too."""

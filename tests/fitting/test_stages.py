@@ -55,6 +55,13 @@ def test_the_caller_hears_every_step_and_may_stop():
     assert (ended.stopped, len(heard)) == (True, 2)
 
 
+def test_windows_over_which_noise_of_the_torque_adds_up_are_skipped():
+    recording = flywheel(1, CVFM(1, [0.35, 0.12]), noise=0.03)[:2000]
+    found = fit(CVFM(1), LinearAxis(0.13), recording, windows=(0.5, 2.0), fit_plant=False)
+    assert [length for length, _ in found.stages] == pytest.approx([0.5], rel=0.01)
+    assert any("less certain" in warning for warning in found.warnings)
+
+
 def short_search(callback=None):
     """A search of one short swing, and its problem."""
     plant, model = pendulum(), LFM(2, [[1e-3, 1e-3]] * 2, v_smooth=0.05)

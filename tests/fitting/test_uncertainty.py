@@ -64,6 +64,16 @@ def test_intervals_know_the_noise_of_the_torque():
     assert 0.3 < np.sqrt(np.mean(np.square(off))) < 1.5
 
 
+def test_intervals_know_the_error_of_the_integration():
+    """Without noise of the torque it is larger than what rounding leaves open."""
+    truth = (0.35, 0.12)
+    recording = flywheel(2, CVFM(1, truth), noise=0.0)
+    found = fit(CVFM(1), LinearAxis(0.13), recording, windows=(2.0,), fit_plant=False)
+    for i, true in zip(found.intervals, truth, strict=True):
+        # By rounding alone 2.6 standard deviations.
+        assert abs(i.value - true) < 1.5 * i.sd < 1e-3 * true
+
+
 def test_the_noise_of_the_torque_counts_once(monkeypatch):
     """A fine encoder shows nothing else, so residuals add nothing to what is drawn."""
     tasks, drawn = [], uncertainty.gathered_information

@@ -24,6 +24,10 @@ from nfriction.io.formats.selection import is_unit, slides, to_si
         ("qd", "deg/s", math.pi / 180),
         ("tau", "mNm", 1e-3),
         ("tau", "Nm", 1.0),
+        ("tau", "[Nmm]", 1e-3),
+        ("tau", "N mm", 1e-3),
+        ("tau", "Ncm", 1e-2),
+        ("tau", "kN", 1e3),
         ("tau", "N m", 1.0),
     ],
 )

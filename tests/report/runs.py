@@ -25,6 +25,7 @@ def score(scale: float | None) -> dict[str, Any]:
         "windows": {"1": errors(None if scale is None else scale / 10)},
         "limit": {"free_run": errors(1e-4), "windows": {"1": errors(1e-4)}},
         "diverged_at": 0.5 if scale is None else None,
+        "zero": None if scale is None else [0.01, -0.02],
     }
 
 
@@ -59,7 +60,7 @@ def results() -> dict[str, Any]:
     sets = {label: {"B": [1e-3, 2e-3], "C": [1e-3, 1e-2]} for label in ("at_rest", "reference")}
     models["NFLFM"] |= {"fit": fit(intervals={}), "coefficients": sets}
     return {
-        "schema": 3,
+        "schema": 4,
         "models": models,
         "best": {
             "model": "LFM",

@@ -81,9 +81,9 @@ def test_edited_entries_are_refused(tmp_path, where, value):
 
 
 def test_results_of_another_schema_or_program_are_refused(tmp_path):
-    write(tmp_path, results() | {"schema": 4})
-    assert "schema 3; run the comparison again" in one_line(tmp_path)
-    write(tmp_path, {"schema": 3, "joints": ["a"]})
+    write(tmp_path, results() | {"schema": 5})
+    assert "schema 4; run the comparison again" in one_line(tmp_path)
+    write(tmp_path, {"schema": 4, "joints": ["a"]})
     assert "not results of a comparison" in one_line(tmp_path)
 
 

@@ -92,15 +92,22 @@ def test_recordings_need_a_rig(tmp_path: Path) -> None:
         train("train_adaptive.py", "run.csv", "--out", tmp_path)
 
 
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Data sets of these tests, built once; compiled models stay in the cache of all tests."""
+    return tmp_path_factory.mktemp("cache")
+
+
 @pytest.mark.parametrize(("adaptive", "made"), [(None, "NFLFM"), (ANCFM(3, [0.02]), "NFNCFM")])
 def test_networks_are_trained_on_the_supervised_set(
     tmp_path: Path,
+    cache: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     adaptive: ANCFM | None,
     made: str,
 ) -> None:
-    monkeypatch.setenv("NFRICTION_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("nfriction.datasets.cache_folder", lambda: cache)
     words = ["--seconds", "3", "--units", "3", "--max-steps", "2", "--out", str(tmp_path)]
     if adaptive is not None:
         words += ["--adaptive", str(save(adaptive, tmp_path / "adaptive.json"))]

@@ -37,6 +37,8 @@ logger = logging.getLogger(__name__)
 # Share of the slowest joint's largest velocity within which the sign of a model made by name turns:
 # the default of 3 mrad/s, or mm/s, where it reaches 3 rad/s, or m/s.
 TURN_SHARE = 1e-3
+# Jumps whose sizes differ by less than this share are alike.
+ALIKE = 0.02
 
 
 def as_model(
@@ -376,19 +378,25 @@ def _spikes(recordings: Sequence[Recording], options: FitOptions) -> Iterator[st
         height = np.minimum(np.abs(at - before), np.abs(at - after))
         height[(2 * np.abs(after - before) > height) | _gaps(recording)[1:-1, None]] = 0.0
         lasting = height > options.spike_ratio * np.fmax(curved, count_seen(q))
-        for name, peak, jump in zip(recording.names, far.T, lasting.T, strict=True):
+        columns = zip(recording.names, far.T, lasting.T, height.T, strict=True)
+        for name, peak, jump, high in columns:
             of = f"{recording.name or 'A recording'}: {name} jumps"
             if peak.any():
                 yield (
                     f"{of} for one sample at {_times(time[1:-1][peak])}; such spikes are errors of "
                     "the sensor, leave these samples out."
                 )
-            if jump.any():
-                yield (
-                    f"{of} for good at {_times(time[2:-1][jump])}: samples are missing there "
-                    "without a gap in time, or the encoder lost counts; give samples their own "
-                    "times, or cut the recording there."
-                )
+            if not jump.any():
+                continue
+            cause, remedy = (
+                "samples are missing there without a gap in time, or the encoder lost counts",
+                "give samples their own times, or cut the recording there",
+            )
+            # Twice by the same amount is no chance.
+            if jump.sum() > 1 and np.ptp(high[jump]) < ALIKE * high[jump].mean():
+                cause = f"a counter overflows, after {high[jump].mean():.3g} {recording.unit} each"
+                remedy = "unwrap its column, as `numpy.unwrap(counts, period=65536)` does"
+            yield f"{of} for good at {_times(time[2:-1][jump])}: {cause}; {remedy}."
 
 
 def _gaps(recording: Recording) -> NDArray[np.bool_]:

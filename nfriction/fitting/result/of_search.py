@@ -32,6 +32,7 @@ from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.uncertainty import (
     encoder_count,
     gathered_information,
+    integration_error,
     measurement_noise,
 )
 from nfriction.fitting.shooting.variables import model_at
@@ -225,9 +226,10 @@ def _identifiability(
 
     Of a network only its plant terms have intervals, and no parameter counts as unidentifiable.
     """
-    off = torch.zeros_like(result.x)
     constant = not problem.friction.schedule.follows_motion
-    if (belief := problem.friction.schedule.belief()) is not None:
+    if (belief := problem.friction.schedule.belief()) is None:
+        off = integration_error(problem, result)
+    else:
         problem, off = _by_data(problem, result.x, belief)
     variables, options = problem.variables, problem.options
     count, friction_count = variables.shared_count, variables.friction_count

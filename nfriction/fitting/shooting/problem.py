@@ -26,15 +26,9 @@ from torch import Tensor
 from nfriction.fitting.adjusted_plant import adjusted_plant
 from nfriction.fitting.data.windows import Windows
 from nfriction.fitting.options import DEFAULTS, FitOptions
-from nfriction.fitting.result.identifiability import (
-    observed_count,
-)
+from nfriction.fitting.result.identifiability import observed_count
 from nfriction.fitting.robust_loss import SQUARES, RobustLoss
-from nfriction.fitting.shooting.normal_equations import (
-    Rows,
-    normal_equations,
-    scaled_rows,
-)
+from nfriction.fitting.shooting.normal_equations import Rows, normal_equations, scaled_rows
 from nfriction.fitting.shooting.sensitivity import StepJacobian, Trajectory, propagate
 from nfriction.fitting.shooting.variables import DecisionVariables, deflected
 from nfriction.fitting.strategy.extrapolation_prior import ExtrapolationPrior

@@ -29,6 +29,7 @@ from nfriction.fitting.shooting.normal_equations import (
     score_covariance,
 )
 from nfriction.fitting.shooting.problem import ShootingProblem
+from nfriction.optim.least_squares import LeastSquaresResult
 
 # Counts of a coarse encoder that is still in use.
 USUAL_COUNTS = 4096
@@ -36,6 +37,8 @@ USUAL_COUNTS = 4096
 SMALL = 1e-3
 # Realisations of the torque's noise for intervals.
 DRAWS = 30
+# Steps of an integration whose error no longer matters, to one of the fit's.
+FINER = 4
 
 
 def rounding(problem: ShootingProblem) -> float:
@@ -172,6 +175,29 @@ def torque_response(
         found.append((_positions(replace(problem, windows=noisy), x) - exact) / SMALL)
     kept = [off for off in found if torch.isfinite(off).all()]
     return torch.stack(kept, -1) if kept else None
+
+
+def integration_error(problem: ShootingProblem, result: LeastSquaresResult) -> Tensor:
+    """Change of the minimum by simulations of finer steps, to first order, like `result.x`.
+
+    Where friction changes its sign within a step, an integration errs by less than an encoder's
+    count; but it errs alike each time, which no average over samples takes out.
+    """
+    variables, x = problem.variables, result.x
+    lower, upper = variables.bounds()
+    free = (lower < upper).nonzero().flatten()
+    finer = replace(problem, substeps=FINER * problem.substeps)
+    off = _positions(finer, x) - _positions(problem, x)
+    run = problem.simulate(x, with_memory=True)
+    weight = problem.loss.weight(problem.deviation(x, run))
+    rows = problem.rows(run, problem.scale * weight.sqrt())
+    scaled = off * problem.scale * weight.sqrt()
+    gradient, _ = normal_equations(rows, scaled, variables.indices(), len(x))
+    step, failed = torch.linalg.solve_ex(result.hessian[free][:, free], -gradient[free])
+    moved = torch.zeros_like(x)
+    if not failed and step.isfinite().all():
+        moved[free] = step
+    return moved
 
 
 def _positions(problem: ShootingProblem, x: Tensor) -> Tensor:

@@ -11,12 +11,21 @@ from torch import Tensor
 from nfriction.fitting.data.inputs import integration_substeps
 from nfriction.fitting.data.windows import Windows, cut_windows
 from nfriction.fitting.options import FitOptions
-from nfriction.fitting.result.identifiability import information, standard_deviations
+from nfriction.fitting.result.identifiability import (
+    covariance_root,
+    information,
+    standard_deviations,
+)
 from nfriction.fitting.result.paired_test import log_ratio, student_quantile
-from nfriction.fitting.shooting.autocorrelation import effective_noise
+from nfriction.fitting.shooting.autocorrelation import (
+    bandwidth,
+    effective_noise,
+    hac_sd,
+    white_noise,
+)
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
-from nfriction.fitting.shooting.uncertainty import explained
+from nfriction.fitting.shooting.uncertainty import explained, gathered_information
 from nfriction.fitting.shooting.variables import Parts, model_at
 from nfriction.fitting.strategy.extrapolation_prior import ExtrapolationPrior
 from nfriction.friction.models import FrictionModel
@@ -331,9 +340,10 @@ def loses(stages: Sequence[HorizonResult], found: HorizonResult) -> bool:
     and a loss of likelihood there beyond that of other parameters within their uncertainty is one.
     Elsewhere law or plant are wrong, and short horizons may be traded for long ones: on free swings
     at will, but errors of a measured torque add up over a long window and lead its parameters
-    astray. As the noise of each horizon is unknown, its log likelihood is that of the root mean
-    square residual; parameters lose that are worse at a shorter horizon by more than its noise, and
-    gain less at their own.
+    astray. Even where these are right, the noise of torques adds up, so that longer windows may
+    determine friction less (`knows_less`). As the noise of each horizon is unknown, its log
+    likelihood is that of the root mean square residual; parameters lose that are worse at a shorter
+    horizon by more than its noise, and gain less at their own.
     """
     from scipy.special import chdtri  # slow to import
 
@@ -341,6 +351,8 @@ def loses(stages: Sequence[HorizonResult], found: HorizonResult) -> bool:
     lower, upper = found.problem.variables.bounds()
     fitted = int((lower < upper)[: found.problem.variables.shared_count].sum())
     driven = bool(found.problem.windows.tau.any())
+    if driven and before.explained and knows_less(found, before):
+        return True
     total, worse = 0.0, False
     for at in (*stages, found):
         new = _squares(at, found)
@@ -356,6 +368,29 @@ def loses(stages: Sequence[HorizonResult], found: HorizonResult) -> bool:
         total += ratio
         worse |= at is not found and ratio > spread * student_quantile(len(new) - 1, 1 - chance)
     return worse and not total <= 0
+
+
+def knows_less(found: HorizonResult, before: HorizonResult) -> bool:
+    """True if a stage leaves the friction more uncertain than one before, by their volume.
+
+    Not of windows of the same length, or without noise of the torque, or where either of them does
+    not determine it at all.
+    """
+    same = found.problem.windows.spans == before.problem.windows.spans
+    if same or not bool(white_noise(found.problem.windows.tau).any()):
+        return False
+    return _log_volume(found) > _log_volume(before)
+
+
+def _log_volume(of: HorizonResult) -> float:
+    """Logarithm of the volume of the friction's uncertainty; NaN where it is infinite."""
+    problem, options = of.problem, of.problem.options
+    lower, upper = problem.variables.bounds()
+    fitted = (lower < upper)[: problem.variables.shared_count].nonzero().flatten()
+    sd = hac_sd(of.residuals, bandwidth(problem.windows.q, options), options)
+    known = gathered_information(problem, of.result.x, sd).subset(fitted)
+    root = covariance_root(known)[fitted < problem.variables.friction_count]
+    return float(torch.linalg.slogdet(root @ root.T)[1])
 
 
 def _squares(at: HorizonResult, of: HorizonResult) -> Tensor:

@@ -42,7 +42,7 @@ _PER_SI: dict[str, dict[str, float]] = {
     "q": _ROTATION | {"m": 1.0, "mm": 1e3},
     "qd": {f"{unit}/s": per for unit, per in _ROTATION.items()}
     | {"rpm": 60 / _TURN, "m/s": 1.0, "mm/s": 1e3},
-    "tau": {"N m": 1.0, "mN m": 1e3, "N": 1.0, "mN": 1e3},
+    "tau": {"N m": 1.0, "mN m": 1e3, "N cm": 1e2, "N": 1.0, "mN": 1e3, "kN": 1e-3},
     "motor": _ROTATION,
     "current": {"A": 1.0, "mA": 1e3},
 }
@@ -50,6 +50,7 @@ _SPELLINGS = {
     "°": "deg", "°/s": "deg/s", "degree": "deg", "degrees": "deg", "degrees/s": "deg/s",
     "Grad": "deg", "Grad/s": "deg/s", "radian": "rad", "radians": "rad", "radians/s": "rad/s",
     "1/min": "rpm", "U/min": "rpm", "Nm": "N m", "N*m": "N m", "N.m": "N m", "mNm": "mN m",
+    "Nmm": "mN m", "N mm": "mN m", "N*mm": "mN m", "N.mm": "mN m", "Ncm": "N cm",
     "sec": "s", "msec": "ms", "μs": "us",
 }  # fmt: skip
 

@@ -69,26 +69,12 @@ class AccelerationClasses:
         stands_for: class whose coefficients each class takes: itself, or a neighbour where there
             are too few data of it, (joint, class).
         notes: joints and classes with too few data, in words.
-        recordings: names of the recordings.
-        joints: names of the joints.
-        times: stamps of each recording [s].
     """
 
     thresholds: Tensor
     labels: tuple[Tensor, ...]
     stands_for: Tensor
     notes: tuple[str, ...]
-    recordings: tuple[str, ...]
-    joints: tuple[str, ...]
-    times: tuple[Array, ...]
-
-    def intervals(self) -> dict[str, dict[str, list[tuple[str, float, float]]]]:
-        """Time intervals by recording and joint: (class, start, end) [s]."""
-        found: dict[str, dict[str, list[tuple[str, float, float]]]] = {}
-        for name, time, labels in zip(self.recordings, self.times, self.labels, strict=True):
-            columns = zip(self.joints, labels.T.numpy(), strict=True)
-            found[name] = {joint: class_intervals(time, known) for joint, known in columns}
-        return found
 
 
 def class_intervals(
@@ -151,9 +137,6 @@ def find_classes(
         labels=tuple(labels),
         stands_for=_merged(seconds, options.least, joints, notes),
         notes=tuple(notes),
-        recordings=tuple(r.name for r in recordings),
-        joints=tuple(joints),
-        times=tuple(r.time for r in recordings),
     )
 
 

@@ -176,6 +176,11 @@ def _noise(linear: LinearPlant, weights: Weights) -> tuple[Array, Array, Array]:
     return process, weights.position_noise**2 * np.eye(n), np.eye(n, 2 * n)
 
 
+def still(_: float) -> tuple[float, float]:
+    """Reference of an arm that is to stay where it is."""
+    return 0.0, 0.0
+
+
 class Feedback:
     """Linear-quadratic feedback to an equilibrium, from afar along a planned motion.
 
@@ -199,7 +204,7 @@ class Feedback:
         top: Gains,
         way: Sequence[Gains] = (),
         *,
-        reference: Callable[[float], tuple[float, float]] = lambda _: (0.0, 0.0),
+        reference: Callable[[float], tuple[float, float]] = still,
         compensation: Compensation | None = None,
         share: float = 1.0,
     ) -> None:

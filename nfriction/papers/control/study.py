@@ -24,13 +24,11 @@ from torch import Tensor
 
 from nfriction.codegen import CompiledFunction
 from nfriction.fitting.fit import fit
-from nfriction.fitting.options import FitOptions
+from nfriction.fitting.options import Method
 from nfriction.friction import model_by_name
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import Coefficient, Law, smooth_sign
 from nfriction.friction.models import FrictionModel
-from nfriction.papers.afem.adaptive import Adaptive
-from nfriction.papers.afem.fit_adaptive import fit_adaptive
 from nfriction.papers.control.feedback import (
     Compensation,
     Feedback,
@@ -39,6 +37,7 @@ from nfriction.papers.control.feedback import (
     balance_gains,
     gains_along,
     linearise,
+    still,
 )
 from nfriction.papers.control.swing_up import plan_swing_up
 from nfriction.papers.twin.dataset import SPECIFICATIONS, Encoder
@@ -147,62 +146,42 @@ def fitted_model(
 ) -> FrictionModel:
     """A model fitted to driven recordings: constants by equation error, others on windows."""
     model = model_by_name(name)(plant.joints)
-    if not model.schedule.follows_motion:
-        fit(model, plant, recordings, method="equation_error", fit_plant=False)
-    elif isinstance(model.schedule, Adaptive):
-        options = FitOptions(windows=WINDOWS, max_steps=max_steps, fit_plant=False)
-        fit_adaptive(model, plant, recordings, options=options)
-    else:
-        fit(model, plant, recordings, windows=WINDOWS, max_steps=max_steps, fit_plant=False)
-    return model
+    method: Method = "output_error" if model.schedule.follows_motion else "equation_error"
+    return fit(
+        model, plant, recordings, method=method, windows=WINDOWS, max_steps=max_steps,
+        fit_plant=False,
+    ).model  # fmt: skip
 
 
 def compensation_of(model: FrictionModel) -> Compensation:
     """Friction torque of a model, sample by sample, compiled; classes advance with the samples."""
     example = torch.zeros(model.joints, dtype=torch.float64)
-    if not model.state_size:
-
-        def torque(qd: Tensor, qdd: Tensor, load: Tensor) -> Tensor:
-            return model.torque(qd, load, model.coefficients(qd, qdd))
-
-        compiled = CompiledFunction(torque, (example,) * 3)
-        return lambda *given: np.reshape(compiled(*map(_rows, given)), given[0].shape)
-
     schedule = model.schedule
     memory: list[Array] = []
-    start = schedule.initial_state(example, example)
 
     def step(qd: Tensor, qdd: Tensor, load: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         # The class of this sample first: a step later it would lag each change of direction.
         following = schedule.advance(qd, qdd, state)
         return model.torque(qd, load, schedule.coefficients_from(qd, qdd, following)), following
 
+    start = schedule.initial_state(example, example)
     advance = CompiledFunction(step, (example, example, example, start))
 
-    def stateful(qd: Array, qdd: Array, load: Array) -> Array:
-        given = [_rows(x) for x in (qd, qdd, load)]
+    def torque(qd: Array, qdd: Array, load: Array) -> Array:
+        given = [np.ascontiguousarray(x).reshape(-1, x.shape[-1]) for x in (qd, qdd, load)]
         if not memory:
-            first = [torch.as_tensor(x) for x in given[:2]]
-            memory.append(schedule.initial_state(*first).detach().numpy())
+            first = schedule.initial_state(*map(torch.as_tensor, given[:2]))
+            memory.append(first.detach().numpy())
         tau_f, memory[0] = advance(*given, memory[0])
         return np.asarray(tau_f).reshape(qd.shape)
 
-    return stateful
-
-
-def _rows(x: Array) -> Array:
-    return np.ascontiguousarray(x).reshape(-1, x.shape[-1])
+    return torque
 
 
 def reference(time: float) -> tuple[float, float]:
     """Angle and rate of the arm that the balance follows: slow, so that friction matters most."""
     w = 2.0 * math.pi * FREQUENCY
     return AMPLITUDE * math.sin(w * time), AMPLITUDE * w * math.cos(w * time)
-
-
-def still(_: float) -> tuple[float, float]:
-    """Reference of an arm that is to stay where it is."""
-    return 0.0, 0.0
 
 
 def weights(joints: int) -> Weights:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ from nfriction.friction.laws import Law
 from nfriction.fuzzy import FuzzySet
 from nfriction.io.files import parse_json, write_atomically
 from nfriction.papers.controller.mamdani import MamdaniController
-from nfriction.papers.controller.rules import RuleBase, Variable
+from nfriction.papers.controller.rules import Variable
 
 Array = NDArray[np.float64]
 
@@ -122,7 +122,7 @@ def evolve(
     own = _genes_of(start)
     reference = judged(own.tolist())
     most = len(start.rule_base.rules)
-    kept = _Checkpoint.read(options)
+    kept = _read(options)
     box = Bounds(np.zeros(len(own)), np.ones(len(own)))
     for price in options.prices:
 
@@ -136,7 +136,7 @@ def evolve(
         near = options.population // 3
         population[:near] = np.clip(own + 0.05 * random.normal(size=(near, len(own))), 0.0, 1.0)
         population[0] = own
-        done, population = kept.populations.get(str(price), (0, population))
+        done, population = kept.get(str(price), (0, population))
         for generation in range(done, options.generations):
             # One generation a call: what is between two is all that a checkpoint needs.
             ended = differential_evolution(
@@ -144,8 +144,11 @@ def evolve(
                 seed=np.random.default_rng([options.seed, generation]), tol=0.0,
             )  # fmt: skip
             population = ended.population
-            kept.populations[str(price)] = generation + 1, population
-            kept.write(options)
+            kept[str(price)] = generation + 1, population
+            if options.checkpoint is not None:
+                rows = {p: (n, np.asarray(of).tolist()) for p, (n, of) in kept.items()}
+                content = {"options": _described(options), "found": rows}
+                write_atomically(options.checkpoint, json.dumps(content).encode())
             if callback is not None:
                 callback(price, generation)
         found += [judged(np.asarray(genes).tolist()) for genes in population]
@@ -195,29 +198,19 @@ def _expressed(start: MamdaniController, genes: Sequence[float]) -> MamdaniContr
     kept = [gate >= 0.5 for gate in genes[-count:]]
     # A controller needs a rule: the one that is nearest to being kept.
     kept[int(np.argmax(genes[-count:]))] = True
-    ends = zip(factors[inputs::2], factors[inputs + 1 :: 2], strict=True)
-    rules = tuple(
-        replace(
-            rule,
-            then=tuple(
-                v.terms[min(int(g * len(v.terms)), len(v.terms) - 1)]
-                for v, g in zip(base.outputs, row, strict=True)
-            ),
-        )
-        for rule, row, keep in zip(base.rules, terms, kept, strict=True)
-        if keep
+
+    def said(row: Array) -> tuple[str, ...]:
+        pairs = zip(base.outputs, row, strict=True)
+        return tuple(v.terms[min(int(g * len(v.terms)), len(v.terms) - 1)] for v, g in pairs)
+
+    rules = zip(base.rules, terms, kept, strict=True)
+    changed = replace(
+        base,
+        inputs=tuple(_moved(v, 0.0, f) for v, f in zip(base.inputs, factors, strict=False)),
+        outputs=tuple(map(_spread, base.outputs, factors[inputs::2], factors[inputs + 1 :: 2])),
+        rules=tuple(replace(rule, then=said(row)) for rule, row, keep in rules if keep),
     )
-    return MamdaniController(
-        RuleBase(
-            base.name,
-            tuple(_moved(v, 0.0, f) for v, f in zip(base.inputs, factors, strict=False)),
-            tuple(
-                _spread(v, middle, width)
-                for v, (middle, width) in zip(base.outputs, ends, strict=True)
-            ),
-            rules,
-        )
-    )
+    return MamdaniController(changed)
 
 
 def _spread(variable: Variable, middle: float, width: float) -> Variable:
@@ -243,33 +236,19 @@ def _moved(variable: Variable, offset: float, factor: float) -> Variable:
     )
 
 
-@dataclass
-class _Checkpoint:
-    """Populations by price with the generations behind them."""
-
-    populations: dict[str, tuple[int, Array]]
-
-    @classmethod
-    def read(cls, options: EvolutionOptions) -> _Checkpoint:
-        path = options.checkpoint
-        if path is None or not path.exists():
-            return cls({})
-        content = parse_json(path.read_bytes())
-        if content["options"] != _described(options):
-            raise ValueError(f"{path}: made with other options; repeat them or take another file.")
-        return cls({p: (done, np.array(rows)) for p, (done, rows) in content["found"].items()})
-
-    def write(self, options: EvolutionOptions) -> None:
-        if options.checkpoint is None:
-            return
-        found = {p: (done, np.asarray(rows).tolist()) for p, (done, rows) in
-                 self.populations.items()}  # fmt: skip
-        content = {"options": _described(options), "found": found}
-        write_atomically(options.checkpoint, json.dumps(content).encode())
+def _read(options: EvolutionOptions) -> dict[str, tuple[int, Array]]:
+    """Generations done and their last population, by price."""
+    path = options.checkpoint
+    if path is None or not path.exists():
+        return {}
+    content = parse_json(path.read_bytes())
+    if content["options"] != _described(options):
+        raise ValueError(f"{path}: made with other options; repeat them or take another file.")
+    return {price: (done, np.array(rows)) for price, (done, rows) in content["found"].items()}
 
 
 def _described(options: EvolutionOptions) -> dict[str, object]:
     """Options that populations depend on; more generations continue a run."""
-    plain = asdict(options)
-    del plain["checkpoint"], plain["generations"]
-    return plain | {"prices": list(options.prices)}
+    return {
+        "prices": list(options.prices), "population": options.population, "seed": options.seed
+    }  # fmt: skip

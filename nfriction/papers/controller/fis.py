@@ -8,14 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nfriction.fuzzy.membership import FuzzySet
-from nfriction.papers.controller.rules import (
-    ANY,
-    Rule,
-    RuleBase,
-    Variable,
-    read_text,
-    shortened,
-)
+from nfriction.papers.controller.rules import ANY, Rule, RuleBase, Variable, read_text, shortened
 
 _METHODS = {"AndMethod": "min", "ImpMethod": "min", "AggMethod": "max", "DefuzzMethod": "centroid"}
 

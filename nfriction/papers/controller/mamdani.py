@@ -1,45 +1,13 @@
 """The papers' fuzzy controller: rule table, min and max, centroid; differentiable and batched."""
 
-from collections.abc import Sequence
 from importlib import resources
 
 import torch
 from torch import Tensor, nn
 
-from nfriction.fuzzy.membership import FuzzySet, bell, trapezoid, two_sided_gaussian
 from nfriction.papers.controller.rules import ANY, SI_FACTOR, RuleBase, parse_rules
 
 _SAMPLES_AT_ONCE = 512  # the clipped output sets of this many fit a core's cache
-# Families of membership functions.
-_GAUSSIAN, _BELL, _TRAPEZOID = 0, 1, 2
-
-
-class LinguisticTerms(nn.Module):
-    """Memberships of one variable in all of its sets; scripts and exports."""
-
-    numbers: Tensor
-    families: list[int]
-
-    def __init__(self, sets: Sequence[FuzzySet]) -> None:
-        super().__init__()
-        # Every set as four numbers of one family: scripts allow no objects of different classes.
-        families, numbers = zip(*(_canonical(term) for term in sets), strict=True)
-        self.families = list(families)
-        self.register_buffer("numbers", torch.tensor(numbers, dtype=torch.float64))
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Memberships, shape (terms, *x.shape)."""
-        held: list[Tensor] = []
-        for term, family in enumerate(self.families):
-            p = self.numbers[term]
-            # Numbers and not their names, for TorchScript sees no globals.
-            if family == 0:
-                held.append(two_sided_gaussian(x, p[0], p[1], p[2], p[3]))
-            elif family == 1:
-                held.append(bell(x, p[0], p[1], p[2]))
-            else:
-                held.append(trapezoid(x, p[0], p[1], p[2], p[3]))
-        return torch.stack(held)
 
 
 class MamdaniController(nn.Module):
@@ -76,7 +44,6 @@ class MamdaniController(nn.Module):
             raise ValueError(f'`centroid` is "trapezoid" or "sum", got {centroid!r}.')
         self.rule_base = rules
         self.inputs, self.outputs = len(rules.inputs), len(rules.outputs)
-        self.terms = nn.ModuleList(LinguisticTerms(variable.sets) for variable in rules.inputs)
         float64 = torch.float64
         universes = torch.tensor([variable.universe for variable in rules.inputs], dtype=float64)
         self.register_buffer("lower", universes[:, 0].clone())
@@ -108,28 +75,18 @@ class MamdaniController(nn.Module):
     def infer(self, x: Tensor) -> Tensor:
         """Outputs (*batch, outputs) of inputs (*batch, inputs) in the rule base's own units."""
         strengths = self._term_strengths(self._rule_strengths(x))
-        if torch.jit.is_scripting() or torch.compiler.is_compiling():
-            y = self._defuzzify(strengths)
-        else:
-            # Exported graphs know no lists of a length that depends on the input.
-            blocks = strengths.split(_SAMPLES_AT_ONCE, -1)
-            y = torch.cat([self._defuzzify(block) for block in blocks], 0)
+        blocks = strengths.split(_SAMPLES_AT_ONCE, -1)
+        y = torch.cat([self._defuzzify(block) for block in blocks], 0)
         return y.reshape(x.shape[:-1] + self.middle.shape)
-
-    def memberships(self, x: Tensor) -> list[Tensor]:
-        """Membership of every term, one (*batch, terms) for each input, in own units."""
-        clamped = torch.clamp(x, self.lower, self.upper)
-        return [terms(clamped[..., i]).movedim(0, -1) for i, terms in enumerate(self.terms)]
 
     def _rule_strengths(self, x: Tensor) -> Tensor:
         """Strengths (rules, samples): the least membership of a rule's terms, times its weight."""
         clamped = torch.clamp(x.reshape(-1, self.inputs), self.lower, self.upper)
         strengths = self.weights
-        for i, terms in enumerate(self.terms):
-            held = terms(clamped[:, i])
+        for i, variable in enumerate(self.rule_base.inputs):
+            held = [term(clamped[:, i]) for term in variable.sets]
             # A row of ones for rules that do not ask for this input.
-            held = torch.cat([held, torch.ones_like(held[:1])])
-            asked = held.index_select(0, self.antecedents[i])
+            asked = torch.stack([*held, torch.ones_like(held[0])])[self.antecedents[i]]
             strengths = asked if i == 0 else torch.minimum(strengths, asked)
         return strengths * self.weights
 
@@ -217,21 +174,3 @@ def _output_sets(
         offset = universe - 0.5 * (universe[0] + universe[-1])
         moments[o] = torch.stack([weights, weights * offset])
     return shapes, moments
-
-
-def _canonical(term: FuzzySet) -> tuple[int, tuple[float, ...]]:
-    """Family of a set and its four numbers: an infinite sigma makes a shoulder."""
-    p = term.parameters
-    if term.shape == "gaussian":
-        return _GAUSSIAN, (p[0], p[1], p[0], p[1])
-    if term.shape == "left_shoulder":
-        return _GAUSSIAN, (p[0], float("inf"), p[0], p[1])
-    if term.shape == "right_shoulder":
-        return _GAUSSIAN, (p[0], p[1], p[0], float("inf"))
-    if term.shape == "two_sided_gaussian":
-        return _GAUSSIAN, p
-    if term.shape == "bell":
-        return _BELL, (*p, 0.0)
-    if term.shape == "triangle":
-        return _TRAPEZOID, (p[0], p[1], p[1], p[2])
-    return _TRAPEZOID, p

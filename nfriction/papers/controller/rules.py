@@ -39,7 +39,7 @@ from pathlib import Path
 from typing import Any
 
 from nfriction.fuzzy.membership import FuzzySet, sets_from_ranges
-from nfriction.io.files import parse_json, write_atomically
+from nfriction.io.files import numbers, parse_json, write_atomically
 
 FORMAT = "nfriction-rules/1"
 # Bounds of foreign files: inference costs rules times points of the output universe.
@@ -245,9 +245,9 @@ def _variable(name: str, entry: Any) -> Variable:
 
 def _set(where: str, term: str, value: dict[str, Any]) -> FuzzySet:
     _check_keys(where, value, {"shape", "parameters"}, set())
-    numbers = _expect(value["parameters"], list, where, '"parameters": a list of numbers')
+    parameters = _expect(value["parameters"], list, where, '"parameters": a list of numbers')
     shape = _expect(value["shape"], str, f"{where}: shape", "text")
-    return FuzzySet(term, shape, tuple(_number(number, where) for number in numbers))
+    return FuzzySet(term, shape, tuple(_number(number, where) for number in parameters))
 
 
 def _table_rules(
@@ -332,21 +332,17 @@ def _check_keys(where: str, entry: Any, needed: set[str], allowed: set[str]) -> 
         )
 
 
-def _number(value: Any, where: str) -> float:
-    # In Python, True is an int.
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"{where}: expected a number, got {_brief(value)}.")
-    try:
-        return float(value)
-    # Integers in JSON have no bound, floats do.
-    except OverflowError as error:
-        raise ValueError(f"{where}: the number is too large.") from error
-
-
 def _pair(value: Any, where: str) -> tuple[float, float]:
     if not isinstance(value, list) or len(value) != 2:
         raise ValueError(f"{where}: expected [low, high], got {_brief(value)}.")
     return _number(value[0], where), _number(value[1], where)
+
+
+def _number(value: Any, where: str) -> float:
+    # `numbers` would read those of a list, too.
+    if isinstance(value, list):
+        raise ValueError(f"{where}: expected a number, got {_brief(value)}.")
+    return float(numbers(where, value))
 
 
 def shortened(error: ValueError) -> str:

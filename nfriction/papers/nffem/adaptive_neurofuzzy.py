@@ -44,6 +44,7 @@ class AdaptiveNeuroFuzzy(Schedule):
     state_size: int = 2
     handles_range = True
     form = "adaptive_neurofuzzy"
+    fit_strategy = "nfriction.papers.nffem.correction:fit_class_correction"
     # Final makes it a constant for TorchScript.
     least_ratio: Final[float] = LEAST_RATIO
 
@@ -79,6 +80,10 @@ class AdaptiveNeuroFuzzy(Schedule):
             adaptive.values.mean(1), largest if scale is None else torch.maximum(largest, scale)
         )
         self.set_parameter_vector(torch.zeros_like(self.parameter_vector()))
+
+    def set_sample_time(self, sample_time: float) -> None:
+        """Set the time between samples [s], see `Adaptive.set_sample_time`."""
+        self.adaptive.set_sample_time(sample_time)
 
     @torch.no_grad()
     def set_range(self, velocity: Tensor, acceleration: Tensor) -> None:

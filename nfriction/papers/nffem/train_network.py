@@ -6,7 +6,7 @@ its outputs, without a validation set. Groups (joints) are trained one after the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from nfriction.fuzzy import Anfis, AnfisRBF, RBFNetwork
-from nfriction.optim.evidence import EvidenceOptions, EvidenceResult
+from nfriction.optim.evidence import EvidenceOptions, EvidenceResult, EvidenceState
 from nfriction.optim.jacobian import trainable
 from nfriction.optim.regularisation import bayesian_regularisation
 from nfriction.papers.controller.mamdani import MamdaniController
@@ -74,6 +74,21 @@ class TrainingOptions(EvidenceOptions):
 
 
 DEFAULTS = TrainingOptions()
+
+
+def recorded_losses(
+    names: Sequence[str],
+) -> tuple[dict[str, list[float]], Callable[[EvidenceState], None]]:
+    """Mean squared error after every step by the name of its group, and the callback for it."""
+    losses: dict[str, list[float]] = {}
+
+    def keep(state: EvidenceState) -> None:
+        # The training of each group counts its steps from 1.
+        if state.step == 1:
+            losses[names[len(losses)]] = []
+        losses[[*losses][-1]].append(0.5 / state.beta)
+
+    return losses, keep
 
 
 @dataclass(frozen=True, eq=False)

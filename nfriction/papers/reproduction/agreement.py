@@ -16,6 +16,7 @@ from nfriction.plant import PendulumChain
 from nfriction.simulation.rollout import rollout
 
 Array = NDArray[np.float64]
+Cells = NDArray[np.int64]
 
 EQUATIONS, TWIN, MUJOCO = "equations", "independent mechanics", "MuJoCo"
 HORIZONS = (1.0, 2.0, 5.0, 10.0)  # [s]
@@ -133,19 +134,18 @@ def _motion(twin: Twin, split: Split) -> Array:
 
 def _shares(train: Array, test: Array) -> tuple[float, float]:
     """Shares of one joint's torque that the two tables miss."""
-    speed, acceleration = (
-        [np.digitize(of[k], np.quantile(train[k], np.linspace(0, 1, n + 1)[1:-1]))
-         for of in (train, test)]
-        for k, n in enumerate((SPEED_CELLS, ACCELERATION_CELLS))
-    )  # fmt: skip
+    cells = []
+    for row, count in ((0, SPEED_CELLS), (1, ACCELERATION_CELLS)):
+        borders = np.quantile(train[row], np.linspace(0, 1, count + 1)[1:-1])
+        cells.append([np.digitize(part[row], borders) for part in (train, test)])
+    speed, acceleration = cells
     both = [ACCELERATION_CELLS * v + a for v, a in zip(speed, acceleration, strict=True)]
     # Cells that training never visited have no mean to judge.
     seen = np.isin(both[1], both[0])
     wanted = test[2, seen]
 
-    def missed(cells: list[NDArray[np.int64]]) -> float:
-        known, judged = cells
+    def missed(known: Cells, judged: Cells) -> float:
         mean = np.bincount(known, train[2]) / np.maximum(np.bincount(known), 1)
         return float(np.sqrt(np.mean((mean[judged[seen]] - wanted) ** 2) / np.mean(wanted**2)))
 
-    return missed(speed), missed(both)
+    return missed(*speed), missed(*both)

@@ -1,53 +1,31 @@
 """The papers' figures from the results of a reproduction."""
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
-from tqdm import tqdm
 
 from nfriction.evaluation.score import RMSE, Score
-from nfriction.io.files import atomic_write
 from nfriction.io.model_file import load
-from nfriction.papers.control.study import SAMPLE_TIME, SHARED, THINNED, balance_figure
 from nfriction.papers.controller.mamdani import paper_controller
 from nfriction.papers.controller.rules import Variable
 from nfriction.papers.nffem.rbf_coefficients import RBFCoefficients
 from nfriction.papers.reproduction import tables
 from nfriction.papers.reproduction.agreement import simulations
-from nfriction.papers.reproduction.stages import (
-    ADAPTIVE,
-    EXPERIMENT,
-    LAWS,
-    NEURO_FUZZY,
-    SECOND_PAPER,
-)
+from nfriction.papers.reproduction.stages import ADAPTIVE, EXPERIMENT, LAWS
 from nfriction.papers.reproduction.workspace import Array, Workspace
 from nfriction.plant import PendulumChain, rigs
-from nfriction.plots import (
-    animate,
-    coefficients_over_time,
-    controller_surface,
-    positions,
-    rmse_bars,
-    style,
-    torque_over_velocity,
-)
+from nfriction.plots import coefficients_over_time, motion, positions, style, torque_over_velocity
 from nfriction.plots.neurofuzzy import draw_map
 from nfriction.recording import Recording
 from nfriction.recording.angles import AngleConvention
-from nfriction.signals import Motion
 from nfriction.simulation.rollout import rollout
 
-DPI = 150
 SHOWN, SECOND_SHOWN = "test_hanging", "test_bent"
 """Held-out recordings that the figures show: the poses of the papers' own model checks."""
 SECOND_SECONDS = 10.0  # as the RTIP paper shows
@@ -55,71 +33,11 @@ INERTIA_SECONDS = 3.0
 """Beyond this a frictionless swing from upright shows rounding rather than inertia."""
 WITHOUT_FRICTION_SECONDS = 6.0
 """Then the motion without friction has nothing in common with the measured one any more."""
-MEASURED = "measured"
 FULL_TENSOR = tuple((0.1 * izz, izz, izz, 0.0, 0.0, 0.0) for izz in (0.04, 0.05, 0.05))
 """Ixx, Iyy, Izz, products of each link [kg m^2]: the printed Izz across, a tenth along it."""
 CLASS_COLOURS = {"low": "#eef3f7", "medium": "#cfe0ec", "high": "#a3c4dc"}
 _POINTS = 600  # of a membership's line
 _CELLS = 81  # of a map along each axis
-
-
-def draw_all(workspace: Workspace, *, progress: bool = False) -> list[Path]:
-    """Draw every figure of both papers as PNG in `figures/`.
-
-    Returns:
-        The files written.
-    """
-    written = []
-    drawers = figures(workspace)
-    for name, draw in tqdm(drawers.items(), unit="figure", disable=not progress, leave=False):
-        figure = draw()
-        path = workspace.folder / "figures" / f"{name}.png"
-        # An interrupt must not leave half a picture under the final name.
-        with atomic_write(path) as temporary:
-            figure.savefig(temporary, dpi=DPI, format="png")
-        figure.clear()
-        written.append(path)
-    lifted = workspace.arrays("control")[f"swing-up, {SHARED}"]
-    time = THINNED * SAMPLE_TIME * np.arange(len(lifted), dtype=np.float64)
-    gif = workspace.folder / "figures" / "control_swing_up.gif"
-    motion = {f"swing-up, {SHARED} compensated": lifted}
-    return [*written, animate(rigs.rtip("free"), time, motion, gif, seconds=8.0)]
-
-
-def figures(workspace: Workspace) -> dict[str, Callable[[], Figure]]:
-    """The function that draws each figure, by the name of its file."""
-    seconds = {
-        f"second_fig_{number}_{law}": partial(second_positions, workspace, law)
-        for number, law in zip((5, 6, 7), LAWS, strict=True)
-    }
-    return {
-        "fig_02_inertia": inertia_cases,
-        "fig_04_without_friction": partial(without_friction, workspace),
-        "fig_07_memberships": controller_memberships,
-        **{
-            f"fig_08_surfaces_joint_{joint}": partial(controller_surface, paper_controller(joint))
-            for joint in (2, 3, 4)
-        },
-        "networks_NFLFM": partial(network_surfaces, workspace),
-        **{
-            f"fig_{number}_coefficients_{model}": partial(coefficients, workspace, model)
-            for number, model in zip((11, 12, 13), NEURO_FUZZY, strict=True)
-        },
-        f"fig_14_positions_{NEURO_FUZZY[-1]}": partial(best_positions, workspace),
-        "second_fig_3_free_arm": second_swing,
-        **seconds,
-        "second_fig_8_torque": partial(second_torque, workspace),
-        "control_balance": lambda: balance_figure(workspace.arrays("control")),
-        "experiment_classes": partial(experiment, workspace),
-        **{
-            f"positions_joint_{joint + 2}": partial(model_groups, workspace, joint)
-            for joint in range(3)
-        },
-        "rmse": lambda: rmse_bars(tables.rmse(workspace, tables.NINE), "rad"),
-        "second_rmse": lambda: rmse_bars(
-            tables.rmse(workspace, SECOND_PAPER).set_axis(list(LAWS)), "rad"
-        ),
-    }
 
 
 def inertia_cases() -> Figure:
@@ -153,33 +71,23 @@ def second_swing() -> Figure:
 def _swings(plants: Mapping[str, PendulumChain], seconds: float) -> Figure:
     """Joint positions of rigs with a free arm, released at 0, 20, 30, 40 degrees as they count."""
     q0 = np.deg2rad([0.0, 20.0, 30.0, 40.0])
-    motions = {}
+    figure, axes = style.panels(len(q0), 1, style.PAGE, 1.3 * len(q0), sharex=True)
+    looks = style.looks(plants)
     for label, plant in plants.items():
         convention, first = AngleConvention.of(plant), plant.first_link
         start = torch.as_tensor(convention.position_to_joint(q0, first))
         steps = round(seconds * 1000)
         run = rollout(plant, None, start, torch.zeros_like(start), sample_time=1e-3, steps=steps)
-        motions[label] = convention.position_from_joint(run.q.numpy(), first)
-    return _lines(motions, ("joint 1", *tables.JOINTS))
-
-
-def _lines(motions: Mapping[str, Array], names: Sequence[str]) -> Figure:
-    """Joint positions at 1 ms (sample, joint), a panel a joint, a line a motion."""
-    figure, axes = style.panels(len(names), 1, style.PAGE, 1.3 * len(names), sharex=True)
-    looks = style.looks(n for n in motions if n != MEASURED)
-    handles: list[Any] = []
-    # Later lines are thinner, so that lines can be distinguished where they coincide.
-    widths = iter((2.2, 1.6, 1.0))
-    for label, motion in motions.items():
-        line = style.MEASURED
-        if label != MEASURED:
-            line = looks[label].line | {"linewidth": next(widths)}
-        for ax, q in zip(axes[:, 0], motion.T, strict=True):
-            ax.plot(np.arange(len(q)) / 1000, q, **line)
-        handles.append(Line2D([], [], **line))
-    _joint_axes(axes[:, 0].tolist(), names, "rad")
+        shown = convention.position_from_joint(run.q.numpy(), first)
+        for ax, q in zip(axes[:, 0], shown.T, strict=True):
+            ax.plot(np.arange(steps + 1) / 1000, q, **looks[label].line)
+    for ax, name in zip(axes[:, 0], ("joint 1", *tables.JOINTS), strict=True):
+        ax.set_ylabel(f"{name} [rad]")
+        ax.yaxis.set_major_locator(MaxNLocator(4))
+        ax.margins(x=0.01)
+    axes[-1, 0].set_xlabel("time [s]")
     figure.align_ylabels(axes[:, 0])
-    style.legend(figure, handles, list(motions))
+    style.legend(figure, [looks[label].handle for label in plants], list(plants))
     return figure
 
 
@@ -202,8 +110,12 @@ def without_friction(workspace: Workspace) -> Figure:
         bench.plant, convention.position_to_joint(q0), convention.rate_to_joint(qd0),
         len(first) - 1,
     )  # fmt: skip
-    motions = {name: convention.position_from_joint(q) for name, q in simulated.items()}
-    return _lines({MEASURED: first.q} | motions, tables.JOINTS)
+    moved = {n: convention.position_from_joint(q) for n, q in simulated.items()}
+    figure = motion(first, {name: _score(first, q) for name, q in moved.items()})
+    for ax in figure.axes:
+        # Here the simulations that leave the measured motion are what is to be seen.
+        ax.autoscale(axis="y")
+    return figure
 
 
 def network_surfaces(workspace: Workspace) -> Figure:
@@ -235,21 +147,22 @@ def coefficients(workspace: Workspace, name: str) -> Figure:
     References:
         TLRIP paper, Figs. 11 to 13.
     """
-    motion = _experiment_motion(workspace)
-    return coefficients_over_time(
-        {name: load(workspace.model(name))}, motion, joint_names=tables.JOINTS
-    )
+    (moved,) = workspace.bench(EXPERIMENT).motions
+    models = {name: load(workspace.model(name))}
+    return coefficients_over_time(models, moved, joint_names=tables.JOINTS)
 
 
-def best_positions(workspace: Workspace) -> Figure:
-    """Measured position of every joint, and simulated by the nonlinear neuro-fuzzy model.
+def group_positions(
+    workspace: Workspace, models: Sequence[str], among: Sequence[str] = tables.NINE
+) -> Figure:
+    """Measured positions and those simulated by these models, errors on the scale of others too.
 
     References:
-        TLRIP paper, Fig. 14.
+        TLRIP paper, Fig. 14 (of NFNLFM).
     """
     recording = next(r for r in workspace.bench("tlrip").test if r.name == SHOWN)
-    best = NEURO_FUZZY[-1]
-    return positions(recording, {best: _score(recording, workspace.arrays(best)[SHOWN])})
+    simulated = {name: workspace.arrays(name)[SHOWN] for name in among}
+    return _on_one_scale(recording, simulated, models)
 
 
 def second_torque(workspace: Workspace) -> Figure:
@@ -263,11 +176,6 @@ def second_torque(workspace: Workspace) -> Figure:
     return torque_over_velocity(bench.plant, models, bench.train, bench.train_motions)
 
 
-def _experiment_motion(workspace: Workspace) -> Motion:
-    (motion,) = workspace.bench(EXPERIMENT).motions
-    return motion
-
-
 def experiment(workspace: Workspace) -> Figure:
     """Position, velocity and acceleration of the friction experiment, a column a joint.
 
@@ -276,27 +184,35 @@ def experiment(workspace: Workspace) -> Figure:
     References:
         TLRIP paper, Table 6.
     """
-    motion = _experiment_motion(workspace)
+    (moved,) = workspace.bench(EXPERIMENT).motions
     intervals = workspace.found(ADAPTIVE[-1])["intervals"]
     figure, axes = style.panels(3, len(tables.JOINTS), style.PAGE, 4.6, sharex=True)
-    rows = (
-        ("position [rad]", motion.q),
-        ("velocity [rad/s]", motion.qd),
-        ("acceleration [rad/s²]", motion.qdd),
-    )
+    rows = {
+        "position [rad]": moved.q, "velocity [rad/s]": moved.qd,
+        "acceleration [rad/s²]": moved.qdd,
+    }  # fmt: skip
+    end = float(moved.time[-1])
     for joint, name in enumerate(tables.JOINTS):
-        for ax, (label, values) in zip(axes[:, joint], rows, strict=True):
-            for known, start, end in intervals[joint]:
-                ax.axvspan(start, end, color=CLASS_COLOURS[known], linewidth=0, zorder=0)
-            ax.plot(motion.time, values[:, joint], color=style.INK, linewidth=0.6)
+        for ax, (label, values) in zip(axes[:, joint], rows.items(), strict=True):
+            for known, start, stop in intervals[joint]:
+                ax.axvspan(start, stop, color=CLASS_COLOURS[known], linewidth=0, zorder=0)
+            ax.plot(moved.time, values[:, joint], color=style.INK, linewidth=0.6)
             ax.grid(False)
             ax.yaxis.set_major_locator(MaxNLocator(4))
-            ax.set_xlim(motion.time[0], motion.time[-1])
+            ax.set_xlim(moved.time[0], end)
             if joint == 0:
                 ax.set_ylabel(label)
         style.title(axes[0, joint], name)
         axes[-1, joint].set_xlabel("time [s]")
-        _strip(axes[0, joint], tables.TABLE_6[name])
+        for known, start, stop in tables.TABLE_6[name]:
+            # A short run ends before the printed intervals do.
+            if start < end:
+                axes[0, joint].axvspan(
+                    start, min(stop, end), ymin=0.93, facecolor=CLASS_COLOURS[known],
+                    edgecolor=style.INK, linewidth=0.4, zorder=4,
+                )  # fmt: skip
+        low, high = axes[0, joint].get_ylim()
+        axes[0, joint].set_ylim(low, high + 0.1 * (high - low))
     figure.align_ylabels(axes[:, 0])
     handles: list[Any] = [Patch(facecolor=colour) for colour in CLASS_COLOURS.values()]
     handles.append(Patch(facecolor="none", edgecolor=style.INK, linewidth=0.4))
@@ -320,42 +236,6 @@ def controller_memberships() -> Figure:
     return figure
 
 
-def model_groups(workspace: Workspace, joint: int) -> Figure:
-    """Measured and simulated position of one joint, a column a kind of model, error below."""
-    bench = workspace.bench("tlrip")
-    recording = next(r for r in bench.test if r.name == SHOWN)
-    groups = {"constant": tuple(LAWS), "adaptive": ADAPTIVE, "neuro-fuzzy": NEURO_FUZZY}
-    q = {n: workspace.arrays(n)[SHOWN][:, joint] for names in groups.values() for n in names}
-    measured = recording.q[:, joint]
-    span = float(np.ptp(measured)) or 1.0
-    figure, axes = style.panels(
-        2, len(groups), style.PAGE, 3.4, sharex=True, sharey="row", height_ratios=[1.5, 1]
-    )
-    # The groups are side by side, so the models of each take the same looks.
-    looks = [look for name, look in style.looks(LAWS).items() if name in LAWS]
-    errors = np.concatenate(list(q.values())) - np.tile(measured, len(q))
-    largest = float(np.abs(errors[np.isfinite(errors)]).max(initial=0.0))
-    # A model that diverges must not flatten all others.
-    shown = min(largest, 0.5 * span) or span
-    factor, unit = style.scaled(recording.unit, shown)
-    for (group, models), (above, below) in zip(groups.items(), axes.T, strict=True):
-        above.plot(recording.time, measured, **style.MEASURED)
-        for look, model in zip(looks, models, strict=True):
-            above.plot(recording.time, q[model], **look.line)
-            below.plot(recording.time, factor * (q[model] - measured), **look.line)
-        style.title(above, group)
-        below.set_xlabel("time [s]")
-    axes[0, 0].set_ylim(measured.min() - 0.25 * span, measured.max() + 0.25 * span)
-    axes[1, 0].set_ylim(style.padded(-factor * shown, factor * shown))
-    axes[0, 0].set_ylabel(f"{recording.names[joint]} [{recording.unit}]")
-    axes[1, 0].set_ylabel(f"error [{unit}]")
-    figure.align_ylabels(axes[:, 0])
-    handles = [Line2D([], [], **line) for line in (style.MEASURED, *(x.line for x in looks))]
-    labels = [", ".join(models) for models in zip(*groups.values(), strict=True)]
-    style.legend(figure, handles, ["measured", *labels])
-    return figure
-
-
 def second_positions(workspace: Workspace, law: str) -> Figure:
     """Measured and simulated positions on the second paper's rig, the first ten seconds.
 
@@ -367,16 +247,20 @@ def second_positions(workspace: Workspace, law: str) -> Figure:
     simulated = {
         name: workspace.arrays(f"rtip-{name}")[SECOND_SHOWN][: len(first)] for name in LAWS
     }
-    figure = positions(first, {law: _score(first, simulated[law])})
-    # One scale of error for the three figures, so that they can be compared by eye.
-    errors = np.stack([np.abs(q - first.q) for q in simulated.values()])
-    largest = np.nanmax(np.where(np.isfinite(errors), errors, np.nan), axis=(0, 1))
-    for ax, most in zip(figure.axes[1::2], largest.tolist(), strict=True):
-        factor, unit = style.scaled(first.unit, most)
-        (line,) = ax.lines
-        line.set_ydata(factor * (simulated[law] - first.q)[:, figure.axes.index(ax) // 2])
-        ax.set_ylim(style.padded(-factor * most, factor * most))
-        ax.set_ylabel(f"error [{unit}]")
+    return _on_one_scale(first, simulated, [law])
+
+
+def _on_one_scale(
+    recording: Recording, simulated: Mapping[str, Array], shown: Sequence[str]
+) -> Figure:
+    """Positions by the models shown, errors on the scale of all, to compare figures by eye."""
+    figure = positions(recording, {name: _score(recording, simulated[name]) for name in shown})
+    errors = np.abs(np.stack(list(simulated.values())) - recording.q)
+    largest = np.where(np.isfinite(errors), errors, 0.0).max((0, 1))
+    # A model that diverges must not flatten all others.
+    largest = np.minimum(largest, 0.5 * np.ptp(recording.q, axis=0))
+    for ax, most in zip(figure.axes[1::2], 1e3 * largest, strict=True):
+        ax.set_ylim(style.padded(-most, most))
     return figure
 
 
@@ -392,14 +276,6 @@ def _score(recording: Recording, simulated: Array) -> Score:
         simulated=simulated,
         diverged_at=float(recording.time[lost.argmax()]) if lost.any() else np.inf,
     )
-
-
-def _joint_axes(axes: Sequence[Axes], names: Sequence[str], unit: str) -> None:
-    for ax, name in zip(axes, names, strict=True):
-        ax.set_ylabel(f"{name} [{unit}]")
-        ax.yaxis.set_major_locator(MaxNLocator(4))
-        ax.margins(x=0.01)
-    axes[-1].set_xlabel("time [s]")
 
 
 def _sets(ax: Axes, variable: Variable) -> None:
@@ -424,18 +300,3 @@ def _sets(ax: Axes, variable: Variable) -> None:
     ax.xaxis.set_major_locator(MaxNLocator(5))
     name = style.symbol(variable.name) if len(variable.name) == 1 else variable.name
     ax.set_xlabel(f"{name} [{unit.replace('^2', '²')}]")
-
-
-def _strip(ax: Axes, intervals: Sequence[tuple[str, float, float]]) -> None:
-    """Intervals as a strip along the upper edge of a panel."""
-    right = ax.get_xlim()[1]
-    for known, start, stop in intervals:
-        # A short run ends before the printed intervals do.
-        if start >= right:
-            continue
-        ax.axvspan(
-            start, min(stop, right), ymin=0.93, facecolor=CLASS_COLOURS[known],
-            edgecolor=style.INK, linewidth=0.4, zorder=4,
-        )  # fmt: skip
-    low, high = ax.get_ylim()
-    ax.set_ylim(low, high + 0.1 * (high - low))

@@ -1,142 +1,282 @@
-"""One page with every table and figure of both papers, in their order, beside what they print."""
+"""Every table and figure of both papers, in their order: as files, as text, and on one page."""
 
 import base64
-from dataclasses import dataclass
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import jinja2
+import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
+from tqdm import tqdm
 
-from nfriction.io.files import write_atomically
-from nfriction.papers.reproduction.stages import NEURO_FUZZY
-from nfriction.papers.reproduction.tables import all_tables, conclusion, fit_ends, order
+from nfriction.io.files import atomic_write, write_atomically
+from nfriction.papers.control.study import SAMPLE_TIME, SHARED, THINNED, balance_figure
+from nfriction.papers.controller.mamdani import paper_controller
+from nfriction.papers.reproduction import figures, tables
+from nfriction.papers.reproduction.stages import ADAPTIVE, LAWS, NEURO_FUZZY, SECOND_PAPER, stages
 from nfriction.papers.reproduction.workspace import Workspace
+from nfriction.plant import rigs
+from nfriction.plots import animate, controller_surface, rmse_bars
 from nfriction.version import __version__
 
 PAGE = "reproduction.html"
+DPI = 150
 _STYLE = resources.files("nfriction.report") / "templates" / "page.css"
 _TEMPLATE = resources.files("nfriction.papers.reproduction") / "data" / "page.html.j2"
+
+Table = Callable[[Workspace], pd.DataFrame]
+Drawing = Callable[[Workspace], Figure]
 
 
 @dataclass(frozen=True)
 class Item:
-    """A table or figure of a paper on the page.
+    """A table or figure of a paper.
 
     Attributes:
         title: its number and caption's content.
-        files: names of tables and figures here, without ending.
         differs: how ours differs from the paper's, if it does.
+        tables: caption and content, by the name of the file.
+        figures: by the name of the file.
         models: whose fits ended as the page then says.
     """
 
     title: str
-    files: tuple[str, ...]
     differs: str = ""
+    tables: Mapping[str, tuple[str, Table]] = field(default_factory=dict)
+    figures: Mapping[str, Drawing] = field(default_factory=dict)
     models: tuple[str, ...] = ()
 
 
 FIRST = (
-    Item("Fig. 2: swing from 0°, 20°, 30°, 40° for three cases of inertia", ("fig_02_inertia",),
-         "No full tensor is printed; ours is Izz across and a tenth of it along each link."),
+    Item("Fig. 2: swing from 0°, 20°, 30°, 40° for three cases of inertia",
+         "No full tensor is printed; ours is Izz across and a tenth of it along each link.",
+         figures={"fig_02_inertia": lambda _: figures.inertia_cases()}),
     Item("Fig. 4: model without friction, an independent simulation and the measured motion",
-         ("fig_04_without_friction", "fig_4_agreement"),
-         "MuJoCo takes the place of SimMechanics, the twin that of the measured motion."),
+         "MuJoCo takes the place of SimMechanics, the twin that of the measured motion.",
+         {"fig_4_agreement": (
+             "Fig. 4: difference from our simulation without friction, from 20.56°, 32.21°, 45°",
+             lambda _: tables.agreement_table())},
+         {"fig_04_without_friction": figures.without_friction}),
     Item("Table 6 and the experiment: classes of acceleration over time",
-         ("table_6", "experiment_classes"),
-         "The experiment is a release from upright, the reading of 180° that fits Table 4."),
-    Item("Tables 7, 8, 9: adaptive coefficients by class", ("table_7", "table_8", "table_9"),
+         "The experiment is a release from upright, the reading of 180° that fits Table 4.",
+         {"table_6": ("Table 6: classes of acceleration in the experiment", tables.table_6)},
+         {"experiment_classes": figures.experiment}),
+    Item("Tables 7, 8, 9: adaptive coefficients by class",
          "The printed ones are lost in the scan. The paper searches by pattern; Gauss-Newton's are "
-         "those from which the neuro-fuzzy models start."),
-    Item("Fig. 7 and Table 4: fuzzy sets of joint 2", ("fig_07_memberships",)),
+         "those from which the neuro-fuzzy models start.",
+         {f"table_{number}": (
+             f"Table {number}: coefficients of A{law} by class of acceleration (the print is lost)",
+             partial(tables.adaptive_coefficients, law=law))
+          for number, law in zip((7, 8, 9), LAWS, strict=True)}),
+    Item("Fig. 7 and Table 4: fuzzy sets of joint 2",
+         figures={"fig_07_memberships": lambda _: figures.controller_memberships()}),
     Item("Fig. 8 and Table 5: coefficients that the fuzzy controllers give",
-         tuple(f"fig_08_surfaces_joint_{joint}" for joint in (2, 3, 4)),
-         "Rules (b) and (c) are lost; all joints have rules (a)."),
-    Item("Networks 2-10-2 after their training on the controllers' outputs", ("networks_NFLFM",),
+         "Rules (b) and (c) are lost; all joints have rules (a).",
+         figures={f"fig_08_surfaces_joint_{joint}":
+                  lambda _, joint=joint: controller_surface(paper_controller(joint))  # type: ignore[misc]
+                  for joint in (2, 3, 4)}),
+    Item("Networks 2-10-2 after their training on the controllers' outputs",
          "The paper shows none. Controllers here span the coefficients by class of the twin.",
-         ("NFLFM-papers",)),
+         figures={"networks_NFLFM": figures.network_surfaces}, models=("NFLFM-papers",)),
     Item("Figs. 11, 12, 13: coefficients of the neuro-fuzzy models in the experiment",
-         ("fig_11_coefficients_NFNCFM", "fig_12_coefficients_NFLFM",
-          "fig_13_coefficients_NFNLFM"),
          "Where the network's correction did not pass its hold-out windows, a joint has the steps "
-         "of the classes alone.", NEURO_FUZZY),
-    Item("Fig. 14: measured and simulated position", ("fig_14_positions_NFNLFM",),
-         "On a recording that no model was fitted to."),
+         "of the classes alone.",
+         figures={f"fig_{number}_coefficients_{name}": partial(figures.coefficients, name=name)
+                  for number, name in zip((11, 12, 13), NEURO_FUZZY, strict=True)},
+         models=NEURO_FUZZY),
+    Item("Fig. 14: measured and simulated position",
+         "On a recording that no model was fitted to.",
+         figures={f"fig_14_positions_{NEURO_FUZZY[-1]}":
+                  partial(figures.group_positions, models=NEURO_FUZZY[-1:],
+                          among=NEURO_FUZZY[-1:])}),
     Item("Table 10: position error of every model",
-         ("table_10", "table_10_measured_drive", "rmse"),
          "Another machine's friction: the printed numbers cannot come out. -pattern: by the "
-         "papers' pattern search; -papers: by their fuzzy controller and network."),
-    Item("Table 11: error of NFNLFM below that of each other model", ("table_11", "error_saved")),
+         "papers' pattern search; -papers: by their fuzzy controller and network.",
+         {"table_10": (
+             "Table 10: position RMSE [mrad] on test releases, free runs, coefficients driven by "
+             "the simulated motion", tables.table_10),
+          "table_10_measured_drive": (
+             "Table 10 again, coefficients driven by the measured motion as in the paper [mrad]",
+             partial(tables.table_10, drive="measured_drive"))},
+         {"rmse": lambda workspace: rmse_bars(tables.rmse(workspace, tables.NINE), "rad")}),
+    Item("Table 11: error of NFNLFM below that of each other model",
+         tables={
+             "table_11": ("Table 11: error of NFNLFM below that of each other model [%]",
+                          tables.table_11),
+             "error_saved": ("error saved by coefficients by class and by networks within a law "
+                             "[%]", tables.steps_saved)}),
 )  # fmt: skip
 SECOND = (
-    Item("Fig. 3: four joints from 0°, 20°, 30°, 40°", ("second_fig_3_free_arm",),
-         "Counted from hanging, as that paper does."),
-    Item("Tables I, II, III: coefficients",
-         ("second_table_i", "second_table_ii", "second_table_iii"),
-         "Coefficients of the twin."),
+    Item("Fig. 3: four joints from 0°, 20°, 30°, 40°",
+         "Counted from hanging, as that paper does.",
+         figures={"second_fig_3_free_arm": lambda _: figures.second_swing()}),
+    Item("Tables I, II, III: coefficients", "Coefficients of the twin.",
+         {f"second_table_{roman.lower()}": (f"second paper, Table {roman}: {law} by {method}",
+                                            partial(tables.second_coefficients, law=law))
+          for roman, law, method in zip(
+              ("I", "II", "III"), LAWS,
+              ("sequential quadratic programming", "pattern search", "pattern search"),
+              strict=True)}),
     Item("Figs. 5, 6, 7: measured and simulated position, first 10 s, one scale of error",
-         ("second_fig_5_NCFM", "second_fig_6_LFM", "second_fig_7_NLFM"),
-         "From 20°, 30°, 40°, which no model was fitted to; the paper shows its own fit from 45°."),
-    Item("Fig. 8: friction torque over velocity", ("second_fig_8_torque",),
-         "Dots: the torque that the smoothed motion implies."),
-    Item("Table IV: position error", ("second_table_iv", "second_rmse")),
+         "From 20°, 30°, 40°, which no model was fitted to; the paper shows its own fit from 45°.",
+         figures={f"second_fig_{number}_{law}": partial(figures.second_positions, law=law)
+                  for number, law in zip((5, 6, 7), LAWS, strict=True)}),
+    Item("Fig. 8: friction torque over velocity",
+         "Dots: the torque that the smoothed motion implies.",
+         figures={"second_fig_8_torque": figures.second_torque}),
+    Item("Table IV: position error", "",
+         {"second_table_iv": ("second paper, Table IV: position RMSE [mrad] on test releases, free "
+                              "runs", tables.second_table_4)},
+         {"second_rmse": lambda workspace: rmse_bars(
+             tables.rmse(workspace, SECOND_PAPER).set_axis(list(LAWS)), "rad")}),
 )  # fmt: skip
+TASKS = {
+    "still": "a link balanced upright, the arm to stay still",
+    "follow": "a link balanced upright while the arm follows a slow sine",
+    "swing-up": "three links swung up in 5 s and balanced, planned with the same friction",
+    "three links": "three links balanced upright while the arm follows a slow sine",
+}
 FUTURE = (
-    Item("Control of the rig with the friction models",
-         ("control_still", "control_follow", "control_balance", "control_swing_up",
-          "control_three_links"),
-         "In simulation."),
+    Item("Control of the rig with the friction models", "In simulation.",
+         {f"control_{task.replace(' ', '_').replace('-', '_')}": (
+             f"future work, control: {what}, by the model whose friction torque is compensated "
+             "(inf: fallen)", partial(tables.control_table, task=task))
+          for task, what in TASKS.items()},
+         {"control_balance": lambda workspace: balance_figure(workspace.arrays("control"))}),
 )  # fmt: skip
 OTHERS = (
-    Item("Positions by kind of model", tuple(f"positions_joint_{joint}" for joint in (2, 3, 4))),
-)
+    Item("Positions by kind of model", "Errors on one scale.",
+         figures={f"positions_{kind}": partial(figures.group_positions, models=models)
+                  for kind, models in (("constant", tuple(LAWS)), ("adaptive", ADAPTIVE),
+                                       ("neuro_fuzzy", NEURO_FUZZY))}),
+)  # fmt: skip
 PARTS = (
     ("Neuro-fuzzy friction models for a triple link rotary inverted pendulum (TLRIP)", FIRST),
     ("Comparison of friction estimation models (RTIP)", SECOND),
     ("Future work of the papers", FUTURE),
     ("Not in the papers", OTHERS),
 )
+ITEMS = tuple(item for _, items in PARTS for item in items)
+SWING_UP = "control_swing_up"
+"""Table and animation of the swing-up."""
+
+
+def all_tables(workspace: Workspace) -> dict[str, tuple[str, pd.DataFrame]]:
+    """Caption and content of every table, by the name of its file."""
+    return {
+        name: (caption, make(workspace))
+        for item in ITEMS
+        for name, (caption, make) in item.tables.items()
+    }
+
+
+def write_tables(workspace: Workspace, *, command: str = "") -> list[Path]:
+    """Write `tables/*.csv`, `rmse.csv` with every error, and `results.json`."""
+    results = {
+        "command": command,
+        "settings": workspace.settings.to_dict(),
+        "order": tables.order(workspace)._asdict(),
+        "stages": {name: workspace.found(name) for name in stages()},
+    }
+    content = {
+        "rmse.csv": tables.long_table(workspace).to_csv(index=False),
+        "results.json": json.dumps(results, indent=1, allow_nan=False),
+    }
+    for name, (_, table) in all_tables(workspace).items():
+        content[f"tables/{name}.csv"] = _flat(table).to_csv(index_label="row")
+    return [write_atomically(workspace.folder / n, t.encode()) for n, t in content.items()]
+
+
+def text(workspace: Workspace) -> str:
+    """All tables beside the printed ones, and whether the papers' order of models holds."""
+    parts = [
+        f"{caption}\n"
+        + _shown(caption, table).to_string(float_format=lambda x: f"{x:.4g}", na_rep="")
+        for caption, table in all_tables(workspace).values()
+    ]
+    parts.append(
+        "printed: the papers' numbers, from recordings that were never published and another "
+        "machine's friction;\nours: simulated twins. -papers: made by the papers' own procedure "
+        "(fuzzy controller, 2-10-2 network), -pattern: by their pattern search."
+    )
+    ends = tables.fit_ends(workspace)
+    return "\n\n".join([*parts, str(tables.order(workspace)), f"how the fits ended\n{ends}"])
+
+
+def draw_all(workspace: Workspace, *, progress: bool = False) -> list[Path]:
+    """Draw every figure of both papers as PNG in `figures/`.
+
+    Returns:
+        The files written.
+    """
+    folder, written = workspace.folder / "figures", []
+    drawings = {name: draw for item in ITEMS for name, draw in item.figures.items()}
+    for name, draw in tqdm(drawings.items(), unit="figure", disable=not progress, leave=False):
+        figure, path = draw(workspace), folder / f"{name}.png"
+        # An interrupt must not leave half a picture under the final name.
+        with atomic_write(path) as temporary:
+            figure.savefig(temporary, dpi=DPI, format="png")
+        figure.clear()
+        written.append(path)
+    lifted = workspace.arrays("control")[f"swing-up, {SHARED}"]
+    time = THINNED * SAMPLE_TIME * np.arange(len(lifted), dtype=np.float64)
+    motion = {f"swing-up, {SHARED} compensated": lifted}
+    plant, gif = rigs.rtip("free"), folder / f"{SWING_UP}.gif"
+    return [*written, animate(plant, time, motion, gif, seconds=8.0)]
 
 
 def write_page(workspace: Workspace) -> Path:
     """Write `reproduction.html` with the tables, and the figures that were drawn."""
-    tables = all_tables(workspace)
-    parts = [(title, [_shown(workspace, tables, item) for item in items]) for title, items in PARTS]
-    made = jinja2.Environment(autoescape=True).from_string(_TEMPLATE.read_text(encoding="utf-8"))
-    text = made.render(
+    made = all_tables(workspace)
+    parts = [
+        (title, [_rendered(workspace, made, item) for item in items]) for title, items in PARTS
+    ]
+    template = jinja2.Environment(autoescape=True).from_string(_TEMPLATE.read_text("utf-8"))
+    page = template.render(
         parts=parts, style=_STYLE.read_text(encoding="utf-8"), version=__version__,
-        conclusion=conclusion(workspace).splitlines(), order=str(order(workspace)),
-        fits=fit_ends(workspace), settings=workspace.settings.to_dict(),
+        conclusion=tables.conclusion(workspace).splitlines(), order=str(tables.order(workspace)),
+        fits=tables.fit_ends(workspace), settings=workspace.settings.to_dict(),
     )  # fmt: skip
-    return write_atomically(workspace.folder / PAGE, text.encode())
+    return write_atomically(workspace.folder / PAGE, page.encode())
 
 
-def _shown(
-    workspace: Workspace, tables: dict[str, tuple[str, pd.DataFrame]], item: Item
+def _rendered(
+    workspace: Workspace, made: Mapping[str, tuple[str, pd.DataFrame]], item: Item
 ) -> dict[str, Any]:
-    """An item's tables as headings and rows of text, and its pictures as URLs."""
+    """An item's tables with cells of text, and its pictures as URLs."""
     ends = [f"{name}: {workspace.found(name)['fit']['status']}" for name in item.models]
-    differs = " ".join([item.differs, *ends]).strip()
-    shown: dict[str, Any] = {"item": item, "differs": differs, "tables": [], "pictures": []}
-    for name in item.files:
-        if name in tables:
-            caption, table = tables[name]
-            # Coefficients stay in SI; errors are read in thousandths.
-            table = 1e3 * table if "[mrad]" in caption else table
-            columns = [f"{column[1]}, {column[0]}" for column in table.columns]
-            rows = [(str(n), [_text(v) for v in row]) for n, row in
-                    zip(table.index, table.to_numpy(), strict=True)]  # fmt: skip
-            shown["tables"].append((caption, columns, rows))
-        for suffix, kind in ((".png", "png"), (".gif", "gif")):
-            path = workspace.folder / "figures" / f"{name}{suffix}"
-            if path.exists():
-                data = base64.b64encode(path.read_bytes()).decode()
-                shown["pictures"].append((path.name, f"data:image/{kind};base64,{data}"))
-    return shown
+    shown = [made[name] for name in item.tables]
+    pictures = {
+        path.name: f"data:image/{path.suffix[1:]};base64,"
+        + base64.b64encode(path.read_bytes()).decode()
+        for name in (*item.figures, *item.tables)
+        for path in (workspace.folder / "figures").glob(f"{name}.*")
+    }
+    return {
+        "title": item.title,
+        "differs": " ".join([item.differs, *ends]),
+        "tables": [(caption, _flat(_shown(caption, t)).map(_cell)) for caption, t in shown],
+        "pictures": pictures.items(),
+    }
 
 
-def _text(value: Any) -> str:
+def _shown(caption: str, table: pd.DataFrame) -> pd.DataFrame:
+    # Coefficients stay in SI; errors are read in thousandths.
+    return 1e3 * table if "[mrad]" in caption else table
+
+
+def _flat(table: pd.DataFrame) -> pd.DataFrame:
+    # One header row, so that any reader of CSV can read it.
+    return table.set_axis([f"{column[1]}, {column[0]}" for column in table.columns], axis=1)
+
+
+def _cell(value: Any) -> str:
     if isinstance(value, str):
         return value
     return "" if pd.isna(value) else f"{value:.4g}"

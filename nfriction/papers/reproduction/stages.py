@@ -1,41 +1,36 @@
 """Stages of a reproduction: fits and their scores, several at a time, kept when finished."""
 
-import logging
 import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from dataclasses import dataclass, replace
+from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
+from graphlib import TopologicalSorter
 from multiprocessing import get_context, parent_process
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from tqdm import tqdm
 
 from nfriction.evaluation.compare import coefficient_summary
-from nfriction.evaluation.results import model_info
 from nfriction.evaluation.score import RMSE, score
-from nfriction.export import ExportError, torchscript
 from nfriction.fitting.fit import fit
-from nfriction.fitting.options import FitOptions
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.friction import model_by_name
 from nfriction.friction.models import FrictionModel
-from nfriction.io.model_file import ModelInfo, load, load_info, save
-from nfriction.optim.evidence import EvidenceState
+from nfriction.io.model_file import load, load_info, save
 from nfriction.papers import twin
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
 from nfriction.papers.afem.classes import class_intervals
-from nfriction.papers.afem.fit_adaptive import fit_adaptive
 from nfriction.papers.afem.fit_by_search import SearchMethod, SearchOptions, fit_by_search
 from nfriction.papers.control import study
-from nfriction.papers.nffem.refine_adaptive import refine_adaptive
-from nfriction.papers.nffem.train_network import TrainingOptions
+from nfriction.papers.nffem.train_network import TrainingOptions, recorded_losses
 from nfriction.papers.reproduction.agreement import missed_torque
 from nfriction.papers.reproduction.procedure import papers_neuro_fuzzy
 from nfriction.papers.reproduction.workspace import (
@@ -51,8 +46,6 @@ from nfriction.recording import Recording
 from nfriction.signals import causal_motion
 from nfriction.simulation.rollout import rollout
 from nfriction.simulation.validate import required_substeps
-
-logger = logging.getLogger(__name__)
 
 LAWS = {"NCFM": "viscous", "LFM": "linear", "NLFM": "nonlinear"}
 """The papers' laws by the name of their constant model."""
@@ -71,44 +64,33 @@ COUNTS = 8192
 """Counts a revolution of the papers' encoders, four edges to each of 2048 lines."""
 
 
-@dataclass(frozen=True)
-class Stage:
+class Stage(NamedTuple):
     """One step of a reproduction.
 
     Attributes:
-        name: of its files.
         needs: stages that come before it.
-        run: does it, given the workspace; returns its result, plain JSON.
+        run: does it, given the workspace and the stage's name; returns its result, plain JSON.
     """
 
-    name: str
     needs: tuple[str, ...]
-    run: Callable[[Workspace], dict[str, Any]]
+    run: Callable[[Workspace, str], dict[str, Any]]
 
 
 def stages() -> dict[str, Stage]:
     """All stages by name; those that take longest, and what they wait for, come first."""
-    found = [Stage(f"twin-{name}", (), partial(make_twin, name=name)) for name in twin.names()]
+    found = {f"twin-{name}": Stage((), make_twin) for name in twin.names()}
+    constant = Stage(("twin-tlrip",), partial(fitted, fit_from_start))
     for law in reversed(LAWS):
-        found += [
-            Stage(law, ("twin-tlrip",), partial(fitted, fit=fit_constant, name=law)),
-            Stage(
-                f"A{law}",
-                (law, f"twin-{EXPERIMENT}"),
-                partial(fitted, fit=fit_by_class, name=f"A{law}"),
-            ),
-            Stage(
-                f"A{law}-pattern",
-                (law, f"twin-{EXPERIMENT}"),
-                partial(fitted, fit=fit_by_pattern, name=f"A{law}-pattern"),
-            ),
-            Stage(f"NF{law}", (f"A{law}",), partial(fitted, fit=fit_network, name=f"NF{law}")),
-            Stage(f"NF{law}-papers", (f"A{law}",), partial(papers_way, law=law)),
-            Stage(f"rtip-{law}", ("twin-rtip",), partial(second_paper, law=law)),
-        ]
-    constant = partial(fitted, fit=fit_constant, name="Stribeck")
-    found += [Stage("Stribeck", ("twin-tlrip",), constant), Stage("control", (), controlled)]
-    return {stage.name: stage for stage in found}
+        by_class = (law, f"twin-{EXPERIMENT}")
+        found |= {
+            law: constant,
+            f"A{law}": Stage(by_class, partial(fitted, fit_by_class)),
+            f"A{law}-pattern": Stage(by_class, partial(fitted, fit_by_pattern)),
+            f"NF{law}": Stage((f"A{law}",), partial(fitted, fit_network)),
+            f"NF{law}-papers": Stage((f"A{law}",), papers_way),
+            f"rtip-{law}": Stage(("twin-rtip",), second_paper),
+        }
+    return found | {"Stribeck": constant, "control": Stage((), controlled)}
 
 
 def reproduce(
@@ -147,40 +129,38 @@ def reproduce(
 
 
 def _run_all(workspace: Workspace, waiting: dict[str, Stage], jobs: int, bar: "tqdm[Any]") -> None:
+    order = TopologicalSorter({n: waiting.keys() & stage.needs for n, stage in waiting.items()})
+    order.prepare()
+    ready: set[str] = set()
     running: dict[Future[None], str] = {}
-    finished = False
-    pool = ProcessPoolExecutor(
-        jobs, mp_context=get_context("spawn"), initializer=_end_with_the_caller
-    )
-    try:
-        while waiting or running:
-            for name in _ready(waiting, running.values()):
-                if len(running) == jobs:
-                    break
+    with (
+        ProcessPoolExecutor(
+            jobs, mp_context=get_context("spawn"), initializer=_end_with_the_caller
+        ) as pool,
+        ExitStack() as on_error,
+    ):
+        on_error.callback(_terminate, pool)
+        while order.is_active():
+            ready |= {*order.get_ready()}
+            for name in [n for n in waiting if n in ready][: jobs - len(running)]:
+                ready.remove(name)
                 running[pool.submit(run_stage, workspace, name)] = name
-                del waiting[name]
             bar.set_postfix_str(", ".join(running.values()))
             # The timeout keeps the bar's clock running.
             done, _ = wait(running, timeout=1.0, return_when=FIRST_COMPLETED)
             for future in done:
-                del running[future]
                 future.result()
+                order.done(running.pop(future))
                 bar.update()
             bar.refresh()
-        finished = True
-    finally:
-        if not finished:
-            # An error or an interrupt. Only an interrupt of the keyboard reaches the workers, and
-            # one of them may have been started just before, so it is not among `running` yet.
-            for worker in list((pool._processes or {}).values()):
-                worker.terminate()
-        pool.shutdown(cancel_futures=True)
+        on_error.pop_all()
 
 
-def _ready(waiting: Mapping[str, Stage], running: Iterable[str]) -> list[str]:
-    """Stages whose needs are finished, in their order."""
-    blocked = {*waiting, *running}
-    return [name for name, stage in waiting.items() if not blocked & set(stage.needs)]
+def _terminate(pool: ProcessPoolExecutor) -> None:
+    # Only an interrupt of the keyboard reaches the workers, and one of them may have been started
+    # just before, so that it is not known to be running yet.
+    for worker in list((pool._processes or {}).values()):
+        worker.terminate()
 
 
 def _end_with_the_caller() -> None:
@@ -202,20 +182,20 @@ def run_stage(workspace: Workspace, name: str) -> None:
     # Several threads make small tensors up to 100 times slower.
     torch.set_num_threads(1)
     start = time.perf_counter()
-    result = stages()[name].run(workspace)
+    result = stages()[name].run(workspace, name)
     workspace.finish(name, result | {"seconds": time.perf_counter() - start})
 
 
 def make_twin(workspace: Workspace, name: str) -> dict[str, Any]:
     """Simulate a twin's recordings, and smooth them once for all fits."""
-    settings = workspace.settings
-    duration = settings.rtip_seconds if name == "rtip" else settings.tlrip_seconds
-    made = twin.build(name, workspace.folder / "twin" / name, seed=settings.seed, duration=duration)
+    settings, rig = workspace.settings, name.removeprefix("twin-")
+    duration = settings.rtip_seconds if rig == "rtip" else settings.tlrip_seconds
+    made = twin.build(rig, workspace.folder / "twin" / rig, seed=settings.seed, duration=duration)
     motions = smoothed(made.plant, list(made.recordings.values()))
     arrays: dict[str, Array] = {}
     for label, motion in zip(made.recordings, motions, strict=True):
         arrays |= {f"{label}_{key}": getattr(motion, key) for key in ("q", "qd", "qdd")}
-    workspace.write_arrays(f"twin-{name}", arrays)
+    workspace.write_arrays(name, arrays)
     found: dict[str, Any] = {
         "recordings": {label: r.digest() for label, r in made.recordings.items()}
     }
@@ -224,55 +204,56 @@ def make_twin(workspace: Workspace, name: str) -> dict[str, Any]:
     return found
 
 
-def fit_constant(workspace: Workspace, bench: Bench, name: str) -> FitResult:
-    """A model with constant coefficients, fitted to trajectories."""
+def fit_from_start(
+    workspace: Workspace,
+    bench: Bench,
+    name: str,
+    *,
+    start: FitResult | None = None,
+    max_steps: int | None = None,
+    **options: Any,
+) -> FitResult:
+    """A model made with these options and fitted to trajectories, from an earlier fit or none."""
     settings = workspace.settings
-    model = model_by_name(name)(bench.plant.joints)
+    model = model_by_name(name)(bench.plant.joints, **options)
     return workspace.fit(name, bench, lambda step: fit(
-        model, bench.plant, bench.train, windows=settings.windows, max_steps=settings.max_steps,
-        fit_plant=settings.fit_plant, motions=bench.train_motions, callback=step,
+        model, bench.plant, bench.train, windows=settings.windows,
+        max_steps=max_steps or settings.max_steps, fit_plant=settings.fit_plant, start=start,
+        motions=bench.train_motions, callback=step,
     ))  # fmt: skip
 
 
 def fit_by_class(workspace: Workspace, bench: Bench, name: str) -> FitResult:
     """A model with coefficients by class of acceleration, from its constant fit."""
-    settings = workspace.settings
-    start = fit_constant(workspace, bench, name.removeprefix("A"))
-    model = model_by_name(name)(bench.plant.joints)
-    options = FitOptions(
-        windows=settings.windows, fit_plant=settings.fit_plant, max_steps=settings.max_steps
-    )
-    return workspace.fit(name, bench, lambda step: fit_adaptive(
-        model, bench.plant, bench.train, options=options, start=start,
-        motions=bench.train_motions, callback=step,
-    ))  # fmt: skip
+    start = fit_from_start(workspace, bench, name.removeprefix("A"))
+    return fit_from_start(workspace, bench, name, start=start)
 
 
 def fit_network(workspace: Workspace, bench: Bench, name: str) -> FitResult:
-    """A neuro-fuzzy model our way: a network corrects the adaptive model, on trajectories."""
-    settings = workspace.settings
+    """A neuro-fuzzy model our way: a network corrects the adaptive model, on trajectories.
+
+    Where the classes did not pay, it corrects the constant law, with inputs of its own choice.
+    """
     start = fit_by_class(workspace, bench, f"A{name.removeprefix('NF')}")
-    options: dict[str, Any] = {
-        "network": "by_class", "terms": settings.terms, "head_units": settings.head_units
-    }  # fmt: skip
-    model = model_by_name(name)(bench.plant.joints, **options)
-    return workspace.fit(name, bench, lambda step: refine_adaptive(
-        model, start, bench.train, length=settings.windows[-1],
-        max_steps=settings.network_steps, callback=step,
-    ))  # fmt: skip
+    first, *others = start.model.schedule.coefficient_sets().values()
+    if all(torch.equal(first, other) for other in others):
+        return fit_without_classes(workspace, bench, name)
+    steps = workspace.settings.network_steps
+    return fit_from_start(
+        workspace, bench, name, start=start, max_steps=steps, network="by_class",
+        **_sizes(workspace),
+    )  # fmt: skip
 
 
 def fit_without_classes(workspace: Workspace, bench: Bench, name: str) -> FitResult:
     """A neuro-fuzzy model from the constant fit of its law."""
+    start = fit_from_start(workspace, bench, name.removeprefix("NF"))
+    return fit_from_start(workspace, bench, name, start=start, **_sizes(workspace))
+
+
+def _sizes(workspace: Workspace) -> dict[str, Any]:
     settings = workspace.settings
-    start = fit_constant(workspace, bench, name.removeprefix("NF"))
-    model = model_by_name(name)(
-        bench.plant.joints, terms=settings.terms, head_units=settings.head_units
-    )
-    return workspace.fit(name, bench, lambda step: fit(
-        model, bench.plant, bench.train, windows=settings.windows, max_steps=settings.max_steps,
-        fit_plant=settings.fit_plant, start=start, motions=bench.train_motions, callback=step,
-    ))  # fmt: skip
+    return {"terms": settings.terms, "head_units": settings.head_units}
 
 
 def fit_searched(
@@ -311,7 +292,7 @@ def fit_by_pattern(workspace: Workspace, bench: Bench, name: str) -> FitResult:
     law = name.removeprefix("A").removesuffix("-pattern")
     return fit_searched(
         workspace, bench, name, "pattern", workspace.settings.windows[-1],
-        start=fit_constant(workspace, bench, law), threads=1,
+        start=fit_from_start(workspace, bench, law), threads=1,
     )  # fmt: skip
 
 
@@ -320,15 +301,7 @@ def network_by_controller(
 ) -> tuple[FrictionModel, dict[str, Any]]:
     """A neuro-fuzzy model the papers' way, from the coefficients by class; how its fit ended."""
     settings = workspace.settings
-    joints = iter(bench.plant.joint_names)
-    losses: dict[str, list[float]] = {}
-
-    def keep(state: EvidenceState) -> None:
-        # The training of each joint counts its steps from 1.
-        if state.step == 1:
-            losses[next(joints)] = []
-        losses[[*losses][-1]].append(0.5 / state.beta)
-
+    losses, keep = recorded_losses(bench.plant.joint_names)
     model, fits = papers_neuro_fuzzy(
         load(workspace.model(f"A{law}")), bench.train_motions,
         samples=settings.controller_samples, units=settings.network_units,
@@ -345,31 +318,34 @@ def network_by_controller(
 
 
 def fitted(
-    workspace: Workspace, fit: Callable[[Workspace, Bench, str], FitResult], name: str
+    fit: Callable[[Workspace, Bench, str], FitResult], workspace: Workspace, name: str
 ) -> dict[str, Any]:
     """Result of a fit on the TLRIP twin."""
     bench = workspace.bench("tlrip")
-    return _finish(workspace, name, bench, fit(workspace, bench, name))
+    found = fit(workspace, bench, name)
+    # A load that a network chose as input is that of the bearings.
+    bench = replace(bench, plant=found.plant)
+    return _judged(workspace, name, bench, found.model, found.to_dict())
 
 
-def second_paper(workspace: Workspace, law: str) -> dict[str, Any]:
+def second_paper(workspace: Workspace, name: str) -> dict[str, Any]:
     """Result of a search on the second paper's rig."""
-    bench, name = workspace.bench("rtip"), f"rtip-{law}"
+    bench, method = workspace.bench("rtip"), SEARCH[name.removeprefix("rtip-")]
     horizon = workspace.settings.search_horizon
-    found = fit_searched(workspace, bench, name, SEARCH[law], horizon, threads=1)
-    return _finish(workspace, name, bench, found)
+    found = fit_searched(workspace, bench, name, method, horizon, threads=1)
+    return _judged(workspace, name, bench, found.model, found.to_dict())
 
 
-def papers_way(workspace: Workspace, law: str) -> dict[str, Any]:
+def papers_way(workspace: Workspace, name: str) -> dict[str, Any]:
     """Result of the papers' own neuro-fuzzy procedure."""
-    bench, name = workspace.bench("tlrip"), f"NF{law}-papers"
+    bench, law = workspace.bench("tlrip"), name.removeprefix("NF").removesuffix("-papers")
     model, ended = network_by_controller(workspace, bench, law)
     info = replace(load_info(workspace.model(f"A{law}")), fit=ended)
     save(model, workspace.model(name), info)
-    return {"fit": ended} | _judged(workspace, name, bench, model, info)
+    return _judged(workspace, name, bench, model, ended)
 
 
-def controlled(workspace: Workspace) -> dict[str, Any]:
+def controlled(workspace: Workspace, name: str) -> dict[str, Any]:
     """Result of the control study: the papers' future work."""
     settings = workspace.settings
     fitted: list[dict[str, FrictionModel]] = []
@@ -377,50 +353,35 @@ def controlled(workspace: Workspace) -> dict[str, Any]:
         recordings = study.driven_recordings(
             plant, study.true_friction(plant), count=1, seconds=12.0, seed=settings.seed
         )
-        names = settings.control_models
-        fitted.append({n: study.fitted_model(plant, recordings, n) for n in names})
-        for name, model in fitted[-1].items():
-            save(model, workspace.model(f"control-{rig}-{name}"))
+        fitted.append(
+            {n: study.fitted_model(plant, recordings, n) for n in settings.control_models}
+        )
+        for label, model in fitted[-1].items():
+            save(model, workspace.model(f"{name}-{rig}-{label}"))
     tables, motions = study.run_study(
         *fitted, seconds=settings.control_seconds, settled=0.375 * settings.control_seconds
     )
-    workspace.write_arrays("control", motions)
+    workspace.write_arrays(name, motions)
     return {"tables": tables}
 
 
-def _finish(workspace: Workspace, stage: str, bench: Bench, found: FitResult) -> dict[str, Any]:
-    info = model_info(found, bench.train)
-    return {"fit": found.to_dict()} | _judged(workspace, stage, bench, found.model, info)
-
-
 def _judged(
-    workspace: Workspace, stage: str, bench: Bench, model: FrictionModel, info: ModelInfo
+    workspace: Workspace,
+    stage: str,
+    bench: Bench,
+    model: FrictionModel,
+    ended: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Scores and coefficients of a model, which is exported as TorchScript."""
-    if workspace.settings.torchscript:
-        script = workspace.model(stage).with_suffix(".pt")
-        try:
-            torchscript(model, script, info)
-        except ExportError as error:
-            script.unlink(missing_ok=True)  # an earlier run's would pass for this one's
-            logger.warning("%s was not exported: %s", stage, " ".join(str(error).split()))
+    """End of a model's fit, its scores and coefficients, and its classes if it has any."""
     scores, simulated = judge(bench, model)
     workspace.write_arrays(stage, simulated)
-    return {
-        "scores": scores,
-        "coefficients": coefficient_summary(model),
-        **_classes(workspace, model),
-    }
-
-
-def _classes(workspace: Workspace, model: FrictionModel) -> dict[str, Any]:
-    """Coefficients of an adaptive model by class, joint and name; its classes in the experiment."""
+    found = {"fit": ended, "scores": scores, "coefficients": coefficient_summary(model)}
     schedule = model.schedule
     if not isinstance(schedule, Adaptive):
-        return {}
+        return found
     (motion,) = workspace.bench(EXPERIMENT).motions
     labels = schedule.classes(torch.tensor(motion.qd), torch.tensor(motion.qdd)).T.numpy()
-    return {
+    return found | {
         "classes": {
             known: {n: schedule.values[:, c, k].tolist() for k, n in enumerate(model.law.names)}
             for c, known in enumerate(CLASSES)

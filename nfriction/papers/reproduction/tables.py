@@ -1,4 +1,4 @@
-"""The papers' tables: our numbers beside the printed ones, as CSV, JSON and text.
+"""The papers' tables: our numbers beside the printed ones.
 
 The papers' recordings were never published, so the printed numbers cannot be reproduced to the
 digit: they come from another machine. Units of the position errors are not printed; radians are
@@ -7,15 +7,13 @@ presumed.
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from functools import cache
 from importlib import resources
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from nfriction.io.files import write_atomically
 from nfriction.papers.reproduction.agreement import agreement
 from nfriction.papers.reproduction.stages import (
     ADAPTIVE,
@@ -25,7 +23,6 @@ from nfriction.papers.reproduction.stages import (
     NEURO_FUZZY,
     PAPERS_WAY,
     SECOND_PAPER,
-    stages,
 )
 from nfriction.papers.reproduction.workspace import Workspace
 from nfriction.plant import rigs
@@ -51,22 +48,18 @@ TLRIP = (*CONSTANT, *ADAPTIVE, *BY_PATTERN, *NEURO_FUZZY, *PAPERS_WAY)
 _PRINTED_10 = TABLE_10 | {n: TABLE_10[n.partition("-")[0]] for n in (*BY_PATTERN, *PAPERS_WAY)}
 
 
-@dataclass(frozen=True)
-class Order:
+class Order(NamedTuple):
     """Verdict on neuro-fuzzy <= adaptive <= constant for each law on every joint.
 
     Attributes:
+        holds: true without exceptions.
         broken: exceptions, in words.
         best: the best of the nine by joint, ties joined by an equals sign.
     """
 
-    broken: tuple[str, ...]
+    holds: bool
+    broken: list[str]
     best: dict[str, str]
-
-    @property
-    def holds(self) -> bool:
-        """True without exceptions."""
-        return not self.broken
 
     def __str__(self) -> str:
         best = ", ".join(f"{joint} {model}" for joint, model in self.best.items())
@@ -103,6 +96,7 @@ def table_10(workspace: Workspace, drive: Drive = "free_run") -> pd.DataFrame:
     return _beside(rmse(workspace, TLRIP, drive=drive), _table(_PRINTED_10))
 
 
+@cache
 def agreement_table() -> pd.DataFrame:
     """Agreement of independent simulations from the paper's check pose; see `agreement`.
 
@@ -257,21 +251,27 @@ def order(workspace: Workspace) -> Order:
         joint: " = ".join(m for m, e in error.items() if e[k] == min(x[k] for x in error.values()))
         for k, joint in enumerate(JOINTS)
     }
-    return Order(tuple(broken), best)
+    return Order(not broken, broken, best)
 
 
 def fit_ends(workspace: Workspace) -> str:
     """The end of every fit in words, and the fits that did not converge."""
     fits = {name: workspace.found(name)["fit"] for name in (*TLRIP, *SECOND_PAPER)}
     lines = [f"{name:13} {fit['status']}" for name, fit in fits.items()]
-    open_ended = [name for name, fit in fits.items() if not fit["converged"]]
-    if not open_ended:
-        return "\n".join([*lines, "", "every fit converged"])
-    summary = (
-        f"{len(open_ended)} of {len(fits)} fits did not converge ({', '.join(open_ended)}): their "
-        "numbers are those of an unfinished search, and their order may change with more steps"
-    )
+    open_ended = _unconverged(workspace)
+    summary = "every fit converged"
+    if open_ended:
+        summary = (
+            f"{len(open_ended)} of {len(fits)} fits did not converge ({', '.join(open_ended)}): "
+            "their numbers are those of an unfinished search, and their order may change with more "
+            "steps"
+        )
     return "\n".join([*lines, "", summary])
+
+
+def _unconverged(workspace: Workspace) -> list[str]:
+    names = (*TLRIP, *SECOND_PAPER)
+    return [name for name in names if not workspace.found(name)["fit"]["converged"]]
 
 
 def conclusion(workspace: Workspace) -> str:
@@ -290,6 +290,7 @@ def conclusion(workspace: Workspace) -> str:
 
     constant = tuple(LAWS)
     *simple, five = SECOND_PAPER
+    missed = workspace.found("twin-tlrip")["missed_torque"]
     lines = [
         "The papers' claims on simulated recordings, as theirs were never published; errors of the "
         "simulated position in mrad, of viscous, load-dependent and five-coefficient friction:",
@@ -311,21 +312,12 @@ def conclusion(workspace: Workspace) -> str:
             f"on the second paper's rig five coefficients err least, {said(SECOND_PAPER)}",
             (five,) * len(simple), simple,
         ),
-        f"Why: {_why(workspace)}",
+        f"Why: of the true friction torque a curve over speed misses {missed['speed']:.1%}, one "
+        "over speed and acceleration, all that a network sees, "
+        f"{missed['speed and acceleration']:.1%}; {len(_unconverged(workspace))} of "
+        f"{len(TLRIP) + len(SECOND_PAPER)} fits ended before they converged.",
     ]  # fmt: skip
     return "\n".join(lines)
-
-
-def _why(workspace: Workspace) -> str:
-    """The reason in numbers: what networks see of the friction, and the fits that did not end."""
-    missed = workspace.found("twin-tlrip")["missed_torque"]
-    speed, both = missed["speed"], missed["speed and acceleration"]
-    ended = [workspace.found(name)["fit"]["converged"] for name in (*TLRIP, *SECOND_PAPER)]
-    return (
-        f"of the true friction torque a curve over speed misses {speed:.1%}, one over speed and "
-        f"acceleration, all that a network sees, {both:.1%}; {ended.count(False)} of {len(ended)} "
-        "fits ended before they converged."
-    )
 
 
 def long_table(workspace: Workspace) -> pd.DataFrame:
@@ -347,98 +339,3 @@ def long_table(workspace: Workspace) -> pd.DataFrame:
                         value = np.inf if value is None else value
                         rows.append(about | {"kind": kind, "joint": joint, "rmse [rad]": value})
     return pd.DataFrame(rows)
-
-
-def all_tables(workspace: Workspace) -> dict[str, tuple[str, pd.DataFrame]]:
-    """The papers' tables with their titles, by the name of their file."""
-    settings = workspace.settings
-    error = "position RMSE [mrad] on test releases, free runs of"
-    methods = ("sequential quadratic programming", "pattern search", "pattern search")
-    found = {
-        "fig_4_agreement": (
-            "Fig. 4: difference from our simulation without friction, from 20.56°, 32.21°, 45°",
-            agreement_table(),
-        ),
-        "table_6": ("Table 6: classes of acceleration in the experiment", table_6(workspace)),
-    }
-    for number, law in zip((7, 8, 9), LAWS, strict=True):
-        found[f"table_{number}"] = (
-            f"Table {number}: coefficients of A{law} by class of acceleration (the print is lost)",
-            adaptive_coefficients(workspace, law),
-        )
-    found |= {
-        "table_10": (
-            f"Table 10: {error} {settings.tlrip_seconds:g} s, coefficients driven by the "
-            "simulated motion",
-            table_10(workspace),
-        ),
-        "table_10_measured_drive": (
-            "Table 10 again, coefficients driven by the measured motion as in the paper [mrad]",
-            table_10(workspace, "measured_drive"),
-        ),
-        "table_11": (
-            "Table 11: error of NFNLFM below that of each other model [%]", table_11(workspace)
-        ),
-        "error_saved": (
-            "error saved by coefficients by class and by networks within a law [%]",
-            steps_saved(workspace),
-        ),
-    }  # fmt: skip
-    for roman, law, method in zip(("I", "II", "III"), LAWS, methods, strict=True):
-        found[f"second_table_{roman.lower()}"] = (
-            f"second paper, Table {roman}: {law} by {method}",
-            second_coefficients(workspace, law),
-        )
-    found["second_table_iv"] = (
-        f"second paper, Table IV: {error} {settings.rtip_seconds:g} s",
-        second_table_4(workspace),
-    )
-    for task, what in (
-        ("still", "a link balanced upright, the arm to stay still"),
-        ("follow", "a link balanced upright while the arm follows a slow sine"),
-        ("swing-up", "three links swung up in 5 s and balanced, planned with the same friction"),
-        ("three links", "three links balanced upright while the arm follows a slow sine"),
-    ):
-        found[f"control_{task.replace(' ', '_').replace('-', '_')}"] = (
-            f"future work, control: {what}, by the model whose friction torque is compensated "
-            "(inf: fallen)",
-            control_table(workspace, task),
-        )
-    return found
-
-
-def write_tables(workspace: Workspace, *, command: str = "") -> list[Path]:
-    """Write `tables/*.csv`, `rmse.csv` with every error, and `results.json`."""
-    verdict = order(workspace)
-    results = {
-        "command": command,
-        "settings": workspace.settings.to_dict(),
-        "order": {"holds": verdict.holds, "broken": list(verdict.broken), "best": verdict.best},
-        "stages": {name: workspace.found(name) for name in stages()},
-    }
-    content = {
-        "rmse.csv": long_table(workspace).to_csv(index=False),
-        "results.json": json.dumps(results, indent=1, allow_nan=False),
-    }
-    for name, (_, table) in all_tables(workspace).items():
-        # One header row, so that any reader of CSV can read it.
-        flat = table.set_axis([f"{column[1]}, {column[0]}" for column in table.columns], axis=1)
-        content[f"tables/{name}.csv"] = flat.to_csv(index_label="row")
-    return [write_atomically(workspace.folder / n, t.encode()) for n, t in content.items()]
-
-
-def text(workspace: Workspace) -> str:
-    """All tables beside the printed ones, and whether the papers' order of models holds."""
-    parts = []
-    for title, table in all_tables(workspace).values():
-        # Coefficients stay in SI; errors are read in thousandths.
-        shown = 1e3 * table if "[mrad]" in title else table
-        written = shown.to_string(float_format=lambda x: f"{x:.4g}", na_rep="")
-        parts.append(f"{title}\n{written}")
-    parts.append(
-        "printed: the papers' numbers, from recordings that were never published and another "
-        "machine's friction;\nours: simulated twins. -papers: made by the papers' own procedure "
-        "(fuzzy controller, 2-10-2 network), -pattern: by their pattern search."
-    )
-    parts += [str(order(workspace)), f"how the fits ended\n{fit_ends(workspace)}"]
-    return "\n\n".join(parts)

@@ -49,7 +49,6 @@ class Settings:
         control_models: fitted to the driven rig, for friction compensation.
         control_seconds: length of each balanced motion [s].
         fit_plant: adjust inertia and gravity terms, too.
-        torchscript: export every model.
         origin: of the recordings, and further options, of a run on other data than the twins.
     """
 
@@ -68,7 +67,6 @@ class Settings:
     control_models: tuple[str, ...] = study.MODELS
     control_seconds: float = 16.0
     fit_plant: bool = False
-    torchscript: bool = True
     origin: str = ""
 
     def to_dict(self) -> dict[str, Any]:
@@ -173,11 +171,10 @@ class Workspace:
             raise ValueError(f"{self.folder}: the stage {stage!r} is not finished; run it first.")
         return result
 
-    def finish(self, stage: str, result: Mapping[str, Any]) -> None:
-        """Mark a stage as finished with its result, plain JSON."""
+    def finish(self, stage: str, result: Mapping[str, Any], *, strict: bool = True) -> None:
+        """Mark a stage as finished with its result, plain JSON; finite numbers alone if strict."""
         content = {"stage": stage, "settings": self.settings.digest(), "result": result}
-        # Refuse NaN: strict JSON readers would not read the file back.
-        text = json.dumps(content, indent=1, allow_nan=False)
+        text = json.dumps(content, indent=1, allow_nan=not strict, default=astuple)
         write_atomically(self._file(stage, "json"), text.encode())
 
     def write_arrays(self, stage: str, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -203,7 +200,18 @@ class Workspace:
         """
         name, path = f"{stage}-fit", self.model(stage)
         if (kept := self.result(name)) is not None:
-            return _restored(kept, path, self.arrays(name), bench)
+            plain = {field: _tuples(value) for field, value in kept.items()}
+            # Those that JSON has as rows.
+            for field, kind in (
+                ("intervals", Interval),
+                ("outliers", Outliers),
+                ("inputs", InputGain),
+            ):
+                plain[field] = tuple(kind(*row) for row in plain[field])
+            return FitResult(
+                model=load(path), plant=load_plant(path), motions=tuple(bench.train_motions),
+                residuals=torch.as_tensor(self.arrays(name)["residuals"]), **plain,
+            )  # fmt: skip
         losses: dict[str, list[float]] = {}
         with tqdm(desc=stage, unit=" steps", disable=not self.progress) as bar:
 
@@ -219,11 +227,11 @@ class Workspace:
             found = make(step)
         self.finish(f"{stage}-losses", losses)
         # The JSON file comes last: it marks the stage as finished.
-        self.write_arrays(name, _tables(found))
+        self.write_arrays(name, {"residuals": found.residuals.numpy()})
         save(found.model, path, model_info(found, bench.train))
         plain = {f.name: getattr(found, f.name) for f in fields(found) if f.name not in _APART}
-        plain["inputs"] = [astuple(gain) for gain in found.inputs]
-        self.finish(name, plain)
+        # Bounds and intervals may be infinite.
+        self.finish(name, plain, strict=False)
         return found
 
     def search_state(self, stage: str) -> SearchState | None:
@@ -263,36 +271,8 @@ class Workspace:
         return self.folder / "stages" / f"{stage}.{suffix}"
 
 
-# Fields of a fit that are kept as arrays or in its model file; the others are plain JSON.
-_APART = ("model", "plant", "motions", "uncertainty", "residuals", "plant_terms", "intervals")
-_TERM = [("name", "U200"), ("value", float), ("bound", float)]
-_INTERVAL = [("name", "U200"), ("value", float), ("low", float), ("high", float)]
-
-
-def _tables(found: FitResult) -> dict[str, NDArray[Any]]:
-    return {
-        "residuals": found.residuals.numpy(),
-        "plant_terms": np.array(list(found.plant_terms), dtype=_TERM),
-        "intervals": np.array([astuple(i) for i in found.intervals], dtype=_INTERVAL),
-    }
-
-
-def _restored(
-    kept: Mapping[str, Any], path: Path, arrays: Mapping[str, NDArray[Any]], bench: Bench
-) -> FitResult:
-    plain = {name: _tuples(value) for name, value in kept.items()}
-    plain["outliers"] = tuple(Outliers(*row) for row in plain["outliers"])
-    plain["inputs"] = tuple(InputGain(*row) for row in plain["inputs"])
-    return FitResult(
-        model=load(path),
-        plant=load_plant(path),
-        # Smoothed once for all stages, so not kept with every fit.
-        motions=tuple(bench.train_motions),
-        residuals=torch.as_tensor(arrays["residuals"]),
-        plant_terms=tuple(arrays["plant_terms"].tolist()),
-        intervals=tuple(Interval(*row) for row in arrays["intervals"].tolist()),
-        **plain,
-    )
+# Fields of a fit that are kept apart, with the twin, or not at all; the others are plain JSON.
+_APART = ("model", "plant", "motions", "uncertainty", "residuals")
 
 
 def _tuples(value: Any) -> Any:

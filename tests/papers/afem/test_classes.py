@@ -6,7 +6,7 @@ import torch
 
 from nfriction import Recording
 from nfriction.papers.afem.adaptive import ALFM
-from nfriction.papers.afem.classes import ClassOptions, find_classes, otsu
+from nfriction.papers.afem.classes import ClassOptions, class_intervals, find_classes, otsu
 from nfriction.signals import Motion
 
 STEP = 2e-3
@@ -32,7 +32,8 @@ DYING = ((6.0, 200.0), (8.0, 30.0), (16.0, 3.0))
 
 
 def test_a_dying_motion_goes_through_all_classes_in_time():
-    schedule, classes = found_in(swinging(*DYING))
+    recording, motion = swinging(*DYING)
+    schedule, classes = found_in((recording, motion))
     assert classes.notes == ()
     assert (classes.stands_for == torch.arange(3)).all()
     for j, scale in enumerate((1.0, 0.5)):
@@ -41,7 +42,9 @@ def test_a_dying_motion_goes_through_all_classes_in_time():
         # An acceleration that starts at zero is not known to be high before its first peak.
         intervals = [
             (known, start, end)
-            for known, start, end in classes.intervals()["swing"][JOINTS[j]]
+            for known, start, end in class_intervals(
+                recording.time, classes.labels[0][:, j].numpy()
+            )
             if end > 0.3
         ]
         assert [known for known, _, _ in intervals] == ["high", "medium", "low"]

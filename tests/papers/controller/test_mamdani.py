@@ -15,7 +15,6 @@ from nfriction.papers.controller.mamdani import MamdaniController, paper_control
 from nfriction.papers.controller.rules import Rule, RuleBase, Variable
 
 FLOAT64 = torch.float64
-pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
 DEGREE = math.pi / 180
 
 
@@ -173,19 +172,6 @@ def test_gradients() -> None:
     scaled = (x / span).detach().requires_grad_()
     middle = controller.middle
     assert torch.autograd.gradcheck(lambda z: controller.infer(z * span) / middle, (scaled,))
-
-
-def test_script_and_export_are_the_same() -> None:
-    controller = paper_controller(2)
-    x = samples(controller, 700) * DEGREE
-    qd, qdd = x.unbind(-1)
-    scripted = torch.jit.script(controller)
-    torch.testing.assert_close(scripted(qd, qdd), controller(qd, qdd), rtol=1e-14, atol=0)
-    shapes = ({0: torch.export.Dim("samples")},) * 2
-    program = torch.export.export(
-        controller, (qd[:9].clone(), qdd[:9].clone()), dynamic_shapes=shapes
-    )
-    torch.testing.assert_close(program.module()(qd, qdd), controller(qd, qdd), rtol=1e-14, atol=0)
 
 
 GAPPED = """

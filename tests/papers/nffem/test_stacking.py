@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nfriction.papers.nffem.refine_adaptive import stacking_weights
+from nfriction.papers.nffem.correction import stacking_weights
 
 F64 = torch.float64
 

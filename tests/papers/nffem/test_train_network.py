@@ -166,12 +166,10 @@ def test_same_seed_same_network_and_more_starts_no_less_evidence() -> None:
     options = TrainingOptions(search_steps=15, max_steps=10)
     three = replace(options, starts=3)
     twins = [RBFNetwork(1, units=5) for _ in range(2)]
-    fits = [train_on_controller(n, controller, samples=1000, options=three)[0] for n in twins]
+    fits = [train_on_controller(n, controller, samples=400, options=three)[0] for n in twins]
     assert torch.equal(flatten(trainable(twins[0])), flatten(trainable(twins[1])))
     assert fits[0].evidence.log_evidence == fits[1].evidence.log_evidence
-    alone = train_on_controller(RBFNetwork(1, units=5), controller, samples=1000, options=options)[
-        0
-    ]
+    alone = train_on_controller(RBFNetwork(1, units=5), controller, samples=400, options=options)[0]
     assert fits[0].evidence.log_evidence >= alone.evidence.log_evidence - 1e-6
 
 

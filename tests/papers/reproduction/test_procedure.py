@@ -8,6 +8,7 @@ from nfriction.friction import model_by_name
 from nfriction.friction.models import LFM
 from nfriction.papers.controller.mamdani import paper_controller
 from nfriction.papers.nffem.rbf_coefficients import RBFCoefficients
+from nfriction.papers.nffem.train_network import TrainingOptions
 from nfriction.papers.reproduction.procedure import controllers_from_classes, papers_neuro_fuzzy
 from nfriction.signals import Motion
 
@@ -90,8 +91,11 @@ def test_equal_seeds_give_equal_networks() -> None:
 
 
 def test_classes_that_agree_still_span_a_universe() -> None:
-    model, _ = papers_neuro_fuzzy(model_by_name("ANCFM")(3, [0.02]), [swing(1.0)], samples=300)
-    qd = torch.as_tensor(swing(1.0).qd)
+    motion, brief = swing(1.0), TrainingOptions(search_steps=5, max_steps=5)
+    model, _ = papers_neuro_fuzzy(
+        model_by_name("ANCFM")(3, [0.02]), [motion], samples=300, options=brief
+    )
+    qd = torch.as_tensor(motion.qd)
     # Within the one percent that such a universe is wide.
     torch.testing.assert_close(
         model.coefficients(qd, qd), torch.full((*qd.shape, 1), 0.02, dtype=torch.float64),

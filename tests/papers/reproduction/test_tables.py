@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from nfriction.papers.reproduction import tables
+from nfriction.papers.reproduction import page, tables
 from nfriction.papers.reproduction.stages import LAWS, SECOND_PAPER, stages
 from nfriction.papers.reproduction.workspace import QUICK, Workspace
 
@@ -95,7 +95,7 @@ def test_tables_6_to_9_are_the_classes(tmp_path: Path) -> None:
 
 
 def test_fits_that_did_not_converge_are_named_at_the_end(tmp_path: Path) -> None:
-    said = tables.text(workspace(tmp_path, {})).splitlines()
+    said = page.text(workspace(tmp_path, {})).splitlines()
     assert "1 of 19 fits did not converge (ALFM)" in said[-1]
     assert any(line.split() == ["NFLFM-papers", "ended"] for line in said)
 
@@ -135,13 +135,13 @@ def test_the_order_is_broken_only_where_it_is(tmp_path: Path, law: str) -> None:
 
 def test_everything_is_written_and_said(tmp_path: Path) -> None:
     made = workspace(tmp_path, {"NFNLFM": 0.5, "LFM": None})
-    written = tables.write_tables(made, command="a command")
+    written = page.write_tables(made, command="a command")
     assert all(path.stat().st_size for path in written)
     results = json.loads((tmp_path / "results.json").read_text())
     assert set(results["stages"]) == set(stages())
     long = pd.read_csv(tmp_path / "rmse.csv")
     # Models, recordings, kinds of error (two drives and one window), joints and all of them.
     assert len(long) == len(EVERY) * 3 * 3 * 4
-    said = tables.text(made)
+    said = page.text(made)
     for name in (*tables.NINE, "Table 11", "Table IV", "on every joint: "):
         assert name in said

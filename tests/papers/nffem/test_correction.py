@@ -10,7 +10,6 @@ from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.friction.laws import LINEAR
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
-from nfriction.papers.nffem.refine_adaptive import refine_adaptive
 from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import F64, pendulum, swing
 from tests.fitting.test_trajectory import ABSOLUTE, windows
@@ -50,10 +49,16 @@ def case():
     return plant, train, held, by_class
 
 
+def refined(model, case, max_steps):
+    plant, train, _, by_class = case
+    return fit(model, plant, train, start=by_class, windows=(1.0,), fit_plant=False,
+               motions=by_class.motions, max_steps=max_steps)  # fmt: skip
+
+
 @pytest.mark.slow
 def test_what_classes_cannot_say_is_learned(case):
-    plant, train, held, by_class = case
-    found = refine_adaptive(network(), by_class, train, length=1.0, max_steps=8)
+    plant, _, held, by_class = case
+    found = refined(network(), case, max_steps=8)
     assert "kept" not in found.status
     assert found.residual < 0.7 * by_class.residual
     ours, before = (score(plant, m, held) for m in (found.model, by_class.model))
@@ -61,13 +66,13 @@ def test_what_classes_cannot_say_is_learned(case):
 
 
 def test_a_correction_that_does_not_help_is_left(case, monkeypatch):
-    plant, train, held, by_class = case
+    plant, _, held, by_class = case
     # However little is taken, the hold-out windows come out worse.
     monkeypatch.setattr(
-        "nfriction.papers.nffem.refine_adaptive._errors",
+        "nfriction.papers.nffem.correction._errors",
         lambda p, vector: (1.0 + vector.any()) * torch.ones(len(p.windows), 2, dtype=F64),
     )
-    found = refine_adaptive(network(), by_class, train, length=1.0, max_steps=1)
+    found = refined(network(), case, max_steps=1)
     assert "kept" in found.status
     ours, before = (score(plant, m, held) for m in (found.model, by_class.model))
     assert ours.free_run.joints == pytest.approx(before.free_run.joints, rel=1e-6)
@@ -75,22 +80,21 @@ def test_a_correction_that_does_not_help_is_left(case, monkeypatch):
 
 def test_a_correction_worse_where_it_was_learned_is_left(case, monkeypatch):
     """Though its parts did well on hold-out windows."""
-    _, train, _, by_class = case
     monkeypatch.setattr(
-        "nfriction.papers.nffem.refine_adaptive._cross_fitted",
+        "nfriction.papers.nffem.correction._cross_fitted",
         lambda schedule, *_: (schedule.parameter_vector(), torch.ones(2, dtype=F64)),
     )
     monkeypatch.setattr(
-        "nfriction.papers.nffem.refine_adaptive._errors",
+        "nfriction.papers.nffem.correction._errors",
         lambda p, vector: (1.0 + vector.any()) * torch.ones(len(p.windows), 2, dtype=F64),
     )
-    found = refine_adaptive(network(), by_class, train, length=1.0, max_steps=1)
+    found = refined(network(), case, max_steps=1)
     assert "kept" in found.status
     assert not found.model.schedule.parameter_vector().any()
 
 
 def test_a_joint_s_part_that_does_not_help_is_left(case, monkeypatch):
-    plant, train, _, by_class = case
+    plant = case[0]
     model = network()
     of_joint = model.schedule.joint_of_parameters()
 
@@ -100,18 +104,20 @@ def test_a_joint_s_part_that_does_not_help_is_left(case, monkeypatch):
         factor = torch.where(moved, torch.tensor([0.5, 2.0]), torch.ones(2))
         return factor.to(F64).expand(len(problem.windows), 2)
 
-    monkeypatch.setattr("nfriction.papers.nffem.refine_adaptive._errors", errors)
-    found = refine_adaptive(model, by_class, train, length=1.0, max_steps=1)
+    monkeypatch.setattr("nfriction.papers.nffem.correction._errors", errors)
+    found = refined(model, case, max_steps=1)
     taken = found.model.schedule.parameter_vector()
     assert taken[of_joint == 0].any()
     assert not taken[of_joint == 1].any()
     assert f"0 of {plant.joint_names[1]}'s" in found.status
 
 
-def test_it_needs_an_adaptive_fit_and_a_network_by_class(case):
-    _, train, _, by_class = case
-    with pytest.raises(ValueError, match='network="by_class"'):
-        refine_adaptive(NFLFM(2, v_smooth=V_SMOOTH), by_class, train)
+@pytest.mark.slow
+def test_without_an_adaptive_fit_to_start_from_there_is_one_first(case):
+    plant, train, _, by_class = case
+    found = fit(network(), plant, train, windows=(1.0,), fit_plant=False, max_steps=1,
+                motions=by_class.motions)  # fmt: skip
+    assert found.model.schedule.adaptive.thresholds.equal(by_class.model.schedule.thresholds)
 
 
 def test_gradient_with_a_memory_is_the_cost_s_derivative():
