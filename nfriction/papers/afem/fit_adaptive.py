@@ -28,7 +28,7 @@ from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.constant import constant_start
 from nfriction.fitting.strategy.continuation import ShootingFitter, settle_states
-from nfriction.fitting.strategy.holdout import cut_for_folds
+from nfriction.fitting.strategy.holdout import StoppedError, cut_for_folds
 from nfriction.fitting.task import Callback, FitTask, known_terms, prepare_task
 from nfriction.friction.models import FrictionModel
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
@@ -127,8 +127,11 @@ def fit_by_class(task: FitTask, classes: ClassOptions = DEFAULTS) -> FitResult:
         task.callback,
     )  # fmt: skip
     name = f"{length:g} s windows, by class"
-    if not by_class.pay(problem, fitter, vector):
-        return by_class.constant_kept()
+    try:
+        if not by_class.pay(problem, fitter, vector):
+            return by_class.constant_kept()
+    except StoppedError:
+        return by_class.constant_kept("Stopped before the classes were judged", converged=False)
     result = fitter.search(problem, problem.variables.start(vector), TOLERANCE, name).result
     found = result_from_shooting(given, problem, result, task.motions)
     q0, qd0 = problem.variables.split(result.x).states.chunk(2, -1)
@@ -327,6 +330,7 @@ class ClassFit:
         """True if classes that two thirds of the windows teach simulate the others better.
 
         Better than the constant law on the constant fit's plant, of which `plant` has the terms.
+        Raises `StoppedError` if the caller stopped one of the searches.
         """
         folds, classes = self.task.options.folds, problem.classes
         assert classes is not None
@@ -341,7 +345,7 @@ class ClassFit:
             start = seen.variables.start(plant)
             end = fitter.search(seen, start, LOOSE, "by class, hold-out")
             if end.stopped:
-                return True  # the caller's stop ends the search that follows, too
+                raise StoppedError
             learnt = end.parts
             squares.append((self._squares(rest, learnt.friction, learnt.plant),
                             self._squares(rest, flat, plant)))  # fmt: skip
@@ -358,7 +362,9 @@ class ClassFit:
 
         They start at the states that suit given classes best.
         """
-        x, _ = settle_states(judged, judged.variables.start(plant, friction=table))
+        x, stopped = settle_states(judged, judged.variables.start(plant, friction=table))
+        if stopped:
+            raise StoppedError
         q0, qd0 = judged.variables.split(x).states.chunk(2, -1)
         self.table.set_parameter_vector(table)
         self.schedule.set_coefficients(self._filled())
@@ -410,9 +416,14 @@ class ClassFit:
         """Coefficients of the constant law, (joint, 1, coefficient)."""
         return self.constant.model.schedule.coefficient_sets()["always"][:, None]
 
-    def constant_kept(self) -> FitResult:
+    def constant_kept(
+        self, reason: str = "The classes simulate no better", *, converged: bool = True
+    ) -> FitResult:
         """The constant fit as the adaptive model's: all classes equal."""
         constant, model = self.constant, self.task.model.requires_grad_(False)
         self.schedule.set_coefficients(self._flat().expand(-1, len(CLASSES), -1))
-        status = f"{constant.status} The classes simulate no better: the constant law is kept."
-        return replace(constant, model=model, motions=self.motions, status=status)
+        return replace(
+            constant, model=model, motions=self.motions,
+            converged=constant.converged and converged,
+            status=f"{constant.status} {reason}: the constant law is kept.",
+        )  # fmt: skip
