@@ -6,10 +6,7 @@ Knows nothing of plants or friction beyond the methods it calls.
 from nfriction.codegen.function import CompiledFunction
 from nfriction.codegen.jit import cache_folder
 from nfriction.codegen.operations import supported_operations
-from nfriction.codegen.rollout import (
-    CompiledRollout,
-    RolloutInputs,
-)
+from nfriction.codegen.rollout import CompiledRollout, RolloutInputs
 from nfriction.codegen.scalar import (
     CodegenError,
     Incomparable,

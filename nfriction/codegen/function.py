@@ -60,10 +60,10 @@ class CompiledFunction:
         self._inputs = {p.name: p.shape for p in program.inputs if p.name in inputs}
         key = program.digest(), self._jacobian
         known = _known.get(key)
-        self._kernel, self._outputs = known or self._built(program)
+        self.kernel, self._outputs = known or self._built(program)
         if known is None:
             self.check(example_inputs)
-        _known[key] = self._kernel, self._outputs
+        _known[key] = self.kernel, self._outputs
         _known.move_to_end(key)
         if len(_known) > _KEPT:
             _known.popitem(last=False)
@@ -75,10 +75,6 @@ class CompiledFunction:
         outputs = {f"y{i}": p.shape for i, p in enumerate(program.outputs)}
         layout = Layout(tuple(self._inputs), tuple(outputs))
         return Kernel(lambda width: _driver(program, layout, width), layout), outputs
-
-    def source(self, width: int = 0) -> str:
-        """LLVM IR that computes so many rows together, 0 for one at a time."""
-        return self._kernel.source(width)
 
     def __call__(self, *inputs: Any) -> Any:
         """Evaluate row by row.
@@ -101,7 +97,7 @@ class CompiledFunction:
         rows = common_rows({name: one.rows for name, one in given.items()})
         p, _ = parameter_rows(self._module, {})
         out = {name: np.empty((rows, *shape)) for name, shape in self._outputs.items()}
-        self._kernel(rows, p, given, out)
+        self.kernel(rows, p, given, out)
         return tuple(out.values()) if len(out) > 1 else out["y0"]
 
     def check(self, example_inputs: Sequence[Tensor]) -> None:

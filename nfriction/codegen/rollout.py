@@ -48,7 +48,7 @@ class ForcedSystem(nn.Module):
         self.plant = plant
         self.friction = friction
         self.step = step
-        self.remembers = int(getattr(friction, "state_size", 0)) > 0
+        self.memory_size = int(getattr(friction, "state_size", 0))
         self.law_size = int(getattr(friction, "law_state_size", 0))
 
     def forward(
@@ -324,13 +324,10 @@ class CompiledRollout:
         self.digest = f"{self._module.shapes} {self._traced.digest()}"
 
     @cached_property
-    def _kernel(self) -> Kernel:
+    def kernel(self) -> Kernel:
+        """The compiled code, emitted at its first use."""
         program = arrange(self._traced, self._system.law_size)
         return Kernel(lambda width: RolloutDriver(program, width), LAYOUT)
-
-    def source(self, width: int = 0) -> str:
-        """LLVM IR that computes so many candidates together, 0 for one at a time."""
-        return self._kernel.source(width)
 
     def _examples(self) -> dict[str, Tensor]:
         n, device = self.joints, self._module.device
@@ -343,7 +340,7 @@ class CompiledRollout:
         seen = [found[name].to(device) for name in ("seen_qd", "seen_qdd")]
         with torch.no_grad():
             held = self._system.friction.coefficients(*seen)
-            if self._system.remembers:
+            if self._system.memory_size:
                 found["memory"] = self._system.friction.initial_state(*seen)
         if self._system.law_size:
             found["law"] = torch.zeros(n, self._system.law_size, dtype=torch.float64)
@@ -397,8 +394,7 @@ class CompiledRollout:
                 given[name] = series("measured", rows(value, 2), steps, (n,))
         size, law = self._system.law_size, inputs.law_state
         law = inputs.q0.new_zeros(n, size) if size and law is None else law
-        memory_size = int(getattr(self._system.friction, "state_size", 0))
-        kept = {"memory": (inputs.hidden_state, memory_size), "law": (law, size)}
+        kept = {"memory": (inputs.hidden_state, self._system.memory_size), "law": (law, size)}
         for name, (state, numbers) in kept.items():
             if state is not None:
                 flat = rows(state, 2).reshape(-1, *state.shape[-2:])
@@ -411,7 +407,7 @@ class CompiledRollout:
                     "driven": inputs.measured is not None,
                     "remembered": inputs.hidden_state is not None}  # fmt: skip
         lost = {"diverged": np.empty(count, dtype=np.int64)}
-        self._kernel(count, p, given, outputs | lost, settings, threads)
+        self.kernel(count, p, given, outputs | lost, settings, threads)
         found = map(torch.from_numpy, outputs.values())
         return tuple(x.reshape(*batch, *x.shape[1:]) for x in found)
 
@@ -451,7 +447,7 @@ class CompiledRollout:
         size = self._system.law_size
         law = (q.new_zeros(self.joints, size),) if size else ()
         for k in range(steps):
-            if not self._system.remembers:
+            if not self._system.memory_size:
                 held = friction.coefficients(qd, qdd)
             else:
                 memory = friction.advance(qd, qdd, memory) if k else friction.initial_state(qd, qdd)

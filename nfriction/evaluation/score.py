@@ -22,7 +22,6 @@ from nfriction.recording import Recording, RecordingLike
 from nfriction.simulation.rollout import Scheme
 
 Array = NDArray[np.float64]
-
 HORIZONS = (1.0, 2.0, 5.0)
 
 

@@ -274,14 +274,7 @@ def _law(
     `signs` is filled with the arguments of hyperbolic tangents of the motion alone, which are then
     read from `sign`; where it is None such calls stay in place.
     """
-    names = ("qd", "load", "c")
-
-    def traced(joints: int) -> Program:
-        sizes = ((joints,), (joints,), (joints, len(model.law.names)))
-        given = {n: _example(*size) for n, size in zip(names, sizes, strict=True)}
-        return trace(lambda qd, load, c: model.torque(qd, load, c), given)
-
-    one, every = traced(1), traced(model.joints)
+    one, every = _traced_law(model, 1), _traced_law(model, model.joints)
     alike = _same_by_joint(one, every, model.joints)
     outputs = one.outputs[0].nodes if alike else every.outputs[0].nodes
     bound, joint = {}, "j"
@@ -323,21 +316,29 @@ def _depends(node: Node, name: str) -> bool:
 
 
 def _reads_load(model: FrictionModel) -> bool:
-    given = {"qd": _example(1), "load": _example(1), "c": _example(1, len(model.law.names))}
-    (torque,) = trace(lambda qd, load, c: model.torque(qd, load, c), given).outputs[0].nodes
-    return _depends(torque, "load")
+    return any(_depends(node, "load") for node in _traced_law(model, 1).outputs[0].nodes)
+
+
+def _traced_law(model: FrictionModel, joints: int) -> Program:
+    given = {"qd": _example(joints), "load": _example(joints),
+             "c": _example(joints, len(model.law.names))}  # fmt: skip
+    return trace(lambda qd, load, c: model.torque(qd, load, c), given)
+
+
+def _elements(program: Program) -> dict[int, str]:
+    """Texts of a program's inputs, by node number."""
+    return {
+        node.number: f"{port.name}[{i}]"
+        for port in program.inputs
+        for i, node in enumerate(port.nodes)
+    }
 
 
 def _load(plant: Plant, dialect: ControllerC) -> str:
     """Statements that compute the load of each joint of a plant."""
     program = trace(plant.load, {"q": _example(plant.joints), "qd": _example(plant.joints)})
-    bound = {
-        node.number: f"{port.name}[{i}]"
-        for port in program.inputs
-        for i, node in enumerate(port.nodes)
-    }
     targets = [f"load[{j}]" for j in range(plant.joints)]
-    lines = _assignments(targets, program.outputs[0].nodes, bound, dialect)
+    lines = _assignments(targets, program.outputs[0].nodes, _elements(program), dialect)
     return _braces([*lines, "(void)q;", "(void)qd;"], "")
 
 
@@ -367,11 +368,6 @@ def _schedule(controller: Controller, dialect: ControllerC) -> str:
 
 
 def _function(name: str, program: Program, outputs: Sequence[str], dialect: ControllerC) -> str:
-    bound = {
-        node.number: f"{port.name}[{i}]"
-        for port in program.inputs
-        for i, node in enumerate(port.nodes)
-    }
     targets, nodes = [], []
     for output, port in zip(outputs, program.outputs, strict=True):
         columns = port.shape[-1]
@@ -385,7 +381,7 @@ def _function(name: str, program: Program, outputs: Sequence[str], dialect: Cont
     kinds = {"c": "REAL c[NF_COEFFICIENTS][NF_JOINTS]", "next": "REAL *next"}
     arguments += [kinds[output] for output in sorted(outputs, reverse=True)]
     head = dialect.own(f"static void {name}(\n    {', '.join(arguments)})")
-    lines = _assignments(targets, nodes, bound, dialect)
+    lines = _assignments(targets, nodes, _elements(program), dialect)
     lines += [f"(void){port.name};" for port in program.inputs]
     return f"{head}\n{_braces(lines, '')}\n"
 

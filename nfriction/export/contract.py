@@ -438,7 +438,6 @@ def _plain(values: Any) -> Any:
 
 def _tensor(name: str, given: Any) -> Tensor:
     """A tensor of nested lists as `_plain` spells them."""
-
     if not isinstance(given, list) or len(given) > MOST_VECTORS:
         raise ValueError(f"`{name}` is no list, or too long")
     values = numbers(name, given, words=("nan", "inf", "-inf"))

@@ -8,6 +8,9 @@ from torch import Tensor, nn
 from nfriction.fitting.adjusted_plant import TORQUE_DELAY, PlantParameter
 from nfriction.fitting.options import DEFAULTS, FitOptions
 
+# Least squared frequency at which a chain swings for its weight to matter [1/s^2].
+WEIGHS = 1e-3
+
 
 def plant_parameters(
     plant: nn.Module,
@@ -80,6 +83,12 @@ def torque_delay_term(options: FitOptions = DEFAULTS) -> PlantParameter:
     return PlantParameter(TORQUE_DELAY, {}, -most, most, options.delay_sd)
 
 
+def has_weight(gravity_moment: Tensor, inertia_coupling: Tensor) -> bool:
+    """True if the pose of a chain matters to gravity: not balanced, nor in a horizontal plane."""
+    own = inertia_coupling.diagonal(dim1=-2, dim2=-1)
+    return bool((gravity_moment.abs() > WEIGHS * own).any())
+
+
 def _chain_terms(
     buffers: Mapping[str, Tensor], driven: bool, options: FitOptions
 ) -> Iterator[PlantParameter]:
@@ -89,7 +98,7 @@ def _chain_terms(
     def coupled(*pairs: tuple[int, int]) -> dict[str, Tensor]:
         return _at(buffers, "inertia_coupling", *pairs, *((j, i) for i, j in pairs))
 
-    weight = bool(buffers["gravity_moment"].any())
+    weight = has_weight(buffers["gravity_moment"], buffers["inertia_coupling"])
     for i in range(links):
         # Without torque and gravity, the inertia is the scale of the friction.
         if driven or weight:
@@ -97,10 +106,11 @@ def _chain_terms(
             yield from _ratio(buffers, name, coupled((i, i)), options.ratio_term)
     # The off-diagonal inertia a_ij = L_i b_j shares the first moment b_j with gravity, so both
     # scale together.
-    for j in range(0 if driven else 1, links):
+    for j in range(0 if driven and weight else 1, links):
         moment = _at(buffers, "gravity_moment", j) | coupled(*((i, j) for i in range(j)))
         yield from _ratio(buffers, f"gravity {j + 1}", moment, options.ratio_term)
-    for i in range(links - 1):
+    # Without weight lengths are only the scale of these.
+    for i in range(links - 1) if weight else ():
         carried = coupled(*((i, j) for j in range(i + 1, links)))
         yield from _ratio(buffers, f"length {i + 1}", carried, options.length_term)
     joints = buffers["angle_offset"].shape[-1]

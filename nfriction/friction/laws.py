@@ -168,8 +168,7 @@ class Law:
                 )
 
     def __deepcopy__(self, memo: object) -> "Law":
-        # Nothing of it can change, and fits copy their models at every search.
-        return self
+        return self  # nothing of it can change, and fits copy their models at every search
 
     @property
     def names(self) -> tuple[str, ...]:

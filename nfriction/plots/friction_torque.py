@@ -1,5 +1,6 @@
 """Friction torque over velocity, or position, with laws: of a motion, and of a table."""
 
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,27 +12,23 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from nfriction.fitting.equation_error import friction_torque
 from nfriction.fitting.hysteresis import path_of
-from nfriction.fitting.result.identifiability import NORMAL_95
+from nfriction.fitting.options import DEFAULTS
+from nfriction.fitting.result.identifiability import NORMAL_95, CoefficientUncertainty
 from nfriction.fitting.torque_table import predict
 from nfriction.friction import model_by_name, plain_name
 from nfriction.friction.memory import load_at_rest
+from nfriction.friction.models import FrictionModel
+from nfriction.plant import Plant
 from nfriction.plots import style
+from nfriction.recording import Recording
+from nfriction.signals import Motion, kalman_smoother
 
 if TYPE_CHECKING:
     from nfriction.evaluation.torque_tables import TorqueFits
     from nfriction.fitting.torque_table import JointFit
     from nfriction.recording.torque_table import JointTorque
-
-from collections.abc import Mapping, Sequence
-
-from nfriction.fitting.equation_error import friction_torque
-from nfriction.fitting.options import DEFAULTS
-from nfriction.fitting.result.identifiability import CoefficientUncertainty
-from nfriction.friction.models import FrictionModel
-from nfriction.plant import Plant
-from nfriction.recording import Recording
-from nfriction.signals import Motion, kalman_smoother
 
 Array = NDArray[np.float64]
 

@@ -85,7 +85,7 @@ def memory_step(
     # Held like the torque: a load that changes within a step is of the step's own order.
     zero = torch.zeros_like(qd)
     load = tau + zero if law.transmitted else plant.load(q, qd)
-    mobility = _mobility(plant, q, zero)
+    mobility = [list(row) for row in zip(*unit_responses(plant, q, zero), strict=True)]
     at_ease = torch.zeros_like(state)
     moved = law.advance(at_ease, zero + SLOW, load, coefficients, step)
     # A constant offset of the torque is no part of the slope.
@@ -120,16 +120,15 @@ def memory_step(
     return (*runge_kutta(rate, q, qd, step), after)
 
 
-def _mobility(plant: Plant, q: Tensor, zero: Tensor) -> list[list[Tensor]]:
-    """Accelerations by unit torques, entry (i, j) of joint i by the torque of joint j."""
+def unit_responses(plant: Plant, q: Tensor, zero: Tensor) -> list[tuple[Tensor, ...]]:
+    """Accelerations of all joints by a unit torque of each, one after the other."""
     unit = torch.eye(plant.joints, dtype=q.dtype, device=q.device)
     # Differences from the motion without torque, because plants have no mass matrix in common.
     rest = plant.forward_dynamics(q, zero, zero)
-    columns = [
+    return [
         (plant.forward_dynamics(q, zero, zero + unit[j]) - rest).unbind(-1)
         for j in range(plant.joints)
     ]
-    return [list(row) for row in zip(*columns, strict=True)]
 
 
 def _chord(rise: Tensor, run: Tensor, steepest: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from nfriction.simulation.compiled import System, integrate_compiled
-from nfriction.simulation.memory_step import memory_of
+from nfriction.simulation.memory_step import memory_of, unit_responses
 from nfriction.simulation.protocols import Friction, NoFriction, Plant, RolloutInputs, as_stateful
 from nfriction.simulation.rk4 import simulate_eager
 
@@ -47,12 +47,7 @@ def moreau_step(
     most = (step * friction.torque(sliding, load, coefficients)).unbind(-1)
     least = (step * friction.torque(-sliding, load, coefficients)).unbind(-1)
     zero = torch.zeros_like(qd)
-    rest = plant.forward_dynamics(q, zero, zero)
-    unit = torch.eye(plant.joints, dtype=qd.dtype, device=qd.device)
-    inverse = [
-        (plant.forward_dynamics(q, zero, zero + unit[j]) - rest).unbind(-1)
-        for j in range(plant.joints)
-    ]
+    inverse = unit_responses(plant, q, zero)
     if getattr(plant, "has_gear", False):
         # A gear's loss is a share of the torque without friction, which the impulses add.
         drag = friction.torque(qd, load, coefficients)

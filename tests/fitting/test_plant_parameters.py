@@ -170,3 +170,11 @@ def test_bounds_hold_the_given_plant():
     assert all(t.lower <= 0.0 < t.upper and t.prior_sd > 0 for t in terms)
     offset = next(t for t in terms if "torque_offset" in t.change)
     assert offset.upper == pytest.approx(0.6)
+
+
+def test_links_in_a_horizontal_plane_have_no_weight_to_fit():
+    """Gravity of the first link, lengths and zeros of angles would have no effect of their own."""
+    plant = PendulumChain([0.3, 0.2], [0.2, 0.15], inertia=[1e-3, 4e-4], gravity=1e-6)
+    names = [term.name for term in plant_parameters(plant, driven=[0, 1])]
+    assert [n for n in names if n.startswith(("inertia", "gravity", "length", "angle"))] == [
+        "inertia 11", "inertia 22", "gravity 2"]  # fmt: skip

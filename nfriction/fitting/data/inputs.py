@@ -20,6 +20,7 @@ from nfriction.fitting.data.windows import begins_at_rest
 from nfriction.fitting.options import DEFAULTS, FitOptions
 from nfriction.fitting.plant_parameters import (
     PlantParameter,
+    has_weight,
     plant_parameters,
     torque_delay_term,
 )
@@ -184,8 +185,10 @@ def is_undriven_pendulum(plant: Plant, joint: Sequence[Recording]) -> bool:
 
 
 def weighs(plant: Plant) -> bool:
-    """True for a chain whose pose matters to gravity, unlike a balanced rotor's."""
-    return isinstance(plant, PendulumChain) and bool(plant.gravity_moment.any())
+    """True for a chain whose pose matters to gravity."""
+    return isinstance(plant, PendulumChain) and has_weight(
+        plant.gravity_moment, plant.inertia_coupling
+    )
 
 
 def adjustable_terms(

@@ -11,9 +11,15 @@ from graphlib import TopologicalSorter
 from multiprocessing import Pipe, get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
+from nfriction import NFNCFM
+from nfriction.fitting.strategy.inputs import seeing_plant
+from nfriction.friction import model_by_name
+from nfriction.papers.reproduction import stages as stages_module
 from nfriction.papers.reproduction import tables
 from nfriction.papers.reproduction.stages import (
     _end_with_the_caller,
@@ -21,7 +27,7 @@ from nfriction.papers.reproduction.stages import (
     run_stage,
     stages,
 )
-from nfriction.papers.reproduction.workspace import Settings, Workspace
+from nfriction.papers.reproduction.workspace import Bench, Settings, Workspace
 
 TINY = Settings(
     tlrip_seconds=2.0,
@@ -47,10 +53,16 @@ def test_at_least_one_stage_at_a_time(tmp_path: Path) -> None:
         reproduce(tmp_path, TINY, jobs=0)
 
 
-def test_a_constant_model_is_fitted_judged_and_kept(tmp_path: Path) -> None:
-    workspace = Workspace(tmp_path, TINY)
-    for name in ("twin-tlrip", "NCFM"):
-        run_stage(workspace, name)
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    """A run whose first twin is made."""
+    made = Workspace(tmp_path_factory.mktemp("run"), TINY)
+    run_stage(made, "twin-tlrip")
+    return made
+
+
+def test_a_constant_model_is_fitted_judged_and_kept(workspace: Workspace) -> None:
+    run_stage(workspace, "NCFM")
     found = workspace.found("NCFM")
     assert {s["split"] for s in found["scores"].values()} == {"train", "test"}
     for score in found["scores"].values():
@@ -58,6 +70,36 @@ def test_a_constant_model_is_fitted_judged_and_kept(tmp_path: Path) -> None:
         assert score["measured_drive"] == score["free_run"]
         assert max(score["free_run"]["joints"]) < 0.5
     assert workspace.model("NCFM").exists()
+
+
+@pytest.mark.parametrize(("high", "network"), [(1e-3, None), (2e-3, "by_class")])
+def test_a_network_corrects_the_law_where_classes_do_not_pay(
+    high: float, network: str | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    asked: dict[str, Any] = {}
+
+    def fitted_model(workspace: Workspace, bench: None, name: str, **options: Any) -> Any:
+        asked[name] = options
+        by_class = [[[1e-3], [1e-3], [high]]]
+        return SimpleNamespace(model=model_by_name(name)(1, by_class if name == "ANCFM" else None))
+
+    monkeypatch.setattr(stages_module, "fit_from_start", fitted_model)
+    stages_module.fit_network(Workspace(tmp_path, TINY), None, "NFNCFM")  # type: ignore[arg-type]
+    assert asked["NFNCFM"].get("network") == network
+    start = asked["NFNCFM"]["start"].model
+    assert type(start).__name__ == ("ANCFM" if network else "NCFM")
+
+
+def test_a_network_that_sees_the_bearing_load_is_judged_on_the_plant_that_knows_it(
+    workspace: Workspace,
+) -> None:
+    def load_seen(workspace: Workspace, bench: Bench, name: str) -> Any:
+        model = NFNCFM(3, [0.03] * 2, inputs=["load"]).requires_grad_(False)
+        plant = seeing_plant(bench.plant, ["load"])
+        return SimpleNamespace(model=model, plant=plant, to_dict=dict)
+
+    found = stages_module.fitted(load_seen, workspace, "NFNCFM")
+    assert all(score["free_run"]["all"] < 1.0 for score in found["scores"].values())
 
 
 def _killed_caller(connection: Connection) -> None:
