@@ -313,7 +313,7 @@ def conclusion(workspace: Workspace) -> str:
             (five,) * len(simple), simple,
         ),
         f"Why: of the true friction torque a curve over speed misses {missed['speed']:.1%}, one "
-        "over speed and acceleration, all that a network sees, "
+        "over speed and acceleration, all that the papers' networks see, "
         f"{missed['speed and acceleration']:.1%}; {len(_unconverged(workspace))} of "
         f"{len(TLRIP) + len(SECOND_PAPER)} fits ended before they converged.",
     ]  # fmt: skip
