@@ -1,5 +1,7 @@
 """Networks that correct adaptive models: better where they can, left where they cannot."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -7,6 +9,7 @@ from nfriction import ALFM, LFM, NFLFM, fit
 from nfriction.evaluation.score import score
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
+from nfriction.fitting.shooting.uncertainty import integration_error
 from nfriction.friction.laws import LINEAR
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy
@@ -120,18 +123,30 @@ def test_without_an_adaptive_fit_to_start_from_there_is_one_first(case):
     assert found.model.schedule.adaptive.thresholds.equal(by_class.model.schedule.thresholds)
 
 
-def test_gradient_with_a_memory_is_the_cost_s_derivative():
+def remembering(**options) -> ShootingProblem:
+    """Windows of a network by class, whose classes remember."""
     model = NFLFM(2, v_smooth=0.1, network="by_class", terms=(2, 2), head_units=2)
-    model.schedule.set_adaptive(adaptive(sample_time=2e-3))
+    model.schedule.set_adaptive(adaptive(sample_time=2e-3, **options))
     model.schedule.adaptive.set_coefficients(1e-2 * model.schedule.adaptive.values)
     model.schedule.deviation.scale.mul_(1e-2)
     model.schedule.deviation.set_range(8.0, [-300.0, 300.0])
     model.requires_grad_(False)
     w = windows()
     memory = model.schedule.initial_state(w.qd0, torch.full_like(w.qd0, 20.0))
-    p = ShootingProblem(
+    return ShootingProblem(
         StepJacobian(pendulum(), model, []), model, w, 1e-3, ABSOLUTE, stride=4, memory=memory
     )
+
+
+def test_finer_steps_that_would_advance_a_memory_sooner_are_no_error_of_the_integration():
+    p = remembering(time_constant=0.02)
+    x = p.variables.start()
+    found = SimpleNamespace(x=x, hessian=p.linearise(x).hessian)
+    assert not integration_error(p, found).any()
+
+
+def test_gradient_with_a_memory_is_the_cost_s_derivative():
+    p = remembering()
     g = torch.Generator().manual_seed(1)
     x = p.variables.start()
     x[: p.variables.friction_count] = 0.1 * torch.randn(
