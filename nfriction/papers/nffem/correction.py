@@ -26,7 +26,7 @@ from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.constant import constant_start
 from nfriction.fitting.strategy.continuation import ShootingFitter
-from nfriction.fitting.strategy.holdout import cut_for_folds
+from nfriction.fitting.strategy.holdout import StoppedError, cut_for_folds
 from nfriction.fitting.strategy.neurofuzzy import input_range
 from nfriction.fitting.task import FitTask
 from nfriction.friction.models import FrictionModel
@@ -147,13 +147,20 @@ def _corrected(
     )  # fmt: skip
     # The memory advances with every step of the integration while the search lasts.
     schedule.set_sample_time(recordings[0].sample_time / substeps)
-    result, shares = kept_correction(
-        schedule, whole, fitter, base, f"{length:g} s windows, network"
-    )
+    kept, stopped = "The network is no better than its start, which is kept.", False
+    try:
+        result, shares = kept_correction(
+            schedule, whole, fitter, base, f"{length:g} s windows, network"
+        )
+    except StoppedError:
+        result, stopped = None, True
+        kept = "Stopped before the network was judged: its start is kept."
     if result is None:
         schedule.set_parameter_vector(base)
-        note = "The network is no better than its start, which is kept."
-        found = replace(start, model=model, status=f"{start.status} {note}")
+        found = replace(
+            start, model=model, status=f"{start.status} {kept}",
+            converged=start.converged and not stopped,
+        )  # fmt: skip
     else:
         found = result_from_shooting(model, whole, result, motions)
         # The plant is that of the start, and so are the terms reported.
@@ -225,6 +232,9 @@ def kept_correction(
 
     Returns:
         The search's result with the shares taken, None where none is; the shares, (joint,).
+
+    Raises:
+        StoppedError: if the caller stopped before the shares were found.
     """
     begun, shares = _cross_fitted(schedule, whole, fitter, base, name)
     # Parameters of a joint whose share is zero stay as they were.
@@ -264,10 +274,10 @@ def _cross_fitted(
             for chosen in (fold != k, fold == k)
         )
         found = fitter.search(seen, seen.variables.start(friction=base), LOOSE, name)
+        if found.stopped:
+            raise StoppedError
         learned.append(found.parts.friction - base)
         unseen.append(rest)
-        if found.stopped:
-            break
     of_joint = schedule.joint_of_parameters()
 
     def errors(shares: Tensor) -> Tensor:

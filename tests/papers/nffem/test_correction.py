@@ -96,6 +96,22 @@ def test_a_correction_worse_where_it_was_learned_is_left(case, monkeypatch):
     assert not found.model.schedule.parameter_vector().any()
 
 
+def test_an_interrupt_while_it_is_judged_keeps_the_adaptive_model(case):
+    plant, train, _, by_class = case
+    heard = []
+
+    def interrupt(stage, step):
+        heard.append(stage)
+        raise KeyboardInterrupt
+
+    found = fit(network(), plant, train, start=by_class, windows=(1.0,), fit_plant=False,
+                motions=by_class.motions, callback=interrupt)  # fmt: skip
+    assert len(heard) == 1
+    assert not found.converged
+    assert "Stopped" in found.status
+    assert not found.model.schedule.parameter_vector().any()
+
+
 def test_a_joint_s_part_that_does_not_help_is_left(case, monkeypatch):
     plant = case[0]
     model = network()
