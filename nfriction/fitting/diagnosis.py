@@ -74,6 +74,8 @@ def likely_mistakes(
     motions: Sequence[Motion],
     convention: AngleConvention,
     options: FitOptions = DEFAULTS,
+    *,
+    zeroed: bool = False,
 ) -> tuple[float, tuple[Mistake, ...]]:
     """Share of unexplained torque as recorded, and mistakes whose correction explains far more.
 
@@ -83,6 +85,7 @@ def likely_mistakes(
         motions: theirs, smoothed.
         convention: of the recorded angles.
         options: `diagnosis_ratio` and the like.
+        zeroed: encoders were set to zero at the start of each recording, wherever that was.
 
     Returns:
         The share [-], and the mistakes that the data support, best first: several where the data
@@ -98,10 +101,12 @@ def likely_mistakes(
         # A torque that is held until the next sample acts late by up to a step.
         if -max(r.sample_time for r in recordings) <= delay[0] <= 0:
             sound = min(delay[1], sound)
+    tested = [*_tested(plant, recordings, motions, convention, given, options, delay)]
+    # Of unlike zeros recordings of one rig balance differently.
+    if len(recordings) > 1 and not zeroed:
+        tested.append(_odd_one_out(plant, recordings, motions, options))
     found = [
-        Mistake(text, share)
-        for text, share in _tested(plant, recordings, motions, convention, given, options, delay)
-        if share < sound / options.diagnosis_ratio
+        Mistake(text, share) for text, share in tested if share < sound / options.diagnosis_ratio
     ]
     if not found and not given.tau.any() and isinstance(plant, PendulumChain | LinearAxis):
         return stated, tuple(_driven_without_torque(plant, recordings, motions, options))
@@ -170,8 +175,6 @@ def _tested(
             yield text, _unexplained(plant, data)
     for text, rig in _corrected_terms(plant, given, options):
         yield text, _unexplained(rig, given)
-    if len(recordings) > 1:
-        yield _odd_one_out(plant, recordings, motions, options)
 
 
 def _odd_one_out(

@@ -105,7 +105,9 @@ def prepare_task(
         delay, _ = balanced_delay(plant, joint, moved, options)
     advanced = advanced_torques(joint, delay)
     # With the delay removed, so that it is not named a second time as a mistake.
-    stated, mistakes = likely_mistakes(plant, advanced, moved, convention, options)
+    stated, mistakes = likely_mistakes(
+        plant, advanced, moved, convention, options, zeroed=per_recording
+    )
     found = (
         *mistake_warning(stated, mistakes),
         *((ZEROED_PER_RECORDING,) if guessed else ()),

@@ -24,6 +24,7 @@ from nfriction import (
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.task import prepare_task
 from nfriction.signals import kalman_smoother
+from tests.evaluation.test_score import zeroed_in_a_pose
 
 COUNT = 2 * math.pi / 4096
 WHEEL = {"inertia": 0.02, "motor": Motor(50, rotor_inertia=1.2e-5)}
@@ -292,6 +293,16 @@ def test_a_recording_of_another_rig_is_named():
     found = prepare_task(CVFM(1), plant, recordings, FitOptions()).mistakes
     assert found == ("other is of another rig, or recorded in another way, than the others",)
     assert not prepare_task(CVFM(1), plant, recordings[:2], FitOptions()).mistakes
+
+
+def test_recordings_whose_encoders_were_zeroed_in_unlike_poses_are_of_one_rig():
+    made = [zeroed_in_a_pose(np.array(zero)) for zero in ((0.02, -0.03), (-0.01, 0.02))]
+    plant, recordings = made[0][0], [recording for *_, recording in made]
+    task = prepare_task(CVFM(2), plant, recordings, FitOptions())
+    assert task.per_recording
+    assert not task.mistakes
+    shared = prepare_task(CVFM(2), plant, recordings, FitOptions(encoder_reference="shared"))
+    assert "of another rig" in shared.mistakes[0]
 
 
 @pytest.mark.parametrize("rounded", [True, False])
