@@ -361,7 +361,7 @@ def estimate_zero(
             break
         slopes = (ahead - back) / (0.2 * sd)
         # The prior only keeps the zero of a joint that gravity does not load.
-        weight = 1 / max(np.mean(now**2), DEFAULTS.min_noise**2)
+        weight = 1 / max(float(np.mean(now**2)), DEFAULTS.min_noise**2)
         data = weight * np.einsum("akj,bkj->ab", slopes, slopes)
         prior = np.eye(joints) / sd**2
         gradient = weight * np.einsum("akj,kj->a", slopes, now) + zero / sd**2
