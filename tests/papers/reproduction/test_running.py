@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from graphlib import TopologicalSorter
 from multiprocessing import Pipe, get_context
 from multiprocessing.connection import Connection
@@ -46,6 +46,24 @@ def test_every_stage_comes_after_those_it_needs() -> None:
     every = {name: stage.needs for name, stage in stages().items()}
     # Raises where a stage needs itself.
     assert set(TopologicalSorter(every).static_order()) == set(every)
+
+
+def test_a_stage_waits_for_those_that_it_needs(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    done: set[str] = set()
+
+    def run(workspace: Workspace, name: str) -> None:
+        assert done >= set(stages()[name].needs)
+        time.sleep(0.005)  # others may begin meanwhile
+        done.add(name)
+
+    monkeypatch.setattr(stages_module, "run_stage", run)
+    monkeypatch.setattr(
+        stages_module, "ProcessPoolExecutor", lambda jobs, **_: ThreadPoolExecutor(jobs)
+    )
+    reproduce(tmp_path, TINY, jobs=3)
+    assert done == set(stages())
 
 
 def test_at_least_one_stage_at_a_time(tmp_path: Path) -> None:
