@@ -6,9 +6,9 @@
 
 All fit the constant law first, the first two then coefficients by class of acceleration. Ours
 corrects these by an ANFIS layer with a radial basis head, on trajectories; `fit` corrects the
-constant law in the same way, and so does ours where the classes do not pay. The papers span a
-fuzzy controller with them and train a radial basis network on its outputs for 40,000 samples a
-joint. After a Ctrl-C or a kill, `--resume` reads the stages that were finished and starts the
+constant law in the same way, and so does ours where the classes simulate no better. The papers
+span a fuzzy controller with them and train a radial basis network on its outputs for 40,000 samples
+a joint. After a Ctrl-C or a kill, `--resume` reads the stages that were finished and starts the
 others again, with the same result.
 """
 

@@ -365,11 +365,10 @@ def estimate_zero(
         data = weight * np.einsum("akj,bkj->ab", slopes, slopes)
         prior = np.eye(joints) / sd**2
         gradient = weight * np.einsum("akj,kj->a", slopes, now) + zero / sd**2
-        covariance = np.linalg.inv(data + prior)
-        # Errors by the torque's noise or the model last for many samples.
+        # Errors by the torque's noise or the model last for many samples, which then count as one.
         lasting = correlation_time(torch.tensor(now)[None])
-        root = covariance @ np.linalg.cholesky(lasting * data + prior)
-        step = -covariance @ gradient
+        root = np.linalg.cholesky(np.linalg.inv(data / lasting + prior))
+        step = -np.linalg.solve(data + prior, gradient)
         trials = zero + SHARES[:, None] * step
         cost = weight * np.sum(error(trials) ** 2, axis=(1, 2))
         cost += np.sum((trials / sd) ** 2, axis=-1)

@@ -59,9 +59,9 @@ TOO_LONG = (
 )
 
 LOSSY = (
-    "Windows of {:g} s were skipped: they would give parameters that are worse at shorter ones, or "
-    "less certain. Errors and noise of the torque add up over long windows, or law or plant are "
-    "wrong."
+    "Windows of {:g} s were skipped: their parameters would be less certain than those of shorter "
+    "windows, or worse there. Errors and noise of the torque add up over long windows; a wrong law "
+    "or plant has the same effect."
 )
 
 

@@ -1,8 +1,8 @@
 """Fits of adaptive models: coefficients by class of acceleration (AFEM).
 
 During a search the classes are those of the measured motion, so the cost is smooth in the
-coefficients. They are kept if what two thirds of the windows teach improves the others, and taken
-as far as they improve simulations in which the class follows the simulated motion.
+coefficients. What the search finds is then taken as far as it also improves simulations in which
+the class follows the simulated motion.
 """
 
 import logging
@@ -17,18 +17,16 @@ from nfriction.fitting.data.inputs import (
     apply_encoder_offsets,
     integration_substeps,
 )
-from nfriction.fitting.data.windows import Windows
+from nfriction.fitting.data.windows import Windows, cut_windows
 from nfriction.fitting.equation_error import coefficient_scale
 from nfriction.fitting.options import EncoderReference, FitOptions
 from nfriction.fitting.result.fit_result import FitResult
 from nfriction.fitting.result.of_search import result_from_shooting
-from nfriction.fitting.result.paired_test import student_quantile
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.fitting.shooting.problem import ShootingProblem
 from nfriction.fitting.shooting.sensitivity import StepJacobian
 from nfriction.fitting.strategy.constant import constant_start
-from nfriction.fitting.strategy.continuation import ShootingFitter, settle_states
-from nfriction.fitting.strategy.holdout import StoppedError, cut_for_folds
+from nfriction.fitting.strategy.continuation import ShootingFitter
 from nfriction.fitting.task import Callback, FitTask, known_terms, prepare_task
 from nfriction.friction.models import FrictionModel
 from nfriction.papers.afem.adaptive import CLASSES, Adaptive
@@ -43,8 +41,6 @@ from nfriction.simulation.rollout import integrate
 logger = logging.getLogger(__name__)
 # Relative decrease of the cost that ends the search by class.
 TOLERANCE = 1e-6
-# Of the searches that are only judged.
-LOOSE = 1e-3
 # Shares of the classes' deviations from the constant law to try, largest first.
 SHARES = (1.0, 0.5, 0.25)
 OPTIONS = FitOptions(windows=(0.5, 2.0))
@@ -64,9 +60,9 @@ def fit_adaptive(
     """Fit a model whose coefficients depend on the class of acceleration.
 
     As `nfriction.fit` does, with options for the classes. The constant law is fitted first. Every
-    class starts there and is pulled toward it, so a class with few data stays there; and where what
-    two thirds of the windows teach simulates the others no better, with the class following the
-    simulation, the constant coefficients are kept.
+    class starts there and is pulled toward it, so a class with few data stays there; and where the
+    result simulates the training windows no better, with the class following the simulation, the
+    constant coefficients are kept.
 
     Args:
         model: the model to fit; changed in place.
@@ -110,7 +106,7 @@ def fit_by_class(task: FitTask, classes: ClassOptions = DEFAULTS) -> FitResult:
     task = replace(task, options=options)
     constant = constant_start(task)
     length = constant.longest_usable_horizon(options.windows)
-    by_class = ClassFit.of(task, schedule, constant, length, classes, options.folds)
+    by_class = ClassFit.of(task, schedule, constant, length, classes)
     task, given, windows = by_class.task, by_class.given, by_class.windows
     terms = adjustable_terms(
         task.plant, task.recordings, options, per_recording=bool(constant.encoder_offsets)
@@ -127,11 +123,6 @@ def fit_by_class(task: FitTask, classes: ClassOptions = DEFAULTS) -> FitResult:
         task.callback,
     )  # fmt: skip
     name = f"{length:g} s windows, by class"
-    try:
-        if not by_class.pay(problem, fitter, vector):
-            return by_class.constant_kept()
-    except StoppedError:
-        return by_class.constant_kept("Stopped before the classes were judged", converged=False)
     result = fitter.search(problem, problem.variables.start(vector), TOLERANCE, name).result
     found = result_from_shooting(given, problem, result, task.motions)
     q0, qd0 = problem.variables.split(result.x).states.chunk(2, -1)
@@ -286,12 +277,8 @@ class ClassFit:
         constant: FitResult,
         length: float,
         options: ClassOptions,
-        folds: int = 1,
     ) -> "ClassFit":
-        """Find the classes, set the schedule of the task's model to them, and cut windows [s].
-
-        At least `folds` windows, shorter ones of short recordings.
-        """
+        """Find the classes, set the schedule of the task's model to them, and cut windows [s]."""
         model = task.model
         joint, motions = apply_encoder_offsets(
             constant.encoder_offsets, task.plant, task.recordings, task.motions
@@ -307,7 +294,7 @@ class ClassFit:
         given = FrictionModel(model.law, table, model.v_smooth).requires_grad_(False)
         # Windows are compared in joint coordinates, without what the encoders are off by.
         corrected = replace(task, recordings=joint, motions=motions)
-        windows = cut_for_folds(joint, motions, length, folds)
+        windows = cut_windows(joint, motions, length)
         return cls(corrected, task.motions, constant, classes, schedule, table, given, windows)
 
     @property
@@ -326,79 +313,27 @@ class ClassFit:
             driving[w, : last - first] = known.to(driving.dtype)
         return driving
 
-    def pay(self, problem: GivenClassesProblem, fitter: ShootingFitter, plant: Tensor) -> bool:
-        """True if classes that two thirds of the windows teach simulate the others better.
-
-        Better than the constant law on the constant fit's plant, of which `plant` has the terms.
-        Raises `StoppedError` if the caller stopped one of the searches.
-        """
-        folds, classes = self.task.options.folds, problem.classes
-        assert classes is not None
-        fold = torch.arange(len(self.windows)) % folds
-        flat, classes = self.table.parameter_vector(), self.drive()
-        squares: list[tuple[Tensor, Tensor]] = []
-        for k in range(folds):
-            seen, rest = (
-                replace(problem, windows=self.windows.subset(own), classes=classes[own])
-                for own in (fold != k, fold == k)
-            )
-            start = seen.variables.start(plant)
-            end = fitter.search(seen, start, LOOSE, "by class, hold-out")
-            if end.stopped:
-                raise StoppedError
-            learnt = end.parts
-            squares.append((self._squares(rest, learnt.friction, learnt.plant),
-                            self._squares(rest, flat, plant)))  # fmt: skip
-        self.table.set_parameter_vector(flat)
-        new, old = (torch.cat(part) for part in zip(*squares, strict=True))
-        # Window by window, as a sum over them hangs on the one or two of the liveliest motion.
-        ratio = torch.log(new / old)
-        spread = ratio.std() / len(ratio) ** 0.5
-        allowed = student_quantile(len(ratio) - 1, 1 - self.task.options.gain_chance)
-        return bool(ratio.mean() + allowed * spread < 0)
-
-    def _squares(self, judged: GivenClassesProblem, table: Tensor, plant: Tensor) -> Tensor:
-        """Mean squared error of windows with the class following the simulation, (window,).
-
-        They start at the states that suit given classes best.
-        """
-        x, stopped = settle_states(judged, judged.variables.start(plant, friction=table))
-        if stopped:
-            raise StoppedError
-        q0, qd0 = judged.variables.split(x).states.chunk(2, -1)
-        self.table.set_parameter_vector(table)
-        self.schedule.set_coefficients(self._filled())
-        error = self._following(judged.plant_at(plant), replace(judged.windows, q0=q0, qd0=qd0))
-        errors = error.residuals(self.schedule.parameter_vector())
-        least = self.task.options.min_noise**2
-        return errors.square().mean((1, 2)).nan_to_num(nan=torch.inf).clamp_min(least)
-
-    def _filled(self) -> Tensor:
-        """Coefficients by class; one without data was never varied and has its neighbour's."""
-        return torch.take_along_dim(self.table.values, self.classes.stands_for[..., None], 1)
-
-    def _following(self, plant: Plant, windows: Windows) -> PositionError:
-        """Errors of windows with the class following the simulation."""
-        task, model = self.task, self.task.model.requires_grad_(False)
-        along = [
-            self.schedule.states(torch.as_tensor(m.qd), torch.as_tensor(m.qdd))
-            for m in task.motions
-        ]
-        memory = torch.stack([along[place][first] for place, first, _ in windows.spans])
-        return PositionError(plant, model, windows, task.measurement, self.substeps, memory=memory)
-
     def backtracked(self, found: FitResult, windows: Windows, baseline: float) -> FitResult:
         """The fit `found` as far as it improves on `baseline` [rad], the constant law's error.
 
         Windows start at the states that the fit found.
         """
-        constant, schedule = self.constant, self.schedule
-        table, flat = self._filled(), self._flat()
-        error = self._following(found.plant, windows)
+        task, constant, model, schedule = self.task, self.constant, self.task.model, self.schedule
+        flat = constant.model.schedule.coefficient_sets()["always"][:, None]
+        # A class without data was never varied: its own entry is still the start.
+        table = torch.take_along_dim(self.table.values, self.classes.stands_for[..., None], 1)
+        model.requires_grad_(False)
+        along = [
+            schedule.states(torch.as_tensor(m.qd), torch.as_tensor(m.qdd)) for m in task.motions
+        ]
+        memory = torch.stack([along[place][first] for place, first, _ in windows.spans])
+        error = PositionError(
+            found.plant, model, windows, task.measurement, self.substeps, memory=memory
+        )
         # As recorded: with the motions and the encoder offsets of the constant fit.
         found = replace(
-            found, model=self.task.model, motions=self.motions,
-            encoder_offsets=constant.encoder_offsets, skipped_horizons=constant.skipped_horizons,
+            found, model=model, motions=self.motions, encoder_offsets=constant.encoder_offsets,
+            skipped_horizons=constant.skipped_horizons,
         )  # fmt: skip
         # Given classes hide that a wrong class feeds back on the motion that chooses it.
         for share in SHARES:
@@ -410,20 +345,7 @@ class ClassFit:
                 status = found.status + part + "".join(f" {note}." for note in self.classes.notes)
                 taken = replace(found, residual=rms, residuals=residuals, status=status)
                 return taken.with_warnings(constant.data_warnings)
-        return self.constant_kept()
-
-    def _flat(self) -> Tensor:
-        """Coefficients of the constant law, (joint, 1, coefficient)."""
-        return self.constant.model.schedule.coefficient_sets()["always"][:, None]
-
-    def constant_kept(
-        self, reason: str = "The classes simulate no better", *, converged: bool = True
-    ) -> FitResult:
-        """The constant fit as the adaptive model's: all classes equal."""
-        constant, model = self.constant, self.task.model.requires_grad_(False)
-        self.schedule.set_coefficients(self._flat().expand(-1, len(CLASSES), -1))
-        return replace(
-            constant, model=model, motions=self.motions,
-            converged=constant.converged and converged,
-            status=f"{constant.status} {reason}: the constant law is kept.",
-        )  # fmt: skip
+        # All classes equal: the adaptive model then is the constant one.
+        schedule.set_coefficients(flat.expand(-1, len(CLASSES), -1))
+        status = f"{constant.status} The classes simulate no better: the constant law is kept."
+        return replace(constant, model=model, motions=self.motions, status=status)

@@ -86,7 +86,7 @@ FIRST = (
          figures={"networks_NFLFM": figures.network_surfaces}, models=("NFLFM-papers",)),
     Item("Figs. 11, 12, 13: coefficients of the neuro-fuzzy models in the experiment",
          "Where the network's correction did not pass its hold-out windows, a joint has the steps "
-         "of the classes alone; where the classes did not pass theirs, the constant law is "
+         "of the classes alone; where the classes simulate no better, the constant law is "
          "corrected.",
          figures={f"fig_{number}_coefficients_{name}": partial(figures.coefficients, name=name)
                   for number, name in zip((11, 12, 13), NEURO_FUZZY, strict=True)},

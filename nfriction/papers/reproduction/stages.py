@@ -232,7 +232,7 @@ def fit_by_class(workspace: Workspace, bench: Bench, name: str) -> FitResult:
 def fit_network(workspace: Workspace, bench: Bench, name: str) -> FitResult:
     """A neuro-fuzzy model our way: a network corrects the adaptive model, on trajectories.
 
-    Where the classes did not pay, it corrects the constant law, with inputs of its own choice.
+    Where the classes simulate no better, it corrects the constant law and chooses its inputs.
     """
     start = fit_by_class(workspace, bench, f"A{name.removeprefix('NF')}")
     first, *others = start.model.schedule.coefficient_sets().values()

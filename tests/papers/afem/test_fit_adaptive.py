@@ -1,7 +1,5 @@
 """Adaptive fits recover coefficients by class and never serve worse than the constant law."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 
@@ -15,7 +13,7 @@ from nfriction.papers.afem.adaptive import ALFM
 from nfriction.papers.afem.classes import ClassOptions
 from nfriction.papers.afem.fit_adaptive import GivenClasses, GivenClassesProblem, fit_adaptive
 from nfriction.papers.afem.fit_by_search import SearchOptions, fit_by_search
-from nfriction.signals import kalman_smoother, quantise
+from nfriction.signals import kalman_smoother
 from tests.fitting.recordings import F64, pendulum, swing
 from tests.fitting.test_trajectory import ABSOLUTE, point, windows
 
@@ -106,41 +104,6 @@ def test_without_a_difference_between_classes_the_constant_law_stays(case):
     flat = constant.model.schedule.values[:, None].expand(2, 3, 2)
     torch.testing.assert_close(model.schedule.values, flat, rtol=1e-3, atol=1e-8)
     assert found.residual <= constant.residual * (1 + 1e-9)
-
-
-@pytest.fixture(scope="module")
-def noisy():
-    """A swing without a difference between classes, and the fit of its law."""
-    plant, truth = pendulum(), LFM(2, [[1.5e-3, 2.5e-3], [8e-4, 1.2e-3]], v_smooth=V_SMOOTH)
-    exact = swing(plant, truth, seconds=3.0, start=(2.6, 0.2))
-    train = replace(exact, q=quantise(exact.q, 4096))
-    law = LFM(2, v_smooth=V_SMOOTH)
-    return plant, train, fit(law, plant, train, fit_plant=False, windows=(0.5,))
-
-
-def test_classes_that_only_learn_the_noise_are_not_taken(noisy):
-    """On the windows that teach them they err less."""
-    plant, train, start = noisy
-    found = fit(ALFM(2, v_smooth=V_SMOOTH), plant, train, fit_plant=False, windows=(0.5,),
-                start=start)  # fmt: skip
-    assert "constant law is kept" in found.status
-    assert found.residual == start.residual
-
-
-def test_an_interrupt_while_classes_are_judged_ends_the_fit(noisy):
-    plant, train, start = noisy
-    heard = []
-
-    def interrupt(stage, step):
-        heard.append(stage)
-        raise KeyboardInterrupt
-
-    found = fit(ALFM(2, v_smooth=V_SMOOTH), plant, train, fit_plant=False, windows=(0.5,),
-                start=start, callback=interrupt)  # fmt: skip
-    assert heard == ["by class, hold-out"]
-    assert not found.converged
-    assert "Stopped" in found.status
-    assert found.residual == start.residual
 
 
 def test_coefficients_that_serve_worse_are_not_taken(case, monkeypatch):
