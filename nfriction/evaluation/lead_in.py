@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from nfriction.fitting.data.inputs import require_drive
 from nfriction.fitting.data.windows import begins_at_rest
 from nfriction.fitting.options import DEFAULTS
-from nfriction.fitting.shooting.autocorrelation import correlation_time, white_noise
+from nfriction.fitting.shooting.autocorrelation import white_noise
 from nfriction.friction.memory import deflections, load_of
 from nfriction.friction.models import FrictionModel
 from nfriction.io.model_file import require_model
@@ -302,7 +302,7 @@ class Zero:
 
     Attributes:
         offset: what to add to its positions, (joint,).
-        root: of its covariance root @ root.T, (joint, joint).
+        root: of its covariance root @ root.T by the noise of positions, (joint, joint).
     """
 
     offset: Array
@@ -365,9 +365,10 @@ def estimate_zero(
         data = weight * np.einsum("akj,bkj->ab", slopes, slopes)
         prior = np.eye(joints) / sd**2
         gradient = weight * np.einsum("akj,kj->a", slopes, now) + zero / sd**2
-        # Errors by the torque's noise or the model last for many samples, which then count as one.
-        lasting = correlation_time(torch.tensor(now)[None])
-        root = np.linalg.cholesky(np.linalg.inv(data / lasting + prior))
+        # By noise alone: what the model's own error makes of the zero is the model's fault.
+        noise = white_noise(torch.tensor(now)[None]).numpy().clip(DEFAULTS.min_noise)
+        known = np.einsum("akj,bkj->ab", slopes / noise, slopes / noise)
+        root = np.linalg.cholesky(np.linalg.inv(known + prior))
         step = -np.linalg.solve(data + prior, gradient)
         trials = zero + SHARES[:, None] * step
         cost = weight * np.sum(error(trials) ** 2, axis=(1, 2))
