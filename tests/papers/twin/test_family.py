@@ -26,13 +26,13 @@ def motions(truth: str, samples: int, **settings: float) -> list[TrueMotion]:
 
 
 @pytest.fixture(scope="module", params=EVERY)
-def two_seconds(request: pytest.FixtureRequest) -> tuple[str, list[TrueMotion]]:
-    return request.param, motions(request.param, 2000)
+def one_second(request: pytest.FixtureRequest) -> tuple[str, list[TrueMotion]]:
+    return request.param, motions(request.param, 1000)
 
 
 @pytest.fixture(scope="module")
 def plain() -> list[TrueMotion]:
-    return motions(family.PLAIN, 2000)
+    return motions(family.PLAIN, 1000)
 
 
 @pytest.fixture(scope="module")
@@ -43,15 +43,15 @@ def drawn() -> twin.Twin:
 # The physics
 
 
-def test_motion_obeys_the_plant(two_seconds: tuple[str, list[TrueMotion]]) -> None:
-    for motion in two_seconds[1]:
+def test_motion_obeys_the_plant(one_second: tuple[str, list[TrueMotion]]) -> None:
+    for motion in one_second[1]:
         q, qd, qdd = (torch.from_numpy(x) for x in (motion.q, motion.qd, motion.qdd))
         needed = rigs.tlrip().inverse_dynamics(q, qd, qdd)
         np.testing.assert_allclose(needed.numpy(), -motion.tau_f, atol=1e-10)
 
 
-def test_friction_is_passive(two_seconds: tuple[str, list[TrueMotion]]) -> None:
-    truth, found = two_seconds
+def test_friction_is_passive(one_second: tuple[str, list[TrueMotion]]) -> None:
+    truth, found = one_second
     for motion in found:
         power = motion.qd * motion.tau_f
         # From bristles at rest nothing can be taken out that was not put in.
@@ -66,15 +66,15 @@ def test_friction_is_passive(two_seconds: tuple[str, list[TrueMotion]]) -> None:
 
 
 def test_every_effect_changes_the_motion(
-    two_seconds: tuple[str, list[TrueMotion]], plain: list[TrueMotion]
+    one_second: tuple[str, list[TrueMotion]], plain: list[TrueMotion]
 ) -> None:
-    truth, found = two_seconds
+    truth, found = one_second
     apart = max(np.abs(a.q - b.q).max() for a, b in zip(found, plain, strict=True))
     assert (apart > 10 * family.COUNT) == (truth != family.PLAIN)
 
 
 def test_steps_are_short_enough() -> None:
-    coarse_and_fine = motions(TOGETHER, 1000), motions(TOGETHER, 4000, step=2.5e-4)
+    coarse_and_fine = motions(TOGETHER, 500), motions(TOGETHER, 2000, step=2.5e-4)
     for coarse, fine in zip(*coarse_and_fine, strict=True):
         assert np.abs(coarse.q - fine.q[::4]).max() < 0.1 * family.COUNT
 
