@@ -86,7 +86,7 @@ def stages() -> dict[str, Stage]:
             law: constant,
             f"A{law}": Stage(by_class, partial(fitted, fit_by_class)),
             f"A{law}-pattern": Stage(by_class, partial(fitted, fit_by_pattern)),
-            f"NF{law}": Stage((f"A{law}",), partial(fitted, fit_network)),
+            f"NF{law}": Stage((law,), partial(fitted, fit_network)),
             f"NF{law}-papers": Stage((f"A{law}",), papers_way),
             f"rtip-{law}": Stage(("twin-rtip",), second_paper),
         }
@@ -210,7 +210,6 @@ def fit_from_start(
     name: str,
     *,
     start: FitResult | None = None,
-    max_steps: int | None = None,
     **options: Any,
 ) -> FitResult:
     """A model made with these options and fitted to trajectories, from an earlier fit or none."""
@@ -218,7 +217,7 @@ def fit_from_start(
     model = model_by_name(name)(bench.plant.joints, **options)
     return workspace.fit(name, bench, lambda step: fit(
         model, bench.plant, bench.train, windows=settings.windows,
-        max_steps=max_steps or settings.max_steps, fit_plant=settings.fit_plant, start=start,
+        max_steps=settings.max_steps, fit_plant=settings.fit_plant, start=start,
         motions=bench.train_motions, callback=step,
     ))  # fmt: skip
 
@@ -230,30 +229,11 @@ def fit_by_class(workspace: Workspace, bench: Bench, name: str) -> FitResult:
 
 
 def fit_network(workspace: Workspace, bench: Bench, name: str) -> FitResult:
-    """A neuro-fuzzy model our way: a network corrects the adaptive model, on trajectories.
-
-    Where the classes simulate no better, it corrects the constant law and chooses its inputs.
-    """
-    start = fit_by_class(workspace, bench, f"A{name.removeprefix('NF')}")
-    first, *others = start.model.schedule.coefficient_sets().values()
-    if all(torch.equal(first, other) for other in others):
-        return fit_without_classes(workspace, bench, name)
-    steps = workspace.settings.network_steps
+    """A neuro-fuzzy model our way: a network corrects the constant law, on trajectories."""
+    start, settings = fit_from_start(workspace, bench, name.removeprefix("NF")), workspace.settings
     return fit_from_start(
-        workspace, bench, name, start=start, max_steps=steps, network="by_class",
-        **_sizes(workspace),
-    )  # fmt: skip
-
-
-def fit_without_classes(workspace: Workspace, bench: Bench, name: str) -> FitResult:
-    """A neuro-fuzzy model from the constant fit of its law."""
-    start = fit_from_start(workspace, bench, name.removeprefix("NF"))
-    return fit_from_start(workspace, bench, name, start=start, **_sizes(workspace))
-
-
-def _sizes(workspace: Workspace) -> dict[str, Any]:
-    settings = workspace.settings
-    return {"terms": settings.terms, "head_units": settings.head_units}
+        workspace, bench, name, start=start, terms=settings.terms, head_units=settings.head_units
+    )
 
 
 def fit_searched(

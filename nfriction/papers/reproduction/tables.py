@@ -300,7 +300,7 @@ def conclusion(workspace: Workspace) -> str:
             ADAPTIVE, constant,
         ),
         claim(
-            f"networks that correct them in simulations err less still, {said(NEURO_FUZZY)}",
+            f"networks fitted to trajectories err less still, {said(NEURO_FUZZY)}",
             NEURO_FUZZY, ADAPTIVE,
         ),
         claim(
