@@ -32,6 +32,7 @@ from nfriction.papers.afem.fit_by_search import SearchMethod, SearchOptions, fit
 from nfriction.papers.control import study
 from nfriction.papers.nffem.train_network import TrainingOptions, recorded_losses
 from nfriction.papers.reproduction.agreement import missed_torque
+from nfriction.papers.reproduction.fresh import free_run_errors, true_positions
 from nfriction.papers.reproduction.procedure import papers_neuro_fuzzy
 from nfriction.papers.reproduction.workspace import (
     FULL,
@@ -195,6 +196,8 @@ def make_twin(workspace: Workspace, name: str) -> dict[str, Any]:
     arrays: dict[str, Array] = {}
     for label, motion in zip(made.recordings, motions, strict=True):
         arrays |= {f"{label}_{key}": getattr(motion, key) for key in ("q", "qd", "qdd")}
+    if rig == "tlrip":
+        arrays["fresh"] = true_positions(duration)
     workspace.write_arrays(name, arrays)
     found: dict[str, Any] = {
         "recordings": {label: r.digest() for label, r in made.recordings.items()}
@@ -355,7 +358,12 @@ def _judged(
     """End of a model's fit, its scores and coefficients, and its classes if it has any."""
     scores, simulated = judge(bench, model)
     workspace.write_arrays(stage, simulated)
-    found = {"fit": ended, "scores": scores, "coefficients": coefficient_summary(model)}
+    found: dict[str, Any] = {
+        "fit": ended, "scores": scores, "coefficients": coefficient_summary(model)
+    }  # fmt: skip
+    if stage not in SECOND_PAPER:
+        true = workspace.arrays("twin-tlrip")["fresh"]
+        found["fresh"] = free_run_errors(bench.plant, model, true)
     schedule = model.schedule
     if not isinstance(schedule, Adaptive):
         return found
