@@ -60,7 +60,7 @@ from nfriction.fitting.task import (
 )
 from nfriction.friction.models import FrictionModel
 from nfriction.friction.neurofuzzy import NeuroFuzzy, NeuroFuzzyModel
-from nfriction.optim.evidence import GroupEvidence, group_evidence
+from nfriction.optim.group_evidence import GroupEvidence, group_evidence
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
