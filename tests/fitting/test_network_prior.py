@@ -69,10 +69,31 @@ def test_the_prior_is_the_one_whose_network_predicts_best(constant, monkeypatch,
     fit(model, one_link(), recording, start=found, windows=(0.5,), fit_plant=False, max_steps=2)
     tried = len(PRIOR_SHARES)
     assert seen[:tried] == pytest.approx([0.6 * share for share in PRIOR_SHARES])
-    # The other windows are held out of the best alone.
-    assert seen[tried:] == [seen[best]] * (DEFAULTS.folds - 1)
+    # The other windows are held out of the best alone, and then it is judged over the law's.
+    assert seen[tried:] == [seen[best]] * DEFAULTS.folds
     # It travels with the model as what it was fitted with.
     assert model.schedule.options()["prior_sd"] == pytest.approx(0.6 * PRIOR_SHARES[best])
+
+
+@pytest.mark.usefixtures("sets_stay")
+@pytest.mark.parametrize(("longer", "kept"), [(1.5, True), (2.0, True), (2.5, False)])
+def test_a_network_that_loses_over_windows_as_long_as_its_laws_is_rejected(
+    constant, monkeypatch, longer, kept
+):
+    """Short windows hardly show a force that is slightly off."""
+    recording, law = constant
+
+    def rms(test, problem, *_):
+        long = test.length > 0.4
+        if isinstance(problem.friction.schedule, NeuroFuzzy):
+            return torch.full((len(test),), longer if long else 0.5).square()
+        return torch.full((len(test),), 2.0 if long else 1.0).square()
+
+    monkeypatch.setattr("nfriction.fitting.strategy.neurofuzzy.holdout_squares", rms)
+    model = NFLFM(1, v_smooth=V_SMOOTH, **SMALL)
+    found = fit(model, one_link(), recording, start=law, **BRIEF, fit_plant=False)
+    assert bool(model.schedule.parameter_vector().any()) is kept
+    assert ("windows of 0.5 s, to which its constant law was fitted" in found.status) is not kept
 
 
 @pytest.mark.usefixtures("sets_stay")
@@ -149,6 +170,7 @@ def test_a_plant_is_let_go_only_for_what_windows_held_back_gain(with_plant, monk
     monkeypatch.setattr(ShootingFitter, "search", search)
     model = NFLFM(1, v_smooth=V_SMOOTH, **SMALL)
     fit(model, one_link(), recording, start=law, **BRIEF)
+    seen.pop()  # over windows as long as the law's
     rounds = len(PRIOR_SHARES) + DEFAULTS.folds - 1
     near, free = seen[0][0], seen[rounds][0]
     assert [trial[0] for trial in seen] == rounds * [near] + rounds * [free]

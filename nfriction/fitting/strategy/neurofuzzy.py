@@ -64,6 +64,10 @@ from nfriction.optim.group_evidence import GroupEvidence, group_evidence
 from nfriction.recording import Recording
 from nfriction.signals import Motion
 
+LOST = (
+    "Network rejected: over windows of {:.3g} s, to which its constant law was fitted, it was "
+    "{:.3g} % worse; the constant law is kept."
+)
 INTERRUPTED = "Stopped before the network was found; its constant law is kept."
 
 
@@ -188,16 +192,20 @@ class _Contest:
         task, best, validation = self.task, self.best, self.validation
         if best is None:
             return self._kept(model, INTERRUPTED, converged=False)
-        before = None
+        before, note = None, ""
         try:
             while best.finite and best is not before:
                 before, best = best, validation.trained_on(best)
+            end = best.end
+            if self.accepts(best) and not end.stopped:
+                end = validation.fit_all(best)
+                note = validation.lost_by(end)
         except StoppedError:
-            best = replace(best, end=best.end.as_stopped())
+            end = best.end.as_stopped()
         if not self.accepts(best):
-            note, stopped = verdict(best.squares, validation.of_law), best.end.stopped
-            return self._kept(model, note, converged=not stopped)
-        end = best.end if best.end.stopped else validation.fit_all(best)
+            note = verdict(best.squares, validation.of_law)
+        if note:
+            return self._kept(model, note, converged=not end.stopped)
         found = copy.deepcopy(end.problem.friction)
         result = result_from_shooting(found, end.problem, end.result, task.motions)
         model.load_state_dict(found.state_dict())
@@ -351,7 +359,7 @@ class Validation:
         self, law: ShootingFitter, start: FitResult, motions: tuple[Motion, ...], length: float
     ) -> None:
         assert law.plant_prior is not None
-        self.law, self.length, self.options = law, length, law.options
+        self.law, self.motions, self.length, self.options = law, motions, length, law.options
         self.plant = law.plant_prior[0]
         self.windows = holdout_windows(law.recordings, motions, length, self.options.folds)
         self.splits = holdout_splits(self.windows, self.options.folds)
@@ -446,6 +454,21 @@ class Validation:
     def fit_all(self, trial: Trial) -> HorizonResult:
         """The network of a trial, fitted to all windows."""
         return self._further(trial, self.windows, f"{self.length:g} s windows")
+
+    def lost_by(self, end: HorizonResult) -> str:
+        """Why a network is rejected that is worse over windows as long as its law's; "" if not.
+
+        Shorter ones, of which some can be held out, hardly show a force that is slightly off.
+        """
+        windows = self.law.cut(self.motions, self.length)
+        if end.stopped or windows.spans == self.windows.spans:
+            return ""
+        law, (friction, plant, *_) = self.law.friction.schedule.parameter_vector(), end.parts
+        network = holdout_squares(windows, end.problem, friction, plant)
+        problem = self.law.problem(windows, self.noise, law)
+        ratio = network.mean() / holdout_squares(windows, problem, law, self.plant).mean()
+        worse = 100 * (float(ratio.sqrt()) - 1)
+        return LOST.format(windows.length, worse) if worse > 0 else ""
 
     def _further(self, trial: Trial, windows: Windows, name: str) -> HorizonResult:
         """The network of a trial, fitted to other windows from where it is."""
