@@ -53,16 +53,14 @@ from nfriction.friction.models import FrictionModel
 from nfriction.plant import PendulumChain, Plant
 from nfriction.signals import Motion
 
-TOO_LONG = (
-    "Windows of {:g} s were skipped: the motion forgets its start within them, or law or plant are "
-    "wrong."
-)
-
-LOSSY = (
-    "Windows of {:g} s were skipped: their parameters would be less certain than those of shorter "
-    "windows, or worse there. Errors and noise of the torque add up over long windows; a wrong law "
-    "or plant has the same effect."
-)
+# Causes of skipped windows that a user can remove.
+SKIPPED = {
+    "too long": "the motion forgets its start within them, or law or plant are wrong",
+    "lossy": (
+        "their parameters would be worse at shorter windows; errors of the torque add up over long "
+        "windows, and a wrong law or plant has the same effect"
+    ),
+}
 
 
 def fit_constant(task: FitTask) -> FitResult:
@@ -117,8 +115,11 @@ def fit_constant(task: FitTask) -> FitResult:
         stages=tuple((stage.problem.windows.length, stage.rms) for stage in search.stages),
         skipped_horizons=search.skipped,
     )
-    reason = LOSSY if search.lossy else TOO_LONG
-    said = [reason.format(length) for length in search.skipped]
+    skipped = f"Windows of {' and '.join(f'{length:g}' for length in search.skipped)} s"
+    said = [f"{skipped} were skipped: {why}." for r, why in SKIPPED.items() if r == search.reason]
+    if search.reason == "noisy":
+        noisy = f"{skipped} were not needed: over them noise of the torque adds up"
+        fitted = replace(fitted, status=f"{fitted.status.rstrip('.')}. {noisy}.")
     driven = bool(found.problem.windows.tau.any())
     if driven and found.result.converged and not (options.fit_delay or task.mistakes):
         with_delay = replace(task, options=replace(options, fit_delay=True))
@@ -195,7 +196,7 @@ def warm_start_from_nested(
     longer = best.problem.windows.spans != own.end.problem.windows.spans
     if (longer or len(own.stages) > 1) and not best.stopped and loses(own.stages, best):
         return own
-    return Continuation((*own.stages[:-1], best), base.skipped, base.lossy)
+    return Continuation((*own.stages[:-1], best), base.skipped, base.reason)
 
 
 def best_of_starts(

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -226,12 +227,12 @@ class Continuation:
     Attributes:
         stages: those that were kept, one at least.
         skipped: lengths of the windows that were skipped [s].
-        lossy: true if the first of these was searched, but lost what shorter windows had found.
+        reason: why the first of these was skipped; empty if the caller stopped the search.
     """
 
     stages: tuple[HorizonResult, ...]
     skipped: tuple[float, ...] = ()
-    lossy: bool = False
+    reason: Literal["", "too long", "lossy", "noisy"] = ""
 
     @property
     def end(self) -> HorizonResult:
@@ -294,10 +295,11 @@ def horizon_continuation(
             )
             ends = [other, found] if other is not found else ends
         if stages and ends[0].lost_motion(stages[-1], options):
-            return Continuation(tuple(stages), rest)
+            return Continuation(tuple(stages), rest, "too long")
         kept = [end for end in ends if not stages or end.stopped or not loses(stages, end)]
         if not kept:
-            return Continuation(tuple(stages), rest, lossy=True)
+            noisy = all(knows_less(end, stages[-1]) for end in ends)
+            return Continuation(tuple(stages), rest, "noisy" if noisy else "lossy")
         found = kept[0]
         if fitter.friction.law.memory and not (found.stopped or found.result.converged):
             # Contacts that react strongly at the start leave a damping that makes steps short.
@@ -351,7 +353,7 @@ def loses(stages: Sequence[HorizonResult], found: HorizonResult) -> bool:
     lower, upper = found.problem.variables.bounds()
     fitted = int((lower < upper)[: found.problem.variables.shared_count].sum())
     driven = bool(found.problem.windows.tau.any())
-    if driven and before.explained and knows_less(found, before):
+    if knows_less(found, before):
         return True
     total, worse = 0.0, False
     for at in (*stages, found):
@@ -371,13 +373,15 @@ def loses(stages: Sequence[HorizonResult], found: HorizonResult) -> bool:
 
 
 def knows_less(found: HorizonResult, before: HorizonResult) -> bool:
-    """True if a stage leaves the friction more uncertain than one before, by their volume.
+    """True if noise of the torque makes a stage's friction less certain than that of one before.
 
-    Not of windows of the same length, or without noise of the torque, or where either of them does
-    not determine it at all.
+    That is, if noise explains the residuals of the shorter windows, and the volume of the
+    friction's uncertainty grows. Not of windows of the same length, or where either of them does
+    not determine the friction at all.
     """
     same = found.problem.windows.spans == before.problem.windows.spans
-    if same or not bool(white_noise(found.problem.windows.tau).any()):
+    noisy = bool(white_noise(found.problem.windows.tau).any())
+    if same or not noisy or not before.explained:
         return False
     return _log_volume(found) > _log_volume(before)
 
