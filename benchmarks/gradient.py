@@ -195,9 +195,8 @@ def regularised(repeats: int) -> None:
     import torch
 
     from nfriction.fuzzy import RBFNetwork
-    from nfriction.optim.evidence import EvidenceOptions
-    from nfriction.optim.jacobian import normal_equations, trainable
-    from nfriction.optim.regularisation import bayesian_regularisation
+    from nfriction.papers.nffem.evidence import EvidenceOptions, bayesian_regularisation
+    from nfriction.papers.nffem.jacobian import normal_equations, trainable
 
     torch.set_num_threads(1)
     random = torch.Generator().manual_seed(0)

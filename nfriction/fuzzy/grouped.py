@@ -81,8 +81,8 @@ class LinearOutputModule(GroupedModule):
         d y_k(sample) / d parameter = F[:, sample] . M[:, parameter],
 
     and least squares needs one product F F^T for all outputs, five times faster than a product of
-    whole Jacobians (`nfriction.optim.jacobian`). The first columns are the regressors, of which
-    `readout` makes the outputs.
+    whole Jacobians (`nfriction.papers.nffem.jacobian`). The first columns are the regressors, of
+    which `readout` makes the outputs.
     """
 
     @abstractmethod

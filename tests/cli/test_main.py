@@ -164,7 +164,12 @@ def test_export_info_and_demo_say_what_they_cannot(bench: Path, compared: Path, 
 
 @pytest.mark.skipif(os.name != "posix", reason="pipes end otherwise there")
 @pytest.mark.parametrize(
-    ("words", "unbuffered"), [(["--version"], ""), (["--version"], "1"), (["info"], "")]
+    ("words", "unbuffered"),
+    [
+        (["--version"], ""),
+        (["--version"], "1"),
+        pytest.param(["info"], "", marks=pytest.mark.slow),
+    ],
 )
 def test_a_closed_pipe_ends_quietly(words: list[str], unbuffered: str, tmp_path: Path) -> None:
     if words == ["info"]:

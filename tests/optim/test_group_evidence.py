@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import torch
 
-from nfriction.optim.evidence import group_evidence
+from nfriction.optim.group_evidence import group_evidence
 
 
 def problem():

@@ -17,9 +17,9 @@ from torch import Tensor, nn
 
 from nfriction.fuzzy import Anfis, AnfisRBF, RBFNetwork
 from nfriction.fuzzy.partition import FreePartition
-from nfriction.optim.jacobian import CHUNK_ENTRIES, flatten, trainable, unflatten
 from nfriction.optim.least_squares import Quadratic
 from nfriction.optim.levenberg_marquardt import LevenbergMarquardt
+from nfriction.papers.nffem.jacobian import CHUNK_ENTRIES, flatten, trainable, unflatten
 
 FuzzyNetwork = Anfis | AnfisRBF | RBFNetwork
 

@@ -14,10 +14,14 @@ import torch
 from torch import Tensor, nn
 
 from nfriction.fuzzy import Anfis, AnfisRBF, RBFNetwork
-from nfriction.optim.evidence import EvidenceOptions, EvidenceResult, EvidenceState
-from nfriction.optim.jacobian import trainable
-from nfriction.optim.regularisation import bayesian_regularisation
 from nfriction.papers.controller.mamdani import MamdaniController
+from nfriction.papers.nffem.evidence import (
+    EvidenceOptions,
+    EvidenceResult,
+    EvidenceState,
+    bayesian_regularisation,
+)
+from nfriction.papers.nffem.jacobian import trainable
 from nfriction.papers.nffem.projection import (
     LINEAR,
     FuzzyNetwork,
@@ -350,18 +354,13 @@ def _regularised(
     layer: FuzzyNetwork, x: Tensor, y: Tensor, prior: dict[str, Tensor], options: EvidenceOptions
 ) -> EvidenceResult:
     """Bayesian regularisation with a prior of its own for each kind of parameter."""
-    parameters = trainable(layer)
-    # Each kind has a scale of its own, so the evidence weights each prior separately.
-    groups: dict[str, list[str]] = {}
-    for name in parameters:
-        groups.setdefault(_kind(name), []).append(name)
     # Frozen parameters have no prior.
-    wanted = {name: value for name, value in prior.items() if name in parameters}
-    return bayesian_regularisation(layer, x, y, groups=groups, prior=wanted, options=options)
+    wanted = {name: prior[name] for name in trainable(layer) if name in prior}
+    return bayesian_regularisation(layer, x, y, kind=_kind, prior=wanted, options=options)
 
 
 def _kind(name: str) -> str:
-    """The prior that a parameter belongs to."""
+    """Group of a parameter: each kind has a scale of its own, for which the evidence decides."""
     part = {"spacings": "centres", "log_widths": "widths", "log_slopes": "slopes"}
     last = name.rsplit(".", 1)[-1]
     kind = "outputs" if last.startswith("output_") else part.get(last, last)

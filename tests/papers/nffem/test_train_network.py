@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from nfriction.fuzzy import Anfis, AnfisRBF, RBFNetwork
-from nfriction.optim.evidence import EvidenceState
-from nfriction.optim.jacobian import flatten, trainable
 from nfriction.papers.controller.mamdani import paper_controller
+from nfriction.papers.nffem.evidence import EvidenceState
+from nfriction.papers.nffem.jacobian import flatten, trainable
 from nfriction.papers.nffem.projection import Scaling, one_group, to_own_units
 from nfriction.papers.nffem.train_network import (
     TrainingOptions,

@@ -1,7 +1,6 @@
-"""Evidence maximisation: least squares with one prior precision for each group of parameters.
+"""Bayesian regularisation: least squares with one prior precision for each group of parameters.
 
-Gauss-Newton steps on the parameters w alternate with MacKay's updates of the precisions. Only
-normal equations are needed, from wherever they come.
+Gauss-Newton steps on the parameters w alternate with MacKay's updates of the precisions.
 
 The precisions alpha (by group) and beta have no halves, as in `posterior`.
 
@@ -13,23 +12,26 @@ References:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple, TypeAlias
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
 
 import torch
 from torch import Tensor, nn
 from tqdm.auto import tqdm
 
-from nfriction.optim.jacobian import Function, NormalEquations, jacobian_pieces
-from nfriction.optim.posterior import (
-    EvidenceProblem,
-    Posterior,
-    factorise,
-    group_sums,
-    posterior,
-    reestimate,
+from nfriction.optim.group_evidence import factorise, group_sums
+from nfriction.papers.nffem.jacobian import (
+    NormalEquations,
+    check_samples,
+    flatten,
+    jacobian_pieces,
+    normal_equations,
+    sum_of_squares,
+    trainable,
+    unflatten,
 )
+from nfriction.papers.nffem.posterior import EvidenceProblem, Posterior, posterior, reestimate
 
 Status = Literal["converged", "noise_floor", "max_steps", "stalled", "not_finite", "stopped"]
 
@@ -114,7 +116,7 @@ class EvidenceResult:
         covariance: posterior covariance of the parameters, shape (p, p).
         steps: accepted steps.
         history: log evidence before each step.
-        model, parameters: differentiated by `predictive_std`, if known.
+        model, parameters: differentiated by `predictive_std`.
     """
 
     status: Status
@@ -129,8 +131,8 @@ class EvidenceResult:
     covariance: Tensor
     steps: int
     history: list[float]
-    model: nn.Module | Function | None = None
-    parameters: dict[str, Tensor] = field(default_factory=dict)
+    model: nn.Module
+    parameters: dict[str, Tensor]
 
     @property
     def converged(self) -> bool:
@@ -156,11 +158,6 @@ class EvidenceResult:
         Returns:
             Shape of the outputs, (m, *outputs).
         """
-        if self.model is None:
-            raise ValueError(
-                "This fit was made from normal equations and knows no model; use `covariance` "
-                "with the Jacobian of your outputs."
-            )
         floor = 0.5 / self.beta if noise else 0.0
         deviations = []
         for _, output, jacobians in jacobian_pieces(self.model, self.parameters, x):
@@ -170,88 +167,77 @@ class EvidenceResult:
         return torch.cat(deviations)
 
 
-class GroupEvidence(NamedTuple):
-    """Evidence for the prior precisions of groups, and better ones.
-
-    Attributes:
-        occam: log of the posterior volume over that of the prior, in nats; with the cost at the
-            optimum taken off it is the log evidence, up to a constant.
-        gamma: parameters of each group that the data determine, (groups,).
-        slope: derivative of the log evidence by the log precision of each group, (groups,).
-        precision: new precision of each group, (groups,).
-    """
-
-    occam: float
-    gamma: Tensor
-    slope: Tensor
-    precision: Tensor
-
-
-def group_evidence(
-    data: Tensor, known: Tensor, offset: Tensor, groups: Tensor, precision: Tensor
-) -> GroupEvidence:
-    """MacKay's update of the precisions alpha of groups of parameters beside a known prior.
-
-    With A = data + known + diag(alpha) at the optimum, the log evidence is stationary where
-
-        alpha_g |offset_g|^2 = gamma_g = alpha_g tr_g((known + diag(alpha))^-1 - A^-1).
-
-    Args:
-        data: curvature of the errors, other variables marginalised, (p, p).
-        known: curvature of a prior that does not change, (p, p).
-        offset: parameters less the mean of the prior, at the optimum, (p,).
-        groups: group of each parameter, -1 of those that the known prior alone covers, (p,).
-        precision: alpha of each group, (groups,).
-    """
-    count, mine = len(precision), groups >= 0
-    prior = known + torch.diag(torch.where(mine, precision[groups.clamp_min(0)], 0.0))
-    variances, volumes = [], []
-    for system in (prior, prior + data):
-        # Scaled to a unit diagonal, so that the units of the parameters cost no digits.
-        scale, factor = factorise(system)
-        variances.append(scale.square() * torch.cholesky_inverse(factor).diagonal())
-        volumes.append(float(scale.log().sum() - factor.diagonal().log().sum()))
-    reduced = (variances[0] - variances[1])[mine]
-    squares = group_sums(offset[mine].square(), groups[mine], count)
-    # Rounding may leave less than nothing of a group that the data do not know.
-    gamma = (precision * group_sums(reduced, groups[mine], count)).clamp_min(0.0)
-    # Data that say nothing cannot choose, and a group at its centre divides by zero.
-    usable = (gamma > torch.finfo(gamma.dtype).eps ** 0.5) & (squares > 0)
-    return GroupEvidence(
-        occam=volumes[1] - volumes[0],
-        gamma=gamma,
-        slope=0.5 * (gamma - precision * squares),
-        precision=torch.where(usable, gamma / squares, precision),
-    )
-
-
-def maximise_evidence(
-    problem: EvidenceProblem, w: Tensor, options: EvidenceOptions | None = None
+def bayesian_regularisation(
+    model: nn.Module,
+    x: Tensor,
+    y: Tensor,
+    *,
+    kind: Callable[[str], str] = str,
+    prior: Mapping[str, Tensor | float] | None = None,
+    options: EvidenceOptions | None = None,
 ) -> EvidenceResult:
-    """Fit parameters, noise precision and one prior precision per group to normal equations.
+    """Train a module in place on samples, with Bayesian regularisation and no validation set.
 
-    A step solves (S + mu diag S) d = -(beta J^T e + alpha (w - w0)) and is taken if
-    beta E_D + sum alpha_g E_g falls; else, or where errors are not finite, mu*10. Then come new
-    alpha and beta, and mu/10 if the first trial fell about as predicted. The damping is relative to
-    the diagonal, so that the units of the parameters do not matter; the first step has hardly any
-    prior, as in Foresee and Hagan.
+    Every trainable parameter is shrunk toward its prior value with the strength that the evidence
+    assigns to its group. A step solves (S + mu diag S) d = -(beta J^T e + alpha (w - w0)) and is
+    taken if beta E_D + sum alpha_g E_g falls; else, or where errors are not finite, mu*10. Then
+    come new alpha and beta, and mu/10 if the first trial fell about as predicted. The damping is
+    relative to the diagonal, so that the units of the parameters do not matter; the first step has
+    hardly any prior, as in Foresee and Hagan. The weights are written when the fit ends, also if an
+    interrupt or the callback ends it; a fit that fails from the start leaves the module unchanged.
 
     Args:
-        problem: errors and priors.
-        w: start, shape (p,).
-        options: settings.
+        model: outputs of sample i depend on sample i only; see `nfriction.papers.nffem.jacobian`
+            for modules that offer their derivatives.
+        x: inputs, shape (n, ...).
+        y: targets, shape of the model's output.
+        kind: group of a parameter by its name; by default each is a group of its own.
+        prior: values w0 by parameter name, 0 where missing.
+        options: settings; the noise floor is in the unit of `y`.
+    Returns:
+        Weights, alpha, beta, gamma, log evidence, error bars and status.
+    Raises:
+        ValueError: samples or prior do not fit the model.
     """
     options = EvidenceOptions() if options is None else options
-    fit = _Fit(problem, options, w.detach().clone())
+    parameters, given = trainable(model), prior or {}
+    if not parameters or (unknown := sorted(set(given) - set(parameters))):
+        wrong = f"`prior` names {unknown}" if parameters else "`model` has nothing to train"
+        raise ValueError(f"{wrong}; parameters that require a gradient are {list(parameters)}.")
+    check_samples(x, y)
+    if not (torch.isfinite(x).all() and torch.isfinite(y).all()):
+        raise ValueError("`x` and `y` must be finite; drop the samples that are not.")
+    groups = [kind(name) for name in parameters]
+    names = list(dict.fromkeys(groups))
+    places = torch.tensor([names.index(group) for group in groups], device=x.device)
+    sizes = torch.tensor([value.numel() for value in parameters.values()], device=x.device)
+    centres = {n: torch.zeros_like(value) + given.get(n, 0.0) for n, value in parameters.items()}
+    # Errors within the rounding of the targets carry no information.
+    rounding = torch.finfo(y.dtype).eps * float(y.square().mean().sqrt())
+    # Samples last in memory, as layers take them: kernels are vectorised over samples.
+    x, y = (part.movedim(0, -1).contiguous().movedim(-1, 0) for part in (x, y))
+    problem = EvidenceProblem(
+        equations=lambda w: normal_equations(model, unflatten(w, parameters), x, y),
+        squares=lambda w: sum_of_squares(model, unflatten(w, parameters), x, y),
+        samples=y.numel(), prior=flatten(centres), groups=places.repeat_interleave(sizes),
+        names=names,
+    )  # fmt: skip
+    options = replace(options, noise_floor=max(options.noise_floor, rounding))
+    fit = _Fit(problem, options, flatten(parameters))
     try:
         status = fit.run()
     except KeyboardInterrupt:
         status = "stopped"
-    return fit.result(status)
+    best = unflatten(fit.state.w.clone(), parameters)
+    with torch.no_grad():
+        for name, parameter in model.named_parameters():
+            if name in best:
+                parameter.copy_(best[name])
+    return fit.result(status, model, best)
 
 
 class _Fit:
-    """A run of `maximise_evidence`."""
+    """A run of `bayesian_regularisation`."""
 
     def __init__(self, problem: EvidenceProblem, options: EvidenceOptions, w: Tensor) -> None:
         self.problem, self.options = problem, options
@@ -383,7 +369,9 @@ class _Fit:
         fall = objective - float(beta * there.squares) - shrinkage
         return (there, fall) if fall > 0 and not self.not_finite else None
 
-    def result(self, status: Status) -> EvidenceResult:
+    def result(
+        self, status: Status, model: nn.Module, parameters: dict[str, Tensor]
+    ) -> EvidenceResult:
         state, names = self.state, self.problem.names
         unknown = torch.full_like(state.alpha, math.nan)
         known = Posterior(self.local.JtJ * math.nan, unknown, math.nan, math.nan, unknown)
@@ -406,4 +394,6 @@ class _Fit:
             covariance=known.covariance,
             steps=state.step,
             history=self.history,
+            model=model,
+            parameters=parameters,
         )

@@ -7,16 +7,15 @@ import torch
 from torch import Tensor, nn
 
 from nfriction.fuzzy import Anfis, AnfisRBF, RBFNetwork
-from nfriction.optim.evidence import EvidenceOptions
-from nfriction.optim.jacobian import (
+from nfriction.papers.nffem.evidence import EvidenceOptions, bayesian_regularisation
+from nfriction.papers.nffem.jacobian import (
     CHUNK_ENTRIES,
     NormalEquations,
     normal_equations,
     shares_columns,
     trainable,
 )
-from nfriction.optim.regularisation import bayesian_regularisation
-from tests.optim.networks import F64, RadialBasis, noise
+from tests.papers.nffem.networks import F64, RadialBasis, noise
 
 LAYERS = {
     "anfis": lambda g: Anfis(g, 2, [3, 2], 2),

@@ -7,17 +7,17 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from nfriction.optim.evidence import (
+from nfriction.papers.nffem.evidence import (
     EvidenceOptions,
     EvidenceResult,
-    maximise_evidence,
+    bayesian_regularisation,
 )
-from nfriction.optim.jacobian import NormalEquations, flatten, trainable
-from nfriction.optim.posterior import EvidenceProblem
-from nfriction.optim.regularisation import bayesian_regularisation, group_index
-from tests.optim.networks import F64, Linear, RadialBasis, Tanh, noise, triangle_wave
+from nfriction.papers.nffem.jacobian import flatten, trainable
+from tests.papers.nffem.networks import F64, Linear, RadialBasis, Tanh, noise, triangle_wave
 
-ONE = {"all": "*"}
+
+def one(_name: str) -> str:
+    return "all"
 
 
 def regression(seed: int, n: int = 60) -> tuple[Tensor, Tensor]:
@@ -55,7 +55,7 @@ def test_effective_parameters_saturate_as_units_are_added() -> None:
     for units in (1, 2, 3, 4, 6, 10):
         fits = [
             bayesian_regularisation(
-                Tanh(units, seed), x, y, groups=ONE, options=EvidenceOptions(max_steps=150)
+                Tanh(units, seed), x, y, kind=one, options=EvidenceOptions(max_steps=150)
             )
             for seed in range(3)
         ]
@@ -105,12 +105,12 @@ def test_a_group_of_its_own_for_the_strong_beats_one_alpha_for_all() -> None:
     for seed in range(0, 100, 10):
         X, y = regression(seed, n=20)
         truth = torch.cat([3 * noise(seed + 1, 3), 0.03 * noise(seed + 2, 8)])
-        one = bayesian_regularisation(Linear(3, 8), X, y, groups=ONE)
+        single = bayesian_regularisation(Linear(3, 8), X, y, kind=one)
         two = bayesian_regularisation(Linear(3, 8), X, y)
-        assert one.converged
+        assert single.converged
         assert two.converged
-        gain += two.log_evidence - one.log_evidence
-        error["one"] += float((one.w - truth).square().sum())
+        gain += two.log_evidence - single.log_evidence
+        error["one"] += float((single.w - truth).square().sum())
         error["two"] += float((two.w - truth).square().sum())
     assert gain > 10 * 3  # three nats a data set: strong evidence by any scale
     assert error["two"] < 0.7 * error["one"]
@@ -245,7 +245,7 @@ def test_prior_holds_what_the_data_do_not_see() -> None:
     with torch.no_grad():
         model.b.copy_(noise(5, 8))
     before = model.b.detach().clone()
-    fit = bayesian_regularisation(model, X, y, prior="initial")
+    fit = bayesian_regularisation(model, X, y, prior={"b": before})
     assert fit.converged
     assert torch.equal(model.b, before)
     assert fit.gamma["b"] == 0
@@ -267,39 +267,14 @@ def test_units_of_the_targets_shift_the_evidence_by_their_jacobian() -> None:
         assert math.isclose(scaled.gamma[group], gamma, rel_tol=1e-6)
 
 
-def test_normal_equations_alone_suffice() -> None:
-    X, y = regression(0)
-    names, index = group_index(trainable(Linear(3, 8)), None)
-
-    def equations(w: Tensor) -> NormalEquations:
-        e = X @ w - y
-        return NormalEquations(X.T @ X, X.T @ e, e @ e)
-
-    start = torch.zeros(11, dtype=F64)
-    alone = maximise_evidence(EvidenceProblem(equations, 60, start, index, names), start)
-    module = bayesian_regularisation(Linear(3, 8), X, y)
-    torch.testing.assert_close(alone.w, module.w, rtol=1e-9, atol=0)
-    assert math.isclose(alone.log_evidence, module.log_evidence, rel_tol=1e-9)
-    with pytest.raises(ValueError, match="knows no model"):
-        alone.predictive_std(X)
-
-
 def test_bad_input_is_refused_at_the_border() -> None:
     X, y = regression(0)
 
     def fit(**options: object) -> EvidenceResult:
         return bayesian_regularisation(Linear(3, 8), X, y, **options)
 
-    with pytest.raises(ValueError, match="exactly one"):
-        fit(groups={"first": "a"})
-    with pytest.raises(ValueError, match="exactly one"):
-        fit(groups={"first": "a", "all": ["*"]})
-    with pytest.raises(ValueError, match="no parameter"):
-        fit(groups={"all": "*", "none": "z*"})
     with pytest.raises(ValueError, match=r"\['c'\]"):
         fit(prior={"c": 0.0})
-    with pytest.raises(ValueError, match="initial"):
-        fit(prior="start")
     with pytest.raises(ValueError, match="positive"):
         EvidenceOptions(tolerance=0.0)
     with pytest.raises(ValueError, match="finite"):

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nfriction.optim.jacobian import (
+from nfriction.papers.nffem.jacobian import (
     flatten,
     jacobian_pieces,
     normal_equations,
@@ -14,7 +14,7 @@ from nfriction.optim.jacobian import (
     trainable,
     unflatten,
 )
-from tests.optim.networks import Linear, RadialBasis, noise
+from tests.papers.nffem.networks import Linear, RadialBasis, noise
 
 
 def per_sample_jacobian(*arguments: object) -> Tensor:

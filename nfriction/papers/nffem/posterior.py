@@ -22,7 +22,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from nfriction.optim.jacobian import NormalEquations
+from nfriction.optim.group_evidence import factorise, group_sums
+from nfriction.papers.nffem.jacobian import NormalEquations
 
 # A group whose prior outweighs its data by this factor is switched off; alpha stops there.
 LARGEST_RATIO = 1e12
@@ -142,20 +143,3 @@ def reestimate(
     # At the centre of its prior the estimate divides zero by zero.
     usable = (known.parameter_squares > 0) & (estimate > 0)
     return torch.where(usable, estimate, alpha), beta
-
-
-def factorise(system: Tensor) -> tuple[Tensor, Tensor]:
-    """Scale s and lower Cholesky factor L with diag(s) S diag(s) = L L^T of unit diagonal."""
-    scale = system.diagonal().clamp(min=torch.finfo(system.dtype).tiny).rsqrt()
-    scaled = scale[:, None] * system * scale
-    factor, failed = torch.linalg.cholesky_ex(scaled)
-    if failed:
-        # Singular to rounding: lift the eigenvalues by the size of that rounding.
-        lift = 10 * len(system) * torch.finfo(system.dtype).eps
-        factor, _ = torch.linalg.cholesky_ex(scaled + lift * torch.eye(len(system)).to(scaled))
-    return scale, factor
-
-
-def group_sums(values: Tensor, groups: Tensor, count: int) -> Tensor:
-    """Sum of `values` over each group, shape (count,)."""
-    return values.new_zeros(count).index_add_(0, groups, values)

@@ -5,9 +5,9 @@ import math
 import torch
 from torch import Tensor
 
-from nfriction.optim.jacobian import NormalEquations
-from nfriction.optim.posterior import EvidenceProblem, posterior, reestimate
-from tests.optim.networks import F64, noise
+from nfriction.papers.nffem.jacobian import NormalEquations
+from nfriction.papers.nffem.posterior import EvidenceProblem, posterior, reestimate
+from tests.papers.nffem.networks import F64, noise
 
 N, GROUPS = 30, torch.tensor([0, 0, 1, 1, 1])
 
