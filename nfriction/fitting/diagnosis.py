@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 
 # Samples of a block that show a curvature despite their noise.
 FEWEST_FOR_CURVATURE = 5
+# Of fewer blocks, one of the corrections explains most by chance.
+FEWEST_BLOCKS = 20
 # Speeds between which a friction torque is linear.
 SPEED_KNOTS = 5
 
@@ -99,7 +101,7 @@ def likely_mistakes(
         do not distinguish them, none where no correction divides the share by `diagnosis_ratio`.
     """
     given = _collect(recordings, motions, options)
-    if not len(given.q):
+    if len(given.q) < FEWEST_BLOCKS * given.block:
         return math.nan, ()
     stated = sound = _unexplained(plant, given)
     delay = 0.0, sound

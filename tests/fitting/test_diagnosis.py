@@ -11,6 +11,7 @@ import torch
 
 from nfriction import (
     CVFM,
+    LFM,
     NCFM,
     LinearAxis,
     Motor,
@@ -26,6 +27,7 @@ from nfriction.fitting.options import FitOptions
 from nfriction.fitting.task import prepare_task
 from nfriction.signals import kalman_smoother
 from tests.evaluation.test_score import zeroed_in_a_pose
+from tests.fitting.recordings import pendulum, swing
 
 COUNT = 2 * math.pi / 4096
 WHEEL = {"inertia": 0.02, "motor": Motor(50, rotor_inertia=1.2e-5)}
@@ -87,6 +89,13 @@ def later(values: np.ndarray, samples: int) -> np.ndarray:
 @pytest.mark.parametrize("name", ["free", "driven", "motor", "axis"])
 def test_sound_data_raise_no_alarm(name):
     assert warnings_of(*measured(name)) == ()
+
+
+def test_a_moment_of_a_motion_names_no_mistake():
+    """Corrections explain the few torques of a short recording by chance."""
+    plant, model = pendulum(), LFM(2, [[2e-3, 3e-3]] * 2)
+    recording = swing(plant, model, seconds=0.3)
+    assert not any("mistake" in w for w in warnings_of(plant, recording.q, None))
 
 
 @functools.cache
