@@ -14,8 +14,9 @@ from single_shooting import single_shooting
 
 from nfriction import Recording, rigs
 from nfriction.evaluation.compare import FAR_WORSE
-from nfriction.evaluation.cross_validation import TimeBlock, blocked_k_fold, with_fitted_offsets
+from nfriction.evaluation.cross_validation import TimeBlock, blocked_k_fold
 from nfriction.evaluation.score import score
+from nfriction.fitting.data.inputs import apply_encoder_offsets
 from nfriction.fitting.fit import fit
 from nfriction.fitting.options import EncoderReference
 from nfriction.fitting.result.fit_result import FitResult
@@ -205,7 +206,11 @@ class Contest:
                 encoder_reference=reference, **self.settings,
             )  # fmt: skip
             fits.append(found)
-            left = with_fitted_offsets(found, fold.left) if in_blocks(fold) else fold.left
+            left = fold.left
+            if in_blocks(fold):
+                offsets = found.encoder_offsets
+                moved = apply_encoder_offsets(offsets, found.plant, *zip(*left, strict=True))
+                left = [TimeBlock(*pair) for pair in zip(*moved, strict=True)]
             left = [one._replace(recording=found.aligned(one.recording)) for one in left]
             rows[m].add(start, found.plant, model, left, self._zeroed(fold))
 
