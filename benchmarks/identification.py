@@ -30,8 +30,8 @@ the same model fitted to all recordings at once: an aim below it is out of this 
 recordings of the single pendulum follow each other as it slows down, so the first one left out asks
 for drag at twice the speed of the others. With `--peer scipy` every
 constant law is also fitted by single shooting, as the baselines on the recordings' cards were,
-which shows how hard these recordings are beside those that are kept apart. A model that is twice
-as bad as one named before it is marked as not fit for use.
+which shows how hard these recordings are beside those that are kept apart. The first row is of no
+friction, and the last the limit of these data; models that `compare` calls unfit are marked.
 DATA holds a folder to each set, with a `recordings.csv` of initial states.
 
 `intervals` fits pieces of recordings, each alone, and prints how often the difference of what two
@@ -65,6 +65,7 @@ from own_rigs import own_rigs, presliding, within_limit
 from pieces import intervals
 from recovery import RELEASES, recovery
 
+from nfriction.cli.inputs import DEFAULT_MODELS
 from nfriction.fitting.options import CHOICES
 
 
@@ -79,7 +80,7 @@ def main() -> int:
     given = commands.add_parser("real", help="recordings left out one by one")
     given.add_argument("data", type=Path)
     given.add_argument("--only", nargs="+", default=list(SETS), choices=list(SETS))
-    given.add_argument("--models", nargs="+", default=["NCFM", "LFM", "NFLFM"])
+    given.add_argument("--models", nargs="+", default=DEFAULT_MODELS.split(","))
     given.add_argument("--blocks", type=int, default=1)
     given.add_argument("--peer", choices=["scipy"])
     given.add_argument("--loss", default="linear", choices=CHOICES["loss"])

@@ -2,8 +2,10 @@
 
 import math
 import time
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,14 +15,15 @@ from numpy.typing import NDArray
 from single_shooting import single_shooting
 
 from nfriction import Recording, rigs
-from nfriction.evaluation.compare import FAR_WORSE
+from nfriction.evaluation.compare import LIMIT, NO_FRICTION, Comparison
 from nfriction.evaluation.cross_validation import TimeBlock, blocked_k_fold
-from nfriction.evaluation.score import score
+from nfriction.evaluation.parallel import dependency_levels, warm_starts
+from nfriction.evaluation.score import Score, score
 from nfriction.fitting.data.inputs import apply_encoder_offsets
 from nfriction.fitting.fit import fit
 from nfriction.fitting.options import EncoderReference
 from nfriction.fitting.result.fit_result import FitResult
-from nfriction.friction import model_by_name
+from nfriction.friction import model_by_name, model_name
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.models import FrictionModel
 from nfriction.plant import Plant
@@ -140,7 +143,7 @@ def real(
     Args:
         data: holds a folder to each set.
         only: sets by name.
-        models: by name, each fitted from the fit of one before it where that helps.
+        models: by name, each fitted from the fit of another as in `compare`.
         blocks: in time, of which one is left out of every recording; 1 leaves out recordings.
         peer: also fit every constant model by single shooting with SciPy.
         recorded_zeros: take encoders for true that were zeroed in a pose held by stiction.
@@ -149,31 +152,25 @@ def real(
     """
     aimed = f"{'aim':>5}  met"
     print(
-        f"{'set':7} {'model':15} unit  free run {aimed} {'5 s':>9} {aimed}"
+        f"{'set':7} {'model':20} unit  free run {aimed} {'5 s':>9} {aimed}"
         f"{'      seen' if seen else ''}  cpu [s]  one by one"
     )
     for name in only:
         contest = Contest(data, SETS[name], models, peer, recorded_zeros, settings)
-        rows = contest.rows(folds(data, contest.of, blocks))
-        known = contest.rows([nothing_left_out(data, contest.of)]) if seen else {}
-        least = math.inf
-        for m, row in rows.items():
-            each = "  ".join(f"{e:.3g}" for e in row.free)
-            errors = [root_mean_square(e) for e in (row.free, row.short)]
-            judged = " ".join(beside(e, t) for e, t in zip(errors, contest.of.target, strict=True))
-            in_all = f"{root_mean_square(known[m].free):10.2f}" if seen else ""
-            # Models come in the order of their parameters, as `Comparison.unfit` judges them.
-            mark = "  not fit for use" if errors[0] >= FAR_WORSE * least else ""
-            least = min(least, errors[0])
-            print(
-                f"{name:7} {m:15} {contest.of.unit:4} {judged}{in_all} {row.spent:8.0f}  "
-                f"{each}{mark}", flush=True,
-            )  # fmt: skip
+        contest.judge(folds(data, contest.of, blocks))
+        if seen:
+            contest.judge([nothing_left_out(data, contest.of)], contest.train)
+        for row in contest.rows():
+            print(f"{name:7} {row}", flush=True)
 
 
 @dataclass(frozen=True)
 class Contest:
-    """Models, and peers if asked for, on the recordings of one set; see `real`."""
+    """Models, and peers if asked for, on the recordings of one set; see `real`.
+
+    Scores are by model, of what was left out and of what was fitted; `fits` are the last ones, and
+    `spent` the processor time of all [s].
+    """
 
     data: Path
     of: Set
@@ -181,54 +178,98 @@ class Contest:
     peer: bool
     recorded_zeros: bool
     settings: dict[str, Any]
+    test: dict[str, list[Score]] = field(default_factory=lambda: defaultdict(list))
+    train: dict[str, list[Score]] = field(default_factory=lambda: defaultdict(list))
+    fits: dict[str, FitResult] = field(default_factory=dict)
+    spent: dict[str, float] = field(default_factory=lambda: defaultdict(float))
 
-    def rows(self, folds: Sequence[Fold]) -> "dict[str, Row]":
-        """Errors of every contestant over all folds."""
-        rows = {m: Row() for m in self.models}
-        if self.peer:
-            rows |= {f"{m}, SciPy": Row() for m in self.models if is_constant(m)}
+    def judge(self, folds: Sequence[Fold], into: dict[str, list[Score]] | None = None) -> None:
+        """Score every contestant on all folds: into `test`, unless given."""
+        into = self.test if into is None else into
         for fold in folds:
-            self._of_models(fold, rows)
+            # Without a fit, the encoders of a block are taken for true.
+            self._score(NO_FRICTION, self.of.plant(), None, fold, fold.left, into)
+            self._judge_models(fold, into)
             if self.peer:
-                self._of_peers(fold, rows)
-        return rows
+                self._judge_peers(fold, into)
 
-    def _of_models(self, fold: Fold, rows: "dict[str, Row]") -> None:
-        plant, reference = self.of.plant(), self.of.encoder_reference
-        fits: list[FitResult] = []
-        for m in self.models:
+    def rows(self) -> list[str]:
+        """Lines of the table, those of models not fit for use marked, and the limit."""
+        plant = self.of.plant()
+        comparison = Comparison(
+            self.fits, self.train, self.test, unit=plant.unit, joint_names=tuple(plant.joint_names)
+        )
+        # Recordings may be too short for windows of 5 s.
+        columns = [None, *({"5"} & set(comparison.horizons("test")))]
+        errors = {m: [math.nan, math.nan] for m in (*self.test, LIMIT)}
+        for k, horizon in enumerate(columns):
+            for m, error in comparison.table(horizon)["all"].items():
+                errors[m][k] = 1e3 * error
+            errors[LIMIT][k] = 1e3 * (comparison.limit(horizon) or math.nan)
+        known = comparison.table(part="train")["all"] if self.train else {}
+        unfit, lines = comparison.unfit(), []
+        for m, pair in errors.items():
+            aims = self.of.target if m in self.fits else (math.nan, math.nan)
+            judged = " ".join(beside(e, t) for e, t in zip(pair, aims, strict=True))
+            in_all = f"{1e3 * known.get(m, math.nan):10.2f}" if self.train else ""
+            each = "  ".join(f"{1e3 * s.free_run.all:.3g}" for s in self.test.get(m, ()))
+            mark = f"  not fit for use: {unfit[m]}" if m in unfit else ""
+            line = f"{m:20} {self.of.unit:4} {judged}{in_all} {self.spent[m]:8.0f}  {each}{mark}"
+            lines.append(line.replace("nan", "  -").rstrip())
+        return lines
+
+    def _judge_models(self, fold: Fold, into: dict[str, list[Score]]) -> None:
+        plant = self.of.plant()
+        origin = warm_starts(list(dict.fromkeys(map(model_name, self.models))))
+        fits: dict[str | None, FitResult] = {}
+        for m in chain.from_iterable(dependency_levels(origin)):
             start = time.process_time()
-            model = model_by_name(m)(plant.joints)
-            before = nearest_fit(fits, model)
-            found = fit(
-                model, plant, fold.fitted, start=before,
+            before = fits.get(origin[m])
+            fits[m] = found = fit(
+                model_by_name(m)(plant.joints), plant, fold.fitted, start=before,
                 motions=before.motions if before else None,
-                encoder_reference=reference, **self.settings,
+                encoder_reference=self.of.encoder_reference, **self.settings,
             )  # fmt: skip
-            fits.append(found)
+            self.spent[m] += time.process_time() - start
+            self.fits[m] = found
             left = fold.left
             if in_blocks(fold):
                 offsets = found.encoder_offsets
                 moved = apply_encoder_offsets(offsets, found.plant, *zip(*left, strict=True))
                 left = [TimeBlock(*pair) for pair in zip(*moved, strict=True)]
             left = [one._replace(recording=found.aligned(one.recording)) for one in left]
-            rows[m].add(start, found.plant, model, left, self._zeroed(fold))
+            self._score(m, found.plant, found.model, fold, left, into)
 
-    def _of_peers(self, fold: Fold, rows: "dict[str, Row]") -> None:
+    def _judge_peers(self, fold: Fold, into: dict[str, list[Score]]) -> None:
         plant = self.of.plant()
         # The peer knows no gaps and one zero for all.
         whole = [r[a : b + 1] for r in fold.fitted for a, b in r.segments]
         states = [None if in_blocks(fold) else first_state(self.data, self.of, r) for r in whole]
-        for m in filter(is_constant, self.models):
-            start = time.process_time()
+        for m in filter(is_constant, dict.fromkeys(map(model_name, self.models))):
+            start, peer = time.process_time(), f"{m}, SciPy"
             model = model_by_name(m)(plant.joints)
             found = single_shooting(model, plant, whole, states)
-            rows[f"{m}, SciPy"].add(start, found, model, fold.left, self._zeroed(fold))
+            self.spent[peer] += time.process_time() - start
+            self.fits[peer] = self.fits[m]  # as large
+            self._score(peer, found, model, fold, fold.left, into)
 
-    def _zeroed(self, fold: Fold) -> bool:
-        """True if zeros are estimated: blocks have those that the rest of their recordings show."""
+    def _score(
+        self,
+        name: str,
+        plant: Plant,
+        model: FrictionModel | None,
+        fold: Fold,
+        left: Sequence[Left] | Sequence[TimeBlock],
+        into: dict[str, list[Score]],
+    ) -> None:
+        # Blocks have the zeros that the rest of their recordings show.
         known = in_blocks(fold) or self.recorded_zeros
-        return not known and self.of.encoder_reference == "per_recording"
+        zeroed = not known and self.of.encoder_reference == "per_recording"
+        for one in left:
+            given = one.initial_state if isinstance(one, Left) else None
+            into[name].append(
+                score(plant, model, one.recording, initial_state=given, zeroed=zeroed)
+            )
 
 
 def in_blocks(fold: Fold) -> bool:
@@ -236,45 +277,8 @@ def in_blocks(fold: Fold) -> bool:
     return isinstance(fold.left[0], TimeBlock)
 
 
-@dataclass
-class Row:
-    """Errors of one contestant on all that was left out, and its processor time [s]."""
-
-    free: list[float] = field(default_factory=list)
-    short: list[float] = field(default_factory=list)
-    spent: float = 0.0
-
-    def add(
-        self,
-        start: float,
-        plant: Plant,
-        model: FrictionModel,
-        left: Sequence[Left] | Sequence[TimeBlock],
-        zeroed: bool,
-    ) -> None:
-        """Count the time since the start, and judge what was found in it."""
-        self.spent += time.process_time() - start
-        for one in left:
-            given = one.initial_state if isinstance(one, Left) else None
-            told = score(
-                plant, model, one.recording, initial_state=given, limit=False, zeroed=zeroed
-            )
-            self.free.append(1e3 * told.free_run.all)
-            five = told.windows.get("5")
-            self.short.append(1e3 * five.all if five else math.nan)
-
-
 def is_constant(name: str) -> bool:
     return isinstance(model_by_name(name)(1).schedule, Constant)
-
-
-def nearest_fit(fits: Sequence[FitResult], model: FrictionModel) -> FitResult | None:
-    """The fit to start from: the constant one of the model's law, else the last."""
-    last = None
-    for last in fits:
-        if last.model.law == model.law and isinstance(last.model.schedule, Constant):
-            break
-    return last
 
 
 def beside(error: float, target: float) -> str:
@@ -282,7 +286,3 @@ def beside(error: float, target: float) -> str:
     if not math.isfinite(target):
         return f"{error:9.2f}     -    -"
     return f"{error:9.2f} {target:5.3g}  {'yes' if error <= target else ' no'}"
-
-
-def root_mean_square(values: Sequence[float]) -> float:
-    return math.sqrt(sum(v * v for v in values) / len(values))

@@ -29,7 +29,7 @@ from nfriction.fitting.equation_error import fit_equation_error
 from nfriction.fitting.options import FitOptions
 from nfriction.fitting.shooting.autocorrelation import effective_noise
 from nfriction.fitting.strategy.continuation import HorizonResult, ShootingFitter
-from nfriction.fitting.strategy.neurofuzzy import _Validation
+from nfriction.fitting.strategy.neurofuzzy import Validation
 from nfriction.friction.coefficients import Constant
 from nfriction.friction.laws import STRIBECK
 from nfriction.friction.models import FrictionModel
@@ -201,7 +201,7 @@ def test_windows_that_are_left_out_are_told(monkeypatch):
     assert not any("were skipped" in told for told in alone.warnings)
     assert found.residual == pytest.approx(alone.residual, rel=0.2)
     # Whatever starts there says it, too.
-    monkeypatch.setattr(_Validation, "trained_on", lambda self, trial: trial)
+    monkeypatch.setattr(Validation, "trained_on", lambda self, trial: trial)
     for kept in (False, True):
         monkeypatch.setattr(
             "nfriction.fitting.strategy.neurofuzzy.gains", lambda *_, kept=kept: kept
